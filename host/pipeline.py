@@ -62,7 +62,7 @@ class Pipeline:
         """Estimate the plane of the plates; return the images on it (unchanged if `move` is False)."""
         with self.quality.timed("plane"):
             masks, swapped = materials.insides(images), self.source.mirrored
-            self.plane, images = imaging.on_their_plane(self.images, images, masks, swapped, move)
+            self.plane, images = imaging.move_to_plane(self.images, images, masks, swapped, move)
         return images
 
     def find_materials(

@@ -312,8 +312,8 @@ class Journal:
                     self._file.write([raw for _, raw in kept], any(not isinstance(e, m.Capture) for e, _ in kept))
             except JournalFullError:
                 self.broken = True
-                told = [e for e, _ in batch if isinstance(e, m.RowFinished | m.Fault | m.StageStatus)]
-                self._publish([m.pack(msgspec.structs.replace(e, seq=after)) for e in told])
+                urgent = [e for e, _ in batch if isinstance(e, m.RowFinished | m.Fault | m.StageStatus)]
+                self._publish([m.pack(msgspec.structs.replace(e, seq=after)) for e in urgent])
                 raise
         if batch:
             self._publish([raw for _, raw in batch])

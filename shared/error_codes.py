@@ -16,6 +16,7 @@ class ErrorCode(StrEnum):
     # Files and folders
     FILE_MISSING = "file-missing"
     FILE_UNREADABLE = "file-unreadable"
+    FILE_UNWRITABLE = "file-unwritable"
     FILE_DAMAGED = "file-damaged"
     FILE_FOREIGN = "file-foreign"  # of another format, or another program's
     FILE_TOO_LARGE = "file-too-large"

@@ -1,4 +1,4 @@
-"""`simulate SCENE.toml --out DIR` writes the raw data of a scene, with its truth; `check` examines scene files."""
+"""`simulate SCENE.toml --out DIR` writes the raw data of a scene and its truth; `check` validates scene files."""
 
 from __future__ import annotations
 
@@ -27,19 +27,25 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         "--layout", choices=("own", "authors"), default="own", help="scan folder, or the published data set's"
     )
     parser.add_argument("--seed", type=int, default=None, help="instead of the scene's seed")
-    parser.add_argument("--columns", action="store_true", help="authors' layout: taken column by column")
+    parser.add_argument("--columns", action="store_true", help="authors' layout: scanned column by column")
     parser.add_argument("--absent", action="store_true", help="authors' layout: lost packets are absent, not zeros")
     parser.add_argument(
-        "--specimens", type=int, default=0, metavar="N", help="the N-th other set of specimens (scene seed + 1000 N)"
+        "--specimens",
+        type=int,
+        default=0,
+        metavar="N",
+        help="use another set of specimens, number N (scene seed + 1000 N)",
     )
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of words")
+    parser.add_argument("--json", action="store_true", help="print one JSON line")
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    """Carry out `simulate`. Raises PolysightError."""
+    """Run `simulate`. Raises PolysightError."""
     if args.layout == "own" and (args.columns or args.absent):
         given = "--columns" if args.columns else "--absent"
-        raise ConfigError(f"{given} with --layout own", "the published data has such scans", "add --layout authors")
+        raise ConfigError(
+            f"{given} with --layout own", "only the published data has such scans", "add --layout authors"
+        )
     rig, scene = load_instrument(args.config), load_scene(args.scene)
     if args.specimens:
         scene = msgspec.structs.replace(scene, seed=scene.seed + 1000 * args.specimens)
@@ -77,9 +83,9 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a subcommand; returns the exit status."""
+    """Run a subcommand; return the exit status."""
     example = "simulate examples/metal-plate.toml --out out/plate"
-    parser = command_line("polysight.simulators", "Stand-ins for everything that is not there.", example)
+    parser = command_line("polysight.simulators", "Simulate scans without hardware.", example)
     commands = parser.add_subparsers(dest="command", required=True)
     text = "raw data of a scene, without sockets"
     sub = commands.add_parser(
@@ -87,7 +93,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     _add_arguments(sub)
     sub.set_defaults(run=_simulate)
-    text = "say what is wrong with scene files, or how one does not fit the rig; nothing when all is well"
+    text = "check scene files alone and with the rig file; print only errors"
     example = "example:\n  python -m polysight.simulators check examples/metal-plate.toml"
     sub = commands.add_parser(
         "check", help=text, description=text, epilog=example, formatter_class=parser.formatter_class

@@ -1,4 +1,4 @@
-"""Programs compiled on demand, once for the same sources and command; the sketch compiled for this machine is one."""
+"""Compile programs on demand and cache them by their sources and command, such as the sketch for this machine."""
 
 from __future__ import annotations
 
@@ -19,43 +19,43 @@ _FLAGS = ("-std=gnu++11", "-O2", "-Wall", "-Wextra", "-fno-exceptions", "-fno-rt
 
 
 def compiled(product: str, sources: Iterable[Path], command: Sequence[str], on_failure: tuple[str, str]) -> Path:
-    """The file that `command` makes of `sources`; the command runs only when there is none of these very sources yet.
+    """Run `command` to make a file of `sources`, unless these sources were already compiled.
 
     Parameters
     ----------
     product
-        Name of the file the command makes, such as "stage" or "arduino_stage.hex".
+        Name of the file that the command makes, such as "stage" or "arduino_stage.hex".
     sources
-        Every file the result depends on, headers and build files too.
+        All files on which the result depends, with headers and build files.
     command
-        Its words; each "{folder}" in them stands for the folder where it must leave `product`.
+        Arguments; "{folder}" is replaced by the folder where it must write `product`.
     on_failure
-        Why it may have failed and what to do, for the error.
+        Cause and remedy for the error.
 
     Returns
     -------
     Path
-        Named by the product and the hash of sources and command: in arduino_stage/build; where that cannot be written,
-        in ~/.cache/polysight/build; else in a folder of this user's below the temporary folder. Several processes may
-        ask at once.
+        A file named after the product and the hash of sources and command, in arduino_stage/build,
+        ~/.cache/polysight/build, or a temporary folder of this user: the first that is writable. Safe with several
+        processes.
 
     Raises
     ------
     DeviceError
-        when the command fails or cannot be started; its message is part of the error.
+        if the command fails; the error has its message.
     """
     digest = hashlib.sha256("\0".join(command).encode())
     for path in sorted(sources):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     name = f"{Path(product).stem}-{digest.hexdigest()[:16]}{Path(product).suffix}"
-    if (FOLDER / name).is_file():  # also where it may be read only
+    if (FOLDER / name).is_file():  # also in a read-only folder
         return FOLDER / name
     result = _folder() / name
     if result.is_file():
         return result
     with tempfile.TemporaryDirectory(prefix=".making-", dir=result.parent) as folder:
         _run([word.replace("{folder}", folder) for word in command], product, on_failure)
-        (Path(folder) / product).replace(result)  # at once: who comes meanwhile sees all of it or nothing
+        (Path(folder) / product).replace(result)  # atomically
     return result
 
 
@@ -70,13 +70,13 @@ def _run(command: list[str], product: str, on_failure: tuple[str, str]) -> None:
 
 
 def _folder() -> Path:
-    """The folder for compiled programs, made when absent. Raises DeviceError when the last choice is another user's."""
+    """Return a writable folder for compiled programs. Raises DeviceError if the last one belongs to another user."""
     places = [FOLDER]
     with suppress(RuntimeError):  # a user without a home
         places.append(Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "polysight" / "build")
     for folder in places:
         try:
-            folder.mkdir(exist_ok=True, parents=folder != FOLDER)  # no arduino_stage: installed without the repository
+            folder.mkdir(exist_ok=True, parents=folder != FOLDER)  # without the repository there is no arduino_stage
         except OSError:
             continue
         if os.access(folder, os.W_OK):
@@ -84,17 +84,17 @@ def _folder() -> Path:
     fallback = Path(tempfile.gettempdir()) / f"polysight-build-{os.getuid()}"
     fallback.mkdir(mode=0o700, exist_ok=True)
     if fallback.stat().st_uid != os.getuid():
-        raise DeviceError(f"{fallback} belongs to another user", "somebody made it first", "set TMPDIR")
+        raise DeviceError(f"{fallback} belongs to another user", "another user created it", "set TMPDIR")
     return fallback
 
 
 def sketch_compiler() -> str | None:
-    """The C++ compiler's path; None without one, or without the sketch's sources."""
+    """Return the C++ compiler's path; None if it or the sketch's sources are missing."""
     return shutil.which("g++") if (SKETCH_DIR / "pc" / "main.cpp").is_file() else None
 
 
 def build_sketch(gxx: str, flags: tuple[str, ...] = _FLAGS) -> Path:
-    """The sketch compiled for this machine. Raises DeviceError when the compiler fails."""
+    """Compile the sketch for this machine. Raises DeviceError if the compiler fails."""
     sources = [*SKETCH_DIR.glob("*.cpp"), *(SKETCH_DIR / "pc").glob("*.cpp")]
     headers = [*SKETCH_DIR.glob("*.h"), *(SKETCH_DIR / "pc").glob("*.h")]
     return compiled(
@@ -103,6 +103,6 @@ def build_sketch(gxx: str, flags: tuple[str, ...] = _FLAGS) -> Path:
         [gxx, *flags, "-o", "{folder}/stage", *map(str, sorted(sources))],
         (
             "the sources were changed, or the compiler is too old",
-            "correct them, or use the Python stand-in: --python",
+            "correct them, or use the Python simulator: --python",
         ),
     )

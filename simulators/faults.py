@@ -1,4 +1,4 @@
-"""The `[faults]` table of simulated capture cards: what can go wrong, and where it is written down."""
+"""The `[faults]` table of simulated capture cards: the faults, and reading them from files and options."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import msgspec
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 from polysight.shared.tables import decode, read_toml
 
@@ -21,19 +22,19 @@ CommandCode = Annotated[int, msgspec.Meta(ge=1, le=0xFFFF)]
 class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The `[faults]` table. Probabilities are per data packet (or frame, pulse, request); numbers count from 0 on.
 
-    The network: `loss`, `duplicate`, `reorder` (changes places with the next packet), `late` (comes `late_packets`
-    packets later), `truncate` (half of it arrives), `corrupt` (a bit of the payload turned), `corrupt_header` (a bit of
-    the ten header bytes turned), `lose_packets` (these packets are lost), `link_down` (from pulse n on nothing passes
-    for s seconds of wire time), `request_loss`, `reply_loss` (carried out, but nothing comes back).
+    The network: `loss`, `duplicate`, `reorder` (swapped with the next packet), `late` (`late_packets` packets
+    later), `truncate` (half of it arrives), `corrupt` (a flipped payload bit), `corrupt_header` (a flipped bit in the
+    ten header bytes), `lose_packets` (these packets are lost), `link_down` (no packets for s seconds of wire time
+    from pulse n on), `request_loss`, `reply_loss` (executed, but without a reply).
     The card: `overflow`, `ddr_full` (half a frame is lost before packetising: no sequence gap, status bits 9 and 7),
-    `mute` (answers nothing), `answers` (falls silent after so many), `reply_delay_ms`, `deaf_ms` (after command 0x03),
+    `mute` (no replies), `answers` (no replies after this number), `reply_delay_ms`, `deaf_ms` (after command 0x03),
     `refuse` (these commands fail), `command_status` (this status bit follows the reply to this command),
-    `pulse_status` (this status bit is sent at this pulse), `stop_after_packets` (sends no data packet after so many),
-    `end_pulses` (the record ends by itself before this pulse), `reset_pulses` (FPGA resets before this pulse),
-    `power_cycle_pulses`, `boot_s`, `stop_discards` (record stop loses what does not fill a packet), `first_sequence`,
+    `pulse_status` (this status bit is sent at this pulse), `stop_after_packets` (no data packets after this number),
+    `end_pulses` (the record ends before this pulse), `reset_pulses` (FPGA resets before this pulse),
+    `power_cycle_pulses`, `boot_s`, `stop_discards` (record stop discards an incomplete packet), `first_sequence`,
     `first_byte_count`.
     The radar: `missed_pulse`, `miss_pulses` (these SYNC_IN pulses start no frame). Its control server:
-    `retrigger_fails` (these lines change nothing), `retrigger_resets` (the connection is reset at these lines). Under
+    `retrigger_fails` (these lines have no effect), `retrigger_resets` (the connection is reset at these lines). Under
     native control: `radar_fault_pulses` (the RF core faults at these pulses).
     """
 
@@ -74,17 +75,17 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def corrupts(self) -> bool:
-        """Whether bits are turned."""
+        """True if bits are flipped."""
         return bool(self.corrupt or self.corrupt_header)
 
     @property
     def disturbs_network(self) -> bool:
-        """Whether any packet can suffer by itself (a link that is down aside)."""
+        """True if single packets can be disturbed (without `link_down`)."""
         some = self.loss or self.duplicate or self.reorder or self.late or self.truncate or self.lose_packets
         return bool(some) or self.corrupts or self.stop_after_packets is not None
 
 
-# Faults that happen under one radar control only.
+# Faults that need a certain radar control.
 OF_CONTROL = {"line_server": ("retrigger_fails", "retrigger_resets"), "native": ("radar_fault_pulses",)}
 
 
@@ -95,20 +96,20 @@ def read_faults(
     base: dict[str, Any] | None = None,
     control: str | None = None,
 ) -> dict[str, Faults]:
-    """Faults per board: `base`, then the file, then the command line's settings.
+    """Read the faults of each board: `base`, overridden by the file, then by the command line.
 
     Parameters
     ----------
     base
-        Where to begin, as a `[faults]` table.
+        A `[faults]` table.
     boards
         Names of all boards.
     path
-        TOML file: keys in `[faults]` count for every board, in `[faults.NAME]` for that board.
+        TOML file: keys in `[faults]` apply to every board, in `[faults.NAME]` to that board.
     settings
-        `KEY=VALUE` for every board or `NAME.KEY=VALUE` for one; the value is written as in TOML.
+        `KEY=VALUE` for every board or `NAME.KEY=VALUE` for one; the value has TOML syntax.
     control
-        The rig's `radar.control`; None where there are no radars.
+        The rig's `radar.control`; None without radars.
 
     Raises
     ------
@@ -119,7 +120,12 @@ def read_faults(
     if path is not None:
         raw = read_toml(path)
         if set(raw) != {"faults"} or not isinstance(raw["faults"], dict):
-            raise ConfigError(f"{path}: holds {sorted(raw)}", "not a fault file", "write one table, [faults]")
+            raise ConfigError(
+                f"{path}: contains {sorted(raw)}",
+                "not a fault file",
+                "write one table, [faults]",
+                code=ErrorCode.FILE_FOREIGN,
+            )
         _merge(table, raw["faults"])
     for setting in settings:
         try:
@@ -138,8 +144,9 @@ def read_faults(
             if control not in (None, needed) and (idle := [key for key in keys if getattr(f, key)]):
                 raise ConfigError(
                     f"faults {idle} of {name}: the rig has radar.control = {control!r}",
-                    f"they happen with {needed!r} only",
+                    f"they need {needed!r}",
                     "leave them out, or change radar.control (--native makes it native)",
+                    code=ErrorCode.VALUES_CONFLICT,
                 )
     return faults
 

@@ -1,7 +1,6 @@
-"""Addresses of a simulated rig: each rig has a loopback subnet 127.x.y.0 to itself, so that every port stays as it is.
+"""Addresses of a simulated rig: its own loopback subnet 127.x.y.0, so that several rigs run at once with equal ports.
 
-The last byte of every card and host address is kept (.180, .181, .182, .30), so that a simulated rig reads like the
-real one, and several of them run at once.
+The last byte of every card and host address is kept (.180, .181, .182, .30), as in the real rig.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ _RADAR_PORT = 5700
 
 
 def on_subnet(rig: Instrument, subnet: str) -> Instrument:
-    """The rig with its cards, host and Pi on `subnet` ("127.x.y"); each keeps the last byte of its address.
+    """Return the rig with its cards, host and Pi on `subnet` ("127.x.y"), with the last bytes of their addresses kept.
 
-    A board's control server gets its card's address and keeps its port; one under native control is reached there too.
+    A board's control server, or its native connection, gets its card's address.
     """
     table: dict[str, Any] = to_builtins(rig)
     for board in table["boards"]:
@@ -43,7 +42,7 @@ def on_subnet(rig: Instrument, subnet: str) -> Instrument:
 
 
 def is_free(rig: Instrument) -> bool:
-    """Whether every address of the rig can be taken now."""
+    """Return True if every address of the rig is free."""
     udp = {(b.card_address, port) for b in rig.boards for port in (SOURCE_PORT, b.command_port)}
     udp |= {(b.host_address, port) for b in rig.boards for port in (b.command_port, b.data_port)}
     radars = (*rig.radar.servers.values(), *(b.usb_serial for b in rig.radar.native.values()))
@@ -55,7 +54,7 @@ def is_free(rig: Instrument) -> bool:
                 held.enter_context(bound_udp(address, port))
             for address, port in tcp:
                 s = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
-                s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a rig ended a moment ago holds nothing
+                s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # addresses of a rig that just ended are free
                 s.bind((address, int(port)))
         except (OSError, DeviceError):
             return False
@@ -63,12 +62,9 @@ def is_free(rig: Instrument) -> bool:
 
 
 def on_free_subnet(rig: Instrument, chance: random.Random | None = None) -> Instrument:
-    """The rig on a loopback subnet, drawn by chance, on which all its addresses are free.
+    """Return the rig on a random loopback subnet with free addresses.
 
-    Raises
-    ------
-    DeviceError
-        when none of 50 subnets is: then this machine's loopback is not 127.0.0.0/8.
+    Raises DeviceError if there is none in 50 attempts, because this machine's loopback is not 127.0.0.0/8.
     """
     chance = chance or random.Random()
     for _ in range(_TRIES):

@@ -1,4 +1,4 @@
-"""How a simulator process lives: it says when it serves, ends on SIGTERM or SIGINT, and never outlives its parent."""
+"""Life of a simulator process: print `ready`, end on SIGTERM or SIGINT, and end with the parent process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def command_line(module: str, description: str, example: str) -> argparse.ArgumentParser:
-    """A parser for `python -m <module>`; `example` is what could follow that."""
+    """Create a parser for `python -m <module>`; `example` has example arguments."""
     return argparse.ArgumentParser(
         prog=f"python -m {module}",
         description=description,
@@ -23,7 +23,7 @@ def command_line(module: str, description: str, example: str) -> argparse.Argume
 
 
 def die_with_parent(sig: signal.Signals = signal.SIGTERM) -> None:
-    """Ask the kernel to send `sig` to this process when its parent ends (Linux; elsewhere nothing happens)."""
+    """Request the signal `sig` at the end of the parent process (Linux only)."""
     if not sys.platform.startswith("linux"):
         return
     parent = os.getppid()
@@ -33,13 +33,13 @@ def die_with_parent(sig: signal.Signals = signal.SIGTERM) -> None:
 
 
 def announce_ready(text: str = "") -> None:
-    """Print `ready <text>` for the parent, who waits for it."""
+    """Print `ready <text>`, for which the parent process waits."""
     sys.stdout.write(f"ready {text}".rstrip() + "\n")
     sys.stdout.flush()
 
 
 def stop_requested() -> threading.Event:
-    """An event that SIGTERM and SIGINT set from now on. Call in the main thread."""
+    """Return an event that SIGTERM and SIGINT will set. Call it in the main thread."""
     event = threading.Event()
 
     def stop(_signal: int, _frame: object) -> None:

@@ -1,10 +1,10 @@
-"""A whole simulated rig in one command: wires, stage, radars with their cards, and on request the Pi's program.
+"""Start a whole simulated rig: wires, stage, radars with capture cards, and optionally the Pi's program.
 
     python -m polysight.simulators.rig --config instrument.toml --scene SCENE.toml --dir DIR --time-scale 30 --with-pi
 
-Writes DIR/instrument.toml, the rig file that reaches these processes, and DIR/truth.json, what the scene truly is; logs
-are in DIR/logs. Prints `ready DIR/instrument.toml` when everything serves, and ends everything on SIGTERM or SIGINT, or
-when one process ends by itself.
+Writes DIR/instrument.toml, the rig file with the addresses of these processes, DIR/truth.json, the truth of the scene,
+and DIR/logs. Prints `ready DIR/instrument.toml` when all processes are ready. SIGTERM, SIGINT or the end of a process
+ends all of them.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from polysight.simulators.radars import make_image
 from polysight.simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight.simulators.wires import MAX_SOCKET_PATH
 
-PATIENT_HEARTBEAT_MS = 2000
+MIN_HEARTBEAT_MS = 2000  # the processes share the cores of a busy machine
 IMAGE_FILE = "firmware.bin"
-READY_LIMIT_S = 60.0
-STOP_LIMIT_S = 5.0
+READY_TIMEOUT_S = 60.0
+STOP_TIMEOUT_S = 5.0
 UNO_TIME_SCALE = 2.0
-_LOOK_S = 0.02
+_POLL_S = 0.02
 _NATIVE_OFFSET_HZ = 790e3  # puts the published rig's direct path in the middle of its IF window
 _LOG_LINES = 15
-# One thread each for linear algebra: two that spin against each other on few cores are ten times slower than one.
+# One thread for linear algebra: several processes with more threads on few cores are ten times slower.
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
 
 
 def _under_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
-    """Let the host configure a rig's radars: each is reached at its card's address, receivers get a start offset."""
+    """Set native radar control: each board at its card's address, the receivers with a start offset."""
     names = [board["name"] for board in table["boards"]]
     table["radar"] |= {"control": "native", "native": {name: {"usb_serial": name} for name in names}}
     for board in table["boards"]:
@@ -53,23 +53,17 @@ def _under_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
 
 
 def _as_programmed(table: dict[str, Any], if_offset_hz: float) -> None:
-    """Have the rig file tell what somebody programmed the receivers with: the scene's offset, added to its own."""
+    """Add the scene's IF offset to the start offsets of the receivers, as if they were programmed so."""
     for board in table["boards"]:
         if board["role"] != "transmit":
             board["start_offset_hz"] += if_offset_hz
 
 
 def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = False) -> Instrument:
-    """The rig file of a simulated rig that lives in `folder`: the scene's overrides, addresses of its own, its paths.
+    """Derive the rig file of a simulated rig in `folder`: the scene's overrides, free addresses, paths.
 
-    `native` puts its radars under the host's own control, whatever the rig file says.
-
-    Raises
-    ------
-    ConfigError
-        when an override breaks a rule.
-    DeviceError
-        when no loopback subnet is free.
+    `native` overrides the radar control of the rig file. Raises ConfigError if an override breaks a rule, DeviceError
+    if no loopback subnet is free.
     """
     table: dict[str, Any] = to_builtins(rig if scene is None else apply_scene(rig, scene))
     if native:
@@ -77,11 +71,10 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     elif table["radar"]["control"] != "native" and scene is not None:
         _as_programmed(table, scene.disturbances.if_offset_hz)
     if table["radar"]["control"] == "native" and not table["radar"]["firmware"]:
-        table["radar"]["firmware"] = str(folder / IMAGE_FILE)  # the boards come with an empty flash
+        table["radar"]["firmware"] = str(folder / IMAGE_FILE)  # the boards start with an empty flash
     table["stage"]["port"] = str(folder / "ttySTAGE")
     table["pi"] |= {"journal_dir": str(folder / "journal"), "key_dir": str(folder / "keys")}
-    # Its processes share a machine's cores with whatever else runs there, which a real rig's do not.
-    table["stage"]["heartbeat_ms"] = max(PATIENT_HEARTBEAT_MS, table["stage"]["heartbeat_ms"])
+    table["stage"]["heartbeat_ms"] = max(MIN_HEARTBEAT_MS, table["stage"]["heartbeat_ms"])
     table["pi"]["host_heartbeat_ms"] = table["stage"]["heartbeat_ms"] // 4
     return on_free_subnet(decode(table, Instrument, f"{rig.name}, simulated"))
 
@@ -99,17 +92,17 @@ class Child:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**_ENVIRONMENT, **os.environ},
-                start_new_session=True,  # Ctrl-C reaches the rig alone, which ends its processes in order
+                start_new_session=True,  # Ctrl-C goes only to the rig, which ends its processes in order
                 preexec_fn=die_with_parent,
             )
 
     @property
     def ready(self) -> bool:
-        """Whether it has said so."""
+        """True if it has printed `ready`."""
         return any(line.startswith("ready") for line in self._lines())
 
     def check(self) -> None:
-        """Raise DeviceError, with the last lines of its log, when it has ended."""
+        """Raise DeviceError with the last lines of its log if the process has ended."""
         status = self._process.poll()
         if status is not None:
             raise DeviceError(
@@ -119,7 +112,7 @@ class Child:
             )
 
     def last_lines(self) -> str:
-        """The end of its log."""
+        """Return the end of its log."""
         return "\n".join(f"    {line}" for line in self._lines()[-_LOG_LINES:])
 
     def _lines(self) -> list[str]:
@@ -130,18 +123,18 @@ class Child:
         self._process.send_signal(number)
 
     def end(self) -> None:
-        """SIGTERM, and SIGKILL when that does not help."""
+        """Send SIGTERM, and SIGKILL after a timeout."""
         if self._process.poll() is None:
             self._process.terminate()
             try:
-                self._process.wait(STOP_LIMIT_S)
+                self._process.wait(STOP_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
 
 
 class RigOptions(NamedTuple):
-    """How the simulated rig runs."""
+    """Options of the simulated rig."""
 
     time_scale: float = 1.0
     with_pi: bool = False
@@ -156,12 +149,9 @@ class RigOptions(NamedTuple):
 
 
 class RigProcesses:
-    """The processes of a simulated rig in `folder`, where its rig file lies.
+    """The processes of a simulated rig in `folder`, which contains its rig file.
 
-    Raises
-    ------
-    DeviceError
-        when one of them ends, or is not ready in time.
+    Raises DeviceError if one of them ends, or is not ready before the timeout.
     """
 
     def __init__(self, rig: Instrument, scene: Path | None, folder: Path, options: RigOptions, stop: Event) -> None:
@@ -208,7 +198,7 @@ class RigProcesses:
         return self.children[-1]
 
     def _wait(self, started: list[Child]) -> None:
-        deadline = time.monotonic() + READY_LIMIT_S
+        deadline = time.monotonic() + READY_TIMEOUT_S
         while not self._stop.is_set():
             self.check()
             waiting = [child for child in started if not child.ready]
@@ -216,15 +206,15 @@ class RigProcesses:
                 return
             if time.monotonic() > deadline:
                 raise DeviceError(
-                    f"simulated rig: {', '.join(c.name for c in waiting)} not ready after {READY_LIMIT_S:.0f} s:\n"
+                    f"simulated rig: {', '.join(c.name for c in waiting)} not ready after {READY_TIMEOUT_S:.0f} s:\n"
                     + waiting[0].last_lines(),
                     "an overloaded machine, or a fault shown above",
                     f"the logs are in {self._logs}",
                 )
-            self._stop.wait(_LOOK_S)
+            self._stop.wait(_POLL_S)
 
     def check(self) -> None:
-        """Raise DeviceError when a process has ended."""
+        """Raise DeviceError if a process has ended."""
         for child in self.children:
             child.check()
 
@@ -241,7 +231,7 @@ class RigProcesses:
 
 
 def card_groups(rig: Instrument) -> list[str]:
-    """Boards that share a process: each recorded board has one to itself, the others go with the first."""
+    """Group the boards into processes: one for each recorded board; the others join the first."""
     groups = [[b.name] for b in rig.recorded] or [[]]
     groups[0] += [b.name for b in rig.boards if not b.record]
     return [",".join(g) for g in groups]
@@ -278,12 +268,9 @@ def _write_files(rig: Instrument, scene: Scene | None, folder: Path, options: Ri
 
 
 def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions, stop: Event) -> None:
-    """Start a simulated rig, say that it is ready, and keep it until `stop` is set.
+    """Start a simulated rig, announce that it is ready, and keep it until `stop` is set.
 
-    Raises
-    ------
-    PolysightError
-        when a file is wrong, or a process does not start or ends by itself.
+    Raises PolysightError if a file is invalid, or a process does not start or ends.
     """
     folder = folder.resolve()
     if len(str(folder / "wires.sock").encode()) > MAX_SOCKET_PATH:
@@ -291,17 +278,19 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
     if options.uno and options.time_scale > UNO_TIME_SCALE:
         raise ConfigError(
             f"--uno with --time-scale {options.time_scale:g}",
-            "the heartbeat clock of the board runs as fast as the rest of it, and the Pi's does not",
+            "the emulated board's heartbeat clock is scaled, the Pi's is not",
             f"give at most {UNO_TIME_SCALE:g}, or leave out --uno",
         )
     scene = None if scene_path is None else load_scene(scene_path)
     if options.time_scale <= 0:
-        raise ConfigError(f"--time-scale {options.time_scale:g}", "time runs forwards", "give a number above 0")
+        raise ConfigError(f"--time-scale {options.time_scale:g}", "it must be positive", "give a number above 0")
     if scene is None and not options.pattern:
-        raise ConfigError("neither --scene nor --pattern", "the radars need something to see", "give one of them")
+        raise ConfigError("neither --scene nor --pattern", "the radars need a signal", "give one of them")
     rig = derive(load_instrument(config), scene, folder, options.native)
     boards = tuple(b.name for b in rig.boards)
-    read_faults(options.faults, list(options.single_faults), boards, control=rig.radar.control)  # else nothing starts
+    read_faults(
+        options.faults, list(options.single_faults), boards, control=rig.radar.control
+    )  # raises before anything starts
     folder.mkdir(parents=True, exist_ok=True)
     _write_files(rig, scene, folder, options)
     power_cycle = Event()
@@ -323,24 +312,24 @@ def main(argv: list[str] | None = None) -> int:
     """Run a simulated rig until SIGTERM or SIGINT."""
     parser = command_line(
         "polysight.simulators.rig",
-        "A whole simulated rig; prints `ready FILE`, the rig file that reaches it, and runs until Ctrl-C.",
+        "Start a simulated rig; print `ready FILE` with its rig file, and run until Ctrl-C.",
         "--config instrument.toml --scene examples/metal-plate.toml --dir out/rig --time-scale 30 --with-pi",
     )
-    parser.add_argument("--config", type=Path, required=True, help="rig file to begin from")
+    parser.add_argument("--config", type=Path, required=True, help="rig file")
     parser.add_argument("--scene", type=Path, help="scene file; not needed with --pattern")
     parser.add_argument("--dir", type=Path, required=True, help="folder of this rig: its rig file, logs, serial port")
-    parser.add_argument("--time-scale", type=float, default=1.0, help="wire time over wall time")
+    parser.add_argument("--time-scale", type=float, default=1.0, help="speed: wire time relative to wall time")
     parser.add_argument("--with-pi", action="store_true", help="run the Pi's program too")
     parser.add_argument("--seed", type=int, help="default: the scene's")
-    parser.add_argument("--pattern", action="store_true", help="a counting pattern instead of the scene's signals")
+    parser.add_argument("--pattern", action="store_true", help="send a counting pattern instead of the scene's signals")
     parser.add_argument("--faults", type=Path, help="TOML file with a [faults] table for the cards")
     parser.add_argument("--fault", action="append", default=[], metavar="[BOARD.]KEY=VALUE", help="a single fault")
-    parser.add_argument("--cache", type=Path, help="folder where the scene's object fields are kept between runs")
-    parser.add_argument("--real-pacing", action="store_true", help="each packet by itself when due, as from a card")
+    parser.add_argument("--cache", type=Path, help="cache folder for the scene's object fields")
+    parser.add_argument("--real-pacing", action="store_true", help="send each packet at its own time, as a card does")
     parser.add_argument(
         "--uno",
         action="store_true",
-        help=f"the stage is the sketch's machine code on an emulated board; --time-scale at most {UNO_TIME_SCALE:g}",
+        help=f"run the sketch's machine code on an emulated board; --time-scale at most {UNO_TIME_SCALE:g}",
     )
     parser.add_argument("--native", action="store_true", help="the host configures and arms the radars (simulated USB)")
     args = parser.parse_args(argv)

@@ -1,8 +1,7 @@
-"""The hub of the simulated wires: relays GPIO edges and stage motion between the processes of a simulated rig.
+"""Hub of the simulated wires: relay GPIO edges and stage motion between the processes of a simulated rig.
 
-Protocol: shared/wires.py and docs/spec/simulated-rig.md. Lines of one party reach every listener in the order they were
-written. Nothing is dropped: what a party does not read is kept for it, up to a bound; beyond it that party alone is
-cut off, with a message, and notices by its closed connection.
+Protocol: shared/wires.py and docs/spec/simulated-rig.md. Lines of a client reach every subscriber in order, and none is
+dropped: unread lines are queued up to a limit; a client that exceeds it is disconnected with a message.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError, PolysightError, ProtocolError
 from polysight.shared.wires import WireMotion, parse
 from polysight.simulators.process import announce_ready, command_line, die_with_parent, stop_requested
@@ -24,12 +24,12 @@ MAX_SOCKET_PATH = 107  # sun_path of Linux holds 108 bytes with its terminator
 _READ_BYTES = 1 << 18
 
 
-class _Party:
-    """One connected process: what it wants to hear, and what it has not read yet."""
+class _Client:
+    """A connected process with its subscriptions and its unread lines."""
 
     def __init__(self, connection: socket.socket, number: int) -> None:
         self.connection = connection
-        self.name = f"party {number}"
+        self.name = f"client {number}"
         self.partial = b""
         self.lines: set[bytes] = set()
         self.motion = False
@@ -37,31 +37,32 @@ class _Party:
 
 
 class WireHub:
-    """Relays S lines to the parties that asked for them with L, M lines to those that sent W; never back to the sender.
+    """Relay S lines to the clients that subscribed with L, M lines to those that sent W, never to the sender.
 
     Parameters
     ----------
     path
-        Unix socket to listen at; a socket file left over from an earlier run is replaced.
+        Unix socket; an unused socket file is replaced.
     report
-        Told why a party was cut off: it wrote what is not a wire line, or did not read.
+        Called with the reason when a client is disconnected: an invalid line, or too many unread bytes.
     max_pending_bytes
-        What is kept for a party that does not read, before it is cut off.
+        Limit of unread bytes of a client.
 
     Raises
     ------
     ConfigError
-        when the path is too long for a Unix socket.
+        if the path is too long for a Unix socket.
     DeviceError
-        when the socket cannot be made, or another hub serves there.
+        if the socket cannot be created, or another hub uses it.
     """
 
     def __init__(self, path: Path, report: Callable[[str], object], max_pending_bytes: int = MAX_PENDING_BYTES) -> None:
         if len(str(path).encode()) > MAX_SOCKET_PATH:
             raise ConfigError(
                 f"{path}: too long for a Unix socket (at most {MAX_SOCKET_PATH} bytes)",
-                "the run's folder lies too deep",
-                "choose a shorter folder, for example below /tmp",
+                "the folder of the run is too deep",
+                "choose a shorter folder, for example in /tmp",
+                code=ErrorCode.VALUE_INVALID,
             )
         self._path = path
         self._report = report
@@ -70,7 +71,7 @@ class WireHub:
         self._listener.setblocking(False)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ, None)
-        self._parties: dict[socket.socket, _Party] = {}
+        self._clients: dict[socket.socket, _Client] = {}
         self._accepted = 0
         self._last_motion = b""
         self._cut: set[bytes] = set()
@@ -82,20 +83,20 @@ class WireHub:
             self.step(poll_s)
 
     def step(self, timeout_s: float) -> None:
-        """One turn: take in what the parties wrote, then write what they want to hear."""
+        """Read lines from the clients, relay them, and write queued lines."""
         for key, events in self._selector.select(timeout_s):
             if key.data is None:
                 self._accept()
-            elif events & selectors.EVENT_READ and key.data.connection in self._parties:
+            elif events & selectors.EVENT_READ and key.data.connection in self._clients:
                 self._read(key.data)
-        for party in list(self._parties.values()):
-            if party.pending:
-                self._write(party)
+        for client in list(self._clients.values()):
+            if client.pending:
+                self._write(client)
 
     def close(self) -> None:
         """Close all connections and remove the socket file."""
-        for party in list(self._parties.values()):
-            self._drop(party)
+        for client in list(self._clients.values()):
+            self._drop(client)
         self._selector.close()
         self._listener.close()
         self._path.unlink(missing_ok=True)
@@ -104,30 +105,30 @@ class WireHub:
         connection, _ = self._listener.accept()
         connection.setblocking(False)
         self._accepted += 1
-        party = _Party(connection, self._accepted)
-        self._parties[connection] = party
-        self._selector.register(connection, selectors.EVENT_READ, party)
+        client = _Client(connection, self._accepted)
+        self._clients[connection] = client
+        self._selector.register(connection, selectors.EVENT_READ, client)
 
-    def _read(self, party: _Party) -> None:
+    def _read(self, client: _Client) -> None:
         try:
-            data = party.connection.recv(_READ_BYTES)
+            data = client.connection.recv(_READ_BYTES)
         except BlockingIOError:
             return
         except OSError:
             data = b""
         if not data:
-            self._drop(party)
+            self._drop(client)
             return
-        *lines, party.partial = (party.partial + data).split(b"\n")
+        *lines, client.partial = (client.partial + data).split(b"\n")
         try:
-            self._relay(party, lines)
-            if len(party.partial) > MAX_LINE_BYTES:
-                raise ProtocolError(f"a line of more than {MAX_LINE_BYTES} bytes: {party.partial[:40]!r}...")
+            self._relay(client, lines)
+            if len(client.partial) > MAX_LINE_BYTES:
+                raise ProtocolError(f"a line of more than {MAX_LINE_BYTES} bytes: {client.partial[:40]!r}...")
         except ProtocolError as e:
-            self._cut_off(party, str(e))
+            self._disconnect(client, str(e))
 
-    def _relay(self, sender: _Party, lines: list[bytes]) -> None:
-        others = [p for p in self._parties.values() if p is not sender]
+    def _relay(self, sender: _Client, lines: list[bytes]) -> None:
+        others = [p for p in self._clients.values() if p is not sender]
         for line in lines:
             tag = line[:2]
             if tag == b"S ":
@@ -155,36 +156,35 @@ class WireHub:
                 sender.pending += b"K\n"
             elif line == b"W":
                 sender.motion = True
-                # Whoever joins late must know where the stage stands now.
-                sender.pending += b"K\n" + self._last_motion
+                sender.pending += b"K\n" + self._last_motion  # a late client needs the stage's position
             else:
                 raise ProtocolError(f"not a wire line: {line!r}")
 
-    def _write(self, party: _Party) -> None:
+    def _write(self, client: _Client) -> None:
         try:
-            sent = party.connection.send(party.pending)
+            sent = client.connection.send(client.pending)
         except BlockingIOError:
             sent = 0
         except OSError:
-            self._drop(party)
+            self._drop(client)
             return
-        del party.pending[:sent]
-        if len(party.pending) > self._max_pending:
-            self._cut_off(party, f"has not read {len(party.pending)} bytes")
+        del client.pending[:sent]
+        if len(client.pending) > self._max_pending:
+            self._disconnect(client, f"{len(client.pending)} unread bytes")
             return
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if party.pending else 0)
-        if self._selector.get_key(party.connection).events != wanted:
-            self._selector.modify(party.connection, wanted, party)
+        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.pending else 0)
+        if self._selector.get_key(client.connection).events != wanted:
+            self._selector.modify(client.connection, wanted, client)
 
-    def _cut_off(self, party: _Party, why: str) -> None:
-        lines = ", ".join(sorted(word.decode() for word in party.lines)) or "none"
-        self._drop(party)
-        self._report(f"{party.name} (listening to lines: {lines}) cut off: {why}")
+    def _disconnect(self, client: _Client, why: str) -> None:
+        lines = ", ".join(sorted(word.decode() for word in client.lines)) or "none"
+        self._drop(client)
+        self._report(f"{client.name} (lines: {lines}) disconnected: {why}")
 
-    def _drop(self, party: _Party) -> None:
-        self._selector.unregister(party.connection)
-        del self._parties[party.connection]
-        party.connection.close()
+    def _drop(self, client: _Client) -> None:
+        self._selector.unregister(client.connection)
+        del self._clients[client.connection]
+        client.connection.close()
 
 
 def _listen(path: Path) -> socket.socket:
@@ -194,7 +194,10 @@ def _listen(path: Path) -> socket.socket:
             with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
                 if probe.connect_ex(str(path)) == 0:
                     raise DeviceError(
-                        f"{path}: another hub serves here", "a simulated rig is still running", "end it first"
+                        f"{path}: another hub uses this socket",
+                        "a simulated rig is still running",
+                        "end it first",
+                        code=ErrorCode.BUSY,
                     )
             path.unlink()
         listener.bind(str(path))
@@ -202,7 +205,7 @@ def _listen(path: Path) -> socket.socket:
     except OSError as e:
         listener.close()
         raise DeviceError(
-            f"{path}: cannot listen: {e}", "the folder is absent or not writable", "make the folder"
+            f"{path}: cannot listen: {e}", "the folder is missing or not writable", "create the folder"
         ) from None
     except DeviceError:
         listener.close()

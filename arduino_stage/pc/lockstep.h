@@ -3,7 +3,7 @@
 #include "machine.h"
 
 // Commands, one a line; each is answered by what happened and then `R <t_ns>`:
-//   rx HEX      bytes from the host          run TICKS    let time go on
+//   rx HEX      bytes from the host          run TICKS    advance the time
 //   rest TICKS  ... until at rest            inputs MASK  press switches
 //   slip DX DY  lose steps                   reset        the reset button
 // What happened: `T HEX` bytes to the host, and the wire lines S and M.

@@ -7,7 +7,7 @@
 namespace {
 Machine* machine;
 constexpr uint64_t NS_PER_TICK = 1000000000ull / board::TICK_HZ;
-constexpr uint64_t TELL_TICKS = board::TICK_HZ / 100;  // while the speed changes, tell it every 10 ms
+constexpr uint64_t REPORT_TICKS = board::TICK_HZ / 100;  // interval of motion messages while the speed changes: 10 ms
 }  // namespace
 
 InterruptLock::InterruptLock() : saved_(0) {}
@@ -35,7 +35,7 @@ void Machine::reset(uint32_t now_ms) {
   width_ = 2u * board::DEFAULT_TRIGGER_US;
   was_homed_ = false;
   if (trigger_high_) edge(tick_, false);
-  if (moved) tell_motion();
+  if (moved) report_motion();
   protocol_.banner();
 }
 
@@ -60,7 +60,7 @@ void Machine::advance(uint64_t tick, uint32_t now_ms) {
 void Machine::arm(uint16_t ticks) {
   next_ = tick_ + ticks;
   armed_ = true;
-  if (motion_.cruising()) tell_motion();  // a leg without a ramp
+  if (motion_.cruising()) report_motion();  // a leg without a ramp
 }
 
 void Machine::step() {
@@ -69,7 +69,7 @@ void Machine::step() {
   if (out & STEP_X) x_ += x_sign_;
   if (out & STEP_Y) y_ += y_sign_;
   if (out & TRIGGER) {
-    tell_motion();
+    report_motion();
     if (!trigger_high_) {
       edge(tick_, true);
       fall_ = tick_ + width_;
@@ -79,12 +79,12 @@ void Machine::step() {
   const uint16_t ticks = motion_.interval();
   if (ticks == 0) {
     armed_ = false;
-    tell_motion();
+    report_motion();
     settle();
     return;
   }
   next_ = tick_ + ticks;
-  if (motion_.cruising() != cruised || (!cruised && tick_ - told_ >= TELL_TICKS)) tell_motion();
+  if (motion_.cruising() != cruised || (!cruised && tick_ - told_ >= REPORT_TICKS)) report_motion();
 }
 
 // The main loop of the sketch, until it has nothing more to do at this moment.
@@ -95,7 +95,7 @@ void Machine::settle() {
   if (stage_.homed() && !was_homed_) {
     zero_x_ = x_ - motion_.x();
     zero_y_ = y_ - motion_.y();
-    tell_motion();
+    report_motion();
   }
   was_homed_ = stage_.homed();
 }
@@ -113,7 +113,7 @@ void Machine::end_trigger(uint64_t until) {
   if (trigger_high_ && fall_ <= until) edge(fall_, false);
 }
 
-void Machine::tell_motion() {
+void Machine::report_motion() {
   told_ = tick_;
   const double um = 1000.0 / rig_.steps_per_mm;
   const double values[] = {(double)(x_ - zero_x_), (double)(y_ - zero_y_), (double)motion_.x_rate()};

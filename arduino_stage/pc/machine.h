@@ -19,10 +19,10 @@ class Machine {
  public:
   explicit Machine(const Rig& rig);
 
-  // What the reset button does. The motors stay where they are.
+  // The reset button. The motors keep their position.
   void reset(uint32_t now_ms);
   void receive(uint8_t byte);
-  // Let time go on until `tick`, with every step and edge that is due.
+  // Advance the time to `tick`, with every step and edge that is due.
   void advance(uint64_t tick, uint32_t now_ms);
 
   uint64_t tick() const { return tick_; }
@@ -46,7 +46,7 @@ class Machine {
   void step();
   void settle();
   void edge(uint64_t tick, bool high);
-  void tell_motion();
+  void report_motion();
   void end_trigger(uint64_t until);
 
   Rig rig_;
@@ -60,7 +60,7 @@ class Machine {
   uint32_t width_ = 2u * board::DEFAULT_TRIGGER_US;
   uint8_t pressed_ = 0;
   int x_sign_ = 1, y_sign_ = 1;
-  int64_t x_, y_;                    // where the stage really is: steps from the closing point of its switches
+  int64_t x_, y_;                    // true position of the stage: steps from the closing point of its switches
   int64_t zero_x_ = 0, zero_y_ = 0;  // where homing found the zero
 
   friend void hal_write(const char* text, uint8_t length);

@@ -22,7 +22,7 @@ volatile sig_atomic_t stop_signal;
 constexpr uint64_t MS = 1000000;            // ns
 constexpr uint64_t CONNECT_LIMIT = 10000 * MS;
 constexpr int STEP_POLL_MS = 2, REST_POLL_MS = 20;
-// A starved process slows the simulated world down rather than flooding it: at most so much wall time at once.
+// A process without CPU time slows the simulated world down: the longest advance at once, wall time.
 constexpr uint64_t LONGEST_LEAP = 20 * MS;
 
 uint64_t wall_ns() {
@@ -114,13 +114,13 @@ int serve(const Options& o, SerialPort& port, int wires) {
     ticks += (double)leap * o.time_scale * (board::TICK_HZ * 1e-9);
     const uint32_t now_ms = (uint32_t)((now - started) / MS);
 
-    if (port.opened()) {  // opening the port resets the board; its boot loader swallows what comes meanwhile
+    if (port.opened()) {  // opening the port resets the board; its boot loader ignores bytes until it ends
       boots_at = now + (uint64_t)o.boot_ms * MS;
       running = false;
     }
     const bool open = port.is_open();
 
-    // Bytes first, so that a starved process does not mistake its own lateness for a silent host.
+    // Read bytes first, so that a late process does not detect a silent host.
     if (!machine.stepping()) machine.advance((uint64_t)ticks, now_ms);
     if (open && !running && now >= boots_at) {
       port.flush();

@@ -49,12 +49,12 @@ void SerialPort::closed() {
 
 bool SerialPort::opened() {
   alignas(inotify_event) char events[4096];
-  bool anew = false;
+  bool rose = false;
   for (ssize_t n; (n = ::read(watch_, events, sizeof events)) > 0;) {
     for (char* p = events; p < events + n;) {
       const inotify_event* event = (const inotify_event*)p;
       if (event->mask & IN_OPEN) {
-        anew |= !dtr_;
+        rose |= !dtr_;
         dtr_ = true;
         clients_++;
       }
@@ -62,7 +62,7 @@ bool SerialPort::opened() {
       p += sizeof(inotify_event) + event->len;
     }
   }
-  return anew;
+  return rose;
 }
 
 int SerialPort::read(unsigned char* bytes, int size) {

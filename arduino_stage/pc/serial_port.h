@@ -1,4 +1,4 @@
-// The far end of the USB cable: a pseudo terminal with a fixed name, and who has opened it.
+// The far end of the USB cable: a pseudo terminal with a fixed name that detects clients.
 #pragma once
 #include <string>
 
@@ -12,15 +12,15 @@ class SerialPort {
   int fd() const { return master_; }
   int watch_fd() const { return watch_; }  // readable when a client opens or closes the port
 
-  // Take note of opening and closing. True when DTR rose, which resets an UNO, however shortly it had been low.
+  // Update after opening and closing. True if DTR rose, even after a very short low: that resets an UNO.
   bool opened();
-  // Whether a client held the port open when opened() was last called.
+  // True if a client held the port open at the last call of opened().
   bool is_open() const { return clients_ > 0; }
   // Up to `size` received bytes; 0 when there are none.
   int read(unsigned char* bytes, int size);
-  // What a client does not read in time is lost, as on a serial line.
+  // Send bytes; those that a client does not read in time are lost, as on a serial line.
   void write(const std::string& bytes);
-  // Forget what was received, and take the bytes as they are from now on.
+  // Drop received bytes and set the terminal to raw mode.
   void flush();
 
  private:

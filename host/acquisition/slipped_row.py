@@ -12,9 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.acquisition.missed_pulses import PlacedFrames, place_frames, slipped_frames, time_before_first_pulse
-from polysight.host.capture import PACKETS, RowCapture, read_index, read_packets, write_index, write_packets
+from polysight.host.capture import (
+    PACKETS,
+    RowCapture,
+    read_index,
+    read_packets,
+    write_error,
+    write_index,
+    write_packets,
+)
 from polysight.shared.config import Instrument
-from polysight.shared.errors import DeviceError
 from polysight.shared.messages import Capture
 from polysight.shared.raster import Row
 
@@ -118,7 +125,7 @@ def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_byt
             f.flush()
             os.fsync(f.fileno())
     except OSError as e:
-        raise DeviceError(f"{path}: cannot be made durable: {e.strerror}", "the disk is full or fails") from None
+        raise write_error(path, "made durable", e) from None
     changed = {"missing": missing, "located": True, "reason": "", "pulses_missed": placed.missed, "frames": runs}
     index_crc = write_index(path.with_suffix(".idx"), {**facts, **changed}, arrivals)
     return msgspec.structs.replace(

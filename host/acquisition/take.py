@@ -11,11 +11,11 @@ from enum import StrEnum
 
 from polysight.host.acquisition.missed_pulses import PlacedFrames
 from polysight.host.acquisition.slipped_row import ReceivedCapture, describe, rewrite_row
-from polysight.host.capture import PACKETS, RowCapture, silent_radar, valid_frames
+from polysight.host.capture import PACKETS, RowCapture, silent_radar, valid_frames, write_error
 from polysight.host.radar import BoardState, RadarState
 from polysight.host.store import PART, Fact, ManifestWriter, ScanFolder, sync_folder, utc_now
 from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DeviceError, ScanError, advice
+from polysight.shared.errors import ScanError, advice
 from polysight.shared.faults import explain
 from polysight.shared.messages import RowFinished
 from polysight.shared.raster import Row
@@ -212,11 +212,7 @@ def commit_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
         try:
             final.with_suffix(PART).rename(final)
         except OSError as e:
-            raise DeviceError(
-                f"{final}: cannot be named: {e.strerror}",
-                "the disk is full, read-only or fails",
-                f"free space; `polysight resume {scan.path}` takes the row again",
-            ) from None
+            raise write_error(final, "renamed", e) from None
         sync_folder(final.parent)
         boards[name] = {
             "file": str(final.relative_to(scan.path)),

@@ -18,7 +18,7 @@ from polysight.host.capture.pcap import inspect_pcap, is_pcap
 from polysight.host.capture.placement import Placed, place_record
 from polysight.host.capture.receiver import Progress, ReceiverProcess, RowCapture
 from polysight.host.capture.scheduling import PRIORITY_REMEDY, receiver_cores, take_priority
-from polysight.host.capture.segment import read_index, write_durably, write_index
+from polysight.host.capture.segment import read_index, write_durably, write_error, write_index
 from polysight.host.capture.survey import CardSurvey, HopFinding, survey_cards
 
 __all__ = [
@@ -60,6 +60,7 @@ __all__ = [
     "take_priority",
     "valid_frames",
     "write_durably",
+    "write_error",
     "write_index",
     "write_packets",
 ]

@@ -169,9 +169,3 @@ def decode_packet_header(packet: bytes | memoryview) -> tuple[int, int]:
         raise ProtocolError(f"data packet of {len(packet)} bytes has no payload", code=ErrorCode.MESSAGE_INVALID)
     sequence, low, high = _PACKET.unpack_from(packet)
     return sequence, low | high << 32
-
-
-def counter_difference(counter: int, origin: int, bits: int) -> int:
-    """Return `counter - origin` of counters that wrap after `bits` bits; nearest to zero."""
-    half = 1 << (bits - 1)
-    return (counter - origin + half) % (2 * half) - half

@@ -73,9 +73,7 @@ def decode_row(
         if the payload is shorter than the shape requires.
     """
     words, valid = row_words(payload, mask, frames, samples, rx, swap_iq)
-    out = np.empty((rx, frames, samples), dtype=np.complex64)
-    out.real = words[:, :, 0].transpose(2, 0, 1)
-    out.imag = words[:, :, 1].transpose(2, 0, 1)
+    out = _complex(words.transpose(2, 3, 0, 1))
     out[:, ~valid] = 0
     return out, valid
 
@@ -91,11 +89,7 @@ def decode_two_lane(
         what = f"a 2-lane chirp has an even number of samples, not {samples}"
         raise DataError(what, "wrong number of samples given", code=ErrorCode.VALUE_INVALID)
     words = _words(payload, chirps * samples * rx * 2).reshape(chirps, rx, samples // 2, 2, 2)
-    first, second = (1, 0) if swap_iq else (0, 1)
-    out = np.empty((rx, chirps, samples), dtype=np.complex64)
-    out.real = words[:, :, :, first, :].reshape(chirps, rx, samples).transpose(1, 0, 2)
-    out.imag = words[:, :, :, second, :].reshape(chirps, rx, samples).transpose(1, 0, 2)
-    return out
+    return _complex(words.transpose(3, 1, 0, 2, 4).reshape(2, rx, chirps, samples), swap_iq)
 
 
 def decode_real(
@@ -126,12 +120,14 @@ def decode_adjacent(
     """
     words = _words(payload, chirps * samples * rx * 2)
     if lanes == 4:
-        pairs = words.reshape(chirps, samples, rx, 2).transpose(2, 0, 1, 3)
-    else:
-        pairs = words.reshape(chirps, rx, samples, 2).transpose(1, 0, 2, 3)
-    first, second = (1, 0) if swap_iq else (0, 1)
-    out = np.empty((rx, chirps, samples), dtype=np.complex64)
-    out.real, out.imag = pairs[..., first], pairs[..., second]
+        return _complex(words.reshape(chirps, samples, rx, 2).transpose(3, 2, 0, 1), swap_iq)
+    return _complex(words.reshape(chirps, rx, samples, 2).transpose(3, 1, 0, 2), swap_iq)
+
+
+def _complex(parts: NDArray[np.int16], swap_iq: bool = False) -> NDArray[np.complex64]:
+    """Join I and Q, int16 [2, rx, chirp, sample] (with `swap_iq` Q and I)."""
+    out = np.empty(parts.shape[1:], dtype=np.complex64)
+    out.real, out.imag = parts[::-1] if swap_iq else parts
     return out
 
 

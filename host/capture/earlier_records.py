@@ -40,11 +40,6 @@ class Past:
     guessed: bool = False  # `base` is uncertain, only the end of its record is known
     anew: int = 0  # number of consecutive complete records with the first counters of a card just switched on
 
-    @staticmethod
-    def ending_at(start: Counters) -> Past:
-        """Knowledge if the previous record certainly ended here."""
-        return Past(start, (0,))
-
     def starts_after(self, strays: PacketLog) -> Past:
         """Return the knowledge after packets between two records, which may be of an unknown record."""
         if strays.count == 0 or self.base is None or self._knows(strays):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Status
+from polysight.host.capture.earlier_records import counter_differences
 from polysight.host.capture.layouts import (
     SAMPLES_TRIED,
     Guess,
@@ -100,10 +101,10 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
 
     Returns its bytes, uint8 [n], and the result. Raises DataError if the packets are not of one record.
     """
-    counts = [dca1000.decode_packet_header(p)[1] for p in packets]
-    ahead = [dca1000.counter_difference(c, counts[0], dca1000.BYTE_COUNT_BITS) for c in counts]
-    ends = [a + len(p) - dca1000.PACKET_HEADER_BYTES for a, p in zip(ahead, packets, strict=True)]
-    size = max(ends) - min(ahead)
+    counts = np.array([dca1000.decode_packet_header(p)[1] for p in packets])
+    ahead = counter_differences(counts, int(counts[0]), dca1000.BYTE_COUNT_BITS)
+    sizes = np.array([len(p) for p in packets]) - dca1000.PACKET_HEADER_BYTES
+    size = int((ahead + sizes).max() - ahead.min())
     if size > 1 << 34:
         what = f"byte counts span {size} bytes: more than one record, or corrupted packets"
         raise DataError(what, code=ErrorCode.FILE_DAMAGED)

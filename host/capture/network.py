@@ -218,7 +218,7 @@ def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int,
             code=ErrorCode.VALUE_INVALID,
         )
     if granted < wanted:
-        return f"{name}: receive buffer of {granted} bytes granted, {wanted} asked for ({limit}); {remedy}"
+        return f"{name}: receive buffer of {granted} bytes granted, {wanted} requested ({limit}); {remedy}"
     return ""
 
 

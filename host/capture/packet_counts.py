@@ -42,11 +42,11 @@ def count_packets(
     If the card restarted within the row, packets before the restart count as `placed` and later ones as `restarted`,
     whichever of them the search took for the record: such a row is masked, unless its start was known.
     """
-    before, anew = _restart(log, found, past, conflicting)
-    placed, duplicate = (placed | before) & ~anew, duplicate & ~anew & ~before
-    conflicting = conflicting & ~anew & ~before
-    left = (found.early | found.old) & ~(anew | before)
-    rest = ~(placed | duplicate | conflicting | left | anew)
+    before, after = _restart(log, found, past, conflicting)
+    placed, duplicate = (placed | before) & ~after, duplicate & ~after & ~before
+    conflicting = conflicting & ~after & ~before
+    left = (found.early | found.old) & ~(after | before)
+    rest = ~(placed | duplicate | conflicting | left | after)
     beyond = (found.offsets >= log.expected) & (found.steps > 0) & (found.offsets < 2 * log.expected)
     outside = rest & (found.own | beyond)
     left |= rest & ~outside & (found.offsets < 0) & (found.steps < 0)
@@ -55,7 +55,7 @@ def count_packets(
         duplicates=int(duplicate.sum()),
         conflicting=int(conflicting.sum()),
         leftover=int(left.sum()),
-        restarted=int(anew.sum()),
+        restarted=int(after.sum()),
         outside=int(outside.sum()),
         disagreeing=int((rest & ~outside & ~left).sum()),
         malformed=log.malformed,
@@ -79,13 +79,13 @@ def _restart(log: PacketLog, found: Found, past: Past, conflicting: Flags) -> tu
         first = int(np.argmax(conflicting & switched_on))
         return switched_on & (index < first) & ~found.old, switched_on & (index >= first)
     packets = CounterView(log, past.base or Counters(0, 0), found.full)
-    again = found.again if found.again is not None else nothing
-    switched_on &= again | ~packets.inside(past.spans, sure=True)  # otherwise left over from a known record
+    repeated = found.repeated if found.repeated is not None else nothing
+    switched_on &= repeated | ~packets.inside(past.spans, sure=True)  # otherwise left over from a known record
     if found.located:
         return nothing, switched_on & ~found.own & (index > np.argmax(found.own))
-    before = _before_restart(packets, past, ~(found.early | found.old | again | switched_on), log.expected)
-    anew = (again | switched_on) & (index > np.argmax(before)) & before.any()
-    return (before, anew) if anew.any() else (nothing, nothing)
+    before = _before_restart(packets, past, ~(found.early | found.old | repeated | switched_on), log.expected)
+    after = (repeated | switched_on) & (index > np.argmax(before)) & before.any()
+    return (before, after) if after.any() else (nothing, nothing)
 
 
 def _before_restart(packets: CounterView, past: Past, live: Flags, expected: int) -> Flags:
@@ -93,8 +93,8 @@ def _before_restart(packets: CounterView, past: Past, live: Flags, expected: int
     if past.base is None:
         lines, many = np.unique(packets.line[live], return_counts=True)
         return live & np.isin(packets.line, lines[(many == many.max(initial=0)) & (many > 1)][:1])
-    foretold = np.zeros(live.size, dtype=np.bool_)
+    selected = np.zeros(live.size, dtype=np.bool_)
     for end in past.ends:
         inside = (packets.ahead >= end) & (packets.ahead < end + expected)
-        foretold |= live & inside & (packets.line == line_of(end, packets.full))
-    return foretold
+        selected |= live & inside & (packets.line == line_of(end, packets.full))
+    return selected

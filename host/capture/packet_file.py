@@ -123,7 +123,7 @@ def _restored(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row
     """Restore the packet log. Raises ValueError if payload is missing."""
     many, sizes = runs["packets"].astype(np.int64), runs["size"].astype(np.int64)
     payload_bytes = sum((many * sizes).tolist())  # each product fits 48 bits; their sum need not fit 64
-    if expected != row.size or not PacketLog.would_keep(expected, payload_bytes) or (sizes == 0).any():
+    if expected != row.size or payload_bytes > PacketLog.most_kept(expected) or (sizes == 0).any():
         raise ValueError("it is of another row, or has more payload than a receiver keeps")
     nth = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
     each = np.repeat(sizes, many)

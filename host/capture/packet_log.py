@@ -94,18 +94,13 @@ class PacketLog:
         """True if `more` bytes of payload can be kept; memory grows up to `_MOST` rows."""
         if self._filled + more <= self.payload.size:
             return True
-        size = min(2 * self.payload.size + more, _MOST * (self.expected + _SPARE_BYTES))
+        size = min(2 * self.payload.size + more, self.most_kept(self.expected))
         if self._filled + more > size:
             return False
         grown = np.empty(size, dtype=np.uint8)
         grown[: self._filled] = self.payload[: self._filled]
         self.payload = grown
         return True
-
-    @staticmethod
-    def would_keep(expected: int, payload_bytes: int) -> bool:
-        """True if a log keeps this much payload of a row of `expected` bytes."""
-        return payload_bytes <= PacketLog.most_kept(expected)
 
     @staticmethod
     def most_kept(expected: int) -> int:

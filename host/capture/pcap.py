@@ -22,7 +22,7 @@ from polysight.shared.files import read_bounded
 
 _MAGIC = {0xA1B2C3D4: 1_000, 0xA1B23C4D: 1}  # microseconds or nanoseconds, as ns a tick
 _PCAPNG = 0x0A0D0D0A
-_AGAIN = "record again: let tcpdump end by itself, or stop it with Ctrl-C"
+_RECORD_AGAIN = "record again: end tcpdump with Ctrl-C"
 _MOST_BYTES = 4 << 30  # half an hour of three boards
 _ETHERNET, _IPV4, _VLAN, _UDP = 1, 0x0800, 0x8100, 17
 
@@ -74,7 +74,7 @@ def read_pcap(path: Path) -> Iterator[Datagram]:
         kept = header.unpack_from(raw, position)[2] if position + header.size <= len(raw) else 0
         if position + header.size + kept > len(raw):
             what = f"{path}: ends within the packet at byte {position}"
-            raise DataError(what, "truncated file", _AGAIN, code=ErrorCode.FILE_DAMAGED)
+            raise DataError(what, "truncated file", _RECORD_AGAIN, code=ErrorCode.FILE_DAMAGED)
         seconds, ticks, kept, _ = header.unpack_from(raw, position)
         position += header.size
         found = _udp(raw[position : position + kept])

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.capture.dca1000 import Counters
 from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.next_record import past_after
 from polysight.host.capture.packet_counts import PacketCounts, count_packets
@@ -73,14 +72,6 @@ class Placed:
             **{name: int(value) for name, value in (vars(self.counts) | vars(self.losses)).items()},
         }
 
-    @property
-    def next_start(self) -> Counters | None:
-        """Counters at the start of the card's next record; None if uncertain."""
-        base, ends = self.past.base, self.past.ends
-        return base.after(ends[0], -(-ends[0] // self._full)) if base is not None and len(ends) == 1 else None
-
-    _full: int = 1
-
 
 @dataclass(frozen=True)
 class Preview:
@@ -118,7 +109,7 @@ def place_record(
     if dropped_by_card:
         located, reason = False, f"the card dropped data before numbering it ({dropped_by_card})"
     row.put_in_place()
-    if located and row.conflicts and not found.foreseen:
+    if located and row.conflicts and not found.start_known:
         located, reason = False, "packets with the same counters have different bytes: the card may have restarted"
     if not located and row.counts.restarted and _RESTARTED not in reason:
         reason = f"{_RESTARTED} within it" + (f"; {reason}" if found.certain else "")
@@ -142,7 +133,6 @@ def place_record(
         and (found.certain or (found.fresh and not row.counts.restarted))
         and row.extent > 0
         and not dropped_by_card,
-        _full=found.full,
     )
     return placed, out
 

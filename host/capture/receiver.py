@@ -63,10 +63,6 @@ class EndRow(_Message, frozen=True):
     not_before_ns: int = 0
 
 
-class Discard(_Message, frozen=True):
-    """Discard the running row and its file. Answered with Discarded."""
-
-
 class Report(_Message, frozen=True):
     """Request Progress. `not_before_ns` is a time before the first pulse (monotonic clock), 0 if unknown."""
 
@@ -161,10 +157,6 @@ class RowCapture(_Message, frozen=True):
         return self.located and not self.missing
 
 
-class Discarded(_Message, frozen=True):
-    """The row is discarded."""
-
-
 class Failed(_Message, frozen=True):
     """The request failed; fields as of a PolysightError."""
 
@@ -174,8 +166,8 @@ class Failed(_Message, frozen=True):
     code: str = ErrorCode.OTHER
 
 
-Request = Open | BeginRow | EndRow | Discard | Report
-Answer = Opened | Began | Progress | RowCapture | Discarded | Failed
+Request = Open | BeginRow | EndRow | Report
+Answer = Opened | Began | Progress | RowCapture | Failed
 A = TypeVar("A", bound=Answer)
 _encoder = msgspec.msgpack.Encoder()
 _requests: Any = msgspec.msgpack.Decoder(Request)
@@ -277,10 +269,6 @@ class ReceiverProcess:
         or 9 in `card_status`, the card dropped data before numbering it, and the row is masked as a whole.
         """
         return self._ask(EndRow(int(card_status or 0), not_before_ns), RowCapture, _ANSWER_TIMEOUT_S)
-
-    def discard(self) -> None:
-        """Discard the running row and its file."""
-        self._ask(Discard(), Discarded, _ANSWER_TIMEOUT_S)
 
     def close(self) -> None:
         """End the process. Safe to repeat."""

@@ -117,10 +117,6 @@ class Receiver:
             return self._begin(request)
         if isinstance(request, messages.EndRow):
             return self._end(request)
-        if isinstance(request, messages.Discard):
-            if self._row is not None:
-                self._discard()
-            return messages.Discarded()
         if self._row is None:
             return messages.Progress(-1, 0, 0, False, 0)
         self._row.not_before_ns = request.not_before_ns or self._row.not_before_ns

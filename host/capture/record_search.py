@@ -44,10 +44,10 @@ class Found:
     fresh: bool = False
     """It starts with the counters of a card just switched on, and nothing else came: the base is practically certain
     for a row with missed triggers, whose frames are placed by arrival times."""
-    foreseen: bool = False  # its start is known from earlier records
+    start_known: bool = False  # its start is known from earlier records
     clock_jumps: int = 0  # number of times the arrival clock went backwards; arrival times are then ignored
     restarted: bool = False  # the card may have restarted just before it, so its last packet is its end
-    again: Flags | None = None  # has counters that came before and is not a known copy; None if no packet has
+    repeated: Flags | None = None  # has counters that came before and is not a known copy; None if no packet has
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class _Verdict:
     excess: bool = False
     doubtful: bool = False
     fresh: bool = False
-    foreseen: bool = False
+    start_known: bool = False
 
 
 def find_record(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int = 0) -> Found:
@@ -90,20 +90,20 @@ def find_record(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int
     old = packets.inside(past.spans, sure=True)
     if past.base is not None and len(past.ends) == 1:
         old |= (packets.line == line_of(past.ends[0], full)) & (packets.ahead < past.ends[0])
-    again = packets.came_before(past.spans) & ~early
+    repeated = packets.came_before(past.spans) & ~early
     live = ~(early | old)
     sorted_out = Found(None, False, False, "", packets.ahead, packets.steps, nothing, early, old, full,
                        clock_jumps=jumps)  # fmt: skip
     found = _found(packets, live, log.expected, frame_bytes, past, sorted_out) if live.any() else None
-    if again.any() and (found is None or not _ends_where_foreseen(found, log)):
+    if repeated.any() and (found is None or not _ends_as_expected(found, log)):
         # Repeated counters in a row without its end: late copies, or the card has restarted.
         if found is not None and found.located:
             why = "packets repeat earlier counters, and the record's end is missing: the card may have restarted"
-            return replace(found, located=False, certain=False, reason=why, restarted=True, again=again)
+            return replace(found, located=False, certain=False, reason=why, restarted=True, repeated=repeated)
         unknown = Past(spans=past.spans, joint=past.joint, joined=past.joined, unseen=True, anew=past.anew)
-        packets = CounterView(log, Counters(int(log.byte_counts[again][0]), int(log.sequences[again][0])), full)
-        sorted_out = replace(sorted_out, old=old & ~again, again=again)
-        found = _found(packets, live | again, log.expected, frame_bytes, unknown, sorted_out)
+        packets = CounterView(log, Counters(int(log.byte_counts[repeated][0]), int(log.sequences[repeated][0])), full)
+        sorted_out = replace(sorted_out, old=old & ~repeated, repeated=repeated)
+        found = _found(packets, live | repeated, log.expected, frame_bytes, unknown, sorted_out)
     if found is None:
         why = "every packet is of an earlier record, by its counters or by its arrival before the first pulse"
         return replace(sorted_out, reason=why)
@@ -118,7 +118,7 @@ def _found(packets: CounterView, live: Flags, expected: int, frame_bytes: int, p
     found = replace(
         sorted_out, base=packets.at(v.base, line), certain=v.certain, located=v.located, reason=v.reason,
         offsets=offsets, steps=steps, own=own, excess=v.excess, doubtful=v.doubtful, fresh=v.fresh,
-        foreseen=v.foreseen,
+        start_known=v.start_known,
     )  # fmt: skip
     if v.located and (why := _rival(packets, found, live & ~own, expected)):
         return replace(found, located=False, certain=False, reason=why)
@@ -133,7 +133,7 @@ def _rival(packets: CounterView, found: Found, rest: Flags, expected: int) -> st
     if later_packets(found, rest, expected, expected).any():
         return "packets of two consecutive records came: it is unknown which is the row's"
     before = (found.offsets < 0) & (found.steps < 0)
-    if _many(packets, rest & ~before, expected) or (not found.foreseen and _many(packets, rest & before, expected)):
+    if _many(packets, rest & ~before, expected) or (not found.start_known and _many(packets, rest & before, expected)):
         return "half of another record came with it: it is unknown which is the row's"
     return ""
 
@@ -151,9 +151,9 @@ def later_packets(found: Found, rest: Flags, stop: int, expected: int) -> Flags:
     return rest & behind & counted
 
 
-def _ends_where_foreseen(found: Found, log: PacketLog) -> bool:
+def _ends_as_expected(found: Found, log: PacketLog) -> bool:
     """True if the last byte came of a located record whose start was known from earlier records."""
-    return found.located and found.foreseen and int((found.offsets + log.sizes)[found.own].max()) == log.expected
+    return found.located and found.start_known and int((found.offsets + log.sizes)[found.own].max()) == log.expected
 
 
 class _Search:
@@ -179,8 +179,8 @@ class _Search:
         furthest = np.full(len(lines), -(1 << 62), dtype=np.int64)
         np.maximum.at(furthest, group, p.ahead[live])
         by_weight = np.lexsort((furthest, weight))[::-1]
-        foreseen = [int(k) for k in by_weight if np.isin(lines[k], self._end_lines)]
-        for k in foreseen:
+        start_known = [int(k) for k in by_weight if np.isin(lines[k], self._end_lines)]
+        for k in start_known:
             verdict = self._judge(live[group == k], int(lines[k]))
             if verdict.located:
                 return int(lines[k]), verdict
@@ -194,7 +194,7 @@ class _Search:
         last_size = int(p.sizes[which][p.ahead[which] == last].max())
         stop, short = last + last_size, last_size < p.full
         if bases.size:
-            verdict = replace(self._from_past(bases, first, stop, short), foreseen=True)
+            verdict = replace(self._from_past(bases, first, stop, short), start_known=True)
         else:
             inside = p.ahead[which] >= stop - self._expected  # none if a packet is longer than the row
             verdict = self._from_itself(int(p.ahead[which][inside].min(initial=last)), first, stop, last_size)

@@ -6,6 +6,7 @@ in ns, bytes of the row received by then), one pair per batch of packets.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import zlib
@@ -29,9 +30,15 @@ def _scan_of(path: Path) -> Path:
     return path.parents[2] if path.parent.parent.name == "raw" else path.parent
 
 
-def disk_full(path: Path) -> tuple[str, str]:
-    """Return cause and remedy for a row's file that cannot be written."""
-    return "the disk is full or fails", f"free space, then `polysight resume {_scan_of(path)}` takes the row again"
+def write_error(path: Path, done: str, e: OSError) -> DeviceError:
+    """Return the error for a file of a scan that cannot be `done`: written, opened, renamed..."""
+    full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return DeviceError(
+        f"{path}: cannot be {done}: {e.strerror}",
+        "the disk is full, read-only or fails",
+        f"free space, then `polysight resume {_scan_of(path)}` continues after the last committed row",
+        code=ErrorCode.DISK_FULL if full else ErrorCode.FILE_UNWRITABLE,
+    )
 
 
 def damaged(path: Path) -> tuple[str, str]:
@@ -63,12 +70,7 @@ class Segment:
                     os.posix_fallocate(self._file.fileno(), 0, size)
                 stack.pop_all()
         except OSError as e:
-            raise DeviceError(
-                f"{path}: cannot reserve {size} bytes: {e.strerror}",
-                "the disk is full or read-only",
-                f"free space, then `polysight resume {_scan_of(path)}`",
-                code=ErrorCode.DISK_FULL,
-            ) from None
+            raise write_error(path, f"reserved ({size} bytes)", e) from None
 
     def finish(self, data: NDArray[np.uint8]) -> int:
         """Write the bytes durably, close the file, and return their CRC-32. Raises DeviceError if the disk fails."""
@@ -79,8 +81,7 @@ class Segment:
                 left = left[self._file.write(left) :]
             os.fsync(self._file.fileno())
         except OSError as e:
-            what = f"{self.path}: cannot be made durable: {e.strerror}"
-            raise DeviceError(what, *disk_full(self.path), code=ErrorCode.DISK_FULL) from None
+            raise write_error(self.path, "made durable", e) from None
         finally:
             self.close()
         return crc
@@ -110,8 +111,7 @@ def write_durably(path: Path, raw: bytes) -> int:
             f.flush()
             os.fsync(f.fileno())
     except OSError as e:
-        what = f"{path}: cannot be written: {e.strerror}"
-        raise DeviceError(what, *disk_full(path), code=ErrorCode.DISK_FULL) from None
+        raise write_error(path, "written", e) from None
     return zlib.crc32(raw)
 
 

@@ -1,8 +1,8 @@
-"""What is known of recorded and processed scans, for lists, pages and commands; nothing here computes a scan again.
+"""Recorded and processed scans for lists, pages and commands; nothing is processed here.
 
-`Scans` lists the scans under a folder and finds one by its name, never outside. `Notes` are the operator's words beside
-a scan. `result_of` says what a processed scan shows, `draw_products` draws it, `probe` looks at one place of it, and
-`compare` at two scans.
+`Scans` lists the scans under a folder and finds the folder of one by its name. `Notes` are the operator's notes and
+tags beside a scan. Of a processed scan, `result_of` gives the results as plain data, `draw_products` draws its maps and
+`probe` reads one place; `compare` takes two scans. They share `Pixels`: images with permittivity and errors.
 """
 
 from polysight.host.catalogue.compare import DIFFERENCE, Comparison, compare, draw_comparison

@@ -1,4 +1,4 @@
-"""Two processed scans side by side: difference of P and of the permittivity, and whether it is more than the errors."""
+"""Compare two processed scans: differences of P and permittivity in standard deviations."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from polysight.shared.errors import DataError
 Real = NDArray[np.float64]
 DIFFERENCE = "RdBu"
 SIGNIFICANT = 3.0
-"""Standard deviations from which a difference is called one."""
-_NEAR_MM = 15.0  # between middles of patches that are taken for the same
+"""Standard deviations above which a difference is significant."""
+_NEAR_MM = 15.0  # largest distance of the centres of one patch in both scans
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ class Comparison:
     Attributes
     ----------
     p, permittivity
-        complex128; not a number where one of the scans says nothing.
+        complex128; nan where one of the scans has no value.
     sigmas
-        float64: |difference of P| in standard deviations; not a number where the error is not known.
+        float64: |difference of P| in standard deviations; nan where the error is not known.
     patches
-        Of each pair of patches at one place: names, permittivities, difference, in standard deviations.
+        For each pair of patches at one place: names, permittivities, difference.
     notes
-        What makes the two hard to compare.
+        Reasons why the two are hard to compare.
     """
 
     first: Pixels
@@ -47,9 +47,9 @@ class Comparison:
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, without the maps."""
-        told = self.sigmas[np.isfinite(self.sigmas)]
-        share = float((told > SIGNIFICANT).mean()) if told.size else None
+        """As plain data, without the maps."""
+        known = self.sigmas[np.isfinite(self.sigmas)]
+        share = float((known > SIGNIFICANT).mean()) if known.size else None
         return {
             "patches": list(self.patches),
             "notes": list(self.notes),
@@ -66,7 +66,7 @@ def compare(first: Path, second: Path) -> Comparison:
     Raises
     ------
     DataError
-        when one of them has no products, is not referenced to metal, or they show different places.
+        if one of them has no products or is not referenced to metal, or they show different places.
     """
     a, b = Pixels(read_products(first)), Pixels(read_products(second))
     for folder, pixels in ((first, a), (second, b)):
@@ -92,7 +92,7 @@ def compare(first: Path, second: Path) -> Comparison:
 
 
 def _places(mine: Real, other: Real) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """For each of `mine` the nearest of `other`, both in mm, and whether it is within half a pixel."""
+    """Index of the nearest of `other` for each of `mine` (mm), and True where it is within half a pixel."""
     nearest = np.abs(mine[:, None] - other[None, :]).argmin(axis=1)
     return nearest, np.abs(mine - other[nearest]) <= max(abs(other[1] - other[0]), abs(mine[1] - mine[0])) * 0.51
 
@@ -105,14 +105,12 @@ def _notes(a: Pixels, b: Pixels) -> list[str]:
     if a.products.simulated != b.products.simulated:
         notes.append("one of the two is simulated")
     if not (np.isfinite(a.p_sigma).any() and np.isfinite(b.p_sigma).any()):
-        notes.append(
-            "the errors of one are not known: an earlier release processed it; no difference can be called one"
-        )
+        notes.append("the errors of one are not known (processed by an earlier release): significance cannot be judged")
     return notes
 
 
 def _pairs(a: Pixels, b: Pixels) -> list[dict[str, Any]]:
-    """Patches of both that have their middle at one place."""
+    """Pairs of patches with their centres at one place."""
     out = []
     others = [s for s in b.products.segments if not s.get("metal_reference")]
     for one in a.products.segments:
@@ -175,6 +173,6 @@ def draw_comparison(found: Comparison, name: str) -> Picture:
 
 
 def _covariance(permittivity: dict[str, Any]) -> Real:
-    """Of (real, imaginary); not a number where an earlier release did not write it."""
-    told = permittivity.get("covariance")
-    return np.array(told, np.float64) if told else np.full((2, 2), np.nan)
+    """Covariance of (real, imaginary); nan if an earlier release did not write it."""
+    known = permittivity.get("covariance")
+    return np.array(known, np.float64) if known else np.full((2, 2), np.nan)

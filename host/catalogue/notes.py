@@ -1,4 +1,4 @@
-"""The operator's words about a scan: `operator.json` beside its rows, notes and tags, read and written whole."""
+"""The operator's notes and tags of a scan, in `operator.json` beside its rows."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ _MOST_BYTES = 1 << 17
 
 
 class Notes(msgspec.Struct, frozen=True):
-    """`notes`, free text, and `tags`, short words, of one scan."""
+    """Free text and short tags of one scan."""
 
     notes: str = ""
     tags: tuple[str, ...] = ()
 
 
 def read_notes(folder: Path) -> Notes:
-    """The notes of a scan; empty where there are none.
+    """Read the notes of a scan; empty if there are none.
 
     Raises
     ------
     DataError
-        when the file is damaged.
+        if the file is damaged.
     """
     path = folder / NOTES
     if not is_plain(path):
@@ -50,7 +50,7 @@ def read_notes(folder: Path) -> Notes:
 
 
 def is_plain(path: Path) -> bool:
-    """Whether there is a regular file at a path: no link, and no pipe at which a reader would wait for ever."""
+    """True if a path is a regular file: no link, and no pipe, on which a reader would block."""
     try:
         return stat.S_ISREG(path.lstat().st_mode)
     except (OSError, ValueError):
@@ -58,22 +58,22 @@ def is_plain(path: Path) -> bool:
 
 
 def write_notes(folder: Path, notes: Notes) -> Notes:
-    """Check and write the notes of a scan; returns them as written.
+    """Check and write the notes of a scan; return them as written.
 
     Raises
     ------
     ConfigError
-        when a text is too long, or there are too many tags.
+        if a text is too long, or there are too many tags.
     """
     text = printable(notes.notes, keep="\n")
     tags = tuple(dict.fromkeys(tag for tag in (printable(t).strip() for t in notes.tags) if tag))
     wrong = ""
     if len(text) > LONGEST_NOTES:
-        wrong = f"the notes have {len(text)} characters, {LONGEST_NOTES} are possible"
+        wrong = f"the notes have {len(text)} characters, {LONGEST_NOTES} are allowed"
     elif len(tags) > MOST_TAGS:
-        wrong = f"{len(tags)} tags, {MOST_TAGS} are possible"
+        wrong = f"{len(tags)} tags, {MOST_TAGS} are allowed"
     elif long := next((tag for tag in tags if len(tag) > LONGEST_TAG), ""):
-        wrong = f"the tag {long[:LONGEST_TAG]!r}... has {len(long)} characters, {LONGEST_TAG} are possible"
+        wrong = f"the tag {long[:LONGEST_TAG]!r}... has {len(long)} characters, {LONGEST_TAG} are allowed"
     if wrong:
         raise ConfigError(
             wrong, "lists have to stay readable", "shorten it; longer texts go into a file of their own",

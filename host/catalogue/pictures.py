@@ -1,6 +1,6 @@
-"""Pictures of images: amplitude and phase of H, V and P, and maps of a processed scan, as PNG with their ends.
+"""Draw images as PNG: amplitude and phase of H, V and P, and the maps of a processed scan.
 
-Row 0 of an image (the smallest y) is at the bottom of its picture; what is not known is transparent.
+Row 0 of an image (the smallest y) is at the bottom of its picture; unknown pixels are transparent.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from polysight.shared.errors import DataError
 AMPLITUDE, PHASE = "cividis", "twilight"
 _RANGE_DB = 35.0
 _RATIO_PERCENTILES = (5.0, 95.0)
-_FAINT_DB, _CLEAR_DB = -26.0, -18.0  # below the brightest: what is fainter holds no phase, and fades out
+_FAINT_DB, _CLEAR_DB = -26.0, -18.0  # relative to the brightest: between them phases fade out
 _THUMBNAIL = 96  # pixels at most
 
 
 class Channels(Protocol):
-    """Both channels of an image, [ny, nx], and which pixels are lit."""
+    """Both channels of an image and the illuminated pixels, [ny, nx]."""
 
     @property
     def h(self) -> NDArray[np.complex64]:
@@ -38,13 +38,13 @@ class Channels(Protocol):
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Lit pixels."""
+        """Illuminated pixels."""
         ...
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One image: its PNG, what the ends of its colour map mean, and which map it is."""
+    """A PNG, the values at the ends of its colour map, and the name of that map."""
 
     png: bytes
     low: float
@@ -54,15 +54,15 @@ class Picture:
 
 
 def draw(images: Channels) -> dict[str, Picture]:
-    """Amplitude and phase of H, V and P = H / V: `h_amplitude`, `h_phase` and so on.
+    """Draw amplitude and phase of H, V and P = H / V: `h_amplitude`, `h_phase` and so on.
 
-    P is as it is in the images: while a scan runs it is not referenced to metal.
+    P is that of the given images: during a scan it is not referenced to metal.
     """
     return {name: _picture(values) for name, values in _channels(images).items()}
 
 
 class _Values(NamedTuple):
-    """What a picture is drawn from: numbers and opacity [ny, nx], ends of the colours."""
+    """Numbers and opacity [ny, nx] of a picture, and the limits of its colours."""
 
     numbers: NDArray[Any]
     opacity: NDArray[Any]
@@ -84,8 +84,8 @@ def _channels(images: Channels) -> dict[str, _Values]:
         out[f"{name}_phase"] = _phase(channel, _fade(_below_top(channel, seen)) * seen)
     clear = _fade(strength) * seen
     level = _db(ratio)
-    told = level[clear > 0.5]
-    low, high = np.percentile(told, _RATIO_PERCENTILES) if told.size else (-10.0, 10.0)
+    shown = level[clear > 0.5]
+    low, high = np.percentile(shown, _RATIO_PERCENTILES) if shown.size else (-10.0, 10.0)
     middle, half = (low + high) / 2, max((high - low) / 2, 3.0)
     out["p_amplitude"] = _Values(level, clear, (float(middle - half), float(middle + half)), AMPLITUDE, "dB")
     out["p_phase"] = _phase(ratio, clear)
@@ -94,7 +94,7 @@ def _channels(images: Channels) -> dict[str, _Values]:
 
 @dataclass(frozen=True)
 class Map:
-    """What a picture of a processed scan shows: its title, unit and colours."""
+    """Title, unit and colours of a picture of a processed scan."""
 
     title: str
     unit: str
@@ -112,13 +112,13 @@ MAPS = {
     "permittivity": Map("permittivity, real part", ""),
     "loss": Map("permittivity, loss", ""),
 }
-"""Pictures of a processed scan, by the name under which they are asked for."""
+"""Pictures of a processed scan by name."""
 
 
 def draw_products(pixels: Pixels, name: str, limits: tuple[float, float] | None = None) -> Picture:
-    """One of `MAPS` of a processed scan; `limits`: other ends of its colours, to compare with another scan.
+    """Draw one of `MAPS` of a processed scan; `limits` replaces the limits of its colours.
 
-    Raises DataError where there is no such picture, or nothing to draw.
+    Raises DataError if there is no such picture, or nothing to draw.
     """
     if name not in MAPS:
         raise DataError(
@@ -130,7 +130,7 @@ def draw_products(pixels: Pixels, name: str, limits: tuple[float, float] | None 
 
 
 def _derived(pixels: Pixels, name: str) -> _Values:
-    """What follows from P: its error, permittivity, loss."""
+    """Maps derived from P: its error, permittivity, loss."""
     if not pixels.referenced:
         raise DataError(
             "no permittivity is shown", "the images are not referenced to metal, or support no result",
@@ -141,7 +141,7 @@ def _derived(pixels: Pixels, name: str) -> _Values:
     seen = pixels.clear & np.isfinite(values)
     if name != "p_sigma":
         seen &= ~pixels.metal_like
-    high = float(np.percentile(values[seen], 85)) if seen.any() else 1.0  # rims of plates look like anything
+    high = float(np.percentile(values[seen], 85)) if seen.any() else 1.0  # edges of plates have any value
     low = 1.0 if name == "permittivity" else 0.0
     return _numbers(values, seen, (low, max(1.3 * high, low + 1e-3)), AMPLITUDE)
 
@@ -153,7 +153,7 @@ def _numbers(values: NDArray[Any], seen: NDArray[np.bool_], limits: tuple[float,
 def picture_of(
     values: NDArray[Any], seen: NDArray[np.bool_], limits: tuple[float, float], colours: str = AMPLITUDE
 ) -> Picture:
-    """A map of numbers without a unit; what is not `seen` is transparent."""
+    """Draw numbers without a unit; pixels that are not `seen` are transparent."""
     return _picture(_numbers(values, seen, limits, colours))
 
 
@@ -204,7 +204,7 @@ def _png(rgba: NDArray[Any], origin: Literal["lower", "upper"]) -> bytes:
 
 
 def colour_bar(colours: str) -> bytes:
-    """A map's colours from left to right, PNG of 256 x 1 pixels."""
+    """Draw a colour map from left to right, as PNG of 256 x 1 pixels."""
     import matplotlib
 
     return _png(matplotlib.colormaps[colours](np.linspace(0, 1, 256))[None], "upper")

@@ -1,4 +1,4 @@
-"""The pixels of a processed scan with what follows from them: place in millimetres, permittivity, and their errors."""
+"""Pixels of a processed scan: images, places in millimetres, permittivity, and errors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from polysight.shared.errors import DataError
 from polysight.shared.tables import decode
 
 Real = NDArray[np.float64]
-_FAINT_DB = -26.0  # below the brightest: what is fainter says nothing
+_FAINT_DB = -26.0  # relative to the brightest; fainter pixels are noise
 _STEP = 1e-5
 
 
@@ -50,18 +50,18 @@ class Pixels:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Pixels that the scan illuminates."""
+        """Illuminated pixels."""
         return self.products.valid
 
     @property
     def referenced(self) -> bool:
-        """Whether the images are relative to metal, and a result may be shown."""
+        """True if the images are relative to metal and the verdict allows a result."""
         verdict = self.products.verdict
         return bool(self.products.materials) and (verdict is None or verdict.usable)
 
     @cached_property
     def clear(self) -> NDArray[np.bool_]:
-        """Pixels bright enough in both channels for their ratio to say something."""
+        """Pixels bright enough in both channels for a meaningful ratio."""
         out = self.valid & np.isfinite(self.h) & np.isfinite(self.v)
         for channel in (np.abs(self.h), np.abs(self.v)):
             top = float(np.percentile(channel[out], 99.5)) if out.any() else 0.0
@@ -87,13 +87,13 @@ class Pixels:
 
     @cached_property
     def p_sigma(self) -> Real:
-        """Standard deviation of each part of P; not a number where it is not known."""
+        """Standard deviation of each part of P; nan where unknown."""
         sigma = self.products.p_sigma
         return np.full(self.valid.shape, np.nan) if sigma is None else np.asarray(sigma, np.float64)
 
     @cached_property
     def theta_rad(self) -> float:
-        """Incidence angle, of the error budget where it says. Raises DataError."""
+        """Incidence angle, from the error budget or the rig. Raises DataError."""
         budget = self.products.materials.get("error_budget") or {}
         try:
             return float(np.radians(budget["incidence"]["deg"]))
@@ -109,14 +109,14 @@ class Pixels:
 
     @cached_property
     def permittivity(self) -> NDArray[np.complex128]:
-        """Permittivity eps' - j eps'' as a half space; not a number where P is too close to metal, or says nothing."""
+        """Permittivity eps' - j eps'' as a half space; nan where P is too close to metal or too dark."""
         p = np.where(self.clear & np.isfinite(self.p), self.p, np.nan).astype(np.complex128)
         eps = permittivity_from_ratio(p, self.theta_rad)
         return np.where(np.isfinite(eps), eps, complex(np.nan, np.nan))
 
     @cached_property
     def permittivity_sigma(self) -> Real:
-        """Standard deviation of each of its parts from that of P: the map is analytic, so one slope says it."""
+        """Standard deviation of each part of the permittivity: that of P times the slope (the map is analytic)."""
         p = np.asarray(self.p, np.complex128)
         with np.errstate(invalid="ignore", over="ignore"):
             near = permittivity_from_ratio(p + _STEP, self.theta_rad)
@@ -125,7 +125,7 @@ class Pixels:
 
     @cached_property
     def metal_like(self) -> NDArray[np.bool_]:
-        """Pixels so close to metal that their permittivity says nothing but that it is large."""
+        """Pixels so close to metal that their permittivity is only known to be large."""
         size = np.abs(self.permittivity)
         with np.errstate(invalid="ignore"):
             unsure = np.isfinite(self.p_sigma) & (self.permittivity_sigma > 0.5 * size)

@@ -1,4 +1,4 @@
-"""One place of a processed scan: both channels, their ratio with its error, permittivity, range profile, materials."""
+"""Results at one place of a processed scan: channels, ratio, permittivity, range profile, nearest materials."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FLOOR_DB = -50.0
 
 
 def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -> dict[str, Any]:
-    """What a processed scan says of one place.
+    """Read all results of a processed scan at one place.
 
     Parameters
     ----------
@@ -32,19 +32,19 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
     x_mm, y_mm
         The place, from the middle of the image.
     library
-        Whose materials are compared; the simulated one if not given.
+        Reference library; the simulated one if not given.
 
     Returns
     -------
     dict
-        Plain data: `place_mm`; `h_db`, `v_db`; `p` with `sigma`; `permittivity` with `sigma` and, where it is not
-        known, `why`; `patch`, the segment of materials.json that the pixel is in; `bands` of that patch; `nearest`
-        materials; `profile`, the focused range profile, or `profile_why` it is not there.
+        Plain data: `place_mm`; `h_db`, `v_db`; `p` and `p_sigma`; `permittivity` and `permittivity_sigma`, or `why`
+        it is unknown; `patch`, the segment of materials.json with this place; `nearest` materials; `profile`, the
+        focused range profile, or `profile_why` there is none.
 
     Raises
     ------
     DataError
-        when there are no products, or the place lies outside the image.
+        if there are no products, or the place lies outside the image.
     """
     products = read_products(folder)
     pixels = Pixels(products)
@@ -72,7 +72,7 @@ def _permittivity(pixels: Pixels, row: int, column: int) -> dict[str, Any]:
     if not pixels.referenced:
         why = "the images are not referenced to metal, or support no result"
     elif not pixels.clear[row, column]:
-        why = "too dark: noise decides here"
+        why = "too dark: only noise"
     else:
         eps, sigma = complex(pixels.permittivity[row, column]), float(pixels.permittivity_sigma[row, column])
         if not pixels.metal_like[row, column]:
@@ -92,8 +92,8 @@ def _patch(segments: list[dict[str, Any]], x_mm: float, y_mm: float) -> dict[str
 
 @lru_cache(maxsize=4)
 def _library(path: Path, changed_ns: int, angle_deg: float) -> dict[str, tuple[complex, float]]:
-    """By material: mean of V / H, and how far its patches spread about it, of each part."""
-    del changed_ns  # of the file: another one is read again
+    """Mean of V / H and spread of its patches (of each part), by material."""
+    del changed_ns  # time of the file: a changed one is read again
     entries = Library.load(path).at(angle_deg).entries
     out = {}
     for name in dict.fromkeys(e.name for e in entries):
@@ -110,7 +110,7 @@ def _nearest(pixels: Pixels, row: int, column: int, library: Path | None) -> lis
     path = library or SIMULATED_LIBRARY
     try:
         known = _library(path, path.stat().st_mtime_ns, float(np.degrees(pixels.theta_rad)))
-    except (PolysightError, OSError):  # of another angle: nothing can be compared
+    except (PolysightError, OSError):  # a library of another angle
         return []
     p, sigma = complex(pixels.p[row, column]), float(pixels.p_sigma[row, column])
     own = sigma / max(abs(p) ** 2, 1e-9) if np.isfinite(sigma) else 0.0

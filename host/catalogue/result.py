@@ -1,4 +1,4 @@
-"""What a processed scan shows, as plain data for a page: verdict, pictures, patches, quality and files."""
+"""Results of a processed scan as plain data for a page: verdict, pictures, patches, quality and files."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _NO_PERMITTIVITY = ("p_sigma", "permittivity", "loss")
 
 
 def result_of(folder: Path) -> dict[str, Any]:
-    """The products of a scan folder, or of a folder of products.
+    """Collect the products of a scan folder, or of a folder of products.
 
     Raises
     ------
     DataError
-        when there are none, or one is damaged.
+        if there are none, or one is damaged.
     """
     products = read_products(folder)
     pixels, verdict = Pixels(products), products.verdict
@@ -54,7 +54,7 @@ def result_of(folder: Path) -> dict[str, Any]:
 
 
 def labels_of(folder: Path, pixels: Pixels) -> dict[str, Any] | None:
-    """Boxes that a person drew, in millimetres; None where nobody did, and what is wrong with a file that is."""
+    """Boxes drawn by hand, in millimetres, or the `problem` of their file; None if there are none."""
     try:
         found = find_labels(folder)
         if found is None:
@@ -74,7 +74,7 @@ def labels_of(folder: Path, pixels: Pixels) -> dict[str, Any] | None:
 
 
 def files_of(folder: Path) -> list[dict[str, Any]]:
-    """Files of a scan's products and exports that somebody may want to have: `of` which, `name`, `bytes`."""
+    """Downloadable files of a scan's products and exports: `of` (which folder), `name`, `bytes`."""
     products = read_products(folder).folder
     found = []
     for of, where in (("products", products), (EXPORT, folder / EXPORT)):

@@ -68,7 +68,7 @@ class Summary:
 
 
 def stamp_of(folder: Path) -> Stamp:
-    """What changes when anything of a summary does."""
+    """Times and sizes of the files that a summary is made from."""
     files = (MANIFEST, NOTES, f"products/{IMAGE}", f"products/{QUALITY}", IMAGE, QUALITY, f"{PROGRAM}/scan.status")
     out = []
     for name in files:
@@ -81,31 +81,31 @@ def stamp_of(folder: Path) -> Stamp:
 
 
 def summary_of(folder: Path, name: str) -> Summary:
-    """A scan's line, but for what time changes: a scan that has not ended is `lost` here."""
+    """Summarise a scan without signs of life: a scan that has not ended is `lost` here, see :func:`as_of_now`."""
     try:
         notes = read_notes(folder)
     except DataError as e:
         notes = Notes(e.what)
-    told: dict[str, Any] = {"name": name, "notes": notes.notes, "tags": notes.tags, **_processed(folder)}
+    facts: dict[str, Any] = {"name": name, "notes": notes.notes, "tags": notes.tags, **_processed(folder)}
     try:
         raw = (folder / MANIFEST).read_bytes() if is_plain(folder / MANIFEST) else None
     except OSError:
         raw = None
     if raw is None:
-        reason = "" if told["processed"] else _start_failure(folder)
-        state = "products" if told["processed"] else "failed" if reason else "begun"
-        return Summary(state=state, reason=reason, **{"seconds": _age(folder), **told})
+        reason = "" if facts["processed"] else _start_failure(folder)
+        state = "products" if facts["processed"] else "failed" if reason else "begun"
+        return Summary(state=state, reason=reason, **{"seconds": _age(folder), **facts})
     first, rows, last = _read(raw)
     if first is None:
-        return Summary(state="damaged", **{"seconds": _age(folder), **told})
+        return Summary(state="damaged", **{"seconds": _age(folder), **facts})
     plan, rig = first.get("plan", {}), first.get("instrument", {})
     started = str(first.get("started_utc", ""))
-    told |= {
+    facts |= {
         "scan_id": str(first.get("scan_id", "")), "simulated": bool(first.get("simulated")), "started_utc": started,
         "rig": str(rig.get("name", "")) if isinstance(rig, dict) else "", "committed": len(rows),
         "rows": int(plan.get("rows", 0)) if isinstance(plan, dict) else 0, "seconds": _seconds(started) or _age(folder),
     }  # fmt: skip
-    return Summary(state=_state(last, told), reason=str(last.get("reason", ""))[:300], **told)
+    return Summary(state=_state(last, facts), reason=str(last.get("reason", ""))[:300], **facts)
 
 
 def _start_failure(folder: Path) -> str:
@@ -138,12 +138,12 @@ def log_tail(path: Path) -> str:
 
 
 def _read(raw: bytes) -> tuple[Fact | None, set[int], Fact]:
-    """First fact, rows that count, and the last fact that says how the scan stands."""
+    """First fact, committed rows, and the last fact about the scan's state."""
     rows: set[int] = set()
     first: Fact | None = None
     last: Fact = {}
     for line in raw.split(b"\n"):
-        if b'"fact":"row_committed"' in line:  # most lines: their digits are enough for a list
+        if b'"fact":"row_committed"' in line:  # most lines; their digits suffice for a list
             found = _ROW.search(line, line.find(b'"pulses"'))
             if found is not None:
                 rows.add(int(found[1]))
@@ -160,18 +160,18 @@ def _read(raw: bytes) -> tuple[Fact | None, set[int], Fact]:
     return first, rows, last
 
 
-def _state(last: Fact, told: dict[str, Any]) -> str:
+def _state(last: Fact, facts: dict[str, Any]) -> str:
     if last.get("fact") == "scan_paused":
         return "paused"  # if its program lives
     if last.get("fact") != "scan_ended":
         return "lost"
-    if last.get("exit_status") == "success" and told["committed"] >= told["rows"]:
+    if last.get("exit_status") == "success" and facts["committed"] >= facts["rows"]:
         return "finished"
     return "stopped" if last.get("exit_status") == "abort" else "failed"
 
 
 def as_of_now(folder: Path, s: Summary) -> Summary:
-    """With the signs of life of its program."""
+    """The summary with the present state, from the signs of life of the scan's program."""
     if s.state not in ("lost", "paused"):
         return s
     life, now = last_alive_s(folder), time.time()
@@ -191,19 +191,19 @@ def _processed(folder: Path) -> dict[str, Any]:
     where = next((f for f in (folder / "products", folder) if (f / IMAGE).exists()), None)
     if where is None:
         return {"processed": False}
-    told: dict[str, Any] = {"processed": True}
+    found: dict[str, Any] = {"processed": True}
     try:
         products = SavedProducts(where)
         verdict = products.verdict
-        told["verdict"] = "" if verdict is None else verdict.level
+        found["verdict"] = "" if verdict is None else verdict.level
         if (where / MATERIALS).exists():
             names = [str(s["name"]) for s in products.segments if s.get("name")]
-            told["materials"] = tuple(dict.fromkeys(names))[:12]
+            found["materials"] = tuple(dict.fromkeys(names))[:12]
         if where == folder:
-            told |= {"scan_id": products.scan_id, "simulated": products.simulated}
+            found |= {"scan_id": products.scan_id, "simulated": products.simulated}
     except (PolysightError, TypeError, KeyError, AttributeError):  # the page of the scan says what is wrong
-        told["verdict"] = "damaged"
-    return told
+        found["verdict"] = "damaged"
+    return found
 
 
 def _age(folder: Path) -> float:

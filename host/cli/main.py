@@ -1,7 +1,7 @@
-"""`polysight`: finds a command's family by name, parses, runs. Exit status 0 only when it worked.
+"""The program `polysight`: parse the command line and run one command. Exit status 0 only when it worked.
 
-Only the family of the command that was asked for is imported, so that every command answers at once. On stderr: what
-went wrong, why, and what to do.
+Only the module of the command is imported, so that every command starts at once. Errors go to stderr: what happened,
+why, and what to do.
 """
 
 from __future__ import annotations
@@ -13,19 +13,17 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
-from polysight.host.cli.options import joined
+from polysight.host.cli.options import CommandParser, describe, joined
 from polysight.shared import __version__
 from polysight.shared.errors import PolysightError, os_error
 
 FAMILIES = {
     "simulated": ("demo", "simulate", "reproduce"),
-    "rig": ("plan", "doctor", "card", "inspect"),
-    "radar": ("radar",),
+    "rig": ("plan", "doctor", "card", "inspect", "radar"),
     "scan": ("scan", "resume", "validate", "drop-raw"),
     "serve": ("serve", "preview", "scans", "note", "ask", "probe", "compare"),
     "process": ("process", "image", "focus", "sync-report"),
-    "materials": ("materials", "report", "permittivity", "concentration", "classify", "train", "export"),
-    "label": ("label",),
+    "materials": ("materials", "report", "permittivity", "concentration", "classify", "train", "export", "label"),
     "calibrate": ("calibrate", "leakage"),
 }
 """Module of this package to the commands that it adds, in the order of the help."""
@@ -40,17 +38,19 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
         epilog="example:\n  polysight demo --out out/demo\n\n`polysight COMMAND --help` says more about a command.",
     )
     parser.add_argument("--version", action="version", version=f"polysight {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=CommandParser)
 
-    def add(name: str, run: Callable[[argparse.Namespace], int], text: str, example: str) -> argparse.ArgumentParser:
-        sub = commands.add_parser(
-            name,
-            help=text,
-            description=f"{text[0].upper()}{text[1:]}.",
-            epilog=f"example:\n  {example}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
+    def add(
+        name: str,
+        run: Callable[[argparse.Namespace], int],
+        text: str,
+        example: str,
+        most_used: tuple[str, ...] = (),
+    ) -> CommandParser:
+        sub = commands.add_parser(name, help=text)
+        describe(sub, text, example)
         sub.set_defaults(run=run)
+        sub.most_used = most_used
         return sub
 
     wanted = [family for family, names in FAMILIES.items() if command in names]

@@ -1,13 +1,14 @@
-"""The commands on materials: materials, report, permittivity, concentration, classify, train, export."""
+"""The commands on materials: materials, report, permittivity, concentration, classify, train, export, label."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from polysight.data import packaged
-from polysight.host.cli.options import Add, add_config_option, add_model_option, count, number
+from polysight.host.cli.options import Add, add_config_option, add_json_option, add_model_option, count, number
 from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -84,40 +85,34 @@ def add_commands(add: Add) -> None:
     _add_classify(add)
     _add_train(add)
     _add_export(add)
+    _add_label(add)
 
 
 def _add_results(add: Add) -> None:
     sub = add(
         "materials",
         _materials,
-        "what the patches of processed scans were named, and their permittivity",
+        "print names and permittivities of the patches of processed scans",
         "polysight materials out/one",
     )
-    sub.add_argument(
-        "data", type=Path, nargs="+", metavar="DATA", help="folders that polysight process wrote, or scan folders"
-    )
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    sub.add_argument("data", type=Path, nargs="+", metavar="DATA", help="scan folders, or folders of products")
+    add_json_option(sub)
 
     sub = add(
-        "report",
-        _report,
-        "say where a scan's report is; make it from the raw rows where it is not there",
-        "polysight report scans/one",
+        "report", _report, "print where a scan's report is; make it if it is missing", "polysight report scans/one"
     )
-    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder, or a folder that polysight process wrote")
+    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder, or a folder of products")
 
 
 def _add_permittivity(add: Add) -> None:
     sub = add(
         "permittivity",
         _permittivity,
-        "permittivity of the patches of a processed scan, also of a thin sheet or of a liquid behind a wall",
+        "print the permittivity of patches, also of a layer in a stack",
         "polysight permittivity out/one --segment 3 --layer glass,5.5,0.05,3 --layer liquid,?\n"
         "  polysight permittivity out/one --layer sheet,?,0.5-3 --layer plate,metal",
     )
-    sub.add_argument(
-        "products", type=Path, metavar="PRODUCTS", help="folder that polysight process wrote, or a scan folder"
-    )
+    sub.add_argument("products", type=Path, metavar="PRODUCTS", help="folder of products, or a scan folder")
     sub.add_argument("--segment", type=int, metavar="N", help="this patch only (default: all)")
     sub.add_argument(
         "--layer",
@@ -125,37 +120,28 @@ def _add_permittivity(add: Add) -> None:
         action="append",
         default=[],
         metavar="LAYER",
-        help="layers in the order the wave meets them: NAME,REAL,LOSS,MM or NAME,metal for a known one, NAME,?,MM for"
-        " the unknown one; NAME,?,A-B fits its thickness too, from A to B mm, NAME,?,? any thickness; without MM the"
-        " last one has no back (default: one interface)",
+        help="a layer, in the order the wave meets them; known: NAME,REAL,LOSS,MM or NAME,metal; unknown: NAME,?,MM,"
+        " with its thickness fitted NAME,?,A-B (mm) or NAME,?,?; without MM the last layer has no back",
     )
-    sub.add_argument(
+    add_json_option(sub)
+    group = sub.add_argument_group("with --layer")
+    group.add_argument(
         "--bands",
         type=count,
         metavar="K",
-        help="with --layer: use K sub-bands of the sweep, as processed with --bands K (default: the whole sweep; all"
-        " sub-bands where a thickness is fitted)",
+        help="use K sub-bands, as processed with --bands K (default: all where a thickness is fitted, else none)",
     )
-    sub.add_argument(
-        "--amplitude",
-        type=_percent,
-        metavar="PERCENT",
-        help="with --layer: how far |H| may be trusted; 0 uses the ratio alone (default: 10)",
+    group.add_argument(
+        "--amplitude", type=_percent, metavar="PERCENT", help="error of |H| (default: 10; 0: use the ratio alone)"
     )
-    sub.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help="with --layer: take the chirp from this rig file (default: the one the products were made with)",
-    )
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    group.add_argument("--config", type=Path, metavar="FILE", help="rig file of the chirp (default: the products')")
 
 
 def _add_concentration(add: Add) -> None:
     sub = add(
         "concentration",
         _concentration,
-        "concentration of a solution from its polarisation angle, each concentration judged by the others",
+        "estimate the concentration of solutions from the polarisation angle",
         "polysight concentration sugar.npz --value water=0",
     )
     sub.add_argument("data", type=Path, metavar="LIBRARY", help="library (.npz), or folder of published material files")
@@ -165,17 +151,17 @@ def _add_concentration(add: Add) -> None:
         action="append",
         default=[],
         metavar="NAME=PERCENT",
-        help="concentration of a material whose name does not tell it as '(3.8%%)' does",
+        help="concentration of a material without one in its name, such as '(3.8%%)'",
     )
     sub.add_argument("--confidence", type=_share, default=0.9, help="of the intervals (default: 0.9)")
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    add_json_option(sub)
 
 
 def _add_classify(add: Add) -> None:
     sub = add(
         "classify",
         _classify,
-        "name the patches of processed scans, of several angles together; or judge the classifiers on a library",
+        "name the patches of processed scans, or judge the classifiers on a library",
         "polysight classify out/at-60 out/at-55",
     )
     sub.add_argument(
@@ -183,12 +169,12 @@ def _add_classify(add: Add) -> None:
         type=Path,
         nargs="+",
         metavar="DATA",
-        help="folders that polysight process wrote, one for each angle the same patches were scanned under; or one"
-        " library (.npz) or folder of published material files, on which every classifier is judged",
+        help="folders of products, one for each angle the patches were scanned under; or one library (.npz) or folder"
+        " of published material files",
     )
     sub.add_argument("--library", type=Path, metavar="FILE", help="reference library (default: the simulated one)")
     add_model_option(sub)
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    add_json_option(sub)
 
 
 def _train(args: argparse.Namespace) -> int:
@@ -212,32 +198,27 @@ def _add_train(add: Add) -> None:
     sub = add(
         "train",
         _train,
-        "make the classifier's reference library from labelled scans, or from simulated ones",
+        "make a reference library from labelled or simulated scans",
         "polysight train --simulate examples/library --out library.npz",
+        ("--simulate", "--authors"),
     )
-    add_config_option(sub, shipped=True)
+    sub.add_argument("data", type=Path, nargs="*", metavar="DATA", help="labelled or simulated scans")
+    sub.add_argument("--simulate", type=Path, metavar="DIR", help="simulate every scene in DIR and use it")
     sub.add_argument(
-        "data", type=Path, nargs="*", metavar="DATA", help="scans that polysight label names, or simulated ones"
+        "--times", type=count, default=1, metavar="N", help="simulate each scene N times, with other specimens"
     )
-    sub.add_argument(
-        "--simulate", type=Path, default=None, metavar="DIR", help="simulate every scene in DIR and use it"
-    )
-    sub.add_argument(
-        "--times", type=count, default=1, metavar="N", help="simulate each scene N times, each with other specimens"
-    )
-    sub.add_argument(
-        "--authors", type=Path, default=None, metavar="DIR", help="the published data set: its materials/ and labels/"
-    )
+    sub.add_argument("--authors", type=Path, metavar="DIR", help="the published data set (materials/, labels/)")
     sub.add_argument("--out", type=Path, required=True, metavar="FILE", help="library to write (.npz)")
+    add_config_option(sub, shipped=True)
 
 
 _FORMATS = {
-    "hdf5": "image.h5: arrays with axes as dimension scales, units, config, versions (needs h5py)",
+    "csv": "materials.csv: a line a patch, permittivity with standard errors",
+    "png": "amplitude (dB) and phase (degrees) of H, V and P, and the materials",
+    "hdf5": "image.h5: arrays with axes, units, config, versions (needs h5py)",
     "netcdf": "image.nc: an xarray dataset; complex variables as h_real, h_imag (needs h5netcdf)",
     "zarr": "image.zarr: the same dataset as a Zarr store (needs zarr)",
-    "mat": "image.mat: the same for MATLAB and Octave",
-    "png": "amplitude (dB) and phase (degrees) of H, V and P, and the materials",
-    "csv": "materials.csv: a line a patch, permittivity with standard errors",
+    "mat": "image.mat: for MATLAB and Octave",
 }
 
 
@@ -258,15 +239,79 @@ def _add_export(add: Add) -> None:
     sub = add(
         "export",
         _export,
-        "write the products of a processed scan for other programs: HDF5, NetCDF, Zarr, MATLAB, PNG, CSV, CPHD",
+        "export a processed scan to HDF5, NetCDF, Zarr, MATLAB, PNG, CSV or CPHD",
         "polysight export out/one --hdf5 --csv",
+        ("--csv", "--png", "--hdf5"),
     )
-    sub.add_argument("products", type=Path, metavar="DIR", help="folder that polysight process wrote, or a scan folder")
+    sub.add_argument("products", type=Path, metavar="DIR", help="folder of products, or a scan folder")
     for name, text in _FORMATS.items():
         sub.add_argument(f"--{name}", action="store_true", help=text)
     sub.add_argument(
         "--cphd",
         action="store_true",
-        help="phase-history.cphd: the scan's rows as bistatic phase history, for other SAR processors (needs sarkit)",
+        help="phase-history.cphd: the rows as bistatic phase history, for SAR processors (needs sarkit)",
     )
     sub.add_argument("--out", type=Path, metavar="DIR", help="folder to write into (default: DIR-export beside it)")
+
+
+_LABEL_EXAMPLES = (
+    "polysight label scans/one                               # asks for the name of each patch\n"
+    "  polysight label scans/one --from-patches --metal 1 --rename 2=oak --rename 3=glass\n"
+    "  polysight label scans/one --box oak=-20,-20,20,20 --specimen 'oak=board 7'"
+)
+
+
+def _label(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.label import Edits, label
+
+    edits = Edits(args.from_patches, args.remove, args.rename, args.box, args.specimen, args.metal)
+    return label(args.scan, edits, args.list, input if sys.stdin.isatty() else None)
+
+
+def _box(text: str) -> tuple[str, tuple[float, float, float, float]]:
+    name, _, corners = text.rpartition("=")
+    try:
+        x0, y0, x1, y1 = (float(part) for part in corners.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=x0,y0,x1,y1 in mm") from None
+    return name, (x0, y0, x1, y1)
+
+
+def _pair(text: str) -> str:
+    if "=" not in text.strip("="):
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=TEXT")
+    return text
+
+
+def _add_label(add: Add) -> None:
+    sub = add(
+        "label",
+        _label,
+        "draw and name boxes on a processed scan, as training data",
+        _LABEL_EXAMPLES,
+        ("--from-patches", "--rename", "--box"),
+    )
+    sub.add_argument("scan", type=Path, metavar="SCAN", help="processed scan folder, or a folder of products")
+    sub.add_argument("--from-patches", action="store_true", help="begin with the patches found, named by number")
+    sub.add_argument(
+        "--rename", type=_pair, action="append", default=[], metavar="OLD=NEW", help="rename a box or a patch's number"
+    )
+    sub.add_argument(
+        "--box",
+        type=_box,
+        action="append",
+        default=[],
+        metavar="NAME=x0,y0,x1,y1",
+        help="draw a box: corners in mm from the image centre; NAME#2 is a second piece of the same material",
+    )
+    sub.add_argument("--remove", action="append", default=[], metavar="NAME", help="remove a box")
+    sub.add_argument("--metal", metavar="NAME", help="the metal reference (default: the box with a metal's name)")
+    sub.add_argument(
+        "--specimen",
+        type=_pair,
+        action="append",
+        default=[],
+        metavar="NAME=WHICH",
+        help="name the piece of material in a box, the same in every scan of it",
+    )
+    sub.add_argument("--list", action="store_true", help="print boxes and patches, and write nothing")

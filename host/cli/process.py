@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def request_of(args: argparse.Namespace, data: Path, out: Path) -> ProcessRequest:
-    """What the options of `polysight process` ask to do with one scan. Raises ConfigError."""
+    """The request of `polysight process` for one scan. Raises ConfigError."""
     from polysight.host.process import ProcessRequest
 
     if args.reference is None and args.reference_by is not None:
@@ -77,76 +77,68 @@ def _sync_report(args: argparse.Namespace) -> int:
 
 def add_commands(add: Add) -> None:
     """Register the commands."""
-    for name, run, text in (
-        ("process", _process, "make images, material names and the report from recorded data"),
-        ("image", _image, "make only the images from recorded data (image.npz), without naming materials"),
-    ):
-        sub = add(name, run, text, f"polysight {name} scans/one --out out/one")
-        _add_data_arguments(sub, several=name == "process")
-        if name == "process":
-            add_material_options(sub)
-            _add_polarimetry_options(sub)
-        else:
-            _add_view_options(sub)
+    sub = add(
+        "process",
+        _process,
+        "make images, material names and a report from recorded data",
+        "polysight process scans/one --out out/one",
+        ("--library", "--metal"),
+    )
+    _add_data(sub, several=True)
+    add_material_options(sub)
+    _add_polarimetry_options(sub)
+    _add_several_options(sub)
+    sub = add("image", _image, "make only the images from recorded data", "polysight image scans/one --out out/one")
+    _add_data(sub)
+    sub.add_argument(
+        "--depth",
+        type=float,
+        default=0.0,
+        metavar="MM",
+        help="shift of the imaged plane, away from the rig (default: 0)",
+    )
+    sub.add_argument(
+        "--grid", type=grid, metavar="COLUMNSxROWS@MM", help="number and distance of pixels (default: the rig file's)"
+    )
     sub = add(
         "focus",
         _focus,
-        "find the object plane's distance and tilt by the sharpness of the image; changes no file of the scan",
+        "find the distance and tilt of the object plane by the sharpness of the image",
         "polysight focus scans/one --out out/focus",
     )
-    sub.add_argument("data", type=Path, metavar="DATA", help="scan folder, or the authors' unsynced/<scan>")
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for focus.json and focus.png")
+    _add_data(sub)
     sub.add_argument(
-        "--depth", type=positive, default=8.0, metavar="MM", help="how far to look to either side (default: 8 mm)"
+        "--depth", type=positive, default=8.0, metavar="MM", help="search range to either side (default: 8 mm)"
     )
-    sub.add_argument("--config", type=Path, default=None, metavar="FILE", help="rig file for unsynced/<scan>")
     sub = add(
         "sync-report",
         _sync_report,
-        "say what synchronisation leaves of frequency, phase and amplitude errors, beside the Cramer-Rao bound",
+        "report the errors that synchronisation leaves, beside the Cramer-Rao bound",
         "polysight sync-report scans/one --out out/sync",
     )
-    sub.add_argument("data", type=Path, metavar="DATA", help="scan folder, or the authors' unsynced/<scan>")
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for sync.json, sync.txt, figures")
+    _add_data(sub)
+
+
+def _add_data(sub: argparse.ArgumentParser, several: bool = False) -> None:
+    """Recorded data, the folder of results, and the rig file of published data."""
+    text = "scan folder, or published unsynced/<scan> or raw/<scan>" + ("; or several, or a folder of them" * several)
+    sub.add_argument("data", type=Path, nargs="+" if several else None, metavar="DATA", help=text)
     sub.add_argument(
-        "--config",
-        type=Path,
-        default=None,
-        metavar="FILE",
-        help="rig file for unsynced/<scan>; scan folders bring their own (default: instrument.toml, if it is here)",
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the results; earlier ones are replaced"
+    )
+    sub.add_argument(
+        "--config", type=Path, metavar="FILE", help="rig file of published data (default: instrument.toml beside it)"
     )
 
 
-def _add_data_arguments(sub: argparse.ArgumentParser, several: bool) -> None:
-    """What `process` and `image` work on; with `several` also the options that matter when more than one is given."""
-    sub.add_argument(
-        "data",
-        type=Path,
-        nargs="+" if several else None,
-        metavar="DATA",
-        help="scan folder, or the authors' unsynced/<scan> or raw/<scan>"
-        + ("; several, or a folder of scans, are processed at once" if several else ""),
+def _add_several_options(sub: argparse.ArgumentParser) -> None:
+    group = sub.add_argument_group(
+        "several scans", "their products go to DIR/<scan>/, their messages to DIR/<scan>.log"
     )
-    sub.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the products; earlier ones are replaced"
-    )
-    sub.add_argument(
-        "--config",
-        type=Path,
-        default=None,
-        metavar="FILE",
-        help="rig file for the authors' data; scan folders bring their own (default: instrument.toml beside the data,"
-        " or here)",
-    )
-    if not several:
-        return
-    many = sub.add_argument_group("several scans", "their products go to DIR/<scan>/, what each says to DIR/<scan>.log")
-    many.add_argument(
-        "--jobs", type=count, metavar="N", help="scans at a time (default: one a core, as far as memory goes)"
-    )
-    many.add_argument("--again", action="store_true", help="process scans again that are finished")
-    many.add_argument(
-        "--dask", metavar="ADDRESS", help="on a Dask cluster, e.g. tcp://host:8786, whose workers see the same folders"
+    group.add_argument("--jobs", type=count, metavar="N", help="scans at a time (default: as cores and memory allow)")
+    group.add_argument("--again", action="store_true", help="process finished scans again")
+    group.add_argument(
+        "--dask", metavar="ADDRESS", help="use a Dask cluster with the same folders, e.g. tcp://host:8786"
     )
 
 
@@ -159,47 +151,24 @@ def grid(text: str) -> tuple[int, int, float]:
     return columns, rows, pixel_mm
 
 
-def _add_view_options(sub: argparse.ArgumentParser) -> None:
-    """`--depth` and `--grid` of `polysight image`."""
-    sub.add_argument(
-        "--depth",
-        type=float,
-        default=0.0,
-        metavar="MM",
-        help="image a plane that lies so much farther than the rig file's, or nearer below 0 (default: 0)",
-    )
-    sub.add_argument(
-        "--grid",
-        type=grid,
-        metavar="COLUMNSxROWS@MM",
-        help="pixels, and their distance in mm, about the same centre (default: the rig file's)",
-    )
-
-
 def _add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
-    """`--reference`, `--reference-by`, `--incidence` and `--bands` of `polysight process`."""
     sub.add_argument(
         "--reference",
         type=Path,
         metavar="SCAN",
-        help="scan of a metal plate over the whole plane, as the metal reference (default: metal in the scene)",
+        help="scan of a metal plate as reference (default: metal in the scene)",
     )
     sub.add_argument(
         "--reference-by",
         choices=["position", "mean"],
-        help="with --reference: divide by it pixel by pixel, masked where it is weak (default), or by one number a"
-        " channel",
+        help="divide by --reference pixel by pixel (default), or by its mean in each channel",
     )
     sub.add_argument(
         "--incidence",
         choices=["one", "pixel"],
         default="one",
-        help="incidence angle: one number for the image (default), or each pixel's own; both are in quality.json",
+        help="incidence angle: one for the image (default), or each pixel's own",
     )
     sub.add_argument(
-        "--bands",
-        type=count,
-        default=1,
-        metavar="K",
-        help="image K sub-bands of the sweep too, for `polysight permittivity --layer ... --bands K` (default: none)",
+        "--bands", type=count, default=1, metavar="K", help="also image K sub-bands, to fit layers (default: none)"
     )

@@ -1,14 +1,12 @@
-"""The commands around a rig: plan, doctor, card, inspect."""
+"""The commands around a rig: plan, doctor, card, inspect, radar."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from polysight.host.cli.options import Add, add_config_option, count, number, positive
+from polysight.host.cli.options import Add, add_action, add_config_option, add_json_option, count, number, positive
 from polysight.shared.errors import ConfigError
-
-_FORM = argparse.RawDescriptionHelpFormatter
 
 
 def add_commands(add: Add) -> None:
@@ -17,136 +15,23 @@ def add_commands(add: Add) -> None:
     _add_doctor(add)
     _add_card(add)
     _add_inspect(add)
+    _add_radar(add)
 
 
-def _card(args: argparse.Namespace) -> int:
-    """`polysight card` without an action."""
-    from polysight.host.jobs.cards import show_cards
-
-    return show_cards(args.config, args.listen, args.json)
-
-
-def _program(args: argparse.Namespace) -> int:
-    from polysight.host.jobs.cards import program_card
-
-    return program_card(args.config, args.board, args.mac, args.at, args.yes, args.wait)
-
-
-def _reset(args: argparse.Namespace) -> int:
-    from polysight.host.jobs.cards import reset_card
-
-    return reset_card(args.config, args.board, args.radar)
-
-
-_seconds = number(float, "a number of seconds from 0 to 3600", lambda value: 0 <= value <= 3600)
-
-
-def _add_card(add_command: Add) -> None:
-    card = add_command(
-        "card", _card, "say of each capture card which hop to it is silent; write its addresses", "polysight card"
-    )
-    add_config_option(card)
-    card.add_argument("--json", action="store_true", help="print JSON, for programs")
-    card.add_argument(
-        "--listen",
-        type=_seconds,
-        default=0.0,
-        metavar="S",
-        help="record from every card for so many seconds, to see whether its radar streams (default: do not)",
-    )
-    actions = card.add_subparsers(dest="action", metavar="ACTION")
-
-    def add(name: str, text: str, example: str) -> argparse.ArgumentParser:
-        sub = actions.add_parser(
-            name, help=text, description=f"{text}.", epilog=f"example:\n  {example}", formatter_class=_FORM
-        )
-        sub.add_argument("board", metavar="BOARD", help="name of the board in the rig file, e.g. RH")
-        # Without a default, so that the one given before the action stays.
-        sub.add_argument("--config", type=Path, default=argparse.SUPPRESS, metavar="FILE", help="rig file")
-        return sub
-
-    sub = add(
-        "program",
-        "write a board's addresses and ports of the rig file into its card's EEPROM, once confirmed",
-        "polysight card program RH --mac 12:34:56:78:90:13 --at 192.168.33.180:4096",
-    )
-    sub.set_defaults(run=_program)
-    sub.add_argument("--mac", required=True, help="MAC address the card gets; cards on one network need different ones")
-    sub.add_argument(
-        "--at",
-        default="",
-        metavar="ADDRESS:PORT",
-        help="where the card answers now (default: as in the rig file; a new card: 192.168.33.180:4096)",
-    )
-    sub.add_argument("--yes", action="store_true", help="do not ask; the default is to have the new address typed")
-    sub.add_argument(
-        "--wait", type=_seconds, default=120.0, metavar="S", help="look for the card afterwards (default: 120 s; 0: no)"
-    )
-    sub = add("reset", "reset a card's FPGA, or the radar on it", "polysight card reset RH")
-    sub.set_defaults(run=_reset)
-    sub.add_argument("--radar", action="store_true", help="the radar board, which must be armed again, not the card")
-
-
-def _doctor(args: argparse.Namespace) -> int:
-    from polysight.host.doctor import DoctorOptions, run_doctor
-
-    if args.move and not args.pulse:
-        raise ConfigError(
-            "--move and --no-pulse", "each point of the row is a burst of SYNC_IN pulses", "leave one of them out"
-        )
-    options = DoctorOptions(args.config, args.out, args.move, args.pulse, args.bursts)
-    return run_doctor(options, args.json, bundle=args.bundle)
-
-
-_bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
-
-
-def _add_doctor(add: Add) -> None:
-    sub = add(
-        "doctor",
-        _doctor,
-        "try every hop of the rig in order, and say what is wrong and what to do; nothing moves without --move",
-        "polysight doctor --config instrument.toml --out scans",
-    )
-    add_config_option(sub)
-    sub.add_argument(
-        "--out", type=Path, default=Path(), metavar="DIR", help="where scans will go: its disk is tried (default: here)"
-    )
-    sub.add_argument(
-        "--move",
-        action="store_true",
-        help="THE STAGE MOVES: home it and run a short row, to try the trigger line; each of its points is a burst of"
-        " SYNC_IN pulses",
-    )
-    sub.add_argument(
-        "--no-pulse",
-        dest="pulse",
-        action="store_false",
-        help="send no SYNC_IN pulses (default: a few bursts at rest; radars that are armed transmit meanwhile)",
-    )
-    sub.add_argument(
-        "--bundle",
-        type=Path,
-        metavar="FILE.zip",
-        help="write what was found, versions, rig file, logs and the last lines of manifests, to send to somebody;"
-        " no raw data, no keys",
-    )
-    sub.add_argument("--bursts", type=_bursts, default=4, metavar="N", help="how many bursts to capture (default: 4)")
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
-
+# --- plan ---
 
 _NUMBERS = (
-    ("--speed-mm-s", positive, "stage speed in a row"),
-    ("--pulses", count, "chirps a position"),
-    ("--period-us", positive, "time from one chirp of a burst to the next"),
-    ("--step-x-mm", positive, "distance of positions in a row; the aperture keeps its size"),
-    ("--step-y-mm", positive, "distance of rows; the aperture keeps its size"),
     ("--columns", count, "positions in a row"),
     ("--rows", count, "rows"),
+    ("--step-x-mm", positive, "distance of positions in a row; the aperture keeps its size"),
+    ("--step-y-mm", positive, "distance of rows; the aperture keeps its size"),
     ("--width-mm", positive, "aperture in x"),
     ("--height-mm", positive, "aperture in y"),
-    ("--accel-mm-s2", positive, "acceleration of the stage"),
     ("--object-distance-mm", positive, "z of the object plane"),
+    ("--speed-mm-s", positive, "stage speed in a row"),
+    ("--accel-mm-s2", positive, "acceleration of the stage"),
+    ("--pulses", count, "chirps a position"),
+    ("--period-us", positive, "time from one chirp of a burst to the next"),
 )
 
 
@@ -172,25 +57,147 @@ def _add_plan(add: Add) -> None:
     sub = add(
         "plan",
         _plan,
-        "time, resolution, noise, aliases and data of a scan before it is made; or the best scan within a time",
+        "predict time, resolution, noise and data of a scan, or propose the best scans within a time",
         "polysight plan --minutes 30\n  polysight plan --speed-mm-s 100 --pulses 16 --period-us 750",
+        ("--minutes", "--like"),
     )
     add_config_option(sub, shipped=True)
-    for flag, kind, text in _NUMBERS:
-        sub.add_argument(flag, type=kind, metavar="N", help=f"{text} (default: the rig file's)")
     sub.add_argument("--minutes", type=positive, metavar="M", help="propose the best plans within this time")
-    sub.add_argument("--count", type=count, default=5, metavar="N", help="how many (default: 5)")
-    sub.add_argument(
-        "--scene-mm", type=_size, metavar="W,H", help="size of what lies on the plane (default: the image's)"
-    )
+    sub.add_argument("--count", type=count, default=5, metavar="N", help="number of proposals (default: 5)")
     sub.add_argument("--like", type=Path, metavar="SCAN", help="take noise and standstill between rows from this scan")
+    sub.add_argument("--scene-mm", type=_size, metavar="W,H", help="size of the scene (default: the image's)")
     sub.add_argument(
-        "--snr-db", type=float, metavar="DB", help="direct path over noise: a channel, a sample, a chirp (default: 5.5)"
+        "--snr-db", type=float, metavar="DB", help="direct path over noise per channel, sample and chirp (default: 5.5)"
     )
     sub.add_argument(
         "--row-overhead-s", type=float, metavar="S", help="standstill between rows (default: 0.3, simulated)"
     )
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    add_json_option(sub)
+    group = sub.add_argument_group("numbers of the plan", "instead of the rig file's")
+    for flag, kind, text in _NUMBERS:
+        group.add_argument(flag, type=kind, metavar="N", help=text)
+
+
+# --- doctor ---
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from polysight.host.doctor import DoctorOptions, run_doctor
+
+    if args.move and not args.pulse:
+        raise ConfigError(
+            "--move and --no-pulse", "each point of the row is a burst of SYNC_IN pulses", "leave one of them out"
+        )
+    options = DoctorOptions(args.config, args.out, args.move, args.pulse, args.bursts)
+    return run_doctor(options, args.json, bundle=args.bundle)
+
+
+_bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
+
+
+def _add_doctor(add: Add) -> None:
+    sub = add(
+        "doctor",
+        _doctor,
+        "check every hop of the rig in order and say what to do; nothing moves without --move",
+        "polysight doctor --config instrument.toml --out scans",
+        ("--config", "--move", "--bundle"),
+    )
+    add_config_option(sub)
+    sub.add_argument(
+        "--move", action="store_true", help="THE STAGE MOVES: home it and run a short row with SYNC_IN pulses"
+    )
+    sub.add_argument(
+        "--bundle",
+        type=Path,
+        metavar="FILE.zip",
+        help="write findings, versions, rig file, logs and last lines of manifests, to send; no raw data, no keys",
+    )
+    sub.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="test the disk of this folder")
+    sub.add_argument(
+        "--no-pulse",
+        dest="pulse",
+        action="store_false",
+        help="send no SYNC_IN pulses (default: a few bursts at rest; armed radars transmit)",
+    )
+    sub.add_argument("--bursts", type=_bursts, default=4, metavar="N", help="bursts to capture (default: 4)")
+    add_json_option(sub)
+
+
+# --- card ---
+
+
+def _card(args: argparse.Namespace) -> int:
+    """`polysight card` without an action."""
+    from polysight.host.jobs.cards import show_cards
+
+    return show_cards(args.config, args.listen, args.json)
+
+
+def _card_program(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.cards import program_card
+
+    return program_card(args.config, args.board, args.mac, args.at, args.yes, args.wait)
+
+
+def _card_reset(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.cards import reset_card
+
+    return reset_card(args.config, args.board, args.radar)
+
+
+_seconds = number(float, "a number of seconds from 0 to 3600", lambda value: 0 <= value <= 3600)
+
+
+def _add_board(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("board", metavar="BOARD", help="name of the board in the rig file, e.g. RH")
+
+
+def _add_own_config(sub: argparse.ArgumentParser) -> None:
+    """`--config` of an action, without a default, so that the one given before the action stays."""
+    sub.add_argument("--config", type=Path, default=argparse.SUPPRESS, metavar="FILE", help="rig file")
+
+
+def _add_card(add: Add) -> None:
+    card = add("card", _card, "check the network path to each capture card; program or reset a card", "polysight card")
+    add_config_option(card)
+    card.add_argument(
+        "--listen",
+        type=_seconds,
+        default=0.0,
+        metavar="S",
+        help="record from every card for S seconds, to see whether its radar streams (default: 0)",
+    )
+    add_json_option(card)
+    actions = card.add_subparsers(dest="action", metavar="ACTION")
+
+    sub = add_action(
+        actions,
+        "program",
+        _card_program,
+        "write a board's addresses and ports from the rig file into its card's EEPROM",
+        "polysight card program RH --mac 12:34:56:78:90:13 --at 192.168.33.180:4096",
+    )
+    _add_board(sub)
+    sub.add_argument("--mac", required=True, help="new MAC address of the card, unique in its network")
+    sub.add_argument(
+        "--at",
+        default="",
+        metavar="ADDRESS:PORT",
+        help="present address of the card (default: the rig file's; a new card: 192.168.33.180:4096)",
+    )
+    sub.add_argument("--yes", action="store_true", help="do not ask for confirmation")
+    sub.add_argument(
+        "--wait", type=_seconds, default=120.0, metavar="S", help="look for the card afterwards (default: 120 s; 0: no)"
+    )
+    _add_own_config(sub)
+    sub = add_action(actions, "reset", _card_reset, "reset a card's FPGA, or its radar", "polysight card reset RH")
+    _add_board(sub)
+    sub.add_argument("--radar", action="store_true", help="reset the radar board, which must be armed again")
+    _add_own_config(sub)
+
+
+# --- inspect ---
 
 
 def _inspect(args: argparse.Namespace) -> int:
@@ -205,17 +212,92 @@ def _inspect(args: argparse.Namespace) -> int:
 
 def _add_inspect(add: Add) -> None:
     sub = add(
-        "inspect", _inspect, "say what a recording of a DCA1000 holds", "polysight inspect scans/one/raw/RH/0000.bin"
+        "inspect", _inspect, "describe a recording of a capture card", "polysight inspect scans/one/raw/RH/0000.bin"
     )
-    sub.add_argument(
-        "file", type=Path, metavar="FILE", help="payload (.bin), or packets recorded by tcpdump -w (.pcap)"
-    )
-    sub.add_argument(
-        "--config", type=Path, metavar="RIG", help="rig file it was recorded with (default: a scan's own; else guessed)"
-    )
-    sub.add_argument(
-        "--placement", action="store_true", help="FILE is a row of a scan: how its packets were placed, decided again"
-    )
+    sub.add_argument("file", type=Path, metavar="FILE", help="payload (.bin), or packets recorded by tcpdump (.pcap)")
     sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the range profile of every antenna")
-    sub.add_argument("--card", default="", metavar="ADDRESS", help="which card, where packets of several were recorded")
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    sub.add_argument(
+        "--config", type=Path, metavar="RIG", help="rig file of the recording (default: the scan's, or a guess)"
+    )
+    sub.add_argument("--placement", action="store_true", help="show how the packets of a scan's row are placed")
+    sub.add_argument("--card", default="", metavar="ADDRESS", help="the card, in a recording of several")
+    add_json_option(sub)
+
+
+# --- radar ---
+
+
+def _radar_plan(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.radar import plan_radars
+
+    return plan_radars(args.config)
+
+
+def _radar_check(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.radar import check_radar
+
+    return check_radar(args.config, args.board, args.trace, args.slow, args.json)
+
+
+def _radar_firmware(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.radar import load_firmware
+
+    return load_firmware(args.config, args.board, args.image, args.flash, args.trace, args.slow)
+
+
+def _radar_replay(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.radar import replay_radar
+
+    return replay_radar(args.config, args.trace, args.json)
+
+
+def _add_link(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--trace", type=Path, metavar="FILE", help="record all words between host and board")
+    sub.add_argument("--slow", action="store_true", help="send words one by one at 1 MHz, for doubtful wiring")
+
+
+def _add_radar(add: Add) -> None:
+    radar = add(
+        "radar",
+        _radar_plan,
+        "check one radar board, load its firmware, or replay a trace",
+        "polysight radar check RH",
+    )
+    add_config_option(radar)
+    actions = radar.add_subparsers(dest="action", metavar="ACTION")
+
+    sub = add_action(
+        actions, "plan", _radar_plan, "show all constraints and the settings of each board", "polysight radar plan"
+    )
+    _add_own_config(sub)
+    sub = add_action(
+        actions,
+        "check",
+        _radar_check,
+        "check one board step by step, from USB to one frame",
+        "polysight radar check RH --trace first-day.jsonl",
+    )
+    _add_board(sub)
+    _add_link(sub)
+    _add_own_config(sub)
+    add_json_option(sub)
+    sub = add_action(
+        actions,
+        "firmware",
+        _radar_firmware,
+        "load TI's firmware into a board's RAM, or write it to its flash",
+        "polysight radar firmware RH xwr22xx_metaImage.bin --flash",
+    )
+    _add_board(sub)
+    sub.add_argument("image", type=Path, metavar="IMAGE", help="TI's xwr22xx_metaImage.bin")
+    sub.add_argument(
+        "--flash", action="store_true", help="write the board's flash (default: RAM, until its next reset)"
+    )
+    _add_link(sub)
+    _add_own_config(sub)
+    sub = add_action(
+        actions, "replay", _radar_replay, "run the check against a trace", "polysight radar replay first-day.jsonl"
+    )
+    sub.add_argument("trace", type=Path, metavar="TRACE", help="file written by --trace")
+    _add_own_config(sub)
+    add_json_option(sub)

@@ -6,14 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from polysight.host.cli.options import Add, add_config_option, add_material_options, material_request
+from polysight.host.cli.options import Add, add_config_option, add_json_option, add_material_options, material_request
 
 if TYPE_CHECKING:
     from polysight.host.process import ProcessRequest
 
 
 def _request(args: argparse.Namespace, folder: Path) -> ProcessRequest:
-    """How the scan is processed: its products go into its own folder."""
+    """Request to process a scan into its own folder."""
     from polysight.host.process import ProcessRequest
 
     return ProcessRequest(data=str(folder), out=str(folder / "products"), **material_request(args))
@@ -49,68 +49,50 @@ def _drop_raw(args: argparse.Namespace) -> int:
 
 def _add_recording_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
-        "--keep-incomplete",
-        action="store_true",
-        help="after all retakes keep a row with gaps, masked, instead of ending the scan",
+        "--keep-incomplete", action="store_true", help="after all retakes keep a row with gaps, masked, and continue"
     )
     sub.add_argument("--no-process", action="store_true", help="only record; `polysight process` can follow later")
+    add_material_options(sub)
 
 
 def add_commands(add: Add) -> None:
     """Register the commands."""
-    _add_recording_commands(add)
-    _add_file_commands(add)
-
-
-def _add_recording_commands(add: Add) -> None:
     sub = add(
         "scan",
         _scan,
-        "scan with the rig, and process while it scans; Ctrl-C ends it after the row, twice at once",
+        "scan with the rig and process meanwhile (Ctrl-C: stop after the row; twice: stop now)",
         "polysight scan --config instrument.toml --out scans/one",
     )
     add_config_option(sub)
-    add_material_options(sub)
-    sub.add_argument("--out", type=Path, required=True, metavar="SCAN", help="scan folder to make; never overwritten")
-    sub.add_argument(
-        "--truth", type=Path, default=None, metavar="FILE", help="truth.json of a simulated scene, for the report"
-    )
+    sub.add_argument("--out", type=Path, required=True, metavar="SCAN", help="new scan folder; never overwritten")
     _add_recording_options(sub)
+    sub.add_argument("--truth", type=Path, metavar="FILE", help="truth.json of a simulated scene, for the report")
 
-    sub = add(
-        "resume",
-        _resume,
-        "go on with a scan that was stopped or killed, at its first missing row",
-        "polysight resume scans/one",
-    )
-    add_material_options(sub)
+    sub = add("resume", _resume, "resume an interrupted scan at its first missing row", "polysight resume scans/one")
     sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder; the rig file is in it")
+    _add_recording_options(sub)
     sub.add_argument(
         "--config",
         type=Path,
         metavar="FILE",
-        help="take [pi], [limits] and the boards' addresses from this rig file from now on; all else must be the scan's"
-        " (default: as before)",
+        help="take [pi], [limits] and the boards' addresses from this rig file from now on (default: the scan's)",
     )
-    _add_recording_options(sub)
 
-
-def _add_file_commands(add: Add) -> None:
     sub = add(
-        "validate", _validate, "check every file of a scan folder, and name every fault", "polysight validate scans/one"
+        "validate", _validate, "check every file of a scan folder and list all faults", "polysight validate scans/one"
     )
     sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder")
     sub.add_argument(
         "--replace", action="store_true", help="place every row again from its packets, and commit what changes"
     )
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    add_json_option(sub)
 
     sub = add(
         "drop-raw",
         _drop_raw,
-        "remove the raw rows of a finished scan that saved products were made from; their digests stay",
+        "delete the raw rows of a processed scan; its products and digests stay",
         "polysight drop-raw scans/one",
     )
     sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder")
     sub.add_argument("--products", type=Path, metavar="DIR", help="products made from it (default: SCAN/products)")
-    sub.add_argument("--yes", action="store_true", help="do not ask; the default is to have the word drop typed")
+    sub.add_argument("--yes", action="store_true", help="do not ask for confirmation")

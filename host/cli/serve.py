@@ -1,4 +1,4 @@
-"""The operator's page and what it does, as commands: serve, preview, scans, note, ask, probe, compare."""
+"""The operator's page, and its functions as commands: serve, preview, scans, note, ask, probe, compare."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from polysight.host.cli.options import RIG, Add
+from polysight.host.cli.options import RIG, Add, add_json_option
 from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -71,48 +71,42 @@ def _add_serve(add: Add) -> None:
     sub = add(
         "serve",
         _serve,
-        "the operator's page: all scans under a folder; plan, start, watch, probe, compare and label them in a browser",
+        "serve the operator's page: plan, start, watch, label and compare scans in a browser",
         "polysight serve scans --config instrument.toml        # then open the address that it prints",
+        ("--config", "--port", "--host"),
     )
-    sub.add_argument(
-        "scans", type=Path, nargs="?", default=Path("scans"), metavar="SCANS", help="folder of scans (default: scans)"
-    )
-    sub.add_argument(
-        "--config", type=Path, metavar="FILE", help="rig file of new scans (default: instrument.toml, if it is here)"
-    )
-    sub.add_argument("--read-only", action="store_true", help="show scans, start and ask for nothing")
+    _add_folder(sub)
+    sub.add_argument("--config", type=Path, metavar="FILE", help="rig file of new scans (default: instrument.toml)")
+    sub.add_argument("--read-only", action="store_true", help="show scans, but start and control nothing")
     _add_place(sub)
     sub = add(
         "preview",
         _preview,
-        "the page of one running or finished scan: time left, images row by row, faults in words",
+        "serve the live view of one running or finished scan",
         "polysight preview scans/one                           # then open http://127.0.0.1:8080/\n"
         "  polysight preview scans/one --control --port 8081     # with buttons to pause and stop",
+        ("--control", "--port", "--host"),
     )
-    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder; it may not be there yet")
-    _add_place(sub)
+    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder; it may not exist yet")
     sub.add_argument(
-        "--control",
-        action="store_true",
-        help="let who opens the printed address pause and stop the scan (default: read-only)",
+        "--control", action="store_true", help="let whoever has the printed address pause and stop the scan"
     )
+    _add_place(sub)
+
+
+def _add_folder(sub: argparse.ArgumentParser) -> None:
+    text = "folder of scans (default: scans)"
+    sub.add_argument("scans", type=Path, nargs="?", default=Path("scans"), metavar="SCANS", help=text)
 
 
 def _add_place(sub: argparse.ArgumentParser) -> None:
-    """Where the server is reached."""
-    sub.add_argument("--port", type=_port, default=8080, help="TCP port (default: 8080; 0: any that is free)")
+    """Options of the address."""
+    sub.add_argument("--port", type=_port, default=8080, help="TCP port (default: 8080; 0: any free one)")
     sub.add_argument(
-        "--host",
-        default="127.0.0.1",
-        metavar="ADDRESS",
-        help="address to serve on (default: this machine only; 0.0.0.0: the whole network, for who has the token)",
+        "--host", default="127.0.0.1", metavar="ADDRESS", help="address (default: this machine; 0.0.0.0: the network)"
     )
     sub.add_argument(
-        "--allow-host",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="answer to this name too, as a browser sends it",
+        "--allow-host", action="append", default=[], metavar="NAME", help="accept requests to this host name too"
     )
     sub.add_argument("--certificate", type=Path, metavar="FILE", help="certificate of TLS (PEM), with --key")
     sub.add_argument("--key", type=Path, metavar="FILE", help="its private key (PEM)")
@@ -137,28 +131,22 @@ def _ask(args: argparse.Namespace) -> int:
 
 
 def _add_lists(add: Add) -> None:
-    sub = add(
-        "scans", _scans, "list the scans under a folder: state, verdict, names, tags, size", "polysight scans scans"
-    )
-    sub.add_argument(
-        "scans", type=Path, nargs="?", default=Path("scans"), metavar="SCANS", help="folder of scans (default: scans)"
-    )
+    sub = add("scans", _scans, "list the scans under a folder", "polysight scans scans")
+    _add_folder(sub)
+    sub.add_argument("--find", default="", metavar="TEXT", help="search names, notes, tags and materials")
     sub.add_argument("--tag", action="append", default=[], metavar="TAG", help="only scans with this tag")
-    sub.add_argument(
-        "--find", default="", metavar="TEXT", help="only scans whose name, notes, tags or materials hold it"
-    )
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    add_json_option(sub)
     sub = add(
         "note",
         _note,
-        "write notes and tags of a scan, kept beside its rows; print them",
+        "show or change notes and tags of a scan",
         "polysight note scans/one --text 'second board' --tag oak",
     )
     sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder")
-    sub.add_argument("--text", metavar="TEXT", help="the notes, in place of those that are there")
+    sub.add_argument("--text", metavar="TEXT", help="replace the notes")
     sub.add_argument("--tag", action="append", default=[], metavar="TAG", help="add a tag")
     sub.add_argument("--untag", action="append", default=[], metavar="TAG", help="remove a tag")
-    sub = add("ask", _ask, "ask a running scan to pause, continue, stop or abort", "polysight ask scans/one pause")
+    sub = add("ask", _ask, "pause, continue, stop or abort a running scan", "polysight ask scans/one pause")
     sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder")
     sub.add_argument(
         "wish",
@@ -188,25 +176,18 @@ def _point(text: str) -> tuple[float, float]:
 
 
 def _add_results(add: Add) -> None:
-    sub = add(
-        "probe",
-        _probe,
-        "one place of a processed scan: H, V, P with its error, permittivity, nearest materials, range profile",
-        "polysight probe scans/one 45,0",
-    )
-    sub.add_argument("data", type=Path, metavar="DATA", help="scan folder, or a folder that polysight process wrote")
+    sub = add("probe", _probe, "print all results at one place of a processed scan", "polysight probe scans/one 45,0")
+    sub.add_argument("data", type=Path, metavar="DATA", help="scan folder, or a folder of products")
     sub.add_argument("at", type=_point, metavar="X,Y", help="place, mm from the image's centre")
-    sub.add_argument(
-        "--library", type=Path, metavar="FILE", help="materials to compare with (default: the simulated ones)"
-    )
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    sub.add_argument("--library", type=Path, metavar="FILE", help="reference library (default: the simulated one)")
+    add_json_option(sub)
     sub = add(
         "compare",
         _compare,
-        "differences of two processed scans: P and permittivity, in standard deviations",
+        "compare two processed scans: differences of P and permittivity",
         "polysight compare scans/one scans/two --png difference.png",
     )
     for name in ("first", "second"):
         sub.add_argument(name, type=Path, metavar="DATA", help="scan folder, or a folder of products")
-    sub.add_argument("--png", type=Path, metavar="FILE", help="draw where P differs, in standard deviations")
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    sub.add_argument("--png", type=Path, metavar="FILE", help="draw the difference of P in standard deviations")
+    add_json_option(sub)

@@ -30,7 +30,7 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _reproduce(args: argparse.Namespace) -> int:
     if args.config != packaged(RIG):
-        load_instrument(args.config)  # a wrong one is told now, not with the first item that needs it
+        load_instrument(args.config)  # refuse a wrong one now, not with the first item that needs it
     sys.stderr.write("polysight reproduce: starting\n")  # its figures' libraries take seconds to load
     sys.stderr.flush()
     if args.authors is not None:
@@ -50,74 +50,58 @@ def add_commands(add: Add) -> None:
     sub = add(
         "demo",
         _demo,
-        "scan a scene with the whole rig simulated, and make the report; no hardware is needed",
+        "scan a scene with a simulated rig and write the report; needs no hardware",
         "polysight demo --out out/demo",
-    )
-    add_config_option(sub, shipped=True)
-    sub.add_argument(
-        "--scene",
-        type=Path,
-        default=packaged(Path("examples/nine-materials.toml")),
-        metavar="FILE",
-        help="what to scan (default: nine materials)",
+        ("--out", "--scene"),
     )
     sub.add_argument(
         "--out",
         type=Path,
         default=Path("out/demo"),
         metavar="DIR",
-        help="folder to make (default: out/demo); an earlier demo's is replaced",
+        help="folder to make (default: out/demo); an existing demo folder is overwritten",
     )
     sub.add_argument(
-        "--time-scale", type=positive, default=None, metavar="X", help="simulated seconds per second (default: 40)"
+        "--scene",
+        type=Path,
+        default=packaged(Path("examples/nine-materials.toml")),
+        metavar="FILE",
+        help="scene file (default: nine materials)",
     )
+    sub.add_argument("--time-scale", type=positive, metavar="X", help="simulated seconds per second (default: 40)")
+    add_config_option(sub, shipped=True)
 
     sub = add(
         "simulate",
         _simulate,
-        "make the raw data of a scene, with truth.json, in one step and without processes",
+        "write the raw data of a scene, with truth.json",
         "polysight simulate examples/point-targets.toml --out out/points",
     )
-    add_config_option(sub, shipped=True)
-    sub.add_argument("scene", type=Path, metavar="SCENE.toml", help="what to scan, e.g. examples/metal-plate.toml")
+    sub.add_argument("scene", type=Path, metavar="SCENE.toml", help="scene file, e.g. examples/metal-plate.toml")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
     sub.add_argument(
         "--layout",
         choices=["own", "authors"],
         default="own",
-        help="a scan folder of this program (default), or unsynced/<scan> as the paper's authors publish it",
+        help="a scan folder (default), or unsynced/<scan> as the paper's authors publish it",
     )
-    sub.add_argument("--seed", type=int, default=None, help="noise seed (default: the scene's)")
-    _add_reproduce(add)
+    sub.add_argument("--seed", type=int, help="noise seed (default: the scene's)")
+    add_config_option(sub, shipped=True)
 
-
-def _add_reproduce(add: Add) -> None:
     sub = add(
         "reproduce",
         _reproduce,
-        "make the paper's tables and figures from simulation or from the published files, beside the published values",
+        "make the paper's tables and figures beside the published values",
         "polysight reproduce --out out/reproduce fig18 fig20\n"
         "  polysight reproduce --authors dataset --out out/authors",
     )
     sub.add_argument("items", nargs="*", metavar="ITEM", help="fig3, fig18, table2 ... (default: all there are)")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the page and the files")
-    add_config_option(sub, shipped=True)
     sub.add_argument("--quick", action="store_true", help="fewer draws, models and placements")
-    sub.add_argument(
-        "--authors",
-        type=Path,
-        metavar="DIR",
-        help="the published data set (materials/, labels/): Table 2, Fig. 18, 20 and 21 from its files",
-    )
-    sub.add_argument(
-        "--images",
-        type=Path,
-        metavar="DIR",
-        help="with --authors: folder in which `polysight process` made images of its scans, judged as well",
-    )
-    sub.add_argument(
-        "--names",
-        type=Path,
-        metavar="FILE",
-        help='with --authors: JSON that says which row of Table 2 a name means, {"plexi 3": 3}',
+    sub.add_argument("--authors", type=Path, metavar="DIR", help="use the published data set (materials/, labels/)")
+    add_config_option(sub, shipped=True)
+    group = sub.add_argument_group("with --authors")
+    group.add_argument("--images", type=Path, metavar="DIR", help="also judge images that `polysight process` made")
+    group.add_argument(
+        "--names", type=Path, metavar="FILE", help='JSON with the row of Table 2 of a name, {"plexi 3": 3}'
     )

@@ -1,12 +1,14 @@
-"""From synchronised rows to the two channel images.
+"""Imaging: from synchronised rows to the H and V images.
 
-`ImageBuilder` takes rows (range gate and reduction), chooses an imager and returns `ChannelImages`, flattened by the
-footprint of a mirror; `SubBandImages` does so for parts of the sweep. Three imagers keep one contract: direct
-(`backproject`, and its adjoint `project`), spectral, and row-incremental. `focus_sweep` finds the plane by sharpness,
-`imaging_facts` measures the point response.
+`ImageBuilder` reduces each row to the range gate, chooses an imager and returns `ChannelImages`, divided by the
+footprint (the image of a mirror); `SubBandImages` does the same for parts of the sweep. The three imagers have one
+interface (`samples.Imager`): direct sum (`backproject` and its adjoint `project`), spectral, and incremental row by
+row. `move_to_plane` estimates the plane of the plates and images on it, `focus_sweep` finds the plane by sharpness,
+`correct_tilt` removes the effect of tilted plates, `imaging_facts` measures the point response. `ImagedWith` lists the
+settings that the gains of an image depend on.
 """
 
-from polysight.host.imaging.aperture import Aperture
+from polysight.host.imaging.aperture import Aperture, Window, window_weights
 from polysight.host.imaging.direct import backproject, project
 from polysight.host.imaging.focus import Focus, focus_sweep
 from polysight.host.imaging.gain_conditions import ImagedWith
@@ -22,12 +24,11 @@ from polysight.host.imaging.images import (
     needed_gate_m,
     sub_bands,
 )
-from polysight.host.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, find_plane, on_their_plane
+from polysight.host.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, find_plane, move_to_plane
 from polysight.host.imaging.reduce import reduction, scene_gate_m
 from polysight.host.imaging.resolution import PointResponse, imaging_facts, point_response
 from polysight.host.imaging.samples import ReducedRow
-from polysight.host.imaging.tilt import Illumination, Rise, levelled
-from polysight.host.imaging.window import Window, window_weights
+from polysight.host.imaging.tilt import Illumination, Rise, correct_tilt
 
 __all__ = [
     "AS_IN_RIG_FILE",
@@ -51,13 +52,13 @@ __all__ = [
     "View",
     "Window",
     "backproject",
+    "correct_tilt",
     "find_plane",
     "focus_sweep",
     "image_grid",
     "imaging_facts",
-    "levelled",
+    "move_to_plane",
     "needed_gate_m",
-    "on_their_plane",
     "point_response",
     "project",
     "reduction",

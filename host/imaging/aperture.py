@@ -1,7 +1,6 @@
-"""What an imager is made for: antennas, stage positions, frequencies, pixels; and whether they are regular.
+"""Input of an imager: antennas, stage positions, frequencies and pixels; regularity checks; windows.
 
-Also the array library of an array (array API), its Fourier transforms and its device, so that imagers run on NumPy,
-PyTorch and CuPy alike.
+Also functions of the array API (namespace, transforms, device), so that imagers run on NumPy, PyTorch and CuPy.
 """
 
 from __future__ import annotations
@@ -15,15 +14,18 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.host.imaging.geometry import Antennas, ImageGrid
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 
-_SAME_M = 1e-6  # closer places are one: 2e-3 rad at one position, far below the noise of any
+_SAME_M = 1e-6  # tolerance of positions: 2e-3 rad at one position, far below the noise
 _FINER = 4  # the lattice in y may be this much finer than the pixels
+Window = str | tuple[Any, ...]
+"""Window as for scipy.signal.get_window; "boxcar" for none."""
 
 
 @dataclass(frozen=True)
 class Aperture:
-    """One board's measurement of one scene.
+    """Geometry of one board's measurement of a scene.
 
     Attributes
     ----------
@@ -44,12 +46,12 @@ class Aperture:
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Of the samples an imager takes: (rx, frequency, row, column)."""
+        """Shape of an imager's samples: (rx, frequency, row, column)."""
         return (len(self.antennas.rx_m), self.frequencies_hz.size, *self.offsets_m.shape[:2])
 
 
 def irregular(aperture: Aperture) -> str | None:
-    """Why positions and pixels form no lattice, in a few words; None when they do."""
+    """Return the reason why positions and pixels do not form a lattice; None if they do."""
     offsets, grid = aperture.offsets_m, aperture.grid
     if np.ndim(grid.z_m):
         return "the imaged surface is not a plane parallel to the stage"
@@ -69,19 +71,19 @@ def irregular(aperture: Aperture) -> str | None:
 
 
 def column_step_m(offsets_m: NDArray[np.float64]) -> float:
-    """Mean distance of two neighbours in a row; 0 for rows of one position."""
+    """Return the mean spacing of positions in a row; 0 for rows of one position."""
     x = offsets_m[..., 0]
     return float((x[:, -1] - x[:, 0]).mean()) / max(1, x.shape[1] - 1)
 
 
 def row_starts_m(offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where each row's evenly spaced positions begin along x, [row]: the best fit to all of the row."""
+    """Return the x of each row's first position, [row]: best fit of evenly spaced positions to the row."""
     x = offsets_m[..., 0]
     return (x - np.arange(x.shape[1]) * column_step_m(offsets_m)).mean(axis=1)
 
 
 def pitch_y_m(aperture: Aperture) -> float | None:
-    """Common measure of the rows' distances and the pixel; None without one."""
+    """Return a common divisor of row spacing and pixel; None without one."""
     y = aperture.offsets_m[:, 0, 1]
     for finer in range(1, _FINER + 1):
         pitch = aperture.grid.pixel_m / finer
@@ -91,13 +93,29 @@ def pitch_y_m(aperture: Aperture) -> float | None:
     return None
 
 
+def window_weights(name: Window, n: int) -> NDArray[np.float64]:
+    """Return a symmetric window of n points without the zeros at its ends, float64 [n]."""
+    match name:  # common ones in NumPy: scipy.signal loads scipy.stats, which takes a second
+        case "boxcar":
+            weights = np.ones(n + 2)
+        case "hann":
+            weights = np.hanning(n + 2)
+        case ("kaiser", float(beta)):
+            weights = np.kaiser(n + 2, beta)
+        case _:
+            from scipy.signal import get_window
+
+            weights = np.asarray(get_window(name, n + 2, fftbins=False), np.float64)
+    return weights[1:-1]
+
+
 def namespace(array: Any) -> Any:
-    """The array API namespace of an array; numpy for anything that is no array.
+    """Return the array API namespace of an array; numpy for lists and numbers.
 
     Raises
     ------
     ConfigError
-        when the array is of another library and `array-api-compat` is not installed.
+        if the array is of another library and `array-api-compat` is not installed.
     """
     if isinstance(array, np.ndarray | np.generic | list | tuple | float | int | complex):
         return np
@@ -108,15 +126,16 @@ def namespace(array: Any) -> Any:
             f"arrays of type {type(array).__module__}.{type(array).__name__} need the package array-api-compat",
             "it is an optional dependency, for GPUs",
             "pip install polysight[gpu], or give numpy arrays",
+            code=ErrorCode.PACKAGE_MISSING,
         ) from None
     return array_api_compat.array_namespace(array)
 
 
 def fft_of(xp: Any) -> ModuleType | Any:
-    """Fourier transforms of a namespace. scipy's for numpy: several transforms at once, in single precision."""
+    """Return the Fourier transforms of a namespace; scipy's for numpy, which keep single precision."""
     return scipy.fft if xp is np else xp.fft
 
 
 def device_of(array: Any) -> Any:
-    """Where an array lies, to make others beside it."""
+    """Return the device of an array."""
     return getattr(array, "device", None)

@@ -1,4 +1,4 @@
-"""The direct imager: a matched filter summed in place, for any antennas, positions and voxels."""
+"""Direct imager: matched filter by direct summation, for any antennas, positions and voxels."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from polysight.host.imaging.aperture import Aperture, device_of, namespace
 from polysight.host.imaging.geometry import excess_path_m, turn
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
-_CHUNK = 1 << 20  # products of position and voxel held at once
+_CHUNK = 1 << 20  # products of position and voxel in memory
 
 
 def backproject(samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any) -> Any:
-    """Backprojection (paper, equation 6, with the exponent's sign that of the conjugate of the received phase).
+    """Backproject samples (paper, equation 6, with the exponent's sign of the conjugate of the received phase).
 
     `image(v) = sum_p sum_f samples[p, f] exp(-j 2 pi f (|v - tx_p| + |v - rx_p| - reference_p) / c)`
 
     Parameters
     ----------
     samples
-        complex [position, frequency], phase +2 pi f tau. One antenna pair per position; several RX are several
-        positions. Of any array API library, on any device: the sum runs there.
+        complex [position, frequency], phase +2 pi f tau, of any array API library and device. One antenna pair per
+        position; several RX are several positions.
     frequencies_hz
         float [frequency]; evenly spaced ones are summed by Horner's rule.
     tx_m, rx_m
@@ -31,8 +31,8 @@ def backproject(samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_
     voxels_m
         float [n, 3], metres.
     reference_m
-        float [position]: path that the samples' phase no longer holds (the direct path; twice the range to the scene's
-        centre for a monostatic radar referenced to it; 0 for raw phase).
+        float [position]: path already removed from the phase (the direct path; twice the range to the scene's centre
+        for a monostatic radar referenced to it; 0 for raw phase).
 
     Returns
     -------
@@ -41,7 +41,7 @@ def backproject(samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_
     Raises
     ------
     ValueError
-        when the shapes do not fit.
+        if the shapes do not fit.
     """
     scene = _Scene(samples, frequencies_hz, tx_m, rx_m, voxels_m, reference_m)
     xp = scene.xp
@@ -62,7 +62,7 @@ def backproject(samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_
 
 
 def project(reflectivity: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any) -> Any:
-    """The forward model, adjoint of :func:`backproject`: what voxels [n] answer, complex128 [position, frequency]."""
+    """Compute the echoes of voxels [n], complex128 [position, frequency]; the adjoint of :func:`backproject`."""
     voxels = namespace(reflectivity).asarray(reflectivity)
     pairs = np.empty((len(tx_m), len(frequencies_hz)))
     scene = _Scene(pairs, frequencies_hz, tx_m, rx_m, voxels_m, reference_m, like=voxels)
@@ -78,7 +78,7 @@ def project(reflectivity: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels
 
 
 class _Scene:
-    """Checked places of a direct sum, in the samples' array library, and delays by chunks of positions."""
+    """Checked geometry of a direct sum as arrays of the samples' library, and delays by chunks of positions."""
 
     def __init__(
         self, samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any, like: Any = None
@@ -105,14 +105,14 @@ class _Scene:
 
     @property
     def step(self) -> float | None:
-        """Distance of the frequencies where three or more are evenly spaced, Hz; else None."""
+        """Spacing of three or more evenly spaced frequencies, Hz; otherwise None."""
         f = np.array(self.frequencies)
         step = (f[-1] - f[0]) / max(1, f.size - 1)
         even = f.size > 2 and np.allclose(np.diff(f), step, rtol=1e-9, atol=1e-6 * abs(step))
         return float(step) if even else None
 
     def delays(self) -> Iterator[tuple[slice, Any]]:
-        """Positions, and their delays to all voxels, float64 [position, voxel], seconds."""
+        """Yield chunks of positions and their delays to all voxels, float64 [position, voxel], seconds."""
         v = self.voxels
         size = max(1, _CHUNK // max(1, v.shape[0]))
         for first in range(0, self.tx.shape[0], size):
@@ -123,13 +123,13 @@ class _Scene:
 
 
 class DirectImager:
-    """An aperture imaged by direct sum: exact wherever positions and pixels are, and slow. See `samples.Imager`."""
+    """Imager by direct sum: exact for any positions and pixels, but slow. See `samples.Imager`."""
 
     def __init__(self, aperture: Aperture) -> None:
         self.aperture = aperture
 
     def image(self, samples: Any) -> Any:
-        """Matched filter of samples [rx, frequency, row, column], complex128 [ny, nx]."""
+        """Return the matched filter of samples [rx, frequency, row, column], complex128 [ny, nx]."""
         xp = namespace(samples)
         rx, m, rows, columns = self.aperture.shape
         total = 0
@@ -139,12 +139,12 @@ class DirectImager:
         return xp.reshape(total, self.aperture.grid.shape)
 
     def constant(self, echo: Any, weights: Any) -> Any:
-        """Image of an echo [rx, frequency] that is the same at every position, times weights [row, column]."""
+        """Return the image of an echo [rx, frequency] at every position, times weights [row, column]."""
         xp = namespace(echo)
         return self.image(echo[:, :, None, None] * xp.astype(weights, echo.dtype)[None, None, :, :])
 
     def samples(self, image: Any) -> Any:
-        """Forward model, the adjoint of :meth:`image`: what pixels [ny, nx] answer, [rx, frequency, row, column]."""
+        """Return the echoes of pixels [ny, nx], [rx, frequency, row, column]; the adjoint of :meth:`image`."""
         xp = namespace(image)
         rx, m, rows, columns = self.aperture.shape
         pixels = xp.reshape(image, (-1,))
@@ -152,7 +152,7 @@ class DirectImager:
         return xp.reshape(xp.stack(answers), (rx, m, rows, columns))
 
     def _places(self, rx: int) -> tuple[Any, ...]:
-        """What `backproject` takes after the samples."""
+        """Return the arguments of `backproject` after the samples."""
         a = self.aperture
         shift = a.offsets_m.reshape(-1, 3)
         places = (a.antennas.tx_m + shift, a.antennas.rx_m[rx] + shift, a.grid.voxels_m)

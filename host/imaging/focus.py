@@ -1,13 +1,13 @@
-"""Autofocus: the plane's distance and tilt, by the sharpness of the image.
+"""Autofocus: find distance and tilt of the object plane by the sharpness of the image.
 
-The scene is imaged on a stack of planes parallel to the stage. Any plane, tilted or not, is a cut through that volume,
-so one stack serves the whole search.
+The scene is imaged on a stack of planes parallel to the stage. Any plane, also a tilted one, is a cut through this
+volume, so one stack is enough for the whole search.
 
-Sharpness is that of the intensities, `sum I^2 / (sum I)^2` (Fienup and Miller, J. Opt. Soc. Am. A 20, 2003), with
-intensities counted per resolution cell, not per pixel: cells grow with the plane's distance, and without that the
-nearest plane would look sharpest. Points and edges show the focus; the inside of a plate does not. An aperture of
-length L sees a wrong depth as a phase that grows with L^2: what a wide scan finds to a tenth of a millimetre, a narrow
-one cannot.
+Sharpness is `sum I^2 / (sum I)^2` of the intensities I (Fienup and Miller, J. Opt. Soc. Am. A 20, 2003), counted per
+resolution cell instead of per pixel: cells grow with the distance of the plane, so that otherwise the nearest plane
+would be the sharpest. Points and edges determine the focus, the inside of a plate does not. A wrong depth causes a
+phase error that grows with the square of the aperture's length: a wide scan resolves a tenth of a millimetre, a narrow
+one does not.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ _MAX_TILT_DEG = 3.0
 
 @dataclass(frozen=True)
 class Focus:
-    """What a focus sweep found.
+    """Result of a focus sweep.
 
     Attributes
     ----------
     depths_mm
         float64 [n]: planes of the sweep, relative to the rig file's.
     sharpness
-        float64 [n]: of the parallel plane at each depth; 1 for the sharpest.
+        float64 [n]: sharpness on the parallel plane at each depth, relative to the largest.
     depth_mm
-        How much farther than the rig file says the object's plane is, at the image's centre.
+        Distance of the object plane minus that in the rig file, at the centre of the image.
     tilt_deg
-        Its rise in z along x and along y, as angles.
+        Rise of the plane in z along x and along y, as angles.
     gain
-        Sharpness on the found plane over that on the rig file's.
+        Sharpness on the found plane relative to the rig file's plane.
     """
 
     depths_mm: NDArray[np.float64]
@@ -53,16 +53,16 @@ class Focus:
 
     @property
     def certain(self) -> bool:
-        """Whether the sharpness falls to both sides of what was found, by more than 2 % at the sweep's ends."""
+        """True if the sharpness falls by more than 2 % towards both ends of the sweep."""
         inside = abs(self.depth_mm) < 0.95 * self.depths_mm[-1] and max(map(abs, self.tilt_deg)) < 0.95 * _MAX_TILT_DEG
         return inside and float(max(self.sharpness[0], self.sharpness[-1])) < 0.98
 
     def transposed(self) -> Focus:
-        """The same with x and y swapped."""
+        """Return the result with x and y swapped."""
         return replace(self, tilt_deg=(self.tilt_deg[1], self.tilt_deg[0]))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, for JSON."""
+        """Return plain numbers for JSON."""
         return {
             "depth_mm": round(self.depth_mm, 3),
             "tilt_deg": [round(t, 3) for t in self.tilt_deg],
@@ -76,18 +76,18 @@ class Focus:
 def focus_sweep(
     builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17, progress: Progress | None = None
 ) -> Focus:
-    """Find the plane on which both channels together are sharpest.
+    """Find the plane on which the sum of both channels is sharpest.
 
     Parameters
     ----------
     builder
-        With all rows, and built with `depth_m` at least as large as here.
+        Has all rows, and a range gate for at least this `depth_m`.
     depth_m
-        How far to look to either side of the rig file's plane.
+        Search range to either side of the rig file's plane.
     planes
-        Planes of the sweep.
+        Number of planes.
     progress
-        Called with planes done and planes in all.
+        Called with the number of planes done and the total.
     """
     grid = builder.grid
     depths = np.linspace(-depth_m, depth_m, planes)
@@ -102,7 +102,7 @@ def focus_sweep(
     x, y = grid.x_m - grid.x_m.mean(), grid.y_m - grid.y_m.mean()
 
     def sharpness(plane: NDArray[np.float64]) -> float:
-        """On a plane: its depth in mm at the centre, and its rise along x and y in mm over 100 mm."""
+        """Return the sharpness on a plane: depth in mm at the centre, rise along x and y in mm per 100 mm."""
         depth, along_x, along_y = plane * [1e-3, 1e-2, 1e-2]
         z = np.clip(depth + along_x * x[None, :] + along_y * y[:, None], depths[0], depths[-1])
         weight = 1 / _at(cells, depths, z)
@@ -126,9 +126,9 @@ def focus_sweep(
 
 
 def _cells(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Area of a resolution cell around every pixel of every plane, relative, [plane, ny, nx].
+    """Return the relative area of a resolution cell at every pixel of every plane, [plane, ny, nx].
 
-    From nine places a plane: it varies slowly.
+    Interpolated from nine points per plane, for it varies slowly.
     """
     aperture, grid = next(iter(builder.boards.values())).aperture, builder.grid
     z = float(np.mean(grid.z_m)) + depths
@@ -150,7 +150,7 @@ def _cells(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _at(stack: NDArray[np.float64], depths: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Intensity on a surface through the stack, by cubic convolution between its planes (Keys 1981)."""
+    """Return the intensity on a surface through the stack, by cubic convolution between planes (Keys 1981)."""
     place = (z - depths[0]) / (depths[1] - depths[0])
     base = np.clip(np.floor(place).astype(np.intp), 0, len(depths) - 2)
     t = place - base
@@ -160,7 +160,7 @@ def _at(stack: NDArray[np.float64], depths: NDArray[np.float64], z: NDArray[np.f
         ((-1.5 * t + 2.0) * t + 0.5) * t,
         (0.5 * t - 0.5) * t * t,
     )
-    # Beyond each end one plane more, as Keys has it.
+    # One extrapolated plane beyond each end (Keys 1981).
     ends = [3 * stack[:1] - 3 * stack[1:2] + stack[2:3], 3 * stack[-1:] - 3 * stack[-2:-1] + stack[-3:-2]]
     stack = np.concatenate([ends[0], stack, ends[1]])
     rows, columns = np.indices(z.shape)

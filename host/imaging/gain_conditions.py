@@ -1,14 +1,14 @@
-"""What the gains of an image depend on, so that a metal reference is only used for images of the same rig.
+"""Settings that the gains of an image depend on; a metal reference is used only for images with the same settings.
 
-Samples are referenced to the direct path and images are divided by the footprint of a perfect mirror. What is left in
-the image of a metal plate is what both do not know: antenna patterns, errors of the measured places, edges. It depends
-on places and turns of the antennas, on the object plane, on the frequencies, on the window over the aperture, and on
-what is taken for the high-pass filters. It does not depend on what cancels:
+Samples are referenced to the direct path, and images are divided by the footprint of an ideal mirror. The remaining
+gains in the image of a metal plate come from antenna patterns, position errors and edges. They depend on position and
+orientation of the antennas, object plane, frequencies, window over the aperture, and assumed high-pass filters. They do
+not depend on settings that cancel:
 
-* receiver and transmitter gain, start frequencies, triggers, crystals, power cycles: direct path and echo share them;
-* the raster, masked positions, pulses of a burst: the footprint has them too;
-* leakage: it is corrected behind the division, and is the receivers' own, the same on the plate as on the scene;
-* speckle filter: it comes later.
+* receiver and transmitter gain, start frequencies, triggers, crystals, power cycles: equal for direct path and echo;
+* raster, masked positions, pulses of a burst: contained in the footprint;
+* leakage: a property of the receivers, equal for plate and scene, and corrected after the division;
+* speckle filter: applied later.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ from polysight.shared.config import Board, Instrument
 from polysight.shared.geometry import Vector, place
 
 SAME_MM = 1e-3
-"""Closer places are one: 2e-3 rad of an echo's phase."""
+"""Tolerance of positions: 2e-3 rad of an echo's phase."""
 SAME_HZ = 1e3
 SAME_CORNER_KHZ = 10.0
-"""Of a filter's corner: less than 0.1 dB and 0.1 degree between direct path and echo, in both channels alike."""
+"""Tolerance of filter corners: less than 0.1 dB and 0.1 degrees between direct path and echo, in both channels."""
 ARM_MM = 100.0
-"""Points so far along a board's x and y show its turn, which antennas in one line do not."""
+"""Points at this distance along a board's x and y show its rotation, which antennas in one line do not."""
 
 
 class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
-    """What a pair of images was made with, as plain numbers.
+    """Settings that a pair of images was made with, as plain numbers.
 
     Attributes
     ----------
     places_mm
-        Rig frame, by board: its antennas in use, then the ends of two arms along the board's x and y.
+        By board, rig frame: antennas in use, then two points along the board's x and y.
     object_distance_mm
         z of the image plane.
     band_hz
         Transmit frequency at the first and last linear sample.
     samples
-        Linear samples.
+        Number of linear samples.
     apodisation
         Window over the aperture, by its name in the rig file.
     high_pass_khz
-        Corners that were undone, by receiver.
+        Corners of the compensated filters, by receiver.
     """
 
     places_mm: dict[str, list[Vector]]
@@ -59,7 +59,7 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, rig: Instrument, filters: Mapping[str, HighPass | None]) -> ImagedWith:
-        """Of a rig with its calibrated places; `filters` by receiver, None or absent: as the chirp programs them."""
+        """Return the settings of a calibrated rig; `filters` by receiver, None or missing: as in the chirp profile."""
         chirp = rig.chirp
         first, last = chirp.linear_samples
         boards = (rig.transmitter, *rig.receivers)
@@ -77,7 +77,7 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def differences(self, now: ImagedWith) -> list[str]:
-        """What is another in `now`, in a few words each; empty when gains can be carried over."""
+        """Return the differences to `now`, in a few words each; empty if the gains apply."""
         return list(self._differences(now))
 
     def _differences(self, now: ImagedWith) -> Iterator[str]:
@@ -106,7 +106,7 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def _places_mm(rig: Instrument, board: Board) -> Iterator[Vector]:
-    """Antennas in use and two arms of a board, rig frame, rounded to a nanometre."""
+    """Yield antennas in use and two points along a board's x and y, rig frame, rounded to a nanometre."""
     antennas = rig.antennas
     used = (antennas.tx_mm[board.tx_antenna],) if board.role == "transmit" else antennas.rx_mm
     for point in (*used, (ARM_MM, 0.0, 0.0), (0.0, ARM_MM, 0.0)):

@@ -1,4 +1,4 @@
-"""Where pixels, antennas and stage positions are: the geometry that every imager shares."""
+"""Positions of pixels, antennas and stage, common to all imagers."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from polysight.shared.raster import Row, mean_burst_travel_mm, plan_raster
 
 
 def distance_m(xp: Any, x: Any, y: Any, z: Any, place_m: Any) -> Any:
-    """`|(x, y, z) - place|`, broadcast; `place_m` is [..., 3]."""
+    """Return `|(x, y, z) - place|`, broadcast; `place_m` is [..., 3]."""
     return xp.sqrt((x - place_m[..., 0]) ** 2 + (y - place_m[..., 1]) ** 2 + (z - place_m[..., 2]) ** 2)
 
 
 def excess_path_m(xp: Any, x: Any, y: Any, z: Any, tx_m: Any, rx_m: Any, reference_m: Any) -> Any:
-    """Excess path of scatterers at (x, y, z) for antennas at `tx_m` and `rx_m`, float64, all broadcast together.
+    """Return the excess path of scatterers at (x, y, z) for antennas at `tx_m` and `rx_m`, float64, broadcast.
 
     Parameters
     ----------
     xp
         Array API namespace.
     x, y, z
-        Places of scatterers, metres.
+        Positions of scatterers, metres.
     tx_m, rx_m
-        Places of antennas [..., 3], metres.
+        Positions of antennas [..., 3], metres.
     reference_m
-        Path that the samples' phase no longer holds (here the direct path).
+        Path already removed from the phase (here the direct path).
     """
     return distance_m(xp, x, y, z, tx_m) + distance_m(xp, x, y, z, rx_m) - reference_m
 
 
 def turn(xp: Any, cycles: Any, real: Any, kind: Any) -> Any:
-    """`exp(-j 2 pi cycles)` in the real and complex dtypes given; `cycles` is float64, and its whole part goes first.
+    """Return exp(-j 2 pi cycles) in the given real and complex dtypes; whole cycles are removed in float64 first.
 
-    Cosine and sine one by one: many times faster than the exponential of a complex array.
+    Separate cosine and sine are many times faster than the exponential of a complex array.
     """
     phase = xp.astype((cycles - xp.round(cycles)) * (-2.0 * math.pi), real)
     return xp.astype(xp.cos(phase), kind) + xp.astype(xp.sin(phase), kind) * 1j
@@ -48,9 +48,9 @@ def turn(xp: Any, cycles: Any, real: Any, kind: Any) -> Any:
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """Pixels of an image: `x_m` [nx] and `y_m` [ny] ascending and evenly spaced by `pixel_m`.
+    """Pixels of an image: `x_m` [nx] and `y_m` [ny] ascend with spacing `pixel_m`.
 
-    They lie on the plane at `z_m`, or on any surface where `z_m` is float64 [ny, nx].
+    `z_m` is the plane of the pixels, or a surface as float64 [ny, nx].
     """
 
     x_m: NDArray[np.float64]
@@ -65,13 +65,13 @@ class ImageGrid:
 
     @property
     def voxels_m(self) -> NDArray[np.float64]:
-        """Every pixel's place, float64 [ny * nx, 3], row by row."""
+        """Positions of all pixels, float64 [ny * nx, 3], row by row."""
         y, x = np.meshgrid(self.y_m, self.x_m, indexing="ij")
         return np.stack([x.ravel(), y.ravel(), np.broadcast_to(self.z_m, x.shape).ravel()], axis=1)
 
 
 def image_grid(rig: Instrument) -> ImageGrid:
-    """The configured grid, centred on the specular midpoint of TX and H, on the object plane."""
+    """Return the configured grid on the object plane, centred on the specular midpoint of TX and H."""
     x, y, z = specular_midpoint_m(rig, rig.receivers[0])
     pixel = rig.image.pixel_mm / 1e3
 
@@ -90,7 +90,7 @@ class Antennas:
 
     @classmethod
     def of(cls, rig: Instrument, board: Board) -> Antennas:
-        """Antennas that make a board's image."""
+        """Return the transmit and receive antennas of a board's image."""
         return cls(np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board)))
 
     @property
@@ -101,18 +101,18 @@ class Antennas:
     def excess_m(
         self, dx: NDArray[np.float64], dy: NDArray[np.float64], z: float | NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Excess path `|v - tx| + |v - rx| - |tx - rx|` for `v - u = (dx, dy, z)`, [rx, ...]; u is the stage offset."""
+        """Return the excess path of points at `(dx, dy, z)` relative to the stage offset, metres, [rx, ...]."""
         pairs = zip(self.rx_m, self.direct_m, strict=True)
         return np.stack([excess_path_m(np, dx, dy, z, self.tx_m, rx, direct) for rx, direct in pairs])
 
     def mirror_m(self, z: float) -> NDArray[np.float64]:
-        """Path from TX over a mirror at the plane `z` to each RX, [rx]: the distance from the TX's mirror image."""
+        """Return the path from TX over a mirror in the plane `z` to each RX, [rx]: distance from TX's image."""
         image = self.tx_m * [1, 1, -1] + [0, 0, 2 * z]
         return np.sqrt(((self.rx_m - image) ** 2).sum(axis=1))
 
 
 def row_offsets_m(rig: Instrument, row: Row) -> NDArray[np.float64]:
-    """True mean stage offset (x, y) of each point's burst, metres [position, 2], in the order the points are met.
+    """Return the mean stage offset (x, y) during each burst of a row, metres [position, 2], in order of recording.
 
     The stage does not stop: a burst is centred half its duration after the trigger point, so even and odd rows differ.
     """
@@ -122,7 +122,7 @@ def row_offsets_m(rig: Instrument, row: Row) -> NDArray[np.float64]:
 
 
 def scan_offsets_m(rig: Instrument) -> NDArray[np.float64]:
-    """The same of all rows, metres [row, column, 3], columns from the smallest x."""
+    """Return the mean stage offsets of all rows, metres [row, column, 3], columns from the smallest x."""
     plan = plan_raster(rig.grid)
     out = np.zeros((plan.rows, plan.columns, 3))
     along = {row.direction: row_offsets_m(rig, row)[:: row.direction, 0] for row in itertools.islice(plan, 2)}

@@ -1,7 +1,7 @@
-"""How regular positions and pixels fit together for the spectral imagers (docs/decisions/0002-imaging.md).
+"""Common lattice of regular positions and pixels for the spectral imagers (docs/decisions/0002-imaging.md).
 
-A `Lattice` holds periods, pitches and strides. The kernels' spectra along x are made here, for every spectral imager,
-and kept in memory: images of one aperture are made again and again.
+A `Lattice` has the periods, pitches and strides. The spectra of the kernels along x are computed here and cached in
+memory, for one aperture is imaged many times.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from polysight.host.imaging.aperture import Aperture, column_step_m, fft_of, pit
 from polysight.host.imaging.geometry import excess_path_m, turn
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
-_FADE = 0.08  # of the kernel's length in x: room in which it fades out and in again
-_FADE_COLUMNS = 20  # at least
-_FILLED = 1e-5  # of the kernel's strongest spectral bin: weaker ones are left out
+_FADE = 0.08  # length of the cross-fade relative to the kernel's length in x
+_FADE_COLUMNS = 20  # smallest length of the cross-fade
+_FILLED = 1e-5  # relative to the kernel's strongest spectral bin: weaker ones are left out
 KEEP_BYTES = 1 << 28
-"""Spectra kept in memory: two boards of the published grid are 90 MB."""
-_kept: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
+"""Size of the cache: two boards of the published grid take 90 MB."""
+_cache: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Periods, pitches and strides.
+    """Periods, pitches and strides of the spectral imagers.
 
     Attributes
     ----------
     size_x, pitch_x_m, stride_x
         Points and pitch of the kernel's period in x; columns are `stride_x` pitches apart.
     first_lag_m
-        Smallest `pixel - position` (x, y) the kernel is exact for.
+        Smallest exact `pixel - position` (x, y).
     exact_x
-        Lags in x that must be exact; the rest of the period is the fade.
+        Number of exact lags in x; the rest of the period is the cross-fade.
     band
-        Signed spectral bins along x that the kernel fills, [k].
+        Signed spectral bins along x with kernel energy, [k].
     size_y, pitch_y_m
-        Points of the transform along y, and its pitch.
+        Points and pitch of the transform along y.
     row_stride, pixel_stride
-        Pitches from one row to the next, of positions and of pixels.
+        Spacing of rows of positions and of rows of pixels, in pitches.
     lags_y
         Number of lags in y.
     """
@@ -64,19 +64,19 @@ class Lattice:
 
     @property
     def wavenumbers(self) -> NDArray[np.float64]:
-        """Of the band, cycles a metre."""
+        """Wavenumbers of the band, cycles per metre."""
         return self.band / (self.size_x * self.pitch_x_m)
 
 
 def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
-    """The lattice of an aperture that is not :func:`irregular`.
+    """Return the lattice of a regular aperture, see :func:`polysight.host.imaging.aperture.irregular`.
 
     Parameters
     ----------
     aperture
-        The nominal one.
+        The nominal aperture.
     slack_m
-        Rows may be shifted along x by up to this much from where it says.
+        Largest shift of rows along x from their nominal position.
     """
     grid, offsets = aperture.grid, aperture.offsets_m
     x, y = offsets[..., 0], offsets[:, 0, 1]
@@ -109,7 +109,7 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
 
 
 def delays_s(aperture: Aperture, x: Any, y: Any, xp: Any = np, device: Any = None) -> Iterator[Any]:
-    """Delay of the excess path for lags `pixel - position` (x [nx], y [ny]), float64 [ny, nx], for each RX in turn."""
+    """Yield the delay of the excess path for lags `pixel - position` (x [nx], y [ny]), float64 [ny, nx], by RX."""
     a = aperture.antennas
     z = float(aperture.grid.z_m) - float(aperture.offsets_m[0, 0, 2])
     tx, places = xp.asarray(a.tx_m, device=device), xp.asarray(a.rx_m, device=device)
@@ -119,10 +119,10 @@ def delays_s(aperture: Aperture, x: Any, y: Any, xp: Any = np, device: Any = Non
 
 
 def cross_fade(xp: Any, kernel: Any, size: int) -> Any:
-    """One period of a kernel [..., fade + size], whose first `fade` points lie left of the period.
+    """Return one period of a kernel [..., fade + size], whose first `fade` points precede the period.
 
-    At the end of the period the right end fades out, and the left end, one period on, fades in: a smooth periodic
-    function with a narrow spectrum, so that phase ramps may shift it by any fraction.
+    At the end of the period the kernel is cross-faded into its start. The smooth periodic function has a narrow
+    spectrum, so that phase ramps shift it by any fraction.
     """
     fade = kernel.shape[-1] - size
     curve = (1 + scipy.special.erf(np.linspace(-1, 1, fade + 2)[1:-1] * 2.7)) / 2  # 1e-4 from its ends
@@ -133,12 +133,12 @@ def cross_fade(xp: Any, kernel: Any, size: int) -> Any:
 
 
 def _band(aperture: Aperture, first: float, last: float, step: float, columns: int) -> NDArray[np.intp]:
-    """Spectral bins along x that the kernels of lags `first` to `last` fill, for a period of `columns` steps.
+    """Return the spectral bins along x with kernel energy for lags `first` to `last` and a period of `columns` steps.
 
-    Seen on a finer lattice, for the first and the last frequency, all RX, and distances in y from end to end.
+    Computed on a finer lattice, for the first and the last frequency, all RX, and nine lags in y.
     """
     grid, y = aperture.grid, aperture.offsets_m[:, 0, 1]
-    fastest = 2 * aperture.frequencies_hz[-1] / SPEED_OF_LIGHT_M_S  # cycles a metre that no geometry can exceed
+    fastest = 2 * aperture.frequencies_hz[-1] / SPEED_OF_LIGHT_M_S  # largest possible wavenumber, cycles per metre
     finer = max(1, math.ceil(2.2 * step * fastest))
     size = columns * finer
     fade = size - math.ceil((last - first) / step * finer) - 1
@@ -153,40 +153,40 @@ def _band(aperture: Aperture, first: float, last: float, step: float, columns: i
 
 
 def _fast(n: int) -> int:
-    """A length from `n` up that transforms fast."""
+    """Return the smallest fast transform length of at least `n`."""
     return int(scipy.fft.next_fast_len(n) or n)
 
 
-def kept(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
-    """Arrays made before under this key, or made now; the longest unused go when `KEEP_BYTES` are full."""
-    if key not in _kept:
-        _kept[key] = make()
-    _kept.move_to_end(key)
-    while len(_kept) > 1 and sum(_bytes(a) for a in _kept.values()) > KEEP_BYTES:
-        _kept.popitem(last=False)
-    return _kept[key]
+def cached(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+    """Return the cached arrays of a key, or make them; the least recently used are dropped beyond `KEEP_BYTES`."""
+    if key not in _cache:
+        _cache[key] = make()
+    _cache.move_to_end(key)
+    while len(_cache) > 1 and sum(_bytes(a) for a in _cache.values()) > KEEP_BYTES:
+        _cache.popitem(last=False)
+    return _cache[key]
 
 
 def _bytes(arrays: Any) -> int:
     if isinstance(arrays, tuple):
         return sum(_bytes(a) for a in arrays)
-    return math.prod(getattr(arrays, "shape", (0,))) * 8  # a lattice is small
+    return math.prod(getattr(arrays, "shape", (0,))) * 8  # the size of a lattice is negligible
 
 
 def forget() -> None:
-    """Drop every kept spectrum."""
-    _kept.clear()
+    """Clear the cache."""
+    _cache.clear()
 
 
 def lattice_key(aperture: Aperture, slack_m: float) -> tuple[Any, ...]:
-    """All that a lattice depends on."""
+    """Return the cache key of a lattice."""
     a, grid = aperture.antennas, aperture.grid
     numbers = (a.tx_m, a.rx_m, aperture.frequencies_hz, aperture.offsets_m, grid.x_m, grid.y_m)
     return ("lattice", slack_m, float(grid.z_m), grid.pixel_m, *(n.tobytes() for n in numbers))
 
 
 def key_of(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tuple[Any, ...]:
-    """All that a kernel depends on."""
+    """Return the cache key of kernels."""
     a, grid = aperture.antennas, aperture.grid
     numbers = (a.tx_m, a.rx_m, aperture.frequencies_hz, lattice.band)
     return (
@@ -199,9 +199,9 @@ def key_of(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tuple[
 
 
 def spectra_along_x(aperture: Aperture, lattice: Lattice, xp: Any = np, device: Any = None) -> Any:
-    """Kernels `exp(-j 2 pi f d / c)` of `pixel - position`, transformed along x: complex64 [rx * frequency, lag y, k].
+    """Return kernels `exp(-j 2 pi f d / c)` of `pixel - position` along x: complex64 [rx * frequency, lag y, k].
 
-    One distance map an RX, and a constant turn from one frequency to the next.
+    One distance map per RX; a constant phase step leads from one frequency to the next.
     """
     fft, n, f = fft_of(xp), lattice.size_x, aperture.frequencies_hz
     fade = n - lattice.exact_x

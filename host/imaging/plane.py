@@ -1,11 +1,11 @@
-"""The object plane's distance and tilt, from the echoes of flat plates.
+"""Estimate distance and tilt of the object plane from the echoes of flat plates.
 
-A plate's echo tells its range twice: roughly but without ambiguity by how the image's amplitude changes with range
-(the sweep's bandwidth), and finely, but only up to half a wavelength's worth of height, by its phase. The first gives
-the plane to about a millimetre and resolves the second. Both are compared with a mirror's on the rig file's plane, seen
+A plate's echo gives its range in two ways: coarse but unambiguous from the change of the image's amplitude with range
+(bandwidth of the sweep), and fine but ambiguous by half a wavelength of height from its phase. The first gives the
+plane within about a millimetre and resolves the second. Both are compared with a mirror on the rig file's plane, seen
 from the same positions, so that aperture, taper and masked positions have no influence.
 
-All plates are taken to lie on one plane as far as they do; how far each lies off it is returned too.
+One plane is fitted to all plates; the height of each plate is returned too.
 """
 
 from __future__ import annotations
@@ -24,43 +24,43 @@ from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
 
 PLANE_REACH_M = 0.015
-"""How far from the rig file's plane plates are looked for."""
+"""Search range to either side of the rig file's plane."""
 MOUNT_STD_M = 1e-3
-"""Standard deviation of the antennas' places beside the rig file's: what the plane's distance cannot tell."""
+"""Standard deviation of the antennas' positions in the rig file, in addition to that of the plane's distance."""
 PRIOR_STD_M = 5.8e-3
-"""Standard deviation of the plane's distance where nothing in the scene tells it: anywhere within 10 mm."""
+"""Standard deviation of the plane's distance if the scene does not determine it: uniform within 10 mm."""
 _WORTH_M = 5e-4
 _STEP_M = 2e-4
-"""Height by which a mirror is moved to find how range and phase change with height."""
+"""Height step to find the change of range and phase with height."""
 _COHERENT = 0.7
-"""A patch whose pixels' ranges agree no better than this (1: the same everywhere) is no plate."""
+"""Smallest coherence of the pixels of a plate (1: all equal)."""
 _TILT_PRIOR_RAD = 0.02
-"""Standard deviation of a plane's tilt before it is seen: one degree."""
-_LEAST_STD_M = 3e-4
-"""A plate's range is not trusted better than this: neighbours' sidelobes reach into it."""
-_MOST_TILT = 0.035
+"""Prior standard deviation of the tilt: one degree."""
+_MIN_STD_M = 3e-4
+"""Smallest standard deviation of a plate's range, due to sidelobes of its neighbours."""
+_MAX_TILT = 0.035
 _PHASE_FITS_RAD = 0.5
-"""Plates whose phases lie on one plane within this are resolved; it is a fifth of what chance leaves."""
+"""Largest RMS phase error of plates on one plane; a fifth of the value for random phases."""
 _PHASE_STD_M = 5e-5
-"""What the reflection's own phase (some degrees for lossy plates) and roughness leave of a height."""
+"""Standard deviation of a height from the phase of the reflection (some degrees for lossy plates) and roughness."""
 
 
 @dataclass(frozen=True)
 class PlaneEstimate:
-    """Where the plates lie, beside the rig file's plane.
+    """Plane of the plates relative to the rig file's plane.
 
     Attributes
     ----------
     offset_m, offset_std_m
-        How much farther the plane is at the middle of the image, and its standard deviation.
+        Distance of the plane behind the rig file's plane at the middle of the image, and its standard deviation.
     tilt_rad, tilt_std_rad
         Rise of the plane's z along x and along y, radians, and their standard deviations.
     heights_m
-        float64 [patch]: each patch's own, from its range (from its phase where `by_phase`); NaN where it does not tell.
+        float64 [patch]: height of each patch from its range (from its phase if `by_phase`); NaN if undetermined.
     by_phase
-        Whether the plates' phases lie on one plane, so that they fix it.
+        The plates' phases lie on one plane and determine it.
     plates
-        How many patches tell.
+        Number of patches with a height.
     """
 
     offset_m: float
@@ -73,23 +73,23 @@ class PlaneEstimate:
 
     @property
     def known(self) -> bool:
-        """Whether anything in the scene tells where the plane is."""
+        """True if the scene determines the plane."""
         return self.plates > 0
 
     @property
     def worth_moving(self) -> bool:
-        """Whether the plane lies off the rig file's by so much that images and angles are made anew."""
+        """True if the offset from the rig file's plane is large enough to form images and angles again."""
         return self.known and abs(self.offset_m) > _WORTH_M and abs(self.offset_m) < PLANE_REACH_M
 
     def applied_to(self, rig: Instrument) -> Instrument:
-        """A rig with its object plane where the plates lie."""
+        """Return a rig with its object plane at the plates."""
         if not self.worth_moving:
             return rig
         distance = rig.geometry.object_distance_mm + 1e3 * self.offset_m
         return msgspec.structs.replace(rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=distance))
 
     def incidence_std_rad(self, rig: Instrument) -> float:
-        """Standard deviation of the incidence angle: by the plane's distance and the antennas' places, radians.
+        """Return the standard deviation of the incidence angle due to plane distance and antenna positions, radians.
 
         d theta / d z = sin theta cos theta / z.
         """
@@ -98,11 +98,11 @@ class PlaneEstimate:
         return float(np.sin(theta) * np.cos(theta) / (rig.geometry.object_distance_mm / 1e3) * known)
 
     def transposed(self) -> PlaneEstimate:
-        """The same with x and y swapped."""
+        """Return the estimate with x and y swapped."""
         return replace(self, tilt_rad=self.tilt_rad[::-1], tilt_std_rad=self.tilt_std_rad[::-1])
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers for quality.json; millimetres and degrees."""
+        """Return plain numbers for quality.json; millimetres and degrees."""
         if not self.known:
             return {"known": False}
         return {
@@ -117,18 +117,18 @@ class PlaneEstimate:
 
 
 UNKNOWN_PLANE = PlaneEstimate(0.0, np.inf, (0.0, 0.0), (np.inf, np.inf), np.zeros(0), False, 0)
-"""Nothing tells: the rig file's plane stands."""
+"""Plane undetermined: use the rig file's plane."""
 
 
 def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> PlaneEstimate:
-    """Find the plane from the insides of flat patches.
+    """Estimate the plane from the insides of flat patches.
 
     Parameters
     ----------
     builder
-        With the rows added; its range gate must hold the plane (`depth_m`).
+        Has the rows, and a range gate that includes the plane (`depth_m`).
     masks
-        bool [ny, nx], one a patch, on the builder's grid.
+        bool [ny, nx], one per patch, on the builder's grid.
     """
     grid = builder.grid
     x, y = grid.x_m - grid.x_m.mean(), grid.y_m - grid.y_m.mean()
@@ -142,7 +142,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     if not tells.any():
         return replace(UNKNOWN_PLANE, heights_m=np.full(len(masks), np.nan))
     places = np.array([(x[m.any(axis=0)].mean(), y[m.any(axis=1)].mean()) if m.any() else (0.0, 0.0) for m in masks])
-    plane, covariance = _fit(places[tells], heights[tells], np.hypot(stds[tells], _LEAST_STD_M))
+    plane, covariance = _fit(places[tells], heights[tells], np.hypot(stds[tells], _MIN_STD_M))
     phase = _heights_by_phase(next(iter(builder.boards.values())), masks, places, plane)
     fine = tells & np.isfinite(phase[0])
     by_phase = False
@@ -150,9 +150,9 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
         finer, fine_covariance = _fit(places[fine], phase[0][fine], np.full(int(fine.sum()), _PHASE_STD_M))
         off = phase[0][fine] - _at(finer, places[fine])
         agree = float(np.sqrt(np.mean((off * phase[1]) ** 2))) < _PHASE_FITS_RAD
-        # Thin sheets turn the phase by themselves: a plane that the ranges do not bear out is none.
-        apart = np.abs(finer - plane) < 3 * np.sqrt(np.diag(covariance)) + [_LEAST_STD_M, 3e-3, 3e-3]
-        if agree and fine.sum() >= 4 and bool(apart.all()) and float(np.hypot(*finer[1:])) < _MOST_TILT:
+        # Thin sheets change the phase themselves: accept the plane only if the ranges agree.
+        apart = np.abs(finer - plane) < 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, 3e-3, 3e-3]
+        if agree and fine.sum() >= 4 and bool(apart.all()) and float(np.hypot(*finer[1:])) < _MAX_TILT:
             plane, covariance, heights, by_phase = finer, fine_covariance, phase[0], True
     std = np.sqrt(np.diag(covariance))
     return PlaneEstimate(
@@ -166,21 +166,21 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     )
 
 
-def on_their_plane(
+def move_to_plane(
     builder: ImageBuilder, images: ChannelImages, masks: Sequence[NDArray[np.bool_]], transposed: bool, move: bool
 ) -> tuple[PlaneEstimate, ChannelImages]:
-    """The plane that patches lie on, and the images on it, where it is not the rig file's.
+    """Estimate the plane of patches; return it and the images on it, if it differs from the rig file's plane.
 
     Parameters
     ----------
     builder, images
-        With the rows added, and what it made of them.
+        Builder with all rows, and its images.
     masks
         bool [ny, nx] insides of the patches, on the images' grid.
     transposed
-        Whether the images are the builder's with x and y swapped.
+        The images are the builder's with x and y swapped.
     move
-        False: the images stay as they are.
+        False: return the images unchanged.
     """
     plane = find_plane(builder, [mask.T if transposed else mask for mask in masks])
     if move and plane.worth_moving:
@@ -190,7 +190,7 @@ def on_their_plane(
 
 
 def _ranges(board: BoardSamples, masks: Sequence[NDArray[np.bool_]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Height of each patch above the rig file's plane by the range of its echo, and its standard deviation, metres."""
+    """Return the height of each patch from the range of its echo, and its standard deviation, metres."""
     image, footprint, _ = board.image()
     slope, mirror_slope = board.range_slope()
     moved, moved_slope = board.mirror_image(_STEP_M), board.mirror_slope(_STEP_M)
@@ -211,7 +211,7 @@ def _ranges(board: BoardSamples, masks: Sequence[NDArray[np.bool_]]) -> tuple[ND
         spread = float(np.sqrt(np.sum(weight * (own - mean) ** 2)))
         height, std = mean / per_metre, spread / abs(per_metre)
         if std < 0.05 and np.isfinite(height):
-            heights[i], stds[i] = height, max(std, _LEAST_STD_M)
+            heights[i], stds[i] = height, max(std, _MIN_STD_M)
     return heights, stds
 
 
@@ -221,7 +221,7 @@ def _heights_by_phase(
     places: NDArray[np.float64],
     plane: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
-    """Height of each patch by the phase of its echo, whole turns as a plane near `plane` asks; and radians a metre."""
+    """Return the height of each patch from its phase, unwrapped with a plane near `plane`; and radians per metre."""
     image, footprint, _ = board.image()
     moved = board.mirror_image(_STEP_M)
     phases = np.full(len(masks), np.nan)
@@ -238,7 +238,7 @@ def _heights_by_phase(
     turn = 2 * np.pi / abs(rate)
     known = np.flatnonzero(np.isfinite(phases))
     best: tuple[float, NDArray[np.float64]] = (np.inf, np.full(len(masks), np.nan))
-    # The range leaves some turns of doubt, the same for all plates but for the tilt: try planes about it.
+    # The range leaves an ambiguity of some turns, common to all plates except for the tilt: try several tilts.
     for tilt_x in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
         for tilt_y in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
             guess = _at(plane + np.array([0.0, tilt_x, tilt_y]), places[known])
@@ -259,9 +259,9 @@ def _heights_by_phase(
 def _fit(
     places: NDArray[np.float64], heights: NDArray[np.float64], stds: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Plane (height, rise along x, rise along y) through heights, and its covariance, with the tilt's prior.
+    """Fit a plane (height, rise along x, rise along y) with a prior on its tilt; return it and its covariance.
 
-    The covariance grows with the scatter about the plane where that is larger than the heights' own deviations.
+    The covariance is scaled up if the scatter around the plane exceeds the standard deviations of the heights.
     """
     rows = np.column_stack([np.ones(len(places)), places]) / stds[:, None]
     information = rows.T @ rows + np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
@@ -273,4 +273,5 @@ def _fit(
 
 
 def _at(plane: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the heights of a plane at places [patch, 2]."""
     return plane[0] + places @ plane[1:]

@@ -1,15 +1,15 @@
-"""Range gate: from 192 fast-time samples to the few frequency samples that the scene can fill.
+"""Range gate: reduce 192 fast-time samples to the few frequency samples that describe the scene; motion in a burst.
 
-Every pixel wants the matched filter `S(d) = sum_t w_t x_t exp(-j 2 pi f_t d / c)` for its excess path d, and all d
-lie in a gate `[d_1, d_2]` of few range cells. Functions `exp(-j 2 pi f d / c)` of d on that gate, for f within the
-swept band B, span a space of about `B (d_2 - d_1) / c + 1` dimensions (Landau and Pollak 1962), so each is a
-combination of those at a few evenly spaced f_m: `exp(-j 2 pi f_t d / c) w_t = sum_m M_mt exp(-j 2 pi f_m d / c)`, M
-by least squares over the gate. Then `S(d) = sum_m (M x)_m exp(-j 2 pi f_m d / c)` with `M x` computed once per
-position: the imagers see M x at f_m and nothing else. Six more samples than the time-bandwidth product make the
-error 1e-6 of the peak (docs/decisions/0002-imaging.md has the derivation).
+A pixel is the matched filter `S(d) = sum_t w_t x_t exp(-j 2 pi f_t d / c)` at its excess path d. All d lie in a gate
+`[d_1, d_2]` of few range cells. The functions `exp(-j 2 pi f d / c)` of d in this gate, f in the swept band B, span a
+space of about `B (d_2 - d_1) / c + 1` dimensions (Landau and Pollak 1962), so each is a combination of those at a few
+evenly spaced f_m: `exp(-j 2 pi f_t d / c) w_t = sum_m M_mt exp(-j 2 pi f_m d / c)`, with M from least squares over the
+gate. Then `S(d) = sum_m (M x)_m exp(-j 2 pi f_m d / c)`, and `M x` is computed once per position; the imagers use only
+M x at f_m. Six samples more than the time-bandwidth product make the error 1e-6 of the peak (derivation:
+docs/decisions/0002-imaging.md).
 
-The direct path is a constant in x. It lies outside the gate but close to it, so it is subtracted, not only windowed
-away: its amplitude is the generalised least-squares estimate with the gate as coloured noise.
+The direct path is a constant in x, close to the gate. Windowing alone does not remove it, so its amplitude is estimated
+(generalised least squares with the gate as coloured noise) and subtracted.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.host.imaging.aperture import Window, window_weights
 from polysight.host.imaging.geometry import Antennas, ImageGrid
-from polysight.host.imaging.window import Window, window_weights
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.raster import RasterPlan
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
-_NOISE = 1e-3  # noise power of one sample beside the gate's, for the direct path's estimate
+_NOISE = 1e-3  # noise power of a sample relative to the gate, for the estimate of the direct path
 REACH = 4  # positions to either side
-_BAND = 0.45  # cycles a position the filter is made for
+_BAND = 0.45  # largest frequency of the filter, cycles per position
 
 
 @dataclass(frozen=True)
 class Reduction:
-    """The linear maps of a scan's range gate.
+    """Linear maps of a scan's range gate.
 
     Attributes
     ----------
     frequencies_hz
         float64 [m].
     matrix
-        complex128 [m, sample]: window, direct-path removal and projection in one. Samples outside the linear part
-        have weight 0.
+        complex128 [m, sample]: window, removal of the direct path and projection. Samples outside the linear part have
+        weight 0.
     direct
         complex128 [sample]: `direct @ x` is the amplitude of the direct path.
     model
-        complex128 [m, m]: an echo of path d and amplitude 1 comes out as `model @ exp(+j 2 pi frequencies_hz d / c)`.
+        complex128 [m, m]: an echo of path d and amplitude 1 becomes `model @ exp(+j 2 pi frequencies_hz d / c)`.
     gate_m
-        Excess paths that are kept.
+        Smallest and largest excess path in the gate.
     """
 
     frequencies_hz: NDArray[np.float64]
@@ -60,7 +60,7 @@ class Reduction:
 def scene_gate_m(
     antennas: tuple[Antennas, ...], plan: RasterPlan, grid: ImageGrid, depth_m: float = 0.0
 ) -> tuple[float, float]:
-    """Smallest and largest excess path between any pixel, `depth_m` nearer or farther, and any stage position."""
+    """Return the smallest and largest excess path of all pixels (`depth_m` nearer and farther) and stage positions."""
     half_x = ((plan.columns - 1) / 2 * plan.step_x_mm + 2) / 1e3  # 2 mm more: the travel within a burst
     half_y = (plan.rows - 1) / 2 * plan.step_y_mm / 1e3
     dx, dy = np.meshgrid(
@@ -74,16 +74,16 @@ def scene_gate_m(
 
 @lru_cache(maxsize=8)
 def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann", extra: int = 6) -> Reduction:
-    """Build the maps of a gate.
+    """Return the linear maps of a range gate.
 
     Parameters
     ----------
     chirp
-        The chirp the samples were taken with.
+        Chirp of the samples.
     gate_m
-        Smallest and largest excess path wanted, metres.
+        Smallest and largest excess path, metres.
     window
-        Fast-time window over the linear samples, by scipy's name; "boxcar" for none.
+        Fast-time window over the linear samples, as for scipy; "boxcar" for none.
     extra
         Frequency samples beyond the time-bandwidth product.
     """
@@ -108,25 +108,25 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
     matrix[:, a:b] = m - np.outer(m.sum(axis=1), direct)
     whole = np.zeros(chirp.samples, complex)
     whole[a:b] = direct
-    # Echoes at the samples' frequencies are likewise combinations of echoes at the few.
+    # Echoes at the samples' frequencies are combinations of echoes at the few frequencies.
     few = np.exp(2j * np.pi * np.outer(d, frequencies))
     from_few = np.linalg.lstsq(few, np.exp(2j * np.pi * np.outer(d, sweep)), rcond=1e-9)[0].T
     return Reduction(frequencies, matrix, whole, (matrix[:, a:b] @ from_few).astype(np.complex128), gate_m)
 
 
 def burst_filters(rig: Instrument) -> NDArray[np.float32]:
-    """Filters `1 / D` that reach 0, 1, .. `REACH` positions to either side, float32 [reach, REACH + 1].
+    """Return inverse filters of the motion in a burst with 0, 1, .. `REACH` taps per side, float32 [reach, REACH + 1].
 
-    The first tap is the middle one, the others stand on both sides. By least squares up to 0.45 cycles a position.
+    The first tap is the middle one, the others apply on both sides. Least squares up to 0.45 cycles per position.
     """
     times_s = np.array(rig.burst.chirp_times_s)
-    moved = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm  # of each chirp, in positions
+    moved = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm  # motion of each chirp, in positions
     turns = np.linspace(0, _BAND, 91)
     loss = np.cos(2 * np.pi * np.outer(turns, moved)).mean(axis=1)
     out = np.zeros((REACH + 1, REACH + 1))
     out[0, 0] = 1
     for reach in range(1, REACH + 1):
-        # What does not turn keeps its amplitude exactly: the taps' sum is one.
+        # The sum of the taps is one, so that constants keep their amplitude.
         basis = 2 * np.cos(2 * np.pi * np.outer(turns, np.arange(1, reach + 1))) - 2
         side = np.linalg.lstsq(basis, 1 / loss - 1, rcond=None)[0]
         out[reach, 0], out[reach, 1 : reach + 1] = 1 - 2 * side.sum(), side
@@ -136,17 +136,16 @@ def burst_filters(rig: Instrument) -> NDArray[np.float32]:
 def undo_burst_motion(
     samples: NDArray[np.complex64], valid: NDArray[np.bool_], turn: NDArray[np.float64], filters: NDArray[np.float32]
 ) -> NDArray[np.complex64]:
-    """Samples of a row as if the stage had stood still during each burst.
+    """Compensate the motion of the stage during each burst of a row.
 
     Parameters
     ----------
     samples
         complex64 [..., position].
     valid
-        bool [position]: a position is filtered as far as all positions to either side are valid; not at all at the
-        row's ends.
+        bool [position]: the filter uses as many neighbours as are valid on both sides; none at the row's ends.
     turn
-        float64 [position]: where the filter is centred, radians from one position to the next.
+        float64 [position]: centre of the filter's band, radians per position.
     filters
         From :func:`burst_filters`.
     """

@@ -1,7 +1,7 @@
-"""Point response: measured, beside the paper's formula and the geometry's limit.
+"""Point response of an aperture: measured widths and sidelobes, the paper's formula and the limit of the geometry.
 
-`point_response` images a point in the middle of the scene with the aperture's own taper and mask; `imaging_facts` puts
-that and what is masked into quality.json.
+`point_response` images a point in the middle of the scene with the aperture's taper and mask; `imaging_facts` gives the
+entry `imaging` of quality.json.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from polysight.host.imaging.images import ChannelImages, ImageBuilder
 from polysight.host.imaging.samples import BoardSamples
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
-_BLOCKS = 32  # positions an axis the response is summed from: enough to see 16 resolution cells to either side
-_CELLS = 6.0  # resolution cells to either side that are looked at
-_POINTS = 20  # a resolution cell
+_BLOCKS = 32  # blocks of positions per axis: exact within 16 resolution cells to either side
+_CELLS = 6.0  # resolution cells evaluated to either side
+_POINTS = 20  # points per resolution cell
 _HALF_POWER = np.sqrt(0.5)
 
 
@@ -32,9 +32,9 @@ class PointResponse:
     Attributes
     ----------
     width_mm
-        Measured between the half-power points, with taper, window and missing positions as they are.
+        Measured between the half-power points, with the actual taper, window and missing positions.
     limit_mm
-        Geometry's limit: 0.886 over the spread of `(sin theta_tx + sin theta_rx) / lambda` along the aperture
+        Limit of the geometry: 0.886 over the spread of `(sin theta_tx + sin theta_rx) / lambda` along the aperture
         (half-power width of an evenly filled band); for a plane at height h about 0.886 lambda h / (2 L cos^3) in x and
         / (2 L cos) in y.
     paper_mm
@@ -50,9 +50,9 @@ class PointResponse:
 
 
 def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointResponse:
-    """Point response of an aperture with weights [row, column], 0 where a position is missing.
+    """Return the point response of an aperture with weights [row, column], 0 where a position is missing.
 
-    Positions are summed in at most 32 x 32 blocks, each at its mean place: beyond what is looked at that would matter.
+    Positions are combined into at most 32 x 32 blocks at their mean positions, exact enough within the evaluated range.
     """
     small, total = _blocks(aperture, weights)
     grid = aperture.grid
@@ -76,7 +76,7 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
 
 
 def _blocks(aperture: Aperture, weights: NDArray[np.floating]) -> tuple[Aperture, NDArray[np.float64]]:
-    """The aperture with neighbouring positions taken together, and the weights' sums."""
+    """Return the aperture with neighbouring positions combined, and the sums of their weights."""
     rows, columns = weights.shape
     at_rows, at_columns = (np.unique(np.linspace(0, n, _BLOCKS + 1).astype(int)[:-1]) for n in (rows, columns))
 
@@ -89,7 +89,7 @@ def _blocks(aperture: Aperture, weights: NDArray[np.floating]) -> tuple[Aperture
 
 
 def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
-    """Half-power width that the aperture's spread of wavenumbers allows along an axis, metres."""
+    """Return the half-power width along an axis from the spread of wavenumbers in the aperture, metres."""
     middle = tuple(n // 2 for n in aperture.offsets_m.shape[:2])
     line = aperture.offsets_m[middle[0]] if axis == 0 else aperture.offsets_m[:, middle[1]]
     slope = np.zeros(len(line))
@@ -103,7 +103,7 @@ def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
 def _cut(
     aperture: Aperture, answer: NDArray[np.complex128], point: NDArray[np.float64], axis: int, cell_m: float
 ) -> tuple[NDArray[np.float64], float]:
-    """Amplitude along an axis through the point, 1 at its place, and the step in metres."""
+    """Return the amplitude along an axis through the point, relative to the point, and the step in metres."""
     count = int(_CELLS * _POINTS)
     step = (cell_m if np.isfinite(cell_m) else aperture.grid.pixel_m) / _POINTS
     voxels = np.tile(point, (2 * count + 1, 1))
@@ -118,7 +118,7 @@ def _cut(
 
 
 def _width(cut: NDArray[np.float64]) -> float:
-    """Points between the half-power points on either side of the middle; infinite when it never falls that low."""
+    """Return the half-power width in points; infinite if the amplitude never falls that low."""
     middle = cut.size // 2
     sides = []
     for side in (cut[middle:], cut[middle::-1]):
@@ -131,7 +131,7 @@ def _width(cut: NDArray[np.float64]) -> float:
 
 
 def _sidelobe_db(cut: NDArray[np.float64]) -> float:
-    """Strongest value beyond the first minimum on either side, dB."""
+    """Return the strongest value beyond the first minimum on either side, dB."""
     middle = cut.size // 2
     levels = []
     for side in (cut[middle:], cut[middle::-1]):
@@ -141,7 +141,7 @@ def _sidelobe_db(cut: NDArray[np.float64]) -> float:
 
 
 def imaging_facts(builder: ImageBuilder, images: ChannelImages) -> dict[str, Any]:
-    """Content of `imaging` in quality.json, by board, plain numbers."""
+    """Return the entry `imaging` of quality.json, by board."""
     out: dict[str, Any] = {name: board_facts(board) for name, board in builder.boards.items()}
     if images.notices:
         out["notices"] = list(images.notices)
@@ -149,10 +149,10 @@ def imaging_facts(builder: ImageBuilder, images: ChannelImages) -> dict[str, Any
 
 
 def board_facts(board: BoardSamples) -> dict[str, Any]:
-    """One board's.
+    """Return the figures of one board.
 
-    `masked` is the share of the tapered aperture without data; `loss_db` what a point's sum loses by it, `-20 log10(1 -
-    masked)`. Amplitudes in the image do not fall by it: it is divided by the positions that are there.
+    `masked` is the share of the tapered aperture without data, `loss_db` the loss of a point's sum due to it,
+    `-20 log10(1 - masked)`. Image amplitudes do not change, for images are divided by the number of valid positions.
     """
     weights = board.weights
     masked = 1 - float(weights.sum() / board.taper.sum())

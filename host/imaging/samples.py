@@ -1,8 +1,8 @@
-"""One board's reduced samples, as rows come in, and its image.
+"""Reduced samples of one board, and its image.
 
-`BoardSamples` reduces each row to the range gate, keeps it, and has it imaged by the fastest imager that is exact for
-the aperture (`choose_imager`). Samples of an ideal mirror on the object plane (`mirror_samples`) give the illumination
-by which images are divided.
+`BoardSamples` reduces each row to the range gate, stores it and images the rows with the imager that `choose_imager`
+selects. The samples of an ideal mirror on the object plane (`mirror_samples`) give the footprint, by which images are
+divided.
 """
 
 from __future__ import annotations
@@ -21,52 +21,53 @@ from polysight.host.imaging.reduce import Reduction, burst_filters, undo_burst_m
 from polysight.host.imaging.spectral import SLACK_M, IncrementalImager, SpectralImager
 from polysight.host.sync import SyncedRow
 from polysight.shared.config import Board, Chirp, Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.raster import plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Image = NDArray[np.complex64]
 _log = logging.getLogger(__name__)
-_AT_ONCE = 120  # positions of one product: more are slower by half (OpenBLAS)
+_CHUNK = 120  # positions per matrix product: larger ones are slower by half (OpenBLAS)
 
 
 class Imager(Protocol):
-    """Matched filter of an aperture's samples at its pixels, and its adjoint; sums, not means.
+    """Matched filter of an aperture at its pixels, and its adjoint; sums, not means.
 
-    With A the forward model of unit reflectivities, `samples(x)` is A x and `image(y)` is A^H y.
+    With the forward model A, `samples(x)` is A x and `image(y)` is A^H y.
     """
 
     @property
     def aperture(self) -> Aperture:
-        """Positions, antennas, frequencies, pixels."""
+        """Positions, antennas, frequencies and pixels."""
         ...
 
     def image(self, samples: Any) -> Any:
-        """Of complex64 [rx, frequency, row, column], weighted, 0 where masked: complex [ny, nx]."""
+        """Image weighted samples, complex64 [rx, frequency, row, column], 0 where masked: complex [ny, nx]."""
         ...
 
     def constant(self, echo: Any, weights: Any) -> Any:
-        """Image of an echo complex [rx, frequency], the same at every position, times weights [row, column]."""
+        """Image an echo, complex [rx, frequency], at every position, times weights [row, column]."""
         ...
 
     def samples(self, image: Any) -> Any:
-        """What pixels complex [ny, nx] answer: complex [rx, frequency, row, column]."""
+        """Return the echoes of pixels, complex [ny, nx]: complex [rx, frequency, row, column]."""
         ...
 
 
 def choose_imager(aperture: Aperture) -> tuple[Imager, str | None]:
-    """The fastest imager that is exact for an aperture, and a notice when it is the slow one."""
+    """Choose the imager: spectral if the aperture is regular, otherwise the slower direct sum (with a notice)."""
     reason = irregular(aperture)
     if reason is None:
         return SpectralImager(aperture), None
     rx, _, rows, columns = aperture.shape
     sums = rx * rows * columns * aperture.grid.x_m.size * aperture.grid.y_m.size
-    notice = f"imaging by direct sum, {sums:.1e} terms, some {sums / 1e7:.0f} s a board: {reason}"
+    notice = f"imaging by direct sum, {sums:.1e} terms, about {sums / 1e7:.0f} s per board: {reason}"
     return DirectImager(aperture), notice
 
 
 def mirror_samples(antennas: Antennas, z_m: float, chirp: Chirp) -> NDArray[np.complex128]:
-    """A mirror's samples after referencing, [rx, sample]; amplitude relative to a direct path of one metre."""
+    """Return the referenced samples of a mirror, [rx, sample]; amplitude relative to a direct path of one metre."""
     path = antennas.mirror_m(z_m)
     sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
     phase = 2j * np.pi * np.outer(path - antennas.direct_m, sweep) / SPEED_OF_LIGHT_M_S
@@ -74,12 +75,12 @@ def mirror_samples(antennas: Antennas, z_m: float, chirp: Chirp) -> NDArray[np.c
 
 
 def mirror_reduced(antennas: Antennas, z_m: float, chirp: Chirp, reduction: Reduction) -> NDArray[np.complex128]:
-    """The same after the range gate, [rx, frequency]."""
+    """Return the samples of a mirror after the range gate, [rx, frequency]."""
     return mirror_samples(antennas, z_m, chirp) @ reduction.matrix.T
 
 
 class ReducedRow(NamedTuple):
-    """One board's row behind the range gate, columns from the smallest x: what images are made from.
+    """A row of a board after the range gate, columns from the smallest x.
 
     samples complex64 [rx, frequency, column], direct path complex64 [rx, column], valid bool [column].
     """
@@ -95,7 +96,7 @@ class BoardSamples:
     Parameters
     ----------
     rig, board
-        The scan's rig file, and one of its receiving boards.
+        Rig of the scan, and one of its receiving boards.
     grid
         Pixels.
     reduction
@@ -103,7 +104,7 @@ class BoardSamples:
     taper
         float32 [row, column]: weight of every position.
     live
-        Keep sums over the rows, for :meth:`current`.
+        Keep running sums over rows for :meth:`current`.
     """
 
     def __init__(
@@ -131,60 +132,60 @@ class BoardSamples:
         self.valid = np.zeros(shape, bool)
         regular = irregular(self.aperture) is None
         self._final: SpectralImager | None = None
-        self._spectra = np.zeros(0, np.complex64)  # of the rows, along x: what the final image needs of each
-        self._padded = np.zeros(0, np.complex64)  # a row, weighted, with the zeros of a period behind it
-        self._stale = set(range(shape[0]))  # rows whose spectra are not those of their samples
-        self._moved = False  # rows are not where the live image's lattice was made for
+        self._spectra = np.zeros(0, np.complex64)  # spectra of the rows along x, for the final image
+        self._padded = np.zeros(0, np.complex64)  # a weighted row, padded with zeros to a period
+        self._stale = set(range(shape[0]))  # rows whose spectra are out of date
+        self._moved = False  # rows differ from the lattice of the live image
         self._live = None
         if live and regular:
             self._live = IncrementalImager(self.aperture, self.mirror)
-            self._prepare()  # kernels are made now, not after the last row
+            self._prepare()  # compute kernels now instead of after the last row
 
     @property
     def aperture(self) -> Aperture:
-        """Where everything is."""
+        """Geometry of antennas, positions and pixels."""
         return Aperture(self._antennas, self._offsets, self._reduction.frequencies_hz, self._grid)
 
     @property
     def model(self) -> NDArray[np.complex128]:
-        """How an echo's samples come out of the range gate, [frequency, frequency], see `reduce.Reduction.model`."""
+        """Effect of the range gate on an echo, [frequency, frequency], see `reduce.Reduction.model`."""
         return self._reduction.model
 
     @property
     def weights(self) -> NDArray[np.float32]:
-        """Taper of each position, 0 without valid data, float32 [row, column]."""
+        """Taper of each position, 0 where not valid, float32 [row, column]."""
         return self.taper * self.valid
 
     def _weights_of(self, index: int) -> NDArray[np.float32]:
-        """One row of :attr:`weights`."""
+        """Return one row of :attr:`weights`."""
         return self.taper[index] * self.valid[index]
 
     @property
     def count(self) -> np.float32:
-        """What a sum over positions and RX is divided by."""
+        """Divisor of a sum over positions and RX."""
         return np.float32((self.weights.sum() or 1.0) * len(self._antennas.rx_m))
 
     def add_row(self, index: int, row: SyncedRow, offsets_m: NDArray[np.float64] | None = None) -> None:
-        """Take in a row; an earlier take of it is replaced.
+        """Add a row; a row added again replaces the earlier one.
 
         Parameters
         ----------
         index
-            Of the row in the plan.
+            Index of the row in the plan.
         row
-            Positions in the order they were met.
+            Positions in order of recording.
         offsets_m
-            float64 [position, 2 or 3], same order: true mean stage offsets, where they are better known than the plan.
+            float64 [position, 2 or 3], same order: measured mean stage offsets; None: as planned.
 
         Raises
         ------
         DataError
-            when the row is not one of this plan's.
+            if the row is not in the plan.
         """
         if not 0 <= index < self._plan.rows:
-            raise _stranger(f"row {index} of board {self.board.name!r} is not in this scan")
+            raise _wrong_row(f"row {index} of board {self.board.name!r} is not in this scan")
         if row.valid.shape != (self._plan.columns,):
-            raise _stranger(
+            raise _wrong_row(
                 f"row {index} of board {self.board.name} has {row.valid.size} positions, the plan {self._plan.columns}"
             )
         forward = slice(None, None, self._plan.row(index).direction)
@@ -195,11 +196,11 @@ class BoardSamples:
         self._put(index, ReducedRow(reduced[:, :-1] * valid, reduced[:, -1] * valid, valid), offsets_m, forward)
 
     def put(self, index: int, row: ReducedRow) -> None:
-        """Take in a row that this range gate has reduced before, see :meth:`reduced`."""
+        """Add a row from :meth:`reduced`, reduced by the same range gate."""
         self._put(index, row)
 
     def reduced(self, index: int) -> ReducedRow:
-        """A row as it was taken in."""
+        """Return a row after the range gate."""
         return ReducedRow(self._cube[:, :, index], self._direct[:, index], self.valid[index])
 
     def _put(
@@ -221,26 +222,26 @@ class BoardSamples:
         self._show(index, 1)
 
     def _reduced(self, samples: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """Samples of a row through the range gate, and the direct path behind them: [rx, frequency + 1, position]."""
-        if samples.strides[1] < 0:  # positions backwards: no product is fast along them
+        """Apply the range gate to a row; return samples and the direct path, [rx, frequency + 1, position]."""
+        if samples.strides[1] < 0:  # reversed positions make the product slow
             return self._reduced(samples[:, ::-1])[..., ::-1]
         pairs = np.asarray(samples, np.complex64).view(np.float32)[..., self._linear]
         out = np.empty((*pairs.shape[:2], self._maps.shape[1]), np.float32)
-        for first in range(0, pairs.shape[1], _AT_ONCE):
-            part = slice(first, first + _AT_ONCE)
+        for first in range(0, pairs.shape[1], _CHUNK):
+            part = slice(first, first + _CHUNK)
             np.matmul(pairs[:, part], self._maps, out=out[:, part])
         return out.view(np.complex64).mT
 
     def _prepare(self) -> None:
-        """Make the imager of all rows where there is a fast one; it is kept while they stay where they are."""
+        """Create the spectral imager of all rows if the aperture is regular; keep it while positions do not change."""
         if self._final is None and irregular(self.aperture) is None:
-            self._final = SpectralImager(self.aperture, slack_m=SLACK_M)  # the live one's lattice: both share spectra
+            self._final = SpectralImager(self.aperture, slack_m=SLACK_M)  # shares spectra with the live imager
             self._spectra = np.zeros((*self._cube.shape[:3], self._final.lattice.band.size), np.complex64)
             self._padded = np.zeros((*self._cube.shape[:2], self._final.period), np.complex64)
             self._stale = set(range(len(self.valid)))
 
     def _transformed(self, imager: SpectralImager, index: int) -> NDArray[np.complex64]:
-        """A row's spectra, [rx, frequency, k]; each row by itself, so that the same rows give the same bits."""
+        """Return the spectra of a row, [rx, frequency, k]; row by row, so that results are bit-exact in any order."""
         if index in self._stale:
             row = self._padded[..., : self.taper.shape[1]]
             np.multiply(self._cube[:, :, index], self._weights_of(index), out=row)
@@ -249,13 +250,13 @@ class BoardSamples:
         return self._spectra[:, :, index]
 
     def keep(self, positions: NDArray[np.bool_]) -> None:
-        """Mask every position [row, column] that is not to be kept, as if it had not been scanned."""
+        """Mask all positions except those in `positions` [row, column], as if they had not been scanned."""
         self.valid &= positions
         self._live = None
         self._stale = set(range(len(self.valid)))
 
     def _show(self, index: int, sign: int) -> None:
-        """Add a row to the live image, or take it away."""
+        """Add a row to the live image, or subtract it (`sign` -1)."""
         weights = sign * self._weights_of(index)
         if self._live is None or not weights.any():
             return
@@ -267,34 +268,31 @@ class BoardSamples:
             self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
 
     def rx_calibration(self) -> NDArray[np.complex128]:
-        """Complex gain of each RX, relative to a direct path of one metre: the mean direct path of all positions, [rx].
-
-        The direct path's length to each RX is known; what remains after it is the receiver's own.
-        """
+        """Return the complex gain of each RX, [rx]: mean direct path of all positions times its known length."""
         total = (self._direct * self.valid).sum(axis=(1, 2), dtype=np.complex128)
         gain = total / max(1, int(self.valid.sum())) * self._antennas.direct_m
         return np.where(gain == 0, 1, gain)
 
     def calibrated(self) -> NDArray[np.complex64]:
-        """Samples with every RX's gain taken out, not weighted."""
+        """Return the samples divided by the gain of each RX, not weighted."""
         return self._cube * (1 / self.rx_calibration()).astype(np.complex64)[:, None, None, None]
 
     def current(self) -> tuple[Image, Image, str | None]:
-        """As :meth:`image`, from the sums over rows where they are kept: equal to 1e-6 of the peak, and at once."""
+        """Return :meth:`image` from running sums if there are any: fast, and equal within 1e-6 of the peak."""
         if self._live is None:
             return self.image()
         image = self._live.image_of_sum(1 / self.rx_calibration())
         return image / self.count, self._live.constant_of_sum() / self.count, None
 
     def image(self, grid: ImageGrid | None = None) -> tuple[Image, Image, str | None]:
-        """Image and footprint of the rows so far, complex64 [ny, nx], and a notice where it was slow.
+        """Return image and footprint of the rows so far, complex64 [ny, nx], and a notice if imaging is slow.
 
-        The same rows give the same bits, in whatever order and however often they came.
+        The result is bit-exact for the same rows in any order.
 
         Parameters
         ----------
         grid
-            Other pixels than the rig file's; they must lie inside the range gate.
+            Other pixels than the rig file's, within the range gate.
         """
         gains, notice = (1 / self.rx_calibration()).astype(np.complex64), None
         if grid is None:
@@ -312,10 +310,10 @@ class BoardSamples:
         return (image / self.count).astype(np.complex64), footprint.astype(np.complex64), notice
 
     def range_profile(self, point_m: NDArray[np.float64], shifts_m: NDArray[np.float64]) -> NDArray[np.complex64]:
-        """The matched filter of a place, and of paths longer by `shifts_m`, complex64 [shift].
+        """Return the matched filter for paths longer by `shifts_m` than that of a point, complex64 [shift].
 
-        All positions are focused on the place, `point_m` [3] in the rig frame; what lies there has its peak at 0, what
-        lies behind it a positive shift.
+        All positions are focused on `point_m` [3], rig frame. An echo from there has its peak at 0, echoes from behind
+        it at positive shifts.
         """
         at = point_m - self._offsets.reshape(-1, 3)
         weights = (self.weights / self.count).ravel()
@@ -327,10 +325,10 @@ class BoardSamples:
         return (np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(shifts_m, f)) @ focused).astype(np.complex64)
 
     def range_slope(self) -> tuple[Image, Image]:
-        """Derivative of image and footprint by range (the excess path of all pixels), carrier taken out; 1 / m.
+        """Return the derivative of image and footprint by range (excess path), without carrier; 1 / m.
 
-        The matched filter of path d is S(d) = sum_m y_m exp(-j 2 pi f_m d / c), so its derivative is the image of
-        samples times -j 2 pi (f_m - f) / c, f the middle of the sweep.
+        The matched filter of path d is S(d) = sum_m y_m exp(-j 2 pi f_m d / c), so its derivative is the image of the
+        samples times -j 2 pi (f_m - f) / c, with f the middle of the sweep.
         """
         imager, _ = self._imager(None)
         factors = self._by_range()
@@ -339,11 +337,11 @@ class BoardSamples:
         return (image / self.count).astype(np.complex64), self.mirror_slope(0.0)
 
     def mirror_image(self, height_m: float) -> Image:
-        """The footprint of a mirror that lies so much farther than the rig file's plane, complex64 [ny, nx]."""
+        """Return the footprint of a mirror `height_m` behind the rig file's plane, complex64 [ny, nx]."""
         return self._constant_image(self._mirror_at(float(np.mean(self._grid.z_m)) + height_m))
 
     def mirror_slope(self, height_m: float) -> Image:
-        """Its derivative by range, see :meth:`range_slope`."""
+        """Return the derivative of :meth:`mirror_image` by range, see :meth:`range_slope`."""
         return self._constant_image(self._mirror_at(float(np.mean(self._grid.z_m)) + height_m) * self._by_range())
 
     def _constant_image(self, echo: NDArray[np.complexfloating]) -> Image:
@@ -359,7 +357,7 @@ class BoardSamples:
         return mirror_reduced(self._antennas, z_m, self._chirp, self._reduction)
 
     def _imager(self, grid: ImageGrid | None) -> tuple[Imager, str | None]:
-        """The imager of the rig file's grid, or of another, and a notice where it is slow."""
+        """Return the imager of the rig file's grid or of another one, and a notice if it is slow."""
         if grid is None and self._final is not None:
             return self._final, None
         imager, notice = choose_imager(replace(self.aperture, grid=self._grid if grid is None else grid))
@@ -369,15 +367,17 @@ class BoardSamples:
 
 
 def _on_pairs(maps: NDArray[np.complex128]) -> NDArray[np.float32]:
-    """Complex maps [map, sample] for samples as pairs (re, im), float32 [2 sample, 2 map].
+    """Return complex maps [map, sample] as real ones for pairs (re, im), float32 [2 sample, 2 map].
 
-    `pairs @ out` are the pairs of `maps @ x`: one real product, half as fast again as a complex one so narrow.
+    `pairs @ out` are the pairs of `maps @ x`: a real product is 1.5 times as fast as such a narrow complex one.
     """
     out = np.empty((maps.shape[1], 2, maps.shape[0], 2), np.float32)
-    out[:, 0, :, 0], out[:, 1, :, 0] = maps.real.T, -maps.imag.T  # what makes the real part
+    out[:, 0, :, 0], out[:, 1, :, 0] = maps.real.T, -maps.imag.T  # contributions to the real part
     out[:, 0, :, 1], out[:, 1, :, 1] = maps.imag.T, maps.real.T
     return out.reshape(2 * maps.shape[1], -1)
 
 
-def _stranger(what: str) -> DataError:
-    return DataError(what, "data and rig file do not belong together", "use the rig file of this scan")
+def _wrong_row(what: str) -> DataError:
+    return DataError(
+        what, "the data were recorded with another rig file", "use the rig file of this scan", code=ErrorCode.MISMATCH
+    )

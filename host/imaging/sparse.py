@@ -1,9 +1,8 @@
-"""Images of scans that leave positions out: iterative reconstruction with the imager and its adjoint.
+"""Reconstruct images of scans with omitted positions, iteratively with an imager and its adjoint.
 
-The matched filter of a thinned grid shows aliases of everything. Where the scene is mostly empty they can be told from
-it: the image x with the least `1/2 |W (G A x - y)|^2 + threshold |x|_1` is found by FISTA (Beck and Teboulle, SIAM J.
-Imaging Sci. 2, 2009): A is the imager's forward model, G what the range gate makes of an echo, W the weights of the
-positions.
+The matched filter of a thinned grid contains aliases. In mostly empty scenes they can be removed: FISTA (Beck and
+Teboulle, SIAM J. Imaging Sci. 2, 2009) finds the image x that minimises `1/2 |W (G A x - y)|^2 + threshold |x|_1`, with
+the imager's forward model A, the effect G of the range gate on an echo, and the weights W of the positions.
 """
 
 from __future__ import annotations
@@ -17,10 +16,10 @@ from numpy.typing import NDArray
 from polysight.host.imaging.samples import BoardSamples, choose_imager
 
 STRENGTH = 0.002
-"""By measurement on simulated plates (docs/decisions/0002-imaging.md): more takes what hardly reflects in V out of the
-image, and with it the plates' names; less leaves more of the aliases in.
+"""Found with simulated plates (docs/decisions/0002-imaging.md): a larger value removes plates with a weak V reflection,
+a smaller one leaves more aliases.
 """
-_POWER_ROUNDS = 12  # of the power iteration for the largest eigenvalue
+_POWER_ROUNDS = 12  # steps of the power iteration
 
 
 @dataclass(frozen=True)
@@ -30,10 +29,10 @@ class Reconstruction:
     Attributes
     ----------
     image
-        complex64 [ny, nx]: reflectivity of each pixel as the samples have it, the conjugate of what `ChannelImages.h`
-        and `v` hold; a point's own amplitude, where the matched filter spreads it.
+        complex64 [ny, nx]: reflectivity of each pixel with the phase of the samples, the conjugate of `ChannelImages.h`
+        and `v`. A point has its own amplitude in one pixel.
     residual
-        float64 [iteration]: `|W (G A x - y)| / |W y|`, what the image does not explain.
+        float64 [iteration]: `|W (G A x - y)| / |W y|`, the unexplained share.
     """
 
     image: NDArray[np.complex64]
@@ -46,19 +45,19 @@ def reconstruct(
     strength: float = STRENGTH,
     progress: Callable[[int, int], None] | None = None,
 ) -> Reconstruction:
-    """Reconstruct one board's image from the positions that are valid.
+    """Reconstruct the image of a board from its valid positions.
 
     Parameters
     ----------
     board
-        Samples of one board; what was not scanned is not valid.
+        Samples of one board; omitted positions are not valid.
     iterations
-        Steps, each one forward and one adjoint imaging.
+        Number of steps, each one forward and one adjoint imaging.
     strength
-        Weight of sparsity, of the strongest pixel of the matched filter: pixels below about this level come out 0, and
-        the others as much weaker. A few points with much left out at random come sooner with 0.01.
+        Weight of sparsity relative to the strongest pixel of the matched filter: pixels below about this level become
+        0, and the others weaker by as much. For a few points with many random omissions 0.01 converges faster.
     progress
-        Called with steps done and steps in all.
+        Called with the number of steps done and the total.
     """
     imager, _ = choose_imager(board.aperture)
     weights, gate = np.sqrt(board.weights), board.model.astype(np.complex64)
@@ -91,7 +90,7 @@ def reconstruct(
 
 
 def _shrunk(x: NDArray[np.complexfloating], threshold: float) -> NDArray[np.complex64]:
-    """Amplitudes reduced by a threshold, phases kept: the proximal step of the 1-norm."""
+    """Reduce amplitudes by a threshold and keep phases: the proximal operator of the 1-norm."""
     size = np.abs(x)
     return (x * (np.maximum(size - threshold, 0) / np.maximum(size, 1e-30))).astype(np.complex64)
 
@@ -99,7 +98,7 @@ def _shrunk(x: NDArray[np.complexfloating], threshold: float) -> NDArray[np.comp
 def _largest_eigenvalue(
     operator: Callable[[NDArray[np.complex64]], NDArray[np.complex64]], start: NDArray[np.complex64]
 ) -> float:
-    """Of a positive operator, by power iteration, 5 % on the safe side."""
+    """Return the largest eigenvalue of a positive operator by power iteration, plus 5 %."""
     x, value = start, 1.0
     for _ in range(_POWER_ROUNDS):
         norm = float(np.linalg.norm(x))

@@ -1,11 +1,11 @@
-"""The spectral imager: for a plane parallel to the stage, imaging is convolution.
+"""Spectral imagers: for a plane parallel to the stage, imaging is a convolution.
 
-TX and RX move together and the object stands still, so the matched filter of a position u at a pixel v depends on `v
-- u` only: `image = sum over rx, f of g * k`, with kernel `k(x, y) = exp(-j 2 pi f d_rx(x, y) / c)`. All products are
-summed in the spectrum, and one inverse transform makes the image.
+TX and RX move together, so the matched filter of a position u at a pixel v depends only on `v - u`:
+`image = sum over rx, f of g * k`, with the kernel `k(x, y) = exp(-j 2 pi f d_rx(x, y) / c)`. All products are summed in
+the spectrum, and one inverse transform gives the image.
 
-Along y rows and pixels share a lattice, and the kernel is sampled on it: nothing is interpolated. Along x each row has
-a shift of its own (the stage's travel within a burst, backlash), which is a phase ramp in the spectrum.
+Along y, rows and pixels share a lattice on which the kernel is sampled, without interpolation. Along x each row has its
+own shift (travel of the stage within a burst, backlash), a phase ramp in the spectrum.
 """
 
 from __future__ import annotations
@@ -15,30 +15,30 @@ from typing import Any
 import numpy as np
 
 from polysight.host.imaging.aperture import Aperture, fft_of, row_starts_m
-from polysight.host.imaging.lattice import Lattice, kept, key_of, lattice, lattice_key, spectra_along_x
+from polysight.host.imaging.lattice import Lattice, cached, key_of, lattice, lattice_key, spectra_along_x
 
 SLACK_M = 2e-3
-"""How far along x a row may start from where the aperture says."""
-_LEFT_OUT = 6e-6  # of the strongest principal component: weaker ones are left out
-_AT_ONCE = 32  # wavenumbers in double precision at once
+"""Largest deviation of a row's start along x from the aperture."""
+_LEFT_OUT = 6e-6  # relative to the strongest principal component: weaker ones are left out
+_CHUNK = 32  # wavenumbers processed in double precision at a time
 
 
 class RowSpectra:
-    """What both spectral imagers do along x: rows into the kernel's band, and the band into pixels.
+    """Transforms along x for both spectral imagers: rows to the kernel's band, and the band to pixels.
 
     Parameters
     ----------
     aperture
-        Not :func:`polysight.host.imaging.aperture.irregular`.
+        A regular aperture, see :func:`polysight.host.imaging.aperture.irregular`.
     xp, device
-        Array API namespace, and where its arrays lie.
+        Array API namespace and device.
     slack_m
-        How far rows may be shifted along x from where the aperture says.
+        Largest shift of rows along x from the aperture.
     """
 
     def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
         self.aperture, self.xp, self.device = aperture, xp, device
-        self.lattice: Lattice = kept(lattice_key(aperture, slack_m), lambda: lattice(aperture, slack_m))
+        self.lattice: Lattice = cached(lattice_key(aperture, slack_m), lambda: lattice(aperture, slack_m))
         self._fft = fft_of(xp)
         self.period = self.lattice.size_x // self.lattice.stride_x
         self._take = self.put(self.lattice.band % self.period)
@@ -48,29 +48,29 @@ class RowSpectra:
         self._to_pixels = self.put(wave.astype(np.complex64))
 
     def put(self, array: Any) -> Any:
-        """A numpy array beside the imager's own."""
+        """Copy a numpy array to the imager's device."""
         return self.xp.asarray(array, device=self.device)
 
     def kernels(self) -> Any:
-        """complex64 [rx * frequency, lag y, k]."""
+        """Return the kernels, complex64 [rx * frequency, lag y, k]."""
         return spectra_along_x(self.aperture, self.lattice, self.xp, self.device)
 
     def key(self, *more: Any) -> tuple[Any, ...]:
-        """Of an array made from the kernels."""
+        """Return the cache key of an array made from the kernels."""
         return (*more, *key_of(self.aperture, self.lattice, self.xp, self.device))
 
     def ramps(self, starts_m: Any) -> Any:
-        """Phase ramps that put rows where they start, complex64 [row, k]."""
+        """Return phase ramps that shift rows to their starts, complex64 [row, k]."""
         cycles = np.outer(starts_m - self._origin, self.lattice.wavenumbers)
         return self.put(np.exp(-2j * np.pi * cycles).astype(np.complex64))
 
     def of_rows(self, rows: Any, ramps: Any) -> Any:
-        """Spectra of rows [..., row, column] in the kernel's band, [..., row, k]; a row of step s repeats s times."""
+        """Return the spectra of rows [..., row, column] in the kernel's band, [..., row, k]."""
         whole = self._fft.fft(rows, n=self.period, axis=-1)
         return self.xp.take(whole, self._take, axis=-1) * ramps
 
     def to_rows(self, spectra: Any, ramps: Any) -> Any:
-        """Adjoint of :meth:`of_rows`."""
+        """Apply the adjoint of :meth:`of_rows`."""
         xp, count, columns = self.xp, self.lattice.band.size, self.aperture.offsets_m.shape[1]
         rest = xp.zeros((*spectra.shape[:-1], self.lattice.size_x - count), dtype=xp.complex64, device=self.device)
         whole = xp.roll(xp.concat([spectra * xp.conj(ramps), rest], axis=-1), int(self.lattice.band[0]), axis=-1)
@@ -78,34 +78,34 @@ class RowSpectra:
         return self._fft.ifft(folded, axis=-1)[..., :columns] * self.period
 
     def of_pixels(self, image: Any) -> Any:
-        """Adjoint of :meth:`to_pixels`: [..., ny, nx] to [..., ny, k]."""
+        """Apply the adjoint of :meth:`to_pixels`: [..., ny, nx] to [..., ny, k]."""
         return self.xp.matmul(image, self.xp.conj(self._to_pixels).mT)
 
     def to_pixels(self, spectra: Any) -> Any:
-        """Spectra of rows of pixels [..., ny, k] at the pixels, [..., ny, nx]."""
+        """Evaluate the spectra of rows of pixels [..., ny, k] at the pixels, [..., ny, nx]."""
         return self.xp.matmul(spectra, self._to_pixels)
 
 
 class SpectralImager(RowSpectra):
-    """All rows at once: a 2-D product for each RX and frequency, one inverse transform."""
+    """Imager of all rows at once: one 2-D product per RX and frequency, one inverse transform."""
 
     def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
         super().__init__(aperture, xp, device, slack_m)
         self._ramps = self.ramps(row_starts_m(aperture.offsets_m))
         self._echo: Any = None  # the last constant echo, and its kernel
         sizes, rows, lines = self.lattice, aperture.offsets_m.shape[0], aperture.grid.shape[0]
-        self._last = sizes.row_stride * (rows - 1)  # where the first row of pixels comes out
+        self._last = sizes.row_stride * (rows - 1)  # lattice row of the first row of pixels
         count = sizes.size_y // sizes.row_stride
         self._tall = self.xp.zeros((count, sizes.band.size), dtype=self.xp.complex64, device=device)  # zeros below rows
         self._repeat = self.put(np.arange(sizes.size_y) % count)
         self._rows = self.put(np.arange(rows) * sizes.row_stride)
         self._pixel_rows = self.put(self._last + np.arange(lines) * sizes.pixel_stride)
-        self._kernels = kept(
+        self._kernels = cached(
             self.key("2d", self.lattice.size_y), lambda: self._fft.fft(self.kernels(), n=self.lattice.size_y, axis=-2)
         )
 
     def image(self, samples: Any) -> Any:
-        """Matched filter of samples [rx, frequency, row, column], complex64 [ny, nx]."""
+        """Return the matched filter of samples [rx, frequency, row, column], complex64 [ny, nx]."""
         rx, m, rows, columns = self.aperture.shape
         channels = self.xp.reshape(samples, (rx * m, rows, columns))
         total = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
@@ -114,11 +114,11 @@ class SpectralImager(RowSpectra):
         return self._inverse(total)
 
     def spectra_of_row(self, samples: Any, index: int) -> Any:
-        """A row [..., column] ready for :meth:`image_of_spectra`: its spectra [..., k]."""
+        """Return the spectra [..., k] of a row [..., column] for :meth:`image_of_spectra`."""
         return self.of_rows(samples, self._ramps[index, :])
 
     def image_of_spectra(self, spectra: Any, factors: Any) -> Any:
-        """:meth:`image` of rows that are transformed along x already [rx, frequency, row, k], with a factor an RX."""
+        """Return :meth:`image` of rows transformed along x [rx, frequency, row, k], with a factor per RX."""
         rx, m = self.aperture.shape[:2]
         total = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
         for r in range(rx):
@@ -129,7 +129,7 @@ class SpectralImager(RowSpectra):
         return self._inverse(total)
 
     def constant(self, echo: Any, weights: Any) -> Any:
-        """Image of an echo [rx, frequency] that is the same at every position, times weights [row, column]."""
+        """Return the image of an echo [rx, frequency] at every position, times weights [row, column]."""
         xp, echo = self.xp, self.xp.asarray(echo, dtype=self.xp.complex64)
         if self._echo is None or not bool(xp.all(self._echo[0] == echo)):
             channels = xp.reshape(echo, (-1,))
@@ -141,7 +141,7 @@ class SpectralImager(RowSpectra):
         return self._inverse(self._echo[1] * white)
 
     def samples(self, image: Any) -> Any:
-        """Forward model, the adjoint of :meth:`image`: what pixels [ny, nx] answer, [rx, frequency, row, column]."""
+        """Return the echoes of pixels [ny, nx], [rx, frequency, row, column]; the adjoint of :meth:`image`."""
         xp, sizes = self.xp, self.lattice
         lines = self.of_pixels(image)
         spread = xp.zeros((sizes.size_y, lines.shape[-1]), dtype=xp.complex64, device=self.device)
@@ -155,7 +155,7 @@ class SpectralImager(RowSpectra):
         return xp.reshape(xp.stack(out), self.aperture.shape)
 
     def _along_y(self, lines: Any) -> Any:
-        """2-D spectrum on the lattice [ky, k], of the rows' spectra [row, k]; a row distance of s repeats s times."""
+        """Return the 2-D spectrum on the lattice [ky, k] of the rows' spectra [row, k]."""
         self._tall[: lines.shape[0], :] = lines
         whole = self._fft.fft(self._tall, axis=0)
         return whole if self.lattice.row_stride == 1 else self.xp.take(whole, self._repeat, axis=0)
@@ -166,16 +166,16 @@ class SpectralImager(RowSpectra):
 
 
 class IncrementalImager(RowSpectra):
-    """Image of the rows so far.
+    """Imager that adds row by row to the image.
 
     Parameters
     ----------
     aperture
-        The nominal one; rows may start up to 2 mm along x from where it says.
+        The nominal aperture; rows may start up to 2 mm along x from it.
     echo
-        complex [rx, frequency]: the constant echo imaged along; None for none.
+        complex [rx, frequency]: constant echo that is imaged as well; None for none.
     xp, device
-        Array API namespace, and where its arrays lie.
+        Array API namespace and device.
     """
 
     def __init__(self, aperture: Aperture, echo: Any = None, xp: Any = np, device: Any = None) -> None:
@@ -183,7 +183,7 @@ class IncrementalImager(RowSpectra):
         rows, lines = aperture.shape[2], aperture.grid.shape[0]
         self._last = self.lattice.row_stride * (rows - 1)
         self._span = self.lattice.pixel_stride * (lines - 1) + 1
-        self._kernels, self._components = kept(self.key("rows"), self._principal_kernels)
+        self._kernels, self._components = cached(self.key("rows"), self._principal_kernels)
         self._clear(np.zeros(aperture.shape[:2]) if echo is None else echo)
 
     def add_row(self, index: int, samples: Any, weights: Any, start_m: float) -> None:
@@ -192,20 +192,20 @@ class IncrementalImager(RowSpectra):
         Parameters
         ----------
         index
-            Of the row.
+            Index of the row.
         samples
-            complex64 [rx, frequency, column], weighted already. To replace an earlier take, the difference to it.
+            complex64 [rx, frequency, column], weighted. To replace a row, give the difference.
         weights
-            float32 [column], for the constant echo; the difference likewise.
+            float32 [column], for the constant echo. To replace a row, give the difference.
         start_m
-            Stage offset of its first column.
+            Stage offset of the first column.
         """
         ramp = self.ramps(np.array([start_m]))[0, :]
         white = self.of_rows(self.xp.astype(weights, self.xp.complex64), ramp)
         self.add_spectra(index, self.of_rows(samples, ramp), white)
 
     def add_spectra(self, index: int, lines: Any, white: Any) -> None:
-        """:meth:`add_row` of a row that is transformed already, [rx, frequency, k], and its weights, [k]."""
+        """Add a row that is transformed along x, [rx, frequency, k], and its weights, [k]."""
         xp, (rx, m) = self.xp, self.aperture.shape[:2]
         by_rx = xp.zeros((lines.shape[-1], rx * m, rx), dtype=xp.complex64, device=self.device)
         for r in range(rx):
@@ -215,23 +215,23 @@ class IncrementalImager(RowSpectra):
         self._constant += self._echo_kernel[:, at] * white[:, None]
 
     def image_of_sum(self, factors: Any) -> Any:
-        """The image of all rows so far, with a factor for each RX [rx], complex64 [ny, nx]."""
+        """Return the image of the rows so far, with a factor per RX [rx], complex64 [ny, nx]."""
         total = self.xp.matmul(self._sum, self.put(np.asarray(factors, np.complex64))[:, None])[:, :, 0]
         return self.to_pixels(total.mT)
 
     def constant_of_sum(self) -> Any:
-        """The image of the constant echo at all rows so far, complex64 [ny, nx]."""
+        """Return the image of the constant echo for the rows so far, complex64 [ny, nx]."""
         return self.to_pixels(self._constant.mT)
 
     def image(self, samples: Any) -> Any:
-        """See :class:`polysight.host.imaging.samples.Imager`; what was added before is dropped."""
+        """See :class:`polysight.host.imaging.samples.Imager`; removes all rows first."""
         rx, m, rows, columns = self.aperture.shape
         self._clear(np.zeros((rx, m)))
         self._add_all(samples, self.xp.zeros((rows, columns), dtype=self.xp.float32, device=self.device))
         return self.image_of_sum(np.ones(rx))
 
     def constant(self, echo: Any, weights: Any) -> Any:
-        """See :class:`polysight.host.imaging.samples.Imager`; what was added before is dropped."""
+        """See :class:`polysight.host.imaging.samples.Imager`; removes all rows first."""
         self._clear(echo)
         self._add_all(self.xp.zeros(self.aperture.shape, dtype=self.xp.complex64, device=self.device), weights)
         return self.constant_of_sum()
@@ -249,7 +249,7 @@ class IncrementalImager(RowSpectra):
         return xp.permute_dims(xp.reshape(xp.stack(out), (rows, rx, m, columns)), (1, 2, 0, 3))
 
     def _clear(self, echo: Any) -> None:
-        """Forget all rows."""
+        """Remove all rows."""
         xp, (rx, _, _, _) = self.xp, self.aperture.shape
         size = (self.lattice.band.size, self.aperture.grid.shape[0])
         self._sum = xp.zeros((*size, rx), dtype=xp.complex64, device=self.device)
@@ -262,23 +262,23 @@ class IncrementalImager(RowSpectra):
             self.add_row(index, samples[:, :, index, :], weights[index, :], float(start))
 
     def _lags(self, index: int) -> slice:
-        """Lags in y between a row of positions and every row of pixels."""
+        """Return the lags in y between a row of positions and every row of pixels."""
         first = self._last - index * self.lattice.row_stride
         return slice(first, first + self._span, self.lattice.pixel_stride)
 
     def _principal_kernels(self) -> tuple[Any, Any]:
-        """Kernels [k, lag, component], and what makes components of channels, [k, component, channel]."""
+        """Return kernels [k, lag, component], and the transform from channels, [k, component, channel]."""
         xp = self.xp
         whole = self.kernels()
         by_k = xp.empty(whole.shape[::-1], dtype=xp.complex64, device=self.device)
         by_k[...] = xp.permute_dims(whole, (2, 1, 0))  # contiguous, so that products are fast
         squares = []
-        for first in range(0, by_k.shape[0], _AT_ONCE):
-            last = min(first + _AT_ONCE, by_k.shape[0])
+        for first in range(0, by_k.shape[0], _CHUNK):
+            last = min(first + _CHUNK, by_k.shape[0])
             exact = xp.astype(by_k[first:last, :, :], xp.complex128)  # weak components need the digits
             squares.append(xp.matmul(xp.conj(exact).mT, exact))
         power, vectors = xp.linalg.eigh(xp.concat(squares))
         strongest = xp.max(power, axis=0)  # ascending: the last component is the strongest at every wavenumber
         count = int(xp.sum(xp.astype(strongest > _LEFT_OUT**2 * strongest[-1], xp.int64)))
-        kept_vectors = xp.astype(vectors[:, :, -count:], xp.complex64)
-        return xp.matmul(by_k, kept_vectors), xp.asarray(xp.conj(kept_vectors).mT, copy=True)
+        vectors_used = xp.astype(vectors[:, :, -count:], xp.complex64)
+        return xp.matmul(by_k, vectors_used), xp.asarray(xp.conj(vectors_used).mT, copy=True)

@@ -1,14 +1,16 @@
-"""What a plate's tilt does to its images, and how to take it out.
+"""Estimate the tilt of plates, and correct its effect on the images.
 
-A flat plate is seen where it mirrors TX to RX: from the stage position whose specular point on the object plane is the
-pixel. A plate that rises by s (radians, along x and y) is seen from elsewhere, as the object plane is a distance
+A flat plate is visible where it reflects TX into RX: from the stage position whose specular point on the object plane
+is the pixel. A plate that rises by s (radians, along x and y) is visible from other positions, like the object plane at
+a distance
 
     d = H^-1 C s        H = d2 (r1 + r2) / dx dy,   C = cos of TX's leg + cos of RX's leg to the plane's normal
 
-away: with e1, e2 the directions of both legs, mirroring asks (e1 + e2)_xy + s (e1 + e2)_z = 0, and (e1 + e2)_xy grows
-with H from the specular point. There the aperture weighs differently, and for H and V differently, whose specular
-points lie apart: 2.5 % of V / H a degree on the published rig (simulated). So a pixel of a tilted plate is divided by
-the mirror's footprint `d` away. The tilt itself is in the image: its phase grows by k C s a metre.
+away: with the directions e1, e2 of both legs, specular reflection requires (e1 + e2)_xy + s (e1 + e2)_z = 0, and
+(e1 + e2)_xy grows with H from the specular point. There the aperture has another weight, which differs between H and V
+because their specular points differ: 2.5 % of V / H per degree on the published rig (simulated). So a pixel of a
+tilted plate is divided by the mirror's footprint `d` away. The tilt follows from the image: its phase grows by k C s
+per metre.
 """
 
 from __future__ import annotations
@@ -25,19 +27,19 @@ from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Rise = tuple[float, float]
 """Growth of a plate's height along x and along y."""
-MOST_RISE = 0.06
-"""Beyond this (3.4 degrees) a phase slope is no plate's tilt."""
-LEAST_ACROSS = 2e-3
-"""Below this (0.11 degrees) it is a neighbour's sidelobe as likely as a tilt: nothing is corrected."""
+MAX_RISE = 0.06
+"""Largest tilt of a plate (3.4 degrees); a steeper phase has another cause."""
+MIN_RISE = 2e-3
+"""Smallest tilt that is corrected (0.11 degrees); smaller ones may come from sidelobes of neighbours."""
 _COHERENT = 0.5
-"""Neighbouring pixels' phase steps must agree so far (1: all the same)."""
-_MOST_CHANGE = 2.0
-"""Factor by which a footprint may differ from its neighbour's `d` away: beyond, the plate is seen past the aperture."""
+"""Smallest coherence of the phase steps between pixels (1: all equal)."""
+_MAX_CHANGE = 2.0
+"""Largest change of the footprint over the distance `d`; a larger one occurs only at the edge of the aperture."""
 
 
 @dataclass(frozen=True)
 class Illumination:
-    """How both channels light the object plane.
+    """Illumination of the object plane by both channels.
 
     Attributes
     ----------
@@ -58,52 +60,53 @@ class Illumination:
 
     @property
     def across(self) -> int:
-        """The axis across the plane of incidence, 0 (x) or 1 (y): there a rise moves the specular point least."""
+        """Axis across the plane of incidence, 0 (x) or 1 (y), where a rise moves the specular point least."""
         return int(np.argmin(np.abs(np.diagonal(self.moved_m.mean(axis=0)))))
 
     def transposed(self) -> Illumination:
-        """The same with x and y swapped."""
+        """Return the illumination with x and y swapped."""
         turned = np.ascontiguousarray(self.footprints.transpose(0, 2, 1))
         return replace(self, footprints=turned, moved_m=self.moved_m[:, ::-1, ::-1], pixel_m=self.pixel_m[::-1])
 
     def rise(self, h: NDArray[np.complexfloating], v: NDArray[np.complexfloating], mask: NDArray[np.bool_]) -> Rise:
-        """Rise of a patch along x and y, radians, from its phase; zero where the phase tells none.
+        """Estimate the rise of a patch along x and y from its phase, radians; zero if undetermined.
 
-        `h`, `v` complex [ny, nx] are reflectivities (conjugates of the samples), `mask` bool [ny, nx] the patch's
-        inside.
+        `h`, `v` complex [ny, nx] are reflectivities (conjugates of the samples), `mask` bool [ny, nx] is the inside of
+        the patch.
         """
         out = []
         for along in (0, 1):
-            # The conjugate's phase falls where the plate rises.
+            # The phase of the conjugate falls where the plate rises.
             step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in (h, v)) / 2
             slope = float(np.angle(step)) / self.pixel_m[along] / float(self.steepness_rad_m.mean())
-            out.append(slope if abs(step) > _COHERENT and abs(slope) < MOST_RISE else 0.0)
+            out.append(slope if abs(step) > _COHERENT and abs(slope) < MAX_RISE else 0.0)
         return out[0], out[1]
 
     def to_level(self, mask: NDArray[np.bool_], rise: Rise) -> NDArray[np.float64]:
-        """Factors [2, n] that bring H and V of a patch's pixels to what a level plate shows there.
+        """Return factors [2, n] that convert H and V of a patch's pixels to those of a level plate.
 
-        Of the footprint's magnitude: its phase ripples with the rows of the grid. And for the rise across the plane of
-        incidence alone: along it H and V are lit alike (|H| changes by some 7 % a degree), and the phase tells less:
-        plates at the sides of the image seem to rise by up to 0.3 degrees, of a narrow aperture by 0.8.
+        They use only the magnitude of the footprint, for its phase ripples with the rows of the grid; and only the rise
+        across the plane of incidence. Along it, H and V are illuminated equally (|H| changes by 7 % per degree), and
+        the phase is less reliable: plates at the sides of the image seem to rise by up to 0.3 degrees (0.8 degrees
+        with a narrow aperture).
         """
         slope = rise[self.across]
-        if abs(slope) < LEAST_ACROSS:
+        if abs(slope) < MIN_RISE:
             return np.ones((2, int(mask.sum())))
         return np.stack([self._change(k, mask, self.moved_m[k][:, self.across] * slope) for k in (0, 1)])
 
     def _change(self, channel: int, mask: NDArray[np.bool_], moved_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A channel's footprint at a patch's pixels over that so far away, [n]; 1 where the light ends between."""
+        """Return the footprint at a patch's pixels divided by that `moved_m` away, [n]; 1 beyond the aperture."""
         rows, columns = np.nonzero(mask)
         level = np.abs(self.footprints[channel])
         at = np.stack([rows + moved_m[1] / self.pixel_m[1], columns + moved_m[0] / self.pixel_m[0]])
         with np.errstate(divide="ignore", invalid="ignore"):
             change = level[rows, columns] / scipy.ndimage.map_coordinates(level, at, order=1, mode="nearest")
-        return np.where((change > 1 / _MOST_CHANGE) & (change < _MOST_CHANGE), change, 1.0)
+        return np.where((change > 1 / _MAX_CHANGE) & (change < _MAX_CHANGE), change, 1.0)
 
 
 def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -> tuple[NDArray[np.float64], float]:
-    """Of one board at its specular point on the plane at `z_m`: `d` a rise [2, 2], metres; radians a metre a rise."""
+    """Return `moved_m` [2, 2] and `steepness_rad_m` of a board at its specular point on the plane at `z_m`."""
     tx, rx = antennas.tx_m, antennas.rx_m.mean(axis=0)
     z_tx, z_rx = z_m - tx[2], z_m - rx[2]
     point = np.append((tx[:2] * z_rx + rx[:2] * z_tx) / (z_tx + z_rx), z_m)
@@ -118,14 +121,14 @@ def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -
     return np.asarray(np.linalg.inv(bend) * cosines, np.float64), wave * cosines
 
 
-def levelled(
+def correct_tilt(
     h: NDArray[np.complexfloating],
     v: NDArray[np.complexfloating],
     lit: Illumination,
     masks: Sequence[NDArray[np.bool_]],
     rises: Sequence[Rise],
 ) -> tuple[NDArray[np.complexfloating], NDArray[np.complexfloating]]:
-    """Both channels with every patch as a level plate would show it; the rest as it is."""
+    """Return both channels with the tilt of every patch corrected; other pixels are unchanged."""
     out = (h.copy(), v.copy())
     for mask, rise in zip(masks, rises, strict=True):
         for channel, factor in zip(out, lit.to_level(mask, rise), strict=True):
@@ -134,7 +137,7 @@ def levelled(
 
 
 def _step(image: NDArray[np.complexfloating], mask: NDArray[np.bool_], axis: int) -> complex:
-    """Mean step of the phase from pixel to pixel inside a patch, as exp(j step) times how well the steps agree."""
+    """Return exp(j mean phase step between pixels of a patch) times the coherence of the steps."""
     inside = np.where(mask & np.isfinite(image), image, 0).astype(np.complex128)
     ahead, behind = (np.take(inside, range(k, inside.shape[axis] - 1 + k), axis) for k in (1, 0))
     product = ahead * np.conj(behind)

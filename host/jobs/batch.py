@@ -25,6 +25,7 @@ import msgspec
 from polysight.host.process import ProcessRequest, cores
 from polysight.host.products import FINISHED, SavedProducts, write_json
 from polysight.host.store import COLLECTION, MANIFEST, ScanFolder, is_source, versions
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, PolysightError
 from polysight.shared.files import read_json
 
@@ -59,7 +60,7 @@ class Job(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a scan; seconds and the largest memory of its program (GB) where it ran."""
+    """Result of one scan, with the time and largest memory (GB) of its program."""
 
     name: str
     status: Status
@@ -93,6 +94,7 @@ def jobs_of(requests: Sequence[ProcessRequest]) -> list[Job]:
                 f"two scans are named {data.name}: {jobs[data.name].request.data} and {data}",
                 "their products would go into one folder",
                 "process them in two runs, each with its own --out",
+                code=ErrorCode.NAME_TAKEN,
             )
         if (data / MANIFEST).exists():  # it brings its own rig file
             request = msgspec.structs.replace(request, config=None)
@@ -105,7 +107,7 @@ NOT_DATA = ("samples", "products", ".products.new", ".products.old", "products-e
 
 
 def made_with(request: ProcessRequest) -> dict[str, Any]:
-    """What products depend on: releases, choices (files by their digest), and the data's files by size and time."""
+    """All that products depend on: releases, options (files by digest), and the data's files by size and time."""
     data = Path(request.data)
     choices = {**request.choices(), **{name: _digest(path) for name, path in request.paths().items()}}
     files = sorted(p for p in data.rglob("*") if p.is_file() and p.relative_to(data).parts[0] not in NOT_DATA)
@@ -124,7 +126,7 @@ def _digest(path: Path) -> Any:
 
 
 def finished(job: Job) -> bool:
-    """Whether the products are there and were made with just this."""
+    """True if the products exist and were made with exactly this."""
     try:
         mark = read_json(job.out / FINISHED)
     except (OSError, ValueError, PolysightError):
@@ -219,6 +221,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
             "Dask is not installed here",
             "it is needed for --dask alone, and not installed with the rest",
             "pip install 'polysight[dask]' here and on the workers (in the repository: '.[dask]')",
+            code=ErrorCode.PACKAGE_MISSING,
         ) from None
     try:
         client = Client(address, timeout=timeout)
@@ -227,6 +230,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
             f"no Dask scheduler at {address}: {e}",
             "it is not running, or a firewall is between",
             "start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`",
+            code=ErrorCode.NO_ANSWER,
         ) from None
     with client:
         jobs_by_name = {job.name: job for job in jobs}
@@ -246,7 +250,7 @@ def memory_bytes(positions: int) -> int:
 
 
 def at_once(positions: int, cores: int, free_bytes: int) -> int:
-    """How many scans fit cores and free memory; at least one."""
+    """Number of scans that fit cores and free memory; at least one."""
     return max(1, min(cores, int(_FREE * free_bytes / memory_bytes(positions))))
 
 
@@ -323,7 +327,7 @@ def _positions(data: Path) -> int:
 
 
 def table(outcomes: Sequence[Outcome], out: Path) -> str:
-    """What became of every scan, and the counts."""
+    """Table of the results of all scans, and their counts."""
     rows = [("scan", "result", "seconds", "memory", "masked", "patches", "")]
     for o in outcomes:
         masked, patches = _found(out / o.name) if o.status in ("done", "skipped") else ("", "")
@@ -343,7 +347,7 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
 
 
 def _verdict(products: Path) -> str:
-    """What the products say of themselves, where that is not `good`; with the first reason."""
+    """The verdict of products with its first reason; empty if `good`."""
     try:
         verdict = SavedProducts(products).verdict
     except (PolysightError, AttributeError, KeyError, TypeError):

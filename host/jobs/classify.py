@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.jobs.print_verdict import print_verdict
+from polysight.host.jobs.materials import print_verdict
 from polysight.host.materials import (
     PATCHES,
     SIMULATED_LIBRARY,

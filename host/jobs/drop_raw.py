@@ -55,13 +55,13 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
 
 
 def _keep(products: Path, scan: ScanFolder) -> None:
-    """Have the products say that they are all that is left of the scan, so that no other's ever replace them."""
-    told = {"scan_id": scan.scan_id, "scan": str(scan.path.resolve()), "dropped_utc": utc_now()}
-    write_json(products / QUALITY, {**read_products(products).quality, RAW_DROPPED: told})
+    """Mark the products as all that is left of the scan, so that they are never replaced."""
+    mark = {"scan_id": scan.scan_id, "scan": str(scan.path.resolve()), "dropped_utc": utc_now()}
+    write_json(products / QUALITY, {**read_products(products).quality, RAW_DROPPED: mark})
 
 
 def processed_digests(folder: Path) -> Digests:
-    """What saved products were made from, as quality.json beside a readable image.npz says. Raises DataError."""
+    """CRCs of the rows that saved products were made from, by board. Raises DataError."""
     products = read_products(folder)
     _ = products.image  # raises when it cannot be read
     try:

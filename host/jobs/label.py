@@ -62,7 +62,7 @@ class FoundPatch:
 
 @dataclass(frozen=True)
 class Edits:
-    """What the options change, in this order.
+    """Changes by the options, in this order.
 
     Attributes
     ----------
@@ -349,7 +349,7 @@ def _table(labels: Labels) -> list[str]:
 def _listing(
     folder: Path, products: SavedProducts, there: tuple[Path, Labels] | None, found: Sequence[FoundPatch]
 ) -> str:
-    """What is drawn, what was found, and how to name it."""
+    """Text of the boxes drawn, the patches found, and how to name them."""
     kind = "simulated " if products.simulated else ""
     lines = [f"{products.folder}: {kind}scan {products.scan_id}"]
     lines.append(f"image: {format_box(image_extent_mm(products.x_m, products.y_m))} from its centre")

@@ -40,7 +40,7 @@ from polysight.shared.errors import ConfigError, PolysightError, ScanError, advi
 
 PRODUCTS = "products"
 _BESIDE = ("program", "operator.json")
-"""What a page or a person may have put into a folder before its scan begins: a program's log, notes."""
+"""Entries that may be in a folder before its scan begins: a program's log, notes."""
 Take = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
 
 

@@ -1,7 +1,6 @@
-"""Commands on materials in saved products: the table, permittivity through layers, and concentration.
+"""Commands on saved products: table of materials, permittivity through layers, concentration, report.
 
-Each prints the verdict first, and nothing of the patches where it is `none`. `report` finds the report of a scan, or
-makes it again from the raw rows.
+Each prints the verdict first, and no patches if it is `none`.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ import numpy as np
 from rich.cells import cell_len
 
 from polysight.host.imaging import sub_bands
-from polysight.host.jobs.print_verdict import print_verdict
 from polysight.host.materials import (
     AMPLITUDE_ERROR,
     Layer,
@@ -39,15 +37,27 @@ from polysight.host.products import (
     read_products,
     refused_text,
 )
+from polysight.host.verdict import NoResult
 from polysight.shared.config import Chirp, load_instrument
 from polysight.shared.errors import ConfigError, DataError
 
 _SAME_FREQUENCY = 1e-6  # relative: far above rounding, far below any other chirp
+_REASONS = 3  # of a verdict, for the terminal
 REPORT = "report.html"
 
 
+def print_verdict(products: SavedProducts, to_terminal: bool = True) -> int:
+    """Print the verdict of products, if they have one; return the exit status it gives: 0, or that of NoResult."""
+    verdict = products.verdict
+    if verdict is None:
+        return 0
+    if to_terminal:
+        sys.stdout.write("".join(f"{line}\n" for line in verdict.lines(_REASONS)))
+    return 0 if verdict.usable else NoResult.exit_status
+
+
 def _chirp(products: SavedProducts, config: Path | None) -> Chirp:
-    """The chirp the products were made with; that of `config` when it is given. Raises DataError, ConfigError."""
+    """The chirp of the products, or that of `config` if given. Raises DataError, ConfigError."""
     chirp = load_instrument(config).chirp if config is not None else products.chirp
     if chirp is None:
         raise DataError(
@@ -59,13 +69,13 @@ def _chirp(products: SavedProducts, config: Path | None) -> Chirp:
 
 
 def _check_bands(row: Mapping[str, Any], chirp: Chirp, source: str) -> None:
-    """Refuse a patch whose sub-bands are no parts of this chirp. Raises DataError."""
+    """Raise DataError if the sub-bands of a patch are not those of this chirp."""
     recorded = [(b["first_hz"], b["last_hz"]) for b in row.get("bands") or ()]
     expected = [(b.first_hz, b.last_hz) for b in sub_bands(chirp, len(recorded))] if recorded else []
-    for told, own in zip(recorded, expected, strict=True):
-        if not all(math.isclose(a, b, rel_tol=_SAME_FREQUENCY) for a, b in zip(told, own, strict=True)):
+    for saved, own in zip(recorded, expected, strict=True):
+        if not all(math.isclose(a, b, rel_tol=_SAME_FREQUENCY) for a, b in zip(saved, own, strict=True)):
             raise DataError(
-                f"segment {row.get('label')} was imaged from {told[0] / 1e9:.4f} to {told[1] / 1e9:.4f} GHz; the chirp"
+                f"segment {row.get('label')} covers {saved[0] / 1e9:.4f} to {saved[1] / 1e9:.4f} GHz; the chirp"
                 f" of {source} has that part from {own[0] / 1e9:.4f} to {own[1] / 1e9:.4f} GHz",
                 "that is another rig file than the scan's",
                 "leave --config out: the products bring their own",
@@ -81,7 +91,7 @@ def permittivity(
     bands: int | None = None,
     amplitude_error: float = AMPLITUDE_ERROR,
 ) -> int:
-    """Permittivity of patches, as one interface or as the unknown layer of a stack; returns the exit status.
+    """Print the permittivity of patches, as a half space or as the unknown layer of a stack; return the exit status.
 
     Without a result (verdict `none`) no permittivity is printed, and the exit status is that of NoResult.
 
@@ -140,7 +150,7 @@ def _line(row: Mapping[str, Any]) -> str:
 
 
 def _in_the_stack(layer: Mapping[str, Any] | None) -> str:
-    """The fit of a layer behind the single interface, which sheets often have none of; a note a line."""
+    """The fit of a layer as text, with a line for each note."""
     if layer is None:
         return ""
     real, loss = layer["permittivity"]
@@ -152,7 +162,7 @@ def _in_the_stack(layer: Mapping[str, Any] | None) -> str:
 
 
 def _estimate(permittivity: Mapping[str, Any]) -> str:
-    """A permittivity with the errors of both parts, and what most of them comes from."""
+    """A permittivity with the errors of both parts and their main source."""
     text = f"{format_permittivity(complex(permittivity['real'], permittivity['imag']), width=6):15s}"
     if spread := permittivity_spread(permittivity):
         text += f"  +- {spread.real_std:.2f}, {spread.loss_std:.2f}"
@@ -161,7 +171,7 @@ def _estimate(permittivity: Mapping[str, Any]) -> str:
 
 
 def concentration(data: Path, given: Mapping[str, float], confidence: float, as_json: bool) -> int:
-    """Line from polarisation angle to concentration, judged with each concentration left out; the exit status.
+    """Fit concentration against polarisation angle, with leave-one-out errors; return the exit status.
 
     `data` is a library (.npz) or a folder of the published material files. Raises DataError.
     """
@@ -190,7 +200,7 @@ def concentration(data: Path, given: Mapping[str, float], confidence: float, as_
     ]
     sys.stdout.write(
         f"{source}: percent = {line.intercept:.2f} + ({np.radians(line.slope):.3f}) * angle in degrees,"
-        f" {line.patches} patches\neach concentration as told by the others:\n{''.join(rows)}"
+        f" {line.patches} patches\neach concentration predicted from the others:\n{''.join(rows)}"
         f"median error {result.median_error:.3f} percent by weight; the {100 * confidence:.0f} % intervals hold the"
         f" truth in {100 * result.covered:.0f} % of the patches\n"
     )
@@ -198,14 +208,14 @@ def concentration(data: Path, given: Mapping[str, float], confidence: float, as_
 
 
 def materials(data: Sequence[Path], as_json: bool) -> int:
-    """What the patches of processed scans were named, and their permittivity; returns the exit status.
+    """Print names and permittivities of the patches of processed scans; return the exit status.
 
-    That of NoResult when one of the scans has none (verdict `none`): nothing is said of its patches.
+    That of NoResult if one of the scans has none (verdict `none`); its patches are not printed.
 
     Raises
     ------
     DataError
-        when a folder holds no materials.
+        if a folder holds no materials.
     """
     scans = [read_products(folder, MATERIALS) for folder in data]
     if as_json:
@@ -229,9 +239,9 @@ def _patch_line(row: dict[str, Any]) -> str:
         return f"{row['label']:>3}  {'not judged':24s} {refused_text(row)}{drawn}\n"
     sure = f"{100 * row['confidence']:.0f} %" if row.get("confidence") is not None else ""
     e = row.get("permittivity")
-    told = _estimate(e) if e is not None else "metal-like" if row.get("metal_like") else "-"
+    value = _estimate(e) if e is not None else "metal-like" if row.get("metal_like") else "-"
     why = f"\n     {row['why']}" if row.get("why") else ""
-    return f"{row['label']:>3}  {_padded(name)} {sure:>5s}  {told}{drawn}".rstrip() + f"{why}\n"
+    return f"{row['label']:>3}  {_padded(name)} {sure:>5s}  {value}{drawn}".rstrip() + f"{why}\n"
 
 
 def _padded(name: str, width: int = 24) -> str:
@@ -240,9 +250,7 @@ def _padded(name: str, width: int = 24) -> str:
 
 
 def report(folder: Path) -> int:
-    """Say where the report of a scan is, and make it from the raw rows where it is not there; the exit status.
-
-    That of NoResult when the scan has none; the report says why.
+    """Print where the report of a scan is; make it if it is missing. Return the exit status, also that of NoResult.
 
     Raises
     ------

@@ -52,7 +52,7 @@ def export_cphd(folder: Path, out: Path | None) -> int:
 
 
 def phase_history(pipeline: Pipeline) -> PhaseHistory:
-    """What the rows of a pipeline hold: gains of the receivers taken out, no weights over the aperture.
+    """The phase history of all rows: gains of the receivers removed, no taper over the aperture.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def phase_history(pipeline: Pipeline) -> PhaseHistory:
 
 
 def _started(source: object) -> str:
-    """When the scan began; empty where nothing tells."""
+    """Start of the scan; empty if unknown."""
     facts = source.facts("scan_started") if isinstance(source, ScanFolder) else []
     return str(facts[0].get("started_utc", "")) if facts else ""
 

@@ -1,4 +1,4 @@
-"""How rows were placed: `inspect --placement` says it of one, `validate --replace` places a scan's rows again."""
+"""Placement of packets in rows: `inspect --placement` shows one row, `validate --replace` places all rows again."""
 
 from __future__ import annotations
 

@@ -284,7 +284,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
 
 
 def _focus_lines(head: str, distance_mm: float, found: Focus, plates: PlaneEstimate) -> list[str]:
-    """What `focus` says: the plane by the plates where there are any, and by sharpness."""
+    """Text of `focus`: the plane by the plates, if there are any, and by sharpness."""
     lines = []
     if plates.known:
         mm, std = 1e3 * plates.offset_m, 1e3 * plates.offset_std_m
@@ -312,7 +312,7 @@ def _focus_lines(head: str, distance_mm: float, found: Focus, plates: PlaneEstim
 
 
 def sync_report(data: Path, out: Path, config: Path | None) -> int:
-    """What synchronisation leaves of errors: figures, JSON, text; returns the exit status. Raises PolysightError."""
+    """Write figures, JSON and text of the residual errors of synchronisation; return the exit status."""
     from polysight.host.capture import row_words
     from polysight.host.report import SyncReport, write_sync_report
     from polysight.host.sync import BoardSetup, synchronise_row

@@ -282,7 +282,7 @@ def told_apart(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
 
 
 def _summary(out: Path, library: Library) -> list[str]:
-    """What a library holds, by material; names that differ in nothing but small and capital letters are pointed out."""
+    """Contents of a library by material; with a note on names that differ only in case."""
     lines = [f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans"]
     for name in library.names:
         mine = [e for e in library.entries if e.name == name]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.imaging import ChannelImages, Illumination, Rise, levelled
+from polysight.host.imaging import ChannelImages, Illumination, Rise, correct_tilt
 from polysight.host.materials.inversion import RigPrior
 from polysight.host.materials.segment import Box, Segmentation, SegmentSettings
 from polysight.host.materials.truth import TruthPlate
@@ -190,5 +190,5 @@ def level(images: ImagePair, found: Segmentation, tilts: Tilts | None = None) ->
         tilts = Tilts(rises, images.lit.across)
     there = [p for p in found.patches if p.label in tilts.rises]
     masks, own = [p.mask for p in there], [tilts.rises[p.label] for p in there]
-    h, v = levelled(images.h, images.v, images.lit, masks, own)
+    h, v = correct_tilt(images.h, images.v, images.lit, masks, own)
     return replace(images, h=h, v=v), tilts

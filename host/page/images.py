@@ -1,6 +1,6 @@
-"""What the live view shows of committed rows: images and range profiles, made by the instrument's own pipeline.
+"""Images and range profiles of committed rows for the live view, made by the instrument's own pipeline.
 
-`RowViewer` takes rows in a thread that may be slow; what it shows is replaced as a whole (`Shown`).
+`RowViewer` processes rows in a thread that may be slow, and replaces its results as a whole (`Shown`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polysight.host.catalogue import Picture, draw
 from polysight.host.imaging import Antennas, image_grid, scene_gate_m
-from polysight.host.page.story import Notice, of_error
+from polysight.host.page.history import Notice, notice_of_error
 from polysight.host.pipeline import Pipeline
 from polysight.host.store import Manifest, ScanFolder
 from polysight.host.sync import SyncedRow
@@ -34,7 +34,7 @@ _BEFORE_M, _BEYOND_M = 0.25, 0.35  # shown on either side of direct path and sce
 
 @dataclass(frozen=True)
 class Shown:
-    """What the rows so far look like. Replaced as a whole, never changed.
+    """Results of the rows so far; replaced as a whole, never changed.
 
     Attributes
     ----------
@@ -43,12 +43,12 @@ class Shown:
     pictures
         See :func:`polysight.host.catalogue.draw`.
     profile
-        Range profile of the last row: `row`, `excess_m` [n], `boards` {name: dB below the direct path [n]}, and where
-        the scene can be: `scene_m`.
+        Range profile of the last row: `row`, `excess_m` [n], `boards` {name: dB below the direct path [n]}, and the
+        range of the scene, `scene_m`.
     sync
-        {board: {row: (phase std in rad after all stages or nan, the same of the direct path, masked positions)}}.
+        {board: {row: (phase std after all stages, rad; the same of the direct path; masked positions)}}; nan: unknown.
     problem
-        Why rows are not shown.
+        The last error of a row.
     """
 
     revision: int = 0
@@ -78,7 +78,7 @@ def range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]
     chirp
         The chirp it was taken with.
     excess_m
-        float64 [n]: where to tell it.
+        float64 [n].
 
     Returns
     -------
@@ -96,12 +96,12 @@ def range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]
 
 
 class RowViewer:
-    """Takes committed rows of one scan, and shows what they make.
+    """Forms images of committed rows of one scan in a thread.
 
     Parameters
     ----------
     path
-        The scan folder; its manifest is not read here, see :meth:`want`.
+        The scan folder; its manifest is not read here.
     content
         Facts so far; grows while the scan runs.
     """
@@ -122,22 +122,22 @@ class RowViewer:
         self._thread = threading.Thread(target=self._run, name="rows", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def want(self, takes: dict[int, int]) -> None:
-        """Show these rows and takes, in this order."""
+        """Set the rows and takes to show, in this order."""
         with self._lock:
             self._wanted = dict(takes)
 
     def close(self) -> None:
-        """End after the row in hand."""
+        """Stop after the current row."""
         self._ended.set()
         if self._thread.is_alive():
             self._thread.join()
 
     def _next(self) -> tuple[int, int] | None:
-        """A row and take that is not shown yet."""
+        """The next row and take that is not processed; None if there is none."""
         with self._lock:
             todo = [
                 (row, take)
@@ -159,13 +159,13 @@ class RowViewer:
                 pipeline = pipeline or Pipeline(self._source, live=True, samples="read")
                 self._add(pipeline, row, take)
             except PolysightError as e:
-                self._fail(row, take, of_error(e))
-            except Exception as e:  # noqa: BLE001  whatever it is, the page says it, and the scan is not concerned
+                self._fail(row, take, notice_of_error(e))
+            except Exception as e:  # noqa: BLE001  the page shows it; the scan is not concerned
                 what = f"Row {row} cannot be shown: {type(e).__name__}: {e}"
-                self._fail(row, take, Notice("warn", what, "A fault of the live view", "Report it; the scan goes on"))
+                self._fail(row, take, Notice("warn", what, "A defect of the live view", "Report it; the scan goes on"))
 
     def _add(self, pipeline: Pipeline, row: int, take: int) -> None:
-        """Take a row in; show it unless others wait and something was shown just now."""
+        """Process a row; publish unless more rows wait and the last pictures are recent."""
         pipeline.add_row(row)
         self._done[row] = take
         self._keep_sync(pipeline, row)
@@ -186,14 +186,14 @@ class RowViewer:
 
     def _keep_sync(self, pipeline: Pipeline, row: int) -> None:
         for name, board in pipeline.quality.boards.items():
-            told = board.rows[row]
-            stages = told["stages"]
+            record = board.rows[row]
+            stages = record["stages"]
             object_rad = float(stages["referenced"][1]) if "referenced" in stages else float("nan")
             direct_rad = float(stages["averaged"][1]) if "averaged" in stages else float("nan")
-            self._sync.setdefault(name, {})[row] = (object_rad, direct_rad, int(told["positions_masked"]))
+            self._sync.setdefault(name, {})[row] = (object_rad, direct_rad, int(record["positions_masked"]))
 
     def _show(self, pictures: dict[str, Picture], profile: dict[str, Any]) -> None:
-        """Publish what there is now."""
+        """Publish new results."""
         sync = {name: dict(sorted(rows.items())) for name, rows in self._sync.items()}
         revision, rows = self.shown.revision + 1, tuple(sorted(self._done))
         self.shown = Shown(revision, rows, pictures, profile, sync, self._problem)

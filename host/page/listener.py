@@ -1,4 +1,4 @@
-"""The Pi's event stream, heard and never answered: no command socket exists here, so nothing can be asked of the Pi."""
+"""Receive the Pi's event stream. There is no command socket here, so the live view cannot command the Pi."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import zmq
 
-from polysight.host.page.story import Notice, of_error, of_fault
+from polysight.host.page.history import Notice, notice_of_error, notice_of_fault
 from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError, ProtocolError
 from polysight.shared.messages import (
@@ -29,23 +29,23 @@ _FAULTS = 20
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What was heard last. Replaced as a whole, never changed.
+class PiState:
+    """State of the Pi by its last events; replaced as a whole, never changed.
 
     Attributes
     ----------
     heard_s, heard_utc_s
-        When anything came, on the monotonic clock and in seconds since 1970; 0 before.
+        Time of the last event, on the monotonic clock and in seconds since 1970; 0 before.
     state
         The Pi's.
     x_mm, y_mm
-        Stage offset in the rig frame; None before it was told.
+        Stage offset in the rig frame; None while unknown.
     row, take, point
         Of the running row; row -1 between rows.
     faults
-        Those told since the last row that ended well.
+        Faults since the last row that was done.
     deaf
-        Why nothing can be heard.
+        Why no events can be received.
     """
 
     heard_s: float = 0.0
@@ -61,19 +61,19 @@ class Heard:
 
 
 class PiListener:
-    """Hears the events of one scan from a thread of its own.
+    """Receives the events of one scan in a thread of its own.
 
     Parameters
     ----------
     instrument
-        Where the Pi publishes.
+        Has the address at which the Pi publishes.
     scan_id
-        Whose events to take.
+        The scan whose events are taken.
     """
 
     def __init__(self, instrument: Instrument, scan_id: str) -> None:
         self._instrument, self._scan_id = instrument, scan_id
-        self.heard = Heard()
+        self.heard = PiState()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="listener", daemon=True)
         self._thread.start()
@@ -87,7 +87,7 @@ class PiListener:
                 if socket.poll(_TURN_MS):
                     self._take(socket.recv_multipart()[-1])
         except PolysightError as e:
-            self.heard = replace(self.heard, deaf=of_error(e, "note"))
+            self.heard = replace(self.heard, deaf=notice_of_error(e, "note"))
         finally:
             context.destroy(linger=0)
 
@@ -95,7 +95,7 @@ class PiListener:
         try:
             event = unpack_event(raw)
         except ProtocolError as e:
-            self.heard = replace(self.heard, deaf=of_error(e, "note"))
+            self.heard = replace(self.heard, deaf=notice_of_error(e, "note"))
             return
         h = replace(self.heard, heard_s=time.monotonic(), heard_utc_s=int(time.time()), deaf=None)
         if isinstance(event, Heartbeat):
@@ -111,10 +111,10 @@ class PiListener:
             elif isinstance(event, RowFinished):
                 h = replace(h, row=-1, point=0, faults=() if event.status == "done" else h.faults)
             elif isinstance(event, Fault):
-                h = replace(h, faults=(*h.faults, of_fault(event))[-_FAULTS:])
+                h = replace(h, faults=(*h.faults, notice_of_fault(event))[-_FAULTS:])
         self.heard = h
 
     def close(self) -> None:
-        """Hear no more."""
+        """Stop the thread."""
         self._ended.set()
         self._thread.join()

@@ -1,4 +1,4 @@
-"""What a page is told, as plain data: the whole state, and the little that changes while the stage moves."""
+"""The state of a scan as plain data for pages: all of it, and the part that changes while the stage moves."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from polysight.host.acquisition import ScanCommand, time_left
+from polysight.host.page.history import Notice, ScanHistory
 from polysight.host.page.images import Shown
-from polysight.host.page.listener import Heard
-from polysight.host.page.story import Notice, Story
-from polysight.host.page.verdict import Signs, judge, no_scan, sync_notices, unreadable
+from polysight.host.page.listener import PiState
+from polysight.host.page.status import LifeSigns, judge, no_scan, sync_notices, unreadable
 from polysight.host.verdict import Verdict
 from polysight.shared.raster import WIDTH_US
 
@@ -24,12 +24,12 @@ _MARKS = {"committed": "c", "kept": "k", "rejected": "r"}
 
 @dataclass(frozen=True)
 class Content:
-    """Everything a snapshot is made of."""
+    """Inputs of a snapshot."""
 
     folder: Path
-    story: Story | None
-    signs: Signs
-    heard: Heard
+    history: ScanHistory | None
+    signs: LifeSigns
+    heard: PiState
     shown: Shown
     asked: ScanCommand | None
     control: bool
@@ -39,21 +39,21 @@ class Content:
 
 def make_snapshot(c: Content) -> dict[str, Any]:
     """The whole state of a scan."""
-    if c.story is None:
+    if c.history is None:
         status = no_scan(c.folder) if not c.problem else unreadable(c.folder, c.problem)
         wishes = _control(c, running=False)
         return {"scan": None, "status": asdict(status), "control": wishes, "notices": _notices(c)}
-    story = c.story
-    marks = "".join(_MARKS.get(story.marks.get(row, ""), ".") for row in range(story.plan.rows))
+    history = c.history
+    marks = "".join(_MARKS.get(history.marks.get(row, ""), ".") for row in range(history.plan.rows))
     return {
-        "scan": _scan(c, story),
-        "status": asdict(judge(story, c.folder, c.signs, c.heard, c.shown, c.asked)),
-        "control": _control(c, running=story.ended is None and c.signs.alive),
-        "progress": {"rows": story.plan.rows, "committed": len(story.takes)},
+        "scan": _scan(c, history),
+        "status": asdict(judge(history, c.folder, c.signs, c.heard, c.shown, c.asked)),
+        "control": _control(c, running=history.ended is None and c.signs.alive),
+        "progress": {"rows": history.plan.rows, "committed": len(history.takes)},
         "marks": marks,
-        "boards": _boards(story, c.shown),
-        "trigger": _trigger(story),
-        "pictures": _pictures(story, c.shown),
+        "boards": _boards(history, c.shown),
+        "trigger": _trigger(history),
+        "pictures": _pictures(history, c.shown),
         "profile": _profile(c.shown),
         "sync": _sync(c.shown),
         "notices": _notices(c),
@@ -62,12 +62,12 @@ def make_snapshot(c: Content) -> dict[str, Any]:
 
 
 def make_motion(c: Content) -> dict[str, Any]:
-    """What changes from moment to moment: the stage, and the time left."""
-    if c.story is None:
+    """The fast-changing part: position of the stage, and time left."""
+    if c.history is None:
         return {"now_s": int(c.signs.now_s)}
-    h, story = c.heard, c.story
+    h, history = c.heard, c.history
     moving = h.x_mm is not None and h.y_mm is not None
-    left_s, basis = remaining(story, c.signs.now_s) if c.signs.alive else (None, "")
+    left_s, basis = remaining(history, c.signs.now_s) if c.signs.alive else (None, "")
     return {
         "now_s": int(c.signs.now_s),
         "left_s": left_s,
@@ -81,52 +81,52 @@ def make_motion(c: Content) -> dict[str, Any]:
 
 
 def _verdict(c: Content) -> dict[str, Any] | None:
-    """How far the results may be trusted, when the scan has ended and was processed."""
-    if c.verdict is None or c.story is None or c.story.ended is None:
+    """The verdict of the results, once the scan has ended and was processed."""
+    if c.verdict is None or c.history is None or c.history.ended is None:
         return None
     return {**c.verdict.to_dict(), "text": c.verdict.text}
 
 
-def remaining(story: Story, now_s: float) -> tuple[int | None, str]:
-    """Seconds to the scan's end and what they are known from (`measured`, `first row`, `plan`); None: not known."""
-    left, known = story.plan.rows - len(story.takes), story.row_seconds
-    if story.ended is not None or known is None:
+def remaining(history: ScanHistory, now_s: float) -> tuple[int | None, str]:
+    """Seconds to the scan's end and their origin (`measured`, `first row`, `plan`); None: not known."""
+    left, known = history.plan.rows - len(history.takes), history.row_seconds
+    if history.ended is not None or known is None:
         return (0, "measured") if left == 0 else (None, "")
     row_s, basis = known
-    since = max(story.last_commit_s, story.run_started_s)
-    return round(time_left(left, row_s, 0.0 if story.paused else now_s - since)), basis
+    since = max(history.last_commit_s, history.run_started_s)
+    return round(time_left(left, row_s, 0.0 if history.paused else now_s - since)), basis
 
 
-def _scan(c: Content, story: Story) -> dict[str, Any]:
-    plan = story.plan
+def _scan(c: Content, history: ScanHistory) -> dict[str, Any]:
+    plan = history.plan
     return {
-        "id": story.scan_id,
+        "id": history.scan_id,
         "folder": str(c.folder),
-        "rig": story.instrument.name,
-        "simulated": story.simulated,
-        "started_utc": story.started.get("started_utc", ""),
+        "rig": history.instrument.name,
+        "simulated": history.simulated,
+        "started_utc": history.started.get("started_utc", ""),
         "columns": plan.columns,
         "rows": plan.rows,
         "step_x_mm": plan.step_x_mm,
         "step_y_mm": plan.step_y_mm,
-        "receivers": [board.name for board in story.instrument.receivers],
+        "receivers": [board.name for board in history.instrument.receivers],
     }
 
 
 def _control(c: Content, running: bool) -> dict[str, Any]:
-    paused = c.story is not None and c.story.paused
+    paused = c.history is not None and c.history.paused
     return {"enabled": c.control, "running": running, "paused": paused, "asked": c.asked}
 
 
-def _boards(story: Story, shown: Shown) -> list[dict[str, Any]]:
+def _boards(history: ScanHistory, shown: Shown) -> list[dict[str, Any]]:
     found = []
-    for name, b in story.boards.items():
+    for name, b in history.boards.items():
         lost = b.frames_expected - b.frames_received
         sync = shown.sync.get(name, {})
         found.append(
             {
                 "name": name,
-                "role": story.instrument.by_name(name).role,
+                "role": history.instrument.by_name(name).role,
                 "frames_expected": b.frames_expected,
                 "frames_lost": lost,
                 "missing_bytes": b.missing_bytes,
@@ -138,26 +138,26 @@ def _boards(story: Story, shown: Shown) -> list[dict[str, Any]]:
     return found
 
 
-def _trigger(story: Story) -> dict[str, Any] | None:
-    if not story.trigger:
+def _trigger(history: ScanHistory) -> dict[str, Any] | None:
+    if not history.trigger:
         return None
-    health = story.trigger.values()
+    health = history.trigger.values()
     return {
         "width_max_us": max(h.width_max_ns for h in health) / 1e3,
         "jitter_max_us": max(h.jitter_max_ns for h in health) / 1e3,
         "width_limit_us": WIDTH_US[1],
-        "pulses": len(story.takes) * story.plan.columns * story.instrument.burst.pulses,
+        "pulses": len(history.takes) * history.plan.columns * history.instrument.burst.pulses,
     }
 
 
-def _pictures(story: Story, shown: Shown) -> dict[str, Any]:
+def _pictures(history: ScanHistory, shown: Shown) -> dict[str, Any]:
     items = {name: {"low": p.low, "high": p.high, "unit": p.unit} for name, p in shown.pictures.items()}
     return {
         "revision": shown.revision,
         "rows": len(shown.rows),
-        "waiting": max(0, len(story.takes) - len(shown.rows)),
-        "width_mm": story.instrument.image.columns * story.instrument.image.pixel_mm,
-        "height_mm": story.instrument.image.rows * story.instrument.image.pixel_mm,
+        "waiting": max(0, len(history.takes) - len(shown.rows)),
+        "width_mm": history.instrument.image.columns * history.instrument.image.pixel_mm,
+        "height_mm": history.instrument.image.rows * history.instrument.image.pixel_mm,
         "items": items,
     }
 
@@ -186,7 +186,7 @@ def _sync(shown: Shown) -> dict[str, Any]:
 
 
 def _notices(c: Content) -> list[dict[str, Any]]:
-    """The newest first."""
+    """All notices, the newest first."""
     found: list[Notice] = []
     if c.problem:
         found.append(
@@ -197,12 +197,12 @@ def _notices(c: Content) -> list[dict[str, Any]]:
                 f"`polysight validate {c.folder}`",
             )
         )
-    if c.story is not None:
-        if c.heard.deaf is not None and c.story.ended is None:
+    if c.history is not None:
+        if c.heard.deaf is not None and c.history.ended is None:
             found.append(c.heard.deaf)
         if c.shown.problem is not None:
             found.append(c.shown.problem)
-        found += sync_notices(c.shown, c.story.plan.columns)
+        found += sync_notices(c.shown, c.history.plan.columns)
         found += c.heard.faults
-        found += reversed(c.story.notices[-_NOTICES:])
+        found += reversed(c.history.notices[-_NOTICES:])
     return [asdict(n) for n in dict.fromkeys(found)]

@@ -1,8 +1,7 @@
-"""Keeps looking at one scan, and keeps the newest snapshot of it: what every page gets, whenever it comes.
+"""Follow one scan in a thread, and keep the newest snapshot of it for all pages.
 
-The scan's manifest and event log are followed as they grow (`ManifestTail`, `EventTail`). A snapshot is made once and
-kept as bytes, so that pages cost nothing but sending, however many there are and however slow they are, and all see the
-same.
+Manifest, event log and products are read as they change (`ManifestTail`, `EventTail`, `ProductsTail`). A snapshot is
+serialised once, so that a page costs only its transmission, and all pages see the same.
 """
 
 from __future__ import annotations
@@ -12,19 +11,21 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgpack
 
 from polysight.host.acquisition import ScanCommand, last_alive_s, send_command
+from polysight.host.page.history import ScanHistory
 from polysight.host.page.images import RowViewer, Shown
-from polysight.host.page.listener import Heard, PiListener
-from polysight.host.page.result import ResultTail
+from polysight.host.page.listener import PiListener, PiState
 from polysight.host.page.snapshot import Content, make_motion, make_snapshot
-from polysight.host.page.story import Story
-from polysight.host.page.verdict import Signs
+from polysight.host.page.status import LifeSigns
+from polysight.host.products import MATERIALS, QUALITY, find_products
 from polysight.host.store import EVENTS, MANIFEST, Fact, Manifest, manifest
+from polysight.host.verdict import Verdict
 from polysight.shared.errors import PolysightError, ProtocolError
 from polysight.shared.messages import AnyEvent, unpack_with_crc
 
@@ -32,19 +33,19 @@ _HEAD = 256
 _TURN_S = 0.2
 _LAPSE_S = 15.0  # the scan program touches its file once a second
 _GRACE_S = 6.0  # from a manifest's first line to the first sign of life
-_PI_LIMIT_S = 6.0
+_PI_LIMIT_S = 6.0  # timeout of the Pi's heartbeat
 _UNATTENDED_ROWS = 3.0  # a scan without signs of life lives while rows come, and for so many rows' time
 
 
 class GrowingFile:
-    """The bytes behind those that were taken.
+    """Bytes that were appended to a file since the last read.
 
     Attributes
     ----------
     replaced
-        Whether the last :meth:`look` found another file than the one before; it is then read from the beginning.
+        True if the last :meth:`look` found another file; it is then read from the beginning.
     modified_s
-        When it was written last, seconds since 1970 by the file system; 0 before it was seen.
+        Time of the last change by the file system, seconds since 1970; 0 before the file exists.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,7 +56,7 @@ class GrowingFile:
         self._seen = (0, -1, -1)
 
     def look(self) -> bytes:
-        """What follows the bytes taken so far; empty when nothing has changed, or the file cannot be read."""
+        """Bytes after those taken so far; empty if nothing has changed or the file cannot be read."""
         self.replaced = False
         try:
             with self.path.open("rb") as f:
@@ -75,31 +76,31 @@ class GrowingFile:
             return b""
 
     def take(self, count: int) -> None:
-        """So many of the bytes were whole records; the next look begins behind them."""
+        """Mark so many bytes as read: those of whole records."""
         self._position += count
 
 
 class ManifestTail:
-    """New facts of a manifest."""
+    """Facts appended to a manifest."""
 
     def __init__(self, path: Path) -> None:
         self.file = GrowingFile(path)
 
     def look(self) -> list[Fact]:
-        """Facts that have come since the last look."""
+        """Facts since the last look."""
         new = manifest.parse(self.file.look())
         self.file.take(new.length)
         return new.facts
 
 
 class EventTail:
-    """New events of an event log; it ends at the first damage, until `resume` has repaired the file."""
+    """Events appended to an event log, up to the first damage, which `resume` repairs."""
 
     def __init__(self, path: Path) -> None:
         self.file = GrowingFile(path)
 
     def look(self) -> list[AnyEvent]:
-        """Events that have come since the last look."""
+        """Events since the last look."""
         raw = self.file.look()
         unpacker = msgpack.Unpacker(raw=True, max_buffer_size=max(len(raw), 1))
         unpacker.feed(raw)
@@ -115,24 +116,57 @@ class EventTail:
         return events
 
 
+class ProductsTail:
+    """The verdict of a scan's products, read again when they change.
+
+    Parameters
+    ----------
+    folder
+        The scan folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._seen: tuple[tuple[int, int], ...] | None = None
+        self._verdict: Verdict | None = None
+
+    def look(self) -> Verdict | None:
+        """The verdict; None if not processed yet, by an earlier release, or if the products cannot be read."""
+        found = find_products(self._folder, QUALITY)
+        seen = () if found is None else tuple(_state(found.folder / name) for name in (MATERIALS, QUALITY))
+        if seen != self._seen:
+            self._seen, self._verdict = seen, None
+            with suppress(PolysightError):  # they are being replaced, or damaged
+                self._verdict = None if found is None else found.verdict
+        return self._verdict
+
+
+def _state(path: Path) -> tuple[int, int]:
+    try:
+        status = path.stat()
+    except OSError:
+        return 0, 0
+    return status.st_mtime_ns, status.st_size
+
+
 class Versioned(NamedTuple):
-    """Something that was published: its number and its JSON."""
+    """Published JSON with its version number."""
 
     version: int
     data: bytes
 
 
 class Watch:
-    """Looks at a scan folder from a thread of its own, until :meth:`close`.
+    """Follows a scan folder in a thread of its own, until :meth:`close`.
 
     Parameters
     ----------
     folder
-        The scan folder; it may not be there yet. Nothing in it is written, but for what :meth:`ask` asks.
+        The scan folder; it may not exist yet. Only :meth:`ask` writes into it.
     control
-        Whether wishes may be asked.
+        True if the scan may be controlled.
     lapse_s
-        Silence of the scan program after which it counts as gone.
+        Timeout of the scan program's signs of life.
     """
 
     def __init__(self, folder: Path, control: bool = False, lapse_s: float = _LAPSE_S) -> None:
@@ -148,15 +182,15 @@ class Watch:
         self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
 
     def start(self) -> None:
-        """Begin to look on."""
+        """Start the thread."""
         self._thread.start()
 
     def _begin(self) -> None:
-        """Forget everything: another scan may be in the folder now."""
+        """Reset all state: another scan may be in the folder now."""
         self._manifest, self._events = ManifestTail(self.folder / MANIFEST), EventTail(self.folder / EVENTS)
-        self._result = ResultTail(self.folder)
+        self._result = ProductsTail(self.folder)
         self._content = Manifest()
-        self._story: Story | None = None
+        self._history: ScanHistory | None = None
         self._viewer: RowViewer | None = None
         self._listener: PiListener | None = None
         self._problem = ""
@@ -167,78 +201,82 @@ class Watch:
         while not self._ended.wait(_TURN_S):
             try:
                 self._turn()
-            except Exception as e:  # noqa: BLE001  a page that stands still must not say that all is well
+            except Exception as e:  # noqa: BLE001  a view that has failed must not show "All is well"
                 self._problem = f"the live view fails: {type(e).__name__}: {e}"
-                nothing = Content(self.folder, None, self._signs(Heard()), Heard(), Shown(), None, False, self._problem)
+                nothing = Content(
+                    self.folder, None, self._signs(PiState()), PiState(), Shown(), None, False, self._problem
+                )
                 self.state = _publish(self.state, make_snapshot(nothing))
 
     def _turn(self) -> None:
-        """One look at everything; publishes what has changed."""
+        """Read everything once, and publish what has changed."""
         self._read()
         self._attend()
         self.shown = self._viewer.shown if self._viewer is not None else Shown()
-        heard = self._listener.heard if self._listener is not None else Heard()
+        heard = self._listener.heard if self._listener is not None else PiState()
         content = Content(
-            self.folder, self._story, self._signs(heard), heard, self.shown, self._wish(), self.control, self._problem,
-            self._result.look(),
+            self.folder, self._history, self._signs(heard), heard, self.shown, self._wish(), self.control,
+            self._problem, self._result.look(),
         )  # fmt: skip
         self.state = _publish(self.state, make_snapshot(content))
         self.motion = _publish(self.motion, make_motion(content))
 
     def _read(self) -> None:
-        """Take in what the files have gained."""
+        """Read what was appended to the files."""
         facts = self._manifest.look()
         if self._manifest.file.replaced:
             self._close_parts()
             self._begin()
             facts = self._manifest.look()
         if facts:
-            self._grown_at = time.monotonic() if self._looked else self._grown_at  # what was there need not be new
+            self._grown_at = (
+                time.monotonic() if self._looked else self._grown_at
+            )  # at the first look nothing is known to be new
         self._looked = True
         self._content.facts += facts
         for fact in facts:
             try:
-                if self._story is None and fact["fact"] == "scan_started":
-                    self._story = Story(fact)
-                elif self._story is not None:
-                    self._story.add_fact(fact)
+                if self._history is None and fact["fact"] == "scan_started":
+                    self._history = ScanHistory(fact)
+                elif self._history is not None:
+                    self._history.add_fact(fact)
             except (PolysightError, KeyError, TypeError, ValueError) as e:
-                self._problem = f"{self.folder / MANIFEST} holds a {fact['fact']} that is not understood: {e}"
-        if self._story is not None:
-            self._story.add_events(self._events.look())
+                self._problem = f"{self.folder / MANIFEST}: unreadable {fact['fact']}: {e}"
+        if self._history is not None:
+            self._history.add_events(self._events.look())
 
     def _attend(self) -> None:
-        """The row thread and the listener, as long as they are needed."""
-        story = self._story
-        if story is None:
+        """Start and stop the row viewer and the listener as needed."""
+        history = self._history
+        if history is None:
             return
         if self._viewer is None:
             self._viewer = RowViewer(self.folder, self._content)
             self._viewer.start()
-        self._viewer.want(story.takes)
-        if story.ended is None and self._listener is None:
-            self._listener = PiListener(story.instrument, story.scan_id)
-        elif story.ended is not None and self._listener is not None:
+        self._viewer.want(history.takes)
+        if history.ended is None and self._listener is None:
+            self._listener = PiListener(history.instrument, history.scan_id)
+        elif history.ended is not None and self._listener is not None:
             self._listener.close()
             self._listener = None
 
-    def _signs(self, heard: Heard) -> Signs:
-        """Whether the scan program and the Pi live."""
+    def _signs(self, heard: PiState) -> LifeSigns:
+        """Signs of life of the scan program and the Pi."""
         now, wall = time.monotonic(), time.time()
         life = last_alive_s(self.folder)
         if life is not None and life != self._life_seen:
             age = max(0.0, wall - life) if self._life_seen is None else 0.0  # from then on changes count, not clocks
             self._life_seen, self._life_at = life, now - age
-        known = None if self._story is None else self._story.row_seconds
+        known = None if self._history is None else self._history.row_seconds
         patience = _GRACE_S if known is None else max(_GRACE_S, _UNATTENDED_ROWS * known[0])
         alive = now - self._grown_at < patience if life is None else now - self._life_at < self._lapse_s
         alive_s = 0 if alive else round(life or self._manifest.file.modified_s)
         silent = now - heard.heard_s if heard.heard_s else None
-        return Signs(alive, alive_s, silent, _PI_LIMIT_S, wall)
+        return LifeSigns(alive, alive_s, silent, _PI_LIMIT_S, wall)
 
     def _wish(self) -> ScanCommand | None:
-        """What was asked, until the manifest shows that it came to pass."""
-        if self._asked is None or self._story is None:
+        """The pending request, until the manifest shows that it was carried out."""
+        if self._asked is None or self._history is None:
             return None
         wish, facts = self._asked
         since = {f["fact"] for f in self._content.facts[facts:]}
@@ -248,14 +286,14 @@ class Watch:
         return wish
 
     def ask(self, wish: ScanCommand) -> None:
-        """Ask the scan for something; returns when it has heard. Raises ScanError."""
+        """Ask the scan to pause, continue, stop or abort; returns when it has taken the request. Raises ScanError."""
         before = len(self._content.facts)
         send_command(self.folder, wish)
-        paused = self._story is not None and self._story.paused
+        paused = self._history is not None and self._history.paused
         self._asked = None if wish is ScanCommand.CONTINUE and not paused else (wish, before)
 
     def wait_for(self, condition: Callable[[dict[str, Any]], bool], limit_s: float) -> bool:
-        """Until a snapshot meets a condition; whether it did within the limit."""
+        """Wait until a snapshot meets a condition; False after the limit."""
         deadline = time.monotonic() + limit_s
         while not condition(json.loads(self.state.data)):
             if time.monotonic() > deadline:
@@ -269,7 +307,7 @@ class Watch:
                 part.close()
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop all threads."""
         self._ended.set()
         if self._thread.is_alive():
             self._thread.join()

@@ -1,4 +1,4 @@
-"""The application: pages, what they read and what they ask for, behind the guard."""
+"""The web application: static pages, GET and POST routes, error answers, behind the guard."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from polysight.host.serve.guard import Guard, refused
 from polysight.host.serve.reading import reading_routes
 from polysight.host.serve.site import Site
 from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, DataError, PolysightError
+from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
 
 STATIC = Path(__file__).parent / "static"
 PAGES = {
@@ -31,7 +31,7 @@ PAGES = {
 
 
 def make_app(site: Site) -> Starlette:
-    """The application of a site."""
+    """Build the application of a site."""
 
     async def page(request: Request) -> Response:
         path, only = request.url.path, site.scans.only
@@ -66,7 +66,8 @@ async def _error(request: Request, e: Exception) -> Response:
     if not isinstance(e, PolysightError):
         raise e
     status = 400 if isinstance(e, ConfigError) else 404 if isinstance(e, DataError) else 409
-    return refused(503 if e.code is ErrorCode.NO_ANSWER else status, e.code, e.what, e.why, e.remedy)
+    silent = isinstance(e, DeviceError) and e.code is ErrorCode.NO_ANSWER
+    return refused(503 if silent else status, e.code, e.what, e.why, e.remedy)
 
 
 async def _not_found(request: Request, e: Exception) -> Response:

@@ -1,8 +1,8 @@
-"""Connections with limits: who is slow is let go, and who is slow in numbers makes room for who is not.
+"""HTTP connections with timeouts and a limit on their number.
 
-uvicorn waits for ever for a request's head, and counts who sends none among those that it serves: eighty half-open
-connections would lock everybody out. Here a head has some seconds, an answer that nobody takes a minute, and of too
-many connections the one that has waited longest without a request goes first.
+uvicorn has no timeout for a request's head: eighty half-open connections would lock everybody out. Here the head must
+come within `HEAD_S`, an answer must be taken within `STALLED_S`, and above `MOST` connections the one that has been
+idle for longest is closed.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ HEAD_BYTES = 16384
 KEEP_ALIVE_S = 5
 
 
-class PatientProtocol(H11Protocol):
-    """uvicorn's HTTP/1.1 with deadlines."""
+class TimeoutProtocol(H11Protocol):
+    """uvicorn's HTTP/1.1 with timeouts."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -30,19 +30,19 @@ class PatientProtocol(H11Protocol):
 
     @property
     def idle(self) -> bool:
-        """Whether no request is being answered."""
+        """True if no request is being answered."""
         return self.cycle is None or self.cycle.response_complete
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for a head; when there are too many, let the oldest idle one go, or this one."""
+        """Start the timeout of the head; of too many connections, close the one idle for longest."""
         super().connection_made(transport)
         self._wait_for_head()
         if len(self.connections) > MOST:
-            waiting = [c for c in self.connections if isinstance(c, PatientProtocol) and c.idle]
+            waiting = [c for c in self.connections if isinstance(c, TimeoutProtocol) and c.idle]
             min(waiting, key=lambda c: c._since).transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes in."""
+        """Receive bytes."""
         super().data_received(data)
         if not self.idle:
             self._cancel("_head")
@@ -55,17 +55,17 @@ class PatientProtocol(H11Protocol):
         super().on_response_complete()
 
     def pause_writing(self) -> None:
-        """Nobody takes what is sent."""
+        """Start the timeout of an answer that is not taken."""
         super().pause_writing()
         self._stalled = self.loop.call_later(STALLED_S, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """It is taken again."""
+        """Stop it."""
         super().resume_writing()
         self._cancel("_stalled")
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The end."""
+        """Stop all timeouts."""
         self._cancel("_head")
         super().connection_lost(exc)
         self._cancel("_stalled")

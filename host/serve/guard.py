@@ -1,8 +1,8 @@
-"""Who may ask what: names of the host, origin, token, rate of wrong tokens, size and time of a body; and safe headers.
+"""Access checks of every request: Host, Origin, token, rate of wrong tokens, size and time of the body; safe headers.
 
-One middleware before everything else. Reading needs the token too unless the server is bound to loopback. The token
-comes in a header, which no form, link or image of another page can send; what reads (images, event streams) may bring
-the session's cookie instead, which allows nothing else.
+One middleware in front of the application. Reading needs the token too unless the server is bound to loopback. The
+token comes in a header, which no form, link or image of another page can send; requests that only read (images, event
+streams) may bring the session's cookie instead.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from polysight.shared.error_codes import ErrorCode
 TOKEN_HEADER = "X-Polysight-Token"
 BODY_BYTES, BODY_S = 1 << 16, 10.0
 TRIES, TRIES_A_SECOND = 20.0, 5.0
-"""Wrong tokens of one address that are compared at once, and each second; a session that was opened is not counted."""
-_ADDRESSES = 4096  # that are remembered
+"""Wrong tokens that one address may send at once, and per second; requests with an open session are not limited."""
+_ADDRESSES = 4096  # remembered at most
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob:; object-src 'none'; base-uri 'none';"
     " form-action 'none'; frame-ancestors 'none'",
@@ -39,27 +39,27 @@ HEADERS = {
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
     "Cache-Control": "no-store",
 }
-_OPEN_PATHS = ("/api/session", "/api/page")  # what a page needs to find out that it lacks the token
+_OPEN_PATHS = ("/api/session", "/api/page")  # with these a page finds out that its token is missing
 
 
 @dataclass(frozen=True)
 class Access:
-    """Who is let in.
+    """Access rules of one server.
 
     Attributes
     ----------
     token
-        For control, and for reading unless `loopback`; "" where nobody may control and everybody may read.
+        Needed for control, and for reading unless `loopback`; "": nobody controls, everybody reads.
     loopback
-        Whether the server is bound to this machine alone.
+        True if the server is bound to this machine only.
     hosts
-        Further names the server answers to, as `Host` has them.
+        Further host names of the server.
     control
-        Whether anything may be asked for.
+        True if POST requests are allowed.
     secure
-        Whether it speaks TLS.
+        True with TLS.
     session
-        The cookie's secret, of this start of the server.
+        Secret of the session cookie, new at each start of the server.
     """
 
     token: str = ""
@@ -70,7 +70,7 @@ class Access:
     session: str = field(default_factory=lambda: secrets.token_urlsafe(18))
 
     def knows_host(self, host: str) -> bool:
-        """Whether a `Host` is a name of this server: a name of somebody else that points here is not."""
+        """True if a `Host` header names this server (a foreign name that resolves to it does not)."""
         name = _name_of(host)
         if name in ("localhost", *self.hosts):
             return True
@@ -78,15 +78,15 @@ class Access:
             address = ipaddress.ip_address(name)
         except ValueError:
             return False
-        return address.is_loopback or not self.loopback  # who gives an address was not sent here by a foreign name
+        return address.is_loopback or not self.loopback  # an address: no foreign name led here
 
     def holds_token(self, headers: Headers) -> bool:
-        """Whether the request brings the token; compared in constant time."""
+        """True if the request has the token; compared in constant time."""
         given = headers.get(TOKEN_HEADER, "")
         return bool(self.token) and hmac.compare_digest(given.encode(), self.token.encode())
 
     def holds_session(self, headers: Headers, port: int) -> bool:
-        """Whether it brings the cookie of an opened session."""
+        """True if the request has the cookie of an open session."""
         given = cookie_parser(headers.get("cookie", "")).get(cookie_name(port), "")
         return hmac.compare_digest(given.encode(), self.session.encode())
 
@@ -110,7 +110,7 @@ class WrongTokens:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def spent(self, address: str) -> bool:
-        """Whether this address has to wait."""
+        """True if this address must wait."""
         return self._left(address) < 1
 
     def note(self, address: str) -> None:
@@ -133,7 +133,7 @@ class Guard:
         self._wrong = WrongTokens()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse, or pass on."""
+        """Refuse the request, or pass it on."""
         if scope["type"] != "http":
             return
         refusal = self._refusal(scope, Headers(scope=scope))
@@ -147,7 +147,7 @@ class Guard:
             await _closing(answer)(scope, receive, _with_headers(send))
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        """Why a request is not let in."""
+        """The refusal of a request; None if it is allowed."""
         method, path = scope["method"], scope["path"]
         if sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_BYTES:
             what = f"The head is longer than {HEAD_BYTES} bytes"
@@ -172,7 +172,7 @@ class Guard:
         return self._unknown(scope, headers)
 
     def _unknown(self, scope: Scope, headers: Headers) -> Response | None:
-        """Whether token or session are missing for what is asked."""
+        """The refusal of a request without the token or session that it needs; None if it is allowed."""
         access, writes = self._access, scope["method"] == "POST"
         if writes and not access.control and scope["path"] != "/api/session":
             return refused(
@@ -206,31 +206,31 @@ def refused(status: int, code: ErrorCode, what: str, why: str, do: str) -> Respo
 
 
 def _closing(answer: Response) -> Response:
-    """The same on a connection that ends with it: what is left of the request is not read."""
+    """The same answer, after which the connection is closed: the rest of the request is not read."""
     answer.headers["Connection"] = "close"
     return answer
 
 
 def length_of(headers: Headers) -> int:
-    """Bytes of the body as the request says; 0 where it does not."""
+    """Content-Length of a request; 0 if it is missing or wrong."""
     text = headers.get("content-length", "0")
     return int(text) if text.isdecimal() and len(text) < 19 else 0
 
 
 def _same_site(headers: Headers, scheme: str, writes: bool) -> bool:
-    """Whether the request comes from a page of this server, or from no page at all."""
+    """True if the request comes from a page of this server, or from no page."""
     if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
         return False
     origin = headers.get("origin")
     if origin is None:
         return True
-    told = urlsplit(origin)
-    same = told.netloc == headers.get("host", "") and told.scheme == scheme
+    parts = urlsplit(origin)
+    same = parts.netloc == headers.get("host", "") and parts.scheme == scheme
     return same if writes else same or "sec-fetch-site" in headers
 
 
 class BodyError(Exception):
-    """A body that is too large or too slow."""
+    """The body of a request is too large or too slow."""
 
     def __init__(self, status: int, what: str) -> None:
         super().__init__(what)
@@ -238,13 +238,13 @@ class BodyError(Exception):
 
 
 def _limited(receive: Receive) -> Receive:
-    """The same body, refused when it grows beyond the limit or takes too long."""
+    """Receive the body with the limits of size and time."""
     taken, begun, whole = 0, time.monotonic(), False
 
     async def limited() -> Message:
         nonlocal taken, whole
         if whole:
-            return await receive()  # a stream waits here for its page to go
+            return await receive()  # an event stream waits here until its page disconnects
         try:
             message = await asyncio.wait_for(receive(), max(0.05, BODY_S - (time.monotonic() - begun)))
         except TimeoutError:
@@ -259,7 +259,7 @@ def _limited(receive: Receive) -> Receive:
 
 
 def _with_headers(send: Send) -> Send:
-    """Every answer with the headers that keep other sites out."""
+    """Send the security headers with every answer."""
 
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":

@@ -1,9 +1,9 @@
-"""Starts programs for the server, from a small process of its own, which loads nothing else of this package.
+"""A small process that starts programs for the server; it imports nothing of this package.
 
-The server has stepped back (low priority, first to go when memory runs out), and whatever it started would inherit
-that; a scan must not. So this is started before, and forks for it. Each line of stdin is a request (`words`, `cwd`,
-`base`): the program runs in a session of its own, its output in `base`.log, its number in `base`.json, its exit status,
-when it has ended, in `base`.status. A line of stdout answers. When the server is gone, this ends; the programs go on.
+The server runs with low priority, and its children would inherit that; a scan must not. So this process is started
+before and forks for the server. Each line of stdin is a request (`words`, `cwd`, `base`): the program runs in a session
+of its own, with its output in `base`.log, its process number in `base`.json and finally its exit status in
+`base`.status. A line of stdout answers. This process ends with the server; the programs go on.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _LOOK_S = 2.0
 
 
 def started_ticks(pid: int) -> int | None:
-    """When a living process began, in ticks since the machine did: with the number it names it for good."""
+    """Start time of a running process in clock ticks since boot, or None; it tells reused process numbers apart."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -32,7 +32,7 @@ def started_ticks(pid: int) -> int | None:
 
 
 def launch(words: list[str], cwd: str, base: str) -> subprocess.Popen[bytes]:
-    """Start one program, and write down which it is."""
+    """Start one program, and record its process number and start time."""
     place = Path(base)
     place.parent.mkdir(parents=True, exist_ok=True)
     for suffix in (".status", ".json"):
@@ -41,21 +41,26 @@ def launch(words: list[str], cwd: str, base: str) -> subprocess.Popen[bytes]:
     with Path(base + ".log").open("a", encoding="utf-8") as log:
         log.write(f"--- {now} {' '.join(words)}\n")
     program = subprocess.Popen(["/bin/sh", "-c", _SHELL, base, *words], cwd=cwd, start_new_session=True)
-    told: dict[str, Any] = {"pid": program.pid, "ticks": started_ticks(program.pid), "words": words, "started_utc": now}
+    record: dict[str, Any] = {
+        "pid": program.pid,
+        "ticks": started_ticks(program.pid),
+        "words": words,
+        "started_utc": now,
+    }
     part = Path(base + ".part")
-    part.write_text(json.dumps(told) + "\n", encoding="utf-8")
+    part.write_text(json.dumps(record) + "\n", encoding="utf-8")
     part.replace(base + ".json")
     return program
 
 
 def main() -> int:
-    """Serve until the other end of stdin is gone."""
+    """Handle requests until stdin is closed."""
     os.set_blocking(0, True)
     running: list[subprocess.Popen[bytes]] = []
     with selectors.DefaultSelector() as selector:
         selector.register(0, selectors.EVENT_READ)
         while True:
-            running = [program for program in running if program.poll() is None]  # those that ended are taken leave of
+            running = [program for program in running if program.poll() is None]  # reaps those that have ended
             if not selector.select(_LOOK_S):
                 continue
             line = sys.stdin.readline()

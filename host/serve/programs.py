@@ -1,7 +1,7 @@
-"""Programs that the page starts: commands of `polysight`, each a process that outlives page and server.
+"""Commands of `polysight` that the page starts, each a process that outlives page and server.
 
-A program's number and log lie in `<folder>/program/`, so that another server finds it again. It is asked to pause or
-stop as from a terminal: by files in `<scan>/control/`. No signal is ever sent to a number that a file names.
+A program's process number and log lie in `<folder>/program/`, where another server finds them. It is paused and stopped
+as from a terminal, by files in `<scan>/control/`; no signal is ever sent to a process number that a file names.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 from polysight.host.catalogue import PROGRAM, is_plain, log_tail
 from polysight.host.serve import launcher
 from polysight.host.serve.launcher import started_ticks
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, ScanError
 
 KINDS = ("scan", "process", "export", "doctor", "train")
@@ -32,9 +33,9 @@ class Program:
     kind
         One of `KINDS`.
     running
-        Whether it lives.
+        True while its process exists.
     status
-        Its exit status; None while it lives, or when it was killed before it could say.
+        Its exit status; None while it runs, or if it was killed.
     words
         Its command line, from `polysight` on.
     """
@@ -47,15 +48,12 @@ class Program:
     log: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
+        """As plain data for JSON."""
         return self.__dict__ | {"words": list(self.words)}
 
 
 class Programs:
-    """Starts programs, and says how those of a folder are.
-
-    Make it before the server steps back: programs inherit nothing of that (see `launcher`).
-    """
+    """Starts programs; create it before the server lowers its priority (see `launcher`)."""
 
     def __init__(self) -> None:
         command = [sys.executable, "-I", str(Path(launcher.__file__))]  # as a module it would load all of this server
@@ -70,13 +68,18 @@ class Programs:
         Raises
         ------
         ScanError
-            when a program of this kind runs there already.
+            if a program of this kind is running there.
         DeviceError
-            when none can be started.
+            if none can be started.
         """
         with self._lock:
             if (found := program_of(folder, kind)) is not None and found.running:
-                raise ScanError(f"{folder}: {kind} runs already", "it was started before", "wait for it, or stop it")
+                raise ScanError(
+                    f"{folder}: {kind} runs already",
+                    "it was started before",
+                    "wait for it, or stop it",
+                    code=ErrorCode.BUSY,
+                )
             _check_place(folder / PROGRAM, kind)
             base = str((folder / PROGRAM).absolute() / kind)
             words = [sys.executable, "-m", "polysight", *map(str, words)]
@@ -100,7 +103,7 @@ class Programs:
         return str(json.loads(line)) if line else "the launcher has ended"
 
     def close(self) -> None:
-        """Start nothing more; what runs goes on."""
+        """End the launcher; started programs go on."""
         for pipe in (self._launcher.stdin, self._launcher.stdout):
             if pipe is not None:
                 pipe.close()
@@ -108,32 +111,33 @@ class Programs:
 
 
 def _check_place(place: Path, kind: str) -> None:
-    """Refuse a folder of logs that somebody has made so that other files would be written. Raises DeviceError."""
+    """Refuse a folder of logs with links, through which other files would be overwritten. Raises DeviceError."""
     files = [place / f"{kind}{suffix}" for suffix in (".json", ".log", ".status", ".part")]
     for path in (place, *files):
         if path.is_symlink() or (path != place and path.exists() and not is_plain(path)):
             raise DeviceError(
                 f"{path} is no file of its own",
                 "the folder was made by another program",
-                "remove it, and look who made it",
+                "remove it, and find out who made it",
+                code=ErrorCode.PATH_OUTSIDE,
             )
 
 
 def programs_of(folder: Path) -> list[Program]:
-    """Every program that was started for a folder, the newest first."""
+    """All programs started for a folder, the newest first."""
     found = [program for kind in KINDS if (program := program_of(folder, kind)) is not None]
     return sorted(found, key=lambda p: p.started_utc, reverse=True)
 
 
 def program_of(folder: Path, kind: str) -> Program | None:
-    """One of them; None where none was started."""
+    """The program of a kind that was started last for a folder; None if there is none."""
     base = folder / PROGRAM / kind
     if (folder / PROGRAM).is_symlink() or not is_plain(base.with_suffix(".json")):
         return None
     try:
-        told = json.loads(base.with_suffix(".json").read_text(encoding="utf-8")[:100_000])
-        pid, ticks = int(told["pid"]), int(told["ticks"])
-        words, began = [str(w) for w in told["words"]], str(told["started_utc"])
+        record = json.loads(base.with_suffix(".json").read_text(encoding="utf-8")[:100_000])
+        pid, ticks = int(record["pid"]), int(record["ticks"])
+        words, began = [str(w) for w in record["words"]], str(record["started_utc"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
     running = started_ticks(pid) == ticks

@@ -1,4 +1,4 @@
-"""`polysight serve` and `polysight preview`: bind, step back, say the address, and serve until Ctrl-C."""
+"""`polysight serve` and `polysight preview`: bind, lower the priority, print the address, serve until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import quote
 
 import uvicorn
 from starlette.applications import Starlette
@@ -21,20 +20,20 @@ from starlette.applications import Starlette
 from polysight.host.catalogue import Scans
 from polysight.host.page import Watch
 from polysight.host.serve.app import make_app
-from polysight.host.serve.connections import HEAD_BYTES, KEEP_ALIVE_S, MOST, PatientProtocol
+from polysight.host.serve.connections import HEAD_BYTES, KEEP_ALIVE_S, MOST, TimeoutProtocol
 from polysight.host.serve.guard import Access
 from polysight.host.serve.programs import Programs
 from polysight.host.serve.site import Site
 from polysight.host.serve.watches import Watches
 from polysight.shared.errors import ConfigError, DeviceError
 
-NICE = 10  # of the server: everything else goes first
-_END_S = 1  # to let go of the pages
+NICE = 10  # priority of the server, below capture and scan
+_END_S = 1  # to close connections
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a server is reached.
+    """Address of a server.
 
     Attributes
     ----------
@@ -54,11 +53,11 @@ class Place:
 
     @property
     def loopback(self) -> bool:
-        """Whether the address reaches this machine only."""
+        """True if only this machine can reach the address."""
         return is_loopback(self.host)
 
     def check(self) -> None:
-        """Refuse files that are not there. Raises ConfigError."""
+        """Raise ConfigError for missing files of TLS."""
         if (self.certificate is None) != (self.key is None):
             raise ConfigError("--certificate and --key", "TLS needs both", "give both, or none")
         for path in (self.certificate, self.key):
@@ -72,32 +71,32 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
     Raises
     ------
     PolysightError
-        when the folder or a file is not there, or the address cannot be bound.
+        if the folder or a file is missing, or the address cannot be bound.
     """
     place.check()
     if not root.is_dir():
         raise ConfigError(f"{root}: no such folder", "scans are listed under it", "make it, or give another")
     listener = _bind(place)
     programs = Programs() if control else None
-    step_back()
+    lower_priority()
     access = _access(place, listener, control)
     config = None if config is None else config.absolute()
     site = Site(Scans(root.absolute()), access, Watches(control), programs, config)
-    threading.Thread(target=site.scans.list, name="first look", daemon=True).start()  # the page finds it done
-    return _run(site, place, listener, f"scans in {root}", "")
+    threading.Thread(target=site.scans.list, name="first list", daemon=True).start()  # cached before the page asks
+    return _run(site, place, listener, f"scans in {root}")
 
 
 def preview(folder: Path, place: Place, control: bool) -> int:
     """Serve the live view of one scan folder until Ctrl-C; returns the exit status. Raises as :func:`serve`."""
     place.check()
     listener = _bind(place)
-    step_back()
+    lower_priority()
     folder = folder.absolute()
     watch = Watch(folder, control)
     watch.start()
     access = _access(place, listener, control)
     site = Site(Scans(folder.parent, folder.name), access, Watches(control, {folder.name: watch}))
-    return _run(site, place, listener, f"live view of {folder}", "")
+    return _run(site, place, listener, f"live view of {folder}")
 
 
 def _access(place: Place, listener: socket.socket, control: bool) -> Access:
@@ -107,9 +106,9 @@ def _access(place: Place, listener: socket.socket, control: bool) -> Access:
     return Access(token, place.loopback, (*hosts, *place.hosts), control, place.certificate is not None)
 
 
-def _run(site: Site, place: Place, listener: socket.socket, what: str, path: str) -> int:
+def _run(site: Site, place: Place, listener: socket.socket, what: str) -> int:
     try:
-        sys.stderr.write(_welcome(site, place, listener, what, path))
+        sys.stderr.write(_welcome(site, place, listener, what))
         sys.stderr.flush()
         server(make_app(site), site, place).run(sockets=[listener])
     finally:
@@ -119,12 +118,12 @@ def _run(site: Site, place: Place, listener: socket.socket, what: str, path: str
 
 
 def server(app: Starlette, site: Site, place: Place | None = None) -> uvicorn.Server:
-    """A quiet server with deadlines, which ends within a second of being told to."""
+    """Build a server with timeouts and without logging, which stops within a second."""
     logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
     place = place or Place()
     config = uvicorn.Config(
         app,
-        http=PatientProtocol,
+        http=TimeoutProtocol,
         ws="none",
         lifespan="off",
         log_config=None,
@@ -143,7 +142,7 @@ def server(app: Starlette, site: Site, place: Place | None = None) -> uvicorn.Se
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address to bind reaches this machine only."""
+    """True if only this machine can reach an address to bind."""
     if host == "localhost":
         return True
     try:
@@ -169,8 +168,8 @@ def _bind(place: Place) -> socket.socket:
     return listener
 
 
-def step_back() -> None:
-    """Everything else goes first: the processor to capture and scan, and memory too, should it run out."""
+def lower_priority() -> None:
+    """Give capture and scan the processor first, and have the kernel end this process first when memory runs out."""
     with contextlib.suppress(OSError, ValueError):
         _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, 1 << 16), most))  # connections are files
@@ -180,17 +179,17 @@ def step_back() -> None:
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
 
-def _welcome(site: Site, place: Place, listener: socket.socket, what: str, path: str) -> str:
+def _welcome(site: Site, place: Place, listener: socket.socket, what: str) -> str:
     host, port = str(listener.getsockname()[0]), listener.getsockname()[1]
     shown = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname(), "::1": "localhost"}.get(host, host)
     token, scheme = site.access.token, "http" if place.certificate is None else "https"
     address = f"{scheme}://[{shown}]:{port}/" if ":" in shown else f"{scheme}://{shown}:{port}/"
-    lines = [f"{what}: {address}{quote(path)}{f'#token={token}' if token else ''}"]
+    lines = [f"{what}: {address}{f'#token={token}' if token else ''}"]
     if site.access.control:
-        lines.append("whoever has this address with its token can start, pause and stop scans")
+        lines.append("anyone with this address and its token can start, pause and stop scans")
     else:
         lines.append("read-only; --control adds buttons to pause and stop the scan")
     if not place.loopback:
         plain = "; nothing is encrypted: --certificate and --key do that" if place.certificate is None else ""
-        lines.append(f"who reaches this machine and has the token can look on{plain}")
-    return "\n".join(lines) + "\nCtrl-C ends the page; what it started goes on\n"
+        lines.append(f"anyone who reaches this machine and has the token can read all scans{plain}")
+    return "\n".join(lines) + "\nCtrl-C ends the page; started programs go on\n"

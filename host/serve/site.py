@@ -34,20 +34,20 @@ T = TypeVar("T")
 
 
 class Site:
-    """One served folder of scans.
+    """Shared state of the requests to one server.
 
     Parameters
     ----------
     scans
-        What is shown.
+        The scans that are shown.
     access
-        Who is let in.
+        Access rules.
     watches
         Live views.
     programs
-        Starts programs; None where nothing can be started.
+        Starts programs; None: nothing can be started.
     config
-        Rig file of new scans; None where there is none.
+        Rig file of new scans; None: there is none.
     """
 
     def __init__(
@@ -109,13 +109,13 @@ class Site:
         return self.scans.root / HIDDEN
 
     def libraries(self) -> dict[str, Path]:
-        """Libraries that were trained here, by name."""
+        """Libraries trained here, by name."""
         folder = self.scans.root / LIBRARIES
         found = sorted(folder.glob("*.npz")) if folder.is_dir() and not folder.is_symlink() else []
         return {path.stem: path for path in found if path.is_file() and not path.is_symlink()}
 
     def close(self) -> None:
-        """End what belongs to the server; programs go on."""
+        """Close the live views; started programs go on."""
         self.watches.close()
         if self.programs is not None:
             self.programs.close()
@@ -217,7 +217,7 @@ class Sizes:
         self._lock = threading.Lock()
 
     def of(self, folder: Path) -> int | None:
-        """The bytes as counted last; None before that."""
+        """Size in bytes at the last count; None before the first."""
         size, at = self._known.get(folder, (None, float("-inf")))
         now = time.monotonic()
         if now - at > _SIZES_S:

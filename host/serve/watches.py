@@ -1,4 +1,4 @@
-"""The live views that are open: one `Watch` a scan, as long as a page looks on."""
+"""Open live views: one `Watch` per scan, kept while a page shows it, and their event streams."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from polysight.shared.errors import DeviceError
 STREAMS = 48
 _MOST, _LINGER_S = 4, 30.0
 _LOOK_S = 0.1
-_ALIVE_S = 2.0  # a page that hears nothing for some of these tries to connect anew
+_ALIVE_S = 2.0  # a page that receives nothing for some of these reconnects
 
 
 class Watches:
-    """Opens a watch when a page asks for a scan, and closes it some time after the last page has gone.
+    """Opens a watch when a page asks for a scan, and closes it some time after the last page has disconnected.
 
     Parameters
     ----------
     control
-        Whether wishes may be asked.
+        True if scans may be controlled.
     kept
-        Watches that were opened before and stay, by name.
+        Watches that stay open, by name.
     """
 
     def __init__(self, control: bool, kept: dict[str, Watch] | None = None) -> None:
@@ -86,21 +86,21 @@ class Watches:
 
     @property
     def full(self) -> bool:
-        """Whether no page more can be told."""
+        """True if no further event stream is allowed."""
         return sum(self._streams.values()) >= STREAMS
 
     async def events(self, name: str, watch: Watch, ending: Callable[[], bool]) -> AsyncIterator[bytes]:
-        """Server-sent events of one page: the newest state and motion, never an older one.
+        """Server-sent events of one page: always the newest state and motion.
 
-        Nothing is queued: who reads slowly is sent less often, and waits in `yield` for the socket to take more.
+        Nothing is queued: a slow page gets fewer events, since `yield` waits for its socket.
         """
-        told = {"state": -1, "motion": -1}
+        sent = {"state": -1, "motion": -1}
         silent_s = 0.0
         with self._stream(name):
             while not ending():
                 for kind, newest in (("state", watch.state), ("motion", watch.motion)):
-                    if newest.version != told[kind]:
-                        told[kind], silent_s = newest.version, 0.0
+                    if newest.version != sent[kind]:
+                        sent[kind], silent_s = newest.version, 0.0
                         yield b"event: %s\nid: %d\ndata: %s\n\n" % (kind.encode(), newest.version, newest.data)
                 if silent_s >= _ALIVE_S:
                     silent_s = 0.0

@@ -5,12 +5,12 @@ Also `sync_folder`, which makes names in a folder durable, and `crc32` (zlib-ng'
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import os
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
+from polysight.host.capture import write_error
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
 from polysight.shared.files import open_to_write
@@ -45,7 +45,7 @@ class AppendFile:
                 self.length = os.fstat(self._file.fileno()).st_size
                 stack.pop_all()
         except OSError as e:
-            raise self._failed("created" if fresh else "opened", e) from None
+            raise write_error(path, "created" if fresh else "opened", e) from None
 
     def lock(self) -> bool:
         """Lock this file until it is closed; return False if another program has locked it.
@@ -62,7 +62,7 @@ class AppendFile:
                 f"{self.path}: cannot be locked: {e.strerror}",
                 "a network disk whose server offers no locks, or the disk fails",
                 "put the scan on a local disk, or have its server offer locks",
-                code=ErrorCode.FILE_UNREADABLE,
+                code=ErrorCode.FILE_UNWRITABLE,
             ) from None
         return True
 
@@ -72,7 +72,7 @@ class AppendFile:
             os.ftruncate(self._file.fileno(), length)
             os.fsync(self._file.fileno())
         except OSError as e:
-            raise self._failed("cut at its last complete record", e) from None
+            raise write_error(self.path, "cut at its last complete record", e) from None
         self.length = length
 
     def append(self, data: bytes) -> None:
@@ -86,20 +86,12 @@ class AppendFile:
         except OSError as e:
             with suppress(OSError):
                 os.ftruncate(self._file.fileno(), self.length)
-            raise self._failed("written", e) from None
+            raise write_error(self.path, "written", e) from None
         self.length = end
 
     def close(self) -> None:
         """Close the file. Safe to repeat."""
         self._file.close()
-
-    def _failed(self, done: str, e: OSError) -> DeviceError:
-        return DeviceError(
-            f"{self.path}: cannot be {done}: {e.strerror}",
-            "the disk is full, read-only or fails",
-            f"free space; `polysight resume {self.path.parent}` continues after the last committed row",
-            code=ErrorCode.DISK_FULL if e.errno == errno.ENOSPC else ErrorCode.FILE_UNREADABLE,
-        )
 
 
 def sync_folder(path: Path) -> None:
@@ -111,9 +103,5 @@ def sync_folder(path: Path) -> None:
         finally:
             os.close(descriptor)
     except OSError as e:
-        raise DeviceError(
-            f"{path}: cannot be made durable: {e.strerror}",
-            "the disk is full or fails",
-            f"free space below {path}, then continue",
-            code=ErrorCode.DISK_FULL,
-        ) from None
+        what, why = f"{path}: cannot be made durable: {e.strerror}", "the disk is full or fails"
+        raise DeviceError(what, why, f"free space below {path}", code=ErrorCode.FILE_UNWRITABLE) from None

@@ -42,7 +42,6 @@ class Manifest:
     numbers: list[int] = field(default_factory=list)  # line number (from 1) of each fact
     length: int = 0  # bytes up to the end of the last complete line
     torn: bool = False  # an incomplete line follows
-    damaged: list[int] = field(default_factory=list)  # numbers of lines with a wrong CRC or form
     faults: list[ManifestFault] = field(default_factory=list)  # damaged lines and breaks in the chain
     count: int = 0  # of the next line
     digest: str = ""  # that the next line must have
@@ -91,7 +90,6 @@ def parse(raw: bytes) -> Manifest:
             found.torn = True
             break
         if fact is None:
-            found.damaged.append(number)
             found.faults.append(ManifestFault(number, "damaged: its CRC is wrong", 1))
             found.count += 1
         else:

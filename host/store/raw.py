@@ -120,7 +120,7 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
                         f"{path}: cannot be removed: {e.strerror}",
                         "you may not write there, or the disk fails",
                         f"mend that, then `polysight drop-raw {scan.path}` deletes the rest",
-                        code=ErrorCode.FILE_UNREADABLE,
+                        code=ErrorCode.FILE_UNWRITABLE,
                     ) from None
         for folder in {path.parent for files in found.files.values() for path in files.values()}:
             sync_folder(folder)
@@ -128,12 +128,6 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
 
 
 def _fact(row: CommittedRow, boards: list[str], products: str) -> Fact:
-    said = {n: {"file": b.file, "bytes": b.bytes, "crc32": b.crc32} for n, b in row.boards.items() if n in boards}
-    return {
-        "fact": "raw_dropped",
-        "row": row.row,
-        "take": row.take,
-        "boards": said,
-        "products": products,
-        "dropped_utc": utc_now(),
-    }
+    files = {n: {"file": b.file, "bytes": b.bytes, "crc32": b.crc32} for n, b in row.boards.items() if n in boards}
+    fact: Fact = {"fact": "raw_dropped", "row": row.row, "take": row.take, "boards": files}
+    return {**fact, "products": products, "dropped_utc": utc_now()}

@@ -368,12 +368,8 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as e:
-        raise DeviceError(
-            f"{folder}: cannot be made: {e.strerror}",
-            "the disk is full or read-only",
-            "free space, or choose another folder",
-            code=ErrorCode.FILE_UNREADABLE,
-        ) from None
+        what, why = f"{folder}: cannot be made: {e.strerror}", "the disk is full or read-only"
+        raise DeviceError(what, why, "free space, or choose another folder", code=ErrorCode.FILE_UNWRITABLE) from None
     sync_folder(folder.parent)
 
 

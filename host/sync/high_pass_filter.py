@@ -174,7 +174,8 @@ def fit_high_pass(
         raise DataError(
             f"no filter fits the sweep: corners of {', '.join(f'{c / 1e3:.0f}' for c in corners)} kHz",
             "the IF range does not include the filter's corners, or the reflector moved",
-            "sweep the IF from about half the lower corner to several times the upper one",
+            "measure at mean IFs from about 250 kHz, which trigger jitter of 200 kHz spreads to half the lower corner,"
+            " to several times the upper corner (docs/how-to/calibration.md)",
             code=ErrorCode.MISMATCH,
         )
     return HighPass(tuple(float(c) for c in corners))

@@ -27,11 +27,11 @@ KINDS = (
     "flows",  # a switch sends packets by turns over queues of different length
     "truncate",
     "turn_header_bit",
-    "reset",  # the card's counters begin anew, in mid-stream
+    "reset",  # the card restarts in mid-stream
     "reset_early",  # in the record's first packets
     "reset_between",  # before the record
     "miss_frames",  # triggers are missed: the record is shorter
-    "end_early",  # the record ends by itself and another one begins: two short packets in one stream
+    "end_early",  # the card ends the record and starts another: two short packets in one stream
     "clock",  # the clock of the arrivals jumps
 )
 _GAP_NS = 20_000  # between packets
@@ -160,7 +160,7 @@ class Adversary:
         if "backlog" in t:
             late |= set(range(max(0, n - chance.randint(1, 4)), n))
         self._late += [Arrival(0, packets[k], sent.number) for k in sorted(late - gone)]
-        coming = [(float(k), self._spoilt(packets[k], t)) for k in range(n) if k not in gone | late]
+        coming = [(float(k), self._damaged(packets[k], t)) for k in range(n) if k not in gone | late]
         if "duplicate" in t and coming:
             coming += [chance.choice(coming) for _ in range(chance.randint(1, 4))]
         if "two_paths" in t:
@@ -173,7 +173,7 @@ class Adversary:
             coming = [(k + 5 * (int(k) % 3), p) for k, p in coming]
         return [p for _, p in sorted(coming, key=lambda kp: kp[0])]
 
-    def _spoilt(self, packet: bytes, troubles: tuple[str, ...]) -> bytes:
+    def _damaged(self, packet: bytes, troubles: tuple[str, ...]) -> bytes:
         if "truncate" in troubles and self._chance.random() < 0.05:
             return packet[: self._chance.randint(DATA_HEADER_BYTES, len(packet))]
         if "turn_header_bit" in troubles and self._chance.random() < 0.05:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.shared.config import Board, Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 from polysight.shared.raster import burst_middle_s, plan_raster
 from polysight.shared.units import us_to_ns
@@ -31,6 +32,7 @@ def sync_line(rig: Instrument, board: Board) -> int:
             f"pi.sync_out names {len(rig.pi.sync_out)} lines for {len(rig.boards)} boards",
             'wiring = "lines" needs one line for every board, in the order of [[boards]]',
             'add lines to pi.sync_out, or use wiring = "fanout"',
+            code=ErrorCode.VALUES_CONFLICT,
         )
     return rig.pi.sync_out[rig.boards.index(board)]
 

@@ -4,11 +4,11 @@
  *   GPIOSHIM_CHIP=PATH     the device; made here, a link to /dev/null
  *   GPIOSHIM_WIRES=SOCKET  hub of the simulated wires (shared/wires.py): S lines in are levels on inputs, S lines out are
  *                          changes of outputs, with the time (CLOCK_MONOTONIC) at which they were made
- *   GPIOSHIM_LABEL, GPIOSHIM_LINES                                    what the chip says of itself
+ *   GPIOSHIM_LABEL, GPIOSHIM_LINES                                    label and size of the chip
  *   GPIOSHIM_FAULTS=denied,no-edges,busy:LINE,slow:US                 faults from the start
  *   GPIOSHIM_SPI=PATH      a spidev device beside it: spidev.c
- *   GPIOSHIM_CLOCK=wires   edges carry their wire time; the thread that reads them lives in it: a sleep ends at once and
- *                          takes as long as was asked for. So a burst is exact however busy the machine is
+ *   GPIOSHIM_CLOCK=wires   edges carry their wire time, which the thread that reads them uses: a sleep returns at once and
+ *                          takes exactly its duration. So a burst is exact even on a busy machine
  *   SIGUSR1                                                           the chip vanishes, as when a driver is unloaded
  *
  * As the kernel does: a request's event buffer drops its oldest event when it is full, and line_seqno tells; edges are
@@ -156,7 +156,7 @@ static int ask_lines(struct request *r, int fd, unsigned long what, void *arg) {
   return 0;
 }
 
-/* ---- the calls that are stood in for ---- */
+/* ---- the replaced system calls ---- */
 static int show_bufsiz(void) {
   char text[16];
   const int length = shown_bufsiz(text, sizeof text), fd = memfd_create("bufsiz", MFD_CLOEXEC);

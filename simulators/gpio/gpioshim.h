@@ -1,4 +1,4 @@
-/* What gpioshim.c (the calls that are stood in for), lines.c (levels, edges, times) and spidev.c (transfers) share. */
+/* Shared by gpioshim.c (replaced system calls), lines.c (levels, edges, times) and spidev.c (transfers). */
 #ifndef GPIOSHIM_H
 #define GPIOSHIM_H
 #define _GNU_SOURCE

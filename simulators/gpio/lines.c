@@ -1,4 +1,4 @@
-/* The lines of the stand-in chip: times, outputs on their way to the simulated wires, and edges that come from there. */
+/* The lines of the stand-in chip: times, outputs sent to the simulated wires, and edges received from them. */
 #include "gpioshim.h"
 #include <errno.h>
 #include <poll.h>
@@ -17,7 +17,7 @@ struct shared *shared;
 __thread uint64_t thread_ns;
 
 /* ---- time ---- */
-#define ROW_GAP_NS 250000000ULL /* between edges of the wires; then wire time is set to the clock's anew */
+#define ROW_GAP_NS 250000000ULL /* between edges of the wires; then wire time is synchronised with the clock again */
 #define CALL_NS 200             /* what looking at the clock takes in wire time */
 
 static uint64_t to_ns(const struct timespec *t) { return t->tv_sec * 1000000000ULL + t->tv_nsec; }
@@ -74,7 +74,7 @@ void set_output_at(unsigned n, int value, uint64_t ns) { /* 0: now */
   shared->head = head + 1;
 }
 
-static void tell(uint64_t ns, unsigned line, unsigned value) {
+static void report(uint64_t ns, unsigned line, unsigned value) {
   char text[64];
   const int n = snprintf(text, sizeof text, "S %llu %u %u\n", (unsigned long long)ns, line, value);
   if (wires >= 0 && send(wires, text, n, MSG_NOSIGNAL) != n) wires = -1;
@@ -87,11 +87,11 @@ void carry(int alive) {
     ended = poll(&end, 1, 1) > 0;
     for (; shared->tail != shared->head; shared->tail++) {
       const struct change *c = &shared->ring[shared->tail % RING];
-      tell(c->ns, c->line, c->value);
+      report(c->ns, c->line, c->value);
     }
   }
   for (unsigned n = 0; n < n_lines; n++)
-    if (shared->high[n]) tell(now_ns(CLOCK_MONOTONIC), n, 0);
+    if (shared->high[n]) report(now_ns(CLOCK_MONOTONIC), n, 0);
   _exit(0);
 }
 

@@ -1,8 +1,8 @@
-"""The radar boards of a simulated rig, as their control connections show them.
+"""Simulated radar boards at their control connections; `scene` simulates their signals.
 
-`board` is one AWR2243 at its SPI lines (mmWaveLink), `cores` what is behind them, `wire` its messages as bytes, `image`
-firmware for it; `control` is how a host reaches it: through its USB chip, at a TCP
-address, or by the line server that stands for the published rig's MATLAB servers. What the radars see is in `scene`.
+`board` is an AWR2243 at its SPI lines (mmWaveLink), `cores` its two cores and flash, `wire` encodes its messages,
+`image` makes firmware for it. `control` connects it to a host: through its USB chip, at a TCP address, or by the line
+server that simulates the published rig's MATLAB servers.
 """
 
 from polysight.simulators.radars.board import FUNCTIONAL, Fault, RadarBoard

@@ -1,7 +1,7 @@
-"""`python -m polysight.simulators.radars TRACE`: play the host's side of a trace to a simulated board.
+"""`python -m polysight.simulators.radars TRACE`: replay the host's side of a trace to a simulated board.
 
-Says where the simulated board answers otherwise than the one the trace was taken from: what the stand-in does not know,
-or what was broken that day. The trace's form: docs/spec/mmwavelink.md.
+Prints where the simulated board answers differently from the traced one: a limit of the simulator, or a fault of the
+traced board. Format of the trace: docs/spec/mmwavelink.md.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from polysight.simulators.radars.board import FUNCTIONAL, RadarBoard
 from polysight.simulators.radars.image import make_image
 
-_LOOK_S, _PATIENCE_S = 1e-4, 15.0
+_STEP_S, _TIMEOUT_S = 1e-4, 15.0
 
 
 class _Time:
@@ -27,15 +27,15 @@ class _Time:
 
 
 def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> list[str]:
-    """Lines that say where the board answers otherwise; none when it is the same. Raises OSError, ValueError."""
+    """Return a line for each different answer of the board. Raises OSError, ValueError."""
     time = _Time()
     board, differences = make(time.now), []
     if not trace.is_file():
-        raise ValueError("no regular file")
+        raise ValueError("not a regular file")
     lines = trace.read_text(encoding="utf-8").splitlines()
     first = json.loads(lines[0]) if lines else None
     if len(lines) < 2 or not isinstance(first, dict) or first.get("trace") != 1:
-        raise ValueError("no trace of form 1, or an empty one")
+        raise ValueError("not a trace of version 1, or an empty one")
     for number, line in enumerate(lines, 1):
         record = json.loads(line)
         time.s = max(time.s, record.get("t", 0.0))
@@ -43,19 +43,19 @@ def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> li
             board.sense(FUNCTIONAL)
             board.reset(held=not record["level"])
         elif record.get("line") == "HOST_INTR" and record["level"]:
-            until = time.s + _PATIENCE_S
+            until = time.s + _TIMEOUT_S
             while not board.interrupt and time.s < until:
-                time.s += _LOOK_S
+                time.s += _STEP_S
             if not board.interrupt:
-                differences.append(f"line {number}: the simulated board has nothing to say here")
+                differences.append(f"line {number}: the simulated board sends nothing here")
         elif "out" in record:
             for word in _words(record["out"]):
                 board.write_word(word)
         elif "in" in record:
-            said = [board.read_word() for _ in _words(record["in"])]
-            if said != _words(record["in"]):
-                here = b"".join(w.to_bytes(2, "little") for w in said).hex()
-                differences.append(f"line {number}: the board said {record['in']}, the simulated one {here}")
+            sent = [board.read_word() for _ in _words(record["in"])]
+            if sent != _words(record["in"]):
+                here = b"".join(w.to_bytes(2, "little") for w in sent).hex()
+                differences.append(f"line {number}: the traced board sent {record['in']}, the simulated one {here}")
     return differences
 
 
@@ -65,15 +65,15 @@ def _words(text: str) -> list[int]:
 
 
 def main() -> int:
-    """Exit status 0 when the simulated board answers the same."""
+    """Return 0 if the simulated board answers the same."""
     parser = argparse.ArgumentParser(
         prog="python -m polysight.simulators.radars",
         description=__doc__,
         epilog="example:\n  python -m polysight.simulators.radars first-day.jsonl",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("trace", type=Path, metavar="TRACE", help="a file that `polysight radar --trace FILE` wrote")
-    parser.add_argument("--empty-flash", action="store_true", help="a board on its first day")
+    parser.add_argument("trace", type=Path, metavar="TRACE", help="a file of `polysight radar --trace FILE`")
+    parser.add_argument("--empty-flash", action="store_true", help="simulate a new board")
     args = parser.parse_args()
     flash = b"" if args.empty_flash else make_image()
     try:

@@ -1,10 +1,8 @@
-"""A simulated AWR2243 board as its SPI lines show it: words in and out, host interrupt, reset and sense lines, pulses.
+"""A simulated AWR2243 board at its SPI lines: words, host interrupt, reset and sense lines, SYNC_IN pulses.
 
-It speaks mmWaveLink of its own (nothing is shared with the host's codec), as TI's interface control document says and
-as real devices were seen to: it answers with a 16-bit CRC, refuses with message id 0, reports a main core fault at
-power-up and then works, comes with an empty flash, and has its data 1 ms after the interrupt. Time is a clock that is
-passed in. What goes wrong is asked for with :meth:`RadarBoard.inject`. A stand-in: how a real device times things is
-not known here.
+It has its own mmWaveLink codec, after TI's interface control document and the observed behaviour of devices: answers
+with a 16-bit CRC, refusals with message id 0, a harmless main core fault at power-up, an empty flash at first, data 1
+ms after the interrupt. The clock is a parameter; `RadarBoard.inject` sets faults. Real timing is not known.
 """
 
 from __future__ import annotations
@@ -24,51 +22,51 @@ ANSWER_S, DATA_S = 1e-4, 1e-3
 
 
 class Fault(Enum):
-    """What goes wrong, once, with the next answer; `EVENT_BETWEEN` sends an event before it."""
+    """Fault of the next answer; `EVENT_BETWEEN` sends an event before it."""
 
-    NACK = "says that the command came damaged"
+    NACK = "reports a damaged command"
     REFUSE = "refuses the command"
     REFUSE_BARE = "refuses the command without a body"
     BAD_CRC = "one bit of the answer's body flips"
     BAD_CHECKSUM = "one bit of the answer's header flips"
     BAD_SYNC = "words before the answer"
     LOST_INTERRUPT = "the interrupt does not come"
-    NO_ANSWER = "hears nothing"
+    NO_ANSWER = "does not answer"
     EVENT_BETWEEN = "an event comes first"
 
 
 class RadarBoard:
-    """One board.
+    """A board.
 
     Parameters
     ----------
     now
-        Seconds.
+        Clock, seconds.
     flash
-        What is in the serial flash; empty on the first day. `make_image()` is an image that it boots from.
+        Content of the serial flash; empty in a new board. It boots from `make_image()`.
     dead_s
-        From a frame's pulse to the next one it bears; the frame period when None.
+        Minimum time from a frame's pulse to the next; default: the frame period.
     fault_pulses
         Pulses since the start, from 0, at which the RF core faults.
     die
-        Tells boards apart: part of the die id.
+        Part of the die id, which identifies the board.
     supply_v
-        Of the RF supplies; LDO bypass at 1.3 V destroys the board.
+        Voltage of the RF supplies; LDO bypass at 1.3 V destroys the board.
     erase_s
-        How long the flash takes to be erased.
+        Duration of erasing the flash.
     fault_at
-        When the main core reports its harmless fault: "power-up", "download" or "never".
+        Time of the main core's harmless fault: "power-up", "download" or "never".
     functional_jumpers
-        SOP0 set, SOP1 and SOP2 open. Without them the sense lines do not reach functional mode.
+        SOP0 set, SOP1 and SOP2 open, which functional mode requires.
     first_generation
-        Boots and refuses as an AWR1243 was seen to.
+        Boots and refuses like an AWR1243.
     answers_32_bit
-        Answers with a CRC of 32 bits. Reports have one where the host asked for it.
+        Answers with a CRC of 32 bits; events have one if the host requested it.
 
     Attributes
     ----------
     cores
-        What the device knows: settings, flash, what it obeyed.
+        Settings, flash and executed commands.
     """
 
     def __init__(
@@ -101,7 +99,7 @@ class RadarBoard:
 
     @property
     def executed(self) -> list[int]:
-        """Numbers of the sub-blocks obeyed, in order."""
+        """Numbers of the executed sub-blocks, in order."""
         return self.cores.executed
 
     @property
@@ -111,17 +109,17 @@ class RadarBoard:
 
     @property
     def armings(self) -> int:
-        """How often frames were started."""
+        """Number of frame starts."""
         return self.cores.armings
 
     @property
     def destroyed(self) -> bool:
-        """Whether its supplies have destroyed it."""
+        """True if LDO bypass has destroyed it."""
         return self.cores.destroyed
 
     def _forget(self) -> None:
         self._in, self._out = bytearray(), bytearray()
-        self._waiting: deque[bytes] = deque()  # messages that the host has not asked for yet
+        self._waiting: deque[bytes] = deque()  # messages not read by the host yet
         self._later: list[tuple[float, bytes]] = []
         self._offered, self._ready_at = False, 0.0
         self._last: tuple[int, bytes] = (-1, b"")
@@ -129,20 +127,20 @@ class RadarBoard:
         self.cores.forget()
 
     def inject(self, *faults: Fault) -> None:
-        """Let these happen to the next answers, one each, instead of what is left of earlier ones."""
+        """Set the faults of the next answers, one each; earlier ones are discarded."""
         self._faults = deque(faults)
 
     # lines
 
     def power(self, on: bool) -> None:
-        """Switch the board's supply; its USB chip has one of its own. What is in the flash stays, finished or not."""
+        """Switch the board's supply, not that of its USB chip; the flash keeps its content."""
         self._forget()
         self.powered = on
         if on and not self._held:
             self._boot()
 
     def sense(self, mode: int) -> None:
-        """Set the sense-on-power lines, read when the reset is released."""
+        """Set the sense-on-power lines, which are read at the release of the reset."""
         self._mode = mode
 
     def reset(self, held: bool) -> None:
@@ -159,22 +157,22 @@ class RadarBoard:
 
     @property
     def interrupt(self) -> bool:
-        """The host interrupt line. Raises DeviceError when unplugged."""
+        """Level of the host interrupt line. Raises DeviceError if unplugged."""
         self._check()
-        self._due()
+        self._deliver()
         return self._offered
 
     @property
     def ready_for_triggers(self) -> bool:
-        """Whether a pulse starts a frame now."""
-        self._due()
+        """True if a pulse would start a frame now."""
+        self._deliver()
         return self.cores.armed and self.cores.frames_left != 0
 
     def trigger(self, pulse_s: float | None = None) -> bool:
-        """A rising edge on SYNC_IN, now or at a time of the pulses' own clock; whether it starts a frame.
+        """Give a rising edge on SYNC_IN, now or at a time of the pulses' clock; return True if it starts a frame.
 
-        One that comes too soon is a fault, and the board hears no pulse any more. A time that jumps back by more than
-        that is another clock.
+        An edge that comes too early causes a fault, after which pulses are ignored. A time that jumps back further is
+        taken for another clock.
         """
         self._pulses_seen += 1
         if not self.ready_for_triggers:
@@ -200,9 +198,9 @@ class RadarBoard:
     # words
 
     def write_word(self, word: int) -> None:
-        """A word from the host, chip select toggled. Raises DeviceError when unplugged."""
+        """Receive a word from the host. Raises DeviceError if unplugged."""
         self._check()
-        self._due()
+        self._deliver()
         self._in += word.to_bytes(2, "little")
         while len(self._in) >= 4 and self._in[:4] not in (TO_DEVICE, READY):
             del self._in[:2]
@@ -214,16 +212,16 @@ class RadarBoard:
         elif self._in[:4] == TO_DEVICE and len(self._in) >= 16:
             length = int.from_bytes(self._in[6:8], "little")
             if ones_sum(bytes(self._in[4:16])) != 0xFFFF:
-                self._in.clear()  # no response at all; the host times out
+                self._in.clear()  # no response: the host has a timeout
             elif len(self._in) >= 4 + length:
                 raw = bytes(self._in[4 : 4 + length])
                 del self._in[: 4 + length]
                 self._message(raw)
 
     def read_word(self) -> int:
-        """A word to the host; all ones when there is none, or it is not ready. Raises DeviceError when unplugged."""
+        """Send a word to the host; all ones if there is none yet. Raises DeviceError if unplugged."""
         self._check()
-        self._due()
+        self._deliver()
         if not self._out or self.now() < self._ready_at - 1e-9:
             return 0xFFFF
         word = int.from_bytes(self._out[:2], "little")
@@ -234,9 +232,9 @@ class RadarBoard:
 
     def _check(self) -> None:
         if not self.plugged:
-            raise DeviceError("the simulated radar is unplugged", "it was asked to be", "plug it in")
+            raise DeviceError("the simulated radar is unplugged", "a test unplugged it", "plug it in")
 
-    def _due(self) -> None:
+    def _deliver(self) -> None:
         for at, raw in sorted(self._later, key=lambda p: p[0]):
             if at <= self.now():
                 self._later.remove((at, raw))
@@ -263,14 +261,14 @@ class RadarBoard:
             self._send(frame(direction, NACK, number, b"", 0, sequence, wide), 0.0)
             return
         if flags & 3 == 3 and self._last[0] == sequence and self._last[1]:
-            self._send(self._last[1], 0.0)  # the answer was lost: it is given again, nothing is done twice
+            self._send(self._last[1], 0.0)  # a retry: repeat the answer, without executing the command again
             return
         delay, error = ANSWER_S, 0
         body, blocks, block = raw[12 : length - 4], b"", 0
         for _ in range(count):
             block, size = struct.unpack_from("<HH", body)
             refused = fault in (Fault.REFUSE, Fault.REFUSE_BARE)
-            error, data, extra = (6, b"", 0.0) if refused else self.cores.obey(block, body[4:size], remaining)
+            error, data, extra = (6, b"", 0.0) if refused else self.cores.execute(block, body[4:size], remaining)
             if error:
                 break
             delay += extra
@@ -278,7 +276,7 @@ class RadarBoard:
             body = body[size:]
         self._busy_until = self.now() + delay
         if error and (self.cores.first_generation or fault is Fault.REFUSE_BARE):
-            answer = frame(direction, RESPONSE, 0, b"", 1, sequence, wide)  # as an AWR1243 was seen to
+            answer = frame(direction, RESPONSE, 0, b"", 1, sequence, wide)  # like an AWR1243
         elif error:
             answer = frame(direction, RESPONSE, 0, struct.pack("<4H", 0, 8, error, block), 1, sequence, wide)  # ICD 4.4
         else:

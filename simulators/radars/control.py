@@ -1,18 +1,17 @@
-r"""How a host reaches the simulated radars: through a board's USB chip, or by a control server that takes lines.
+r"""Control connections of the simulated radars: a board's USB chip, the same over TCP, or a control server.
 
-:class:`UsbChip` is the FT4232H between host and board: byte streams of its four channels, decoded to lines and words.
-Channel A and B understand the MPSSE commands of FTDI's application note AN_108 that SPI needs, and answer an unknown
-one as the chip does (0xFA and the command). C and D are bit-bang ports. What the streams do wrong is collected in
-`errors`. A stand-in: USB's own timing is not shown.
+`UsbChip` is the FT4232H between host and board: it decodes the byte streams of its four channels to lines and words.
+Channels A and B have the MPSSE commands of FTDI's application note AN_108 that SPI needs, and answer an unknown one
+with 0xFA and the command, as the chip does; C and D are bit-bang ports. `errors` collects protocol errors of the host.
+The timing of USB is not simulated.
 
-:class:`RadarSocket` puts that chip at a TCP address: what `usb_serial = "tcp://address:port"` in a rig file reaches.
-Requests: channel (A..D), `W` or `R`, size (u16, little-endian), and the bytes of a write. A read is answered with a u16
-count and the bytes that are there.
+`RadarSocket` connects the chip to a TCP address, `usb_serial = "tcp://address:port"` in a rig file. Requests: channel
+(A..D), `W` or `R`, size (u16, little-endian), and the bytes of a write. The answer to a read is a u16 count and the
+available bytes.
 
-:class:`LineServer` stands for the published rig's MATLAB servers beside mmWave Studio: TCP, takes the line
-`Retrigger\n`, arms the radar, and never answers. What goes wrong with those is drawn from the `[faults]` table: a line
-that changes nothing (`retrigger_fails`), a connection broken at a line (`retrigger_resets`). Specification:
-docs/spec/simulated-rig.md.
+`LineServer` simulates the published rig's MATLAB servers beside mmWave Studio: over TCP it receives the line
+`Retrigger\n`, arms the radar, and never replies. Faults of the `[faults]` table: a line without effect
+(`retrigger_fails`), a connection reset at a line (`retrigger_resets`). Specification: docs/spec/simulated-rig.md.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ import socket
 import struct
 from collections.abc import Callable
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
 from polysight.simulators.faults import Faults
 from polysight.simulators.radars.board import RadarBoard
@@ -29,15 +29,15 @@ from polysight.simulators.radars.board import RadarBoard
 _CLOCK, _OUT, _SELECT = 1 << 0, 1 << 1, 1 << 3
 _BARE = (0x85, 0x87, 0x8A, 0x8C, 0x8D, 0x97)
 _CHANNELS = "ABCD"
-_PIN_S = 0.2e-6  # one pin command holds its pins so long (FTDI AN_114)
-_CLOCKS_S = 0.2e-6  # two clocks, the least before and between chip selects (ICD 3.2.4); twice that is beyond doubt
+_PIN_S = 0.2e-6  # duration of a pin command (FTDI AN_114)
+_CLOCKS_S = 0.2e-6  # two clocks, the minimum before and between chip selects (ICD 3.2.4); required here: twice that
 _HEAD = struct.Struct("<ccH")
 LINE = b"Retrigger"
-_LINGER_NONE = struct.pack("ii", 1, 0)  # closing sends a reset
+_NO_LINGER = struct.pack("ii", 1, 0)  # closing sends a reset
 
 
 class UsbChip:
-    """One chip. `channel("A")` and so on are ports with `write`, `read`, `close`."""
+    """The USB chip of a board; `channel("A")` to `channel("D")` return its ports."""
 
     def __init__(self, board: RadarBoard) -> None:
         self._board = board
@@ -45,17 +45,17 @@ class UsbChip:
         self.words_written: list[int] = []
         self.spi_hz = 0.0
         self._fast, self._pins, self._latched = False, 0, 0
-        self._high_s, self._low_s = float("inf"), 0.0  # how long chip select has been so
+        self._high_s, self._low_s = float("inf"), 0.0  # time since the last change of chip select
         self._answers = {name: bytearray() for name in _CHANNELS}
         self._pending = {name: bytearray() for name in _CHANNELS}
         self._sense = 0
 
     def channel(self, name: str) -> UsbChannel:
-        """One of the four channels."""
+        """Return one of the four channels."""
         return UsbChannel(self, name)
 
     def take(self, name: str, data: bytes) -> None:
-        """Bytes from the host for a channel. Raises DeviceError when unplugged."""
+        """Receive bytes from the host for a channel. Raises DeviceError if unplugged."""
         self._check()
         if name == "D":
             pins = data[-1]
@@ -71,11 +71,11 @@ class UsbChip:
             while self._pending[name]:
                 used = commands[name](self._pending[name])
                 if used == 0:
-                    return  # the rest of a command comes with the next bytes
+                    return  # incomplete command
                 del self._pending[name][:used]
 
     def give(self, name: str, size: int) -> bytes:
-        """Bytes of a channel for the host. Raises DeviceError when unplugged."""
+        """Return up to `size` bytes of a channel for the host. Raises DeviceError if unplugged."""
         self._check()
         found = bytes(self._answers[name][:size])
         del self._answers[name][:size]
@@ -160,7 +160,7 @@ class UsbChip:
 
 
 class UsbChannel:
-    """A port of one channel."""
+    """Port of one channel."""
 
     def __init__(self, chip: UsbChip, name: str) -> None:
         self._chip, self._name = chip, name
@@ -171,64 +171,87 @@ class UsbChannel:
         self._chip.take(self._name, data)
 
     def read(self, size: int) -> bytes:
-        """Up to so many bytes."""
+        """Receive up to `size` bytes."""
         return self._chip.give(self._name, size)
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the port."""
         self.closed = True
 
 
-class RadarSocket:
-    """One chip, for one client at a time.
+class _Server:
+    """A TCP server for an event loop that polls `fileno` and calls `serve`. Raises DeviceError if it cannot listen."""
 
-    Raises
-    ------
-    DeviceError
-        when the address cannot be taken.
-    """
-
-    def __init__(self, address: str, board: RadarBoard) -> None:
+    def __init__(self, address: str, what: str) -> None:
         host, _, port = address.removeprefix("tcp://").rpartition(":")
         try:
             self._listener = socket.create_server((host, int(port)))
         except OSError as e:
             raise DeviceError(
-                f"simulated radar: cannot take {address}: {e.strerror}", "another program listens there"
+                f"{what}: cannot listen at {address}: {e.strerror}",
+                "another program uses this address",
+                code=ErrorCode.BUSY,
             ) from None
         self._listener.setblocking(False)
         self.address = f"tcp://{host}:{self._listener.getsockname()[1]}"
-        self.chip = UsbChip(board)
-        self._client: socket.socket | None = None
-        self._unread = b""
+        self._clients: dict[int, tuple[socket.socket, bytes]] = {}  # by descriptor, with incomplete requests
         self._ready = select.epoll()
         self._ready.register(self._listener, select.EPOLLIN)
 
     def fileno(self) -> int:
-        """One descriptor for the listener and its client."""
+        """Return an epoll descriptor for the listener and its clients."""
         return self._ready.fileno()
 
     def serve(self) -> None:
-        """Do what was asked for."""
+        """Process pending connections and requests."""
         for descriptor, _ in self._ready.poll(0):
             if descriptor == self._listener.fileno():
-                self._drop()  # a new one takes the chip over
-                self._client = self._listener.accept()[0]
-                self._ready.register(self._client, select.EPOLLIN)
-            elif self._client is not None:
-                self._read(self._client)
+                self._accept()
+            elif descriptor in self._clients:
+                client, rest = self._clients[descriptor]
+                try:
+                    data = client.recv(65536)
+                    if data:
+                        self._clients[descriptor] = client, self._execute(client, rest + data)
+                        continue
+                except (OSError, DeviceError):
+                    pass  # disconnected or unplugged: close the connection
+                self._drop(descriptor)
 
-    def _read(self, client: socket.socket) -> None:
-        try:
-            data = client.recv(65536)
-            if data:
-                self._unread = self._obey(client, self._unread + data)
-                return
-        except (OSError, DeviceError):
-            pass  # gone, or unplugged: both close the connection
-        self._drop()
+    def _accept(self) -> None:
+        client, _ = self._listener.accept()
+        self._clients[client.fileno()] = client, b""
+        self._ready.register(client, select.EPOLLIN)
 
-    def _obey(self, client: socket.socket, data: bytes) -> bytes:
+    def _execute(self, client: socket.socket, data: bytes) -> bytes:
+        """Process the requests in `data` and return the incomplete rest. Raises OSError to close the connection."""
+        raise NotImplementedError
+
+    def _drop(self, descriptor: int) -> None:
+        self._ready.unregister(descriptor)
+        self._clients.pop(descriptor)[0].close()
+
+    def close(self) -> None:
+        """Close all sockets."""
+        for descriptor in list(self._clients):
+            self._drop(descriptor)
+        self._listener.close()
+        self._ready.close()
+
+
+class RadarSocket(_Server):
+    """A USB chip at a TCP address, for one client at a time."""
+
+    def __init__(self, address: str, board: RadarBoard) -> None:
+        super().__init__(address, "simulated radar")
+        self.chip = UsbChip(board)
+
+    def _accept(self) -> None:
+        for descriptor in list(self._clients):  # the new client replaces the old one
+            self._drop(descriptor)
+        super()._accept()
+
+    def _execute(self, client: socket.socket, data: bytes) -> bytes:
         while len(data) >= _HEAD.size:
             channel, what, size = _HEAD.unpack_from(data)
             port = channel.decode("ascii")
@@ -243,100 +266,26 @@ class RadarSocket:
             data = data[_HEAD.size + size :]
         return data
 
-    def _drop(self) -> None:
-        if self._client is not None:
-            self._ready.unregister(self._client)
-            self._client.close()
-            self._client, self._unread = None, b""
 
-    def close(self) -> None:
-        """Close all sockets."""
-        self._drop()
-        self._listener.close()
-        self._ready.close()
-
-
-class LineServer:
-    """One board's control server.
-
-    Parameters
-    ----------
-    address
-        `address:port` to listen at.
-    rearm
-        Called for each line that arms the radar.
-
-    Raises
-    ------
-    DeviceError
-        when the address cannot be taken.
-    """
+class LineServer(_Server):
+    """Control server of a board at `address:port`; it calls `rearm` for each line that arms the radar."""
 
     def __init__(self, address: str, rearm: Callable[[], None], faults: Faults) -> None:
-        host, _, port = address.rpartition(":")
-        try:
-            self._listener = socket.create_server((host, int(port)))
-        except OSError as e:
-            raise DeviceError(
-                f"simulated control server: cannot take {address}: {e.strerror}", "another program listens there"
-            ) from None
-        self._listener.setblocking(False)
+        super().__init__(address, "simulated control server")
         self._rearm, self._faults = rearm, faults
-        self._clients: dict[int, tuple[socket.socket, bytes]] = {}
-        self._ready = select.epoll()
-        self._ready.register(self._listener, select.EPOLLIN)
         self.lines = 0
         self.unknown_lines = 0
 
-    def fileno(self) -> int:
-        """One descriptor for the listener and all its clients."""
-        return self._ready.fileno()
-
-    def serve(self) -> None:
-        """Take what has come."""
-        for descriptor, _ in self._ready.poll(0):
-            if descriptor == self._listener.fileno():
-                client, _ = self._listener.accept()
-                client.setblocking(False)
-                self._clients[client.fileno()] = client, b""
-                self._ready.register(client, select.EPOLLIN)
-            else:
-                self._read(descriptor)
-
-    def _read(self, descriptor: int) -> None:
-        client, rest = self._clients[descriptor]
-        try:
-            data = client.recv(4096)
-        except OSError:
-            data = b""
-        *lines, rest = (rest + data).split(b"\n")
-        self._clients[descriptor] = client, rest
-        alive = bool(data)
+    def _execute(self, client: socket.socket, data: bytes) -> bytes:
+        *lines, rest = data.split(b"\n")
         for line in lines:
-            alive &= self._take(client, line)
-        if not alive:
-            self._drop(descriptor)
-
-    def _take(self, client: socket.socket, line: bytes) -> bool:
-        """Obey one line; whether the connection lives on."""
-        if line.strip() != LINE:
-            self.unknown_lines += 1
-            return True
-        number, self.lines = self.lines, self.lines + 1
-        if number in self._faults.retrigger_resets:
-            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_NONE)
-            return False
-        if number not in self._faults.retrigger_fails:
-            self._rearm()
-        return True
-
-    def _drop(self, descriptor: int) -> None:
-        self._ready.unregister(descriptor)
-        self._clients.pop(descriptor)[0].close()
-
-    def close(self) -> None:
-        """Close all sockets."""
-        for descriptor in list(self._clients):
-            self._drop(descriptor)
-        self._listener.close()
-        self._ready.close()
+            if line.strip() != LINE:
+                self.unknown_lines += 1
+                continue
+            number, self.lines = self.lines, self.lines + 1
+            if number in self._faults.retrigger_resets:
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
+                raise ConnectionResetError
+            if number not in self._faults.retrigger_fails:
+                self._rearm()
+        return rest

@@ -1,6 +1,6 @@
-"""The two cores of a simulated AWR2243: their states, and what each command does to them.
+"""The two cores of a simulated AWR2243: their states, and the effect of each command.
 
-Which state answers what, with the sections of TI's document, is the table in docs/spec/mmwavelink.md ("The stand-in").
+The table in docs/spec/mmwavelink.md ("The stand-in") has the answers in each state, with the sections of TI's document.
 """
 
 from __future__ import annotations
@@ -15,24 +15,21 @@ from polysight.simulators.radars.wire import FAULT_DATA, OLD_UP_EMPTY, OLD_UP_WR
 BOOT_S, RF_UP_S, RF_INIT_S, ERASE_S, READY_S = 0.05, 0.02, 0.3, 4.0, 1e-3
 UP_MAIN, UP_RF, MAIN_FAULT, BOOTED = 0x5000, 0x5001, 0x5002, 0x5005
 CALIBRATED, TRIGGER_READY, FRAME_END, RF_FAULT = 0x1004, 0x100B, 0x100F, 0x1002
-PROFILE, CHIRP, FRAME, STREAM_SET, STREAM, ADVANCED = 0x0100, 0x0101, 0x0102, 0x0103, 0x0104, 0x0105
+PROFILE, CHIRP, FRAME, STREAM_SET, STREAM = 0x0100, 0x0101, 0x0102, 0x0103, 0x0104
 SAVE, RESTORE, CHUNK_BYTES, CHUNKS = 0x00AB, 0x008B, 224, 3
 SIZES = {  # data bytes of each sub-block
     0x0080: 8, 0x0082: 8, 0x0083: 4, 0x0085: 4, 0x0086: 12, 0x0089: 12, RESTORE: 228, 0x008D: 16, SAVE: 4, 0x00C0: 0,
-    PROFILE: 44, CHIRP: 20, FRAME: 24, STREAM_SET: 20, STREAM: 4, ADVANCED: 148, 0x0120: 4, 0x0121: 4, 0x0122: 0,
-    0x0125: 0, 0x0140: 4, 0x0220: 0, 0x0223: 0, 0x02CC: 4, 0x02EA: 0, 0x4000: 0, 0x4041: 12, 0x4042: 8, 0x4043: 4,
-    0x4044: 4, 0x4045: 4, 0x4046: 4, 0x404C: 12, 0x40C0: 8, 0x40C1: 36, 0x40E0: 0,
+    PROFILE: 44, CHIRP: 20, FRAME: 24, STREAM_SET: 20, STREAM: 4, 0x0120: 4, 0x0121: 4, 0x0122: 0, 0x0140: 4,
+    0x0220: 0, 0x0223: 0, 0x02CC: 4, 0x02EA: 0, 0x4000: 0, 0x4041: 12, 0x4042: 8, 0x4043: 4,
+    0x4044: 4, 0x4045: 4, 0x4046: 4, 0x404C: 12, 0x40C0: 8, 0x40E0: 0,
 }  # fmt: skip
 _BEFORE_FRAMES = (0x0080, 0x0082, 0x0086, 0x00C0, PROFILE, CHIRP, 0x4041, 0x4042, 0x4043, 0x4044, 0x4045)
-_WITHOUT_RF = (0x4080, 0x404C, 0x4000, 0x40E0)  # what the main core obeys before the RF core is up
+_WITHOUT_RF = (0x4080, 0x404C, 0x4000, 0x40E0)  # commands before the RF power-up
 
 
 @dataclass
 class Cores:
-    """Both cores, and the serial flash beside them.
-
-    `event` sends a report after a delay. `first_generation` boots and refuses as an AWR1243 was seen to.
-    """
+    """Both cores and the serial flash. `event` sends an event after a delay; see `RadarBoard` for the other fields."""
 
     now: Callable[[], float]
     event: Callable[[int, bytes, float], None]
@@ -59,18 +56,18 @@ class Cores:
         self.forget()
 
     def forget(self) -> None:
-        """What a reset does: RAM and settings are gone, the flash stays."""
+        """Reset: clear RAM and settings, keep the flash."""
         self.ram = self._booted = b""
         self.main_up = self.rf_up = self.calibrated = self.crc32_events = False
         self.frames_left, self.armed, self.frame_ends = 0, False, -1.0
-        self._file: tuple[int, int] | None = None  # place, bytes that are missing
+        self._file: tuple[int, int] | None = None  # file type, missing bytes
         self._restored: dict[int, bytes] = {}
         self._part = b""
         for kept in (self.settings, self.profiles, self.chirps):
             kept.clear()
 
     def boot(self) -> None:
-        """The reset was released in functional mode: ROM, then the flash's image when it is whole (ICD 5.21.1)."""
+        """Boot in functional mode: ROM, then the flash's image if it is complete (ICD 5.21.1)."""
         self.main_up = True
         broken = boot_errors(self.flash)
         self._booted = b"" if broken else self.flash
@@ -81,8 +78,8 @@ class Cores:
         if self.fault_at == "power-up":
             self.event(MAIN_FAULT, FAULT_DATA, BOOT_S + 1e-3)
 
-    def obey(self, number: int, data: bytes, remaining: int) -> tuple[int, bytes, float]:
-        """Error number (0: none; ICD table 5.1, 7.1, 7.2), data of the answer, and how much longer it takes."""
+    def execute(self, number: int, data: bytes, remaining: int) -> tuple[int, bytes, float]:
+        """Execute a command; return error number (0: none; ICD table 5.1, 7.1, 7.2), answer, and extra delay in s."""
         if number == 0x4080:
             return self._download(data, remaining)
         if number not in SIZES or (self.first_generation and number == 0x008D):
@@ -100,9 +97,9 @@ class Cores:
     def _do(self, number: int, data: bytes) -> tuple[int, bytes]:
         if number == 0x0140:
             return self._start_or_stop(struct.unpack_from("<H", data)[0]), b""
-        if number in (FRAME, ADVANCED) and self.armed:
+        if number == FRAME and self.armed:
             return 83, b""
-        if number in (0x0120, 0x0121, 0x0122, 0x0125):
+        if number in (0x0120, 0x0121, 0x0122):
             return self._read_back(number, data)
         if number in (PROFILE, CHIRP):
             return self._keep(number, data), b""
@@ -113,7 +110,9 @@ class Cores:
     def _effect(self, number: int, data: bytes) -> bytes:
         if number == 0x404C:
             self.crc32_events = data[0] == 1
-        elif number == 0x4000 and (self._patched() or not self.first_generation):  # else it never comes, as received
+        elif number == 0x4000 and (
+            self._patched() or not self.first_generation
+        ):  # otherwise it never reports, as observed
             self.rf_up = True
             self.event(UP_RF, struct.pack("<4I", self.rf_tests, 2000, 0, 0), RF_UP_S)
         elif number == 0x00C0:
@@ -143,7 +142,7 @@ class Cores:
         self.event(CALIBRATED, struct.pack("<IIhHII", passed, passed, 41, 0, 500, 0), RF_INIT_S)
 
     def _keep(self, number: int, data: bytes) -> int:
-        """A profile (0..3) or a range of chirps (0..511) of a profile that is there (ICD tables 5.24, 5.26)."""
+        """Store a profile (0..3), or chirps (0..511) of one (ICD tables 5.24, 5.26); return an error number."""
         first, last, profile = struct.unpack_from("<3H", data)
         if number == PROFILE:
             if first > 3:
@@ -159,17 +158,16 @@ class Cores:
         return 0
 
     def _read_back(self, number: int, data: bytes) -> tuple[int, bytes]:
-        """What is set, in the form in which it was sent (ICD 5.6.1..5.6.6)."""
+        """Read back a setting in the form in which it was sent (ICD 5.6.1..5.6.6)."""
         kept = {
             0x0120: lambda: self.profiles.get(struct.unpack_from("<H", data)[0]),
             0x0121: lambda: self.chirps.get(struct.unpack_from("<H", data)[0]),
             0x0122: lambda: self.settings.get(FRAME),
-            0x0125: lambda: self.settings.get(ADVANCED),
         }[number]()
         return (5, b"") if kept is None else (0, kept)
 
     def _calibration(self, number: int, data: bytes) -> tuple[int, bytes]:
-        """672 bytes of calibration in three parts (ICD 5.2.11, 5.3.2)."""
+        """Save or restore 672 bytes of calibration in three parts (ICD 5.2.11, 5.3.2)."""
         _, part = struct.unpack_from("<2H", data)
         if part >= CHUNKS:
             return 5, b""
@@ -204,38 +202,24 @@ class Cores:
     def _start(self) -> int:
         if self.armed:
             return 20
-        advanced = ADVANCED in self.settings and 0x40C1 in self.settings
-        needed = _BEFORE_FRAMES if advanced else (*_BEFORE_FRAMES, FRAME, 0x40C0)
-        if not self.calibrated or any(n not in self.settings for n in needed):
+        if not self.calibrated or any(n not in self.settings for n in (*_BEFORE_FRAMES, FRAME, 0x40C0)):
             return 22
-        if advanced and FRAME not in self.settings:
-            frames, period, trigger = self._advanced()
-        else:
-            _, _, _, _, frames, _, period, trigger = struct.unpack_from("<6HIH", self.settings[FRAME])
+        _, _, _, _, frames, _, period, trigger = struct.unpack_from("<6HIH", self.settings[FRAME])
         self.frames_left, self.armed, self.frame_ends = frames or -1, True, -1.0
         self.armings += 1
-        if trigger == 1:  # by software: they run at once (ICD table 5.27)
+        if trigger == 1:  # software trigger: they run at once (ICD table 5.27)
             self.armed, self.frames_left = False, 0
             self.event(FRAME_END, b"", frames * period * 5e-9)
         else:
             self.event(TRIGGER_READY, b"", READY_S)
         return 0
 
-    def _advanced(self) -> tuple[int, int, int]:
-        """Frames, period of the first sub-frame, trigger (ICD table 5.30)."""
-        data = self.settings[ADVANCED]
-        return struct.unpack_from("<H", data, 132)[0], struct.unpack_from("<I", data, 24)[0], data[134]
-
     def period_s(self) -> float:
-        """Of the frames that were started."""
-        if FRAME in self.settings:
-            return struct.unpack_from("<I", self.settings[FRAME], 12)[0] * 5e-9
-        return self._advanced()[1] * 5e-9
+        """Return the frame period, seconds."""
+        return struct.unpack_from("<I", self.settings[FRAME], 12)[0] * 5e-9
 
     def _download(self, data: bytes, remaining: int) -> tuple[int, bytes, float]:
-        """A part of a file (ICD 5.18.1). The flash is erased at the first part and written with each; a device checks
-        what it holds only when it boots, so whatever is sent is kept.
-        """
+        """Store a part of a file (ICD 5.18.1). The first part erases the flash; its content is checked only at boot."""
         if not self.main_up:
             return 6, b"", 0.0
         first = self._file is None

@@ -1,9 +1,8 @@
-"""Firmware images for simulated boards: TI's outer form around nothing that could run.
+"""Firmware images for simulated boards: TI's file format without a program.
 
-The form is that of TI's `xwr22xx_metaImage.bin` (7,940 bytes) as public copies show it: `MSTR`, length of all but the
-CRC at byte 20, `MEND`, an `RPRC` part at byte 128 for the main core and one behind it for the RF core, CRC-32 at the
-end. Each part holds the ROM version it patches 56 bytes from its begin, and the patch's 72 bytes from it: major, minor,
-build, debug, year, month, day.
+The format is that of public copies of TI's `xwr22xx_metaImage.bin` (7,940 bytes): `MSTR`, length without the CRC at
+byte 20, `MEND`, an `RPRC` part for the main core at byte 128 and one for the RF core after it, CRC-32 at the end. A
+part has its ROM version at offset 56 and the patch version at 72: major, minor, build, debug, year, month, day.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ _MAIN_AT, _RF_AT = 0x80, 0x880
 
 
 def make_image(size: int = 7940, *, rom: bytes = _ROM) -> bytes:
-    """An image of so many bytes that a board boots from."""
+    """Make an image of `size` bytes from which a simulated board boots."""
     filler = bytes(n * 7 % 251 for n in range(size - 4))
     image = bytearray(filler)
     image[:0x80] = struct.pack("<4s5I", b"MSTR", 2, 0x37, 0, 0, size - 4).ljust(0x5C, b"\0") + b"MEND".ljust(
@@ -30,7 +29,7 @@ def make_image(size: int = 7940, *, rom: bytes = _ROM) -> bytes:
 
 
 def boot_errors(image: bytes) -> int:
-    """Status bits of a device that boots from this (ICD table 7.3); 0 when it does."""
+    """Return the status bits of a boot from this image (ICD table 7.3); 0 if it succeeds."""
     if image[:4] != b"MSTR":
         return METAHEADER_NOT_FOUND | MSSIMAGE_NOT_FOUND
     length = int.from_bytes(image[20:24], "little")
@@ -40,7 +39,7 @@ def boot_errors(image: bytes) -> int:
 
 
 def patch_of(image: bytes, main: bool) -> bytes:
-    """The last six bytes of a version answer (ICD tables 5.66, 5.157): major, minor, date, build and debug."""
+    """Return the last six bytes of a version answer (ICD tables 5.66, 5.157): major, minor, date, build and debug."""
     at = (_MAIN_AT if main else _RF_AT) + 0x48
     major, minor, build, debug, *date = image[at : at + 7]
     return bytes((major, minor, *date, build << 4 | debug))

@@ -86,16 +86,16 @@ class SerialPort:
             events = os.read(self._watch, 4096)
         except BlockingIOError:
             return False
-        anew = False
+        rose = False
         for _, mask, _, _ in _EVENT.iter_unpack(events):  # a watch on one file: no names follow
             if mask & _IN_OPEN:
-                anew |= not self._dtr
+                rose |= not self._dtr
                 self._dtr = True
                 self._clients += 1
             if mask & _IN_CLOSE:
                 self._clients -= 1
                 self._dtr = self._clients > 0 or not termios.tcgetattr(self._master)[2] & termios.HUPCL
-        return anew
+        return rose
 
     def read(self) -> bytes:
         """Received bytes; empty when there are none."""

@@ -17,7 +17,7 @@ from polysight.simulators.stage.logic import MOTION_VERBS, Event, Refused, Stage
 from polysight.simulators.stage.motion import NS_PER_TICK, SWITCH_X, SWITCH_Y, TICK_HZ, StepEngine
 
 FIRMWARE = "0.1.0"
-TELL_TICKS = TICK_HZ // 100  # interval of motion messages while the speed changes: 10 ms
+REPORT_TICKS = TICK_HZ // 100  # interval of motion messages while the speed changes: 10 ms
 _TAIL = re.compile(rb"\*([^*]{4})")
 
 
@@ -86,7 +86,7 @@ class PythonStage:
         if self._fall is not None:
             self._edge(self.tick, 0)
         if moved:
-            self._tell_motion()
+            self._report_motion()
         self._send(Reply("banner", fields={"fw": FIRMWARE, "proto": str(PROTOCOL_VERSION)}).encode())
 
     def receive(self, data: bytes) -> None:
@@ -122,7 +122,7 @@ class PythonStage:
         self._x += dx
         self._y += dy
         if trigger:
-            self._tell_motion()
+            self._report_motion()
             if self._fall is None:
                 self._edge(self.tick, 1)
                 self._fall = self.tick + 2 * self._logic.parameters[Parameter.TRIGGER]
@@ -130,12 +130,12 @@ class PythonStage:
         ticks = engine.interval()
         if ticks == 0:
             self._armed = False
-            self._tell_motion()
+            self._report_motion()
             self._settle()
             return
         self._next = self.tick + ticks
-        if engine.cruise != cruised or (not cruised and self.tick - self._told >= TELL_TICKS):
-            self._tell_motion()
+        if engine.cruise != cruised or (not cruised and self.tick - self._told >= REPORT_TICKS):
+            self._report_motion()
 
     def _settle(self) -> None:
         while True:
@@ -154,14 +154,14 @@ class PythonStage:
                 break
         if self._logic.homed and not self._was_homed:
             self._zero_x, self._zero_y = self._x - self._engine.x, self._y - self._engine.y
-            self._tell_motion()
+            self._report_motion()
         self._was_homed = self._logic.homed
 
     def _arm(self, ticks: int) -> None:
         if ticks:
             self._next, self._armed = self.tick + ticks, True
             if self._engine.cruise:  # a leg without a ramp
-                self._tell_motion()
+                self._report_motion()
 
     def _inputs(self) -> int:
         return self._pressed | (SWITCH_X if self._x <= 0 else 0) | (SWITCH_Y if self._y <= 0 else 0)
@@ -174,7 +174,7 @@ class PythonStage:
         if self._fall is not None and self._fall <= until:
             self._edge(self._fall, 0)
 
-    def _tell_motion(self) -> None:
+    def _report_motion(self) -> None:
         self._told = self.tick
         um = 1000 / self._rig.steps_per_mm
         values = (self._x - self._zero_x, self._y - self._zero_y, self._engine.x_rate)

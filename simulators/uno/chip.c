@@ -33,8 +33,7 @@ static void tifr_write(avr_t *a, avr_io_addr_t addr, uint8_t value, void *param)
     if (flags[i]->raised.reg == addr && value >> flags[i]->raised.bit & 1) avr_clear_interrupt(a, flags[i]);
 }
 
-/* A program that stands still is a jump to itself; a reset cures it, the watchdog's too. Whose reset it was and when: simavr
- * begins its count of cycles anew. */
+/* A hanging program is a jump to itself, until a reset, also by the watchdog. simavr restarts its cycle count then. */
 #define JUMP_TO_ITSELF 0xcfff
 static int hangs, by_watchdog;
 static avr_flashaddr_t hangs_at;

@@ -27,17 +27,17 @@ static avr_irq_t *pin_irq(int pin) {
 }
 
 /* ---- the wires ---- */
-#define TELL_EVERY (5 * MS)
+#define REPORT_EVERY (5 * MS)
 #define SPEED_OVER (10 * MS) /* a step that waited 16 us for another interrupt is 0.2 % of it */
 #define STANDSTILL (40 * MS) /* the slowest step takes 32 ms */
-static uint64_t told;
+static uint64_t reported_at;
 
 static void send_wires(const char *text, int length) {
   if (send(rig.wires, text, length, MSG_NOSIGNAL) != length) ended = 1;
 }
 
-/* Tell where the stage is: always at a trigger, else when it is not where the last line has it. */
-static void tell_motion(int at_trigger) {
+/* Report the stage's motion: always at a trigger, else when it differs from the prediction of the last line. */
+static void report_motion(int at_trigger) {
   static uint64_t from_step, last_ns;
   static int32_t from_x;
   static double speed; /* of x, steps per cycle, between two of its steps */
@@ -50,26 +50,26 @@ static void tell_motion(int at_trigger) {
     from_x = x->position;
   }
   if (avr->cycle - x->risen > STANDSTILL) speed = 0;
-  told = avr->cycle;
+  reported_at = avr->cycle;
   const long long now[3] = {
-    llround((x->position - rig.zero_x + speed * (double)(told - x->risen)) * rig.um_per_step),
+    llround((x->position - rig.zero_x + speed * (double)(reported_at - x->risen)) * rig.um_per_step),
     llround((motors[1].position - rig.zero_y) * rig.um_per_step), llround(speed * HZ * rig.um_per_step) };
-  const double expected = last[0] + last[2] * 1e-9 * (double)(NS(told) - last_ns);
+  const double expected = last[0] + last[2] * 1e-9 * (double)(NS(reported_at) - last_ns);
   const int as_told = fabs(now[0] - expected) < rig.um_per_step && now[1] == last[1] && !now[2] == !last[2];
   if (as_told && !at_trigger) return;
   memcpy(last, now, sizeof now);
-  last_ns = NS(told);
+  last_ns = NS(reported_at);
   char text[96];
-  send_wires(text, snprintf(text, sizeof text, "M %llu %lld %lld %lld\n", (u64)NS(told), now[0], now[1], now[2]));
+  send_wires(text, snprintf(text, sizeof text, "M %llu %lld %lld %lld\n", (u64)NS(reported_at), now[0], now[1], now[2]));
 }
 
-void tell_motion_if_due(void) {
-  if (rig.wires >= 0 && avr->cycle >= told + TELL_EVERY) tell_motion(0);
+void report_motion_if_due(void) {
+  if (rig.wires >= 0 && avr->cycle >= reported_at + REPORT_EVERY) report_motion(0);
 }
 
 static void tell_trigger(int value) {
   char text[64];
-  if (value) tell_motion(1); /* where the stage is at this very step */
+  if (value) report_motion(1); /* where the stage is at this very step */
   send_wires(text, snprintf(text, sizeof text, "S %llu %d %d\n", (u64)NS(avr->cycle), rig.trigger_line, value));
 }
 

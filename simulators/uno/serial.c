@@ -115,18 +115,18 @@ static void closed(void) {
 
 int pty_opened(void) {
   char events[4096] __attribute__((aligned(8)));
-  int anew = 0;
+  int rose = 0;
   for (ssize_t n; (n = read(pty_watch, events, sizeof events)) > 0;)
     for (char *e = events; e < events + n; e += sizeof(struct inotify_event) + ((struct inotify_event *)e)->len) {
       const uint32_t what = ((struct inotify_event *)e)->mask;
       if (what & IN_OPEN) {
-        anew |= !dtr;
+        rose |= !dtr;
         dtr = 1;
         pty_clients++;
       }
       if (what & IN_CLOSE) closed();
     }
-  return anew;
+  return rose;
 }
 
 void read_pty(int wait_ms) {

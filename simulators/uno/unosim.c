@@ -151,7 +151,7 @@ static int serve_real_time(double speed, uint64_t boot_cycles) {
     }
     read_pty(0);
     if (!run_to(avr->cycle + SLICE)) return !ended;
-    tell_motion_if_due();
+    report_motion_if_due();
     keep_pace(speed);
   }
   return 0;

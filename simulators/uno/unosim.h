@@ -1,4 +1,4 @@
-/* What the parts of the emulator share; unosim.c tells what it is. Times are cycles of the 16 MHz clock. */
+/* Shared by the parts of the emulator (see unosim.c). Times are cycles of the 16 MHz clock. */
 #pragma once
 #define _GNU_SOURCE
 #include <signal.h>
@@ -14,7 +14,7 @@ typedef unsigned long long u64;
 
 extern avr_t *avr;
 extern volatile sig_atomic_t ended;
-extern int lockstep; /* time goes on when told; else at a multiple of real time */
+extern int lockstep; /* time advances by command; else at a multiple of real time */
 
 void say(const char *format, ...); /* in lockstep: to standard output */
 
@@ -34,7 +34,7 @@ void press(unsigned mask);
 void slip(int dx, int dy);
 void watch(char *pins);
 void tell_position(void);
-void tell_motion_if_due(void); /* to the wires */
+void report_motion_if_due(void); /* to the wires */
 void tell_pin_costs(void);
 int connect_wires(const char *path);
 
@@ -47,8 +47,8 @@ int make_pty(const char *link);
 void feed(uint8_t byte);
 int line_idle(void);
 uint64_t line_idle_since(void);
-uint64_t line_backlog(void); /* time that what is on its way to the board takes */
-int pty_opened(void);        /* whether DTR rose since the last look: that resets the board */
+uint64_t line_backlog(void); /* duration of the bytes still on their way to the board */
+int pty_opened(void);        /* true if DTR rose since the last call: that resets the board */
 void read_pty(int wait_ms);
 
 /* chip.c: the microcontroller */

@@ -1,4 +1,4 @@
-"""A scan in which boards miss pulses: found, named, taken again; or kept, each frame at its pulse or masked."""
+"""Scans in which boards miss pulses: the row is retaken, or kept with each frame at its pulse or masked."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _kept(paced, payload, folder: Path, missed: dict[str, set[int]]) -> set[str]
     return told
 
 
-def test_row_with_an_edge_that_nobody_sent_does_not_count_as_whole(paced, payload, tmp_path):
+def test_row_with_a_spurious_edge_is_not_complete(paced, payload, tmp_path):
     """A radar that counts its frames sees one edge too many: as many frames as pulses, all behind it one place off."""
     for take in (1, 2):
         paced.cards["RV"].extra[0, take] = 20

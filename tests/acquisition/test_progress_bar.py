@@ -1,4 +1,4 @@
-"""The bar of a running scan: on a terminal rows and points, elsewhere a line at every tenth; notices on both."""
+"""Progress of a running scan: bars of rows and points on a terminal, otherwise a line per tenth; notices on both."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_time_left_in_words():
     assert left(2 * 3600 + 3 * 60 + 4) == "1 of 20 rows, 2:03:04 left"
 
 
-def test_notices_are_told_and_steps_are_not():
+def test_notices_are_shown_and_steps_are_not():
     step = {"rows": ROWS, "committed": 3, "row": 4, "take": 1}
     told = ("warning", "retake", "home", "check", "connect", "stop", "held", "wait", "end")
     said = shown(*(ScanProgress(phase, f"so {phase}", **step) for phase in (*told, "row", "state")), terminal=False)

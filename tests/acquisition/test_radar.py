@@ -90,11 +90,11 @@ def test_a_reset_is_a_fault_until_the_next_line(server):
         assert radars.states()["RH"].state is RadarState.UNKNOWN
 
 
-def test_refused_connection_says_what_to_do(server):
+def test_refused_connection_is_an_error_with_a_remedy(server):
     server.close()
-    with pytest.raises(DeviceError, match=r"RH: .*127\.0\.0\.1:\d+: connection refused") as e:
+    with pytest.raises(DeviceError) as e:
         LineServers({"RH": server.address}, 5.0)
-    assert "no server listens" in e.value.why
+    assert server.address in e.value.what
     assert "radar.servers" in e.value.remedy
 
 
@@ -103,13 +103,14 @@ def test_server_gone_between_rows_is_named(server):
         server.accept()
         server.close()
         wait_for(lambda: radars._is_closed("RH"), "radar")
-        with pytest.raises(DeviceError, match="connection refused"):
+        with pytest.raises(DeviceError):
             radars.arm(1)
 
 
 def test_unknown_host_is_named():
-    with pytest.raises(DeviceError, match=r"no-such-host\.invalid:5000"):
+    with pytest.raises(DeviceError) as e:
         LineServers({"RH": "no-such-host.invalid:5000"}, 2.0)
+    assert "no-such-host.invalid:5000" in e.value.what
 
 
 HALF_OPEN = """
@@ -259,7 +260,7 @@ def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_
 # --- the simulated server ---
 
 
-def test_simulated_server_arms_once_a_line_and_fails_as_told():
+def test_simulated_server_arms_once_a_line_and_has_its_faults():
     armed = []
     made = LineServer("127.0.0.1:0", lambda: armed.append(1), Faults(retrigger_fails=(1,), retrigger_resets=(3,)))
     address = f"127.0.0.1:{made._listener.getsockname()[1]}"

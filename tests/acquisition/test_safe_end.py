@@ -1,4 +1,4 @@
-"""However a scan ends, the rig is left at rest, nothing moves unasked, and the error says what is safe."""
+"""Every end of a scan leaves the rig at rest; nothing moves without a request; errors name the rows that are safe."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_stage_that_is_not_ready_between_rows_is_not_homed(rig, tmp_path, state)
     assert commands(rig.pi).count(m.Home) == 1
 
 
-def test_homing_that_somebody_else_began_is_waited_for():
+def test_homing_that_another_program_started_is_waited_for():
     states = iter(["homing", "homing", "ready"])
     status = SimpleNamespace(scan_id="s", homed=True, fault=0, reason="")
     socket = SimpleNamespace(poll=lambda _: None)
@@ -160,7 +160,7 @@ def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, tmp_
     assert said_at_end == [(False, f"{e.value.what}; 1 rows wait to be processed")]
 
 
-def test_error_of_any_kind_says_what_is_safe(rig, tmp_path, monkeypatch):
+def test_every_error_names_the_rows_that_are_safe(rig, tmp_path, monkeypatch):
     def commit(*_: object) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
@@ -185,7 +185,7 @@ def test_pi_that_is_lost_in_mid_scan(rig, tmp_path):
 # --- a display that fails ---------------------------------------------------------------------------------------------
 
 
-def test_progress_that_cannot_be_told_ends_no_scan(rig, tmp_path):
+def test_failing_progress_output_ends_no_scan(rig, tmp_path):
     calls = []
 
     def told(p) -> None:
@@ -221,7 +221,7 @@ class ClosedPipe(io.TextIOWrapper):
 
 
 @pytest.mark.parametrize("kind", [FullDisk, ClosedPipe])
-def test_scan_whose_messages_nobody_reads_is_made_and_processed(rig, tmp_path, monkeypatch, kind):
+def test_scan_without_a_terminal_is_recorded_and_processed(rig, tmp_path, monkeypatch, kind):
     """In row 1 the terminal goes, and with it stdout and stderr."""
     config = tmp_path / "rig.toml"
     config.write_text(tomli_w.dumps(to_builtins(rig.instrument)))
@@ -278,13 +278,14 @@ def test_processing_that_fails_does_not_hide_that_every_row_is_there(rig, tmp_pa
         raise error
 
     monkeypatch.setattr(live, "Pipeline", broken)
-    with pytest.raises(PolysightError, match=r"oops|no images") as e:
+    with pytest.raises(PolysightError) as e:
         live.scan(config, request(tmp_path / "s"), None, False, True)
+    assert str(error.args[0]) in e.value.what
     assert "every row is committed" in capsys.readouterr().out
     assert f"polysight process {tmp_path / 's'}" in e.value.remedy
 
 
-def test_a_whole_scan_does_not_fail_because_the_pi_could_not_be_told(rig, tmp_path, monkeypatch):
+def test_a_complete_scan_succeeds_if_the_pi_run_cannot_be_ended(rig, tmp_path, monkeypatch):
     """Its disk is full, say: every row is committed, and what follows has all it needs."""
 
     def refused(*_):

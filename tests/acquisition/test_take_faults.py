@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
 
 import pytest
 
@@ -11,7 +10,7 @@ from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.acquisition.take import ON_REQUEST, FaultKind, TakeFault
 from polysight.host.capture.dca1000 import Status
-from polysight.host.page.story import CAUSES, of_rejection
+from polysight.host.page.history import CAUSES, notice_of_rejection
 from polysight.shared.faults import PiFault, explain
 from tests.support.paths import REPO
 
@@ -58,7 +57,7 @@ def pi_fault(rig) -> None:
     ],
     ids=lambda x: x.__name__ if callable(x) else "",
 )
-def test_a_take_that_is_rejected_says_its_kind_and_board(rig, tmp_path, spoil, said):
+def test_a_rejected_take_has_the_kind_and_board_of_its_fault(rig, tmp_path, spoil, said):
     spoil(rig)
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 1)
@@ -75,8 +74,7 @@ def test_data_that_the_card_dropped_rejects_the_row_and_its_status_is_kept(rig, 
 
     def overflowing(row: int, take: int) -> None:
         if (row, take) == (0, 1):
-            status = struct.pack("<HHHH", 0xA55A, 0x0A, bit, 0xEEAA)
-            card.out.sendto(status, (card.board.host_address, card.board.command_port))
+            card.report_status(bit)
         send_row(row, take)
 
     card.send_row = overflowing
@@ -101,7 +99,7 @@ def test_stopped_now_is_on_request_whatever_else_is_missing(rig, tmp_path):
     assert (fact["reasons"], fact["faults"]) == ([str(ON_REQUEST)], [{"kind": "on_request"}])
 
 
-def test_a_row_that_is_kept_says_the_same(rig, tmp_path):
+def test_a_row_kept_incomplete_has_the_kind_and_board_of_its_fault(rig, tmp_path):
     for take in (1, 2, 3):
         rig.cards["RV"].drop[1, take] = {3}
     result = run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
@@ -114,7 +112,7 @@ def test_every_kind_has_its_words_and_its_line_in_the_specification():
     assert set(re.findall(r"`([a-z_]+)`(?=[^|\n]*\|[^|\n]*\|$)", table, re.MULTILINE)) >= set(FaultKind)
     for kind in FaultKind:
         fault = TakeFault(kind, "text", "RV", 103 if kind is FaultKind.PI_FAULT else 0)
-        notice = of_rejection(0, 1, [str(fault)], [fault.fact()], "")
+        notice = notice_of_rejection(0, 1, [str(fault)], [fault.fact()], "")
         assert notice.why
         assert notice.do
     assert set(CAUSES) == set(FaultKind) - {FaultKind.PI_FAULT}
@@ -124,12 +122,12 @@ def test_words_follow_the_kind_alone():
     """Reasons are for people: whatever they say, the cause is that of the kind."""
     told = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
     for kind, (why, do) in CAUSES.items():
-        notice = of_rejection(0, 1, [told], [TakeFault(kind, told, "RV").fact()], "")
+        notice = notice_of_rejection(0, 1, [told], [TakeFault(kind, told, "RV").fact()], "")
         assert (notice.why, notice.do) == (why, do)
     pulse_too_long = TakeFault(FaultKind.PI_FAULT, "a pulse was too long", number=int(PiFault.PULSE_TOO_LONG))
-    notice = of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.fact()], "")
+    notice = notice_of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.fact()], "")
     assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).why.lower()
     for unknown in ([], [{"kind": "of_a_newer_release", "board": "RV"}]):
-        notice = of_rejection(0, 1, [told], unknown, "")
+        notice = notice_of_rejection(0, 1, [told], unknown, "")
         assert (notice.why, notice.detail) == ("", told)
         assert notice.do

@@ -1,4 +1,4 @@
-"""Time left: what the rows took, whatever was waited for between them; the same in the terminal and in the page."""
+"""Time left: the duration of rows without pauses between them, the same in the terminal and on the page."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from polysight.host.acquisition import scan_loop as running
 from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.progress import time_left, typical_row_s
 from polysight.host.acquisition.scan import run_scan
+from polysight.host.page.history import ScanHistory, seconds
 from polysight.host.page.snapshot import remaining
-from polysight.host.page.story import Story, seconds
 
 ROW_S, PAUSE_S, HOMING_S = 12.0, 7200.0, 240.0
 
 
-def test_time_left_is_rows_times_their_time_less_what_has_passed_of_one():
+def test_time_left_is_rows_times_their_time_minus_elapsed_time():
     assert time_left(10, ROW_S) == 10 * ROW_S
     assert time_left(0, ROW_S, 5.0) == 0
     for elapsed in (0.0, 1.0, ROW_S):
@@ -25,7 +25,7 @@ def test_time_left_is_rows_times_their_time_less_what_has_passed_of_one():
     assert time_left(10, ROW_S, -3.0) == 10 * ROW_S
 
 
-def test_a_row_that_took_long_does_not_change_what_rows_usually_take():
+def test_one_long_row_does_not_change_the_typical_row_time():
     usual = [11.0, 12.0, 13.0] * 20
     assert typical_row_s([*usual, 900.0]) == statistics.median(usual)
     assert typical_row_s([*usual, *[6.0] * 25]) == 6.0, "a rig that was sped up is believed after 25 rows"
@@ -69,18 +69,18 @@ def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
     assert [left for word, left in told if isinstance(word, str)] == [2 * ROW_S] * 2, "before the pause and after it"
 
 
-def test_the_page_says_the_same(rig, tmp_path):
+def test_the_page_has_the_same_time_left(rig, tmp_path):
     """The facts of a scan with times of our own: rows a minute apart, a pause of a day before the last."""
     run_scan(rig.instrument, tmp_path / "s")
     utc = "2026-05-{:02d}T02:{:02d}:00.000+00:00"
-    story: Story | None = None
+    history: ScanHistory | None = None
     for fact in running.ScanFolder.load(tmp_path / "s").content.facts:
-        if story is None:
-            story = Story(fact | {"started_utc": utc.format(1, 0)})
+        if history is None:
+            history = ScanHistory(fact | {"started_utc": utc.format(1, 0)})
         elif fact["fact"] == "row_committed" and fact["row"] < 3:
-            story.add_fact(fact | {"committed_utc": utc.format(1, fact["row"] + 1)})
-    assert story is not None
-    story.add_fact({"fact": "scan_paused", "paused_utc": utc.format(1, 3)})
-    story.add_fact({"fact": "scan_continued", "continued_utc": utc.format(2, 3)})
-    left, _ = remaining(story, seconds(utc.format(2, 3)) + 20)
+            history.add_fact(fact | {"committed_utc": utc.format(1, fact["row"] + 1)})
+    assert history is not None
+    history.add_fact({"fact": "scan_paused", "paused_utc": utc.format(1, 3)})
+    history.add_fact({"fact": "scan_continued", "continued_utc": utc.format(2, 3)})
+    left, _ = remaining(history, seconds(utc.format(2, 3)) + 20)
     assert left == pytest.approx(time_left(1, 60.0, 20.0))

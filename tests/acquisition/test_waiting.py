@@ -1,4 +1,4 @@
-"""The scan waits between rows rather than lose data: for processing, for the disk; and it stops as it is told."""
+"""The scan waits between rows for processing and disk instead of losing data, and stops on request."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def limited(instrument, **limits):
     return msgspec.structs.replace(instrument, limits=msgspec.structs.replace(instrument.limits, **limits))
 
 
-def test_next_row_waits_for_processing_and_says_so(rig, tmp_path):
+def test_next_row_waits_for_processing_with_a_notice(rig, tmp_path):
     """Processing hangs on row 0: with one row allowed to wait, row 2 is committed last; released, all are."""
     release, started, at_wait = threading.Event(), [], []
 

@@ -49,7 +49,7 @@ def test_replies_and_status_count_from_any_source_port(scripted, source_port):
         client._socket.getpeername()
 
 
-def test_status_is_told_from_replies(scripted):
+def test_status_messages_are_not_replies(scripted):
     client, card = scripted(
         lambda code, _: [reply(Code.STATUS, Status.LVDS_BUFFER_FULL), reply(Code.VERSION, 1), b"noise", reply(code)]
     )
@@ -64,7 +64,7 @@ def test_status_is_told_from_replies(scripted):
     assert client.strangers == 2
 
 
-def test_lost_reply_is_asked_for_again(scripted):
+def test_lost_reply_is_retried(scripted):
     client, card = scripted(lambda code, n: [] if n == 1 else [reply(code)], timeout_s=6.0)
     client.alive()
     assert [c for c, _ in card.seen] == [Code.ALIVE, Code.ALIVE]
@@ -117,7 +117,7 @@ def test_end_of_the_record_before_is_not_that_of_this_one(scripted, between):
     assert client.take_status() == Status(0)
 
 
-def test_completed_record_is_waited_for_but_not_for_ever(scripted):
+def test_wait_for_a_completed_record_has_a_timeout(scripted):
     def answers(code, _):
         yield reply(code)
         if code == Code.RECORD_STOP:

@@ -1,4 +1,4 @@
-"""`polysight card` as a user runs it, against simulated cards: which hop is silent, and what is written."""
+"""`polysight card` against simulated cards: the hop that does not work, and writing the EEPROM."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_a_port_in_use_and_a_radar_that_does_not_stream(cards, card, rig, tmp_pa
     assert (hop["verdict"], "is in use" in hop["found"], "ss -ulnp" in hop["remedy"]) == ("error", True, True)
 
 
-def test_a_buffer_below_two_bursts_is_an_error_with_what_to_do(cards, card, rig, tmp_path):
+def test_a_buffer_below_two_bursts_is_an_error_with_a_remedy(cards, card, rig, tmp_path):
     cards("LS", "RH", "RV")
     table = to_builtins(rig)
     table["card"]["receive_buffer_bytes"] = 8192
@@ -125,7 +125,7 @@ def test_a_buffer_below_two_bursts_is_an_error_with_what_to_do(cards, card, rig,
         (["reset", "RX"], "no board 'RX'"),
     ],
 )
-def test_what_is_refused_writes_nothing(cards, card, words, says):
+def test_refused_commands_write_nothing(cards, card, words, says):
     made = cards("RH")
     before = made.endpoints["RH"].card.network
     done = card(*words)
@@ -199,7 +199,7 @@ def test_a_mute_card_is_not_programmed(cards, card):
     assert "written" not in done.out
 
 
-def test_an_eeprom_failure_is_told(cards, card):
+def test_an_eeprom_failure_is_reported(cards, card):
     cards("RH", RH=Faults(command_status=((0x04, 2),)))
     done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "0")
     assert done.status == 5

@@ -44,7 +44,7 @@ def test_counters_wrap():
 
 
 @pytest.mark.parametrize("raw", [b"", b"12345678", bytes.fromhex("5aa509000000aaef"), bytes.fromhex("5aa509000000aa")])
-def test_what_is_no_reply_is_refused(raw):
+def test_malformed_replies_are_refused(raw):
     with pytest.raises(ProtocolError):
         d.decode_reply(raw)
 

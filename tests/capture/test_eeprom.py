@@ -1,4 +1,4 @@
-"""A card's addresses: the bytes of command 0x04, what is refused, and that nothing is written unconfirmed."""
+"""EEPROM of a card: bytes of command 0x04, refused settings, no write without confirmation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_the_bytes_are_reversed():
     mac=st.binary(min_size=5, max_size=5).filter(any),
     ports=st.lists(st.integers(1025, 65535), min_size=2, max_size=2, unique=True),
 )
-def test_the_card_reads_what_was_meant(net, ends, mac, ports):
+def test_the_card_decodes_the_settings_sent(net, ends, mac, ports):
     host, card = (".".join(map(str, (*net, end))) for end in ends)
     settings = EepromSettings(host, card, (b"\2" + mac).hex(":"), *ports)
     read = Network.decode(settings.encode())

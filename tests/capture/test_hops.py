@@ -1,4 +1,4 @@
-"""A silent card's error names the hop: no route, no link, no device, a mute card, a radar that does not stream."""
+"""Errors of a silent card name the hop: no route, no link, no device, a mute card, a radar that does not stream."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_every_hop_reads_differently(tmp_path, given, hop, says):
     assert error.remedy
 
 
-def test_what_the_kernel_does_not_tell_is_not_guessed(tmp_path):
+def test_unknown_hops_are_not_guessed(tmp_path):
     assert silent_hop(CARD, tmp_path) is Hop.UNKNOWN
     assert route_interface(CARD, tmp_path) is None
     assert neighbour_answers(CARD, tmp_path) is None

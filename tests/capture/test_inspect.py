@@ -99,14 +99,14 @@ def a_whole_picture(tmp_path: Path) -> bytes:
         (lambda _p: Path(sys.executable).resolve().read_bytes()[: 1 << 20], False),
     ],
 )
-def test_what_is_no_capture_has_a_status_of_its_own(tmp_path, capsys, content, is_capture):
+def test_files_that_are_no_recordings_have_their_own_status(tmp_path, capsys, content, is_capture):
     path = tmp_path / "x.bin"
     path.write_bytes(content(tmp_path))
     assert inspect_file(path, None, None, "", as_json=False) == (0 if is_capture else DataError.exit_status)
     assert ("not a capture" in capsys.readouterr().out) is not is_capture
 
 
-def test_empty_and_truncated_recordings_are_told(tmp_path):
+def test_empty_and_truncated_recordings_are_reported(tmp_path):
     path = tmp_path / "x.bin"
     path.write_bytes(row(4, False).tobytes() + b"12345")
     assert "5 bytes after" in main_text(inspect_bin(path))
@@ -129,7 +129,7 @@ def test_real_samples_are_recognised(tmp_path, lanes, samples):
 @pytest.mark.parametrize(
     "given", [Shape(2, True, 256), Shape(4, True, 512), Shape(4, False, 256), Shape(2, False, 256)]
 )
-def test_a_layout_that_does_not_fit_is_told(tmp_path, given):
+def test_a_layout_that_does_not_fit_is_reported(tmp_path, given):
     path = tmp_path / "x.bin"
     row(4, False).tofile(path)
     assert inspect_shape(path, Shape(4, True, 256)).remarks == []
@@ -137,7 +137,7 @@ def test_a_layout_that_does_not_fit_is_told(tmp_path, given):
     assert any(str(Shape(4, True, 256)) in text for text in remarks)
 
 
-def test_wrong_order_of_i_and_q_is_told(tmp_path):
+def test_swapped_i_and_q_are_reported(tmp_path):
     path = tmp_path / "x.bin"
     row(4, True).tofile(path)
     assert any("I and Q" in text for text in inspect_shape(path, Shape(4, True, 256)).remarks)
@@ -165,7 +165,7 @@ def altered(words: np.ndarray, fault: str) -> np.ndarray:
         ("clipping", "full scale"),
     ],
 )
-def test_a_fault_is_told_and_the_layout_is_still_recognised(tmp_path, lanes, is_complex, fault, says):
+def test_a_fault_is_reported_and_the_layout_still_recognised(tmp_path, lanes, is_complex, fault, says):
     """Nothing is given: the layout is guessed from data with the fault in it, and the fault is the only remark."""
     sound = row(lanes, False) if is_complex else real_row(lanes)
     path = tmp_path / "x.bin"
@@ -181,7 +181,7 @@ def test_a_fault_is_told_and_the_layout_is_still_recognised(tmp_path, lanes, is_
 
 @pytest.mark.parametrize("lanes", [4, 2])
 @pytest.mark.parametrize("dead", [0, 3])
-def test_a_missing_antenna_is_told_in_either_layout(tmp_path, lanes, dead):
+def test_a_missing_antenna_is_reported_in_either_layout(tmp_path, lanes, dead):
     path = tmp_path / "x.bin"
     row(lanes, False, dead=dead).tofile(path)
     r = inspect_bin(path)
@@ -254,7 +254,7 @@ def test_pcap_forms(tmp_path, order, magic, tick):
     assert found[0].source == ("192.168.33.180", 1024)
 
 
-def test_pcap_with_loss_is_placed_and_told(tmp_path):
+def test_lost_packets_of_a_pcap_are_masked_and_reported(tmp_path):
     data = row(4, False).tobytes()
     count, sequence = 2**48 - 30_000, 2**32 - 3
     starts = range(0, len(data), 1456)

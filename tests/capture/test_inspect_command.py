@@ -21,7 +21,7 @@ def polysight(tmp_path):
     return functools.partial(Bench(tmp_path).here, "inspect")
 
 
-def test_the_command_draws_and_says_what_the_rig_file_makes_of_it(polysight, tmp_path):
+def test_the_command_plots_and_compares_with_the_rig_file(polysight, tmp_path):
     row(4, False).tofile(tmp_path / "right.bin")
     row(2, False).tofile(tmp_path / "wrong.bin")
     done = polysight("right.bin", "--config", RIG_FILE, "--plot", "right.png")
@@ -51,7 +51,7 @@ def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
     assert "nothing from a DCA1000 at 192.168.33.7" in polysight("both", "--card", "192.168.33.7").err
 
 
-def test_a_row_of_a_scan_brings_its_own_rig_file_and_says_that_it_is_simulated(polysight, tmp_path):
+def test_a_row_of_a_scan_is_read_with_the_scans_rig_file(polysight, tmp_path):
     (tmp_path / "scene.toml").write_text(small_scene(8, 2, metal=False))
     simulate = [sys.executable, "-m", "polysight.simulators", "simulate", tmp_path / "scene.toml", "--config", RIG_FILE]
     subprocess.run([*simulate, "--out", tmp_path / "scan"], check=True, capture_output=True)

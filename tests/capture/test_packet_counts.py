@@ -26,7 +26,7 @@ def others_than(counts: PacketCounts, *names: str) -> dict[str, int]:
     cut=st.floats(0, 1),
     batch=st.sampled_from([1, 7, 64]),
 )
-def test_what_comes_after_a_reset_within_a_row_is_counted_as_restarted(grid, start, rows, cut, batch):
+def test_packets_after_a_reset_within_a_row_are_counted_as_restarted(grid, start, rows, cut, batch):
     frame, frames = grid
     size = frame * frames
     many = -(-size // FULL)

@@ -14,7 +14,7 @@ from polysight.host.capture.dca1000 import Counters, encode_packet
 from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Losses, place_record
-from tests.support.capture.records import FULL, Record, is_original_or_masked, log_of, mask_of, place
+from tests.support.capture.records import FULL, Record, is_original_or_masked, log_of, mask_of, next_start, place
 
 SLOW = [HealthCheck.too_slow]  # a busy machine is no fault
 COUNT, SEQUENCE = 1 << 48, 1 << 32
@@ -56,9 +56,9 @@ def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, c
         assert not out[mask].any()
     else:
         assert mask.all()
-    if placed.located and placed.next_start is not None:
-        assert placed.next_start.byte_count == (count + len(record.data)) % COUNT
-        assert placed.next_start.sequence == (sequence + len(record.packets)) % SEQUENCE
+    if placed.located and (start := next_start(placed)) is not None:
+        assert start.byte_count == (count + len(record.data)) % COUNT
+        assert start.sequence == (sequence + len(record.packets)) % SEQUENCE
 
 
 @dataclass
@@ -175,14 +175,14 @@ def test_bytes_the_card_dropped_itself_mask_the_whole_record():
     """Status bits 7 and 9: the counters have no gap, so no byte's place is certain, even when the count is right."""
     record = Record.make(5 * 4096, 0, 1)
     log = log_of(5 * 4096, record.packets)
-    placed, _ = place_record(log, 4096, Past.ending_at(Counters(0, 1)), dropped_by_card="DDR_FULL")
+    placed, _ = place_record(log, 4096, Past(Counters(0, 1), (0,)), dropped_by_card="DDR_FULL")
     assert not placed.complete
     assert placed.missing == [(0, 5 * 4096)]
     assert "dropped data before numbering it (DDR_FULL)" in placed.reason
     assert placed.counts.placed == len(record.packets)
 
 
-def test_losses_are_told_by_kind():
+def test_losses_are_counted_by_kind():
     record = Record.make(30 * FULL, 0, 1)
     kept = [p for k, p in enumerate(record.packets) if k not in (0, 1, 7, 12, 13, 29)]
     placed, _ = place(30 * FULL, [kept[1], kept[0], *kept[2:]], Counters(0, 1), 65536)
@@ -308,7 +308,7 @@ def test_fresh_counters_need_no_history():
 def test_second_record_continues_and_the_stale_first_is_outside():
     first, second = Record.make(5000, 0, 1), Record.make(5000, 5000, 5, seed=1)
     placed, _ = place(5000, first.packets)
-    assert placed.next_start == Counters(5000, 5)
+    assert next_start(placed) == Counters(5000, 5)
     placed, out = place(5000, [second.packets[0], first.packets[-1], *second.packets[1:]], placed.past, 1000)
     assert placed.complete
     assert (placed.counts.leftover, placed.counts.outside) == (1, 0)
@@ -326,7 +326,7 @@ def test_more_than_expected_is_not_a_row():
 def test_nothing_and_nonsense():
     placed, out = place(5000, [], Counters(0, 1))
     assert placed.missing == [(0, 5000)]
-    assert placed.next_start is None
+    assert next_start(placed) is None
     placed, out = place(5000, [b"", b"short", b"0123456789"], Counters(0, 1))
     assert placed.counts.malformed == 3
     assert not out.any()
@@ -340,7 +340,7 @@ def test_nothing_and_nonsense():
     known=st.booleans(),
     batch=st.sampled_from([1, 2, 7]),
 )
-def test_last_short_packet_of_the_record_before_is_told_from_the_first_of_this_one(rest, count, sequence, known, batch):
+def test_last_packet_of_the_previous_record_is_not_the_first_of_this_one(rest, count, sequence, known, batch):
     """The record before was stopped early, and what its card still held comes when this one is received already."""
     late = Record.make(rest, count, sequence, seed=1)
     record = Record.make(20 * FULL + 100, (count + rest) % COUNT, (sequence + 1) % SEQUENCE)
@@ -349,7 +349,7 @@ def test_last_short_packet_of_the_record_before_is_told_from_the_first_of_this_o
     assert (placed.located, placed.missing) == (True, [])
     assert out.tobytes() == record.data
     assert (placed.counts.leftover, placed.counts.placed) == (1, len(record.packets))
-    assert placed.next_start == Counters((count + rest + out.size) % COUNT, (sequence + 1 + 21) % SEQUENCE)
+    assert next_start(placed) == Counters((count + rest + out.size) % COUNT, (sequence + 1 + 21) % SEQUENCE)
 
 
 def test_truncated_first_packet_is_not_the_last_of_the_record_before():

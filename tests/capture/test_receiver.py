@@ -1,4 +1,4 @@
-"""The receiving process over real sockets: bit-exact rows, masked losses, clear errors, a clean end."""
+"""The receiver process over real sockets: bit-exact rows, masked losses, clear errors, a clean end."""
 
 from __future__ import annotations
 
@@ -132,12 +132,11 @@ def _waiting(board: Board) -> int:
     return 0
 
 
-def test_discard_and_an_empty_row(board, tmp_path):
+def test_a_new_row_discards_the_one_before_and_may_be_empty(board, tmp_path):
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, 4096, 4096, tmp_path / "a.part")
-        receiver.discard()
+        receiver.begin_row(0, 2, 4096, 4096, tmp_path / "b.part")
         assert not (tmp_path / "a.part").exists()
-        receiver.begin_row(0, 2, 4096, 4096, tmp_path / "a.part")
         row = receiver.end_row()
     assert (row.packets, row.missing, row.first_arrival_ns) == (0, [(0, 4096)], 0)
 
@@ -147,7 +146,7 @@ def test_errors_come_back_to_the_host(board, tmp_path):
         with refused(ErrorCode.BUSY, f"{board.host_address}:{board.data_port}"):
             ReceiverProcess(board, 1 << 20)
         (tmp_path / "file").write_text("")
-        with refused(ErrorCode.DISK_FULL):
+        with refused(ErrorCode.FILE_UNWRITABLE):
             receiver.begin_row(0, 1, 4096, 4096, tmp_path / "file" / "a.part")
         with pytest.raises(DeviceError):
             receiver.end_row()
@@ -222,7 +221,7 @@ def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
         assert swamped.end_row().kernel_drops == 0
 
 
-def test_what_the_card_dropped_itself_is_reported_with_the_row(board, card, tmp_path):
+def test_data_dropped_by_the_card_masks_the_row(board, card, tmp_path):
     data = noise(20_000, 4)
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, len(data), 1000, tmp_path / "a.part")
@@ -236,7 +235,7 @@ def test_what_the_card_dropped_itself_is_reported_with_the_row(board, card, tmp_
     assert read_index(tmp_path / "a.idx")[0]["card_status"] == row.card_status
 
 
-def test_the_short_last_packet_is_told_unasked(board, card, tmp_path):
+def test_the_short_last_packet_is_reported_at_once(board, card, tmp_path):
     """Frames were missed: the byte count is never reached, and the card's short tail says that nothing follows."""
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, 40_960, 4096, tmp_path / "a.part")

@@ -1,4 +1,4 @@
-"""More than one record among a row's packets, and cards that begin anew near where they began before."""
+"""More than one record among a row's packets, and cards that restart near their former start."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def rows_until_accepted(card: Card, size: int, past: Past) -> int:
 
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
 @pytest.mark.parametrize("resets", [(0, 1), (0, 2), (0, 3), (-1,), (-2,), (0, -1)])
-def test_a_card_that_begins_anew_soon_after_it_was_switched_on(size, resets):
+def test_a_card_that_restarts_soon_after_power_up_is_accepted_again(size, resets):
     """Its counters are those of records that came whole: they are no leftovers, and no perfect row is lost for ever."""
     card, many = Card(size), -(-size // FULL)
     past = place(size, card.record().packets, None, FRAME, batch=64)[0].past
@@ -38,7 +38,7 @@ def test_a_card_that_begins_anew_soon_after_it_was_switched_on(size, resets):
 
 
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
-def test_a_card_whose_counters_begin_anew_with_every_record(size):
+def test_a_card_that_restarts_with_every_record_is_accepted(size):
     card = Card(size)
     past = place(size, card.record().packets, None, FRAME, batch=64)[0].past
     accepted = []
@@ -74,7 +74,7 @@ def test_a_silent_row_that_comes_with_the_next_one_is_not_taken_for_it(came):
 
 
 @pytest.mark.parametrize("tail", [4, 60, 175])
-def test_the_end_of_a_record_nobody_saw_is_not_taken_for_a_perfect_row(tail):
+def test_the_end_of_an_unseen_record_is_not_taken_for_a_row(tail):
     card = Card(SHORT_END)
     past = place(SHORT_END, card.record().packets, None, FRAME, batch=64)[0].past
     unseen, own = card.record(), card.record()

@@ -1,4 +1,4 @@
-"""Where and how urgently a receiver runs, what buffer the kernel grants, and what is said when it is too little."""
+"""Core and priority of a receiver, the receive buffer, and warnings if the system grants less."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_cores_leave_the_first_to_the_host():
     assert len(receiver_cores(2)) == 2
 
 
-def test_where_and_how_urgently_it_runs_is_said(board):
+def test_core_and_priority_are_reported(board):
     core = max(os.sched_getaffinity(0))
     with ReceiverProcess(board, 1 << 20, Core(core, own=True)) as receiver:
         pinned = os.sched_getaffinity(receiver.pid) == {core}
@@ -62,7 +62,7 @@ def test_the_rights_are_written_where_a_login_and_a_desktop_read_them(tmp_path):
         assert refused.returncode == 2
 
 
-def test_what_is_not_permitted_is_said(monkeypatch):
+def test_missing_permissions_are_warnings(monkeypatch):
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 

@@ -1,4 +1,4 @@
-"""Rows that were placed wrongly once, each by itself: a late packet, a full last packet, counters that begin anew."""
+"""Rows that were once placed wrongly: a late packet, a full last packet, counters that restart."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_full_and_a_short_late_packet_before_a_perfect_row_are_left_over(known
 @pytest.mark.parametrize("size", [FULL_ENDS, DEFAULT])
 @pytest.mark.parametrize("before", [1, 2, 5])
 @pytest.mark.parametrize("lost", [0, 100, FULL, 2 * FULL])
-def test_counters_that_begin_anew_in_the_first_packets_give_no_wrong_byte(size, before, lost):
+def test_a_restart_in_the_first_packets_gives_no_wrong_byte(size, before, lost):
     zero, one = records(size, 2, first=70_000, sequence=9)
     past = place(size, zero.packets, None, FRAME, batch=256)[0].past
     rest = Record.make(size - before * FULL - lost, 0, 1)
@@ -94,7 +94,7 @@ def test_overlapping_payload_is_compared():
     assert is_original_or_masked(record, placed, out)
 
 
-def test_what_came_before_the_first_pulse_is_left_over():
+def test_packets_before_the_first_pulse_are_left_over():
     """An earlier program's last packets, of which nothing is known: only the time tells."""
     zero, one = records(FULL_ENDS, 2)
     log = log_of(FULL_ENDS, [], t_ns=1)

@@ -1,4 +1,4 @@
-"""A row's file: memory taken again, a full disk, a damaged index."""
+"""A row's file: reused memory, a full disk, a damaged index."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_memory_is_taken_again_and_clean():
     assert not second.payload[:8000].any()
 
 
-def test_a_segment_is_what_was_given(tmp_path):
+def test_a_segment_holds_the_bytes_given(tmp_path):
     data = np.arange(8000, dtype=np.uint8)
     assert Segment(tmp_path / "b", 8000).finish(data) == zlib.crc32((tmp_path / "b").read_bytes())
     assert (tmp_path / "b").read_bytes() == data.tobytes()

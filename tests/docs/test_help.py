@@ -44,6 +44,22 @@ def test_help_has_an_example_that_works(parser):
     assert [f for line in lines for f in command_faults(line)] == []
 
 
+def test_help_begins_with_a_sentence_an_example_and_the_options_used_most():
+    root = parser_of("polysight.host.cli.main")
+    assert root is not None
+    for parser in [p for p in leaves(root) if p is not root]:
+        text = parser.format_help()
+        usage, sentence, *_ = text.split("\n\n")
+        assert usage.startswith(f"usage: {parser.prog}")
+        assert len(sentence.splitlines()) == 1
+        assert sentence.endswith(".")
+        assert sentence.count(". ") == 0, f"{parser.prog}: one sentence"
+        first = re.search(r"\noptions:\n(.*?)(?:\n\n|\Z)", text, re.DOTALL)
+        shown = re.findall(r"^  (-\S+)", first[1], re.MULTILINE) if first else []
+        assert len([option for option in shown if option != "-h,"]) <= 3, f"{parser.prog}: {shown}"
+        assert all(name in text for a in parser._actions for name in a.option_strings), parser.prog
+
+
 @pytest.mark.parametrize("parser", parsers(), ids=lambda p: p.prog.replace(" ", "-"))
 def test_every_option_is_explained(parser):
     assert parser.description

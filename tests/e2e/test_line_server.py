@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import pytest
-
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validation import validate
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.tables import decode, to_builtins
 from tests.support.pattern_rig import counts, small_table, start_rig
+from tests.support.refusals import refused
 
 PORTS = {"LS": 5000, "RH": 5001, "RV": 5002}
 
@@ -35,7 +35,7 @@ def test_each_row_is_armed_once_and_comes_whole(bench):
 def test_scan_that_forgets_to_rearm_gets_no_data(bench):
     rig, instrument = small_rig(bench)
     forgetful = decode({**to_builtins(instrument), "radar": {"control": "endless"}}, Instrument, "test")
-    with pytest.raises(Exception, match="no data"):
+    with refused(ErrorCode.ROW_INCOMPLETE):
         run_scan(forgetful, bench.folder / "scan")
     assert list(ScanFolder.load(bench.folder / "scan").committed()) == []
     assert all(board["unarmed"] > 0 and board.get("frames", 0) == 0 for board in counts(bench, rig).values())
@@ -48,6 +48,6 @@ def test_rearming_that_failed_silently_is_a_missed_row_and_is_taken_again(bench)
     assert result.retakes >= 1
     first = result.folder.facts("row_rejected")[0]
     assert first["row"] == 1
-    assert any(r.startswith("RH: no data: its radar was asked to re-arm") for r in first["reasons"])
+    assert {"kind": "no_data", "board": "RH"} in first["faults"]
     assert validate(bench.folder / "scan") == []
     assert counts(bench, rig)["RH"]["unarmed"] > 0

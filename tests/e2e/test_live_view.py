@@ -100,7 +100,7 @@ def test_a_scan_is_followed_paused_lost_and_stopped(slow_rig):
     view.wait(lambda s: shown(s) > rows, "rows after the pause")
 
     scan.kill()
-    gone = view.wait_headline("The scan program is gone")
+    gone = view.wait_headline("The scan program has ended")
     assert "polysight resume" in gone["status"]["do"]
 
     again = rig.start("polysight", "resume", rig.folder / "scan", "--no-process")

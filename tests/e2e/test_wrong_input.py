@@ -54,7 +54,7 @@ def damaged_rig(folder: Path, old: str, new: str) -> Path:
     ("old", "new", "words"),
     [
         ("baud = 115200", "baud = 115200\nbaude = 9600", ("stage", "baude")),
-        ("columns = 350", 'columns = "many"', ("grid.columns", "many", "int")),
+        ("columns = 350", 'columns = "many"', ("grid.columns", "many", "whole number")),
         ("pulses = 16", "pulses = 16 17", ("not valid TOML", "line")),
         ("period_us = 1500.0", "period_us = 15.0", ("burst", "300 us")),
     ],
@@ -315,7 +315,7 @@ def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
     lonely.write_text(tomli_w.dumps(table))
     with listening(lonely_instrument.pi.command_address):
         scan = bench.start("polysight", "scan", "--config", lonely, "--out", "s")
-        bench.wait_for(lambda: "reaching" in scan.err, "the scan says that it connects")
+        bench.wait_for(lambda: "connect" in scan.err, "the scan says that it connects")
         scan.interrupt()
         ended = scan.wait(10)
     assert ended.status == 128 + signal.SIGINT

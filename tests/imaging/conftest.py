@@ -1,4 +1,4 @@
-"""Small scenes of known truth: point targets and a uniform plane, as synchronised rows."""
+"""Synchronised rows of point targets, on a small grid."""
 
 from __future__ import annotations
 

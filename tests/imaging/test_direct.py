@@ -1,3 +1,5 @@
+"""Backprojection by direct sum: focus, adjoint, linearity, for any antennas and voxels."""
+
 import numpy as np
 import pytest
 
@@ -61,7 +63,7 @@ def test_project_is_its_adjoint_for_any_antennas_and_voxels(even):
     assert abs(forward - back) < 1e-10 * np.linalg.norm(x) * np.linalg.norm(y)
 
 
-def test_it_is_linear_and_one_frequency_works():
+def test_backprojection_is_linear_and_works_with_one_frequency():
     rng = np.random.default_rng(2)
     tx, rx, voxels = (rng.uniform(-0.5, 0.5, (5, 3)) for _ in range(3))
     a, b = (rng.standard_normal((5, 1)) + 0j for _ in range(2))
@@ -85,5 +87,5 @@ def test_shapes_that_do_not_fit_are_refused(change):
         "reference_m": np.zeros(3),
     }
     assert backproject(**good).shape == (4,)
-    with pytest.raises(ValueError, match="must be"):
+    with pytest.raises(ValueError, match=r"\["):
         backproject(**{**good, **change})

@@ -1,4 +1,4 @@
-"""Autofocus brings back a plane that the rig file has wrong."""
+"""Autofocus finds a plane that differs from the rig file."""
 
 import msgspec
 import numpy as np
@@ -11,7 +11,7 @@ PLACES_MM = [(-60, -55), (-10, -60), (58, -50), (-62, 5), (3, -4), (60, 8), (-55
 
 
 def _swept(make_rig, points_rows, depth_mm=0.0, tilt_deg=(0.0, 0.0), noise=0.3):
-    """Points on a plane `depth_mm` farther than the rig file says and rising by `tilt_deg` along x and y."""
+    """Points on a plane `depth_mm` behind the rig file's, with the tilt `tilt_deg` along x and y."""
     rig = make_rig(88, 41, 8.0, 8.0, pixels=(75, 75))
     grid, rng = image_grid(rig), np.random.default_rng(1)
     centre = np.array([grid.x_m.mean(), grid.y_m.mean()])
@@ -40,7 +40,7 @@ def test_a_plane_wrong_by_3_mm_or_1_degree_is_found_within_half_a_millimetre_and
     assert abs(found.depths_mm[np.argmax(found.sharpness)] - depth_mm) <= 2
 
 
-def test_a_narrow_scan_says_that_it_cannot_tell(make_rig, points_rows):
+def test_a_narrow_scan_gives_no_certain_result(make_rig, points_rows):
     rig = make_rig(21, 21, 6.0, 6.0, pixels=(31, 31))
     point = np.array([image_grid(rig).x_m[15], image_grid(rig).y_m[15], image_grid(rig).z_m])
     builder = ImageBuilder(rig, depth_m=8e-3)
@@ -49,7 +49,7 @@ def test_a_narrow_scan_says_that_it_cannot_tell(make_rig, points_rows):
     assert not focus_sweep(builder, planes=5).certain
 
 
-def test_the_found_distance_put_into_the_rig_file_leaves_nothing_to_find(make_rig, points_rows):
+def test_with_the_right_distance_in_the_rig_file_nothing_is_found(make_rig, points_rows):
     rig = make_rig(88, 9, 8.0, 8.0, pixels=(31, 31))
     point = np.array([image_grid(rig).x_m[15], image_grid(rig).y_m[15], image_grid(rig).z_m + 3e-3])
     geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=rig.geometry.object_distance_mm + 3)
@@ -60,7 +60,7 @@ def test_the_found_distance_put_into_the_rig_file_leaves_nothing_to_find(make_ri
     assert abs(focus_sweep(builder, planes=9).depth_mm) < 0.3
 
 
-def test_the_planes_themselves_come_back_from_between_them_the_first_and_the_last_too():
+def test_interpolation_between_planes_is_exact_at_all_planes():
     depths = np.linspace(-4e-3, 4e-3, 9)
     stack = 1 + np.random.default_rng(1).random((9, 3, 4))
     for plane, depth in zip(stack, depths, strict=True):

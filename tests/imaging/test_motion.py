@@ -1,4 +1,4 @@
-"""The filter that undoes the stage's travel within a burst."""
+"""Compensation of the stage's motion within a burst."""
 
 import msgspec
 import numpy as np
@@ -11,14 +11,14 @@ COUNT, MIDDLE = 61, slice(REACH, -REACH)
 
 @pytest.fixture(scope="module")
 def fast(rig):
-    """A rig whose bursts fill nearly all of the way from point to point: 16 pulses at 100 mm/s in steps of 2.5 mm."""
+    """A rig whose bursts nearly fill the step: 16 pulses at 100 mm/s in steps of 2.5 mm."""
     grid = msgspec.structs.replace(rig.grid, columns=100, rows=8, step_x_mm=2.5, step_y_mm=4.0)
     stage = msgspec.structs.replace(rig.stage, speed_mm_s=100.0)
     return msgspec.structs.replace(rig, grid=grid, stage=stage)
 
 
 def burst_mean(turns, rig):
-    """A wave that turns by so many cycles a position, averaged over each position's burst."""
+    """A wave of `turns` cycles per position, averaged over the burst of each position."""
     pulse = (np.arange(rig.burst.pulses) - (rig.burst.pulses - 1) / 2) * rig.burst.period_us * 1e-6
     offsets = pulse * rig.stage.speed_mm_s / rig.grid.step_x_mm
     return np.exp(2j * np.pi * turns * (np.arange(COUNT)[:, None] + offsets)).mean(axis=1).astype(np.complex64)
@@ -28,7 +28,7 @@ def burst_mean(turns, rig):
     ("turns", "centre"), [(-0.4, 0.0), (-0.2, 0.0), (0.0, 0.0), (0.1, 0.0), (0.3, 0.0), (0.0, 0.1), (0.35, 0.1)]
 )
 def test_every_wave_keeps_its_amplitude_and_phase(fast, turns, centre):
-    """Whatever part of its turning burst alignment has undone."""
+    """For any part of its phase change that burst alignment has removed."""
     still = np.exp(2j * np.pi * turns * np.arange(COUNT))
     average = burst_mean(turns - centre, fast) * np.exp(2j * np.pi * centre * np.arange(COUNT))
     valid, turn = np.ones(COUNT, bool), np.full(COUNT, 2 * np.pi * centre)
@@ -42,8 +42,8 @@ def test_a_slow_stage_and_one_pulse_need_no_filter(rig):
     np.testing.assert_allclose(burst_filters(slow), np.eye(REACH + 1)[np.zeros(REACH + 1, int)], atol=1e-6)
 
 
-def test_masked_positions_and_ends_are_neither_used_nor_changed(fast):
-    """A filter reaches as far as all is valid: what a masked position holds does not matter."""
+def test_masked_positions_have_no_influence_and_ends_are_not_changed(fast):
+    """The filter uses only valid neighbours."""
     rng = np.random.default_rng(1)
     samples = (rng.standard_normal((2, COUNT)) + 1j * rng.standard_normal((2, COUNT))).astype(np.complex64)
     valid = np.ones(COUNT, bool)
@@ -56,7 +56,7 @@ def test_masked_positions_and_ends_are_neither_used_nor_changed(fast):
         np.testing.assert_array_equal(first[:, alone], samples[:, alone])
 
 
-def test_a_row_run_the_other_way_is_filtered_alike(fast):
+def test_a_row_in_the_other_direction_is_filtered_equally(fast):
     rng = np.random.default_rng(2)
     samples = (rng.standard_normal((2, COUNT)) + 1j * rng.standard_normal((2, COUNT))).astype(np.complex64)
     valid, turn = rng.uniform(size=COUNT) < 0.9, rng.uniform(-1, 1, COUNT)

@@ -1,4 +1,4 @@
-"""The direct imager knows nothing of this rig: it focuses what another radar recorded.
+"""The direct imager focuses a recording of another radar.
 
 The recording is not part of this project: one degree of azimuth (117 pulses, 9.29 to 9.91 GHz, HH) of the Gotcha
 Volumetric SAR Data Set, recorded from an aircraft at 10 km by the US Air Force Research Laboratory and released to the
@@ -24,7 +24,7 @@ def recorded():
         pytest.skip("no recording of another radar: POLYSIGHT_GOTCHA=data_3dsar_pass1_az001_HH.mat (AFRL, public)")
     data = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)["data"]
     antenna = np.stack([data.x, data.y, data.z], axis=1).astype(float)
-    # Its phase is that of the conjugate, two ways, relative to the scene's centre.
+    # Its phase is conjugated, two-way, relative to the scene's centre.
     return np.conj(data.fp.T), data.freq.astype(float), antenna, 2.0 * data.r0
 
 
@@ -64,7 +64,7 @@ def test_recorded_pulses_of_an_aircraft_focus_to_their_bandwidth_and_aperture(re
     assert _half_power_width(along_y, 0.06) == pytest.approx(across, rel=0.2)
 
 
-def test_they_do_not_focus_when_the_phase_between_pulses_is_lost_or_the_range_is_wrong(recorded):
+def test_without_pulse_to_pulse_phase_or_with_a_wrong_range_there_is_no_focus(recorded):
     rng = np.random.default_rng(0)
     s, _, _, reference = recorded
     focused = _cut(recorded, 1, 0.06).max()

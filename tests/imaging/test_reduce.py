@@ -1,3 +1,5 @@
+"""The range gate: few frequency samples give the matched filter of all samples, and the direct path is removed."""
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -25,7 +27,7 @@ def test_few_samples_give_every_matched_filter_output_of_all(rig, echo_m, pixel_
     weight = scipy.signal.get_window("hann", b - a + 2, fftbins=False)[1:-1]
     all_samples = (weight / weight.sum() * x[a:b] * np.exp(-2j * np.pi * _sweep(chirp)[a:b] * pixel_m / C)).sum()
     few = (gate.matrix @ x * np.exp(-2j * np.pi * gate.frequencies_hz * pixel_m / C)).sum()
-    assert abs(few - all_samples) < 1e-3  # the echo's leak into the direct path's estimate is all that differs
+    assert abs(few - all_samples) < 1e-3  # the echo leaks into the estimate of the direct path
     assert len(gate.frequencies_hz) <= 10
 
 
@@ -40,10 +42,10 @@ def test_without_the_direct_path_removal_the_error_is_below_1e_4_of_the_peak(rig
 
 
 @given(st.floats(*GATE))
-def test_the_model_says_how_an_echo_comes_out(rig, echo_m):
+def test_the_model_predicts_an_echo_after_the_gate(rig, echo_m):
     gate = reduction(rig.chirp, GATE)
-    came_out = gate.matrix @ np.exp(2j * np.pi * _sweep(rig.chirp) * echo_m / C)
-    np.testing.assert_allclose(gate.model @ np.exp(2j * np.pi * gate.frequencies_hz * echo_m / C), came_out, atol=1e-4)
+    reduced = gate.matrix @ np.exp(2j * np.pi * _sweep(rig.chirp) * echo_m / C)
+    np.testing.assert_allclose(gate.model @ np.exp(2j * np.pi * gate.frequencies_hz * echo_m / C), reduced, atol=1e-4)
 
 
 @pytest.mark.parametrize("window", ["hann", "boxcar"])
@@ -56,7 +58,7 @@ def test_the_direct_path_vanishes_and_is_measured(rig, window):
     assert abs(gate.direct @ echo) < 2e-3
 
 
-def test_gate_holds_every_pixel_at_every_position(make_rig):
+def test_the_gate_contains_every_pixel_at_every_position(make_rig):
     rig = make_rig()
     grid, plan = image_grid(rig), plan_raster(rig.grid)
     for board in rig.receivers:

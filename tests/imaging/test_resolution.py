@@ -1,3 +1,5 @@
+"""Point response: measured widths and sidelobes agree with formulas; missing positions cost what is reported."""
+
 import msgspec
 import numpy as np
 import pytest
@@ -66,10 +68,10 @@ def test_missing_positions_cost_what_is_reported(make_rig, points_rows):
     summed = np.abs(board.image()[0]).max() * float(board.count) / (board.valid.size * 4)
     whole = np.abs(board.image()[0]).max()
     assert -20 * np.log10(summed / whole) == pytest.approx(facts["loss_db"], abs=1e-3)
-    assert whole == pytest.approx(1, abs=0.03)  # the image itself does not fall
+    assert whole == pytest.approx(1, abs=0.03)  # image amplitudes do not change
 
 
-def test_no_data_no_response(make_rig):
+def test_without_data_there_is_no_response(make_rig):
     facts = board_facts(ImageBuilder(make_rig(5, 5)).boards["RV"])
     assert facts["masked"] == 1
     assert "loss_db" not in facts

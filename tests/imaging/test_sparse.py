@@ -1,4 +1,4 @@
-"""Sparse scans: what the matched filter blurs with aliases, the reconstruction tells from them."""
+"""Reconstruction of sparse scans removes aliases and keeps weak reflectors."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def _kept(name):
 
 
 @pytest.mark.parametrize("name", ["every second row", "every second column", "a random quarter"])
-def test_points_of_a_sparse_scan_come_out_without_aliases(board, name):
+def test_points_of_a_sparse_scan_are_reconstructed_without_aliases(board, name):
     samples = board(_kept(name))
     found = reconstruct(samples, iterations=40, strength=0.03)
     truth = np.zeros((40, 40), complex)
@@ -60,8 +60,8 @@ def test_points_of_a_sparse_scan_come_out_without_aliases(board, name):
     assert found.residual[-1] < 0.25 < found.residual[0]
 
 
-def test_what_reflects_weakly_beside_something_strong_is_kept(board):
-    """Beside metal thin wood has 0.42 of its amplitude in H and 0.035 in V: by default both stay what they are."""
+def test_weak_reflectors_beside_a_strong_one_are_kept(board):
+    """Thin wood has 0.42 of the amplitude of metal in H and 0.035 in V."""
     amplitudes = np.array([1.0, 0.035j, -0.42])
     found = reconstruct(board(_kept("every second column"), amplitudes), iterations=25)
     sums = np.array([found.image[j - 1 : j + 2, i - 1 : i + 2].sum() for j, i in AT])

@@ -36,7 +36,7 @@ def desk(tmp_path):
         yield tmp_path, stop
 
 
-def test_wishes_are_heard_once(desk):
+def test_commands_are_obeyed_once(desk):
     folder, stop = desk
     send_command(folder, ScanCommand.PAUSE)
     assert stop.paused
@@ -74,7 +74,7 @@ def test_signs_of_life_go_on_and_the_folder_goes_with_the_desk(tmp_path):
     assert not (tmp_path / CONTROL).exists()
 
 
-def test_what_was_asked_of_an_earlier_scan_is_forgotten(tmp_path):
+def test_commands_for_an_earlier_scan_are_deleted(tmp_path):
     (tmp_path / CONTROL).mkdir()
     for wish in ScanCommand:
         (tmp_path / CONTROL / wish).touch()

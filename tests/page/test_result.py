@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 
-from polysight.host.page.result import ResultTail
+from polysight.host.page.watch import ProductsTail
 from tests.support.page.chromium import DESK, PHONE
 from tests.support.page.live_view import GrowingScan, served
 from tests.support.processes import LIMIT_S
@@ -13,7 +13,7 @@ from tests.support.products import REASON, judged_products
 
 
 def test_the_verdict_follows_the_products(tmp_path):
-    tail = ResultTail(tmp_path)
+    tail = ProductsTail(tmp_path)
     assert tail.look() is None
     for level in ("care", "none", None, "good"):
         shutil.rmtree(tmp_path / "products", ignore_errors=True)

@@ -101,7 +101,7 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
         return state["status"]["level"] == "good" and state["control"]["running"]
 
     wait_for(lives, "that it lives")
-    assert watch.wait_for(lambda s: s["status"]["headline"] == "The scan program is gone", LIMIT_S)
+    assert watch.wait_for(lambda s: s["status"]["headline"] == "The scan program has ended", LIMIT_S)
     state = told(watch)
     assert not state["control"]["running"]
     assert "polysight resume" in state["status"]["do"]
@@ -111,7 +111,7 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
 
 def test_an_unfinished_folder_without_a_program_is_said_to_be_at_once(growing, watching):
     growing.grow_to("row_committed")
-    assert told(watching(growing.path))["status"]["headline"] == "The scan program is gone"
+    assert told(watching(growing.path))["status"]["headline"] == "The scan program has ended"
 
 
 def test_a_damaged_row_is_named_and_the_others_are_shown(growing, watching):

@@ -7,8 +7,6 @@ Bursts are in wire time, so that the machine may be busy; tests/pi/test_stand_in
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from contextlib import closing
 from itertools import pairwise
 
@@ -17,8 +15,8 @@ import pytest
 
 from polysight.shared import messages as m
 from polysight.simulators import gpio, uno
-from tests.support.paths import REPO
 from tests.support.pi.wires_log import WiresLog
+from tests.support.stage.processes import StageProcess
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 if lacking := gpio.missing() + uno.missing():
@@ -37,27 +35,19 @@ def rig(gpio_rig, tmp_path):
         grid=replace(gpio_rig.grid, columns=POINTS, rows=1),
         burst=replace(gpio_rig.burst, pulses=PULSES, period_us=PERIOD_NS / 1e3),
         stage=replace(
-            gpio_rig.stage, port=str(tmp_path / "tty"), centre_x_mm=POINTS + 3.0, centre_y_mm=2.0, heartbeat_ms=10_000
+            gpio_rig.stage,
+            port=str(tmp_path / "ttySTAGE"),
+            centre_x_mm=POINTS + 3.0,
+            centre_y_mm=2.0,
+            heartbeat_ms=10_000,
         ),
-    )
+    )  # fmt: skip
 
 
-@pytest.fixture
-def board(rig, write_config, hub):
-    """The emulated UNO's process, at the port of the rig."""
-    command = ["polysight.simulators.uno", "--config", write_config(rig), "--wires", hub, "--link", rig.stage.port]
-    command = [sys.executable, "-m", *map(str, command), "--time-scale", str(SPEED)]
-    with subprocess.Popen(command, cwd=REPO, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("ready")
-        yield
-        process.terminate()
-
-
-@pytest.mark.usefixtures("board")
 @pytest.mark.slow
-def test_every_point_of_a_row_is_a_burst(rig, hub, start):
-    with closing(WiresLog(hub, TRIGGER, SYNC)) as wires:
+def test_every_point_of_a_row_is_a_burst(rig, hub, start, write_config, tmp_path):
+    board = StageProcess(tmp_path, "uno", SPEED, hub, write_config(rig))
+    with closing(board), closing(WiresLog(hub, TRIGGER, SYNC)) as wires:
         program, host = start(rig, **gpio.environment(rig.pi.gpio_chip, hub, wire_time=True))
         host.accepted(host.begin())
         host.home()

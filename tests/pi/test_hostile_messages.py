@@ -18,6 +18,7 @@ from polysight.shared import messages as m
 from polysight.shared.errors import ProtocolError
 from polysight.shared.raster import RasterPlan
 from tests.support.pi.host_side import HostSide
+from tests.support.pi.program import resident_bytes
 from tests.support.pi.wires_log import WiresLog
 
 NAN, INF = float("nan"), float("inf")
@@ -32,10 +33,6 @@ BEGIN = m.BeginRun(
 PULSE = m.Pulse(pulses=1, period_us=1500.0, width_us=1.0)
 REPLAY, ALIVE = m.Replay(scan_id="scan", from_seq=1), m.Alive(scan_id="scan")
 RUN, END = m.RunRow(scan_id="scan", row_index=0, take=1), m.EndRun(scan_id="scan", exit_status="abort")
-
-
-def resident_bytes() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 def draw(rng: random.Random, valid: list[Any]) -> bytes:

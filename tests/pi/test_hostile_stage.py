@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import threading
-from pathlib import Path
 
 import pytest
 
 from polysight.shared import messages as m
 from polysight.shared.stage_line import Reply
+from tests.support.pi.program import resident_bytes
 
 BOUND_BYTES = 24 << 20
 FLOOD = 100_000  # lines
 HUGE = 9_999_999_999  # ten digits, the most that a line may hold
-
-
-def resident_bytes() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 @pytest.mark.parametrize("sign", [1, -1])

@@ -11,7 +11,6 @@ import socket
 import threading
 import time
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -19,10 +18,11 @@ from polysight.pi_controller import executor as executors
 from polysight.pi_controller.executor import REPLAYS_WAITING
 from polysight.pi_controller.system import MAX_BYTES
 from polysight.shared import messages as m
+from tests.support.pi.program import resident_bytes
 
 MORE, LONG, COMMAND = 1, 2, 4
 ENOUGH_BYTES = 2 << 30  # a client that could send so much was not stopped
-BOUND_MB = 400  # the unit's MemoryMax is 512
+BOUND_BYTES = 400 << 20  # MemoryMax of the unit is 512 MiB
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
 
 
@@ -50,10 +50,6 @@ def is_cut(peer: socket.socket) -> bool:
     return False
 
 
-def resident_mb(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096 >> 20
-
-
 ATTACKS = {
     "a message of many frames": (0, b"DEALER", lambda: frame(b"", MORE) + frame(bytes(60_000), MORE) * 10),
     "subscriptions": (1, b"SUB", lambda: b"".join(frame(b"\x01" + os.urandom(1000)) for _ in range(50))),
@@ -72,12 +68,12 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
 
     def watch() -> None:
         while not ended.wait(0.02):
-            highest[0] = max(highest[0], resident_mb(pid))
+            highest[0] = max(highest[0], resident_bytes(pid))
 
     watcher = threading.Thread(target=watch)
     watcher.start()
     sent = 0
-    while highest[0] << 20 < MAX_BYTES and sent < ENOUGH_BYTES:  # ZeroMQ itself ends some of these connections
+    while highest[0] < MAX_BYTES and sent < ENOUGH_BYTES:  # ZeroMQ itself ends some of these connections
         with connected((program.ready[1], program.events[1])[which], kind) as peer, suppress(ConnectionError):
             peer.settimeout(0.1)  # a connection that was cut may stall before it is closed
             left = b""
@@ -90,11 +86,11 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     ended.set()
     watcher.join()
     assert 0 < sent < ENOUGH_BYTES
-    assert highest[0] < BOUND_MB
+    assert highest[0] < BOUND_BYTES
     host.wait(m.Heartbeat, lambda beat: beat.t_mono_ns > cut_ns)  # events were cut off, too: they come again
     assert host.row(0).status == "done"
     deadline = time.monotonic() + 60
-    while resident_mb(pid) >= BOUND_MB and time.monotonic() < deadline:
+    while resident_bytes(pid) >= BOUND_BYTES and time.monotonic() < deadline:
         time.sleep(0.1)
     status, _, err = program.end()
     assert status == 0

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
+from contextlib import closing
 
 import msgspec
 import pytest
 
 from polysight.pi_controller.cli import main
-from tests.support.paths import REPO, RIG_FILE
+from polysight.simulators.builds import sketch_compiler
+from tests.support.stage.processes import StageProcess
 
 
 @pytest.mark.slow
 def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys):
     """Until another program lets DTR fall when it closes the port."""
-    port = tmp_path / "tty"
+    port = tmp_path / "ttySTAGE"
     pi = msgspec.structs.replace(instrument.pi, command_address="tcp://127.0.0.1:9")  # no service
     arguments = ["--config", str(write_config(msgspec.structs.replace(instrument, pi=pi))), "--stage-port", str(port)]
 
@@ -24,14 +25,10 @@ def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys
         assert main([*command, *arguments, "--json"]) == 0
         return json.loads(capsys.readouterr().out)
 
-    stage = [sys.executable, "-m", "polysight.simulators.stage", "--config", str(RIG_FILE), "--link", str(port)]
-    with subprocess.Popen([*stage, "--time-scale", "20"], cwd=REPO, stdout=subprocess.PIPE, text=True) as simulated:
-        assert simulated.stdout is not None
-        assert simulated.stdout.readline().startswith("ready")
+    with closing(StageProcess(tmp_path, "pc" if sketch_compiler() else "python", 20.0)):
         assert place("home") == {"x_mm": 0.0, "y_mm": 0.0}
         assert place("jog", "--dx", "10") == {"x_mm": 10.0, "y_mm": 0.0}
         assert place("jog", "--dx", "-4", "--dy", "1.5") == {"x_mm": 6.0, "y_mm": 1.5}
         subprocess.run(["stty", "-F", port, "hupcl"], check=True)
         assert main(["jog", *arguments, "--dx", "1"]) != 0
         assert "polysight-pi home" in capsys.readouterr().err
-        simulated.terminate()

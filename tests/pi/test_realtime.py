@@ -14,10 +14,9 @@ import pytest
 
 from polysight.pi_controller.system import OTHERS_PRIORITY, PRIORITY
 from polysight.simulators import gpio
+from tests.support.pi.program import require_stand_in_chip
 
-pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
-if lacking := gpio.missing():
-    pytest.skip(f"no stand-in chip without {' '.join(lacking)}: {gpio.ENABLING_COMMAND}", allow_module_level=True)
+require_stand_in_chip()
 
 PR_CAPBSET_DROP, CAP_IPC_LOCK, CAP_SYS_NICE = 24, 14, 23
 

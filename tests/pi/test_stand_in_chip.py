@@ -20,12 +20,10 @@ from polysight.shared.faults import PiFault
 from polysight.shared.wires import WireEdge
 from polysight.simulators import gpio
 from tests.support.paths import REPO
-from tests.support.pi.program import run
+from tests.support.pi.program import require_stand_in_chip, run
 from tests.support.pi.wires_log import WiresLog
 
-pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
-if lacking := gpio.missing():
-    pytest.skip(f"no stand-in chip without {' '.join(lacking)}: {gpio.ENABLING_COMMAND}", allow_module_level=True)
+require_stand_in_chip()
 
 TRIGGER, SYNC = 26, 22
 POINTS = 4

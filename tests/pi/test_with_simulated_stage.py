@@ -1,39 +1,19 @@
 """The Pi half and the simulated stage, both as processes: the sketch's dialogue, wire time."""
 
-import subprocess
-import sys
 from itertools import pairwise
 
 import pytest
 
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
-from tests.support.paths import REPO
+from tests.support.rigs import at_stage_port
+from tests.support.stage.processes import StageProcess
 
 
-@pytest.fixture
-def simulated_stage(instrument, hub):
-    """The stage's process, at the port of the rig."""
-    stage = [
-        "polysight.simulators.stage",
-        "--config",
-        "instrument.toml",
-        "--wires",
-        hub,
-        "--link",
-        instrument.stage.port,
-    ]
-    command = [sys.executable, "-m", *map(str, stage), "--time-scale", "30", "--python"]
-    with subprocess.Popen(command, cwd=REPO, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("ready")
-        yield
-        process.terminate()
-
-
-@pytest.mark.usefixtures("simulated_stage")
-def test_rows_abort_hold_and_retake(hub, start, instrument):
-    _, host = start(instrument, "--wires", hub)
+def test_rows_abort_hold_and_retake(hub, start, instrument, tmp_path, request):
+    stage = StageProcess(tmp_path, "python", 30.0, hub)
+    request.addfinalizer(stage.close)
+    _, host = start(at_stage_port(instrument, str(stage.link)), "--wires", hub)
     host.accepted(host.begin())
     host.home()
     for row in range(2):

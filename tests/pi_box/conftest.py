@@ -16,7 +16,7 @@ import tomli_w
 from polysight.shared.tables import to_builtins
 from polysight.simulators.uno import ENABLING_COMMAND, missing
 from tests.pi_box.box import Box
-from tests.pi_box.installed import InstalledPi, rig_of_the_box, tell
+from tests.pi_box.installed import InstalledPi, print_figure, rig_of_the_box
 from tests.pi_box.uno import Uno
 from tests.support.pi.host_side import HostSide
 
@@ -52,7 +52,7 @@ def pi(image: Path) -> Iterator[InstalledPi]:
                 pi = InstalledPi(box, uno, work)
                 begun = time.monotonic()
                 pi.install()
-                tell(f"booted in {box.boot_s:.0f} s, installed in {time.monotonic() - begun:.0f} s")
+                print_figure(f"booted in {box.boot_s:.0f} s, installed in {time.monotonic() - begun:.0f} s")
                 box.run("sudo rm -r /opt/polysight/releases/0")  # the image's, libraries without a program
                 pi.allow_for_a_slow_processor()
                 pi.configure()

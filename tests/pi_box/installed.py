@@ -24,8 +24,8 @@ INSTALL_LIMIT_S = 7200
 READY_LIMIT_S = 1800.0
 
 
-def tell(text: str) -> None:
-    """One line to standard output, which `make test-pi` shows."""
+def print_figure(text: str) -> None:
+    """Print one line, which `make test-pi` shows."""
     sys.stdout.write(text + "\n")
 
 
@@ -90,7 +90,7 @@ class InstalledPi:
         return self.box.run(f"sudo systemctl show --value --property={name} polysight-pi").strip()
 
     def until_ready(self) -> None:
-        """Until the service has told systemd that it is ready."""
+        """Wait until the service has notified systemd that it is ready."""
         self.box.wait(lambda: self.shown("ActiveState") == "active", f"the service runs\n{self.log()}", READY_LIMIT_S)
 
     def log(self) -> str:

@@ -19,7 +19,7 @@ import zmq
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 from polysight.shared.sockets import HandshakeMonitor, requester
-from tests.pi_box.installed import PROGRAM, READY_LIMIT_S, InstalledPi, tell
+from tests.pi_box.installed import PROGRAM, READY_LIMIT_S, InstalledPi, print_figure
 from tests.support.pi.host_side import HostSide
 from tests.support.rigs import published_rig
 
@@ -82,7 +82,7 @@ def test_the_unit_exposes_little(pi: InstalledPi):
     """systemd's own measure, taken where the service runs."""
     text = pi.box.run("sudo systemd-analyze security --no-pager polysight-pi")
     score = float(text.split("Overall exposure level for polysight-pi.service:")[1].split()[0])
-    tell(f"systemd-analyze security: {score}")
+    print_figure(f"systemd-analyze security: {score}")
     assert score <= 3.0
 
 
@@ -124,12 +124,12 @@ def test_home_brings_the_motors_to_zero(pi: InstalledPi):
     """`polysight-pi home` on the host, through the service; the steps are counted at the board's pins."""
     begun = time.monotonic()
     assert json.loads(pi.on_host("home", "--json")) == {"x_mm": 0.0, "y_mm": 0.0}
-    tell(f"home, through the service: {seconds(begun)}")
+    print_figure(f"home, through the service: {seconds(begun)}")
     assert pi.uno.stands_at_mm == (0.0, 0.0)
 
 
 def test_a_bench_burst_is_made_of_one_rise_and_one_fall_a_pulse(pi: InstalledPi, homed: HostSide):
-    """What the kernel's driver writes to the chip's registers, seen from outside the Pi: as many pulses as are told.
+    """The kernel's driver writes as many pulses to the chip's registers, seen from outside the Pi, as are reported.
 
     Clearing a line that is low is no edge: the program does so to be quick. An emulated processor may be so late that a
     pulse would come too early for a radar: the burst ends there, and says so.
@@ -152,14 +152,16 @@ def test_a_bench_burst_is_made_of_one_rise_and_one_fall_a_pulse(pi: InstalledPi,
             break
     spacings_ms = [(b.t_s - a.t_s) * 1e3 for a, b in itertools.pairwise(rises)] or [0.0]
     widths_us = [(fall.t_s - rise.t_s) * 1e6 for rise, fall in zip(rises, falls, strict=True)]
-    tell(f"bench burst: {len(rises)} of {i.pulses} pulses, {min(widths_us):.0f} .. {max(widths_us):.0f} us wide and"
-         f" {min(spacings_ms):.2f} .. {max(spacings_ms):.2f} ms apart, on this computer's clock")  # fmt: skip
+    print_figure(
+        f"bench burst: {len(rises)} of {i.pulses} pulses, {min(widths_us):.0f} .. {max(widths_us):.0f} us wide and"
+        f" {min(spacings_ms):.2f} .. {max(spacings_ms):.2f} ms apart, on this computer's clock"
+    )
 
 
 def test_check_finds_everything_that_is_there(bench: InstalledPi):
     findings = bench.check()
     verdicts = {name: f["verdict"] for name, f in findings.items()}
-    tell("check: " + ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items()))
+    print_figure("check: " + ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items()))
     assert "fail" not in verdicts.values(), findings
     # Rights of the unit, which a shell lacks; and Debian's driver does not say what dead programs' lines become.
     assert {n for n, v in verdicts.items() if v == "warn"} <= {"real time", "line release"}
@@ -183,7 +185,7 @@ def test_a_jog_by_hand_moves_the_motors_by_its_distance(bench: InstalledPi):
     assert json.loads(bench.box.run(f"{by_hand} home {config}")) == {"x_mm": 0.0, "y_mm": 0.0}
     begun = time.monotonic()
     assert json.loads(bench.box.run(f"{by_hand} jog --dx 10 --dy 5 {config}")) == {"x_mm": 10.0, "y_mm": 5.0}
-    tell(f"jog by 10 mm and 5 mm, the program's start included: {seconds(begun)}")
+    print_figure(f"jog by 10 mm and 5 mm, the program's start included: {seconds(begun)}")
     bench.box.wait(lambda: not bench.uno.moving, "the motors rest")
     assert bench.uno.stands_at_mm == (10.0, 5.0)
 
@@ -199,7 +201,7 @@ def test_a_line_whose_program_is_killed_becomes_an_input(bench: InstalledPi):
 
 
 def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed: HostSide):
-    """kill -9 in the middle of a row: the stage stops by itself, and no event that was told is lost."""
+    """kill -9 in the middle of a row: the stage stops by itself, and no published event is lost."""
     homed.accepted(homed.begin("killed"))
     homed.accepted(m.RunRow(scan_id="killed", row_index=0, take=1))
     homed.wait(m.RowStarted)
@@ -213,7 +215,7 @@ def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed:
     ramp_mm = in_row_mm_s**2 / 2 / pi.rig.stage.accel_mm_s2
     assert beyond_mm <= (pi.rig.stage.heartbeat_ms / 1e3 + 0.1) * in_row_mm_s + ramp_mm
     pi.until_ready()
-    tell(f"kill -9 in a row: the stage went on for {beyond_mm:.0f} mm (heartbeat"
+    print_figure(f"kill -9 in a row: the stage went on for {beyond_mm:.0f} mm (heartbeat"
          f" {pi.rig.stage.heartbeat_ms / 1e3:g} s here); the service was ready after {seconds(begun)}")  # fmt: skip
     assert pid_of(pi) != killed
     back = pi.host()
@@ -228,7 +230,7 @@ def test_a_service_that_hangs_is_started_anew(pi: InstalledPi):
     pi.systemctl("kill --signal=STOP polysight-pi")
     pi.box.wait(lambda: pid_of(pi) not in (hung, "0"), "another process")
     pi.until_ready()
-    tell(f"SIGSTOP: ready again after {seconds(begun)}")
+    print_figure(f"SIGSTOP: ready again after {seconds(begun)}")
     assert "watchdog" in pi.box.run("sudo journalctl --unit polysight-pi --no-pager").lower()
 
 
@@ -259,13 +261,13 @@ def test_update_and_roll_back(pi: InstalledPi):
     before, first = pi.box.run(kept), pid_of(pi)
     begun = time.monotonic()
     pi.install()
-    tell(f"update: {seconds(begun)}")
+    print_figure(f"update: {seconds(begun)}")
     pi.until_ready()
     assert pi.release() == "releases/2"
     second = pid_of(pi)
     begun = time.monotonic()
     pi.box.run("sudo ~/.cache/polysight-install/install.sh --roll-back")
-    tell(f"roll back: {seconds(begun)}")
+    print_figure(f"roll back: {seconds(begun)}")
     pi.until_ready()
     assert pi.release() == "releases/1"
     assert len({first, second, pid_of(pi)}) == 3
@@ -292,7 +294,7 @@ def test_a_power_cut_in_a_row_loses_no_event_that_was_told(pi: InstalledPi, home
     homed.wait(m.RowStarted)
     pi.box.cut_power()
     pi.until_ready()
-    tell(f"power cut: logged in again after {pi.box.boot_s:.0f} s")
+    print_figure(f"power cut: logged in again after {pi.box.boot_s:.0f} s")
     back = pi.host()
     assert back.replay("cut")[: len(homed.journalled)] == homed.journalled
     assert back.ask(m.Hello()).state == "idle"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.coverage import Cubes
-from polysight.host.imaging import Illumination, levelled
+from polysight.host.imaging import Illumination, correct_tilt
 from polysight.host.materials.segment import box_mask
 from polysight.simulators.scene import decode_scene
 from tests.support.pipelines import pipeline_of
@@ -47,7 +47,7 @@ def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(ti
     images, level = tilted
     masks = _insides(images)
     rises = [images.lit.rise(images.h, images.v, mask) for mask in masks]
-    h, v = levelled(images.h, images.v, images.lit, masks, rises)
+    h, v = correct_tilt(images.h, images.v, images.lit, masks, rises)
     truth = _ratios(level.h, level.v, masks)
     before, after = (np.abs(_ratios(*c, masks) / truth - 1) for c in ((images.h, images.v), (h, v)))
     assert before.max() > 0.02

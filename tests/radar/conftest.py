@@ -21,7 +21,7 @@ def clock() -> VirtualClock:
 
 @pytest.fixture
 def board(clock: VirtualClock) -> RadarBoard:
-    """One whose flash holds firmware, as on every day but the first."""
+    """A board with firmware in its flash."""
     return RadarBoard(lambda: clock.time, flash=make_image())
 
 

@@ -1,4 +1,4 @@
-"""Laws of a disturbed link: a command is obeyed once or not at all, and never as another one."""
+"""A disturbed link: a command is executed once or not at all, and never as another one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FRAMES = 8
 
 
 class FlippingWords(BoardWords):
-    """Flips one bit of one word, counted over both directions."""
+    """Flip one bit of one word, counted over both directions."""
 
     def __init__(self, board: Simulated, clock: VirtualClock, at: int, bit: int) -> None:
         super().__init__(board, clock)
@@ -47,30 +47,30 @@ def _faults_of_one_command() -> st.SearchStrategy[list[Fault]]:
 
 @settings(deadline=None)
 @given(st.lists(_faults_of_one_command(), min_size=1, max_size=8))
-def test_whatever_is_lost_every_command_is_obeyed_in_order_and_once(faults_of_each: list[list[Fault]]):
-    """Twice only where the answer was lost and its repetition was then heard damaged: a NACK asks for a new number."""
+def test_commands_are_executed_once_in_order_although_messages_are_lost(faults_of_each: list[list[Fault]]):
+    """Twice only if the answer was lost and its retry was damaged, because a NACK requires a new sequence number."""
     clock = VirtualClock()
     board = Simulated(lambda: clock.time, flash=make_image())
     radar = RadarBoard("RH", BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")))
     radar.configure()
     board.executed.clear()
     link: Link = radar._link
-    told = []
+    result = []
     for n, faults in enumerate(faults_of_each):
         sent = (LOW_POWER_OFF, LdoBypass(), Chirp(0))[n % 3]
         board.inject(*faults)
         link.call(sent)
         unheard = (Fault.NACK, Fault.NO_ANSWER)
         twice = len(faults) > 1 and faults[0] not in unheard and faults[1] is Fault.NACK
-        told += [sent.ID] * (2 if twice else 1)
-    assert board.executed == told
+        result += [sent.ID] * (2 if twice else 1)
+    assert board.executed == result
 
 
 @settings(deadline=None, max_examples=60)
 @given(st.integers(0, 900), st.integers(0, 15))
 @example(0, 0)
 @example(7, 3)
-def test_a_flipped_bit_anywhere_never_makes_another_setting(at: int, bit: int):
+def test_a_flipped_bit_never_changes_a_setting(at: int, bit: int):
     clock = VirtualClock()
     clean_board, board = (
         Simulated(lambda: clock.time, flash=make_image()),

@@ -1,4 +1,4 @@
-"""Firmware that cannot brick a board: refused before a byte is sent, verified, and cut off anywhere recovered from."""
+"""Firmware downloads cannot brick a board: checked before, verified after, recoverable when interrupted anywhere."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_file_that_is_no_image_is_refused_with_the_reason(data, why):
 
 @settings(deadline=None)
 @given(st.integers(0, 8 * len(DATA) - 1))
-def test_no_flipped_bit_passes(bit):
+def test_an_image_with_a_flipped_bit_is_refused(bit):
     data = bytearray(DATA)
     data[bit // 8] ^= 1 << bit % 8
     with pytest.raises(ConfigError):
@@ -63,19 +63,19 @@ def test_no_flipped_bit_passes(bit):
 
 @settings(deadline=None)
 @given(st.integers(0, len(DATA) - 1))
-def test_no_part_of_an_image_passes(size):
+def test_a_truncated_image_is_refused(size):
     with pytest.raises(ConfigError):
         check_image(DATA[:size], "image.bin")
 
 
-def test_an_image_tells_what_it_patches_and_to_what(tmp_path):
+def test_an_image_has_the_versions_of_rom_and_patches(tmp_path):
     (tmp_path / "a.bin").write_bytes(DATA)
     image = read_image(tmp_path / "a.bin")
     assert (image.name, image.rom, image.patches) == ("a.bin", (2, 2, 1, 7), ("2.2.2.0", "2.2.4.0"))
 
 
 @pytest.mark.parametrize("size", [1, 223, 224, 225, 456, 457, 1000])
-def test_parts_of_an_image_join_to_it(size):
+def test_the_parts_of_an_image_are_the_whole_image(size):
     image = bytes(n % 251 for n in range(size))
     parts = file_chunks(image)
     joined = b"".join(chunk.part for chunk, _ in parts)
@@ -84,7 +84,7 @@ def test_parts_of_an_image_join_to_it(size):
     assert [remaining for _, remaining in parts] == list(reversed(range(len(parts))))
 
 
-def test_ti_s_image_begins_with_the_bytes_that_a_user_sent_to_ram():
+def test_the_first_part_is_that_of_a_user_s_log():
     """TI E2E 1267477: 35 parts, the first with type 0, length 7940 and the magic."""
     first, remaining = file_chunks(DATA, TO_RAM)[0]
     assert remaining == 0x22
@@ -92,7 +92,7 @@ def test_ti_s_image_begins_with_the_bytes_that_a_user_sent_to_ram():
 
 
 class PowerCut(BoardWords):
-    """Switches the board off when its host has written so many messages."""
+    """Switch the board off after `after` messages of its host."""
 
     def __init__(self, board, clock, after: int) -> None:
         super().__init__(board, clock)
@@ -115,12 +115,12 @@ def ignored(sent: int, of: int) -> None: ...
 
 @pytest.fixture
 def new(clock) -> Simulated:
-    """A board on its first day: its flash is empty, and it reports the harmless fault."""
+    """A new board: its flash is empty, and it reports the harmless fault."""
     return Simulated(lambda: clock.time)
 
 
 @pytest.mark.parametrize("fault_at", ["power-up", "download", "never"])
-def test_a_new_board_works_from_ram_and_its_flash_is_left_alone(clock, fault_at):
+def test_a_new_board_runs_from_ram_and_its_flash_stays_empty(clock, fault_at):
     board = Simulated(lambda: clock.time, fault_at=fault_at)
     radar = made(board, clock, IMAGE)
     radar.configure()
@@ -140,24 +140,24 @@ def test_without_an_image_a_new_board_is_refused(new, clock):
     assert "image header" in caught.value.why  # from its boot status
 
 
-def test_a_flash_that_holds_the_image_is_not_loaded_again(board, clock):
+def test_an_image_in_the_flash_is_not_downloaded_again(board, clock):
     made(board, clock, IMAGE).configure()
     assert 0x4080 not in board.executed
 
 
 @pytest.mark.parametrize("fault_at", ["power-up", "download", "never"])
-def test_the_flash_is_written_and_verified_by_a_start_from_it(clock, fault_at):
+def test_a_flash_write_is_verified_by_a_start_from_the_flash(clock, fault_at):
     board = Simulated(lambda: clock.time, fault_at=fault_at)
     radar = made(board, clock)
-    told: list[tuple[int, int]] = []
-    assert "2.2.2.0 from flash" in radar.write_flash(IMAGE, lambda sent, of: told.append((sent, of)))
+    result: list[tuple[int, int]] = []
+    assert "2.2.2.0 from flash" in radar.write_flash(IMAGE, lambda sent, of: result.append((sent, of)))
     assert board.cores.flash == DATA
-    assert told[-1] == (35, 35)
+    assert result[-1] == (35, 35)
     radar.configure()
     assert radar.state is State.CONFIGURED
 
 
-def test_the_slow_erase_is_waited_for(clock):
+def test_a_slow_erase_does_not_time_out(clock):
     board = Simulated(lambda: clock.time, erase_s=0.9 * CHUNK_TIMEOUT_S)
     made(board, clock).write_flash(IMAGE, ignored)
     assert board.cores.flash == DATA
@@ -187,19 +187,19 @@ def test_the_rf_part_of_another_board_is_not_configured(clock, use):
     assert 0x0080 not in board.executed
 
 
-@pytest.mark.parametrize(("tests", "said"), [(0, "0x7FFFFFF"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
-def test_failed_self_tests_of_the_rf_core_are_reported(board, clock, tests, said):
+@pytest.mark.parametrize(("tests", "text"), [(0, "0x7FFFFFF"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
+def test_failed_self_tests_of_the_rf_core_are_reported(board, clock, tests, text):
     board.cores.rf_tests = tests
     radar = made(board, clock)
-    told = []
-    radar.configure(lambda step, came: told.append(came) if step.name == "RF power-up" else None)
-    assert (said in told[0]) if said else told == ["RF core is up"]
+    result = []
+    radar.configure(lambda step, came: result.append(came) if step.name == "RF power-up" else None)
+    assert (text in result[0]) if text else result == ["RF core is up"]
     assert radar.facts["rf_tests_passed"] == tests
 
 
 @pytest.mark.parametrize("rom", [(1, 2, 0, 5), (2, 0, 0, 3), (2, 2, 1, 6), (6, 2, 1, 7), (0, 0, 0, 0), (255,) * 4])
 @pytest.mark.parametrize("flash", [b"", DATA], ids=["flash empty", "flash written"])
-def test_an_image_for_another_rom_is_never_sent(clock, rom, flash):
+def test_an_image_for_another_rom_is_not_sent(clock, rom, flash):
     board = Simulated(lambda: clock.time, flash=flash)
     board.cores.main_rom = rom
     for use in (lambda r: r.write_flash(IMAGE, ignored), lambda r: r.configure()):
@@ -211,15 +211,15 @@ def test_an_image_for_another_rom_is_never_sent(clock, rom, flash):
 
 @pytest.mark.parametrize("core", ["main_rom", "rf_rom"])
 @pytest.mark.parametrize(
-    ("rom", "said"),
+    ("rom", "text"),
     [((1, 2, 0, 5), "AWR1243"), ((6, 2, 0, 13), "57..64 GHz"), ((255,) * 4, "generation 255"), ((0,) * 4, "0.0.0.0")],
 )
 @pytest.mark.parametrize("image", [None, IMAGE])
-def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, rom, said, image):
+def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, rom, text, image):
     """The same codes would be other frequencies on it."""
     board = Simulated(lambda: clock.time, flash=DATA)
     setattr(board.cores, core, rom)
-    with refused(ErrorCode.MISMATCH, said):
+    with refused(ErrorCode.MISMATCH, text):
         made(board, clock, image).configure()
     assert set(board.executed) <= {0x404C, 0x4000, 0x0220, 0x40E0}
 
@@ -232,9 +232,9 @@ def test_another_patch_of_the_rf_core_is_a_warning(clock, monkeypatch, flash):
     monkeypatch.setattr(board.cores, "_effect", lambda n, d: effect(n, d)[:10] + old if n == 0x0220 else effect(n, d))
     radar = made(board, clock, IMAGE)
     radar.configure()
-    (told,) = [line for line in radar.warnings if "RF core reports patch 2.1.0.0" in line]
-    assert "2.2.4.0" in told
-    assert ("--flash" in told) is bool(flash)
+    (result,) = [line for line in radar.warnings if "RF core reports patch 2.1.0.0" in line]
+    assert "2.2.4.0" in result
+    assert ("--flash" in result) is bool(flash)
 
 
 @pytest.mark.parametrize("broken", [b"", DATA[:100], DATA[:-1], bytes(9000), DATA[:400] + b"\xff" + DATA[401:]])
@@ -245,7 +245,7 @@ def test_a_download_repairs_any_content_of_the_flash(clock, broken):
 
 
 @pytest.mark.parametrize("part", range(1, 37))
-def test_power_lost_at_any_part_is_recovered_from(clock, part):
+def test_a_power_failure_at_any_part_is_recoverable(clock, part):
     """Part 36 is the version question after the last part; the first two messages are questions too."""
     board = Simulated(lambda: clock.time, flash=make_image(4000))
     radar = made(board, clock, words=PowerCut(board, clock, part + 1))
@@ -253,7 +253,7 @@ def test_power_lost_at_any_part_is_recovered_from(clock, part):
         radar.write_flash(IMAGE, ignored)
     board.power(True)
     rescued = made(board, clock, IMAGE)
-    rescued.configure()  # from RAM, whatever the flash holds
+    rescued.configure()  # from RAM, with any content of the flash
     assert rescued.state is State.CONFIGURED
     made(board, clock).write_flash(IMAGE, ignored)
     made(board, clock).configure()
@@ -270,7 +270,7 @@ def test_a_restart_during_a_download_ends_it_at_once(clock, part):
     assert clock.time < 5.0
 
 
-def test_a_part_that_is_refused_is_named(new, clock, monkeypatch):
+def test_a_refused_part_is_an_error_with_its_number(new, clock, monkeypatch):
     obey = new.cores._download
     seen = []
 
@@ -287,9 +287,9 @@ def test_a_flash_that_loses_data_is_an_error(new, clock, monkeypatch):
     obey = new.cores._download
 
     def forget(data, remaining):
-        told = obey(data, remaining)
+        result = obey(data, remaining)
         new.cores.flash = new.cores.flash[:-1] + b"\xff"
-        return told
+        return result
 
     monkeypatch.setattr(new.cores, "_download", forget)
     with pytest.raises(DeviceError):
@@ -302,8 +302,8 @@ def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, 
     effect = new.cores._effect
 
     def answer(number, data):
-        told = effect(number, data)
-        return told[:10] + bytes(reported) if number == 0x40E0 and any(told[10:]) else told
+        result = effect(number, data)
+        return result[:10] + bytes(reported) if number == 0x40E0 and any(result[10:]) else result
 
     monkeypatch.setattr(new.cores, "_effect", answer)
     radar = made(new, clock, IMAGE)
@@ -318,7 +318,7 @@ def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, 
 
 
 @pytest.mark.parametrize("fault", [Fault.BAD_CRC, Fault.LOST_INTERRUPT, Fault.NACK, Fault.BAD_CHECKSUM])
-def test_a_disturbed_download_arrives_whole(new, clock, fault):
+def test_a_disturbed_download_is_complete(new, clock, fault):
     radar = made(new, clock)
     radar._words.board.inject(fault, fault)
     radar.write_flash(IMAGE, ignored)

@@ -54,7 +54,7 @@ def test_round_trip(original: Message):
 
 
 @given(message(), st.data())
-def test_any_flipped_bit_is_noticed(original: Message, data):
+def test_any_flipped_bit_is_detected(original: Message, data):
     raw = bytearray(encode(original))
     bit = data.draw(st.integers(0, 8 * len(raw) - 1))
     raw[bit // 8] ^= 1 << bit % 8
@@ -62,7 +62,7 @@ def test_any_flipped_bit_is_noticed(original: Message, data):
         decode(bytes(raw))
 
 
-def test_every_flipped_bit_of_the_published_start_is_noticed():
+def test_every_flipped_bit_of_the_published_start_is_detected():
     for bit in range(8 * len(bytes.fromhex(START))):
         raw = bytearray.fromhex(START)
         raw[bit // 8] ^= 1 << bit % 8
@@ -71,7 +71,7 @@ def test_every_flipped_bit_of_the_published_start_is_noticed():
 
 
 @given(st.binary(max_size=300))
-def test_noise_is_refused_and_never_something_else(noise: bytes):
+def test_noise_is_refused(noise: bytes):
     with pytest.raises(ProtocolError):
         decode(DEVICE_SYNC + noise[: len(noise) // 2] + b"\0")
 
@@ -95,7 +95,7 @@ def test_checksum_does_not_depend_on_the_order_of_words(words: list[int], random
     assert checksum(struct.pack(f"<{len(words)}H", *words)) == checksum(struct.pack(f"<{len(words)}H", *mixed))
 
 
-def test_an_event_with_a_16_bit_crc_is_read():
+def test_an_event_with_a_16_bit_crc_is_decoded():
     """The first event after power-up; its CRC-16 is CCITT-FALSE, whose check value is 0x29B1."""
     assert crc(b"123456789", 2) == bytes.fromhex("b129")
     block = struct.pack("<HHIQQ", 0x5000, 24, 7, 0, 0)

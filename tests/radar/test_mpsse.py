@@ -37,7 +37,7 @@ def test_the_clock_is_10_mhz_and_rests_low(chip, usb):
 
 
 @given(st.lists(st.integers(0, 0xFFFF), max_size=130))
-def test_words_arrive_as_they_were_sent(words):
+def test_words_arrive_unchanged(words):
     chip = UsbChip(simulated.RadarBoard(lambda: 0.0))
     usb = UsbWords(*(chip.channel(n) for n in "ABCD"), sleep=float)
     usb.write(words)
@@ -46,7 +46,7 @@ def test_words_arrive_as_they_were_sent(words):
 
 
 @given(st.lists(st.integers(0, 0xFFFF), max_size=20), st.data())
-def test_a_stream_may_be_cut_anywhere(words, data):
+def test_a_stream_may_be_split_anywhere(words, data):
     chip = UsbChip(simulated.RadarBoard(lambda: 0.0))
     stream = write_words(words)
     cut = data.draw(st.integers(0, len(stream)))
@@ -56,15 +56,15 @@ def test_a_stream_may_be_cut_anywhere(words, data):
 
 
 @pytest.mark.parametrize("byte", [0, 1, 3, 4, 8])
-def test_a_wrong_stream_is_noticed(chip, byte):
-    """The stand-in refuses what would not be this SPI: its silence above means something."""
+def test_an_invalid_stream_is_detected(chip, byte):
+    """The simulated chip detects violations of the SPI protocol, so that its silence above counts."""
     stream = bytearray(write_words([0x1234, 0x5678]))
     stream[byte] ^= 0x09
     chip.take("A", bytes(stream))
     assert chip.errors or chip.words_written != [0x1234, 0x5678]
 
 
-def test_two_words_under_one_chip_select_are_noticed(chip):
+def test_two_words_under_one_chip_select_are_detected(chip):
     chip.take("A", bytes.fromhex("80c04b 1101001234 1101005678"))
     assert "two words under one chip select" in chip.errors
 
@@ -89,7 +89,7 @@ def test_the_reset_is_released_in_functional_mode_only(board, chip):
     assert board.executed == []
 
 
-def test_unplugged_in_a_row_is_a_fault(rig, board, usb, clock):
+def test_unplugging_during_a_row_is_a_fault(rig, board, usb, clock):
     radar = RadarBoard("RH", usb, clock, program(rig, rig.by_name("RH")))
     radar.arm(4)
     board.plugged = False

@@ -1,15 +1,19 @@
-"""All boards of a rig under native control: armed together, done together, and what the manifest keeps."""
+"""All boards of a rig under native control: armed and done together, reset and reopened after faults, reported."""
 
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import msgspec
 import pytest
 
+from polysight.host.radar import board as boards
 from polysight.host.radar.backends import radar_control
 from polysight.host.radar.interface import RadarState
-from polysight.host.radar.native import NativeRadars
+from polysight.host.radar.native import NativeRadars, radar_board
+from polysight.host.radar.trace import ReplayedWords, read_trace
+from polysight.host.radar.usb import UsbWords
 from polysight.host.store.manifest import decode_line, encode_line
 from polysight.shared.config import Instrument, NativeRadar, Radar
 from polysight.shared.error_codes import ErrorCode
@@ -23,90 +27,127 @@ PERIOD_S = 1.5e-3
 FRAMES = 24
 
 
-class Boards:
-    """Simulated boards by USB serial number."""
+class Link(BoardWords):
+    """A link that can be lost for good."""
+
+    lost = False
+
+    def write(self, words):
+        self._check()
+        super().write(words)
+
+    def read(self, count):
+        self._check()
+        return super().read(count)
+
+    def interrupt(self):
+        self._check()
+        return super().interrupt()
+
+    def reset(self, held):
+        self._check()
+        super().reset(held)
+
+    def _check(self) -> None:
+        if self.lost or self.closed:
+            raise DeviceError("the USB device is gone")
+
+
+class Usb:
+    """Simulated boards by USB serial number; RH cannot be opened before `back_at`."""
 
     def __init__(self, rig: Instrument, clock) -> None:
         self.clock = clock
-        self.by_serial = {
+        self.boards = {
             b.usb_serial: RadarBoard(lambda: clock.time, flash=make_image(), die=n)
             for n, b in enumerate(rig.radar.native.values(), 1)
         }
-        self.words = {s: BoardWords(b, clock) for s, b in self.by_serial.items()}
+        self.links: dict[str, list[Link]] = {serial: [] for serial in self.boards}
+        self.back_at = 0.0
+
+    def open(self, serial: str) -> Link:
+        if serial == "FTRH" and self.clock.now() < self.back_at:
+            raise DeviceError("no such USB device")
+        self.links[serial].append(Link(self.boards[serial], self.clock))
+        return self.links[serial][-1]
+
+    def unplug(self, for_s: float) -> None:
+        self.links["FTRH"][-1].lost = True
+        self.back_at = self.clock.now() + for_s
 
     def pulses(self, count: int, but: str = "") -> None:
         for _ in range(count):
-            for serial, board in self.by_serial.items():
+            for serial, board in self.boards.items():
                 if serial != but:
                     board.trigger()
             self.clock.sleep(PERIOD_S)
 
 
 @pytest.fixture
-def boards(rig, clock) -> Boards:
-    return Boards(rig, clock)
+def usb(rig, clock) -> Usb:
+    return Usb(rig, clock)
 
 
 @pytest.fixture
-def radars(rig, boards, clock):
-    with NativeRadars(rig, boards.words.__getitem__, clock) as made:
+def radars(rig, usb, clock):
+    with NativeRadars(rig, usb.open, clock) as made:
         yield made
 
 
-def test_each_board_is_bound_by_its_serial_number(rig, radars, boards):
+def test_each_board_is_identified_by_its_serial_number(rig, radars, usb):
     assert radars.states() == {}
     for board in rig.boards:
-        tx = boards.by_serial[f"FT{board.name}"].settings[0x0101][18]
+        tx = usb.boards[f"FT{board.name}"].settings[0x0101][18]
         assert tx == (0b010 if board.role == "transmit" else 0)
 
 
-def test_a_row_is_done_when_every_board_says_so(radars, boards):
+def test_a_row_is_done_when_every_board_reports_it(radars, usb):
     radars.arm(FRAMES)
     assert {s.state for s in radars.states().values()} == {RadarState.ARMED}
     radars.row_begins()
-    boards.pulses(FRAMES - 1)
+    usb.pulses(FRAMES - 1)
     assert {s.state for s in radars.states().values()} == {RadarState.ARMED}
-    boards.pulses(1)
+    usb.pulses(1)
     assert {n: s.state for n, s in radars.states().items()} == dict.fromkeys(("LS", "RH", "RV"), RadarState.DONE)
 
 
-def test_a_board_that_missed_a_pulse_still_waits(radars, boards):
+def test_a_board_that_missed_a_pulse_is_not_done(radars, usb):
     radars.arm(FRAMES)
-    boards.pulses(1, but="FTRV")
-    boards.pulses(FRAMES - 1)
+    usb.pulses(1, but="FTRV")
+    usb.pulses(FRAMES - 1)
     states = radars.states()
     assert states["RH"].state is RadarState.DONE
     assert states["RV"].state is RadarState.ARMED
     assert radars.wait_done(3.0) == ["RV"]
     radars.arm(FRAMES)
-    boards.pulses(FRAMES)
+    usb.pulses(FRAMES)
     assert radars.wait_done(3.0) == []
 
 
-def test_a_board_in_fault_is_not_done(radars, boards):
+def test_a_board_in_fault_is_not_done(radars, usb):
     radars.arm(FRAMES)
-    boards.by_serial["FTRH"].say(0x1002, bytes(4))
-    boards.pulses(FRAMES)
+    usb.boards["FTRH"].say(0x1002, bytes(4))
+    usb.pulses(FRAMES)
     assert radars.wait_done(3.0) == ["RH"]
 
 
-def test_two_names_of_one_board_are_refused(rig, boards, clock):
-    boards.by_serial["FTRV"].cores.die = 2
+def test_two_names_for_one_board_are_refused(rig, usb, clock):
+    usb.boards["FTRV"].cores.die = 2
     with pytest.raises(DeviceError, match="RH and RV"):
-        NativeRadars(rig, boards.words.__getitem__, clock)
+        NativeRadars(rig, usb.open, clock)
 
 
-def test_boards_without_a_die_id_keep_no_calibration(rig, boards, clock, tmp_path):
-    for board in boards.by_serial.values():
+def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock, tmp_path):
+    for board in usb.boards.values():
         board.cores.die = 0
     kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, calibration_dir=str(tmp_path)))
-    with NativeRadars(kept, boards.words.__getitem__, clock):
+    with NativeRadars(kept, usb.open, clock):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_fault_is_told_and_the_next_row_resets_that_board_alone(radars, boards):
+def test_after_a_fault_the_next_row_resets_only_that_board(radars, usb):
     radars.arm(FRAMES)
-    bad = boards.by_serial["FTRH"]
+    bad = usb.boards["FTRH"]
     bad.trigger()
     bad.trigger()
     states = radars.states()
@@ -115,66 +156,67 @@ def test_a_fault_is_told_and_the_next_row_resets_that_board_alone(radars, boards
     assert states["RV"].state is RadarState.ARMED
     radars.arm(FRAMES)
     assert bad.executed.count(0x4000) == 2
-    assert boards.by_serial["FTRV"].executed.count(0x4000) == 1
-    boards.pulses(FRAMES)
+    assert usb.boards["FTRV"].executed.count(0x4000) == 1
+    usb.pulses(FRAMES)
     assert {s.state for s in radars.states().values()} == {RadarState.DONE}
 
 
-def test_the_report_fits_the_manifest_and_is_told_once(radars):
+def test_the_report_fits_the_manifest_and_is_returned_once(radars):
     radars.arm(FRAMES)
-    told = radars.report()
-    assert decode_line(encode_line({"fact": "radars", **told})) == {"fact": "radars", **json.loads(json.dumps(told))}
-    assert set(told["boards"]) == {"LS", "RH", "RV"}
-    assert told["boards"]["RV"]["rf_firmware"] == "2.2.1.7 patch 2.2.4.0"
-    assert set(told["boards"]["RV"]["temperatures_c"]) >= {"rx1", "tx3"}
-    assert len(told["boards"]["RV"]["sent"]) > 40
-    assert 0.9e6 < told["direct_if_hz"]["RH"] < 1.05e6
-    assert any(c.startswith("IF budget of RV") for c in told["constraints"])
+    result = radars.report()
+    assert decode_line(encode_line({"fact": "radars", **result})) == {
+        "fact": "radars",
+        **json.loads(json.dumps(result)),
+    }
+    assert set(result["boards"]) == {"LS", "RH", "RV"}
+    assert result["boards"]["RV"]["rf_firmware"] == "2.2.1.7 patch 2.2.4.0"
+    assert set(result["boards"]["RV"]["temperatures_c"]) >= {"rx1", "tx3"}
+    assert len(result["boards"]["RV"]["sent"]) > 40
+    assert 0.9e6 < result["direct_if_hz"]["RH"] < 1.05e6
+    assert any(c.startswith("IF budget of RV") for c in result["constraints"])
     again = radars.report()
     assert again["boards"]["RV"]["sent"] == []
     assert "constraints" not in again
 
 
-def test_a_broken_constraint_is_refused_before_a_byte_is_written(rig, clock, boards):
+def test_a_broken_constraint_is_refused_before_anything_is_sent(rig, usb, clock):
     def never(serial: str) -> BoardWords:
         raise AssertionError(f"{serial} was opened")
 
     wrong = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, rx_gain_db=31))
     with refused(ErrorCode.VALUE_INVALID, "RX gain step"):
         NativeRadars(wrong, never, clock)
-    with NativeRadars(rig, boards.words.__getitem__, clock) as made, refused(ErrorCode.VALUE_INVALID, "frames"):
+    with NativeRadars(rig, usb.open, clock) as made, refused(ErrorCode.VALUE_INVALID, "frames"):
         made.arm(65536)
 
 
-def test_ldo_bypass_never_reaches_a_board_without_its_acknowledgement(rig, clock, boards):
+def test_ldo_bypass_is_not_sent_without_the_board_s_acknowledgement(rig, usb, clock):
     native = {n: msgspec.structs.replace(b, ldo_bypass=True) for n, b in rig.radar.native.items()}
     wrong = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, native=native))
     with refused(ErrorCode.VALUE_INVALID, "LDO bypass of LS"):
-        NativeRadars(wrong, boards.words.__getitem__, clock)
-    assert not any(b.destroyed for b in boards.by_serial.values())
+        NativeRadars(wrong, usb.open, clock)
+    assert not any(b.destroyed for b in usb.boards.values())
 
 
-def test_a_board_that_fails_at_the_start_closes_the_others(rig, clock, boards):
-    boards.by_serial["FTRV"].cores.flash = b""
+def test_a_board_that_fails_at_the_start_closes_the_others(rig, usb, clock):
+    usb.boards["FTRV"].cores.flash = b""
     with refused(ErrorCode.RADAR_NO_FIRMWARE, "RV"):
-        NativeRadars(rig, boards.words.__getitem__, clock)
-    assert all(w.closed for w in boards.words.values())
+        NativeRadars(rig, usb.open, clock)
+    assert all(link.closed for links in usb.links.values() for link in links)
 
 
-def test_three_boards_behind_usb(rig, clock, boards):
-    from polysight.host.radar.usb import UsbWords
-
-    chips = {s: UsbChip(b) for s, b in boards.by_serial.items()}
+def test_three_boards_behind_usb(rig, usb, clock):
+    chips = {s: UsbChip(b) for s, b in usb.boards.items()}
     with NativeRadars(
         rig, lambda s: UsbWords(*(chips[s].channel(n) for n in "ABCD"), sleep=clock.sleep), clock
     ) as made:
         made.arm(FRAMES)
-        boards.pulses(FRAMES)
+        usb.pulses(FRAMES)
         assert {s.state for s in made.states().values()} == {RadarState.DONE}
     assert [c.errors for c in chips.values()] == [[], [], []]
 
 
-def test_the_rig_file_must_name_every_board_and_each_serial_once(rig):
+def test_the_rig_file_must_have_every_board_and_each_serial_once(rig):
     table = to_builtins(rig)
     del table["radar"]["native"]["RV"]
     with refused(ErrorCode.VALUE_INVALID, "radar.native"):
@@ -191,3 +233,85 @@ def test_the_backend_is_chosen_by_the_rig_file(rig, monkeypatch):
     )
     made = radar_control(rig)
     assert isinstance(made, NativeRadars)
+
+
+# --- lost links, traces ---
+
+
+def run_row(radars, usb) -> dict[str, RadarState]:
+    radars.arm(FRAMES)
+    usb.pulses(FRAMES)
+    return {name: s.state for name, s in radars.states().items()}
+
+
+def traces(radars) -> list[dict[str, str]]:
+    result = radars.report()["traces"]
+    assert isinstance(result, list)
+    return result
+
+
+ALL_DONE = dict.fromkeys(("LS", "RH", "RV"), RadarState.DONE)
+
+
+@pytest.mark.parametrize("for_s", [0.0, 2.0])
+def test_a_lost_link_is_reopened(radars, usb, for_s):
+    assert run_row(radars, usb) == ALL_DONE
+    usb.unplug(for_s)
+    assert radars.states()["RH"].state is RadarState.FAULT
+    assert run_row(radars, usb) == ALL_DONE
+    assert [len(usb.links[s]) for s in ("FTLS", "FTRH", "FTRV")] == [1, 2, 1]
+    assert usb.links["FTRH"][0].closed
+
+
+def test_a_link_that_cannot_be_reopened_is_a_fault_of_that_board_only(radars, usb):
+    usb.unplug(for_s=20.0)
+    radars.arm(FRAMES)
+    result = radars.states()
+    assert (result["RH"].state, result["RV"].state) == (RadarState.FAULT, RadarState.ARMED)
+    assert "USB" in result["RH"].detail
+    usb.clock.sleep(20.0)
+    assert run_row(radars, usb) == ALL_DONE
+
+
+def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
+    kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, trace_dir=str(tmp_path / "traces")))
+    with NativeRadars(kept, usb.open, clock) as radars:
+        assert run_row(radars, usb) == ALL_DONE
+        usb.unplug(0.0)
+        assert run_row(radars, usb) == ALL_DONE
+        result = traces(radars)
+    files = sorted((tmp_path / "traces").iterdir())
+    assert sorted(t["file"] for t in result) == [str(f) for f in files]
+    assert [read_trace(f)[0]["board"] for f in files] == ["LS", "RH", "RH", "RV"]
+    assert any("error" in record for record in read_trace(files[1])[1] + read_trace(files[2])[1])
+    # The first link's trace replays the bring-up without the board.
+    replayed = ReplayedWords(files[0])
+    made = radar_board(rig, "LS", replayed, replayed, None)
+    made.configure()
+    made.arm(FRAMES)
+
+
+def test_a_full_disk_ends_a_trace_but_no_row(rig, usb, clock, tmp_path, monkeypatch):
+    monkeypatch.setattr("polysight.host.radar.native.new_trace", lambda *_: Path("/dev/full"))
+    kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, trace_dir=str(tmp_path)))
+    with NativeRadars(kept, usb.open, clock) as radars:
+        assert run_row(radars, usb) == ALL_DONE
+        result = traces(radars)
+    assert len(result) == 3
+    assert all("No space" in t["ended"] for t in result)
+
+
+def test_a_fatal_event_during_arming_is_retried(radars, usb, monkeypatch):
+    """The board faults once at its start."""
+    arm, failed = boards.RadarBoard.arm, []
+
+    def once(board, frames) -> None:
+        if board.name == "RV" and not failed:
+            failed.append(board.name)
+            board.fail("RF core fault")
+            raise DeviceError("RV: RF core fault")
+        arm(board, frames)
+
+    monkeypatch.setattr(boards.RadarBoard, "arm", once)
+    assert run_row(radars, usb) == ALL_DONE
+    assert failed == ["RV"]

@@ -1,4 +1,4 @@
-"""Whatever fails, and whenever: no hang, no traceback, nothing accepted that is not so, and the right cause named."""
+"""Random faults at random times: no hang, no traceback, no false success, and the right cause in the error."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def clean() -> Simulated:
 
 
 def accepted_rightly(found: Outcome, clean: Simulated) -> bool:
-    """A row that counts as done: the board was told what a sound one was, and made its frames.
+    """Return True if the board of a completed row has the settings of a sound one and has made its frames.
 
-    One that loses its power as the host looks for the last time has lost what it was told.
+    A board that loses power at the last poll of the host has lost its settings.
     """
     over = found.words.at == found.words.count
     same = found.board.settings == clean.settings or (over and found.board.executed == clean.executed)
@@ -50,9 +50,9 @@ def test_random_faults(clean, request):
             assert accepted_rightly(found, clean), (number, case.name, at)
             continue
         failed += 1
-        said = f"{found.error.what} {found.error.why} {' '.join(found.radar.warnings)}"
-        if not re.search(case.cause, said, re.DOTALL):
-            unnamed.append((number, case.name, at, said))
+        text = f"{found.error.what} {found.error.why} {' '.join(found.radar.warnings)}"
+        if not re.search(case.cause, text, re.DOTALL):
+            unnamed.append((number, case.name, at, text))
     print(f"{cases} faults, {failed} ended in an error, {len(unnamed)} of these without the right cause", dict(kinds))  # noqa: T201
     for line in unnamed[:20]:
         print(line)  # noqa: T201
@@ -63,8 +63,8 @@ def test_random_faults(clean, request):
 OF_THE_BOARD = ("flash", "another board", "jumpers")
 
 
-def test_whatever_failed_between_them_the_next_row_runs_once_it_is_mended():
-    """A reset and a configuration bring every board back that is sound itself."""
+def test_after_a_repaired_fault_the_next_row_runs():
+    """A reset and a configuration recover every board without a defect of its own."""
     for number in range(60):
         case, at = draw(random.Random(number))
         if case.name.startswith(OF_THE_BOARD):
@@ -75,14 +75,14 @@ def test_whatever_failed_between_them_the_next_row_runs_once_it_is_mended():
         assert found.radar.state is State.ARMED, (number, case.name, at)
 
 
-def test_the_faults_strike(clean):
-    """Of the faults that are drawn most happen within the run: the law above is not one of faults that never come."""
+def test_most_drawn_faults_happen_within_the_run(clean):
+    """Most of the drawn faults happen within the run, so that the law above is not empty."""
     del clean
     struck = [run(*draw(random.Random(number))).struck for number in range(40)]
     assert sum(struck) > 24
 
 
-def test_a_clean_run_is_done(clean):
+def test_a_run_without_a_fault_is_done(clean):
     assert len(clean.executed) > 20
     assert clean.cores.flash == IMAGE.data
     assert clean.armings == 1

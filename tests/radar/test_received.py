@@ -1,4 +1,4 @@
-"""Every message that a real device is known to have sent is understood."""
+"""Every known message of a real device is decoded."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.radar.boards import VirtualClock
 from tests.support.refusals import refused
 
 
-class Said:
+class Sent:
     """A device that says given messages: one after each command, or all at once."""
 
     def __init__(self, *messages: bytes) -> None:
@@ -48,9 +48,9 @@ class Said:
     def close(self) -> None: ...
 
 
-def link(*messages: bytes) -> tuple[Link, Said]:
-    said = Said(*messages)
-    return Link("RH", said, VirtualClock(), [].append), said
+def connect(*messages: bytes) -> tuple[Link, Sent]:
+    sent_words = Sent(*messages)
+    return Link("RH", sent_words, VirtualClock(), [].append), sent_words
 
 
 @pytest.mark.parametrize("raw", received.ALL.values(), ids=received.ALL.keys())
@@ -60,7 +60,7 @@ def test_every_received_message_is_decoded(raw):
     assert message.kind in (Kind.RESPONSE, Kind.EVENT)
 
 
-def test_an_error_carries_message_id_0_and_names_error_and_sub_block():
+def test_an_error_has_message_id_0_error_number_and_sub_block():
     message = decode(received.AWR2243_ERROR)
     assert (message.message_id, message.sequence, message.direction) == (0, 10, Direction.RF_TO_HOST)
     assert message.error == (62, 0x0105)
@@ -72,7 +72,7 @@ def test_an_error_without_a_body_is_an_error():
     assert message.error == (None, None)
 
 
-def test_an_acknowledgement_without_a_body_is_none():
+def test_an_acknowledgement_without_a_body_is_no_error():
     assert decode(received.AWR1243_RF_UP).error is None
 
 
@@ -88,7 +88,7 @@ def test_power_up_events_of_either_length_report_no_boot_error(raw):
     assert 1000 < event.values["power_up_us"] < 5000
 
 
-def test_the_fault_during_loading_is_a_register_that_read_back_wrong():
+def test_the_fault_during_loading_is_a_register_read_back_error():
     event = decode_event(decode(received.AWR2243_FAULT).blocks[0])
     assert event.id == MAIN_CPU_FAULT
     assert "register read-back" in event.detail
@@ -97,44 +97,44 @@ def test_the_fault_during_loading_is_a_register_that_read_back_wrong():
 @pytest.mark.parametrize("sequence", range(16))
 def test_a_refusal_without_a_body_ends_a_command_with_any_sequence_number_at_once(sequence):
     """The known one has number 0; it is not known if such a device repeats the command's number."""
-    asked, said = link(received.AWR1243_ERROR)
-    asked.sequence = sequence
+    line, sent_words = connect(received.AWR1243_ERROR)
+    line.sequence = sequence
     with refused(ErrorCode.REFUSED_BY_PEER, "LowPower"):
-        asked.call(LOW_POWER_OFF)
-    assert len([w for w in said.written if w[:4] == bytes.fromhex("34122143")]) == 1
+        line.call(LOW_POWER_OFF)
+    assert len([w for w in sent_words.written if w[:4] == bytes.fromhex("34122143")]) == 1
 
 
 def test_a_refusal_with_message_id_0_is_the_answer_to_its_sequence():
-    asked, said = link(received.AWR2243_ERROR)
-    asked.sequence = 10
+    line, sent_words = connect(received.AWR2243_ERROR)
+    line.sequence = 10
     with refused(ErrorCode.REFUSED_BY_PEER, "LowPower", "error 62", "0x0105"):
-        asked.call(LOW_POWER_OFF)
-    assert len([w for w in said.written if w[:4] == bytes.fromhex("34122143")]) == 1
+        line.call(LOW_POWER_OFF)
+    assert len([w for w in sent_words.written if w[:4] == bytes.fromhex("34122143")]) == 1
 
 
 @pytest.mark.parametrize(("direction", "kind"), [(2, 1), (5, 1), (1, 1), (6, 0)])
 def test_a_response_of_another_core_is_no_answer(direction, kind):
-    asked, _ = link(*[frame(direction, kind, 0x202, b"", 0, 0, True)] * 3)
+    line, _ = connect(*[frame(direction, kind, 0x202, b"", 0, 0, True)] * 3)
     with refused(ErrorCode.NO_ANSWER):
-        asked.call(DEVICE_CONFIGURATION)
+        line.call(DEVICE_CONFIGURATION)
 
 
 def test_an_answer_without_its_last_chunk_is_no_answer():
-    asked, _ = link(chunk(1, 0x40E0, bytes(16)))
+    line, _ = connect(chunk(1, 0x40E0, bytes(16)))
     with refused(ErrorCode.NO_ANSWER):
-        asked.call(GET_MAIN_VERSION)
+        line.call(GET_MAIN_VERSION)
 
 
-def test_an_acknowledgement_with_a_16_bit_crc_is_taken():
-    asked, _ = link(received.AWR1243_RF_UP)
-    assert asked.call(RF_POWER_UP).blocks == ()
+def test_an_acknowledgement_with_a_16_bit_crc_is_accepted():
+    line, _ = connect(received.AWR1243_RF_UP)
+    assert line.call(RF_POWER_UP).blocks == ()
 
 
 def test_a_refusal_of_another_sequence_is_late():
-    asked, _ = link(received.AWR2243_ERROR)
+    line, _ = connect(received.AWR2243_ERROR)
     with refused(ErrorCode.NO_ANSWER):
-        asked.call(DEVICE_CONFIGURATION)
-    assert "late" in asked.warnings[0]
+        line.call(DEVICE_CONFIGURATION)
+    assert "late" in line.warnings[0]
 
 
 def chunk(remaining: int, block: int, data: bytes) -> bytes:
@@ -147,14 +147,14 @@ def chunk(remaining: int, block: int, data: bytes) -> bytes:
 
 
 def test_an_answer_in_chunks_is_joined():
-    asked, _ = link(chunk(2, 0x40E0, bytes(16)), chunk(1, 0x40E1, b"abcd"), chunk(0, 0x40E2, b"efgh"))
-    assert [b.data for b in asked.call(GET_MAIN_VERSION).blocks] == [bytes(16), b"abcd", b"efgh"]
+    line, _ = connect(chunk(2, 0x40E0, bytes(16)), chunk(1, 0x40E1, b"abcd"), chunk(0, 0x40E2, b"efgh"))
+    assert [b.data for b in line.call(GET_MAIN_VERSION).blocks] == [bytes(16), b"abcd", b"efgh"]
 
 
 def test_an_answer_with_a_missing_chunk_is_no_answer():
-    asked, _ = link(chunk(2, 0x40E0, bytes(16)), chunk(0, 0x40E2, b"efgh"))
+    line, _ = connect(chunk(2, 0x40E0, bytes(16)), chunk(0, 0x40E2, b"efgh"))
     with refused(ErrorCode.NO_ANSWER):
-        asked.call(GET_MAIN_VERSION)
+        line.call(GET_MAIN_VERSION)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_an_answer_with_a_missing_chunk_is_no_answer():
     ],
 )
 @pytest.mark.parametrize("number", [MAIN_POWER_UP, BOOT_STATUS])
-def test_boot_bits_are_told_by_what_they_mean(number, bits, meaning, cure):
+def test_boot_bits_have_their_meaning(number, bits, meaning, cure):
     event = decode_event(SubBlock(number, bytes(4) + bits.to_bytes(8, "little") + bytes(8)))
     assert meaning in event.detail
     assert event.values["cure"] == cure

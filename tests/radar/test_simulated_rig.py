@@ -28,7 +28,7 @@ from tests.support.rigs import published_rig
 EMPTY = decode_scene({"name": "the direct path alone"}, "test")
 
 
-def test_the_derived_rig_breaks_no_constraint_and_reaches_every_board(tmp_path: Path):
+def test_the_derived_rig_keeps_all_constraints_and_has_every_address(tmp_path: Path):
     rig = derive(published_rig(), EMPTY, tmp_path, native=True)
     assert rig.radar.control == "native"
     assert [c for c in constraints(rig, 5600) if not c.holds] == []
@@ -36,16 +36,16 @@ def test_the_derived_rig_breaks_no_constraint_and_reaches_every_board(tmp_path: 
     assert all(b.usb_serial.startswith("tcp://127.") for b in rig.radar.native.values())
 
 
-def test_programmed_offsets_make_the_signals_that_the_scene_s_offset_made(tmp_path: Path):
-    """The same start frequencies, told by the scene, by the rig file or programmed: the same samples."""
-    told = derive(published_rig(), EMPTY, tmp_path)
+def test_offsets_give_the_same_signals_from_scene_rig_file_and_program(tmp_path: Path):
+    """The same start frequencies, from the scene, the rig file or native control, give the same samples."""
+    result = derive(published_rig(), EMPTY, tmp_path)
     native = derive(published_rig(), EMPTY, tmp_path, native=True)
     at = np.zeros(2)
     a = SimulatedRig(published_rig(), EMPTY, 5).signals("RH", at, at)
-    b = SimulatedRig(told, without_offset(EMPTY), 5).signals("RH", at, at)
+    b = SimulatedRig(result, without_offset(EMPTY), 5).signals("RH", at, at)
     np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(a, SimulatedRig(native, EMPTY, 5).signals("RH", at, at))
-    assert {b.start_offset_hz for b in told.recorded} == {EMPTY.disturbances.if_offset_hz}
+    assert {b.start_offset_hz for b in result.recorded} == {EMPTY.disturbances.if_offset_hz}
     moved = tuple(
         msgspec.structs.replace(x, start_offset_hz=x.start_offset_hz + 1e5) if x.name == "RH" else x
         for x in native.boards
@@ -87,7 +87,7 @@ def test_a_board_runs_a_row_over_its_socket(rig, served):
     radar.close()
 
 
-def test_a_board_unplugged_behind_its_socket_is_a_fault_that_says_where(rig, served):
+def test_a_board_unplugged_behind_its_socket_is_a_fault_with_its_address(rig, served):
     made, board = served
     radar = RadarBoard("LS", open_board(made.address), SystemClock(), program(rig, rig.by_name("LS")))
     radar.configure()
@@ -97,7 +97,7 @@ def test_a_board_unplugged_behind_its_socket_is_a_fault_that_says_where(rig, ser
     radar.close()
 
 
-def test_nobody_at_the_address_is_named():
+def test_an_address_without_a_server_is_an_error():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     with refused(ErrorCode.NO_ANSWER, f"tcp://127.0.0.1:{port}"):
@@ -106,7 +106,7 @@ def test_nobody_at_the_address_is_named():
         open_board("tcp://nonsense")
 
 
-def test_a_request_cut_anywhere_is_taken_whole(served):
+def test_a_split_request_is_processed(served):
     made, _ = served
     ask = struct.pack("<ccH", b"B", b"W", 2) + b"\x81\x87" + struct.pack("<ccH", b"B", b"R", 1)
     with socket.create_connection(("127.0.0.1", int(made.address.rpartition(":")[2]))) as client:

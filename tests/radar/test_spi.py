@@ -15,7 +15,7 @@ from tests.support.refusals import refused
 
 
 def ignored(_):
-    """An event that nobody keeps."""
+    """Discard an event."""
 
 
 @pytest.fixture
@@ -49,13 +49,13 @@ def test_sequence_numbers_count_on_and_wrap(link, sent):
     assert link.warnings == []
 
 
-def test_reading_is_announced_by_the_ready_word_each_time(link, sent):
+def test_every_read_starts_with_the_ready_word(link, sent):
     link.call(GET_TEMPERATURES)
     assert [raw == READY_TO_READ for raw in sent] == [False, True]
 
 
 @pytest.mark.parametrize("fault", [Fault.BAD_CRC, Fault.BAD_CHECKSUM, Fault.LOST_INTERRUPT, Fault.NO_ANSWER])
-def test_a_lost_answer_is_asked_for_again_with_the_same_sequence(link, board, sent, fault):
+def test_a_lost_answer_is_retried_with_the_same_sequence_number(link, board, sent, fault):
     before = list(board.executed)
     board.inject(fault)
     link.call(LOW_POWER_OFF)
@@ -66,7 +66,7 @@ def test_a_lost_answer_is_asked_for_again_with_the_same_sequence(link, board, se
     assert commands(sent)[-1].sequence == 3
 
 
-def test_a_nack_is_answered_by_a_new_sequence_without_the_retry_flag(link, board, sent):
+def test_a_nack_is_retried_with_a_new_sequence_number_without_the_flag(link, board, sent):
     board.inject(Fault.NACK)
     link.call(LOW_POWER_OFF)
     assert [(m.sequence, m.retry) for m in commands(sent)] == [(2, False), (3, False)]
@@ -79,7 +79,7 @@ def test_words_before_the_sync_word_are_skipped(link, board, sent):
     assert len(commands(sent)) == 1
 
 
-def test_an_event_between_command_and_answer_is_kept(link, board, sent):
+def test_an_event_between_command_and_answer_is_not_lost(link, board, sent):
     board.inject(Fault.EVENT_BETWEEN)
     link.call(LOW_POWER_OFF)
     assert len(commands(sent)) == 1
@@ -93,14 +93,14 @@ def test_events_come_in_order_and_once(link, board):
     assert [e.id for e in link.poll()] == [0x100B, 0x100F, 0x1012]
 
 
-def test_a_refusal_is_an_error_in_words_and_is_not_repeated(link, board, sent):
+def test_a_refusal_is_an_error_without_a_retry(link, board, sent):
     board.inject(Fault.REFUSE)
     with refused(ErrorCode.REFUSED_BY_PEER, "RH", "LowPower", "error 6"):
         link.call(LOW_POWER_OFF)
     assert len(commands(sent)) == 1
 
 
-def test_it_gives_up_after_its_tries(link, board, sent, clock):
+def test_retries_are_limited(link, board, sent, clock):
     board.inject(*[Fault.NO_ANSWER] * ATTEMPTS)
     began = clock.time
     with refused(ErrorCode.NO_ANSWER):
@@ -123,7 +123,7 @@ def test_rf_power_up_is_never_sent_twice(words, clock, board, sent, fault):
     assert len(commands(sent)) == 1
 
 
-def test_unplugged_is_an_error_at_once(link, board):
+def test_an_unplugged_link_is_an_error_at_once(link, board):
     board.plugged = False
     with pytest.raises(DeviceError, match="unplugged"):
         link.call(LOW_POWER_OFF)
@@ -131,6 +131,6 @@ def test_unplugged_is_an_error_at_once(link, board):
         link.poll()
 
 
-def test_an_event_that_never_comes_is_named(link):
+def test_an_event_that_does_not_come_is_a_timeout_with_its_number(link):
     with refused(ErrorCode.NO_ANSWER, "0x100B", "2 s"):
         link.wait_for((0x100B,), 2.0, ignored)

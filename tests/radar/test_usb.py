@@ -56,7 +56,7 @@ def test_four_channels_in_their_modes(plugged):
 
 @pytest.mark.parametrize("packet", [1, 2, 3, 7, 61, 510])
 @pytest.mark.usefixtures("plugged")
-def test_answers_cut_anywhere_arrive_whole(bus, clock, packet):
+def test_split_answers_are_joined(bus, clock, packet):
     bus.packet = packet
     words = open_usb("FT1234")
     words.reset(held=True)
@@ -79,8 +79,8 @@ def test_slow_mode_is_one_word_a_transfer(plugged):
     words.close()
 
 
-def test_a_path_on_the_bus_finds_the_board_whatever_its_serial_number(bus, plugged):
-    """pyftdi takes any of the chips when it is given a bus address alone, by the chance of a set's order."""
+def test_a_usb_path_finds_the_board_with_any_serial_number(bus, plugged):
+    """pyftdi opens any of the chips when given a bus address alone, in the order of a set."""
     others = [chip(RadarBoard(lambda: 0.0), "FT1234", (4, n)) for n in (1, 3, 4, 5, 6)]
     for other in others:
         bus.plug(other)
@@ -91,7 +91,7 @@ def test_a_path_on_the_bus_finds_the_board_whatever_its_serial_number(bus, plugg
         open_usb("usb:1-7")
 
 
-def test_a_serial_number_that_two_chips_have_opens_neither_and_lists_their_paths(bus, plugged):
+def test_a_serial_number_of_two_chips_opens_neither_and_lists_their_paths(bus, plugged):
     other = chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3))
     bus.plug(other)
     with pytest.raises(DeviceError, match=r"1-4\.2, 1-4\.3") as caught:
@@ -102,7 +102,7 @@ def test_a_serial_number_that_two_chips_have_opens_neither_and_lists_their_paths
 
 @pytest.mark.parametrize(("number", "cause"), [(errno.EBUSY, "another program"), (errno.EACCES, "udev rule")])
 @pytest.mark.usefixtures("plugged")
-def test_what_keeps_a_chip_from_being_claimed_is_named(bus, number, cause):
+def test_a_chip_that_cannot_be_claimed_is_an_error_with_the_cause(bus, number, cause):
     bus.refuses = number
     with pytest.raises(DeviceError) as caught:
         open_usb("FT1234")
@@ -111,13 +111,13 @@ def test_what_keeps_a_chip_from_being_claimed_is_named(bus, number, cause):
 
 
 @pytest.mark.usefixtures("plugged")
-def test_a_chip_that_is_not_there_is_named():
+def test_a_missing_chip_is_an_error_with_its_serial_number():
     with pytest.raises(DeviceError, match="FT9"):
         open_usb("FT9")
 
 
-def test_a_late_plug_is_found(bus, board):
-    """pyftdi remembers an empty bus, too."""
+def test_a_chip_that_is_plugged_in_later_is_found(bus, board):
+    """pyftdi caches an empty bus, too."""
     with pytest.raises(DeviceError):
         open_usb("FT7")
     bus.plug(chip(board, "FT7"))
@@ -125,7 +125,7 @@ def test_a_late_plug_is_found(bus, board):
 
 
 @pytest.mark.parametrize("closed", ["before", "after"])
-def test_a_replugged_chip_is_found_and_the_dead_one_let_go_of(bus, plugged, closed):
+def test_a_replugged_chip_is_found_and_the_old_one_closed(bus, plugged, closed):
     words = open_usb("FT1234")
     if closed == "before":
         words.close()
@@ -182,7 +182,7 @@ def test_a_scan_survives_a_replug_of_one_board(bus, rig, clock):
     assert [c.errors + c.chip.errors for c in chips.values()] == [[], [], []]
 
 
-def test_without_pyftdi_the_error_names_the_extra(monkeypatch):
+def test_missing_pyftdi_is_an_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyftdi", None)
     monkeypatch.setitem(sys.modules, "pyftdi.ftdi", None)
     with refused(ErrorCode.PACKAGE_MISSING, "pyftdi") as caught:

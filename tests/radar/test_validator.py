@@ -77,16 +77,16 @@ def test_the_published_chirp_with_centred_receivers_holds(rig):
         ("start frequency of RH", "chirp", {"start_hz": 75.99e9}),
     ],
 )
-def test_a_value_outside_is_named_with_formula_limit_and_value(rig, name, table, values):
+def test_a_broken_constraint_is_reported_with_formula_limits_and_value(rig, name, table, values):
     wrong = changed(rig, table, **values)
     assert name in broken(wrong)
     with pytest.raises(ConfigError) as caught:
         require(wrong, FRAMES)
-    told = next(c for c in constraints(wrong, FRAMES) if c.name == name and not c.holds)
-    assert str(told) in str(caught.value)
-    assert told.formula in str(told)
-    assert f"{told.value:.12g}" in str(told)
-    assert told.remedy in str(caught.value)
+    result = next(c for c in constraints(wrong, FRAMES) if c.name == name and not c.holds)
+    assert str(result) in str(caught.value)
+    assert result.formula in str(result)
+    assert f"{result.value:.12g}" in str(result)
+    assert result.remedy in str(caught.value)
 
 
 def test_76_ghz_is_inside_the_band_to_the_code(rig):
@@ -97,7 +97,7 @@ def test_76_ghz_is_inside_the_band_to_the_code(rig):
         assert (f"start frequency of {transmitter.name}" not in broken(wrong)) is holds
 
 
-def test_simulated_radars_alone_may_be_without_filters(rig):
+def test_only_simulated_radars_may_have_no_filters(rig):
     native = {n: NativeRadar(usb_serial=f"tcp://127.0.{k}.1:2000") for k, n in enumerate(rig.radar.native)}
     served = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, native=native))
     assert broken(changed(served, "chirp", hpf1_khz=0.0, hpf2_khz=0.0)) == set()
@@ -123,7 +123,7 @@ ANY_INT = st.one_of(st.integers(-70_000, 70_000), st.integers())
     st.one_of(st.just(790e3), ANY_FLOAT),
     st.integers(-1, 70_000),
 )
-def test_whatever_a_rig_file_holds_it_is_refused_or_can_be_encoded(floats, ints, offset_hz, frames):
+def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, frames):
     rig = of_receiver(native_rig(), start_offset_hz=offset_hz)
     wrong = floats | ints
     for table in sorted({table for table, _ in wrong}):
@@ -148,7 +148,7 @@ def test_pulse_gap(rig, monkeypatch):
     assert broken(rig) == {"pulse gap"}
 
 
-def test_the_shortest_burst_period_is_where_the_chirps_leave_300_us(rig):
+def test_the_shortest_burst_period_leaves_300_us_after_the_chirps(rig):
     """idle + ramp + 0.01 + 300 us, and 200 us to the next pulse."""
     edge = 100.0 + 128.5 + 0.01 + 300.0 + 200.0
     assert "inter-frame time" not in broken(changed(rig, "burst", period_us=edge + 1e-6))
@@ -156,25 +156,25 @@ def test_the_shortest_burst_period_is_where_the_chirps_leave_300_us(rig):
 
 
 @pytest.mark.parametrize(("chirp_us", "holds"), [(228.51, True), (228.5, False), (300.0, False)])
-def test_chirps_of_one_frame_follow_each_other_as_the_radar_makes_them(rig, chirp_us, holds):
-    """idle + ramp + 10 ns is what the radar makes of its profile; the host must know the same."""
+def test_the_chirp_spacing_must_be_that_of_the_radar(rig, chirp_us, holds):
+    """The radar's spacing is idle + ramp + 10 ns; the rig file must have the same."""
     burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=chirp_us, period_us=6000.0)
     many = msgspec.structs.replace(rig, burst=burst)
     assert ("chirp spacing" not in broken(many)) is holds
-    told = next(c for c in constraints(many, FRAMES) if c.name == "chirp spacing")
-    idle = float(told.remedy.split()[3].strip(","))
+    result = next(c for c in constraints(many, FRAMES) if c.name == "chirp spacing")
+    idle = float(result.remedy.split()[3].strip(","))
     mended = msgspec.structs.replace(many, radar=msgspec.structs.replace(rig.radar, idle_us=idle))
     assert "chirp spacing" not in broken(mended)
 
 
-def test_a_frame_of_many_chirps_needs_its_time(rig):
+def test_a_frame_of_many_chirps_needs_a_longer_period(rig):
     chirps = 16 * 228.51
     for period, holds in ((chirps + 500.0 + 1e-3, True), (chirps + 499.0, False)):
         burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=228.51, period_us=period)
         assert ("inter-frame time" not in broken(msgspec.structs.replace(rig, burst=burst))) is holds
 
 
-def test_a_usb_path_acknowledges_no_ldo_bypass(rig):
+def test_a_usb_path_does_not_acknowledge_ldo_bypass(rig):
     native = {**rig.radar.native, "RH": NativeRadar(usb_path="1-4.2", ldo_bypass=True)}
     wrong = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, native=native))
     assert broken(wrong) == {"LDO bypass of RH"}
@@ -208,17 +208,19 @@ def test_if_budget(rig, mode, offset, holds):
     assert ("IF budget of RH" not in broken(wrong)) is holds
 
 
-def test_following_the_remedy_of_the_if_budget_centres_the_path(rig):
+def test_the_remedy_of_the_if_budget_centres_the_direct_path(rig):
     wrong = of_receiver(rig, start_offset_hz=0.0)
-    told = next(c for c in constraints(wrong, FRAMES) if c.name == "IF budget of RH")
-    offset = float(re.findall(r"[\d.]+", told.remedy)[-1])
+    result = next(c for c in constraints(wrong, FRAMES) if c.name == "IF budget of RH")
+    offset = float(re.findall(r"[\d.]+", result.remedy)[-1])
     mended = of_receiver(rig, start_offset_hz=offset)
     assert direct_if_hz(mended, mended.by_name("RH")) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=60.0)
 
 
-def test_every_constraint_has_a_test_that_breaks_it(rig):
+def test_every_constraint_is_tested(rig):
     tested = {
-        c for mark in test_a_value_outside_is_named_with_formula_limit_and_value.pytestmark for c, *_ in mark.args[1]
+        c
+        for mark in test_a_broken_constraint_is_reported_with_formula_limits_and_value.pytestmark
+        for c, *_ in mark.args[1]
     }
     tested |= {"frames", "pulse gap", "LDO bypass of RH", "IF budget of RH"}
     general = {c.name for c in constraints(rig, FRAMES) if not c.name.endswith((" of LS", " of RV"))}

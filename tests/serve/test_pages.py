@@ -309,7 +309,7 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
     page.fill("#train-name", "mine")
     page.click("#train button")
     page.browser.wait(
-        "document.getElementById('train-told').innerText == 'The library is made.'", "the library", LIMIT_S
+        "document.getElementById('train-told').innerText == 'The library is saved.'", "the library", LIMIT_S
     )
     assert Library.load(scans / "libraries" / "mine.npz").names == ("copper", "my plastic")
     page.open("/scan?scan=one")

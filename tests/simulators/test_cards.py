@@ -1,4 +1,4 @@
-"""The cards' process from end to end: a test client plays host and Pi, over the real sockets and the real hub."""
+"""The process of the simulated cards: a test client is host and Pi, over real sockets and the real hub."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ def test_a_record_goes_on_while_the_stage_moves_or_owes_a_burst(
     stage.close()
 
 
-def test_the_report_tells_what_happened_and_a_power_cycle_moves_the_card(
+def test_the_report_has_all_counts_and_a_power_cycle_moves_the_card(
     rig: Instrument, start: Start, pulse: Callable[..., None], tmp_path: Path
 ) -> None:
     report = tmp_path / "report.json"
@@ -233,9 +233,7 @@ def test_the_report_tells_what_happened_and_a_power_cycle_moves_the_card(
         (["--boards", "RH"], "neither --scene nor --pattern"),
     ],
 )
-def test_wrong_arguments_are_told_in_one_message(
-    rig: Instrument, tmp_path: Path, arguments: list[str], words: str
-) -> None:
+def test_wrong_arguments_are_one_message(rig: Instrument, tmp_path: Path, arguments: list[str], words: str) -> None:
     config = tmp_path / "rig.toml"
     config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
     command = [

@@ -1,4 +1,4 @@
-"""Faults of a card at work: over real sockets, with a clock that the test moves; what is counted is what happened."""
+"""Faults of a simulated card over real sockets, with the test's own clock; the counts are the truth."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_a_turned_bit_is_one_bit_of_the_payload_or_of_the_header(rig: Instrument
             assert np.unpackbits(turned[at]).sum() == 1
 
 
-def test_the_ddr_overflow_is_told_by_its_own_bit_and_leaves_no_gap_in_the_sequence(
+def test_the_ddr_overflow_has_its_own_bit_and_leaves_no_gap_in_the_sequence(
     rig: Instrument, sockets: ExitStack
 ) -> None:
     bench = Bench(rig, sockets, ddr_full=0.2)

@@ -6,13 +6,13 @@ import struct
 from contextlib import ExitStack
 
 import numpy as np
-import pytest
 
 from polysight.shared.config import Instrument
-from polysight.shared.errors import DeviceError
+from polysight.shared.error_codes import ErrorCode
 from polysight.simulators.cards import CardEndpoint, CardSender, Network, Pace, bound_udp
 from polysight.simulators.faults import Faults
 from tests.simulators.card_bench import ALIVE, EEPROM, START, Bench, reply
+from tests.support.refusals import refused
 
 
 def test_the_eeproms_addresses_are_taken_over_the_network_after_a_power_cycle(
@@ -80,7 +80,7 @@ def test_packets_in_calls_of_many_keep_the_delay_as_a_mean_also_after_a_pause(
         assert 956 * 25e-6 <= now[0] - began <= 1000 * 25e-6 + 0.01
 
 
-def test_an_endpoint_says_which_address_is_not_its_own() -> None:
+def test_an_address_of_another_machine_is_an_error() -> None:
     network = Network("127.0.0.30", "203.0.113.5", bytes(6), 4096, 4098)
-    with pytest.raises(DeviceError, match=r"203\.0\.113\.5:4096"):
+    with refused(ErrorCode.BUSY, "203.0.113.5:4096"):
         CardEndpoint("RH", network, Faults(), 0, 1.0, lambda: 0.0, Pace())

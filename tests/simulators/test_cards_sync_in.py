@@ -1,4 +1,4 @@
-"""Laws of SYNC_IN: which pulses start frames, and where the stage is at each."""
+"""SYNC_IN of the simulated radars: the pulses that start frames, and the stage's position at each."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.errors import ConfigError
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.raster import plan_raster
 from polysight.shared.wires import WireMotion
 from polysight.simulators.cards.sync_in import Pulse, StageTrack, SyncInput, sync_line
 from polysight.simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
+from tests.support.refusals import refused
 
 RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
 DEAD_NS = 278_500  # ramp end 128.5 us + 150 us
@@ -45,7 +46,7 @@ def test_a_burst_of_the_rig_file_starts_a_frame_each_and_a_pulse_too_soon_does_n
     assert sync.too_soon == 1
 
 
-def test_a_wire_clock_that_starts_anew_does_not_silence_the_radar() -> None:
+def test_a_restarted_wire_clock_does_not_silence_the_radar() -> None:
     sync = SyncInput(RIG)
     assert len(sync.frames(pulses([10**12, 0, 1_500_000]))) == 3
 
@@ -65,7 +66,7 @@ def test_an_unknown_stage_stands_in_the_middle_of_the_grid() -> None:
     assert (x[0], y[0]) == (0.0, 0.0)
 
 
-def test_motion_lines_are_kept_long_enough_and_not_for_ever() -> None:
+def test_motion_lines_are_kept_long_enough_and_not_forever() -> None:
     track = StageTrack(RIG)
     for k in range(20_000):
         track.add(WireMotion(k * 1000, k, 250_000, 0))
@@ -112,7 +113,7 @@ def test_every_board_hangs_on_the_fan_out_or_on_its_own_line() -> None:
     rig = with_lines(22, 23, 24)
     assert [sync_line(rig, b) for b in rig.boards] == [22, 23, 24]
     short = with_lines(22, 23)
-    with pytest.raises(ConfigError, match="2 lines for 3 boards"):
+    with refused(ErrorCode.VALUES_CONFLICT, "2 lines", "3 boards"):
         sync_line(short, short.boards[0])
 
 

@@ -172,7 +172,7 @@ def test_packet_size_and_delay_are_taken_from_the_packet_configuration() -> None
     assert [len(p) for p in packets(card.lvds(stream(3000), 0.0))] == [1010] * 3
 
 
-def test_what_most_clients_ask_for_is_done_with_1456_bytes_a_packet_and_nonsense_changes_nothing() -> None:
+def test_the_usual_packet_size_gives_1456_bytes_and_malformed_requests_change_nothing() -> None:
     card = Card(HOME)
     for request in (
         "5aa5 0300 0600 c005350c0000 aaee",
@@ -186,7 +186,7 @@ def test_what_most_clients_ask_for_is_done_with_1456_bytes_a_packet_and_nonsense
     assert [len(p) for p in packets(card.lvds(stream(3000), 0.0))] == [1466] * 2
 
 
-def test_a_configuration_that_does_not_suit_the_radar_records_nothing_and_the_card_says_so() -> None:
+def test_a_wrong_lane_configuration_records_nothing_and_is_reported() -> None:
     card = Card(HOME)
     card.command(bytes.fromhex("5aa5 0300 0600 01020102031e aaee"), 0.0)  # 2-lane
     card.command(START, 0.0)
@@ -205,7 +205,7 @@ def test_the_eeprom_is_taken_at_the_next_power_cycle() -> None:
     assert card.network == Network("192.168.33.30", "192.168.33.181", bytes.fromhex("123456789013"), 4200, 4201)
 
 
-def test_an_overflow_is_told_only_while_recording() -> None:
+def test_an_overflow_is_reported_only_while_recording() -> None:
     card = ready_card()
     assert card.overflow() == []
     card.command(START, 0.0)

@@ -1,4 +1,4 @@
-"""Laws of the card's faults: seeded, the same however packets are grouped, and exactly what was asked for."""
+"""Faults of the simulated card: from a seed, independent of grouping, and as configured."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 from polysight.simulators.cards.dca1000 import Status
 from polysight.simulators.cards.fault_draws import NetworkFaults, OverflowFaults, PulseFaults
 from polysight.simulators.cards.sync_in import Pulse
 from polysight.simulators.faults import Faults, read_faults
+from tests.support.refusals import refused
 
 EVERYTHING = Faults(loss=0.1, duplicate=0.1, reorder=0.1, late=0.1, late_packets=7, truncate=0.1, lose_packets=(3, 50))
 
@@ -124,7 +126,7 @@ def test_a_fault_that_does_not_exist_is_refused(setting: str) -> None:
 def test_a_fault_file_holds_faults_only(tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     path.write_text("loss = 0.1\n")
-    with pytest.raises(ConfigError, match="holds"):
+    with refused(ErrorCode.FILE_FOREIGN, path):
         read_faults(path, [], ("RH",))
 
 
@@ -139,5 +141,5 @@ def test_a_fault_file_holds_faults_only(tmp_path: Path) -> None:
 def test_a_fault_that_cannot_happen_with_the_rigs_radars_is_refused(fault: str, control: str) -> None:
     assert read_faults(None, [fault], ("RH",), control=control)["RH"] != Faults()
     for other in {"endless", "line_server", "native"} - {control}:
-        with pytest.raises(ConfigError, match=f"{fault.partition('=')[0]}.*{other}"):
+        with refused(ErrorCode.VALUES_CONFLICT, fault.partition("=")[0], other):
             read_faults(None, [fault], ("RH",), control=other)

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.error_codes import ErrorCode
+from polysight.shared.errors import DeviceError
 from polysight.shared.wires import WireClient, WireEdge, WireMessage, WireMotion, encode
 from polysight.simulators.wires import WireHub
+from tests.support.refusals import refused
 
 Serve = Callable[..., Path]
 Join = Callable[..., WireClient]
@@ -63,7 +65,7 @@ def take(client: WireClient, n: int) -> list[WireMessage]:
     return got
 
 
-def test_ten_thousand_edges_of_two_senders_reach_the_listener_in_each_senders_order(serve: Serve, join: Join) -> None:
+def test_edges_arrive_in_the_order_of_each_sender(serve: Serve, join: Join) -> None:
     path = serve()
     listener, stage, pi = join(path, (22, 26), motion=True), join(path), join(path)
     n = 5000
@@ -85,7 +87,7 @@ def test_ten_thousand_edges_of_two_senders_reach_the_listener_in_each_senders_or
     assert listener.receive(0.05) is None
 
 
-def test_only_what_was_asked_for_arrives_and_never_ones_own(serve: Serve, join: Join) -> None:
+def test_a_client_gets_its_subscriptions_and_never_its_own_lines(serve: Serve, join: Join) -> None:
     path = serve()
     pi = join(path, (26,))
     cards = join(path, (22,), motion=True)
@@ -99,7 +101,7 @@ def test_only_what_was_asked_for_arrives_and_never_ones_own(serve: Serve, join: 
     assert cards.receive(0.05) is None
 
 
-def test_who_joins_late_learns_where_the_stage_stands(serve: Serve, join: Join) -> None:
+def test_a_late_client_gets_the_stage_s_position(serve: Serve, join: Join) -> None:
     path = serve()
     stage, early = join(path), join(path, motion=True)
     stage.send(WireMotion(1, 10, 20, 0), WireMotion(2, 30, 40, 50))
@@ -109,7 +111,7 @@ def test_who_joins_late_learns_where_the_stage_stands(serve: Serve, join: Join) 
     assert late.receive(0.05) is None
 
 
-def test_a_party_that_does_not_read_holds_nobody_up_and_loses_nothing(serve: Serve, join: Join) -> None:
+def test_a_client_that_does_not_read_delays_nobody_and_loses_nothing(serve: Serve, join: Join) -> None:
     path = serve()
     slow, fast, stage = join(path, (26,)), join(path, (26,)), join(path)
     edges = [WireEdge(k, 26, k % 2) for k in range(50_000)]
@@ -118,23 +120,21 @@ def test_a_party_that_does_not_read_holds_nobody_up_and_loses_nothing(serve: Ser
     assert take(slow, len(edges)) == edges
 
 
-def test_beyond_the_bound_the_slow_party_is_cut_off_with_a_message_and_the_others_go_on(
-    serve: Serve, join: Join, reports: list[str]
-) -> None:
+def test_beyond_the_limit_only_the_slow_client_is_disconnected(serve: Serve, join: Join, reports: list[str]) -> None:
     path = serve(max_pending_bytes=10_000)
     slow, fast, stage = join(path, (26,)), join(path, (26,)), join(path)
     edges = [WireEdge(k, 26, k % 2) for k in range(50_000)]
     for i in range(0, len(edges), 100):
         stage.send(*edges[i : i + 100])
         assert len(take(fast, 100)) == 100
-    with pytest.raises(DeviceError, match=r"closed|broke"):
+    with pytest.raises(DeviceError):
         take(slow, len(edges))
     assert len(reports) == 1
     assert "26" in reports[0]
 
 
 @pytest.mark.parametrize("line", [b"S 1 26\n", b"X\n", b"L a\n", b"M 1 2 3\n", b"M 1 2 3 x\n", b"S" * 1000])
-def test_a_party_that_writes_something_else_is_cut_off_with_a_message(
+def test_a_client_that_sends_an_invalid_line_is_disconnected(
     serve: Serve, join: Join, reports: list[str], line: bytes
 ) -> None:
     path = serve()
@@ -145,12 +145,12 @@ def test_a_party_that_writes_something_else_is_cut_off_with_a_message(
         bad.sendall(encode(WireEdge(1, 26, 1)) + line)
         assert bad.recv(1) == b""
     assert take(listener, 1) == [WireEdge(1, 26, 1)]
-    assert "cut off" in reports[0]
+    assert len(reports) == 1
 
 
-def test_two_hubs_do_not_share_a_socket_but_a_dead_hubs_file_is_replaced(serve: Serve, tmp_path: Path) -> None:
+def test_a_used_socket_is_refused_and_an_unused_one_is_replaced(serve: Serve, tmp_path: Path) -> None:
     path = serve()
-    with pytest.raises(DeviceError, match="another hub"):
+    with refused(ErrorCode.BUSY, path):
         WireHub(path, str)
     left_over = tmp_path / "old.sock"
     with socket.socket(socket.AF_UNIX) as dead:
@@ -159,6 +159,6 @@ def test_two_hubs_do_not_share_a_socket_but_a_dead_hubs_file_is_replaced(serve: 
     assert not left_over.exists()
 
 
-def test_a_path_too_long_for_a_unix_socket_says_so(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="too long"):
+def test_a_path_too_long_for_a_unix_socket_is_refused(tmp_path: Path) -> None:
+    with refused(ErrorCode.VALUE_INVALID):
         WireHub(tmp_path / ("x" * 120), str)

@@ -102,8 +102,8 @@ def talker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Driver]:
         real, dialogue = request.config.getoption("--stage-port"), request.node.callspec.params.get("path")
         if real:
             driver = PortDriver(real)
-        elif dialogue is not None or request.config.getoption("--long"):
-            # Three times real time, but a heartbeat is one of the wall clock, however fast the motion runs.
+        elif request.config.getoption("--long") or (dialogue is not None and dialogue.stem in ("hold", "sequence")):
+            # Three times real time, but the heartbeat counts wall time, however fast the motion runs.
             speed = 1.0 if dialogue is not None and dialogue.stem == "heartbeat" else 3.0
             process = closed.enter_context(closing(StageProcess(tmp_path, "pc", speed)))
             driver = PortDriver(str(process.link), speed)

@@ -1,4 +1,4 @@
-"""A scan goes on with a rig file that says otherwise how the rig is reached, and with nothing else otherwise."""
+"""A scan resumes with a rig file that differs in the connection settings only."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tomli_w
 
 from polysight.host.acquisition.scan import resume_scan
 from polysight.host.cli.main import main
-from polysight.host.page.story import Story
+from polysight.host.page.history import ScanHistory
 from polysight.host.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, with_connection
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
@@ -87,7 +87,7 @@ def moved(rig: Instrument) -> Instrument:
     return decode(table, Instrument, "moved")
 
 
-def test_what_was_taken_up_holds_from_then_on(undisturbed, tmp_path):
+def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
     """For every reader, and for a later resume that says nothing; what the scan was begun with is still there."""
     small = undisturbed.copy(tmp_path / "moved")
     scan = ScanFolder.load(small.path)
@@ -100,7 +100,7 @@ def test_what_was_taken_up_holds_from_then_on(undisturbed, tmp_path):
     started, (first, second) = scan.facts("scan_started")[0], scan.facts("scan_resumed")
     assert decode(started["instrument"], Instrument, "begun") == begun
     assert (first["rig"], "rig" in second) == (connection_of(now), False)
-    story = Story(started)
+    story = ScanHistory(started)
     for fact in (first, second):
         story.add_fact(fact)
     assert story.instrument == now

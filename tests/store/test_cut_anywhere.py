@@ -177,7 +177,7 @@ def goes_on_behind(scan: SmallScan, undisturbed, lost: int, rows: set[int] = fro
     """Resume: the host is told how much the journal lost, and keeps all it had."""
     before = (scan.path / "events.msgpack").read_bytes()
     assert resumed(scan, undisturbed) == rows
-    assert any(f"ends {lost} events before" in text for text in scan.told)
+    assert any(f"ends {lost} events before" in text for text in scan.messages)
     after = (scan.path / "events.msgpack").read_bytes()
     assert after.startswith(before)
     assert len(after) > len(before)

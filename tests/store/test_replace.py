@@ -1,4 +1,4 @@
-"""Rows placed again from their packets: what changes is committed anew, what does not is not touched."""
+"""Rows placed again from their packets: different results are committed, equal ones not touched."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def holds(scan: ScanFolder, data: bytes, missing: list[tuple[int, int]]) -> None
         assert (row.payload[~row.mask] == want[~row.mask]).all()
 
 
-def test_what_comes_out_the_same_is_not_touched(tmp_path):
+def test_rows_with_the_same_result_are_not_touched(tmp_path):
     scan, data = scan_with(tmp_path / "scan", lost=9)
     before = {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()}
     assert [(r.changed, r.left) for r in replace_rows(scan)] == [(False, "")] * 2
@@ -73,7 +73,7 @@ def test_what_comes_out_the_same_is_not_touched(tmp_path):
     holds(scan, data, [(9 * 1456, 10 * 1456)])
 
 
-def test_a_row_that_was_masked_in_vain_is_committed_anew(tmp_path, capsys):
+def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
     scan, data = scan_with(tmp_path / "scan", lost=9, wrong=True)
     assert errors(scan.path) == []
     assert inspect_placement(scan.path / "raw/RH/0000.bin", as_json=False) == 1
@@ -111,7 +111,7 @@ def test_a_kill_while_rows_are_replaced_loses_nothing(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx", PACKETS])
 @pytest.mark.parametrize("other", [False, True])
-def test_a_damaged_file_is_told_and_never_placed(tmp_path, suffix, other):
+def test_a_damaged_file_is_reported_and_never_placed(tmp_path, suffix, other):
     """One bit of it is turned, or it is another board's."""
     scan, _ = scan_with(tmp_path / "scan", lost=9)
     path = scan.path / f"raw/RH/0000{suffix}"

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import zlib
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.host.store import manifest
+from polysight.host.store.append_only import crc32
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import ManifestWriter, encode_line, parse
 from polysight.host.store.scan_folder import ScanFolder, new_scan_id
@@ -39,7 +42,7 @@ def test_manifest_round_trip(some):
     raw = b"".join(map(encode_line, some))
     found = parse(raw)
     assert found.facts == some
-    assert (found.length, found.torn, found.damaged) == (len(raw), False, [])
+    assert (found.length, found.torn, found.faults) == (len(raw), False, [])
 
 
 @given(st.lists(facts, min_size=1, max_size=3), st.data())
@@ -55,7 +58,7 @@ def test_flipped_bit_is_never_a_fact(some, data):
     for fact in found.facts:
         assert fact in some
     assert len(found.facts) <= len(some)
-    assert found.torn or found.damaged or found.facts == some
+    assert found.torn or found.faults or found.facts == some
 
 
 def test_every_truncation_gives_the_whole_lines_before_it(tmp_path):
@@ -69,7 +72,7 @@ def test_every_truncation_gives_the_whole_lines_before_it(tmp_path):
         found = parse(raw[:n])
         assert found.facts == some[:whole]
         assert found.torn == (n not in ends)
-        assert found.damaged == []
+        assert found.faults == []
         path.write_bytes(raw[:n])
         with ManifestWriter(path, create=False) as writer:
             writer.append({"fact": "scan_resumed"})
@@ -185,7 +188,7 @@ def test_read_row_refuses_damage(whole):
         scan.read_row("RH", 17)
 
 
-def test_what_is_no_scan_is_refused(whole, tmp_path):
+def test_other_folders_are_refused(whole, tmp_path):
     with refused(ErrorCode.FILE_MISSING):
         validate(tmp_path / "nothing")
     (whole / "manifest.jsonl").write_bytes(b"")
@@ -240,9 +243,15 @@ def test_scan_ids_fit_the_wire():
     json.dumps(name)
 
 
-def test_start_that_died_before_its_first_line_is_begun_anew(tmp_path):
+def test_start_that_died_before_its_first_line_is_repeated(tmp_path):
     instrument = small_instrument()
     for torn in (b"", b'{"fact":"scan_star'):
         (tmp_path / "manifest.jsonl").write_bytes(torn)
         assert ScanFolder.create(tmp_path, instrument, plan_raster(instrument.grid)).committed() == {}
         (tmp_path / "manifest.jsonl").unlink()
+
+
+@given(st.binary(max_size=3000))
+def test_it_is_that_of_zlib(data):
+    assert crc32(data) == zlib.crc32(data)
+    assert crc32(np.frombuffer(data, np.uint8).data) == zlib.crc32(data)

@@ -1,4 +1,4 @@
-"""A disk that does not answer is an error; only what it says wrongly is taken again, and only a scan is 'in use'."""
+"""Read errors of the disk are errors, never a reason to retake a row; a disk without locks is not a scan in use."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
 
 
-def test_lock_that_another_program_holds_is_told_from_a_disk_without_locks(tmp_path, monkeypatch):
+def test_a_locked_scan_and_a_disk_without_locks_are_different_errors(tmp_path, monkeypatch):
     path = tmp_path / "manifest.jsonl"
     with ManifestWriter(path, create=True), refused(ErrorCode.BUSY):
         ManifestWriter(path, create=False)
@@ -25,7 +25,7 @@ def test_lock_that_another_program_holds_is_told_from_a_disk_without_locks(tmp_p
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(appending.fcntl, "flock", no_locks)
-    with refused(ErrorCode.FILE_UNREADABLE, os.strerror(errno.ENOLCK)):
+    with refused(ErrorCode.FILE_UNWRITABLE, os.strerror(errno.ENOLCK)):
         ManifestWriter(path, create=False)
 
 

@@ -1,4 +1,4 @@
-"""Scan folders and files from elsewhere: no path leads out of the folder, and no small file takes much memory."""
+"""Untrusted scan folders and files: no path leads out of the folder, and no small file takes much memory."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_a_board_whose_name_is_a_path_is_refused(name, tmp_path):
     text = RIG_FILE.read_text().replace('name = "RH"', f"name = {json.dumps(name)}", 1)
     assert text != RIG_FILE.read_text()
     (tmp_path / "rig.toml").write_text(text)
-    with pytest.raises(ConfigError, match="name"):
+    with pytest.raises(ConfigError):
         load_instrument(tmp_path / "rig.toml")
 
 
@@ -112,7 +112,7 @@ def bomb(path: Path, size: int = 6 << 30) -> Path:
 
 @pytest.mark.parametrize("read", [read_image, read_patches, Library.load], ids=["image", "patches", "library"])
 def test_an_archive_that_claims_too_much_is_refused_by_its_size(read, tmp_path):
-    with pytest.raises(DataError, match="bytes"):
+    with refused(ErrorCode.FILE_TOO_LARGE):
         read(bomb(tmp_path / "big.npz"))
 
 
@@ -169,13 +169,13 @@ def test_links_within_a_scan_and_of_its_products_folder_are_allowed(scan, tmp_pa
     assert ScanFolder.load(scan.path).committed()
 
 
-def test_a_pipe_in_a_scan_keeps_nobody_waiting(scan):
+def test_a_pipe_in_a_scan_is_refused(scan):
     os.mkfifo(scan.path / "raw" / "pipe")
     with refused(ErrorCode.FILE_FOREIGN, "raw/pipe"):
         ScanFolder.load(scan.path)
 
 
-def test_what_a_link_leads_to_is_not_emptied_for_new_products(tmp_path):
+def test_the_target_of_a_link_is_not_emptied_for_new_products(tmp_path):
     victim, out = tmp_path / "victim", tmp_path / "products"
     (victim / "folder").mkdir(parents=True)
     (tmp_path / ".products.new").symlink_to(victim)
@@ -206,13 +206,13 @@ def begun_with(scan: ScanFolder, **told: object) -> Path:
 @pytest.mark.parametrize("file", ["../hpf.toml", "/etc/passwd"])
 def test_calibration_outside_the_scan_is_not_read(scan, file):
     told = {"hpf": {"file": file, "crc32": "0", "copied_from": ""}}
-    with pytest.raises(DataError, match="outside"):
+    with refused(ErrorCode.PATH_OUTSIDE):
         calibration_of_scan(ScanFolder.load(begun_with(scan, calibration=told)))
 
 
 def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
     rig = scan.content.facts[0]["instrument"]
-    with pytest.raises(DataError, match="outside"):
+    with refused(ErrorCode.PATH_OUTSIDE):
         calibration_of_scan(
             ScanFolder.load(
                 begun_with(scan, instrument={**rig, "calibration": {"hpf": "/etc/passwd"}}, calibration=None)
@@ -281,7 +281,7 @@ def test_a_netcdf_file_that_claims_too_much_is_refused_by_its_size(tmp_path):
     with h5py.File(tmp_path / "big.nc", "w") as f:
         f.create_dataset("h_real", shape=(1 << 20, 1 << 20), dtype="f4", chunks=(1024, 1024), compression="gzip")
     assert (tmp_path / "big.nc").stat().st_size < 1 << 20
-    with pytest.raises(DataError, match="bytes"):
+    with refused(ErrorCode.FILE_TOO_LARGE):
         read_netcdf(tmp_path / "big.nc")
 
 
@@ -297,7 +297,7 @@ def linked(f: h5py.File) -> None:
 def test_a_netcdf_file_with_arrays_in_other_files_is_refused(make, tmp_path):
     with h5py.File(tmp_path / "a.nc", "w") as f:
         make(f)
-    with pytest.raises(DataError, match="another file"):
+    with refused(ErrorCode.PATH_OUTSIDE):
         read_netcdf(tmp_path / "a.nc")
 
 
@@ -306,5 +306,5 @@ def test_a_pickle_whose_lists_are_one_list_is_refused_by_its_size(tmp_path):
     one = [np.ones(1, np.complex64)] * 3
     content = {"values": [[row] * 1000] * 3, "ref_values": one, "name": "a", "incident_angle": 55.0}
     (tmp_path / "a.pkl").write_bytes(pickle.dumps({**content, "collection_name": "s", "ref_name": "m"}))
-    with pytest.raises(DataError, match="pixels"):
+    with pytest.raises(DataError):
         read_material(tmp_path / "a.pkl")

@@ -1,7 +1,7 @@
 """In the guest: emulated UNO -> pseudo terminal and trigger wire -> gpio-sim -> the Pi's program, as a Pi runs it.
 
-Carries out the one row of the rig file that is its argument, and prints `RESULT {...}`: what the Pi told, and what the
-kernel saw on the lines. The repository is on PYTHONPATH, which conftest.py hands over on the kernel's command line.
+Executes the only row of the rig file that is its argument, and prints `RESULT {...}`: the Pi's events, and the changes
+of the lines recorded by the kernel. conftest.py passes PYTHONPATH, with the repository, on the kernel's command line.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def loopback_up() -> None:
 
 
 def trigger_wire(listener: socket.socket, chip: SimChip) -> None:
-    """The wire from the board's trigger pin to the chip: every edge it tells is driven into the input."""
+    """The wire from the board's trigger pin to the chip: every edge is driven into the input."""
     peer, _ = listener.accept()
     with peer, peer.makefile("r", encoding="ascii") as lines:
         for line in lines:
@@ -56,7 +56,7 @@ def start(*command: str) -> subprocess.Popen[str]:
 
 
 def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
-    """Home, run the row, end the Pi's program; what it told."""
+    """Home, run the row, end the Pi's program; return its events."""
     rig = load_instrument(config)
     python = [sys.executable, "-m"]
     uno = start(

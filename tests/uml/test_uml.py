@@ -38,7 +38,7 @@ class Pulse(NamedTuple):
 
 
 def bursts_of(result: dict[str, Any]) -> list[tuple[Capture, list[Pulse]]]:
-    """The Pi's capture events with their pulses, after checking that what the Pi tells is what the kernel saw."""
+    """The Pi's capture events with their pulses, after checking that they agree with the kernel's record."""
     changes = result["changes"]
     assert {line for _, line, _ in changes} == {SYNC_OUT}
     rises = [i for i, (_, _, value) in enumerate(changes) if value]
@@ -52,7 +52,7 @@ def bursts_of(result: dict[str, Any]) -> list[tuple[Capture, list[Pulse]]]:
         assert burst[-2].rise_ns < capture.last_ns <= burst[-1].rise_ns
         assert max(p.fall_ns - p.rise_ns for p in burst) <= capture.width_max_ns
         bursts.append((capture, burst))
-    assert list(pulses) == []  # no pulse that was not told
+    assert list(pulses) == []  # no pulse without an event
     assert [c.point for c, _ in bursts] == list(range(len(bursts)))
     assert (result["pi_status"], result["left_high"]) == (0, 0)
     return bursts
@@ -69,22 +69,22 @@ def period_errors_ns(bursts: list[tuple[Capture, list[Pulse]]]) -> list[int]:
     return [b.rise_ns - a.rise_ns - PERIOD_NS for _, burst in bursts for a, b in itertools.pairwise(burst)]
 
 
-def tell(text: str) -> None:
+def print_figure(text: str) -> None:
     """One line to standard output, which `make test-uml` shows."""
     sys.stdout.write(text + "\n")
 
 
-def tell_figures(what: str, bursts: list[tuple[Capture, list[Pulse]]]) -> None:
+def print_figures(what: str, bursts: list[tuple[Capture, list[Pulse]]]) -> None:
     """The figures of docs/benchmarks.md."""
     errors = [e / 1e3 for e in sorted(period_errors_ns(bursts))]
     latency = [(burst[0].rise_ns - capture.edge_ns) / 1e3 for capture, burst in bursts]
     cuts = quantiles(latency, n=1000, method="inclusive")
     width = max(p.fall_ns - p.rise_ns for _, burst in bursts for p in burst) / 1e3
     bound = max(capture.width_max_ns for capture, _ in bursts) / 1e3
-    tell(f"{what}: {len(bursts)} positions, {sum(len(burst) for _, burst in bursts)} pulses, none lost")
-    tell(f"  period error {errors[0]:+.2f} .. {errors[-1]:+.2f} us, median {errors[len(errors) // 2]:+.2f} us")
-    tell(f"  edge to first pulse p50 {cuts[499]:.2f} us, p99.9 {cuts[998]:.2f} us")
-    tell(f"  longest pulse {width:.2f} us, the Pi's bound of it {bound:.2f} us")
+    print_figure(f"{what}: {len(bursts)} positions, {sum(len(burst) for _, burst in bursts)} pulses, none lost")
+    print_figure(f"  period error {errors[0]:+.2f} .. {errors[-1]:+.2f} us, median {errors[len(errors) // 2]:+.2f} us")
+    print_figure(f"  edge to first pulse p50 {cuts[499]:.2f} us, p99.9 {cuts[998]:.2f} us")
+    print_figure(f"  longest pulse {width:.2f} us, the Pi's bound of it {bound:.2f} us")
 
 
 def test_a_published_row_in_virtual_time(run_row):
@@ -92,7 +92,7 @@ def test_a_published_row_in_virtual_time(run_row):
     result = run_row(350, "time-travel=inf-cpu")
     assert complete(result, 350), result["finished"]
     bursts = bursts_of(result)
-    tell_figures("virtual time", bursts)
+    print_figures("virtual time", bursts)
     assert sum(len(burst) for _, burst in bursts) == 5600
     assert max(map(abs, period_errors_ns(bursts))) <= 2_000
     edges = [capture.edge_ns for capture, _ in bursts]
@@ -110,8 +110,8 @@ def test_a_row_in_real_time(run_row):
         result = run_row(20, real_time=True)
         bursts = bursts_of(result)
         if complete(result, 20):
-            tell_figures("real time", bursts)
+            print_figures("real time", bursts)
             return
         assert result["finished"][1] != 0, result["finished"]
-        tell(f"a take ended with {result['finished']}")
+        print_figure(f"a take ended with {result['finished']}")
     pytest.fail("no take of five was complete: this machine is too busy")

@@ -78,8 +78,8 @@ function show() {
   by("count").textContent = `${found.length === all ? "" : `${found.length} of `}${all} scan${all === 1 ? "" : "s"}`
     + (told.left_out?.length ? ` · not shown (links, odd names): ${told.left_out.slice(0, 3).join(", ")}${told.left_out.length > 3 ? ", …" : ""}` : "")
     + (told.free_bytes ? ` · ${bytes(told.free_bytes)} free` : "");
-  if (!all) by("told").textContent = server.starts ? "No scan is here yet: begin with New scan." : "No scan is here yet.";
-  else if (!by("told").classList.contains("wrong")) by("told").textContent = found.length ? "" : "None of them matches.";
+  if (!all) by("told").textContent = server.starts ? "No scans yet: start one with New scan." : "No scans yet.";
+  else if (!by("told").classList.contains("wrong")) by("told").textContent = found.length ? "" : "No scan matches.";
 }
 
 async function look() {
@@ -100,7 +100,7 @@ async function showTraining() {
   by("train-log").hidden = !program;
   if (!program) return;
   by("train-log").textContent = program.log;
-  by("train-told").textContent = program.running ? "It learns…" : program.status === 0 ? "The library is made." : "No library was made:";
+  by("train-told").textContent = program.running ? "Training…" : program.status === 0 ? "The library is saved." : "Training failed:";
   if (program.running) setTimeout(showTraining, 1000);
 }
 

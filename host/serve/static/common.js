@@ -35,7 +35,7 @@ async function answer(path, given, options) {
   try {
     reply = await fetch(address(path, given), { ...options, headers: { ...options?.headers, "X-Polysight-Token": token } });
   } catch {
-    throw new Refused({ what: "The server does not answer", why: "`polysight serve` was ended, or the network is gone", do: "start it again; scans go on regardless" }, 0);
+    throw new Refused({ what: "The server is not responding", why: "`polysight serve` was ended, or the network is gone", do: "start it again; scans go on regardless" }, 0);
   }
   if (reply.status === 429) {
     await new Promise((go) => setTimeout(go, 1100));
@@ -112,7 +112,7 @@ export const pageOf = (page, scan) => `/${page}?${new URLSearchParams({ scan })}
 export function permittivity(p) {
   if (!p || p.real === null || p.real === undefined) return "–";
   const error = (std) => (std ? ` ± ${std.toPrecision(2)}` : "");
-  return `${p.real.toFixed(2)}${error(p.real_std)} − j (${(-p.imag).toFixed(2)}${error(p.imag_std)})`;
+  return `${p.real.toFixed(2)}${error(p.real_std)} − j (${signed(-p.imag, 2)}${error(p.imag_std)})`;
 }
 
 /** A material's name as people read it. */
@@ -169,8 +169,8 @@ export function askForToken() {
   if (by("token-bar")) return;
   const field = make("input", null, null, { id: "token-field", type: "password", autocomplete: "off", required: true });
   const form = make("form", null, "token-bar", { id: "token-bar" });
-  form.append(make("label", "This server asks for its token: what follows #token= in the address that it printed.", null, { htmlFor: "token-field" }),
-    field, make("button", "Use it"));
+  form.append(make("label", "Enter the token: the text after #token= in the address that the server printed.", null, { htmlFor: "token-field" }),
+    field, make("button", "Apply"));
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     const given = field.value.trim().replace(/^.*#token=/, "");

@@ -66,7 +66,7 @@ function showTable() {
     return row;
   });
   by("rows").replaceChildren(...rows);
-  by("share").textContent = told.significant_share === null ? "The errors are not known: no difference can be called one."
+  by("share").textContent = told.significant_share === null ? "Errors are unknown: significance cannot be judged."
     : `${(100 * told.significant_share).toFixed(1)} % of ${told.compared} pixels differ by more than ${told.significant_sigmas} standard deviations.`;
   by("warnings").replaceChildren(...told.notes.map((n) => make("li", n)));
 }

@@ -89,7 +89,7 @@ export class Labels {
     try {
       const told = await post("labels", this.scan, { boxes, metal: this.boxes.find((b) => b.metal)?.name.trim() ?? null, specimens });
       this.touched = false;
-      by("label-told").textContent = ["Saved. Process again to have them looked at.", ...told.notes.map((n) => `Note: ${n}.`)].join(" ");
+      by("label-told").textContent = ["Saved. Process again to use them.", ...told.notes.map((n) => `Note: ${n}.`)].join(" ");
       by("use-labels").disabled = false;
       by("use-labels").checked = true;
     } catch (error) { complain("label-told", error); }

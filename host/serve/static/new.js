@@ -19,7 +19,7 @@ function showPlan(p) {
   for (const [name, text] of facts) list.append(make("dt", name), make("dd", text));
   const warnings = make("ul");
   for (const w of p.warnings) warnings.append(nest(make("li", null, w.refused ? "refused" : ""), ...rich(`${w.refused ? "Refused: " : ""}${w.text}`)));
-  by("forecast").replaceChildren(make("p", p.possible ? span(p.time_s.total) : "This cannot be scanned", "time"), list, warnings);
+  by("forecast").replaceChildren(make("p", p.possible ? span(p.time_s.total) : "Not possible", "time"), list, warnings);
   by("start").disabled = !p.possible;
 }
 
@@ -57,7 +57,7 @@ async function showDoctor() {
   }));
   const last = program.log.split("\n").at(-1);
   by("doctor").disabled = program.running;
-  by("doctor-told").textContent = program.running ? "It looks…" : program.status === null ? "It was stopped." : last;
+  by("doctor-told").textContent = program.running ? "Checking…" : program.status === null ? "Stopped." : last;
   by("rig-note").textContent = program.running ? "" : `checked ${new Date(program.started_utc).toLocaleTimeString()}`;
   if (program.running) setTimeout(showDoctor, 700);
 }

@@ -16,7 +16,7 @@ export async function showProbe(scan, x, y, library) {
     told = await get("probe", { ...scan, x: x.toFixed(2), y: y.toFixed(2), library });
     complain("probe-hint");
   } catch (error) { complain("probe-hint", error); return null; }
-  by("probe-hint").textContent = told.lit ? "" : "The scan does not light this place.";
+  by("probe-hint").textContent = told.lit ? "" : "The scan does not illuminate this place.";
   const facts = [["place", `x ${told.place_mm[0].toFixed(1)}, y ${told.place_mm[1].toFixed(1)} mm`.replaceAll("-", "−")],
     ["|H|, |V|", `${db(told.h_db)}, ${db(told.v_db)}${told.referenced ? " beside metal" : ""}`],
     ["P", told.p.real === null ? "nothing" : `${complex(told.p)}${told.p_sigma === null ? "" : ` ± ${number(told.p_sigma, 2)}`}`]];

@@ -118,7 +118,7 @@ async function follow() {
   by("program").hidden = !program || (!program.running && program.status === 0 && running === "");
   if (program) {
     by("program-title").textContent = `polysight ${program.kind} ${ending(program)}`;
-    if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "It has said nothing yet.";
+    if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "No output yet.";
   }
   const was = running;
   running = program?.running ? program.kind : "";
@@ -130,7 +130,7 @@ async function follow() {
 async function run(path, body) {
   complain("told");
   try {
-    by("told").textContent = "It starts…";
+    by("told").textContent = "Starting…";
     await post(path, scan, body);
     running = path;
     await follow();
@@ -160,7 +160,7 @@ async function load() {
   by("probe").hidden = !result || Boolean(labels?.open);
   by("label-open").hidden = !(result && server.control);
   if (!result) {
-    if (!by("told").textContent) by("told").textContent = summary.rows ? "This scan was not processed yet." : "";
+    if (!by("told").textContent) by("told").textContent = summary.rows ? "Not processed yet." : "";
     return;
   }
   by("use-labels").disabled = !result.labels;

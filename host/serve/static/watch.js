@@ -155,7 +155,7 @@ function showNotices() {
     }
     return item;
   });
-  if (!items.length) items.push(make("li", "Nothing that you need to know of.", "none"));
+  if (!items.length) items.push(make("li", "No faults.", "none"));
   by("notices").replaceChildren(...items);
   by("more").hidden = notices.length <= FEW;
   by("more").textContent = allNotices ? "Fewer" : `All ${notices.length}`;
@@ -180,7 +180,7 @@ function showBoards() {
     line("late or twice", (b) => [grouped((b.counts.late ?? 0) + (b.counts.duplicates ?? 0)), ""]);
     line("dropped by this machine", (b) => bad(b.counts.kernel_drops ?? 0));
   }
-  line("takes not counted", (b) => bad(b.retaken));
+  line("takes rejected", (b) => bad(b.retaken));
   line("pulses missed", (b) => bad(b.counts.pulses_missed ?? 0));
   line("positions masked", (b) => bad(b.masked));
   by("board-table").replaceChildren(table);
@@ -188,7 +188,7 @@ function showBoards() {
   by("trigger").textContent = t
     ? `Triggers: ${grouped(t.pulses)} pulses; the longest ${t.width_max_us.toFixed(1)} µs of ${t.width_limit_us} allowed, `
       + `the latest ${t.jitter_max_us.toFixed(1)} µs late.`
-    : "Triggers: nothing heard yet.";
+    : "Triggers: no data yet.";
 }
 
 function showPlots() {
@@ -256,8 +256,8 @@ function lost() {
   document.body.classList.add("lost");
   by("status").dataset.level = "wait";
   by("sign").textContent = "?";
-  by("headline").textContent = "This page has lost the live view";
-  tell("detail", "It tries again by itself. The scan does not depend on it.");
+  by("headline").textContent = "Connection to the live view lost";
+  tell("detail", "Reconnecting. The scan continues without this page.");
   tell("why", "Likely: the server was ended, or the network is gone.");
   tell("do", "");
   document.title = "? · polysight";
@@ -287,7 +287,7 @@ async function showProgram() {
   by("program").hidden = !program || !(program.running || ill) || (program.running && Boolean(state?.scan) && !ill);
   if (by("program").hidden) return;
   by("program-title").textContent = program.running ? "The program is starting" : `polysight scan ${ending(program)}`;
-  if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "It has said nothing yet.";
+  if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "No output yet.";
   if (state) showButtons();
 }
 
@@ -295,7 +295,7 @@ async function resume() {
   by("answer").textContent = "…";
   try {
     await post("resume", { scan: name });
-    by("answer").textContent = "The program starts; this takes some seconds.";
+    by("answer").textContent = "Starting; this takes some seconds.";
     await showProgram();
   } catch (error) { complain("answer", error); }
 }

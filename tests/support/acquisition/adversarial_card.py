@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import struct
 import time
 
 from polysight.shared.config import Board
@@ -33,8 +32,7 @@ class AdversarialCard(FakeCard):
         )
         self.sent.append((row, take, troubles))
         self._send(sent.arrivals)
-        status = struct.pack("<HHHH", 0xA55A, 0x0A, 0x0100, 0xEEAA)
-        self.out.sendto(status, (self.board.host_address, self.board.command_port))
+        self.report_status()
 
     def _send(self, arrivals: list[Arrival]) -> None:
         for k, arrival in enumerate(arrivals):
@@ -42,14 +40,7 @@ class AdversarialCard(FakeCard):
                 time.sleep(0.002)
             self.out.sendto(arrival.packet, (self.board.host_address, self.board.data_port))
 
-    def _serve(self) -> None:
-        while not self._stop.is_set():
-            try:
-                raw, sender = self.commands.recvfrom(2048)
-            except TimeoutError:
-                continue
-            code = struct.unpack_from("<H", raw, 2)[0]
-            self.recording = {5: True, 6: False}.get(code, self.recording)
-            self.out.sendto(struct.pack("<HHHH", 0xA55A, code, 0x0402 if code == 0x0E else 0, 0xEEAA), sender)
-            if code in (5, 6):  # before the row runs; after its stop
-                self._send(self.adversary.take_late(0.3))
+    def _command(self, code: int, sender: tuple[str, int]) -> None:
+        super()._command(code, sender)
+        if code in (5, 6):  # before the row runs; after its stop
+            self._send(self.adversary.take_late(0.3))

@@ -55,11 +55,17 @@ class FakeCard:
                 continue
             code = struct.unpack_from("<H", raw, 2)[0]
             self.seen.append(code)
-            if self.mute:
-                continue
-            self.recording = {5: True, 6: False}.get(code, self.recording)
-            status = 0x0402 if code == 0x0E else 0
-            self.out.sendto(struct.pack("<HHHH", 0xA55A, code, status, 0xEEAA), sender)
+            if not self.mute:
+                self._command(code, sender)
+
+    def _command(self, code: int, sender: tuple[str, int]) -> None:
+        self.recording = {5: True, 6: False}.get(code, self.recording)
+        self.out.sendto(struct.pack("<HHHH", 0xA55A, code, 0x0402 if code == 0x0E else 0, 0xEEAA), sender)
+
+    def report_status(self, bits: int = 0x0100) -> None:
+        """Send an asynchronous status, by default that the record is completed."""
+        status = struct.pack("<HHHH", 0xA55A, 0x0A, bits, 0xEEAA)
+        self.out.sendto(status, (self.board.host_address, self.board.command_port))
 
     def send_frame(self, row: int, take: int, slot: int, frame_bytes: int) -> None:
         """The frame of one pulse, unless the radar missed it; packets leave as they fill."""
@@ -75,8 +81,7 @@ class FakeCard:
     def end_frames(self) -> None:
         """The short last packet, and its status."""
         self._send_packet(len(self._rest))
-        status = struct.pack("<HHHH", 0xA55A, 0x0A, 0x0100, 0xEEAA)
-        self.out.sendto(status, (self.board.host_address, self.board.command_port))
+        self.report_status()
 
     def _send_packet(self, size: int) -> None:
         body, self._rest = self._rest[:size], self._rest[size:]
@@ -98,8 +103,7 @@ class FakeCard:
                 self.out.sendto(head + body, to)
             self.sequence += 1
             self.count += len(body)
-        status = struct.pack("<HHHH", 0xA55A, 0x0A, 0x0100, 0xEEAA)
-        self.out.sendto(status, (self.board.host_address, self.board.command_port))
+        self.report_status()
 
     def close(self) -> None:
         self._stop.set()
@@ -140,17 +144,10 @@ class LateCard(FakeCard):
             self.recording = False
             self.end_frames()
 
-    def _serve(self) -> None:
-        while not self._stop.is_set():
-            try:
-                raw, sender = self.commands.recvfrom(2048)
-            except TimeoutError:
-                continue
-            code = struct.unpack_from("<H", raw, 2)[0]
-            if code == 5:
-                self.recording, self._record = True, self._record + 1
-            self.out.sendto(struct.pack("<HHHH", 0xA55A, code, 0x0402 if code == 0x0E else 0, 0xEEAA), sender)
-            if code == 6 and self.recording:
-                time.sleep(self._lag_s)
-                self._finish(self._record)
-                self.recording = False
+    def _command(self, code: int, sender: tuple[str, int]) -> None:
+        recorded = self.recording
+        self._record += code == 5
+        super()._command(code, sender)
+        if code == 6 and recorded:
+            time.sleep(self._lag_s)
+            self._finish(self._record)

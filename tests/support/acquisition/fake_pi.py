@@ -19,20 +19,20 @@ class FakePi:
     def __init__(self, rig: Instrument, cards: list[FakeCard]) -> None:
         self.rig, self.cards = rig, cards
         self.journal: dict[str, list[m.AnyEvent]] = {}
-        self.stage = rig.stage.placement_settings  # what Hello tells; {}: nothing, as older releases
+        self.stage = rig.stage.placement_settings  # in the reply to Hello; {} as of older releases
         self.homed = False
         self.run: m.BeginRun | None = None
         self.state: m.State = "idle"
         self.homings, self.home_fails, self.lost_mm = 0, set(), (0.0, 0.0)
-        self.lose_events = 0  # leave out so many events of PUB
+        self.lose_events = 0  # number of events that PUB loses
         self.lose_replies = 0
         self.fail_rows: dict[tuple[int, int], int] = {}  # (row, take): fault number
-        self.fault, self.latched = 0, ""  # what Status tells of the first fault: number and reason
+        self.fault, self.latched = 0, ""  # number and reason of the first fault
         self.hang_at: set[int] = set()  # rows that never end; half of their data is sent
         self.paced = False  # frames are sent at the times of their pulses
         self.hang_after_captures = False  # such rows send their bursts before they hang
-        self.notes: dict[tuple[int, int], str] = {}  # what RowFinished says of a row that is done
-        self.wanted_end = False  # the hanging row shall end well
+        self.notes: dict[tuple[int, int], str] = {}  # reason in RowFinished of a completed row
+        self.wanted_end = False  # the hanging row must end
         self.commands: list[m.AnyCommand] = []
         self.rows_run: list[tuple[int, int]] = []
         self._ran: set[tuple[int, int]] = set()  # since the last BeginRun
@@ -187,7 +187,7 @@ class FakePi:
             card.end_frames()
 
     def finish_hanging(self) -> None:
-        """The hanging row ends well, with no host to see it."""
+        """End the hanging row as done."""
         assert self.hanging is not None
         (row, take), self.hanging = self.hanging, None
         n = row.points

@@ -69,8 +69,14 @@ def place(
     size: int, packets: list[bytes], start: Counters | Past | None = None, frame: int = 1, batch: int = 7
 ) -> tuple[Placed, np.ndarray]:
     """Place a row that starts at these counters, or behind what is known of the records before."""
-    past = Past.ending_at(start) if isinstance(start, Counters) else start
+    past = Past(start, (0,)) if isinstance(start, Counters) else start
     return place_record(log_of(size, packets, batch), frame, past)
+
+
+def next_start(placed: Placed) -> Counters | None:
+    """Counters with which the card's next record starts; None if that is uncertain."""
+    base, ends = placed.past.base, placed.past.ends
+    return base.after(ends[0], -(-ends[0] // FULL)) if base is not None and len(ends) == 1 else None
 
 
 def mask_of(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:

@@ -9,6 +9,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
+from polysight.simulators import gpio
 from tests.support.paths import REPO
 
 PROGRAM = (sys.executable, "-m", "polysight.pi_controller")
@@ -46,6 +49,18 @@ class Process:
         if self.popen.poll() is None:
             self.popen.kill()
         self.popen.communicate(timeout=60)
+
+
+def require_stand_in_chip() -> None:
+    """Skip the module where the stand-in GPIO chip cannot be used."""
+    pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
+    if lacking := gpio.missing():
+        pytest.skip(f"no stand-in chip without {' '.join(lacking)}: {gpio.ENABLING_COMMAND}", allow_module_level=True)
+
+
+def resident_bytes(pid: int | str = "self") -> int:
+    """Memory of a process."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
 
 
 def run(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:

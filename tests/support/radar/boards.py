@@ -12,7 +12,7 @@ from tests.support.rigs import published_rig
 
 
 class VirtualClock:
-    """Time that passes by waiting, and a little by looking."""
+    """Virtual time, advanced by `sleep` and slightly by `now`."""
 
     def __init__(self) -> None:
         self.time = 0.0
@@ -26,7 +26,7 @@ class VirtualClock:
 
 
 class BoardWords:
-    """The word link of a simulated board, without USB between."""
+    """The word link of a simulated board, without USB."""
 
     def __init__(self, board: RadarBoard, clock: VirtualClock) -> None:
         self.board, self.clock = board, clock
@@ -53,7 +53,7 @@ class BoardWords:
 
 
 class Restarts(BoardWords):
-    """The board's supply fails for a moment when its host has written so many commands."""
+    """Interrupt the board's supply for a moment after `after` commands of its host."""
 
     def __init__(self, board: RadarBoard, clock: VirtualClock, after: int) -> None:
         super().__init__(board, clock)

@@ -64,7 +64,7 @@ class FaultyWords(BoardWords):
 
 @dataclass(frozen=True)
 class Case:
-    """A fault: its name, what it does at its moment, and the pattern of an error that names the cause."""
+    """A fault: name, action, and the pattern of an error with the right cause."""
 
     name: str
     cause: str
@@ -127,7 +127,7 @@ def _flood(rng: random.Random) -> Case:
 
 
 def draw(rng: random.Random) -> tuple[Case, int]:
-    """A fault, and the transfer at which it happens."""
+    """Draw a fault and the transfer at which it happens."""
     at = round(10 ** rng.uniform(0.0, 3.7))
     once = [f for f in Fault if f is not Fault.REFUSE and f is not Fault.REFUSE_BARE]
     made = {
@@ -173,7 +173,7 @@ def draw(rng: random.Random) -> tuple[Case, int]:
 
 @dataclass
 class Outcome:
-    """What came of it."""
+    """Result of a run."""
 
     case: Case
     at: int
@@ -185,7 +185,7 @@ class Outcome:
     words: FaultyWords
 
     def heal(self) -> None:
-        """Let what was wrong between host and board be mended: plugged in, powered, quiet lines."""
+        """Repair the faults between host and board: plugged in, powered, undisturbed lines."""
         self.words.flip, self.words.stuck, self.words.dead = (lambda word: word), None, None
         self.board.plugged, self.board.cores.destroyed = True, False
         self.board.inject()
@@ -194,7 +194,7 @@ class Outcome:
 
 
 def run(case: Case, at: int) -> Outcome:
-    """Configure, arm, run a row of pulses, and look whether all frames ended. Only DeviceError is caught."""
+    """Configure, arm, and run a row of pulses; check that all frames ended. Only DeviceError is caught."""
     clock = VirtualClock()
     board = Simulated(lambda: clock.time, flash=case.flash, functional_jumpers=case.jumpers)
     board.power(case.supply)

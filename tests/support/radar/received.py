@@ -1,4 +1,4 @@
-"""Bytes that real devices sent, as their users published them (TI E2E forum), and what they mean."""
+"""Bytes of real devices, published by their users (TI E2E forum), with their meaning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plays a written conversation (the form is told in test_dialogues.py) with a stage."""
+"""Plays a written conversation (syntax: test_dialogues.py) with a stage."""
 
 from __future__ import annotations
 

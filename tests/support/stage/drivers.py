@@ -1,4 +1,4 @@
-"""Stages with one face: the sketch on this machine, its Python stand-in, machine code on an emulated UNO, a port."""
+"""One interface for every stage: sketch on this machine, Python stand-in, machine code on an emulated UNO, a port."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def motions(wires: list[WireMessage]) -> list[WireMotion]:
 
 
 class Driver:
-    """Sends lines, lets time go on, and collects what comes back."""
+    """Sends lines, advances the time, and collects the replies."""
 
     def __init__(self) -> None:
         self.wires: list[WireMessage] = []
@@ -60,14 +60,14 @@ class Driver:
         return
 
     def until(self, there: Callable[[], bool]) -> None:
-        """Go on when this holds of what was received. In virtual time it holds by now or never."""
+        """Wait until this holds for the received bytes. In virtual time it holds now or never."""
         assert there(), f"received {self.received!r}"
 
     def linger(self) -> None:
-        """Let come what may have been under way. In virtual time it is there."""
+        """Wait for bytes still under way. In virtual time there are none."""
 
     def still(self) -> bool:
-        """Whether nothing has moved and no trigger was given since the last call."""
+        """True if nothing has moved and no trigger was sent since the last call."""
         quiet = not self.wires
         self.wires.clear()
         return quiet
@@ -102,12 +102,12 @@ class Driver:
         kept, self.received = self.received, b""
         self.rx(bytes([Immediate.STATUS]))
         self.until(lambda: b"status " in self.received)
-        told = next(line for line in self.received.splitlines(keepends=True) if line.startswith(b"status "))
-        self.received = kept + self.received.replace(told, b"", 1)
-        return Reply.decode(told)
+        status = next(line for line in self.received.splitlines(keepends=True) if line.startswith(b"status "))
+        self.received = kept + self.received.replace(status, b"", 1)
+        return Reply.decode(status)
 
     def resync(self) -> None:
-        """Get an answer to a new greeting, after whatever was sent before; all that came until then is dropped."""
+        """Greet again and drop everything received before the answer."""
         self.sequence = (self.sequence + 1) % 65536
         answer = b"ok N%d " % self.sequence
         self.rx(b"\n" + Command(self.sequence, "HELLO").encode())

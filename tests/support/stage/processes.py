@@ -1,4 +1,4 @@
-"""Simulated stages as processes, with a listener at their wires."""
+"""Simulated stages as processes, with a listener at their wires or a hub."""
 
 from __future__ import annotations
 
@@ -20,25 +20,38 @@ COMMANDS = {"pc": ("stage",), "python": ("stage", "--python"), "uno": ("uno",)}
 
 
 class StageProcess:
-    """`python -m polysight.simulators.stage` or `.uno`: its port is `link`; `messages` has what came over its wires."""
+    """`python -m polysight.simulators.stage` or `.uno` at the port `link`.
 
-    def __init__(self, folder: Path, kind: str, time_scale: float = 1.0) -> None:
+    Without a `hub` the wires end here: `messages` has what came over them.
+    """
+
+    def __init__(
+        self, folder: Path, kind: str, time_scale: float = 1.0, hub: Path | None = None, config: Path = RIG_FILE
+    ) -> None:
         self.link = folder / "ttySTAGE"
         self.messages: list[WireMessage] = []
         module, *options = COMMANDS[kind]
+        command = [
+            sys.executable,
+            "-m",
+            f"polysight.simulators.{module}",
+            "--config",
+            config,
+            "--boot-ms",
+            50,
+            *options,
+        ]
+        command += ["--wires", hub or folder / "wires", "--link", self.link, "--time-scale", time_scale]
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
             listener.bind(str(folder / "wires"))
             listener.listen()
             listener.settimeout(LIMIT_S)
-            command = [sys.executable, "-m", f"polysight.simulators.{module}", "--config", str(RIG_FILE), "--boot-ms"]
-            command += ["50", "--wires", str(folder / "wires"), "--link", str(self.link), *options]
-            self.process = subprocess.Popen(
-                [*command, "--time-scale", str(time_scale)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                cwd=REPO,
-            )  # fmt: skip
-            self.wires, _ = listener.accept()
-        self._listener = threading.Thread(target=self._listen, daemon=True)
-        self._listener.start()
+            pipe = subprocess.PIPE
+            self.process = subprocess.Popen(list(map(str, command)), stdout=pipe, stderr=pipe, text=True, cwd=REPO)
+            self._listener = threading.Thread(target=self._listen, daemon=True)
+            if hub is None:
+                self.wires, _ = listener.accept()
+                self._listener.start()
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == f"ready {self.link}\n"
 
@@ -66,7 +79,8 @@ class StageProcess:
     def close(self) -> None:
         self.process.kill()
         self.process.communicate()
-        self._listener.join(LIMIT_S)
+        if self._listener.ident:
+            self._listener.join(LIMIT_S)
 
 
 PARENT = """

@@ -80,7 +80,7 @@ class SmallPi:
         self._scan_id, self._seen, self._take = scan_id, last_seq, on_event
 
     def _commit(self, kind: type[m.AnyEvent], *events: dict[str, Any]) -> None:
-        """As the executor does: what cannot be journalled puts the Pi into fault."""
+        """As the executor: a failing journal puts the Pi into fault."""
         for event in events:
             self._journal.add(kind, **event)
         try:
@@ -121,7 +121,7 @@ class SmallPi:
             self._commit(m.RowFinished, end)
 
     def events(self) -> list[m.AnyEvent]:
-        """What is in the journal and was not seen yet."""
+        """Return new events of the journal."""
         found = [m.unpack_event(raw) for raw in self._journal.read(self._scan_id, self._seen + 1, 10000)[0]]
         for event in found:
             assert event.seq == self._seen + 1, "the sequence has a gap"
@@ -130,7 +130,7 @@ class SmallPi:
         return found
 
     def drain(self) -> None:
-        """Nothing is under way."""
+        """No events are pending."""
 
     def end_run(self, scan_id: str, exit_status: m.ExitStatus, reason: str) -> None:
         assert scan_id == self._scan_id
@@ -147,7 +147,7 @@ class SmallPi:
         raise AssertionError(f"nothing asks for an abort here: {reason}")
 
     def lose(self) -> None:
-        """The program is gone; its files stay as they are."""
+        """End the program; its files stay."""
         os.close(self.event_socket)
         os.close(self._journal._lock)
 
@@ -178,7 +178,7 @@ class SmallRig:
         return {}
 
     def discard_before(self, not_before_ns: int) -> None:
-        """Nothing is left over here."""
+        """No packets are left over."""
 
     def end_row(self, not_before_ns: int = 0) -> dict[str, RowCapture]:
         del not_before_ns
@@ -203,7 +203,7 @@ class SmallRig:
         )  # fmt: skip
 
     def close(self) -> None:
-        """Forget the row."""
+        """Close the row's files."""
         for segment in self._segments.values():
             segment.close()
 
@@ -214,12 +214,12 @@ class SmallScan:
     def __init__(self, samples: Samples, folder: Path) -> None:
         self._samples = samples
         self.path, self.journals = folder / "scan", folder / "journal"
-        self.told: list[str] = []
+        self.messages: list[str] = []
         self.acknowledged: set[int] = set()
 
     @contextmanager
     def _connected(self) -> Iterator[None]:
-        """In place of the sockets: a Pi that has just been started, or one that goes on."""
+        """Replace the sockets by a Pi that was just started, or one that continues."""
         instrument = self._samples.instrument
         with ExitStack() as stack:
             pi = SmallPi(instrument, self.journals)
@@ -232,20 +232,20 @@ class SmallScan:
             yield
 
     def run(self) -> ScanResult:
-        """Begin the scan, or go on with it when it is begun."""
+        """Start or resume the scan."""
         with self._connected():
             if self.begun:
-                return resume_scan(self.path, progress=self._tell)
-            return run_scan(self._samples.instrument, self.path, progress=self._tell)
+                return resume_scan(self.path, progress=self._on_progress)
+            return run_scan(self._samples.instrument, self.path, progress=self._on_progress)
 
     @property
     def begun(self) -> bool:
-        """Whether the manifest has its first line."""
+        """True if the manifest has its first line."""
         path = self.path / MANIFEST
         return path.exists() and manifest.read(path).length > 0
 
-    def _tell(self, progress: ScanProgress) -> None:
-        self.told.append(progress.message)
+    def _on_progress(self, progress: ScanProgress) -> None:
+        self.messages.append(progress.message)
         if progress.phase == "committed":
             self.acknowledged.add(progress.row)
 

@@ -1,7 +1,7 @@
-"""What a scan's own files say about it: rows, takes, counts of each board, times, and what went wrong.
+"""Rows, takes, counts of each board, times and faults of a scan, collected from its manifest and events.
 
-Gathered fact by fact and event by event, without files or clocks, so that the same files tell the same story to whoever
-begins to look later. What went wrong becomes a `Notice`: a sentence with likely cause and remedy (`CAUSES`).
+No files and no clocks are read here, so that the same facts always give the same history. A fault becomes a `Notice`:
+a sentence with its likely cause and remedy (`CAUSES`).
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ CAUSES: dict[FaultKind, tuple[str, str]] = {
     K.ON_REQUEST: ("Somebody stopped the scan in this row", "Nothing; `polysight resume` takes the row again"),
     K.RADAR_STOPPED: (
         "The radar hit a fault of its own",
-        "It is armed anew; if that fails too, power-cycle the board",
+        "It is armed again; if that fails, power-cycle the board",
     ),
     K.RADAR_WAITS: ("SYNC_IN pulses did not reach the board", "Check its SYNC_IN wire and the fan-out buffer"),
     K.NO_END: ("The Pi or the network was busy", "Nothing, while it is rare; else the Pi's load and network"),
-    K.COUNTS_DIFFER: ("The stage and the Pi do not agree on what was passed", "Check the stage's trigger wire"),
+    K.COUNTS_DIFFER: ("The stage and the Pi counted different numbers of points", "Check the stage's trigger wire"),
     K.NO_DATA: (
         "The radar is not armed, or its card has lost network or power",
         "`polysight card` names the silent hop",
@@ -41,41 +41,41 @@ CAUSES: dict[FaultKind, tuple[str, str]] = {
     K.HELD: ("Somebody held the stage for more than 2 s", "Nothing"),
     K.PULSES_MISSED: (
         "The board missed SYNC_IN pulses",
-        "Check its SYNC_IN wire; after the scan `polysight doctor` sends some to try",
+        "Check its SYNC_IN wire; after the scan run `polysight doctor`",
     ),
     K.SLIPPED: (
         "The board saw edges on SYNC_IN that the Pi did not send",
-        "Check its SYNC_IN wire and ground, and what runs beside it",
+        "Check its SYNC_IN wire and ground, and cables beside it",
     ),
     K.FRAMES_MISSING: (
         "The board missed SYNC_IN pulses, or the end of its data was lost",
-        "Check its SYNC_IN wire; after the scan `polysight doctor` sends some to try",
+        "Check its SYNC_IN wire; after the scan run `polysight doctor`",
     ),
     K.CARD_DROPPED: ("The card could not send as fast as the radar measured", "Check its cable and the switch"),
-    K.LOST_BY_HOST: ("This machine was too busy to take the packets", "Close other programs on the host"),
+    K.LOST_BY_HOST: ("This machine was too busy to receive the packets", "Close other programs on the host"),
     K.LOST_ON_THE_WAY: (
         "Packets were lost between card and host",
         "Nothing, while it is rare; else check cable and switch",
     ),
     K.CONFLICTING: (
         "Packets with the same counters brought different bytes",
-        "Nothing: the row is taken again. If it comes back, reset the card: `polysight card reset BOARD`",
+        "Nothing: the row is retaken. If it comes back, reset the card: `polysight card reset BOARD`",
     ),
     K.UNLOCATED: (
         "Packets were lost at the row's beginning, or the radar saw triggers that were not sent",
         "Nothing, while it is rare; else check cable, switch and SYNC_IN wire",
     ),
 }
-"""Likely cause of a fault and what to do. Those of the Pi are in shared/faults.py."""
+"""Likely cause and remedy by kind of fault. Those of the Pi are in shared/faults.py."""
 RowMark = Literal["committed", "kept", "rejected"]
 _RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
 
 
 @dataclass(frozen=True)
 class Notice:
-    """Something a person should know: in few words, and `detail` for who wants to know more.
+    """A message to the operator: what, why, what to do, and `detail` on demand.
 
-    `row` is -1 when it is of no row, `utc` empty when the time is not known.
+    `row` is -1 if no row is concerned, `utc` is empty if the time is not known.
     """
 
     level: Level
@@ -88,17 +88,17 @@ class Notice:
 
 
 def sentence(text: str) -> str:
-    """A text that begins with a capital letter, as the pages show it; a command does not."""
+    """Return the text with a capital letter first; a command stays as it is."""
     return text if text.startswith("polysight") else text[:1].upper() + text[1:]
 
 
-def of_error(error: PolysightError, level: Level = "warn") -> Notice:
-    """An error that was raised."""
+def notice_of_error(error: PolysightError, level: Level = "warn") -> Notice:
+    """Notice of an error that was raised."""
     return Notice(level, sentence(error.what), sentence(error.why), sentence(error.remedy))
 
 
-def of_fault(event: Fault) -> Notice:
-    """A fault that the Pi told. Those it takes the row again for by itself are warnings."""
+def notice_of_fault(event: Fault) -> Notice:
+    """Notice of a fault of the Pi; a warning if the Pi retakes the row by itself."""
     table = explain(event.number)
     passing = PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in (
         PiFault.HOST_LOST, PiFault.POINTS_MISMATCH, PiFault.ABORTED,
@@ -113,7 +113,7 @@ def of_fault(event: Fault) -> Notice:
 
 
 def _cause(faults: Sequence[Fact]) -> tuple[str, str]:
-    """Likely cause and remedy of a row's faults, from the first one that is known; newer kinds are not."""
+    """Likely cause and remedy of a row's faults: those of the first known kind."""
     for fault in faults:
         if fault["kind"] == K.PI_FAULT and fault.get("number"):
             table = explain(int(fault["number"]))
@@ -123,22 +123,22 @@ def _cause(faults: Sequence[Fact]) -> tuple[str, str]:
     return "", ""
 
 
-def of_rejection(row: int, take: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) -> Notice:
-    """A take that did not count."""
+def notice_of_rejection(row: int, take: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) -> Notice:
+    """Notice of a rejected take."""
     why, do = _cause(faults)
-    do = do or "Nothing: the row is taken again by itself"
-    return Notice("warn", f"Row {row}, take {take}, did not count", why, do, "; ".join(reasons), row, utc)
+    do = do or "Nothing: the row is retaken automatically"
+    return Notice("warn", f"Row {row}, take {take}, was rejected", why, do, "; ".join(reasons), row, utc)
 
 
-def of_kept(row: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) -> Notice:
-    """A row that is kept though something of it is missing."""
+def notice_of_kept_row(row: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) -> Notice:
+    """Notice of a row that is kept with gaps."""
     why, do = _cause(faults)
     return Notice("warn", f"Row {row} is kept with gaps, which are masked", why, do, "; ".join(reasons), row, utc)
 
 
 @dataclass
 class BoardCounts:
-    """What came from one board, over its committed rows; `retaken` counts takes that were rejected because of it."""
+    """Data of one board over the committed rows; `retaken` counts takes that were rejected because of it."""
 
     frames_expected: int = 0
     frames_received: int = 0
@@ -149,13 +149,13 @@ class BoardCounts:
 
 @dataclass
 class TriggerHealth:
-    """The worst SYNC_IN pulses of one row, as the Pi measured them."""
+    """Longest SYNC_IN pulse and largest jitter of one row, measured by the Pi."""
 
     width_max_ns: int = 0
     jitter_max_ns: int = 0
 
     def add(self, event: Capture) -> None:
-        """Take in one burst."""
+        """Add one burst."""
         self.width_max_ns = max(self.width_max_ns, event.width_max_ns)
         self.jitter_max_ns = max(self.jitter_max_ns, event.jitter_ns)
 
@@ -165,8 +165,8 @@ def seconds(utc: str) -> float:
     return datetime.fromisoformat(utc).timestamp()
 
 
-class Story:
-    """A scan as told by its manifest and its events.
+class ScanHistory:
+    """A scan according to its manifest and events.
 
     Attributes
     ----------
@@ -175,13 +175,11 @@ class Story:
     takes
         Committed rows and the take that counts, in the order they were committed.
     marks
-        What became of each row so far.
+        Outcome of each row so far.
     ended
-        How the last run ended; None while it goes on, or when nobody could write it.
+        Last fact of a run that ended; None while it goes on, or if it was killed.
     paused
-        Whether the scan waits because somebody asked for it.
-    run_seq
-        The events from this number on are of the last run.
+        True while the scan is paused on request.
     """
 
     def __init__(self, started: Fact) -> None:
@@ -207,8 +205,8 @@ class Story:
     # --- the manifest ---
 
     def add_fact(self, fact: Fact) -> None:
-        """Take in the next fact; unknown ones are passed over."""
-        tellers = {
+        """Add the next fact; unknown kinds are ignored."""
+        handlers = {
             "row_committed": self._row_committed,
             "row_rejected": self._row_rejected,
             "row_withdrawn": self._row_withdrawn,
@@ -217,8 +215,8 @@ class Story:
             "scan_continued": self._scan_continued,
             "scan_ended": self._scan_ended,
         }
-        if fact["fact"] in tellers:
-            tellers[fact["fact"]](fact)
+        if fact["fact"] in handlers:
+            handlers[fact["fact"]](fact)
 
     def _row_committed(self, fact: Fact) -> None:
         row, kept = int(fact["row"]), fact.get("kept_incomplete")
@@ -228,7 +226,7 @@ class Story:
         self._rows[row] = fact["boards"]
         self.rows_since_trouble = 0 if kept else self.rows_since_trouble + 1
         if kept:
-            self.notices.append(of_kept(row, kept, fact.get("faults", []), fact.get("committed_utc", "")))
+            self.notices.append(notice_of_kept_row(row, kept, fact.get("faults", []), fact.get("committed_utc", "")))
         if not fact.get("committed_utc"):
             return  # made in one step, by `polysight simulate`
         at = seconds(fact["committed_utc"])
@@ -241,9 +239,9 @@ class Story:
         self.marks[row] = "rejected"
         self.rows_since_trouble = 0
         for name in self._rejected:
-            told = any(f.get("board") == name for f in faults)
-            self._rejected[name] += told if faults else any(r.startswith(f"{name}:") for r in reasons)  # older scans
-        self.notices.append(of_rejection(row, int(fact["take"]), reasons, faults, fact.get("rejected_utc", "")))
+            named = any(f.get("board") == name for f in faults)
+            self._rejected[name] += named if faults else any(r.startswith(f"{name}:") for r in reasons)  # older scans
+        self.notices.append(notice_of_rejection(row, int(fact["take"]), reasons, faults, fact.get("rejected_utc", "")))
 
     def _row_withdrawn(self, fact: Fact) -> None:
         row = int(fact["row"])
@@ -254,9 +252,9 @@ class Story:
         self.notices.append(
             Notice(
                 "warn",
-                f"Row {row} on the disk is not what was committed",
-                "The disk, or somebody, changed it",
-                "Nothing: it is taken again",
+                f"Row {row} on the disk differs from what was committed",
+                "The disk is faulty, or the file was changed",
+                "Nothing: the row is retaken",
                 why,
                 row,
                 fact.get("withdrawn_utc", ""),
@@ -266,7 +264,7 @@ class Story:
     def _scan_resumed(self, fact: Fact) -> None:
         self.ended, self.paused = None, False
         self.run_started_s = seconds(fact["resumed_utc"])
-        if fact.get("rig"):  # the Pi is somewhere else from now on
+        if fact.get("rig"):  # the Pi has another address from now on
             self.instrument = with_connection(self.instrument, fact["rig"])
 
     def _scan_paused(self, fact: Fact) -> None:
@@ -275,7 +273,7 @@ class Story:
     def _scan_continued(self, fact: Fact) -> None:
         self.paused = False
         if self.last_commit_s:
-            self.last_commit_s += seconds(fact["continued_utc"]) - self._paused_at  # a pause is no time of a row
+            self.last_commit_s += seconds(fact["continued_utc"]) - self._paused_at  # a pause does not count
 
     def _scan_ended(self, fact: Fact) -> None:
         self.ended, self.paused = fact, False
@@ -283,38 +281,38 @@ class Story:
     # --- the Pi's events ---
 
     def add_events(self, events: Iterable[AnyEvent]) -> None:
-        """Take in journalled events; those that were taken in already change nothing."""
+        """Add events of the event log; repeated ones change nothing."""
         for event in events:
             if isinstance(event, Capture):
                 self.trigger.setdefault(event.row_index, TriggerHealth()).add(event)
             elif isinstance(event, FaultEvent) and event.seq not in self._fault_seqs:
                 self._fault_seqs.add(event.seq)
-                self.notices.append(of_fault(event))
+                self.notices.append(notice_of_fault(event))
 
-    # --- what follows from them ---
+    # --- derived ---
 
     @property
     def boards(self) -> dict[str, BoardCounts]:
         """Counts over the committed rows, by board."""
         found = {name: BoardCounts(retaken=n) for name, n in self._rejected.items()}
         for boards in self._rows.values():
-            for name, told in boards.items():
+            for name, facts in boards.items():
                 board = found.setdefault(name, BoardCounts())
-                board.frames_expected += int(told["frames_expected"])
-                board.frames_received += int(told["frames_received"])
-                board.missing_bytes += int(told["missing_bytes"])
+                board.frames_expected += int(facts["frames_expected"])
+                board.frames_received += int(facts["frames_received"])
+                board.missing_bytes += int(facts["missing_bytes"])
                 for kind in _RECEPTION:
-                    if kind in told:
-                        board.counts[kind] = board.counts.get(kind, 0) + int(told[kind])
+                    if kind in facts:
+                        board.counts[kind] = board.counts.get(kind, 0) + int(facts[kind])
         return found
 
     @property
     def row_seconds(self) -> tuple[float, str] | None:
-        """How long a row takes, and from what that is known; None when it is not."""
+        """Duration of a row and its origin (`measured`, `first row`, `plan`); None if it is not known."""
         if self._row_seconds:
             return typical_row_s(self._row_seconds), "measured"
         if self.last_commit_s > self.run_started_s:
             return self.last_commit_s - self.run_started_s, "first row"
         if self.simulated:
-            return None  # nobody knows how fast the simulated time goes
+            return None  # the speed of simulated time is not known
         return scan_time(self.instrument).total_s / self.instrument.grid.rows, "plan"

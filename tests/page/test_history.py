@@ -1,0 +1,138 @@
+"""What a scan's files say about it."""
+
+from __future__ import annotations
+
+import pytest
+
+from polysight.host.page.history import ScanHistory, seconds
+from polysight.host.page.snapshot import remaining
+from polysight.host.store import manifest
+from polysight.host.store.events import read_events
+from polysight.host.store.scan_folder import EVENTS, MANIFEST, ScanFolder
+from polysight.shared.messages import Capture, Fault
+
+UTC = "2026-05-01T02:{:02d}:{:02d}.000+00:00"
+
+
+def facts_of(folder):
+    return manifest.read(folder / MANIFEST).facts
+
+
+def told(facts):
+    history = ScanHistory(facts[0])
+    for fact in facts[1:]:
+        history.add_fact(fact)
+    return history
+
+
+@pytest.fixture
+def begun(finished):
+    """A history whose scan began at 02:00 and has committed rows 0 and 1 at 02:01 and 02:02."""
+    facts = facts_of(finished)
+    rows = [f for f in facts if f["fact"] == "row_committed"]
+    history = ScanHistory(facts[0] | {"started_utc": UTC.format(0, 0), "simulated": False})
+    for minute, row in enumerate(rows[:2], 1):
+        history.add_fact(row | {"committed_utc": UTC.format(minute, 0)})
+    return history, rows[2]
+
+
+def test_counts_are_those_of_the_scan_folder(finished):
+    history, scan = told(facts_of(finished)), ScanFolder.load(finished)
+    rows = scan.committed()
+    assert history.takes == {row: r.take for row, r in rows.items()}
+    assert history.ended is not None
+    for name, board in history.boards.items():
+        each = [r.boards[name] for r in rows.values()]
+        assert board.frames_expected == sum(b.frames_expected for b in each)
+        assert board.frames_received == sum(b.frames_received for b in each)
+        assert board.missing_bytes == sum(b.missing_bytes for b in each)
+
+
+def test_trigger_health_is_the_worst_of_each_row(finished):
+    history, events = told(facts_of(finished)), read_events(finished / EVENTS).events
+    history.add_events(events)
+    captures = [e for e in events if isinstance(e, Capture)]
+    for row, health in history.trigger.items():
+        assert health.width_max_ns == max(c.width_max_ns for c in captures if c.row_index == row)
+    assert set(history.trigger) == {c.row_index for c in captures}
+
+
+def test_a_fault_told_twice_is_one(finished):
+    history = told(facts_of(finished))
+    fault = Fault(scan_id="s", seq=9, t_mono_ns=1, number=103, what="a trigger edge was lost")
+    history.add_events([fault])
+    history.add_events([fault])
+    assert [n.level for n in history.notices] == ["warn"]
+    assert "103" in history.notices[0].what
+    assert history.notices[0].do
+
+
+def test_time_left_is_what_rows_took(begun):
+    history, last = begun
+    now = seconds(UTC.format(2, 20))
+    assert remaining(history, now) == (40, "measured")
+    history.add_fact(last | {"committed_utc": UTC.format(3, 0)})
+    assert remaining(history, seconds(UTC.format(9, 0))) == (0, "measured")
+
+
+def test_a_pause_is_no_time_of_a_row(begun):
+    history, last = begun
+    history.add_fact({"fact": "scan_paused", "paused_utc": UTC.format(2, 0)})
+    assert history.paused
+    assert remaining(history, seconds(UTC.format(30, 0))) == (60, "measured")
+    history.add_fact({"fact": "scan_continued", "continued_utc": UTC.format(40, 0)})
+    assert not history.paused
+    history.add_fact(last | {"committed_utc": UTC.format(41, 0)})
+    assert history.row_seconds == (60.0, "measured")
+
+
+def test_time_left_before_the_first_row_is_the_plan_s(finished):
+    started = facts_of(finished)[0]
+    real, simulated = ScanHistory(started | {"simulated": False}), ScanHistory(started | {"simulated": True})
+    row_s = real.row_seconds
+    assert row_s is not None
+    assert row_s[1] == "plan"
+    assert row_s[0] > 2 * real.plan.step_x_mm / real.instrument.stage.speed_mm_s
+    assert simulated.row_seconds is None
+
+
+def test_rejected_then_committed_leaves_a_warning(begun):
+    history, last = begun
+    history.add_fact(
+        {"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {},
+         "faults": [{"kind": "no_data", "board": "RV"}], "rejected_utc": UTC.format(2, 30)}
+    )  # fmt: skip
+    assert history.marks[2] == "rejected"
+    assert history.boards["RV"].retaken == 1
+    assert history.boards["RH"].retaken == 0
+    assert "polysight card" in history.notices[-1].do
+    history.add_fact(last)
+    assert history.marks[2] == "committed"
+    assert len(history.notices) == 1
+
+
+def test_rejections_of_earlier_releases_are_told_without_a_cause(begun):
+    history, _ = begun
+    history.add_fact({"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {}})
+    assert (history.marks[2], history.notices[-1].detail) == ("rejected", "RV: no data")
+    assert (history.notices[-1].why, history.boards["RV"].retaken) == ("", 1)
+
+
+def test_withdrawn_is_missing_until_taken_again(begun):
+    history, _ = begun
+    history.add_fact({"fact": "row_withdrawn", "row": 1, "take": 1, "reasons": ["short"]})
+    assert (set(history.takes), 1 in history.marks) == ({0}, False)
+
+
+def test_resumed_is_not_ended(finished):
+    history = told(facts_of(finished))
+    history.add_fact({"fact": "scan_resumed", "resumed_utc": UTC.format(5, 0), "rows_missing": 0})
+    assert history.ended is None
+
+
+def test_facts_of_newer_releases_are_passed_over(begun):
+    history, _ = begun
+    before = dict(vars(history))
+    for name in ("takes", "boards", "rows", "ended", "something_new"):
+        history.add_fact({"fact": name})
+    assert vars(history) == before

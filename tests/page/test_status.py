@@ -1,0 +1,133 @@
+"""The headline: the worst thing first, always with what to do about it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from polysight.host.acquisition.control import ScanCommand
+from polysight.host.page.history import ScanHistory, notice_of_fault
+from polysight.host.page.images import Shown
+from polysight.host.page.listener import PiState
+from polysight.host.page.status import LifeSigns, judge, no_scan
+from polysight.host.store import manifest
+from polysight.host.store.scan_folder import MANIFEST
+from polysight.shared.faults import EXPLANATIONS, PiFault
+from polysight.shared.messages import Fault
+
+FOLDER = Path("scans/one")
+LIVELY = LifeSigns(alive=True, alive_s=0, pi_silent_s=0.3, pi_limit_s=6.0, now_s=1.8e9)
+RUNNING = PiState(heard_s=1.0, state="running", row=1, take=1)
+REJECTED = {"fact": "row_rejected", "row": 1, "take": 1, "reasons": ["RV: no data"], "boards": {}}
+REJECTED["faults"] = [{"kind": "no_data", "board": "RV"}]
+
+
+@pytest.fixture
+def history(finished):
+    """One of three rows is committed."""
+    facts = manifest.read(finished / MANIFEST).facts
+    history = ScanHistory(facts[0])
+    history.add_fact(next(f for f in facts if f["fact"] == "row_committed"))
+    return history
+
+
+def status(history, signs=LIVELY, heard=RUNNING, shown=Shown(), asked=None):  # noqa: B008
+    return judge(history, FOLDER, signs, heard, shown, asked)
+
+
+def test_all_is_well_needs_nothing_done(history):
+    s = status(history)
+    assert (s.level, s.do) == ("good", "")
+    assert "Row 1" in s.detail
+
+
+def test_a_dead_program_outranks_everything_but_the_end(history):
+    gone = replace(LIVELY, alive=False, alive_s=1.7e9, pi_silent_s=99.0)
+    s = status(history, gone, replace(RUNNING, state="fault"), asked=ScanCommand.ABORT)
+    assert (s.level, s.headline) == ("bad", "The scan program has ended")
+    assert f"polysight resume {FOLDER}" in s.do
+    assert "1 of 3 rows are safe" in s.detail
+    history.add_fact({"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request"})
+    assert status(history, gone).headline == "Stopped on request"
+
+
+@pytest.mark.parametrize(
+    ("signs", "heard", "word"),
+    [
+        (replace(LIVELY, pi_silent_s=7.0), RUNNING, "Pi is silent"),
+        (LIVELY, replace(RUNNING, state="fault"), "stopped with a fault"),
+        (LIVELY, replace(RUNNING, state="held"), "held"),
+        (replace(LIVELY, now_s=4e9), replace(RUNNING, row=-1), "No row has ended"),
+    ],
+)
+def test_trouble_says_why_and_what_to_do(history, signs, heard, word):
+    history.add_fact(
+        {"fact": "row_committed", "row": 0, "take": 2, "boards": {}, "committed_utc": "2026-01-01T00:00:00Z"}
+    )
+    history._row_seconds = [20.0]
+    s = status(history, signs, heard)
+    assert word in s.headline
+    assert s.level in ("warn", "bad")
+    assert s.why
+    assert s.do
+
+
+@pytest.mark.parametrize("number", sorted(EXPLANATIONS))
+def test_every_fault_of_the_pi_has_words(history, number):
+    notice = notice_of_fault(Fault(scan_id="s", seq=1, t_mono_ns=1, number=number, what=EXPLANATIONS[number].what))
+    assert notice.what
+    assert notice.why
+    assert notice.do
+    lasting = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM, PiFault.TRIGGER_LINE_LOST, PiFault.JOURNAL_FULL)
+    assert notice.level == "bad" or number not in lasting
+    s = status(history, heard=replace(RUNNING, state="fault", faults=(notice,)))
+    assert (s.level, s.why, s.do) == ("bad", notice.why, notice.do)
+
+
+def test_a_row_taken_again_is_a_warning_for_a_while(history):
+    history.add_fact(REJECTED)
+    s = status(history, heard=replace(RUNNING, take=2))
+    assert s.level == "warn"
+    assert "Row 1 is retaken" in s.headline
+    assert "polysight card" in s.do
+    row = {"fact": "row_committed", "take": 2, "boards": {}}
+    for n in (1, 2):
+        history.add_fact(row | {"row": n})
+        assert status(history).level == "warn"
+    history.add_fact(row | {"row": 0})
+    assert status(history).level == "good"
+
+
+@pytest.mark.parametrize(("direct_rad", "masked", "level"), [(0.004, 0, "good"), (0.3, 0, "warn"), (0.004, 2, "warn")])
+def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, level):
+    shown = Shown(sync={"RH": {0: (0.02, direct_rad, masked)}})
+    s = status(history, shown=shown)
+    assert s.level == level
+    assert bool(s.do) == (level == "warn")
+
+
+def test_wishes_are_said_until_they_come_to_pass(history):
+    assert status(history, asked=ScanCommand.PAUSE).headline == "Pausing after this row"
+    history.add_fact({"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"})
+    assert status(history, asked=ScanCommand.PAUSE).headline == "Paused"
+    assert status(history, asked=ScanCommand.STOP).headline == "Stopping after this row"
+    assert status(history, asked=ScanCommand.ABORT).headline == "Stopping now"
+
+
+def test_ends_say_how(history):
+    ended = {"fact": "scan_ended", "exit_status": "fail", "reason": "the Pi did not answer"}
+    history.add_fact(ended | {"why": "it is off", "remedy": "switch it on"})
+    s = status(history)
+    assert (s.level, s.detail, s.why, s.do) == ("bad", "The Pi did not answer", "It is off", "Switch it on")
+    history.add_fact(ended)
+    assert f"polysight resume {FOLDER}" in status(history).do
+    for row in (1, 2):
+        history.add_fact({"fact": "row_committed", "row": row, "take": 1, "boards": {}})
+    history.add_fact(ended | {"exit_status": "success", "reason": "every row is committed"})
+    assert (status(history).level, status(history).do) == ("done", "")
+
+
+def test_no_scan_says_how_to_begin_one():
+    assert f"polysight scan --out {FOLDER}" in no_scan(FOLDER).do

@@ -1,9 +1,8 @@
-"""Writers of the published data set's forms: `unsynced/<scan>` folders, `raw/` cubes, `labels/` and `materials/`.
+"""Write the layouts of the published data set: `unsynced/<scan>` folders, `raw/` cubes, `labels/` and `materials/`.
 
-The byte formats are the published data set's description; written here independently of the host that reads them.
-Cubes hold the simulated rig's echoes as perfect synchronisation leaves them. The images of `labels/` and the pixels of
-`materials/` are drawn, not imaged: Fresnel's reflection of each box, with speckle and phase errors; what they are for
-is to have files of the exact form with a known truth.
+The byte formats follow the description of the data set, implemented independently of the host. Cubes are simulated
+echoes after ideal synchronisation. The images of `labels/` and the pixels of `materials/` are not imaged but drawn:
+Fresnel reflection of each box with speckle and phase errors. They are test files of the exact format with known truth.
 """
 
 from __future__ import annotations
@@ -30,25 +29,25 @@ from polysight.simulators.scene.scene_file import Scene, apply_scene
 
 Complex = NDArray[np.complexfloating]
 Skipped = Mapping[tuple[str, int], Collection[int]]
-PIXELS = 150  # of an image's side
+PIXELS = 150  # per side of an image
 METAL = "copper"
 LATE_S = 2.0
-"""After its data has ended a card sends what is left, less than a packet (seen on a DCA1000)."""
+"""Delay after which a card sends the last, incomplete packet (observed on a DCA1000)."""
 
 
 class AuthorsLayout:
-    """The published data set's raw folder: `unsynced/<scan>/<board>/<x>_<y>.bin`, packet logs and three JSON files.
+    """Writer of the published raw layout: `unsynced/<scan>/<board>/<x>_<y>.bin`, packet logs and three JSON files.
 
     Parameters
     ----------
     path, rig, scan_id, started_s
-        Where, with which rig, under which name, and the unix time of the first packet.
+        Folder, rig, name of the scan, and Unix time of the first packet.
     zero_filling
-        Lost packets are zeros in the file; otherwise they are absent from it.
+        Write zeros for lost packets; otherwise leave them out.
     by_columns
-        The rows that are written are columns: the stage runs along y.
+        The stage runs along y: rows are columns of the grid.
     skipped
-        Points of a row, by board name and row, at which the radar did not start: nothing of them is in the file.
+        Points of a row, by board name and row, at which the radar did not start; the file has no data of them.
     """
 
     def __init__(
@@ -66,12 +65,12 @@ class AuthorsLayout:
         self._now_s, self._zero_filling = started_s, zero_filling
 
     def start(self) -> None:
-        """Make the folder and write the three JSON files. Raises DataError when it is not empty."""
+        """Create the folder and write the three JSON files. Raises DataError if it is not empty."""
         new_folder(self.folder)
         write_settings(self.folder, self._rig, self._zero_filling, self._by_columns)
 
     def write_row(self, row: Row, payloads: dict[str, NDArray[np.int16]], gaps: dict[str, Gaps]) -> None:
-        """One file for each board, named by the grid index where the row starts, and its packet log."""
+        """Write one file per board, named by the grid index of the row's start, and its packet log."""
         step_s = abs(row.step_mm) / self._rig.stage.speed_mm_s
         start = row.column(0)
         stem = f"{row.index}_{start}" if self._by_columns else f"{start}_{row.index}"
@@ -94,12 +93,12 @@ class AuthorsLayout:
         self._now_s += row.points * step_s + LATE_S + 2.0
 
     def end(self) -> None:
-        """Nothing more is written."""
+        """Write nothing more."""
 
     def _log(self, size: int, lost: Gaps, points: list[int], step_s: float) -> str:
-        """One line for each packet that arrived: sequence number, payload bytes, unix time.
+        """Return a line for each packet received: sequence number, payload bytes, Unix time.
 
-        The last one, which is not full, comes late: the card sends it by a timer. The authors' decoder lives on that.
+        The last, incomplete packet is late, for the card sends it after a timeout; the authors' decoder needs that.
         """
         full, frame = packet_payload_bytes(self._rig), self._rig.frame_bytes
         pulses, period_s = self._rig.burst.pulses, self._rig.burst.period_us * 1e-6
@@ -118,7 +117,7 @@ class AuthorsLayout:
 
 
 def write_settings(folder: Path, rig: Instrument, zero_filling: bool, by_columns: bool) -> None:
-    """The three JSON files of a scan."""
+    """Write the three JSON files of a scan."""
     for name, content in (
         ("data_collection_cfg", _collection(rig, folder.name, zero_filling, by_columns)),
         ("devices_comm_cfg", _devices(rig)),
@@ -183,27 +182,27 @@ def _radars(rig: Instrument) -> dict[str, Any]:
 
 
 def _turn(board: Board, axis: str, which: int) -> float:
-    """A mount's turn about an axis, degrees; 0 when it has none."""
+    """Return a mount's rotation about an axis, degrees; 0 without one."""
     turns = [s.turn_deg for s in board.mount if s.about == axis and s.turn_deg is not None]
     return turns[which] if turns else 0.0
 
 
 def _last_shift(board: Board) -> float:
-    """Last shift of a mount along x, mm: where the board's origin is."""
+    """Return the last shift of a mount along x, mm: the origin of the board."""
     shifts = [s.shift_mm[0] for s in board.mount if s.shift_mm is not None]
     return shifts[-1] if shifts else 0.0
 
 
 @dataclass(frozen=True)
 class Material:
-    """A material of the drawn forms; without permittivity it is metal."""
+    """A material of drawn files; without permittivity it is metal."""
 
     name: str
     permittivity: complex | None
     thickness_mm: float | None = None
 
     def reflection(self, angle_deg: float) -> tuple[complex, complex]:
-        """r_s and r_p."""
+        """Return r_s and r_p."""
         if self.permittivity is None:
             return -1.0 + 0j, -1.0 + 0j
         r_s, r_p = half_space(self.permittivity, np.radians(angle_deg))
@@ -212,7 +211,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Errors:
-    """What is wrong with a drawn pixel: relative amplitude and phase (rad), half of the variance shared by a box.
+    """Errors of a drawn pixel: relative amplitude and phase (rad); half of the variance is common to a box.
 
     `leakage` is the amplitude of p in H and of s in V.
     """
@@ -232,22 +231,22 @@ def write_cube(
     common_reference: bool = False,
     by_columns: bool = False,
 ) -> Path:
-    """Write `out`/raw/<scan> and return it.
+    """Write a cube in `out`/raw/<scan> and return the folder.
 
     Parameters
     ----------
     rig, scene, out
-        Rig file and scene; the scene's overrides are applied, its disturbances are off. Where to write.
+        Rig and scene (its overrides are applied, its disturbances ignored), and the output folder.
     keep_direct
-        The direct path is still in the cube, beside the object's echo.
+        Include the direct path.
     from_transmitter
         Phases are 2 pi f tau; otherwise 2 pi f (tau - tau_direct) with each RX's own direct path.
     common_reference
-        With the direct path of RX1 for all RX instead.
+        Use the direct path of RX1 for all RX.
     conjugate
         Phases have the opposite sign.
     by_columns
-        The settings say so. The bursts' travel is still along x.
+        Write this into the settings; the travel in a burst is still along x.
     """
     name = "".join(c if c.isalnum() else "-" for c in scene.name).strip("-") or "scene"
     folder = out / "raw" / name
@@ -269,7 +268,7 @@ def write_cube(
 def draw_pixels(
     material: Material, angle_deg: float, n: int, errors: Errors, rng: np.random.Generator
 ) -> tuple[Complex, Complex]:
-    """H and V of n pixels of one box, complex64 [n], with unit gain."""
+    """Draw H and V of n pixels of a box, complex64 [n], with unit gain."""
     r_s, r_p = material.reflection(angle_deg)
     out = []
     for signal in (r_s + errors.leakage * r_p, r_p + errors.leakage * r_s):
@@ -284,7 +283,7 @@ def draw_pixels(
 def write_material(
     folder: Path, material: Material, angle_deg: float, scan: str, pixels: int, errors: Errors, seed: int
 ) -> Path:
-    """Write `folder`/<name>_<angle>.pkl with its own metal reference; a second scan's file is numbered."""
+    """Write `folder`/<name>_<angle>.pkl with its own metal reference; further files are numbered."""
     rng = np.random.default_rng(seed)
     gain_h, gain_v = (rng.uniform(0.5, 2.0) * np.exp(2j * np.pi * rng.uniform()) for _ in range(2))
     values = []
@@ -324,18 +323,18 @@ def write_labels(
     seed: int,
     upside_down: bool = False,
 ) -> Path:
-    """Write `folder`/<scan>: sar_h.npy, sar_v.npy and <scan>.json; returns it.
+    """Write `folder`/<scan> with sar_h.npy, sar_v.npy and <scan>.json; return the folder.
 
     Parameters
     ----------
     folder, scan
-        Where, and the scan's name.
+        Output folder, and name of the scan.
     boxes, materials
-        Name to pixel corners [x0, y0, x1, y1], ends left out, and name to material.
+        Name to pixel corners [x0, y0, x1, y1] (half-open), and name to material.
     angle_deg, errors, seed
-        Incidence angle, and what is drawn of errors.
+        Incidence angle, errors, and their seed.
     upside_down
-        The images' rows count from the other end than the boxes' y.
+        The images' rows run opposite to the boxes' y.
     """
     rng = np.random.default_rng(seed)
     path = folder / scan
@@ -362,7 +361,7 @@ def write_labels(
 
 
 def _sar_config() -> dict[str, Any]:
-    """The published files' keys."""
+    """Return the keys of the published files."""
     focus = {"alignment_configs": {}, "sar_focuse_center": [0.0, 0.0, 0.0]}
     return {
         "numX": 350,

@@ -1,4 +1,4 @@
-"""Laws of reflection: limits, energy, and the paper's Eq. 3 as the inverse of Eq. 2."""
+"""Reflection in the simulator: limits, energy, and the paper's Eq. 3 as the inverse of Eq. 2."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ F = 78.5e9
 
 
 @given(permittivities, angles)
-def test_no_interface_reflects_more_than_it_gets(eps: complex, theta: float) -> None:
+def test_an_interface_reflects_at_most_all_power(eps: complex, theta: float) -> None:
     s, p = half_space(eps, theta)
     assert abs(s) <= 1 + 1e-12
     assert abs(p) <= 1 + 1e-12
@@ -56,7 +56,7 @@ def test_a_good_conductor_tends_to_metal_with_p_of_plus_one(theta: float) -> Non
 
 
 @given(permittivities, thicknesses, angles)
-def test_a_passive_plate_reflects_at_most_everything(eps: complex, d: float, theta: float) -> None:
+def test_a_passive_plate_reflects_at_most_all_power(eps: complex, d: float, theta: float) -> None:
     s, p = slab(eps, d, F, theta)
     assert abs(s) <= 1 + 1e-9
     assert abs(p) <= 1 + 1e-9
@@ -69,7 +69,7 @@ def test_a_thick_absorbing_plate_is_a_half_space(real: float, loss: float, theta
 
 
 @given(permittivities, angles)
-def test_a_plate_of_no_thickness_is_not_there(eps: complex, theta: float) -> None:
+def test_a_plate_of_zero_thickness_has_no_echo(eps: complex, theta: float) -> None:
     assert np.allclose(slab(eps, 1e-12, F, theta), 0.0, atol=1e-5)
 
 
@@ -87,7 +87,7 @@ def test_scene_plates_choose_their_model() -> None:
     assert np.allclose(plate_reflection(thin, F, theta), slab(3.78 - 0.7j, 0.5e-3, F, theta))
 
 
-def test_stacks_are_what_they_are_made_of():
+def test_stacks_reduce_to_slabs_and_half_spaces():
     theta = np.radians([0.0, 40.0, 55.0, 70.0])
     water, glass = Layer((9.37, 18.0)), Layer((5.5, 0.05), 3.0)
     np.testing.assert_allclose(layered([water], F, theta), half_space(9.37 - 18j, theta), rtol=1e-12)
@@ -101,8 +101,8 @@ def test_stacks_are_what_they_are_made_of():
     np.testing.assert_allclose(layered([opaque, water], F, theta), half_space(6 - 9j, theta), rtol=1e-9)
 
 
-def test_the_back_of_a_thick_sheet_answers_after_its_front() -> None:
-    """Samples of a path tau have phase +2 pi f tau; so must those of the way through the sheet and back."""
+def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None:
+    """Samples of a path tau have the phase +2 pi f tau, also inside the sheet."""
     rig = load_instrument(Path(__file__).parents[2] / "instrument.toml")
     theta, thick_m, eps = np.radians(55.0), 0.1, 4.0
     sheet = Plate("sheet", (0.0, 0.0), (45.0, 45.0), permittivity=(eps, 0.02), thickness_mm=1e3 * thick_m)

@@ -1,9 +1,9 @@
-"""From the two images to named patches with their permittivity.
+"""Materials: find patches in the two images, estimate their permittivities, and name them.
 
-`analyse` takes an `ImagePair`, the `Optics`, which metal is the reference (`MetalChoice`) and what is known of the
-scene (`KnownScene`); it returns a `MaterialsResult`. A `Classifier` names patches by a `Library` of labelled patches;
-`make_library` and `fit_library` make one. `fit_layer` fits thin layers, `fit_concentration` solutions. What is shared
-between scans is in `patch_files`, boxes with names in `labels`; `published` reads the published data set's files.
+`analyse` takes an `ImagePair`, the `Optics`, the choice of the metal reference (`MetalChoice`) and known facts of the
+scene (`KnownScene`); it returns a `MaterialsResult`. A `Classifier` names patches by a `Library` of labelled patches,
+which `make_library` makes of scans. `fit_layer` fits thin layers, `fit_concentration` solutions. `patch_files` stores
+the features of a scan's patches, `labels` reads and writes boxes with names, `published` reads the published data set.
 """
 
 from polysight.host.materials.analyse import (

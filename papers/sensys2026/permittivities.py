@@ -147,14 +147,14 @@ def table2_item(run: Run) -> Item:
         for j, m in enumerate(group.materials):
             e = estimate_permittivity(seen.h[:, j].ravel(), seen.v[:, j].ravel(), np.radians(group.angle_deg))
             true, row = m.permittivity, {"number": m.number, "name": m.name, "angle_deg": group.angle_deg}
-            told = (f"{true.real:.2f}", "–" if m.number == 23 else f"{-true.imag:.2f}")
+            printed = (f"{true.real:.2f}", "–" if m.number == 23 else f"{-true.imag:.2f}")
             if e.value is None or e.real_std is None:
                 rows.append((str(m.number), m.name, "metal", "metal", "metal-like", "", "", ""))
                 data.append(row | {"recovered": None, "metal_like": True})
                 continue
             apart = abs(e.value - true) / abs(true)
             rows.append((
-                str(m.number), m.name, *told, f"{e.value.real:.2f}", f"{-e.value.imag:.2f}", f"± {e.real_std:.2f}",
+                str(m.number), m.name, *printed, f"{e.value.real:.2f}", f"{-e.value.imag:.2f}", f"± {e.real_std:.2f}",
                 f"{100 * apart:.1f} %",
             ))  # fmt: skip
             data.append(row | {"published": true, "recovered": e.value, "std": e.real_std, "relative_error": apart})
@@ -236,10 +236,10 @@ def _item(true: dict[str, complex], pixels: dict[str, list[Complex]], centres: l
         dress(ax, name, "real part ε′", "loss ε″")
         every = np.concatenate(pixels[name])
         medians = np.array([np.median(v.real) - 1j * np.median(-v.imag) for v in pixels[name]])
-        told = published()["location_variance"][name]
+        printed = published()["location_variance"][name]
         for part, take, key in (("ε′", np.real, "real"), ("ε″", np.imag, "loss")):
             within = float(np.mean([take(v).var() for v in pixels[name]]))
-            row = {"published": told[key], "all": float(take(every).var()), "within": within}
+            row = {"published": printed[key], "all": float(take(every).var()), "within": within}
             row["between"] = float(take(medians).var())
             data[f"{name} {key}"] = row
             rows.append((name, part, *(f"{x:.4f}" for x in row.values())))

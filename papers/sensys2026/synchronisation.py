@@ -35,13 +35,13 @@ GRID = {"columns": 6, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
 OFFSETS_HZ = (200e3, 250e3, 350e3, 450e3, 600e3, 870e3, 1.1e6, 1.3e6, 1.5e6, 1.7e6)
 USUAL_HZ = 870e3
 SKIRT_HZ = (60e3, 200e3)
-"""Where the smear of a bent chirp lies, from its tone."""
-_PADDED = 4096  # points of a spectrum
+"""Range of the smear of a bent chirp, relative to its tone."""
+_PADDED = 4096  # length of spectra
 
 
 @dataclass(frozen=True)
 class SyncScan:
-    """What one scan of metal plates gives.
+    """Results of one scan of metal plates.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class SyncScan:
 
 @cache
 def sync_scan(run: Run) -> SyncScan:
-    """Three metal plates, all disturbances on.
+    """Simulate three metal plates with all disturbances.
 
     "Before" is one chirp of each position as the hardware trigger left it, mixed down by one frequency for the whole
     scan, so that the object lies in the range gate at all; "after" is the pipeline's.
@@ -155,8 +155,8 @@ def fig12(run: Run) -> Item:
 
 def fig15(run: Run) -> Item:
     """Standard deviation of frequency, phase and amplitude after each stage, and the Cramer-Rao bounds."""
-    told = published()
-    limits = {"frequency_hz": told["frequency_std_hz"], "phase_rad": told["phase_std_rad"]}
+    printed = published()
+    limits = {"frequency_hz": printed["frequency_std_hz"], "phase_rad": printed["phase_std_rad"]}
     summary: dict[str, Any] = {name: r.summary() for name, r in sync_scan(run).reports.items()}
     fig = new_figure(11.5, 4.4)
     chirps = " and ".join(f"{c['chirps']} chirps of {b}" for b, c in summary.items())
@@ -208,9 +208,9 @@ def _stage_rows(summary: Mapping[str, Any], limits: Mapping[str, float]) -> tupl
     rows = []
     for board, content in summary.items():
         for name, s in content["stages"].items():
-            told = [f"{limits[q]:g}" if name == "referenced" and q in limits else "" for q in QUANTITIES]
+            printed = [f"{limits[q]:g}" if name == "referenced" and q in limits else "" for q in QUANTITIES]
             own = [f"{s[f'{q}_std']:.4g}" for q in QUANTITIES]
-            cells = [x for pair in zip(own, told, strict=True) for x in pair]
+            cells = [x for pair in zip(own, printed, strict=True) for x in pair]
             rows.append((f"{board}, {name}: {STAGES[name]}", *cells[:-1]))
     return tuple(rows)
 

@@ -1,4 +1,4 @@
-"""Rows placed again from their packets: what changes is committed anew, what does not is not touched."""
+"""Rows placed again from their packets: different results are committed, equal ones not touched."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from polysight.host.materials.published import (
 )
 from polysight.host.polarimetry import ratio_from_permittivity
 from polysight.shared.error_codes import ErrorCode
-from polysight.simulators.scene import Errors, Material, write_labels
+from tests.support.drawn_files import Errors, Material, write_labels
 from tests.support.refusals import refused
 
 MATERIALS = {

@@ -19,7 +19,7 @@ from polysight.papers.sensys2026.dataset_run import authors_recipe, text_of, wit
 from polysight.papers.sensys2026.item import Table
 from polysight.papers.sensys2026.table2 import table2
 from polysight.shared.error_codes import ErrorCode
-from polysight.simulators.scene import Errors, Material, write_labels, write_material
+from tests.support.drawn_files import Errors, Material, write_labels, write_material
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 

@@ -99,7 +99,7 @@ def _draw_permittivity(
 
 
 def _draw_errors(ax: Axes, result: ConcentrationResult, printed: float) -> None:
-    """Draw the distribution of the errors, each concentration left out, and the published median (`printed`, percent)."""
+    """Draw the distribution of the errors, each concentration left out; `printed` is the published median, percent."""
     error = np.sort([abs(r.percent - r.true_percent) for r in result.left_out])
     ax.step(np.concatenate([[0], error]), np.arange(error.size + 1) / error.size, where="post", color=PALETTE[0])
     ax.axvline(printed, color=PALETTE[6], ls="--", lw=1.2, label=f"published median {printed:g} %")

@@ -177,7 +177,7 @@ def without_leakage(p: Complex, axial_ratio: float) -> Complex:
 
 
 def authors_recipe(p: Complex, angle_deg: float) -> complex:
-    """Return the permittivity computed as the authors do: their leakage, their factor, the middle pixels by |P|, mean of Eq. 3."""
+    """Return the permittivity by the authors' recipe: leakage, factor, the middle pixels by |P|, mean of Eq. 3."""
     used = without_leakage(p, AXIAL_RATIO) * METAL_FACTOR
     low, high = np.percentile(np.abs(used), PERCENTILES)
     kept = used[(np.abs(used) >= low) & (np.abs(used) <= high)]

@@ -185,7 +185,7 @@ def fig19(run: Run) -> Item:
 
 
 def _spread_deg(values: npt.NDArray[np.complexfloating]) -> float:
-    """Return the circular standard deviation of the phase, degrees (Mardia and Jupp, Directional Statistics, section 2.3)."""
+    """Return the circular standard deviation of the phase, degrees (Mardia and Jupp, section 2.3)."""
     length = min(float(np.abs(np.mean(values / np.abs(values)))), 1.0)
     return float(np.degrees(np.sqrt(-2 * np.log(length))))
 

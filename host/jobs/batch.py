@@ -189,8 +189,8 @@ def _why(log: Path, status: int) -> str:
     if status < 0:
         return f"killed by signal {-status}; signal 9 is usually the system running out of memory: give --jobs 1"
     lines = [x.strip() for x in log.read_text(encoding="utf-8", errors="replace").splitlines() if x.strip()]
-    told = [x for x in lines if not x.startswith(("why:", "do:"))]
-    return told[-1] if told else f"exit status {status}"
+    messages = [x for x in lines if not x.startswith(("why:", "do:"))]
+    return messages[-1] if messages else f"exit status {status}"
 
 
 def run_here(jobs: Sequence[Job], at_once: int) -> Iterator[Outcome]:

@@ -11,14 +11,7 @@ frames. `simulate` writes a scan, as a scan folder (`layouts`) or in the publish
 from polysight.simulators.scene.cubes import reference_cube, synced_cube
 from polysight.simulators.scene.layouts import OwnLayout
 from polysight.simulators.scene.optics import layered, strips
-from polysight.simulators.scene.published_layout import (
-    AuthorsLayout,
-    Errors,
-    Material,
-    write_cube,
-    write_labels,
-    write_material,
-)
+from polysight.simulators.scene.published_layout import AuthorsLayout, write_cube
 from polysight.simulators.scene.radar import PatternSource, SignalSource, SimulatedRig, pattern_frames
 from polysight.simulators.scene.scene_file import (
     Disturbances,
@@ -37,9 +30,7 @@ from polysight.simulators.scene.specimens import draw_specimens
 __all__ = [
     "AuthorsLayout",
     "Disturbances",
-    "Errors",
     "Layer",
-    "Material",
     "OwnLayout",
     "PatternSource",
     "Plate",
@@ -62,6 +53,4 @@ __all__ = [
     "truth",
     "without_offset",
     "write_cube",
-    "write_labels",
-    "write_material",
 ]

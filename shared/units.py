@@ -4,6 +4,7 @@ from __future__ import annotations
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 NS_PER_S = 1_000_000_000
+NS_PER_MS = 1_000_000
 NS_PER_US = 1_000
 
 

@@ -33,7 +33,7 @@ _COMPLETED_TIMEOUT_S = 0.2  # from a record's stop to its last packet and its st
 
 
 class Ending(Enum):
-    """Why a record counts as ended."""
+    """Reasons why a record counts as ended."""
 
     BYTES = "every expected byte has arrived"
     STATUS = "the card reports the record as completed"

@@ -83,7 +83,7 @@ def place_frames(
     except _UndeterminedError as e:
         return PlacedFrames(np.full(received, -1, dtype=np.int64), [], n, str(e))
     slots = np.where(low == high, low, -1)
-    possible = np.zeros(n + 1, dtype=np.int64)  # how many frames may be of each pulse
+    possible = np.zeros(n + 1, dtype=np.int64)  # number of frames that may be of each pulse
     np.add.at(possible, low, 1)
     np.add.at(possible, high + 1, -1)
     missed = np.flatnonzero(np.cumsum(possible)[:n] == 0).tolist()

@@ -1,9 +1,9 @@
 """A scan as a Bluesky run: `RadarScan`, an ophyd-async flyer, and the plan `radar_scan`.
 
-The rig's own programs do the scan, as `polysight scan` does: rows are transactions, and what is committed stays,
-however the plan ends. Bluesky gets the metadata, an event for each committed row, and progress; rows themselves stay in
-the scan folder, whose path is in the start document. Needs the extra `bluesky`. Bluesky's RunEngine ends a run that is
-paused while rows are taken, for nothing could be replayed: it is stopped after the row, and `polysight resume` goes on.
+The scan runs as with `polysight scan`: rows are transactions, and committed rows stay, however the plan ends. Bluesky
+gets metadata, an event for each committed row, and progress; the data stay in the scan folder, whose path is in the
+start document. Needs the extra `bluesky`. A RunEngine that is paused while rows are taken ends the run, since rows
+cannot be replayed: the scan stops after the row, and `polysight resume` continues it.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from ophyd_async.core import (
 from polysight.host.acquisition import ControlFolder, ScanProgress, ScanResult, StopRequest, run_scan
 from polysight.host.store import MANIFEST, ScanFolder
 from polysight.shared.config import load_instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, ScanError
 
 ROWS = "rows"
@@ -49,7 +50,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
     name
         Of the device; begins the names of its signals and data keys.
     keep_incomplete
-        Keep rows with gaps when retakes did not help, instead of ending.
+        Keep rows with gaps after all retakes, instead of ending.
     """
 
     def __init__(self, config: Path | str, name: str = "radar_scan", keep_incomplete: bool = False) -> None:
@@ -71,7 +72,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
 
     @AsyncStatus.wrap
     async def stage(self) -> None:
-        """Forget the scan before."""
+        """Reset the state of the previous scan."""
         await self._end()
         self._place, self._stop, self._told = None, StopRequest(), 0
         self._begun.clear()
@@ -79,7 +80,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """End a scan that still runs, after the row in hand; returns when it has ended."""
+        """Stop a running scan after the current row, and wait for its end."""
         await self._end()
 
     async def _end(self) -> None:
@@ -90,17 +91,20 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
 
     @AsyncStatus.wrap
     async def prepare(self, value: Path | str) -> None:
-        """The folder that the next scan goes into; it must not hold anything, and the rig file must be good.
+        """Set the folder of the next scan, and check it and the rig file.
 
         Raises
         ------
         ConfigError
-            when it does, or is not.
+            if the folder is not empty, or the rig file is wrong.
         """
         folder = Path(value)
         rig = load_instrument(self._config)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise ConfigError(f"{folder} is not an empty folder", "a scan has a folder of its own", "give another one")
+            raise ConfigError(
+                f"{folder} is not an empty folder", "a scan has a folder of its own", "give another one",
+                code=ErrorCode.FILE_EXISTS,
+            )  # fmt: skip
         self._place = folder
         self._set_folder(str(folder.resolve()))
         self._set_planned(rig.grid.rows)
@@ -110,10 +114,13 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
-        """Begin; done when the first row is being taken. Raises PolysightError when it does not come to that."""
+        """Start; done when the first row is being taken. Raises PolysightError if it is not."""
         if self._place is None or self._scanning is not None:
             raise ScanError(
-                f"{self.name}: not prepared, or a scan runs", "a scan needs a folder of its own", "prepare it first"
+                f"{self.name}: not prepared, or a scan runs",
+                "a scan needs a folder of its own",
+                "prepare it first",
+                code=ErrorCode.BUSY,
             )
         self._scanning = asyncio.create_task(asyncio.to_thread(self._scan, self._place, asyncio.get_running_loop()))
         while not self._begun.is_set() and not self._scanning.done():
@@ -135,7 +142,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
         self._checked(await scanning)
 
     async def stop(self, success: bool = True) -> None:
-        """End the scan after the row in hand; at once where the run has failed."""
+        """Stop the scan after the current row; at once if the run has failed."""
         self._stop.request()
         if not success:
             self._stop.request()

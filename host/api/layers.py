@@ -10,6 +10,7 @@ import numpy as np
 from polysight.host.materials import LAYER_FORMS, Layer, LayerFit, fit_row, incidence_std_rad, parse_layer
 from polysight.host.products import ProcessedScan
 from polysight.shared.config import Chirp
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -56,7 +57,9 @@ def _layer(one: str | Layer) -> Layer:
     try:
         return parse_layer(one)
     except ValueError:
-        raise ConfigError(f"{one!r} is no layer", "it has another form", f"write {LAYER_FORMS}") from None
+        raise ConfigError(
+            f"{one!r} is no layer", "it has another form", f"write {LAYER_FORMS}", code=ErrorCode.VALUE_INVALID
+        ) from None
 
 
 def _ambiguous(fit: LayerFit | None) -> bool:

@@ -15,6 +15,7 @@ from polysight.host.polarimetry import ratio
 from polysight.host.process import Options, materials_content
 from polysight.host.products import ProcessedScan, plain, scan_facts
 from polysight.host.store import ScanFolder, Source, require_raw
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 
@@ -50,6 +51,7 @@ class Processing:
                 f"{self.folder}: no row is recorded whole",
                 "the scan was stopped in its first row, or files are missing",
                 f"`polysight resume {self.folder}` takes the missing rows of a scan folder",
+                code=ErrorCode.NO_DATA,
             )
         for row in rows:
             self.pipeline.add_row(row)

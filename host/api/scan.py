@@ -29,7 +29,8 @@ from polysight.host.products import (
 from polysight.host.store import MANIFEST, ScanFolder, Source, open_source
 from polysight.host.verdict import Verdict
 from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.errors import ConfigError, DataError
+from polysight.shared.error_codes import ErrorCode
+from polysight.shared.errors import ConfigError, DataError, no_such
 
 if TYPE_CHECKING:
     import xarray
@@ -108,7 +109,7 @@ def open_scan(
 def _check_arguments(
     model: str | None, library: str | os.PathLike[str] | None, box: Box | None, bands: int, incidence: str
 ) -> None:
-    """Refuse now what could not be used after all rows are read. Raises ConfigError."""
+    """Check the arguments before any row is read. Raises ConfigError."""
     wrong = ""
     if incidence not in ("one", "pixel"):
         wrong = f"incidence is {incidence!r}: 'one' or 'pixel'"
@@ -121,23 +122,23 @@ def _check_arguments(
     elif library is not None and not Path(library).is_file():
         wrong = f"library {library}: no such file"
     if wrong:
-        raise ConfigError(wrong, "the argument is wrong", "see help(polysight.open_scan)")
+        raise ConfigError(wrong, "the argument is wrong", "see help(polysight.open_scan)", code=ErrorCode.VALUE_INVALID)
 
 
 def _products_only(path: Path, options: Options, anew: bool) -> Scan:
     if anew:
         raise ConfigError(
-            f"{path}: products cannot be processed again",
-            "the recorded rows are not in this folder",
+            f"{path}: products cannot be processed again", "the recorded rows are not in this folder",
             "give the scan folder with these parameters, or leave them out to read the products",
-        )
+            code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
     return Scan(path, None, SavedProducts(path), options)
 
 
 def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:
     """Recorded data of any layout. Raises DataError or ConfigError."""
     if not path.is_dir():
-        raise DataError(f"{path}: no such folder", "the path is wrong", "give the folder of a scan or of products")
+        raise no_such(path)
     if (path / MANIFEST).exists():
         return ScanFolder.load(path)
     if isinstance(rig, Instrument):
@@ -187,7 +188,7 @@ class Scan:
 
     @property
     def verdict(self) -> Verdict | None:
-        """How far the result may be trusted, with reasons; None where it was not judged (products of earlier releases).
+        """Verdict of the result, with reasons; None for products of earlier releases.
 
         Processes recorded rows where there are no products. Raises as :meth:`image`.
         """
@@ -354,20 +355,21 @@ class Scan:
     def _processing(self) -> Processing:
         if self._source is None:
             raise DataError(
-                f"{self.folder}: holds no recorded rows",
-                "it is a folder of products",
-                "open the scan folder instead",
-            )
+                f"{self.folder}: holds no recorded rows", "it is a folder of products", "open the scan folder instead",
+                code=ErrorCode.NO_DATA,
+            )  # fmt: skip
         return Processing(self._source, self.folder, self._options)
 
     @cached_property
     def _saved(self) -> ProcessedScan:
         if self._saved_products is None:
-            raise DataError(f"{self.folder}: holds no products", "it was not processed", "polysight process")
+            raise DataError(
+                f"{self.folder}: holds no products", "it was not processed", "polysight process", code=ErrorCode.NO_DATA
+            )
         return read_processed(self._saved_products)
 
     def _processed(self, metal_referenced: bool) -> ProcessedScan:
-        """The saved products where they are of the kind asked for, else what processing gives. Raises DataError."""
+        """The saved products if they are of this kind, otherwise processed rows. Raises DataError."""
         if self._saved_products is not None and self._saved.metal_referenced == metal_referenced:
             return self._saved
         if self._source is None:
@@ -377,24 +379,22 @@ class Scan:
     def _other_kind(self, metal_referenced: bool) -> DataError:
         if metal_referenced:
             return DataError(
-                f"{self.folder}: these images are not referenced to metal",
-                "only images were made of this scan",
+                f"{self.folder}: these images are not referenced to metal", "only images were made of this scan",
                 "image(metal_referenced=False) reads them; `polysight process` finds metal, patches and materials",
-            )
+                code=ErrorCode.MISMATCH,
+            )  # fmt: skip
         return DataError(
-            f"{self.folder}: these images are referenced to metal",
-            "the images before that are not kept in the products",
-            "open the scan folder, or ask for metal_referenced=True",
-        )
+            f"{self.folder}: these images are referenced to metal", "products do not keep the images before that",
+            "open the scan folder, or ask for metal_referenced=True", code=ErrorCode.MISMATCH,
+        )  # fmt: skip
 
     def _unknown(self, what: str) -> DataError:
         return DataError(
-            f"{self.folder}: the products do not say the {what}",
-            "they were made by an earlier release, or scan.json or quality.json is missing",
-            "open the scan folder instead",
-        )
+            f"{self.folder}: the {what} of the products is unknown", "an earlier release made them, or scan.json or"
+            " quality.json is missing", "open the scan folder instead", code=ErrorCode.KEY_MISSING,
+        )  # fmt: skip
 
     def _columns(self, *names: str) -> xarray.Dataset:
-        """Those of the patches' variables that are there, with the coordinates of their dimension."""
+        """These variables of the patches, where they exist, with the coordinates of their dimension."""
         patches = self.patches()
         return patches[[name for name in names if name in patches]].drop_vars(["x", "y"], errors="ignore")

@@ -2,7 +2,7 @@
 
 An unknown layout is guessed (and called a guess): of all layouts that fit, the one whose spectra have the least
 disorder. A file of whole packets, with headers, is recognised and placed by byte count first. `pcap.py` reads packet
-captures; `polysight.host.jobs.look` prints and plots the report. `kind_of` recognises other kinds of files.
+captures; `polysight.host.jobs.recordings` prints and plots the report. `kind_of` recognises other kinds of files.
 """
 
 from __future__ import annotations

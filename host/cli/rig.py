@@ -201,11 +201,9 @@ def _add_card(add: Add) -> None:
 
 
 def _inspect(args: argparse.Namespace) -> int:
-    from polysight.host.jobs.look import inspect_file
+    from polysight.host.jobs.recordings import inspect_file, inspect_placement
 
     if args.placement:
-        from polysight.host.jobs.placement import inspect_placement
-
         return inspect_placement(args.file, args.json)
     return inspect_file(args.file, args.config, args.plot, args.card, args.json)
 

@@ -32,11 +32,9 @@ def _resume(args: argparse.Namespace) -> int:
 
 
 def _validate(args: argparse.Namespace) -> int:
-    from polysight.host.jobs.look import validate_folder
+    from polysight.host.jobs.recordings import replace_folder, validate_folder
 
     if args.replace:
-        from polysight.host.jobs.placement import replace_folder
-
         return replace_folder(args.folder, args.json)
     return validate_folder(args.folder, args.json)
 

@@ -1,15 +1,9 @@
-"""Measure packet loss of the scan's receivers over loopback while every core is busy.
-
-`python -m polysight.host.doctor.receiver_load CARD HOST PORT PACKETS RATE` sends full packets as a card does, at RATE
-packets/s, and prints the seconds it took.
-"""
+"""Measure packet loss of the scan's receivers over loopback while every core is busy."""
 
 from __future__ import annotations
 
 import os
 import random
-import socket
-import struct
 import subprocess
 import sys
 import tempfile
@@ -27,7 +21,7 @@ from polysight.shared.config import Instrument
 PACKET_TIME_US = 11.0
 _RATE_S = 1.5  # duration of each rate
 _DRAIN_S = 5.0
-_MAX_LAG_S = 0.005  # a card catches up no more than its own buffer
+_SENDER = Path(__file__).with_name("send_packets.py")
 _BUSY_LOOP = "while True: sum(range(100_000))"
 
 
@@ -71,22 +65,24 @@ def measure_receivers(rig: Instrument, rates: list[float], seconds: float = _RAT
         for _ in range(os.cpu_count() or 1):
             busy = stack.enter_context(subprocess.Popen([sys.executable, "-c", _BUSY_LOOP], start_new_session=True))
             stack.callback(busy.kill)
-        return [_measure_rate(rate, seconds, receivers, folder) for rate in rates], receivers[0].scheduling
+        results, sent = [], 0
+        for rate in rates:
+            packets = max(2, round(rate * seconds))
+            results.append(_measure_rate(rate, sent, packets, receivers, folder))
+            sent += packets
+        return results, receivers[0].scheduling
 
 
-def _measure_rate(rate: float, seconds: float, receivers: list[ReceiverProcess], folder: Path) -> LoadResult:
-    packets = max(2, round(rate * seconds))
+def _measure_rate(rate: float, first: int, packets: int, receivers: list[ReceiverProcess], folder: Path) -> LoadResult:
+    """Send `packets` packets to each receiver; like a card, the counters continue from record to record (`first`)."""
     for r in receivers:
         r.begin_row(0, 1, packets * MAX_PAYLOAD_BYTES, 1, folder / f"{r.board.name}.part")
-    module = [sys.executable, "-m", "polysight.host.doctor.receiver_load"]
-    senders = [
-        subprocess.Popen(
-            [*module, r.board.card_address, r.board.host_address, str(r.board.data_port), str(packets), str(rate)],
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        for r in receivers
-    ]
+    senders = []
+    for r in receivers:
+        card, host = (r.board.card_address, CARD_SOURCE_PORT), (r.board.host_address, r.board.data_port)
+        words = map(str, (*card, *host, first, packets, rate, MAX_PAYLOAD_BYTES))
+        command = [sys.executable, "-I", str(_SENDER), *words]
+        senders.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
     took_s = [float(sender.communicate()[0] or "inf") for sender in senders]
     deadline = time.monotonic() + _DRAIN_S
     while not all(r.poll().complete for r in receivers) and time.monotonic() < deadline:
@@ -96,24 +92,3 @@ def _measure_rate(rate: float, seconds: float, receivers: list[ReceiverProcess],
             break
     lost = sum(packets - r.end_row().packets for r in receivers)
     return LoadResult(rate, packets / max(took_s), packets * len(receivers), lost)
-
-
-def send_packets(card: str, host: str, port: int, packets: int, rate: float) -> float:
-    """Send full packets with consecutive counters from `card` to `host`, at `rate` packets/s; return the seconds."""
-    period_s = 1 / rate
-    payload = (bytes(range(256)) * 6)[:MAX_PAYLOAD_BYTES]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind((card, CARD_SOURCE_PORT))
-        began = due = time.perf_counter()
-        for k in range(packets):
-            count = k * MAX_PAYLOAD_BYTES
-            sock.sendto(struct.pack("<IIH", k + 1, count & 0xFFFFFFFF, count >> 32) + payload, (host, port))
-            due = max(due + period_s, time.perf_counter() - _MAX_LAG_S)
-            if (ahead := due - time.perf_counter()) > 0.0005:
-                time.sleep(ahead)
-        return time.perf_counter() - began
-
-
-if __name__ == "__main__":
-    _, card, host, port, packets, rate = sys.argv
-    sys.stdout.write(f"{send_packets(card, host, int(port), int(packets), float(rate))}\n")

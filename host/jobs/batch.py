@@ -25,6 +25,7 @@ import msgspec
 from polysight.host.process import ProcessRequest, cores
 from polysight.host.products import FINISHED, SavedProducts, write_json
 from polysight.host.store import COLLECTION, MANIFEST, ScanFolder, is_source, versions
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, PolysightError
 from polysight.shared.files import read_json
 
@@ -93,6 +94,7 @@ def jobs_of(requests: Sequence[ProcessRequest]) -> list[Job]:
                 f"two scans are named {data.name}: {jobs[data.name].request.data} and {data}",
                 "their products would go into one folder",
                 "process them in two runs, each with its own --out",
+                code=ErrorCode.NAME_TAKEN,
             )
         if (data / MANIFEST).exists():  # it brings its own rig file
             request = msgspec.structs.replace(request, config=None)
@@ -187,8 +189,8 @@ def _why(log: Path, status: int) -> str:
     if status < 0:
         return f"killed by signal {-status}; signal 9 is usually the system running out of memory: give --jobs 1"
     lines = [x.strip() for x in log.read_text(encoding="utf-8", errors="replace").splitlines() if x.strip()]
-    told = [x for x in lines if not x.startswith(("why:", "do:"))]
-    return told[-1] if told else f"exit status {status}"
+    messages = [x for x in lines if not x.startswith(("why:", "do:"))]
+    return messages[-1] if messages else f"exit status {status}"
 
 
 def run_here(jobs: Sequence[Job], at_once: int) -> Iterator[Outcome]:
@@ -219,6 +221,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
             "Dask is not installed here",
             "it is needed for --dask alone, and not installed with the rest",
             "pip install 'polysight[dask]' here and on the workers (in the repository: '.[dask]')",
+            code=ErrorCode.PACKAGE_MISSING,
         ) from None
     try:
         client = Client(address, timeout=timeout)
@@ -227,6 +230,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
             f"no Dask scheduler at {address}: {e}",
             "it is not running, or a firewall is between",
             "start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`",
+            code=ErrorCode.NO_ANSWER,
         ) from None
     with client:
         jobs_by_name = {job.name: job for job in jobs}

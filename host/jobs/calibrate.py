@@ -41,8 +41,10 @@ LEAST_PIXELS = 100  # of a plate that serves as reference
 LEAST_LEAKAGE_STD = 1e-3
 
 
-def _tell(path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool) -> int:
-    """Say what was found and what to set; 0."""
+def _print_result(
+    path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool
+) -> int:
+    """Print the result and the keys to set; return 0."""
     if as_json:
         sys.stdout.write(
             json.dumps({"file": str(path), "simulated": file.simulated, **to_builtins(file)}, indent=1) + "\n"
@@ -102,7 +104,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
         f"the target lay at ({file.target_mm[0]:+.2f}, {file.target_mm[1]:+.2f}) mm, turned by"
         f" {file.target_turn_deg:+.2f} degrees; its points explain {100 * file.explained:.1f} % of the echoes",
     ]
-    return _tell(path, file, lines, _key("direct_path", path), as_json)
+    return _print_result(path, file, lines, _key("direct_path", path), as_json)
 
 
 def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) -> int:
@@ -130,7 +132,7 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
         + f"; IF {b.if_from_khz:.0f}..{b.if_to_khz:.0f} kHz, {b.chirps} chirps, the fit leaves {b.residual_db:.2f} dB"
         for name, b in boards.items()
     ]
-    return _tell(path, file, lines, _key("hpf", path), as_json)
+    return _print_result(path, file, lines, _key("hpf", path), as_json)
 
 
 def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool) -> int:
@@ -154,7 +156,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
         lines.append(f"{len(file.bands)} sub-bands kept: {edges} GHz; for process --bands {len(file.bands)} alone")
     else:
         lines.append("sub-bands are not kept: calibrate with --bands K for process --bands K")
-    return _tell(path, file, lines, _key("metal", path), as_json)
+    return _print_result(path, file, lines, _key("metal", path), as_json)
 
 
 def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
@@ -169,17 +171,17 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
     lines, what_to_set = [], []
     rate_khz = source.instrument.chirp.sample_rate_hz / 1e3
     for name, b in boards.items():
-        told = f"{name}: direct path at {b.direct_if_hz / 1e3:.1f} +- {b.direct_if_standard_error_hz / 1e3:.1f} kHz"
-        told += f" ({b.expected_if_hz / 1e3:.0f} kHz by the rig file)"
-        told += f", an alias of {b.direct_if_hz / 1e3 + b.alias * rate_khz:.0f} kHz" if b.alias else ""
+        line = f"{name}: direct path at {b.direct_if_hz / 1e3:.1f} +- {b.direct_if_standard_error_hz / 1e3:.1f} kHz"
+        line += f" ({b.expected_if_hz / 1e3:.0f} kHz by the rig file)"
+        line += f", an alias of {b.direct_if_hz / 1e3 + b.alias * rate_khz:.0f} kHz" if b.alias else ""
         lines += [
-            told,
+            line,
             f"{name}: start_offset_hz {b.start_offset_was_hz:.0f} -> {b.start_offset_hz:.0f} puts it at"
             f" {b.middle_hz / 1e3:.0f} kHz; where mmWave Studio programs the board:"
             f" {b.start_offset_hz - b.start_offset_was_hz:+.0f} Hz to its start frequency",
         ]
         what_to_set += [f'[[boards]]  name = "{name}"', f"start_offset_hz = {b.start_offset_hz:.0f}"]
-    return _tell(path, file, lines, what_to_set, as_json)
+    return _print_result(path, file, lines, what_to_set, as_json)
 
 
 def leakage_of_scans(

@@ -17,8 +17,8 @@ _ASK_S = 1.5  # limit of one question to a card that is perhaps just starting, a
 _PAUSE_S = 0.2
 
 
-def typed(what: str, word: str, yes: bool) -> str:
-    """Say what would be done, and return what is typed in answer; `word` unasked when `yes` was given."""
+def confirm(what: str, word: str, yes: bool) -> str:
+    """Print what would be done and return the typed answer; with `yes` return `word` without asking."""
     sys.stdout.write(f"{what}\n")
     if yes:
         return word
@@ -60,9 +60,9 @@ def _text(survey: CardSurvey) -> str:
     head = (
         f"{b.name} ({b.role}{unused}): card {b.card_address}:{b.command_port}, data to {b.host_address}:{b.data_port}\n"
     )
-    untold = [hop.hop for hop in survey.hops if hop.verdict == "not checked" and not hop.found]
-    tail = f"  not checked {', '.join(untold)}\n" if untold else ""
-    return head + "".join(_line(hop) for hop in survey.hops if hop.hop not in untold) + tail
+    unchecked = [hop.hop for hop in survey.hops if hop.verdict == "not checked" and not hop.found]
+    tail = f"  not checked {', '.join(unchecked)}\n" if unchecked else ""
+    return head + "".join(_line(hop) for hop in survey.hops if hop.hop not in unchecked) + tail
 
 
 def _line(hop: HopFinding) -> str:
@@ -118,7 +118,7 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
             f"{name}: a card, FPGA {card.version()}, answers at {now.card_address}:{now.command_port}; its EEPROM is"
             f" written anew, and cannot be read back.\n{name}: {settings.text()}"
         )
-        program_eeprom(card, settings, typed(what, settings.confirmation, yes))
+        program_eeprom(card, settings, confirm(what, settings.confirmation, yes))
     sys.stdout.write(f"{name}: written, and the card reports no failure. Now switch the card off and on.\n")
     sys.stdout.flush()
     if wait_s > 0:

@@ -191,8 +191,8 @@ def _contradictions(
     for m, together, *each in zip(matched, named, *alone, strict=True):
         names = [n.verdict.name for n in each]
         if together.verdict.name == UNKNOWN and len(set(names) - {UNKNOWN}) > 1:
-            told = ", ".join(f"{name} at {a:g} degrees" for name, a in zip(names, angles_deg, strict=True))
-            out.append(f"patch {m.label} contradicts itself: {told}; was it moved or exchanged between the scans?")
+            answers = ", ".join(f"{name} at {a:g} degrees" for name, a in zip(names, angles_deg, strict=True))
+            out.append(f"patch {m.label} contradicts itself: {answers}; was it moved or exchanged between the scans?")
     return out
 
 
@@ -201,8 +201,10 @@ def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
     strange = [r for r in rows if r["truth"] and r["truth"] not in names]
     known = [r for r in rows if r["truth"] and not (r in strange and r["name"] == UNKNOWN)]
     if strange:
-        told = sum(r["name"] == UNKNOWN for r in strange)
-        sys.stdout.write(f"{len(strange)} patches of materials that the library lacks, {told} of them told so\n")
+        unknown = sum(r["name"] == UNKNOWN for r in strange)
+        sys.stdout.write(
+            f"{len(strange)} patches of materials that the library lacks, {unknown} of them named unknown\n"
+        )
     if known:
         right, share = sum(r["name"] == r["truth"] for r in known), np.mean([r["pixels_right"] for r in known])
         sys.stdout.write(f"{right} of {len(known)} patches named right, {share:.1%} of their pixels\n")

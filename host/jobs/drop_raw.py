@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from polysight.host.jobs.cards import typed
+from polysight.host.jobs.cards import confirm
 from polysight.host.products import QUALITY, RAW_DROPPED, read_products, write_json
 from polysight.host.store import Digests, ScanFolder, drop, droppable, utc_now
 from polysight.shared.errors import ConfigError, DataError
@@ -45,7 +45,7 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
     for where in sorted({path.parent for boards in what.files.values() for path in boards.values()}):
         names = sorted(path.name for boards in what.files.values() for path in boards.values() if path.parent == where)
         sys.stdout.write(f"to be removed: {where.relative_to(folder)}: {', '.join(names)}\n")
-    said = typed(text, WORD, yes)
+    said = confirm(text, WORD, yes)
     if said != WORD:
         raise ConfigError(f"nothing dropped: answered {said!r}", f"{WORD!r} was asked for", f"type {WORD}, or --yes")
     _keep(products, scan)

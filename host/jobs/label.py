@@ -57,7 +57,7 @@ class FoundPatch:
 
     number: int
     box: Box
-    told: str
+    description: str
 
 
 @dataclass(frozen=True)
@@ -200,10 +200,10 @@ def found_patches(products: SavedProducts) -> list[FoundPatch]:
         x0, y0, x1, y1 = row["box_mm"]
         mx, my = (min(margin_mm, _LARGEST_MARGIN * (b - a)) for a, b in ((x0, x1), (y0, y1)))
         sure = f" {100 * row['confidence']:.0f} %" if row.get("confidence") is not None else ""
-        told = f"named {row['name']}{sure}" if row.get("name") else "not named"
-        told = REFERENCE if row.get("metal_reference") else told
-        told = row["box"] if row.get("box") else "not judged" if row.get("refused") else told
-        out.append(FoundPatch(int(row["label"]), (x0 + mx, y0 + my, x1 - mx, y1 - my), told))
+        text = f"named {row['name']}{sure}" if row.get("name") else "not named"
+        text = REFERENCE if row.get("metal_reference") else text
+        text = row["box"] if row.get("box") else "not judged" if row.get("refused") else text
+        out.append(FoundPatch(int(row["label"]), (x0 + mx, y0 + my, x1 - mx, y1 - my), text))
     return out
 
 
@@ -291,7 +291,7 @@ def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
     sys.stdout.write(f"name each patch; Enter leaves it out, m is the metal reference (called {METAL})\n")
     try:
         for patch in found:
-            question = f"patch {patch.number}, {format_box(patch.box)}, {patch.told}: "
+            question = f"patch {patch.number}, {format_box(patch.box)}, {patch.description}: "
             name, is_metal = _asked_name(question, boxes, ask, metal is None)
             if name:
                 boxes[name] = patch.box
@@ -306,7 +306,7 @@ def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
 
 
 def _asked_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missing: bool) -> tuple[str, bool]:
-    """A name that can be used and is not there yet, or nothing; and whether it was told to be the metal."""
+    """A name that can be used and is not there yet, or nothing; and whether it is the metal."""
     while True:
         answer = ask(question).strip()
         is_metal = answer in ("m", "M") and metal_missing
@@ -340,8 +340,8 @@ def _table(labels: Labels) -> list[str]:
     """The boxes as lines of a table."""
     rows = [("name", "specimen", "box", "")]
     for name, box in labels.boxes.items():
-        told = "metal reference" if name == labels.metal else ""
-        rows.append((material_of(name), labels.specimen(name) or "-", format_box(box), told))
+        text = "metal reference" if name == labels.metal else ""
+        rows.append((material_of(name), labels.specimen(name) or "-", format_box(box), text))
     widths = [max(cell_len(row[i]) for row in rows) for i in range(3)]
     return ["  ".join(c + " " * (w - cell_len(c)) for c, w in zip(r, (*widths, 0), strict=True)).rstrip() for r in rows]
 
@@ -358,8 +358,8 @@ def _listing(
         lines += [f"drawn by hand: {there[0]}", *(f"  {line}" for line in _table(boxes))]
     if found:
         lines += ["patches that were found, a box inside each:"]
-        lines += [f"  {f.number:>3}  {format_box(f.box)}  {f.told}" for f in found]
-        metal = next((f.number for f in found if f.told == REFERENCE), "NUMBER")
+        lines += [f"  {f.number:>3}  {format_box(f.box)}  {f.description}" for f in found]
+        metal = next((f.number for f in found if f.description == REFERENCE), "NUMBER")
         lines.append(f"to name them: polysight label {folder} --from-patches --metal {metal} --rename NUMBER=NAME ...")
     lines.append(f"to draw one:  polysight label {folder} --box NAME=x0,y0,x1,y1 (mm)")
     return "".join(f"{line}\n" for line in lines)

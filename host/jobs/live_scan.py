@@ -77,7 +77,7 @@ class ScanBar:
         self._bars = Progress(*columns, console=self._console, disable=not self._console.is_terminal)
         self._rows = self._bars.add_task("rows", total=None, left="")
         self._points = self._bars.add_task("points", total=None, left="", visible=False)
-        self._told = -1
+        self._printed_tenth = -1
 
     def __enter__(self) -> ScanBar:
         with suppress(OSError):
@@ -100,8 +100,8 @@ class ScanBar:
             self._console.print(f"{p.phase}: {p.message}", highlight=False)
         if not self._console.is_terminal and p.phase == "committed":
             tenth = 10 * p.committed // max(1, p.rows)
-            if tenth != self._told:
-                self._told = tenth
+            if tenth != self._printed_tenth:
+                self._printed_tenth = tenth
                 self._console.print(f"{p.committed} of {p.rows} rows, {_clock(p.remaining_s)}", highlight=False)
 
 
@@ -130,14 +130,14 @@ def _run(folder: Path, options: Options, process: bool, take: Take) -> int:
     stop = StopRequest()
     with ScanBar() as bar, ControlFolder(folder, stop) as desk:
 
-        def told(progress: ScanProgress) -> None:
+        def show(progress: ScanProgress) -> None:
             if progress.phase != "connect":
                 desk.open()  # the scan folder is there, and locked by this program
             bar.update(progress)
 
-        result = take(live.add_row if process else None, told, stop)
+        result = take(live.add_row if process else None, show, stop)
     if result.exit_status == "success":
-        _tell(f"{folder}: every row is committed\n")
+        _print(f"{folder}: every row is committed\n")
     if result.processing_error is not None:
         raise _unprocessed(folder, result, result.processing_error)
     if result.exit_status != "success":
@@ -149,7 +149,7 @@ def _run(folder: Path, options: Options, process: bool, take: Take) -> int:
     return 0
 
 
-def _tell(text: str) -> None:
+def _print(text: str) -> None:
     """Say something on stdout; that nobody reads it is no reason not to make the products."""
     with suppress(OSError):
         sys.stdout.write(text)
@@ -209,14 +209,14 @@ def scan(config: Path, request: ProcessRequest, truth: Path | None, keep_incompl
         if truth is not None:
             read_truth(truth)
 
-    def take(on_row: OnRow | None, tell: OnProgress, stop: StopRequest) -> ScanResult:
-        def told(progress: ScanProgress) -> None:
+    def take(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
+        def show(progress: ScanProgress) -> None:
             if truth is not None and progress.phase == "row" and not (folder / TRUTH).exists():
                 with suppress(OSError):  # said below: a row is worth more
                     shutil.copyfile(truth, folder / TRUTH)
-            tell(progress)
+            on_progress(progress)
 
-        result = run_scan(rig, folder, on_row=on_row, progress=told, keep_incomplete=keep_incomplete, stop=stop)
+        result = run_scan(rig, folder, on_row=on_row, progress=show, keep_incomplete=keep_incomplete, stop=stop)
         if truth is not None and not (folder / TRUTH).exists():
             sys.stderr.write(f"note: {truth} was not copied into {folder}; a report does without\n")
         return result
@@ -239,9 +239,9 @@ def resume(request: ProcessRequest, keep_incomplete: bool, process: bool, config
         _check_options(options, source.instrument, calibration_of_scan(source))
         check_products_folder(folder / PRODUCTS, source.scan_id)
 
-    def take(on_row: OnRow | None, tell: OnProgress, stop: StopRequest) -> ScanResult:
+    def take(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
         return resume_scan(
-            folder, on_row=on_row, progress=tell, keep_incomplete=keep_incomplete, stop=stop, rig_now=rig_now
+            folder, on_row=on_row, progress=on_progress, keep_incomplete=keep_incomplete, stop=stop, rig_now=rig_now
         )
 
     return _run(folder, options, process, take)

@@ -246,8 +246,8 @@ def image(data: Path, out: Path, config: Path | None, view: View = AS_IN_RIG_FIL
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:
         save_images(new, source, pipeline.rig, images, pipeline.quality)
-    told = (*coverage_lines(pipeline.quality.coverage()), f"image: {out / IMAGE}")
-    sys.stdout.write("".join(f"{line}\n" for line in told))
+    lines = (*coverage_lines(pipeline.quality.coverage()), f"image: {out / IMAGE}")
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
     sys.stdout.flush()
     pipeline.quality.note_imaging(pipeline.images, images)
     write_json(out / QUALITY, quality_content(pipeline.quality))

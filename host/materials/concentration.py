@@ -1,8 +1,8 @@
 """Concentration of a solution from its polarisation angle (section 9.4 of the paper).
 
-Phi = arctan |P| (Eq. 8) falls steadily as sugar is dissolved. A straight line through known concentrations is the
-calibration; what it says of an unknown one comes with a prediction interval. How good it is, is judged on
-concentrations that the line has not seen: all patches of one are left out together.
+Phi = arctan |P| (Eq. 8) falls steadily as sugar is dissolved. The calibration is a straight line through known
+concentrations, which gives unknown ones with a prediction interval. It is judged by cross-validation: all patches of
+one concentration are left out together.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy.typing as npt
 import scipy
 
 from polysight.host.materials.library import Library
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 Real = npt.NDArray[np.float64]
@@ -23,7 +24,7 @@ _PERCENT = re.compile(r"(\d+(?:\.\d+)?)\s*%")
 
 
 def polarisation_angle_rad(p: npt.ArrayLike) -> Real:
-    """Polarisation angle arctan |P| of metal-referenced ratios (Eq. 8 of the paper), radians; 45 degrees for metal."""
+    """Return the polarisation angle arctan |P| of metal-referenced ratios (Eq. 8), radians; 45 degrees for metal."""
     return np.arctan(np.abs(np.asarray(p)))
 
 
@@ -40,7 +41,7 @@ class Line:
     residual_std
         Standard deviation about the line, percent.
     patches
-        Number of patches it went through.
+        Number of patches fitted.
     """
 
     slope: float
@@ -52,13 +53,14 @@ class Line:
 
     @classmethod
     def through(cls, angle_rad: npt.ArrayLike, percent: npt.ArrayLike) -> Line:
-        """Fit. Raises DataError with fewer than three patches or two concentrations."""
+        """Fit the line. Raises DataError with fewer than three patches or two concentrations."""
         x, y = np.asarray(angle_rad, np.float64), np.asarray(percent, np.float64)
         if x.size < 3 or np.unique(y).size < 2 or np.ptp(x) == 0:
             raise DataError(
                 f"{x.size} patches of {np.unique(y).size} concentrations",
-                "a line with an interval needs three patches and two concentrations that look different",
+                "a line with an interval needs three patches and two concentrations with different angles",
                 "measure more concentrations",
+                code=ErrorCode.NOT_ENOUGH_DATA,
             )
         slope, intercept = (float(c) for c in np.polyfit(x, y, 1))
         residual = y - (intercept + slope * x)
@@ -67,11 +69,11 @@ class Line:
         return cls(slope, intercept, float(x.mean()), spread, std, int(x.size))
 
     def percent(self, angle_rad: npt.ArrayLike) -> Real:
-        """Concentration, percent by weight, shape of the angles."""
+        """Return the concentrations, percent by weight, in the shape of the angles."""
         return self.intercept + self.slope * np.asarray(angle_rad, np.float64)
 
     def interval(self, angle_rad: npt.ArrayLike, confidence: float = 0.9) -> tuple[Real, Real]:
-        """Prediction interval of a new patch: lower and upper end, percent by weight.
+        """Return the prediction interval of a new patch: lower and upper end, percent by weight.
 
         Student's t over the residuals, wider away from the calibration's middle (Draper and Smith, Applied Regression
         Analysis, section 1.4).
@@ -85,7 +87,7 @@ class Line:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """One patch as seen by a line that knows no patch of its concentration."""
+    """Estimate of one patch by a line fitted without its concentration."""
 
     name: str
     true_percent: float
@@ -96,7 +98,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class ConcentrationResult:
-    """The line through everything, and how well lines without each concentration tell it."""
+    """The line through all patches, and the estimates with each concentration left out."""
 
     line: Line
     left_out: tuple[LeftOut, ...]
@@ -113,9 +115,9 @@ class ConcentrationResult:
 
 
 def concentrations(names: Iterable[str], given: Mapping[str, float] | None = None) -> dict[str, float]:
-    """Percent by weight of each material name: as given, or the number before a percent sign in the name.
+    """Return material name to percent by weight: as given, or the number before a percent sign in the name.
 
-    Names without either are left out.
+    Names without either are omitted.
     """
     out: dict[str, float] = {}
     for name in names:
@@ -130,21 +132,21 @@ def concentrations(names: Iterable[str], given: Mapping[str, float] | None = Non
 def fit_concentration(
     library: Library, given: Mapping[str, float] | None = None, confidence: float = 0.9
 ) -> ConcentrationResult:
-    """Line through a library's patches of known concentration, judged with each concentration left out.
+    """Fit a line through a library's patches of known concentration, and judge it with each one left out.
 
     Parameters
     ----------
     library
-        Patches; their names tell the concentration (``"sugar (3.8%)"``) or `given` does (``{"water": 0.0}``).
+        Patches; the concentration is in their names (``"sugar (3.8%)"``) or in `given` (``{"water": 0.0}``).
     given
-        Concentration in percent by weight of single names.
+        Name to concentration, percent by weight.
     confidence
-        Of the intervals.
+        Confidence of the intervals.
 
     Raises
     ------
     DataError
-        when fewer than three concentrations are known, or patches of several incidence angles are mixed.
+        with fewer than three known concentrations, or patches of several incidence angles.
     """
     known = concentrations(library.names, given)
     entries = [e for e in library.entries if e.name in known]
@@ -152,15 +154,17 @@ def fit_concentration(
     if len(values) < 3:
         raise DataError(
             f"{len(values)} known concentrations in this library",
-            "leaving one out must leave two; a name tells it as in 'sugar (3.8%)'",
-            "give more, or say what a name means: --value water=0",
+            "three are needed to leave one out; names contain them as in 'sugar (3.8%)'",
+            "add scans, or give the concentration of a name: --value water=0",
+            code=ErrorCode.NOT_ENOUGH_DATA,
         )
     angles = [e.incidence_deg for e in entries]
     if max(angles) - min(angles) > 1.0:
         raise DataError(
-            f"patches seen under {min(angles):.1f} to {max(angles):.1f} degrees",
-            "the polarisation angle changes with the incidence",
+            f"patches under incidence angles of {min(angles):.1f} to {max(angles):.1f} degrees",
+            "the polarisation angle changes with the incidence angle",
             "use scans of one geometry",
+            code=ErrorCode.MISMATCH,
         )
     x = np.array([float(np.median(polarisation_angle_rad(e.p))) for e in entries])
     y = np.array([known[e.name] for e in entries])

@@ -1,18 +1,18 @@
-"""Joint inversion of a scene: all patches' permittivities with what the rig leaves uncertain, and the error budget.
+"""Joint inversion of a scene: permittivities of all patches together with the rig's errors, and the error budget.
 
 Relative to metal, a patch of true inverse ratio t = r_p / r_s = 1 / P is measured as
 
     V / H = (1 + rho) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
 
 with a, b the leakage of p into H and of s into V, rho the error of the metal reference, kappa the patch's brightness
-beside an ideal one (roughness, tilt, edges). r_s and r_p follow from t and the incidence angle by Eq. 2 and 3.
-Unknown are a, b, rho, the angle's error, and t of every patch; known are the measured ratios and brightnesses, each
-with its standard deviation, and a prior of everything that was not measured: zero mean, stated width. The solution is
-the maximum of the posterior (least squares, scipy), its covariance the inverse of the information matrix there.
+relative to an ideal one (roughness, tilt, edges). r_s and r_p follow from t and the incidence angle by Eq. 2 and 3.
+Unknown are a, b, rho, the angle's error, and t of every patch. The data are the measured ratios and brightnesses with
+their standard deviations; all that was not measured has a prior of zero mean and stated width. The solution is the
+maximum of the posterior (least squares, scipy), its covariance the inverse of the information matrix there.
 
-Where brightness and ratio of several patches agree on a leakage, the scene has measured it; where they do not tell, the
-prior stands. Each source of data or prior has a share in the variance of each permittivity; the shares add up to it:
-with J the Jacobian of all residuals and C the covariance, source s contributes C J_s' J_s C.
+If brightness and ratio of several patches determine the leakage, the scene has measured it; otherwise the prior
+remains. Each source of data or prior has a share in the variance of each permittivity; the shares add up to it: with J
+the Jacobian of all residuals and C the covariance, source s contributes C J_s' J_s C.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ Complex = npt.NDArray[np.complex128]
 BRIGHTNESS_STD = 0.05
 """Prior of ln kappa: plates rough by 0.2 mm lose 7 %, edges and tilts change |H| by some per cent."""
 BRIGHTNESS_FREEDOM = 4.0
-"""How many patches' worth of evidence that prior is, when the patches' own scatter corrects it."""
+"""Weight of that prior against the patches' own scatter, in number of patches."""
 OUTLIER = 3.0
-"""Standard deviations of brightness beyond which a patch (a thin sheet, a shadow) loses its say (Cauchy)."""
+"""Standard deviations of brightness beyond which a patch (a thin sheet, a shadow) loses weight (Cauchy)."""
 METAL_LIKE = 0.25
-"""|t - 1| below which no permittivity is given: it grows as 4 / |t - 1|^2, and its error with it."""
+"""|t - 1| below which no permittivity is given: it grows as 4 / |t - 1|^2, and so does its error."""
 LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "brightness")
 _NUISANCES = 8  # a, b (2 each), rho (2), angle, brightness of the metal
-_BENT = 0.1  # standard deviation over radius of curvature of Eq. 3 beyond which its error is drawn, not propagated
+_BENT = 0.1  # standard deviation over radius of curvature of Eq. 3 above which errors are sampled, not propagated
 _DRAWS = 4000
 _LEAST_STD = 1e-6  # of a ratio: below it the information matrix has no inverse in double precision
 
 
 @dataclass(frozen=True)
 class PatchMeasurement:
-    """What was measured of one patch, relative to metal; leakage is still in it.
+    """Measurement of one patch, relative to metal; leakage is not removed.
 
     Attributes
     ----------
@@ -57,9 +57,9 @@ class PatchMeasurement:
     std
         Standard deviation of its real part and of its imaginary part: noise, speckle, edges.
     theta_rad
-        Incidence angle, as far as it is known.
+        Nominal incidence angle.
     brightness
-        |H|; None when it is not to be used.
+        |H|; None if it is not used.
     """
 
     inverse_ratio: complex
@@ -70,24 +70,24 @@ class PatchMeasurement:
 
 @dataclass(frozen=True)
 class RigPrior:
-    """What is known beforehand of the rig, as means and standard deviations.
+    """Prior of the rig's errors: means and standard deviations.
 
     Attributes
     ----------
     theta_std_rad
-        Standard deviation of the incidence angle's error, the same for all patches.
+        Standard deviation of the incidence angle's error, equal for all patches.
     leakage
-        Of p in H and of s in V: as measured, or zero.
+        Leakage of p into H and of s into V: as measured, or zero.
     leakage_std
         Standard deviation of each real and imaginary part.
     leakage_measured
-        Whether that is a measurement, or the prior of the mount.
+        True if it was measured; otherwise it is the prior of the mount.
     channels_known
-        Whether the images' amplitudes are relative to the direct path.
+        True if the images' amplitudes are relative to the direct path.
     reference_std
         Relative standard deviation of metal's V / H, each part.
     brightness_std
-        Of ln |H| beside what Eq. 2 says, one patch beside another.
+        Standard deviation of ln |H| relative to Eq. 2, of single patches.
     """
 
     theta_std_rad: float
@@ -106,15 +106,15 @@ class PatchEstimate:
     Attributes
     ----------
     inverse_ratio
-        1 / P = r_p / r_s with everything estimated taken out.
+        1 / P = r_p / r_s, corrected for all estimated errors.
     inverse_ratio_covariance
         float64 [2, 2] of its real and imaginary part.
     permittivity
-        eps' - j eps''; None when the patch is metal-like.
+        eps' - j eps''; None if the patch is metal-like.
     covariance
-        float64 [2, 2] of its real and its imaginary part; None when metal-like.
+        float64 [2, 2] of its real and its imaginary part; None if metal-like.
     shares
-        Source to its share of the covariance's trace; they add up to 1.
+        Source to its share of the covariance's trace; the sum is 1.
     """
 
     inverse_ratio: complex
@@ -136,19 +136,19 @@ class Inversion:
     Attributes
     ----------
     patches
-        One estimate a patch, in the order given.
+        Estimates of the patches, in the given order.
     leakage
-        Estimate of p in H, s in V.
+        Estimated leakage of p into H, of s into V.
     leakage_std
-        Standard deviation of each: root of the mean variance of its two parts.
+        Standard deviation of each: root mean variance of its two parts.
     prior_std
-        The same before this scene was seen.
+        The same of the prior.
     theta_error_rad, theta_std_rad
-        How much larger the angle is than it was taken for, and the standard deviation of that.
+        True minus nominal incidence angle, and its standard deviation.
     misfit
-        Brightness beside the model's, in standard deviations, one a patch; NaN where it was not used.
+        Brightness minus the model's, in standard deviations, of each patch; NaN if it was not used.
     brightness_std
-        Standard deviation of ln |H| that the patches' scatter and the prior agree on.
+        Standard deviation of ln |H| from the patches' scatter and the prior.
     cost
         Sum of squared residuals at the solution, priors included.
     """
@@ -166,12 +166,12 @@ class Inversion:
 
     @property
     def leakage_determined(self) -> bool:
-        """Whether the scene narrowed the leakage of both receivers to less than half of what was known before."""
+        """True if the scene reduced the uncertainty of both leakages to less than half of the prior's."""
         return max(self.leakage_std) < 0.5 * self.prior_std
 
 
 def true_ratio(inverse: npt.ArrayLike, a: complex, b: complex, rho: complex = 0j) -> Complex:
-    """T of a measured V / H: the first formula of the module's text, solved for t."""
+    """Return t of a measured V / H: the first formula of the module's docstring, solved for t."""
     c = np.asarray(inverse, np.complex128) * (1 + b) / ((1 + a) * (1 + rho))
     return (c - b) / (1 - a * c)
 
@@ -179,19 +179,19 @@ def true_ratio(inverse: npt.ArrayLike, a: complex, b: complex, rho: complex = 0j
 def measured_ratio(
     t: npt.ArrayLike, a: Complex | complex, b: Complex | complex, rho: Complex | complex = 0j
 ) -> Complex:
-    """V / H of a true t: the first formula of the module's text."""
+    """Return V / H of a true t: the first formula of the module's docstring."""
     t = np.asarray(t, np.complex128)
     return (1 + rho) * (1 + a) / (1 + b) * (t + b) / (1 + a * t)
 
 
 def slope(t: npt.ArrayLike, theta_rad: float) -> Complex:
-    """D eps / d t of Eq. 3 by t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
+    """Return d eps / d t of Eq. 3 with t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
     t = np.asarray(t, np.complex128)
     return 4 * np.sin(theta_rad) ** 2 * np.tan(theta_rad) ** 2 * (1 + t) / (1 - t) ** 3
 
 
 def forward_differences(f: Callable[[Real], Real], x: Real) -> Real:
-    """Jacobian of f at x, [value, parameter]; f is called once, for all steps: x of shape [step, parameter]."""
+    """Return the Jacobian of f at x, [value, parameter]; f is called once, with x of shape [step, parameter]."""
     step = np.sqrt(np.finfo(np.float64).eps) * np.maximum(1.0, np.abs(x))
     at = f(np.concatenate([x[None], x + np.diag(step)]))
     return ((at[1:] - at[0]) / step[:, None]).T
@@ -200,7 +200,7 @@ def forward_differences(f: Callable[[Real], Real], x: Real) -> Real:
 class _Model:
     """Residuals of the fit. Parameters are deviations from the prior's mean in its standard deviations.
 
-    Those of a patch are t as deviations from the measured ratio in units of its standard deviation.
+    Those of a patch are the deviation of t from the measured ratio, in its standard deviations.
     """
 
     def __init__(self, seen: Sequence[PatchMeasurement], prior: RigPrior, brightness_std: float) -> None:
@@ -208,26 +208,26 @@ class _Model:
         self.q = np.array([s.inverse_ratio for s in seen], np.complex128)
         self.std = np.maximum(np.array([s.std for s in seen], np.float64), _LEAST_STD)
         level = np.array([np.nan if s.brightness is None else s.brightness for s in seen], np.float64)
-        # Metal-like patches have |H| = 1 whatever the leakage: they tell nothing of it.
+        # Metal-like patches have |H| = 1 with any leakage: they give no information on it.
         self.bright = np.isfinite(level) & (level > 0) & (np.abs(self.q - 1) > METAL_LIKE)
         self.log_level = np.log(np.where(self.bright, level, 1.0))
         self.start = true_ratio(self.q, *prior.leakage)
         self.theta = np.array([s.theta_rad for s in seen], np.float64)
 
     def nuisances(self, x: Real) -> tuple[Complex, Complex, Complex, Real]:
-        """a, b, rho and the angle's error; all of [..., parameter] to [..., 1]."""
+        """Return a, b, rho and the angle's error; [..., parameter] to [..., 1] each."""
         p, u = self.prior, [x[..., k, None] for k in range(7)]
         a = p.leakage[0] + p.leakage_std * (u[0] + 1j * u[1])
         b = p.leakage[1] + p.leakage_std * (u[2] + 1j * u[3])
         return a, b, p.reference_std * (u[4] + 1j * u[5]), p.theta_std_rad * u[6]
 
     def ratios(self, x: Real) -> Complex:
-        """T of every patch, [..., patch]."""
+        """Return t of every patch, [..., patch]."""
         real, imag = np.split(x[..., _NUISANCES:], 2, axis=-1)
         return self.start + self.std * (real + 1j * imag)
 
     def misfit(self, x: Real) -> Real:
-        """Brightness beside the model's in standard deviations, [..., patch]; 0 where it is not used."""
+        """Return brightness minus the model's in standard deviations, [..., patch]; 0 if it is not used."""
         a, _, _, error = self.nuisances(x)
         t, theta = self.ratios(x), self.theta + error
         r_s = fresnel(permittivity_from_ratio(t, theta), theta)[0]
@@ -237,7 +237,7 @@ class _Model:
         return np.where(self.bright & np.isfinite(off), np.clip(off, -1e3, 1e3), 0.0)
 
     def residuals(self, x: Real) -> Real:
-        """Priors of the nuisances, then ratios, then brightness; [..., parameter] to [..., residual]."""
+        """Return residuals of the priors, of ratios, and of brightness; [..., parameter] to [..., residual]."""
         a, b, rho, _ = self.nuisances(x)
         off = (measured_ratio(self.ratios(x), a, b, rho) - self.q) / self.std
         misfit = self.misfit(x)
@@ -249,7 +249,7 @@ class _Model:
         return forward_differences(self.residuals, x)
 
     def source_rows(self) -> dict[str, npt.NDArray[np.intp]]:
-        """Which residuals belong to which source."""
+        """Return source to the indices of its residuals."""
         ratios = np.arange(_NUISANCES, _NUISANCES + 2 * self.n)
         bright = np.concatenate([[7], np.arange(_NUISANCES + 2 * self.n, _NUISANCES + 3 * self.n)])
         rows = {"noise": ratios, "metal reference": np.array([4, 5]), "leakage": np.arange(4)}
@@ -259,15 +259,15 @@ class _Model:
 def invert(seen: Sequence[PatchMeasurement], prior: RigPrior) -> Inversion:
     """Solve for all patches of a scene together.
 
-    The standard deviation of brightness is found in two turns: the patches' own scatter about the first solution
-    corrects its prior (the mean of a scaled inverse chi-square; Gelman et al., Bayesian Data Analysis, section 2.6).
+    The standard deviation of brightness is estimated in two steps: the patches' scatter about the first solution
+    corrects its prior (mean of a scaled inverse chi-square; Gelman et al., Bayesian Data Analysis, section 2.6).
 
     Parameters
     ----------
     seen
         The patches without the metal reference.
     prior
-        What is known of the rig.
+        Prior of the rig's errors.
 
     Returns
     -------
@@ -313,7 +313,7 @@ def _solution(model: _Model, found: scipy.optimize.OptimizeResult) -> Inversion:
 
 
 def _estimate(model: _Model, x: Real, jac: Real, covariance: Real, i: int, t: complex, theta: float) -> PatchEstimate:
-    """One patch: its ratio and permittivity with covariance, and where that comes from."""
+    """Estimate one patch: ratio and permittivity with covariance, and the shares of the sources."""
     at = [_NUISANCES + i, _NUISANCES + model.n + i]
     unit = model.std[i]
     of_ratio = unit**2 * covariance[np.ix_(at, at)]
@@ -345,9 +345,9 @@ def _estimate(model: _Model, x: Real, jac: Real, covariance: Real, i: int, t: co
 
 
 def _drawn(t: complex, theta: float, covariance: Real, unit: float, theta_std: float) -> Real:
-    """Covariance of the permittivity by drawing ratio and angle, where Eq. 3 bends within the error bar.
+    """Return the covariance of the permittivity by sampling ratio and angle, if Eq. 3 bends within the error.
 
-    Draws beyond three standard deviations are left out, on both sides of them all: near metal the far tail has none.
+    Samples beyond three standard deviations are dropped: near metal the moments of the far tail do not exist.
     """
     rng = np.random.default_rng(0)
     drawn = rng.multivariate_normal(np.zeros(3), covariance, _DRAWS, method="cholesky")
@@ -360,10 +360,10 @@ def _drawn(t: complex, theta: float, covariance: Real, unit: float, theta_std: f
 
 
 def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:
-    """Errors of 1 / P at any t [...] by leakage and metal reference as the inversion left them, float64 [..., 2, 6].
+    """Return the errors of 1 / P at t [...] by leakage and metal reference after the inversion, float64 [..., 2, 6].
 
-    Times its transpose it is their covariance; of several t side by side, that between them too.
-    d t = -(1 - t) (b + a t) - t rho to first order.
+    The product with its transpose is the covariance, for several t also between them. To first order
+    d t = -(1 - t) (b + a t) - t rho.
     """
     t = np.asarray(t, np.complex128)
     scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
@@ -374,5 +374,5 @@ def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real
 
 
 def ratio_error(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:
-    """Standard deviation of 1 / P that leakage and reference leave at any t: root of both parts' mean variance."""
+    """Return the standard deviation of 1 / P at t by leakage and reference: root mean variance of both parts."""
     return np.sqrt(np.sum(ratio_slopes(estimate, prior, t) ** 2, axis=(-2, -1)) / 2)

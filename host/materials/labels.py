@@ -1,8 +1,8 @@
-"""Label files (`labels.json`): boxes with names, which of them is metal, and which specimen each is.
+"""Label files (`labels.json`): boxes with names, the metal reference among them, and their specimens.
 
-`polysight label` writes what a person drew, in millimetres; `polysight process` writes a box inside each patch that it
-found, in pixels, named by the classifier. Both are read here, and so are the published data set's files.
-`Labels.patches` makes patches of them.
+`polysight label` writes the boxes of a person, in millimetres; `polysight process` writes a box inside each patch that
+it found, in pixels, named by the classifier. Both forms are read, and the published data set's files too.
+`Labels.patches` makes patches of the boxes.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy.typing as npt
 from polysight.host.materials.result import MaterialsResult
 from polysight.host.materials.segment import Box, Patch, Segmentation, axis_mm, box_mask, make_patch
 from polysight.host.materials.truth import TruthPlate
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.files import read_json
 
@@ -29,17 +30,17 @@ SPECIMEN = "#"
 
 
 def is_metal(name: str) -> bool:
-    """Whether a material's name is that of a metal."""
+    """Return true if a material's name is that of a metal."""
     return any(word in METALS for word in re.findall(r"[a-z]+", name.lower()))
 
 
 def material_of(name: str) -> str:
-    """The material of a box called material or material#specimen."""
+    """Return the material of a box named material or material#specimen."""
     return name.partition(SPECIMEN)[0]
 
 
 def format_box(box: Box) -> str:
-    """A box in words: `x -22.5 to 22.5, y 0.0 to 45.0 mm`."""
+    """Format a box: `x -22.5 to 22.5, y 0.0 to 45.0 mm`."""
     x0, y0, x1, y1 = (b + 0.0 for b in box)
     return f"x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f} mm"
 
@@ -51,15 +52,15 @@ class Labels:
     Attributes
     ----------
     boxes
-        Name to (x0, y0, x1, y1): millimetres from the image centre, or pixel indices (end left out).
+        Name to (x0, y0, x1, y1): millimetres from the image centre, or pixel indices (end excluded).
     unit
-        Which of both.
+        Unit of the boxes.
     metal
-        Name of the box that is the metal reference; None: the first whose name is that of a metal.
+        Name of the box with the metal reference; None: the first box with the name of a metal.
     specimens
-        Name of a box to the physical piece that lies there, for those that are told.
+        Name of a box to its physical piece, if known.
     by_hand
-        Whether a person drew and named them; boxes of `polysight process` have the classifier's names.
+        True if a person drew and named them; boxes of `polysight process` have the classifier's names.
     description
         Free text.
     """
@@ -72,15 +73,15 @@ class Labels:
     description: str = ""
 
     def is_metal(self, name: str) -> bool:
-        """Whether this box is the metal reference, or may be where the file does not tell."""
+        """Return true if this box is the metal reference, or has a metal's name if the file has no reference."""
         return name == self.metal if self.metal is not None else is_metal(material_of(name))
 
     def specimen(self, name: str) -> str | None:
-        """Which piece lies in a box: as told, or what follows `#` in its name; None where nothing says."""
+        """Return the physical piece in a box: as given, or the part of its name after `#`; None if not known."""
         return self.specimens.get(name) or name.partition(SPECIMEN)[2] or None
 
     def in_mm(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Labels:
-        """The same with boxes in millimetres from the centre of an image with these axes."""
+        """Return the labels with boxes in millimetres from the centre of an image with these axes."""
         if self.unit == "mm":
             return self
         x, y = axis_mm(x_m), axis_mm(y_m)
@@ -94,40 +95,50 @@ class Labels:
         return replace(self, boxes={n: converted(b) for n, b in self.boxes.items()}, unit="mm")
 
     def patches(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[Segmentation, dict[int, str]]:
-        """Patches of the boxes, and the box name of each; see :func:`patches_from_labels`."""
+        """Return patches of the boxes, and the box name of each; see :func:`patches_from_labels`."""
         return patches_from_labels(dict(self.boxes), x_m, y_m, unit=self.unit)
 
 
 def read_labels(path: Path) -> Labels:
-    """Read a label file. Names and boxes are as they stand there: :func:`check_labels` judges them.
+    """Read a label file; names and boxes are not checked, see :func:`check_labels`.
 
     Raises
     ------
     DataError
-        when the file is absent, not JSON, an entry is not four numbers, or a key has another form.
+        if the file is missing, not JSON, an entry is not four numbers, or a key is invalid.
     """
     remedy = "correct it, or draw the boxes again: polysight label SCAN"
     try:
         raw: Any = read_json(path)
     except FileNotFoundError:
-        raise DataError(f"{path}: no such label file", "the path is wrong", "polysight label SCAN makes one") from None
+        raise DataError(
+            f"{path}: no such label file", "the path is wrong", "polysight label SCAN makes one",
+            code=ErrorCode.FILE_MISSING,
+        ) from None  # fmt: skip
     except (OSError, ValueError) as e:
-        raise DataError(f"{path}: not a label file: {e}", "a label file is JSON with a key `labels`", remedy) from None
+        raise DataError(
+            f"{path}: not a label file: {e}", "a label file is JSON with a key `labels`", remedy,
+            code=ErrorCode.FILE_UNREADABLE,
+        ) from None  # fmt: skip
+
+    def invalid(what: str, expected: str) -> DataError:
+        return DataError(f"{path}: {what}", f"expected {expected}", remedy, code=ErrorCode.VALUE_INVALID)
+
     boxes = raw.get("labels") if isinstance(raw, dict) else None
     if not isinstance(boxes, dict):
-        raise DataError(f"{path}: has no `labels`", "expected {name: [x0, y0, x1, y1]} under that key", remedy)
+        raise invalid("no `labels`", "{name: [x0, y0, x1, y1]} under that key")
     out: dict[str, Box] = {}
     for name, box in boxes.items():
         if not (isinstance(box, list) and len(box) == 4 and all(_is_number(b) for b in box)):
-            raise DataError(f"{path}: labels.{name} = {box!r}", "expected four numbers [x0, y0, x1, y1]", remedy)
+            raise invalid(f"labels.{name} = {box!r}", "four numbers [x0, y0, x1, y1]")
         out[str(name)] = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
     unit, metal, specimens = raw.get("unit", "pixel"), raw.get("metal"), raw.get("specimens") or {}
     if unit not in ("mm", "pixel"):
-        raise DataError(f"{path}: unit = {unit!r}", 'expected "mm" or "pixel"', remedy)
+        raise invalid(f"unit = {unit!r}", '"mm" or "pixel"')
     if not (metal is None or (isinstance(metal, str) and metal in out)):
-        raise DataError(f"{path}: metal = {metal!r}", f"expected the name of a box: {', '.join(out)}", remedy)
+        raise invalid(f"metal = {metal!r}", f"the name of a box: {', '.join(out)}")
     if not (isinstance(specimens, dict) and all(n in out and isinstance(s, str) for n, s in specimens.items())):
-        raise DataError(f"{path}: specimens = {specimens!r}", "expected {name of a box: which piece it is}", remedy)
+        raise invalid(f"specimens = {specimens!r}", "{name of a box: name of the piece}")
     by_hand, text = raw.get("by_hand") is True, raw.get("description")
     return Labels(out, unit, metal, specimens, by_hand, text if isinstance(text, str) else "")
 
@@ -137,7 +148,7 @@ def _is_number(value: Any) -> bool:
 
 
 def pack_labels(labels: Labels) -> bytes:
-    """Content of a label file that :func:`read_labels` reads back."""
+    """Return the content of a label file for :func:`read_labels`."""
     content: dict[str, Any] = {
         "description": labels.description,
         "unit": labels.unit,
@@ -150,7 +161,7 @@ def pack_labels(labels: Labels) -> bytes:
 
 
 def labels_of(found: MaterialsResult, description: str = "") -> Labels:
-    """Boxes around the insides of a result's patches, in pixels, called what each was drawn or named; all differ."""
+    """Return boxes around the interiors of a result's patches, in pixels, with unique names as drawn or classified."""
     out: dict[str, Box] = {}
     for r in found.patches:
         named = r.verdict.name if r.verdict is not None else None
@@ -165,9 +176,9 @@ def labels_of(found: MaterialsResult, description: str = "") -> Labels:
 def patches_from_plates(
     plates: Sequence[TruthPlate], x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float
 ) -> tuple[Segmentation, dict[int, str]]:
-    """Patches where plates are known to be, and the name of each label; several plates may have the same name.
+    """Return patches at the known plates, and label to name; several plates may have the same name.
 
-    Parameters as of :func:`patches_from_labels`. Raises DataError when a plate holds no pixel.
+    Parameters as of :func:`patches_from_labels`. Raises DataError if a plate has no pixel.
     """
     boxes = {f"{plate.name} ({n})": plate.box_mm for n, plate in enumerate(plates, 1)}
     found, _ = patches_from_labels(boxes, x_m, y_m, unit="mm", margin_mm=margin_mm)
@@ -182,30 +193,30 @@ def patches_from_labels(
     flip_y: bool = False,
     margin_mm: float = 0.0,
 ) -> tuple[Segmentation, dict[int, str]]:
-    """Patches from boxes drawn by hand.
+    """Make patches of boxes drawn by hand.
 
     Parameters
     ----------
     boxes
-        Name to (x0, y0, x1, y1): pixel indices (end left out), or millimetres from the image centre.
+        Name to (x0, y0, x1, y1): pixel indices (end excluded), or millimetres from the image centre.
     x_m, y_m
         Pixel centres in metres.
     unit
         Unit of the boxes.
     flip_y
-        Pixel rows count from the top (largest y).
+        True if pixel rows count from the top (largest y).
     margin_mm
-        Kept free inside the box; hand-drawn boxes usually lie inside the material already.
+        Margin inside the box; hand-drawn boxes usually lie inside the material already.
 
     Returns
     -------
     segmentation, names
-        and the name of each label.
+        Patches, and label to name.
 
     Raises
     ------
     DataError
-        when a box holds no pixel.
+        if a box has no pixel.
     """
     x, y = axis_mm(x_m), axis_mm(y_m)
     labels = np.zeros((y.size, x.size), np.int32)
@@ -221,7 +232,10 @@ def patches_from_labels(
             mask = np.zeros(labels.shape, bool)
             mask[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = True
         if not mask.any():
-            raise DataError(f"label {name}: box {box} holds no pixel", f"the image has {x.size} x {y.size} pixels")
+            raise DataError(
+                f"label {name}: box {box} has no pixel", f"the image has {x.size} x {y.size} pixels",
+                code=ErrorCode.NO_DATA,
+            )  # fmt: skip
         n = len(patches) + 1
         patches.append(make_patch(n, mask, x_m, y_m, margin_mm))
         labels[mask] = n

@@ -1,10 +1,10 @@
-"""The one unknown layer of a stack: its permittivity, and its thickness where that is not known.
+"""Fit the one unknown layer of a stack: its permittivity, and its thickness if it is not known.
 
-The solution is the least chi-square, with the full covariance of the data (what all sub-bands share does not average
-out, differences between them are known better) and the incidence angle as a nuisance with its prior. Starts come from a
-grid over index, loss and phase, so that no branch (half a wave more in the sheet) is missed. Error bars are those of
-the curvature, or of draws from the posterior where the valley is bent. What the data cannot tell apart is listed as
-rivals, not hidden.
+The solution has the least chi-square, with the full covariance of the data (errors common to all sub-bands do not
+average out, differences between them are known better) and the incidence angle as a nuisance with its prior. Start
+values come from a grid over index, loss and phase, so that no branch (half a wave more in the sheet) is missed. Error
+bars are those of the curvature, or of samples of the posterior if the valley is bent. Other solutions that the data do
+not exclude are listed as rivals.
 """
 
 from __future__ import annotations
@@ -20,31 +20,33 @@ import scipy
 
 from polysight.host.materials.layers import Bands, Layer, average, check_stack
 from polysight.host.materials.permittivity import format_permittivity
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, PolysightError
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Real = npt.NDArray[np.float64]
 REAL_RANGE = (1.0, 40.0)
 LOSS_RANGE = (0.0, 60.0)
-"""Where permittivities are looked for: from air to beyond water at these frequencies (9.4 - j18)."""
+"""Search ranges of the permittivity: from air to beyond water at these frequencies (9.4 - j18)."""
 THICKNESS_RANGE_M = (0.1e-3, 12e-3)
-"""Where a thickness is looked for of which nothing is known."""
+"""Search range of an unknown thickness."""
 START_PHASE_RAD = 0.25
-"""Steps of the grid of starts in the phase of the wave's way through the layer and back: no valley lies between."""
+"""Step of the start grid in the phase of the path through the layer and back: no valley is narrower."""
 LOSS_TANGENTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 2.0)
 INDEX_STEPS = 60
 STARTS = 24
 RIVAL = 9.0
+"""A second solution is a rival if its chi-square is within this of the best: three standard deviations, enlarged as the
+error bars if the model misses the data."""
 MOST_THICKNESS_M = 30e-3
-"""A second solution is a rival when its chi-square is within this of the best: three standard deviations, as wide as
-the error bars are where the model misses the data."""
+"""Largest thickness to fit."""
 UNLIKELY = 1e-3
-"""The stack does not explain data that it would miss by as much in one of a thousand scans."""
+"""Probability of a larger chi-square below which the stack does not explain the data."""
 DETERMINED = 0.05
-"""Relative error of permittivity or thickness that 95 % regions may reach for a fit to be called determined."""
+"""Largest relative half width of 95 % regions of a fit that is not ambiguous."""
 _DRAWS = 1500
 _REACH = 4.0  # standard deviations
-_BENT = 1.15  # ratio of drawn to linear standard deviations from which on the drawn ones are used
+_BENT = 1.15  # ratio of sampled to linear standard deviations above which the sampled ones are used
 
 
 @dataclass(frozen=True)
@@ -56,16 +58,16 @@ class LayerFit:
     permittivity
         eps' - j eps''.
     thickness_m
-        Of the unknown layer: fitted or as given (None: half space).
+        Thickness of the unknown layer, fitted or given; None: half space.
     std_real, std_loss, std_thickness_m
-        Standard deviations; enlarged by sqrt(chi-square per degree of freedom) where the model misses the data by more
-        than their deviations. Zero for a thickness that was given.
+        Standard deviations, enlarged by sqrt(chi-square per degree of freedom) if that is above 1. Zero for a given
+        thickness.
     chi2, freedom
         Sum of squared residuals over their deviations; data minus unknowns.
     rivals
-        Other solutions that the data cannot exclude (chi-square within 9, or more where the model misses the data).
+        Other solutions that the data do not exclude (chi-square within 9, or more if the model misses the data).
     at_limit
-        Unknowns that lie at an end of where they are looked for; no loss is not one.
+        Unknowns at an end of their search range, except a loss of zero.
     covariance
         float64 [2, 2] of (eps', eps''), or [3, 3] of (eps', eps'', thickness in metres) where that was fitted.
     """
@@ -83,7 +85,7 @@ class LayerFit:
 
     @property
     def stretch(self) -> float:
-        """Chi-square per degree of freedom where the model misses the data by more than their deviations, else 1."""
+        """Chi-square per degree of freedom, at least 1."""
         return max(1.0, self.chi2 / self.freedom) if self.freedom > 0 else 1.0
 
     @property
@@ -94,11 +96,11 @@ class LayerFit:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether the data do not exclude another solution, or a fitted thickness leaves either open beyond 5 %."""
+        """True if there are rivals, or a fitted thickness makes permittivity or thickness uncertain by over 5 %."""
         return bool(self.rivals) or (self.std_thickness_m > 0 and 2 * self.relative_std > DETERMINED)
 
     def warnings(self) -> list[str]:
-        """What a reader of the number must know, in words."""
+        """Return the warnings about this fit, one sentence each."""
         out = []
         for r in self.rivals:
             size = "" if r.thickness_m is None or not self.std_thickness_m else f" at {1e3 * r.thickness_m:.3g} mm"
@@ -116,14 +118,14 @@ class LayerFit:
         if self.std_real > 0.2 * self.permittivity.real or self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):
             out.append("the data hardly depend on this layer: its error bar is large")
         if self.at_limit:
-            out.append(f"{' and '.join(self.at_limit)} at the limit of what was looked for: the truth may lie beyond")
+            out.append(f"{' and '.join(self.at_limit)} at the limit of the search range: the true value may be beyond")
         return out
 
 
 def fit_layer(
     bands: Bands, stack: Sequence[Layer], theta_rad: float, thickness_range_m: tuple[float, float] | None = None
 ) -> LayerFit:
-    """The permittivity of the one layer whose permittivity is None, and its thickness where a range of it is given.
+    """Fit the permittivity of the one layer whose permittivity is None, and its thickness if a range is given.
 
     Parameters
     ----------
@@ -134,33 +136,36 @@ def fit_layer(
     theta_rad
         Incidence angle in air.
     thickness_range_m
-        When given, the unknown layer's thickness is fitted too, within this range; else it is as the stack says
-        (its `thickness_m`, or its `thickness_range_m`).
+        Range for fitting the unknown layer's thickness; None: the layer's own `thickness_m` or `thickness_range_m`.
 
     Returns
     -------
     LayerFit
-        The best solution with its error bars; look at `ambiguous`, `rivals` and `warnings()`.
+        The best solution with its error bars; see `ambiguous`, `rivals` and `warnings()`.
 
     Raises
     ------
     PolysightError
-        when not exactly one layer is unknown, or a thickness is missing.
+        if not exactly one layer is unknown, or a thickness is missing.
     DataError
-        when there are fewer data than unknowns.
+        with fewer data than unknowns.
     """
     at = [i for i, layer in enumerate(stack) if layer.permittivity is None]
     if len(at) != 1:
         raise PolysightError(
-            f"{len(at)} layers of unknown permittivity", "one can be fitted", "give the permittivity of the others"
+            f"{len(at)} layers of unknown permittivity",
+            "one can be fitted",
+            "give the permittivity of the others",
+            code=ErrorCode.VALUES_CONFLICT,
         )
     check_range(thickness_range_m or stack[at[0]].thickness_range_m)
     model = _Model(bands, tuple(stack), at[0], theta_rad, thickness_range_m or stack[at[0]].thickness_range_m)
     if model.freedom < 0:
         raise DataError(
             f"{model.data} numbers for {model.unknowns} unknowns",
-            "a thickness cannot be told from one sub-band's ratio",
+            "one sub-band's ratio does not determine a thickness",
             "give more sub-bands, the amplitude, or the thickness",
+            code=ErrorCode.NOT_ENOUGH_DATA,
         )
     rough = sorted((model.solve(start, precision=1e-3) for start in model.starts()), key=lambda one: one.chi2)
     level = rough[0].chi2 + 3 * RIVAL * model.fit(rough[0], drawn=False).stretch
@@ -175,17 +180,18 @@ def fit_layer(
 
 
 def check_range(thickness_range_m: tuple[float, float] | None) -> None:
-    """Raise PolysightError where a thickness is looked for beyond what a sweep of a few GHz can tell apart."""
+    """Raise PolysightError if the search range is too large for a sweep of a few GHz."""
     if thickness_range_m is not None and thickness_range_m[1] > MOST_THICKNESS_M:
         raise PolysightError(
             f"a thickness of up to {1e3 * thickness_range_m[1]:g} mm",
-            f"beyond {1e3 * MOST_THICKNESS_M:g} mm a layer holds too many half waves to tell two of them apart",
+            f"above {1e3 * MOST_THICKNESS_M:g} mm a layer has too many half waves to distinguish them",
             "narrow the range, or measure the thickness; a thick lossy layer is a half space",
+            code=ErrorCode.VALUE_INVALID,
         )
 
 
 def _differ(a: LayerFit, b: LayerFit) -> bool:
-    """Whether two solutions are two: farther apart than their error bars and than the solver's step."""
+    """Return true if two solutions differ by more than their error bars and the solver's precision."""
     real = abs(a.permittivity.real - b.permittivity.real)
     loss = abs(a.permittivity.imag - b.permittivity.imag)
     thick = abs((a.thickness_m or 0.0) - (b.thickness_m or 0.0))
@@ -198,7 +204,7 @@ def _differ(a: LayerFit, b: LayerFit) -> bool:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Where the solver ended: unknowns, chi-square, Jacobian of the residuals, and which bounds it ended on."""
+    """Result of the solver: unknowns, chi-square, Jacobian of the residuals, and active bounds."""
 
     x: Real
     chi2: float
@@ -207,7 +213,7 @@ class _Solution:
 
 
 def _apart(found: Sequence[_Solution], level: float, relative: float) -> list[_Solution]:
-    """Solutions up to a chi-square, each place once (as far apart as `relative`), best first."""
+    """Return solutions up to a chi-square `level`, without repetitions (closer than `relative`), best first."""
     out: list[_Solution] = []
     for one in found:
         if one.chi2 <= level and all(
@@ -220,7 +226,7 @@ def _apart(found: Sequence[_Solution], level: float, relative: float) -> list[_S
 class _Model:
     """Residuals of one fit. Unknowns: eps', eps'', the thickness in mm if fitted, the angle's error over its deviation.
 
-    The last only where the angle has a deviation; it is no unknown of the layer and has a residual of its own.
+    The last only if the angle has a deviation; it is no unknown of the layer and has its own residual (the prior).
     """
 
     def __init__(
@@ -247,7 +253,7 @@ class _Model:
         self.wavenumber = 2 * np.pi * float(np.mean(bands.spectrum.frequency_hz)) / SPEED_OF_LIGHT_M_S * 1e-3  # per mm
 
     def residuals(self, x: npt.ArrayLike, thin: int = 1) -> Real:
-        """Residuals over deviations, [..., data (+ 1)], for unknowns [..., n]; every `thin`-th frequency."""
+        """Return normalised residuals, [..., data (+ 1)], of unknowns [..., n]; with every `thin`-th frequency."""
         x = np.asarray(x, np.float64)
         wide = x[..., None, None, :]
         eps: list[npt.ArrayLike] = [
@@ -270,7 +276,7 @@ class _Model:
         return np.concatenate([out, x[..., -1:]], axis=-1) if self.turned else out
 
     def starts(self) -> list[Real]:
-        """Local minima of chi-square over a grid of index, phase and loss, best first."""
+        """Return local minima of chi-square on a grid of index, phase and loss, best first."""
         sine2 = float(np.sin(self.theta_rad) ** 2)
         low, high = (float(np.sqrt(max(real - sine2, 1e-3))) for real in REAL_RANGE)
         known_mm = 1e3 * (self.stack[self.at].thickness_m or 0.0)
@@ -291,7 +297,7 @@ class _Model:
             out = (x[2] < self.range_mm[0]) | (x[2] > self.range_mm[1])
         grid = np.stack([*x, *([np.zeros(real.shape)] * self.turned)], axis=-1)
         chi2 = np.full(real.shape, np.inf)
-        # One frequency of a sub-band is enough to find where to start where the thickness is free.
+        # A few frequencies of a sub-band are enough for start values.
         chi2[~out] = np.sum(self.residuals(grid[~out], thin=6) ** 2, axis=-1)
         valleys = (chi2 == scipy.ndimage.minimum_filter(chi2, size=3, mode="nearest")) & ~out
         index = np.argwhere(valleys)
@@ -299,30 +305,30 @@ class _Model:
         return [grid[tuple(one)] for one in index[order]]
 
     def _slopes(self, x: Real) -> Real:
-        """Jacobian of the residuals, [data, n], by central differences, all at once."""
+        """Return the Jacobian of the residuals, [data, n], by central differences."""
         step = np.diag(1e-6 * np.maximum(np.abs(x), 0.1))
         apart = self.residuals(np.concatenate([x + step, x - step]))
         return ((apart[: x.size] - apart[x.size :]) / (2 * np.diag(step)[:, None])).T
 
     def solve(self, start: Real, precision: float = 1e-10) -> _Solution:
-        """Least squares from one start."""
+        """Solve by least squares from one start."""
         width = self.upper - self.lower
         done = scipy.optimize.least_squares(
             self.residuals,
             np.clip(start, self.lower + 1e-9 * width, self.upper - 1e-9 * width),
             bounds=(self.lower, self.upper),
             x_scale="jac",
-            jac=cast("Any", self._slopes),  # scipy-stubs know a name only
+            jac=cast("Any", self._slopes),  # scipy-stubs accept only a name
             xtol=precision,
             ftol=precision,
             gtol=precision,
             max_nfev=200,
         )
-        # On a bound (no loss at all) the solver's Jacobian still has the slope that the error bar needs.
+        # At a bound (no loss) the solver's Jacobian still has the slope for the error bar.
         return _Solution(done.x, float(2 * done.cost), done.jac, done.active_mask)
 
     def fit(self, one: _Solution, drawn: bool) -> LayerFit:
-        """A solution with its error bars; by draws from the posterior where `drawn` and the valley is bent."""
+        """Return a solution with its error bars; by samples of the posterior if `drawn` and the valley is bent."""
         n = self.unknowns
         covariance = np.asarray(np.linalg.pinv(one.jacobian.T @ one.jacobian), np.float64)
         own = self._drawn(one, covariance) if drawn else covariance[:n, :n]
@@ -344,15 +350,15 @@ class _Model:
         )
 
     def _drawn(self, one: _Solution, covariance: Real) -> Real:
-        """Second moments of the posterior about a solution, [unknowns, unknowns]; linear where the valley is straight.
+        """Return second moments of the posterior about a solution, [unknowns, unknowns]; linear in straight valleys.
 
-        Importance sampling: draws along index and phase, in which the valley is straighter than in thickness.
+        By importance sampling along index and phase, where the valley is straighter than in thickness.
         """
         n, x = self.unknowns, one.x
         to_z = self._straight(x)
         spread = to_z @ covariance @ to_z.T
         spread = spread + np.diag(1e-12 * np.maximum(np.diag(spread), 1e-18))
-        # A wide proposal (Student's t of five degrees); farther than _REACH lies another valley: a rival, no error bar.
+        # A wide proposal (Student's t, five degrees of freedom); beyond _REACH there is another valley: a rival.
         rng, freedom = np.random.default_rng(0), 5.0
         unit = rng.standard_normal((_DRAWS, x.size)) / np.sqrt(rng.chisquare(freedom, (_DRAWS, 1)) / freedom)
         unit = 1.15 * unit[np.sum(unit**2, axis=1) < (_REACH / 1.15) ** 2]
@@ -372,7 +378,7 @@ class _Model:
         return second if np.any(ratio > _BENT) else linear
 
     def _straight(self, x: Real) -> Real:
-        """Derivatives of (eps', eps'', phase in place of thickness, angle) by the unknowns, [n, n]."""
+        """Return derivatives of (eps', eps'', phase instead of thickness, angle) by the unknowns, [n, n]."""
         out = np.eye(x.size)
         if self.sized:
             index = float(np.sqrt(max(x[0] - np.sin(self.theta_rad) ** 2, 1e-3)))
@@ -380,7 +386,7 @@ class _Model:
         return out
 
     def _from_straight(self, x: Real, draws: Real) -> Real:
-        """Unknowns [..., n] at draws (eps', eps'', thickness times index, angle) about x."""
+        """Return unknowns [..., n] at samples (eps', eps'', thickness times index, angle) about x."""
         out = x + draws
         if self.sized:
             sine2 = np.sin(self.theta_rad) ** 2

@@ -1,4 +1,4 @@
-"""Layers of a segment of materials.json: the stack as typed, its fit, and the fit as plain values."""
+"""Layers of a segment of materials.json: parse the stack, fit it, and convert the fit to plain values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _RANGE = re.compile(r"([0-9.eE+]+)\s*-\s*([0-9.eE+]+)")
 
 
 def parse_layer(text: str) -> Layer:
-    """A layer as typed, in one of `LAYER_FORMS`. Raises ValueError for another form."""
+    """Parse a layer in one of `LAYER_FORMS`. Raises ValueError for another form."""
     name, *rest = (part.strip() for part in text.split(","))
     if rest == ["metal"]:
         return Layer(name, METAL)
@@ -63,7 +63,7 @@ def fit_row(
     amplitude_error: float = AMPLITUDE_ERROR,
     theta_std_rad: float = 0.0,
 ) -> LayerFit | None:
-    """The unknown layer of a stack, from a segment of materials.json.
+    """Fit the unknown layer of a stack to a segment of materials.json.
 
     Parameters
     ----------
@@ -72,22 +72,22 @@ def fit_row(
     stack
         Layers in the order the wave meets them, one unknown.
     bands
-        Sub-bands to use; None: those that the segment holds where a thickness is fitted, else the whole sweep.
+        Sub-bands to use; None: those of the segment if a thickness is fitted, else the whole sweep.
     amplitude_error
-        How far |H| may be trusted, relative; 0 leaves it out.
+        Relative standard deviation of |H|; 0: it is not used.
     theta_std_rad
         Standard deviation of the incidence angle.
 
     Returns
     -------
-    None for the metal reference, a segment without a usable ratio, or one that is no plate (noise, several kinds).
+    None for the metal reference, a segment without a usable ratio, or one that is no plate (noise, several materials).
 
     Raises
     ------
     DataError
-        when the segment does not hold so many sub-bands, or there are fewer data than unknowns.
+        if the segment has not so many sub-bands, or there are fewer data than unknowns.
     PolysightError
-        when the stack has not exactly one unknown layer, or a thickness is missing.
+        if the stack has not exactly one unknown layer, or a thickness is missing.
     """
     refused = row.get("refused")
     if row.get("metal_reference") or (refused and refused.get("what") not in NOT_PASSIVE):
@@ -100,13 +100,13 @@ def fit_row(
 
 
 def incidence_std_rad(materials: Mapping[str, Any]) -> float:
-    """Standard deviation of the incidence angle by materials.json, radians; 0 where it does not say."""
-    told = ((materials.get("error_budget") or {}).get("incidence") or {}).get("std_deg")
-    return float(np.radians(told or 0.0))
+    """Return the standard deviation of the incidence angle in materials.json, radians; 0 if it is not there."""
+    std_deg = ((materials.get("error_budget") or {}).get("incidence") or {}).get("std_deg")
+    return float(np.radians(std_deg or 0.0))
 
 
 def layer_content(fit: LayerFit) -> dict[str, Any]:
-    """A fit as plain values for JSON; permittivities as [eps', eps''], lengths in millimetres."""
+    """Return a fit as plain values for JSON; permittivities as [eps', eps''], lengths in millimetres."""
     sized = fit.std_thickness_m > 0
     units = np.array([1.0, 1.0, 1e3])[: 3 if sized else 2]
     covariance = None if fit.covariance is None else (fit.covariance * np.outer(units, units)).tolist()

@@ -1,9 +1,9 @@
 """Stacks of layers: sheets thinner than the wave, sheets on metal, liquids behind a container's wall.
 
-Eq. 3 of the paper sees one interface. A sheet has two, a filled container three, and the wave that returns from the
-ones behind is as strong as the first. Here the whole stack is the model
-(:func:`polysight.host.polarimetry.multilayer`), and the measured quantities are those of the sub-bands of the sweep
-(`Spectrum`, `Bands`). :func:`polysight.host.materials.layer_fit.fit_layer` finds the unknown layer.
+Eq. 3 of the paper holds for one interface. A sheet has two, a filled container three, and the echoes of the rear ones
+are as strong as the first. Here the model is the whole stack (:func:`polysight.host.polarimetry.multilayer`), and the
+data are those of the sub-bands of the sweep (`Spectrum`, `Bands`).
+:func:`polysight.host.materials.layer_fit.fit_layer` fits the unknown layer.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import scipy
 from polysight.host.imaging import window_weights
 from polysight.host.polarimetry import multilayer
 from polysight.shared.config import Chirp
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, PolysightError
 
 Real = npt.NDArray[np.float64]
@@ -42,7 +43,7 @@ class Spectrum:
 
     @classmethod
     def of(cls, chirp: Chirp, bands: int = 1, window: str = "hann") -> Spectrum:
-        """Sub-bands of the linear part of a chirp: windows that overlap by half, as in Welch's method.
+        """Return sub-bands of the linear part of a chirp: windows that overlap by half, as in Welch's method.
 
         One band is the whole linear part under the image's own window
         (:func:`polysight.host.imaging.reduce.reduction`).
@@ -50,14 +51,14 @@ class Spectrum:
         first, last = chirp.linear_samples
         length = 2 * (last - first) / (bands + 1)
         starts = np.linspace(first, last - length, bands)
-        # The sum over all samples of a smooth window is that over a few: inner echoes turn slowly with frequency.
+        # A few frequencies suffice for a smooth window: the phase of inner echoes changes slowly with frequency.
         inside = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES
         weight = window_weights(window, 2 * _FREQUENCIES - 1)[::2]
         frequency = chirp.first_sample_hz + chirp.hz_per_sample * (starts[:, None] + length * inside)
         return cls(frequency, np.tile(weight / weight.sum(), (bands, 1)))
 
     def thinned(self, step: int) -> Spectrum:
-        """Every `step`-th frequency, four at least: enough to find where to start."""
+        """Return every `step`-th frequency, at least four: enough for start values."""
         step = max(1, min(step, self.weight.shape[1] // 4))
         weight = self.weight[:, step // 2 :: step]
         return Spectrum(self.frequency_hz[:, step // 2 :: step], weight / weight.sum(axis=1, keepdims=True))
@@ -65,30 +66,29 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class Bands:
-    """What was measured, one entry for each of K sub-bands.
+    """Measurement in K sub-bands.
 
     Attributes
     ----------
     spectrum
-        The frequencies over which the image of each sub-band sums coherently.
+        Frequencies of the coherent sum in each sub-band's image.
     inverse_ratio
-        complex128 [K]: V / H, metal-referenced, leakage removed. The strong channel is below the line.
+        complex128 [K]: V / H, metal-referenced, leakage removed. The strong channel is in the denominator.
     sigma
         float64 [K]: standard deviation of its real part and of its imaginary part.
     amplitude_h, sigma_h
-        float64 [K] or None: |H| relative to metal and its standard deviation, where it may be trusted (it depends on
-        the size and the place of a patch, the ratio does not).
+        float64 [K] or None: |H| relative to metal and its standard deviation, if it is reliable (unlike the ratio it
+        depends on the size and the place of a patch).
     covariance
         float64 [2 K, 2 K] of the errors of `inverse_ratio`, ordered real, imaginary part of the first band, then of
-        the second: leakage, metal reference and edges are off by the same in all bands, so that differences between
-        bands are known better than each. None: independent, as `sigma` says.
+        the second. Errors of leakage, metal reference and edges are common to all bands, so that differences between
+        bands are known better. None: independent errors by `sigma`.
     common_h
-        Relative standard deviation of a factor of |H| that all bands share; `sigma_h` is beside it.
+        Relative standard deviation of a factor of |H| common to all bands, in addition to `sigma_h`.
     theta_std_rad
         Standard deviation of the incidence angle.
     phase_per_angle
-        How far V / H turns, in radians per radian by which the angle is larger than it was taken for: a plane that is
-        nearer than images were focused on.
+        Phase of V / H in radians per radian of the angle's error, which also means that the plane is out of focus.
     """
 
     spectrum: Spectrum
@@ -107,15 +107,21 @@ class Bands:
             raise PolysightError(
                 f"{len(self.spectrum.frequency_hz)} sub-bands, ratios {k} and deviations {self.sigma.shape} do not fit",
                 "each sub-band has its frequencies, one ratio and one deviation",
+                code=ErrorCode.MISMATCH,
             )
         if not (np.all(np.isfinite(self.inverse_ratio)) and np.all(self.sigma > 0)):
             raise DataError(
-                "a sub-band holds no usable ratio", "it was masked, or its deviation is zero", "leave that sub-band out"
+                "a sub-band has no usable ratio",
+                "it was masked, or its deviation is zero",
+                "leave that sub-band out",
+                code=ErrorCode.VALUE_INVALID,
             )
         if (self.amplitude_h is None) != (self.sigma_h is None):
-            raise PolysightError("bands: amplitude_h and sigma_h go together")
+            raise PolysightError("bands: amplitude_h and sigma_h go together", code=ErrorCode.KEY_MISSING)
         if self.covariance is not None and self.covariance.shape != (2 * k[0], 2 * k[0]):
-            raise PolysightError(f"bands: a covariance {self.covariance.shape} of {k[0]} complex ratios")
+            raise PolysightError(
+                f"bands: a covariance {self.covariance.shape} of {k[0]} complex ratios", code=ErrorCode.MISMATCH
+            )
 
     @property
     def data_covariance(self) -> Real:
@@ -130,7 +136,7 @@ class Bands:
 
 
 MOST_PERMITTIVITY = 1000.0
-"""Of a layer that is given as known."""
+"""Largest permittivity and loss of a known layer."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +152,7 @@ class Layer:
     thickness_m
         None: a half space (only the last layer).
     thickness_range_m
-        Of the unknown layer: fit the thickness too, within this range; `thickness_m` is not used then.
+        Range for fitting the unknown layer's thickness too; `thickness_m` is not used then.
     """
 
     name: str
@@ -156,7 +162,7 @@ class Layer:
 
 
 def predict(stack: Sequence[Layer], spectrum: Spectrum, theta_rad: float) -> tuple[Complex, Real]:
-    """V / H and |H| of a known stack in each sub-band, relative to metal.
+    """Return V / H and |H| of a known stack in each sub-band, relative to metal.
 
     A sub-band's image is the weighted coherent sum over its frequencies: r_s and r_p are averaged before their ratio.
 
@@ -165,7 +171,7 @@ def predict(stack: Sequence[Layer], spectrum: Spectrum, theta_rad: float) -> tup
     stack
         Layers in the order the wave meets them; air follows the last unless it is a half space.
     spectrum
-        Of K sub-bands.
+        Frequencies of K sub-bands.
     theta_rad
         Incidence angle in air.
 
@@ -177,11 +183,13 @@ def predict(stack: Sequence[Layer], spectrum: Spectrum, theta_rad: float) -> tup
     Raises
     ------
     PolysightError
-        when a layer is unknown, or one before the last has no thickness.
+        if a layer is unknown, or one before the last has no thickness.
     """
     unknown = [layer.name for layer in stack if layer.permittivity is None]
     if unknown:
-        raise PolysightError(f"layers without permittivity: {unknown}", "nothing is to be fitted here")
+        raise PolysightError(
+            f"layers without permittivity: {unknown}", "nothing is fitted here", code=ErrorCode.KEY_MISSING
+        )
     check_stack(stack)
     eps: list[npt.ArrayLike] = [complex(layer.permittivity or 1.0) for layer in stack]
     thick: list[npt.ArrayLike] = [np.inf if x.thickness_m is None else x.thickness_m for x in stack]
@@ -191,7 +199,7 @@ def predict(stack: Sequence[Layer], spectrum: Spectrum, theta_rad: float) -> tup
 def average(
     eps: Sequence[npt.ArrayLike], thickness: Sequence[npt.ArrayLike], spectrum: Spectrum, theta_rad: npt.ArrayLike
 ) -> tuple[Complex, Real]:
-    """V / H and |H| [..., K] of stacks, each entry a number or [..., 1, 1]; parameters else as :func:`predict`."""
+    """Return V / H and |H| [..., K] of stacks; entries are numbers or [..., 1, 1]; else as :func:`predict`."""
     both = multilayer(eps, thickness, spectrum.frequency_hz, theta_rad)
     r_s, r_p = (np.asarray((r * spectrum.weight).sum(axis=-1), np.complex128) for r in both)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -206,6 +214,7 @@ def check_stack(stack: Sequence[Layer]) -> None:
             f"layers without thickness before the last: {open_ended}" if stack else "an empty stack",
             "only the last layer may be a half space",
             "give each layer its thickness",
+            code=ErrorCode.KEY_MISSING,
         )
     for layer in stack:
         eps = layer.permittivity
@@ -215,5 +224,6 @@ def check_stack(stack: Sequence[Layer]) -> None:
             raise PolysightError(
                 f"{layer.name}: permittivity {eps.real:g}, loss {-eps.imag:g}",
                 f"no passive material has less than 1 or a negative loss; more than {MOST_PERMITTIVITY:g} is a metal",
-                "eps' - j eps'' is given as two numbers from 1 and from 0 on; metal as the word metal",
+                "give eps' of at least 1 and eps'' of at least 0; a metal layer as the word metal",
+                code=ErrorCode.VALUE_INVALID,
             )

@@ -1,8 +1,8 @@
-"""The patches' ratios in sub-bands of the sweep: what tells a thin layer from a thick one.
+"""Ratios of the patches in sub-bands of the sweep, to separate thin layers from thick ones.
 
-The error of a ratio has a part that all sub-bands of a patch share (leakage, metal reference, edges and tilt) and a
-part of its own in each (noise, sidelobes). Differences between sub-bands are therefore known better than each of them:
-their full covariance is recorded.
+The error of a ratio has a part common to all sub-bands of a patch (leakage, metal reference, edges and tilt) and a part
+of its own in each (noise, sidelobes). Differences between sub-bands are therefore known better than each of them: their
+full covariance is stored.
 """
 
 from __future__ import annotations
@@ -25,26 +25,27 @@ from polysight.host.materials.permittivity import inverse_spread, median_ratio
 from polysight.host.materials.result import MaterialsResult
 from polysight.host.polarimetry import PlaneReference
 from polysight.shared.config import Chirp
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 Image = npt.NDArray[np.complexfloating]
 AMPLITUDE_ERROR = 0.1
-"""Relative standard deviation of |H| of a patch: its size, its edges and its tilt are in it, and in no ratio."""
+"""Relative standard deviation of |H| of a patch by its size, edges and tilt, which do not affect ratios."""
 BAND_SHARE = 0.75
-"""Error of V / H of one sub-band beside the others, per spread of the pixels about the whole sweep's V / H.
+"""Error of V / H of one sub-band relative to the others, per spread of the pixels about the whole sweep's V / H.
 
 All of these constants are measured in simulated scenes of layered plates (benchmarks/layers).
 """
 BAND_STD = 5e-4
-"""The same that is there however even the pixels are."""
+"""Least value of that error, even with uniform pixels."""
 BAND_AMPLITUDE_STD = 3e-3
-"""Relative error of |H| of one sub-band beside the others."""
+"""Relative error of |H| of one sub-band relative to the others."""
 LAYERED_STD_RAD = 2.5e-3
-"""Error of the incidence angle where plates are layered: echoes from inside make their plane look farther, by 2.5 mm in
-simulated scenes of nothing else."""
+"""Error of the incidence angle with layered plates: echoes from inside make their plane look farther, by 2.5 mm in
+simulated scenes of layered plates only."""
 PHASE_PER_ANGLE = 4.5
-"""Radians by which V / H turns per radian of that error: H and V are lit from different points of a plane that images
-are not focused on. Measured in the same scenes."""
+"""Phase of V / H in radians per radian of that error: H and V are illuminated from different points of a plane that is
+out of focus. Measured in the same scenes."""
 
 
 def with_bands(
@@ -54,9 +55,9 @@ def with_bands(
     optics: Optics,
     plane: PlaneReference | None = None,
 ) -> MaterialsResult:
-    """The same result with each patch's ratios in sub-bands; as it is where no sub-bands were imaged.
+    """Return the result with each patch's ratios in sub-bands; unchanged without sub-bands.
 
-    `plane` is metal scanned on its own, imaged in the same sub-bands. Parameters and errors as :func:`band_rows`.
+    `plane` is metal scanned separately, imaged in the same sub-bands. Parameters and errors as :func:`band_rows`.
     """
     if not bands:
         return found
@@ -72,7 +73,7 @@ def band_rows(
     smooth_px: float,
     references: Sequence[PlaneReference] | None = None,
 ) -> dict[int, list[dict[str, Any]]]:
-    """Each patch's ratio in each sub-band, ready for materials.json.
+    """Return each patch's ratio in each sub-band, for materials.json.
 
     Parameters
     ----------
@@ -81,27 +82,28 @@ def band_rows(
     bands, images
         Sub-bands and their image pairs, [K].
     leakage, smooth_px
-        As for the whole sweep.
+        Those of the whole sweep.
     references
-        Metal scanned on its own, one for each sub-band; None: the metal region of the scene.
+        Metal scanned separately, for each sub-band; None: the metal region of the scene.
 
     Returns
     -------
     Patch number to K dicts: first_hz, last_hz, ratio {real, imag} or null, inverse_ratio_std, own_std (the part that
     the other sub-bands do not share), amplitude_h, covariance [2][2 K] of the real and the imaginary part of 1 / ratio
-    with those of all sub-bands (real, imaginary part of the first, of the second, ...). Null where the sub-band shows
-    nothing of the patch, or nothing of the metal: its footprint is another than the whole sweep's.
+    with those of all sub-bands (real, imaginary part of the first, of the second, ...). Null if the sub-band shows no
+    pixel of the patch or of the metal: its footprint differs from the whole sweep's.
 
     Raises
     ------
     DataError
-        when the reference was not imaged in these sub-bands.
+        if the reference was not imaged in these sub-bands.
     """
     if references is not None and len(references) != len(bands):
         raise DataError(
-            f"the metal reference holds {len(references)} sub-bands, not {len(bands)}",
+            f"the metal reference has {len(references)} sub-bands, not {len(bands)}",
             "a sub-band is divided by metal in the same part of the sweep",
             f"give a reference with --bands {len(bands)}",
+            code=ErrorCode.MISMATCH,
         )
     parts: dict[int, list[dict[str, Any]]] = {r.patch.label: [] for r in found.patches}
     for k, (band, made) in enumerate(zip(bands, images, strict=True)):
@@ -111,14 +113,14 @@ def band_rows(
             at = r.patch.interior & made.valid
             whole = (found.h[at], found.v[at])
             parts[r.patch.label].append(
-                {"first_hz": band.first_hz, "last_hz": band.last_hz, **_seen(h[at], v[at], whole, error)}
+                {"first_hz": band.first_hz, "last_hz": band.last_hz, **_measure_band(h[at], v[at], whole, error)}
             )
     common = {r.patch.label: measure_patch(r.patch, found.h, found.v, 0.0).std for r in found.patches}
     return {label: _with_covariance(rows, found, common[label]) for label, rows in parts.items()}
 
 
 def _with_covariance(rows: list[dict[str, Any]], found: MaterialsResult, common: float) -> list[dict[str, Any]]:
-    """One patch's sub-bands with the covariance of their errors; `common` is the deviation that its place brings."""
+    """Add the covariance of the errors to one patch's sub-bands; `common` is the deviation common to all of them."""
     if any(row["ratio"] is None for row in rows) or not math.isfinite(common):
         return [row | {"covariance": None} for row in rows]
     inverse = np.array([1 / complex(row["ratio"]["real"], row["ratio"]["imag"]) for row in rows])
@@ -140,11 +142,11 @@ def _relative_to_metal(
     smooth_px: float,
     reference: PlaneReference | None,
 ) -> tuple[Image, Image, float]:
-    """H and V of a sub-band, [ny, nx], relative to metal, and the reference's relative standard error.
+    """Return H and V of a sub-band, [ny, nx], relative to metal, and the reference's relative standard error.
 
-    Not numbers where the sub-band shows no metal.
+    All are NaN if the sub-band shows no metal.
     """
-    metal = replace(found.metal, mask=found.metal.mask & made.valid)  # elsewhere the images are 0, and not metal
+    metal = replace(found.metal, mask=found.metal.mask & made.valid)
     if not metal.mask.any():
         nothing = np.full(made.valid.shape, complex(np.nan, np.nan))
         return nothing, nothing, float("nan")
@@ -155,8 +157,8 @@ def _relative_to_metal(
     return h, v, reference_spread(h, v, metal, reference)
 
 
-def _seen(h: Image, v: Image, whole: tuple[Image, Image], error: float) -> dict[str, Any]:
-    """Ratio of a patch's pixels [n] in a sub-band, its standard deviations, and |H|; null where they do not tell.
+def _measure_band(h: Image, v: Image, whole: tuple[Image, Image], error: float) -> dict[str, Any]:
+    """Return ratio of a patch's pixels [n] in a sub-band, its standard deviations, and |H|; null without usable pixels.
 
     `whole` are H and V of the same pixels of the whole sweep, `error` the relative error of the metal reference.
     """
@@ -181,37 +183,37 @@ def bands_of_row(
     amplitude_error: float = AMPLITUDE_ERROR,
     theta_std_rad: float = 0.0,
 ) -> Bands | None:
-    """What :func:`polysight.host.materials.layer_fit.fit_layer` needs of a row of materials.json.
+    """Return the input of :func:`polysight.host.materials.layer_fit.fit_layer` from a row of materials.json.
 
     Parameters
     ----------
     row
         One segment.
     chirp
-        Of the scan.
+        Chirp of the scan.
     count
-        Sub-bands to use: those that were recorded with it, or 1: the whole sweep.
+        Number of sub-bands: as in the row, or 1 for the whole sweep.
     amplitude_error
-        Relative standard deviation of |H|, the same error in all sub-bands; 0: |H| is not used.
+        Relative standard deviation of |H|, common to all sub-bands; 0: |H| is not used.
     theta_std_rad
         Standard deviation of the incidence angle.
 
     Returns
     -------
-    None when the segment has no usable ratio.
+    None if the segment has no usable ratio.
 
     Raises
     ------
     DataError
-        when the segment was not processed with so many sub-bands.
+        if the segment was not processed with so many sub-bands.
     """
     parts = [row] if count == 1 else list(row.get("bands") or ())
     if len(parts) != count:
-        there = f"{len(parts)} sub-bands" if parts else "no sub-bands"
         raise DataError(
-            f"segment {row.get('label')} holds {there}, not {count}",
+            f"segment {row.get('label')} has {len(parts) or 'no'} sub-bands, not {count}",
             "sub-bands are imaged from the recorded rows",
             f"process the scan again with --bands {count}",
+            code=ErrorCode.MISMATCH,
         )
     if any(p.get("ratio") is None or not p.get("inverse_ratio_std") for p in parts):
         return None
@@ -222,7 +224,7 @@ def bands_of_row(
     if count > 1 and all(p.get("covariance") for p in parts):
         covariance = np.array([line for p in parts for line in p["covariance"]], np.float64)
     else:
-        # Products of earlier releases do not say what the bands share: K of them know no more than one.
+        # Products of earlier releases have no covariance: K bands are then no better than one.
         sigma = np.sqrt(count) * sigma
     turn = (float(np.hypot(theta_std_rad, LAYERED_STD_RAD)), PHASE_PER_ANGLE) if theta_std_rad else (0.0, 0.0)
     if not amplitude_error or any(a is None for a in level):

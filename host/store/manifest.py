@@ -82,7 +82,7 @@ def decode_line(line: bytes) -> Fact | None:
 def parse(raw: bytes) -> Manifest:
     """Read a manifest's bytes."""
     lines = raw.split(b"\n")
-    tail = lines.pop()  # what follows the last line end
+    tail = lines.pop()  # an incomplete last line
     found, due = Manifest(torn=bool(tail)), 0  # due: one more than the last count that was read
     for number, line in enumerate(lines, 1):
         fact = decode_line(line)

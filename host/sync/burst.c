@@ -1,6 +1,6 @@
-/* Burst alignment, one position after another: `align.align_in_numpy` in one pass over the card's words. The words of a
-   position (64 KB) are read from memory once and stay in the second-level cache, from where a chirp at a time is
-   unpacked into the first-level cache. What is estimated and why: `align.py` and `numpy_passes.py`. */
+/* Burst alignment, position by position: `align.align_in_numpy` in one pass over the card's words. The words of a
+   position (64 KB) are read from memory once and stay in the second-level cache; each chirp is unpacked from there into
+   the first-level cache. The method is described in `align.py` and `numpy_passes.py`. */
 #include "passes.h"
 
 #define REFERENCES 4       /* `align.REFERENCES` */
@@ -44,7 +44,7 @@ static void find_taps(const Equaliser *e, double frequency, Complex *taps)
     taps[2] = (Complex){(both.re + apart.re) / 2, (both.im + apart.im) / 2};
 }
 
-/* Of one position, for each chirp. */
+/* Work arrays of one position, per chirp. */
 typedef struct {
     int *order;
     double *frequency, *found, *coherence, *sorted;
@@ -53,7 +53,7 @@ typedef struct {
     uint8_t *usable, *second_half;
 } Chirps;
 
-/* What is handed out, [position][chirp] unless said otherwise. */
+/* Results, [position][chirp] unless noted. */
 typedef struct {
     float *mean, *halves; /* complex [position][RX][sample] and [position][2][RX][block] */
     double *centre;       /* [position] */
@@ -62,7 +62,7 @@ typedef struct {
     int32_t *peak;
 } Aligned;
 
-/* `align._coherent`: chirps that match as well as the median one of their position does. */
+/* `align._coherent`: usable chirps with at least GOOD of the median coherence of their position. */
 static void choose_coherent(const double *coherence, const uint8_t *usable, int chirps, double *sorted, uint8_t *good)
 {
     int count = 0;
@@ -77,13 +77,13 @@ static void choose_coherent(const double *coherence, const uint8_t *usable, int 
         good[k] = usable[k] && coherence[k] >= GOOD * sorted[(count - 1) / 2];
 }
 
-/* `align._against_one`: offsets from one chirp; from another one where the first matches few of the others. Returns the
+/* `align._against_one`: offsets relative to one chirp; try another one if it matches few of the others. Returns the
    middle of the signal's band. */
 static double against_one(Work *w, Chirps *c, const uint8_t *valid, int full_scale, const int32_t *peak)
 {
     int chirps = w->chirps, reference = 0, usable = 0, at = 0;
     double best_sum = 0, best = 0, centre = 0, noise = 4 / sqrt((double)RX * w->n);
-    for (int wanted = 1; wanted >= 0; wanted--) /* the valid ones, first to last */
+    for (int wanted = 1; wanted >= 0; wanted--) /* valid chirps first, in order */
         for (int k = 0; k < chirps; k++)
             if ((valid[k] != 0) == wanted)
                 c->order[at++] = k;
@@ -112,11 +112,11 @@ static double against_one(Work *w, Chirps *c, const uint8_t *valid, int full_sca
     }
     for (int k = 0; k < chirps; k++)
         best = c->coherence[k] > best ? c->coherence[k] : best;
-    c->coherence[reference] = c->usable[reference] ? best : 0; /* as good as its best match */
+    c->coherence[reference] = c->usable[reference] ? best : 0; /* the reference is as good as its best match */
     return centre;
 }
 
-/* Values less their mean over the good chirps, halved; zero where not good. */
+/* Subtract the mean over the good chirps and halve the values; zero where not good. */
 static void centre_errors(double *values, const uint8_t *good, int chirps, int count)
 {
     double mean = 0;
@@ -150,7 +150,7 @@ static void align_position(Work *w, Chirps *c, const Equaliser *e, const int16_t
         count += out.good[k];
     }
 
-    /* Each chirp against the sum of the others: what it differs by from their mean, it differs by less from all's. */
+    /* Each chirp against the sum of the others; its difference from the mean of all chirps is smaller. */
     double level = against_others(w, out.frequency, c->taps, e->taps, out.good, c->found, c->found_product,
                                   c->energy, out.frequency_error, out.phase_error);
     level /= count > 1 ? (double)count * count : 1;
@@ -164,7 +164,7 @@ static void align_position(Work *w, Chirps *c, const Equaliser *e, const int16_t
         out.phase[k] = remainder(out.phase[k] + shift, TURN);
         out.frequency[k] += correction;
         c->frequency[k] += correction;
-        /* What is filtered and then turned is what is turned and then filtered by turned taps. */
+        /* Filtering and then turning equals turning and then filtering with turned taps. */
         for (int t = 0; t < e->taps; t++) {
             Complex turn = cis(FOLD * (t - e->taps / 2) * correction - shift / TURN);
             c->taps[k * e->taps + t] = times(c->taps[k * e->taps + t], turn);
@@ -188,7 +188,7 @@ static void align_position(Work *w, Chirps *c, const Equaliser *e, const int16_t
     centre_errors(out.phase_error, out.good, chirps, count);
 }
 
-/* Room for some values of a size, in floats of `memory`, on cache lines of its own; only counted where memory is NULL. */
+/* Reserve space for values of a size in `memory` on its own cache lines; only count it if memory is NULL. */
 static void *room(float *memory, size_t *used, size_t count, size_t size)
 {
     void *here = memory ? memory + *used : NULL;
@@ -196,7 +196,7 @@ static void *room(float *memory, size_t *used, size_t count, size_t size)
     return here;
 }
 
-/* Lays all arrays out in memory; returns the floats it needs. */
+/* Assign all arrays to memory; return the number of floats needed. */
 static size_t lay_out(Work *w, Chirps *c, int taps, float *memory)
 {
     size_t used = 0, row = (size_t)LANES * (w->samples + 2 * FOLD), chirps = w->chirps, size = w->size;
@@ -238,7 +238,7 @@ static size_t lay_out(Work *w, Chirps *c, int taps, float *memory)
     return used;
 }
 
-/* What does not change from one position to the next. */
+/* Compute tables that are the same for all positions. */
 static void prepare(Work *w)
 {
     roots_of_unity(w->size, w->root_c, w->root_s);
@@ -253,8 +253,8 @@ static void prepare(Work *w)
 }
 
 /* `align.align_row` for four RX. words: int16 [position][chirp][sample][2][RX]; valid [position][chirp]; [a, b): linear
-   samples, a whole number of blocks; size: of the transform; filter: sample rate, reach, whether IF is signed, corners;
-   equalise: whether to undo it. Returns 0, or 1 when there is no memory. */
+   samples, a whole number of blocks; size: of the transform; filter: sample rate, reach, IF signed, corners; equalise:
+   compensate the filter. Returns 0, or 1 if there is not enough memory. */
 int NAME(align)(const int16_t *words, const uint8_t *valid, int positions, int chirps, int samples, int a, int b,
                 int size, int full_scale, const double *filter, int corners, int equalise, float *mean, float *halves, double *centre,
                 uint8_t *good, double *frequency, double *phase, double *amplitude, double *gain, double *error,

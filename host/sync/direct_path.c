@@ -1,10 +1,10 @@
-/* The direct path of every position: `numpy_direct_path.py` in C, with its names. Complex arrays are handed over as real
-   and imaginary part side by side. */
+/* Direct path of every position: `numpy_direct_path.py` in C, with the same names. Complex arrays have real and imaginary
+   parts interleaved. */
 #include "signal.h"
 
 #define STEPS 3 /* `numpy_direct_path.STEPS` */
 
-/* Sum of a position's two halves, [rx][block], times weights, into parts x and y. */
+/* Sum of a position's two halves, [rx][block], times weights, as real part x and imaginary part y. */
 static inline void weighted(const float *restrict halves, const float *restrict weights, int count, float *restrict x,
                             float *restrict y)
 {
@@ -17,8 +17,8 @@ static inline void weighted(const float *restrict halves, const float *restrict 
     }
 }
 
-/* Medians of the magnitudes of sixteen spectra of `size` powers, an even number: the bits of a positive number are in its
-   order, so the upper one of the middle two is found bit by bit, by counting the smaller ones. */
+/* Medians of the magnitudes of sixteen spectra of `size` powers, an even number. The bits of positive floats sort like
+   the numbers, so the upper of the two middle values is found bit by bit, by counting smaller ones. */
 static inline void medians(const int32_t *restrict powers, int size, double *restrict median)
 {
     int32_t upper[LANES] = {0}, lower[LANES] = {0}, tried[LANES], count[LANES] = {0};
@@ -46,7 +46,7 @@ static inline void medians(const int32_t *restrict powers, int size, double *res
     }
 }
 
-/* `numpy_direct_path.search` of one spectrum: power [size]. */
+/* `numpy_direct_path.search` for one spectrum: power [size]. */
 static void choose_peaks(const float *power, int size, int nearest, int farthest, float comparable, int32_t *first,
                          int32_t *second)
 {
@@ -68,9 +68,9 @@ static void choose_peaks(const float *power, int size, int nearest, int farthest
     *second = is_object ? top : lower;
 }
 
-/* halves: [position][2][rx][block]; weights [rx][block]: beam, steering and window; bins of the object beyond the direct
-   path: nearest..farthest. Gives the bins [2][position] and the median magnitude of a spectrum. Returns 0, or 1 when there
-   is no memory. */
+/* `numpy_direct_path.search`. halves: [position][2][rx][block]; weights [rx][block]: beam, steering and window; the
+   object is nearest..farthest bins above the direct path. Results: bins [2][position], median magnitude [position].
+   Returns 0, or 1 if there is not enough memory. */
 int NAME(search)(const float *halves, const float *weights, int positions, int blocks, int size, int nearest,
                  int farthest, const double *comparable, int32_t *bins, double *median)
 {
@@ -112,7 +112,7 @@ int NAME(search)(const float *halves, const float *weights, int positions, int b
     return 0;
 }
 
-/* A, A w and with a third row A q at a frequency: sums over the blocks of g [row][block], demodulated. */
+/* Estimates A, A w and (third row) A q at a frequency: demodulated sums over the blocks of g [row][block]. */
 static void estimate_at(const float *g_re, const float *g_im, int rows, int blocks, double frequency, float *c, float *s,
                         Complex *estimate)
 {
@@ -128,7 +128,7 @@ static void estimate_at(const float *g_re, const float *g_im, int rows, int bloc
     }
 }
 
-/* `numpy_direct_path.refine`: steering [rx][block], estimator [row][rx][block]; frequency [position] is changed. */
+/* `numpy_direct_path.refine`: steering [rx][block], estimator [row][rx][block]; changes frequency [position]. */
 int NAME(refine)(const float *halves, const float *steering, const float *estimator, int positions, int blocks, int rows,
                  double *frequency, double *estimates, double *steps)
 {
@@ -180,8 +180,8 @@ static inline void turned(const float *restrict values, const float *restrict we
     }
 }
 
-/* `numpy_direct_path.turn`: mean [position][rx][sample] into out [rx][position][sample], zero where not found, and halves
-   into halves_out; phase in turns, origin: the sample whose phase it is. */
+/* `numpy_direct_path.turn`: mean [position][rx][sample] to out [rx][position][sample], zero where not found, and halves
+   to halves_out; phase in turns at the sample origin. */
 int NAME(turn)(const float *mean, const float *halves, const float *steering, const float *folded_steering,
                int positions, int samples, int blocks, const double *origin, const double *frequency,
                const double *phase, const uint8_t *found, float *out, float *halves_out)

@@ -21,7 +21,8 @@ second of the two strongest peaks is tried. Nothing is smoothed.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, cast
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -35,6 +36,9 @@ from polysight.shared.config import Board, Chirp, Instrument
 from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
+Loops = compiled.Library | ModuleType
+"""The compiled loops, or `numpy_direct_path`, which has the same functions."""
+
 _FFT = 256  # size of the search FFT, over averaged samples
 _SPREAD_M = 0.1  # standard deviation in x and y of the echoes' origin, around the mirror point
 _GAIN_SPREAD = 0.3  # relative gain and phase differences of the RX that the nulls tolerate
@@ -42,38 +46,7 @@ _NOISE = 1e-2  # noise power of a sample relative to an echo as strong as the di
 _COMPARABLE = 0.35  # a second peak this strong, one object distance below the first, is the direct path
 _LOST = 0.3  # smallest amplitude of a direct path, relative to the row's median
 _OUTLIER = 5.0  # standard deviations from the row's amplitude
-_C64, _F64 = NDArray[np.complex64], NDArray[np.float64]
 _PRESENT = 30.0  # smallest power of a direct path relative to the noise; noise reaches 12 once in 100,000 positions
-
-
-class Loops(Protocol):
-    """Interface of `numpy_direct_path` and `compiled.Library`; documented in the former."""
-
-    def search(
-        self, halves: _C64, weights: _C64, size: int, object_bins: tuple[int, int], comparable: float
-    ) -> tuple[NDArray[np.int32], _F64]:
-        """Find the bins of the direct path and of the second candidate."""
-        ...
-
-    def refine(
-        self, halves: _C64, steering: _C64, estimator: _C64, frequency: _F64
-    ) -> tuple[_F64, NDArray[np.complex128], _F64]:
-        """Refine frequencies; return frequency, estimate and last step."""
-        ...
-
-    def turn(
-        self,
-        mean: _C64,
-        halves: _C64,
-        steering: _C64,
-        folded_steering: _C64,
-        origin: float,
-        frequency: _F64,
-        phase: _F64,
-        found: NDArray[np.bool_],
-    ) -> tuple[_C64, _C64]:
-        """Remove the direct path's frequency and phase from samples and halves."""
-        ...
 
 
 class DirectPath(NamedTuple):
@@ -203,7 +176,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     by
         Its loops: compiled or `numpy_direct_path`, with equal results; None: compiled where that is possible.
     """
-    loops = by or (compiled.library() if len(path.beam) == compiled.RX else None) or cast(Loops, numpy_direct_path)
+    loops = by or (compiled.library() if len(path.beam) == compiled.RX else None) or numpy_direct_path
     a, b = whole_blocks(chirp.linear_samples)
     n = (b - a) // FOLD
     usable: NDArray[np.bool_] = np.any(aligned.good, axis=1)
@@ -251,7 +224,7 @@ def _try_others(
     how: tuple[Loops, NDArray[np.complex64], NDArray[np.complex64]],
     *found: NDArray[np.generic],
 ) -> None:
-    """Where the amplitude is an outlier in its row, use the second peak if it is not; changes `found` in place.
+    """Use the second peak where the amplitude is an outlier in its row; changes `found` in place.
 
     `how` are the loops, the steering and the estimator; `found` are frequency, estimate and last step from `refine`.
     An outlier is beyond `_OUTLIER` standard deviations, estimated from the median absolute deviation of the row.

@@ -1,5 +1,5 @@
-/* The three passes over a burst's words, `numpy_passes.py` in C: for the whole burst of one position at a time. Words are
-   int16 [chirp][sample][2][RX]; x + j y are a chirp's samples, `signal.h` says in which order. */
+/* Three passes over the words of a burst, `numpy_passes.py` in C, for one position at a time. Words are int16
+   [chirp][sample][2][RX]; x + j y are the samples of a chirp, in the order described in `signal.h`. */
 #ifndef PASSES_H
 #define PASSES_H
 
@@ -8,21 +8,21 @@
 #define BAND_BINS 9 /* `numpy_passes.BAND_BINS` */
 #define PARTS 8     /* `tone._BLOCKS` */
 
-/* Sizes, tables, and memory to work in. */
+/* Sizes, tables and work arrays. */
 typedef struct {
     int chirps, samples, a, b; /* linear samples [a, b) */
-    int n, blocks, size;       /* of them, of their blocks, of the transform that seeks a tone */
+    int n, blocks, size;       /* number of linear samples, of blocks; size of the transform */
     int parts, edges[PARTS + 1];
     double part_times[PARTS];
-    int16_t *i, *q; /* the burst's, I and Q apart: [chirp][sample][RX] each */
+    int16_t *i, *q; /* I and Q of the burst: [chirp][sample][RX] each */
     float *root_c, *root_s, *phase_c, *phase_s;
-    float *one_re, *one_im, *row_re, *row_im, *re, *im; /* one chirp, sixteen behind each other, sixteen across */
+    float *one_re, *one_im, *row_re, *row_im, *re, *im; /* one chirp; sixteen records in sequence; sixteen interleaved */
     float *spare, *folded_re, *folded_im, *all_re, *all_im, *total;
     double *power, *smooth, *sums, *newton;
     int *bin, *place;
 } Work;
 
-/* Products of a chirp x + j y with the conjugate of u + j v, of every RX; returns the energy of the chirp. */
+/* Multiply a chirp i + j q by the conjugate of k + j l for every RX; return the energy of the chirp. */
 static inline float correlate(const int16_t *restrict i, const int16_t *restrict q, const int16_t *restrict k,
                               const int16_t *restrict l, float *restrict re, float *restrict im, int count)
 {
@@ -36,14 +36,14 @@ static inline float correlate(const int16_t *restrict i, const int16_t *restrict
     return energy;
 }
 
-/* Sums over the RX. */
+/* Sum over the RX. */
 static inline void over_rx(const float *restrict values, float *restrict sums, int samples)
 {
     for (int n = 0; n < samples; n++)
         sums[n] = (values[4 * n] + values[4 * n + 1]) + (values[4 * n + 2] + values[4 * n + 3]);
 }
 
-/* Four records, one behind the other, into one that holds their values in turn. */
+/* Interleave four records that are stored one after the other. */
 static inline void in_turn(const float *restrict values, float *restrict out, int quarter)
 {
     for (int i = 0; i < quarter; i++) {
@@ -54,7 +54,7 @@ static inline void in_turn(const float *restrict values, float *restrict out, in
     }
 }
 
-/* Records [LANES][n] in the order [n][LANES], with zeros behind them up to [size][LANES]. */
+/* Transpose records [LANES][n] to [n][LANES], padded with zeros to [size][LANES]. */
 static inline void interleave(const float *restrict records, float *restrict spare, float *restrict out, int n,
                               int size)
 {
@@ -63,7 +63,7 @@ static inline void interleave(const float *restrict records, float *restrict spa
     memset(out + LANES * n, 0, sizeof *out * LANES * (size - n));
 }
 
-/* Place of the strongest bin of each of sixteen spectra. */
+/* Index of the strongest bin of each of sixteen spectra. */
 static inline void strongest(const float *restrict re, const float *restrict im, int size, int32_t *restrict at)
 {
     float best[LANES];
@@ -82,7 +82,7 @@ static inline Complex bin_value(const float *re, const float *im, int place)
     return (Complex){re[LANES * place], im[LANES * place]};
 }
 
-/* `tone.strongest`: the tone whose strongest bin is at a place of a spectrum; the frequency in cycles a sample. */
+/* `tone.strongest`: the tone at the strongest bin of a spectrum; frequency in cycles per sample. */
 static inline Complex interpolated(const Work *w, const float *re, const float *im, int at, double *frequency)
 {
     int size = w->size, top = w->bin[at];
@@ -96,7 +96,7 @@ static inline Complex interpolated(const Work *w, const float *re, const float *
     return times(peak, cis(whole * (w->n - 1) / 2));
 }
 
-/* Middle of the band that holds the signal of linear samples x + j y, cycles a sample 0..1. */
+/* Middle of the signal's band in linear samples x + j y, cycles per sample 0..1. */
 static double centre_of_band(Work *w, const int16_t *restrict x, const int16_t *restrict y)
 {
     int n = w->n, size = w->size, width = BAND_BINS * size / n / 2, top = 0;
@@ -116,12 +116,12 @@ static double centre_of_band(Work *w, const int16_t *restrict x, const int16_t *
         }
         w->power[w->bin[i]] = power;
     }
-    for (int box = 0; box < 3; box++) { /* three boxes make a bell */
+    for (int box = 0; box < 3; box++) { /* three box filters are nearly Gaussian */
         double sum = 0, *other = w->smooth;
         for (int i = 0; i < width; i++)
             sum += w->power[i % size];
         for (int i = 0; i < size; i++) {
-            w->smooth[i] = sum; /* of the box that begins here */
+            w->smooth[i] = sum; /* sum of the box that starts here */
             sum += w->power[(i + width) & (size - 1)] - w->power[i];
         }
         w->smooth = w->power;
@@ -158,7 +158,7 @@ static double match(Work *w, int reference, double *frequency, Complex *product,
     return centre_of_band(w, u, v);
 }
 
-/* Newton's method on the periodograms of records [part][record], `tone.refine`; the frequency in cycles a sample. */
+/* Newton's method on the periodograms of records [part][record], `tone.refine`; frequency in cycles per sample. */
 static void newton(const double *restrict re, const double *restrict im, const double *restrict t, int parts,
                    int count, int steps, double *restrict f, Complex *restrict tone, double *restrict s)
 {
@@ -192,8 +192,8 @@ static void newton(const double *restrict re, const double *restrict im, const d
     }
 }
 
-/* Continue the `count` values that begin at signal + s by s to either side, by the parabola through three,
-   `high_pass_filter.shifted`. */
+/* Extrapolate the `count` values that start at signal + s by s values to either side with the parabola through three
+   values, `high_pass_filter.shifted`. */
 static inline void extend(float *signal, int count, int s)
 {
     float *end = signal + s + count;
@@ -203,7 +203,7 @@ static inline void extend(float *signal, int count, int s)
     }
 }
 
-/* Add a signal, extended by s values, through one tap or three, s values apart. */
+/* Filter a signal, extended by s values, with one or three taps at a spacing of s, and add it. */
 static inline void add_filtered(const float *restrict re, const float *restrict im, const Complex *taps, int count, int s,
                                 float *restrict to_re, float *restrict to_im, int values)
 {
@@ -223,8 +223,8 @@ static inline void add_filtered(const float *restrict re, const float *restrict 
     }
 }
 
-/* A chirp's linear samples x + j y mixed down by exp(-j 2 pi frequency (n - middle)) and averaged over every
-   FOLD samples, into [block][RX] with one block of room at either end. */
+/* Mix a chirp's linear samples x + j y by exp(-j 2 pi frequency (n - middle)) and average every FOLD samples, to
+   [block][RX] with one spare block at either end. */
 static inline void mix_and_fold(Work *w, const int16_t *restrict x, const int16_t *restrict y, double frequency,
                                 float *restrict re, float *restrict im)
 {
@@ -258,7 +258,7 @@ static inline void add(const float *restrict re, const float *restrict im, float
     }
 }
 
-/* Products of x + j y with the conjugate of u + j v, and energies of x + j y. */
+/* Multiply x + j y by the conjugate of u + j v; also the energy of x + j y. */
 static inline void multiply(const float *restrict x, const float *restrict y, const float *restrict u,
                             const float *restrict v, float *restrict re, float *restrict im, float *restrict energy,
                             int values)
@@ -340,7 +340,7 @@ static float against_others(Work *w, const double *frequency, const Complex *tap
     return level;
 }
 
-/* A whole chirp x + j y mixed down by exp(-j 2 pi frequency (n - middle of the linear samples)). */
+/* Mix a whole chirp x + j y by exp(-j 2 pi frequency (n - middle of the linear samples)). */
 static inline void mix(Work *w, const int16_t *restrict x, const int16_t *restrict y, double frequency, int blocks,
                        float *restrict re, float *restrict im)
 {
@@ -358,7 +358,7 @@ static inline void mix(Work *w, const int16_t *restrict x, const int16_t *restri
     }
 }
 
-/* Third pass: the sum of the chirps, mixed down and through their taps, and what each of two halves adds to it; see
+/* Third pass: the sum of the chirps, mixed down and filtered, and the contributions of two halves; see
    `numpy_passes.average`. mean is complex [RX][sample], halves complex [2][RX][block]. */
 static void average(Work *w, const double *frequency, const Complex *weights, int count,
                     const uint8_t *good, const uint8_t *second_half, float *mean, float *halves)

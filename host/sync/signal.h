@@ -1,9 +1,9 @@
-/* Small loops over one chirp of four RX, or over sixteen records at a time, for burst.c and direct_path.c.
+/* Loops over one chirp of four RX, or over sixteen records at a time, for burst.c and direct_path.c.
 
-   A chirp's samples of all RX lie in line, as the card sends them: value 4 n + r is sample n of RX r. Records that are
-   transformed together lie across: value 16 n + k is sample n of record k. So every inner loop runs over values that lie
-   next to each other, and the compiler makes vector instructions of it, as wide as the processor has them: these files
-   are compiled once for each width (`build.py`), with WIDTH in bits at the end of the functions' names (`width.c`).
+   Samples of a chirp are stored as the card sends them: value 4 n + r is sample n of RX r. Records that are transformed
+   together are interleaved: value 16 n + k is sample n of record k. So inner loops run over contiguous values and are
+   vectorised by the compiler. The files are compiled once per vector width (`build.py`), with WIDTH in bits at the end of
+   the functions' names (`width.c`).
 
    Complex values are pairs of arrays `re`, `im`; a turn is 2 pi. */
 #ifndef SIGNAL_H
@@ -15,22 +15,21 @@
 #include <string.h>
 
 #define RX 4    /* of an AWR2243 */
-#define FOLD 4  /* samples that are averaged before fine estimates, `numpy_passes.FOLD` */
-#define LANES 16  /* samples averaged x RX; also records that are transformed at once */
+#define FOLD 4  /* samples averaged before fine estimates, `numpy_passes.FOLD` */
+#define LANES 16  /* FOLD x RX; also the number of records transformed together */
 
 #define JOIN(name, width) name##_##width
 #define NAMED(name, width) JOIN(name, width)
 #define NAME(name) NAMED(name, WIDTH)
 
-/* Before a loop whose rounds do not depend on each other. */
+/* Marks a loop with independent iterations. */
 #define VECTOR _Pragma("omp simd")
 
 #define TURN 6.283185307179586476925
 
 typedef struct { double re, im; } Complex;
 
-/* Cosine and sine of a number of turns, within 1e-9: polynomials of half the angle, so that loops of it become vector
-   instructions. */
+/* Cosine and sine of a number of turns, within 1e-9, by polynomials of half the angle, which the compiler vectorises. */
 static inline Complex cis(double turns)
 {
     double x = TURN / 2 * (turns - floor(turns + 0.5)), q = x * x, s, c;
@@ -50,7 +49,7 @@ static inline Complex conjugate(Complex a) { return (Complex){a.re, -a.im}; }
 static inline double magnitude(Complex a) { return sqrt(a.re * a.re + a.im * a.im); }
 static inline double angle(Complex a) { return atan2(a.im, a.re); }
 
-/* Zeroed memory for `count` floats, on its own cache lines; free with `release`. */
+/* Allocate zeroed memory for `count` floats on its own cache lines; free it with `release`. */
 static inline float *reserve(size_t count)
 {
     char *block = calloc(count * sizeof(float) + 128, 1);
@@ -70,7 +69,7 @@ static inline void release(float *memory)
     free(block);
 }
 
-/* The words of some samples, I of four RX then Q of four RX, with I and Q apart: x + j y. */
+/* Separate the words of some samples (I of four RX, then Q of four RX) into I and Q: x + j y. */
 static inline void part_iq(const int16_t *restrict words, int samples, int16_t *restrict x, int16_t *restrict y)
 {
     for (int n = 0; n < samples; n++) {
@@ -90,8 +89,8 @@ static inline int32_t largest(const int16_t *restrict words, int count)
     return high > -(int32_t)low ? high : -(int32_t)low;
 }
 
-/* exp(-j 2 pi (frequency (step m - origin) + turns)) for m < count: an outer product of coarse and fine steps, as in
-   `tone.phasor`. Up to seven values more are written. */
+/* exp(-j 2 pi (frequency (step m - origin) + turns)) for m < count, as an outer product of coarse and fine steps like
+   `tone.phasor`. Writes up to seven more values. */
 static inline void ramp(double frequency, double turns, int step, double origin, int count, float *restrict c,
                         float *restrict s)
 {
@@ -119,7 +118,7 @@ static inline void ramp(double frequency, double turns, int step, double origin,
     }
 }
 
-/* scale exp(-j 2 pi frequency q) for the samples q of a block, of all RX. */
+/* scale exp(-j 2 pi frequency q) for the samples q of a block, for all RX. */
 static inline void phases_within(double frequency, double scale, float *restrict c, float *restrict s)
 {
     for (int i = 0; i < LANES; i++) {
@@ -139,7 +138,7 @@ static inline void roots_of_unity(int size, float *c, float *s)
     }
 }
 
-/* The bin that `transform` leaves at a place. */
+/* The bin at an index of the output of `transform`. */
 static inline int bin_at(int place, int size)
 {
     int bin = 0, scale = 1;
@@ -150,7 +149,7 @@ static inline int bin_at(int place, int size)
     return bin + scale * place;
 }
 
-/* Four rows of sixteen values: Fourier transform of length four across them, then times powers one to three of w. */
+/* Fourier transform of length four across four rows of sixteen values, times powers one to three of w. */
 static inline void butterfly(float *restrict re, float *restrict im, int row, const float w[6])
 {
     float *restrict re1 = re + row, *restrict re2 = re + 2 * row, *restrict re3 = re + 3 * row;
@@ -170,7 +169,7 @@ static inline void butterfly(float *restrict re, float *restrict im, int row, co
     }
 }
 
-/* Fourier transforms of sixteen records [size][LANES] in place, by decimation in frequency; bins as of `bin_at`. */
+/* Fourier transforms of sixteen records [size][LANES] in place, decimation in frequency; bin order as in `bin_at`. */
 static inline void transform(float *restrict re, float *restrict im, int size, const float *c, const float *s)
 {
     int n = size;

@@ -1,1 +1,1 @@
-"""The paper's tables and figures made again from simulation, each beside the published value."""
+"""Reproduction of the paper's tables and figures by simulation, beside the published values."""

@@ -1,7 +1,7 @@
-"""How names fare as conditions worsen: specimens' spread, noise, the angle's error, plates' tilt (a figure of Fig. 18).
+"""Accuracy of names against spread of specimens, noise, error of the angle, and tilt of plates (part of Fig. 18).
 
 Solids at 60 degrees, a library of other specimens, patches of 12 pixels with the noise of `patches.py`. Where the error
-budget knows of a condition, the discriminant is told its size, as the program tells it.
+budget includes a condition, the discriminant gets its size, as in processing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Real = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Curve:
-    """Shares of patches named right and wrong over a condition; the rest is called unknown."""
+    """Shares of patches named right and wrong against a condition; the rest is called unknown."""
 
     label: str
     at: tuple[float, ...]
@@ -39,7 +39,7 @@ class Curve:
 
 
 Change = Callable[[Samples, np.random.Generator, float], Samples]
-Told = Callable[[Samples, float], SceneErrors | None]
+Budget = Callable[[Samples, float], SceneErrors | None]
 
 
 def curves(quick: bool) -> tuple[tuple[str, str, tuple[Curve, ...]], ...]:
@@ -55,8 +55,8 @@ def curves(quick: bool) -> tuple[tuple[str, str, tuple[Curve, ...]], ...]:
         ("Specimens' spread", "of the real part, % (loss: 5 times that)", (_known(spreads, differing, quick),)),
         ("Noise", "beside that of Fig. 18", (_known(noises, noisy, quick),)),
         ("Angle off by", "degrees", (
-            _changed("told by the budget", angles, taught, base, quick, _no_change, _angle_told, off=True),
-            _changed("not told", angles, taught, base, quick, _no_change, _nothing, off=True),
+            _changed("known to the budget", angles, taught, base, quick, _no_change, _angle_budget, off=True),
+            _changed("unknown to the budget", angles, taught, base, quick, _no_change, _nothing, off=True),
         )),
         ("Plates tilted by", "degrees across the plane of incidence", (
             _changed("tilt taken out", tilts, taught, base, quick, _gains(TILT_LEFT), _nothing),
@@ -83,7 +83,7 @@ def _changed(
     errors: Errors,
     quick: bool,
     change: Change,
-    told: Told,
+    budget: Budget,
     off: bool = False,
 ) -> Curve:
     """Of conditions that the library does not know; with `off` scans look from another angle, on either side."""
@@ -93,7 +93,7 @@ def _changed(
         for side in (-1, 1):
             rng = np.random.default_rng([7, side + 1])
             test = change(_drawn(errors, ANGLE_DEG + side * value * off, quick), rng, value)
-            one = _judge(model, test, lambda mine, value=value: told(mine, value))
+            one = _judge(model, test, lambda mine, value=value: budget(mine, value))
             right, wrong = right + one[0] / 2, wrong + one[1] / 2
         judged.append((right, wrong))
     return Curve(label, tuple(at), *_columns(judged))
@@ -104,10 +104,10 @@ def _drawn(errors: Errors, angle_deg: float, quick: bool) -> Samples:
 
 
 def _judge(
-    model: Model, test: Samples, told: Callable[[Samples], SceneErrors | None] = lambda _: None
+    model: Model, test: Samples, budget: Callable[[Samples], SceneErrors | None] = lambda _: None
 ) -> tuple[float, float]:
     """Shares of patches named right, and wrong."""
-    named, right, _ = by_patch(model, test, told)
+    named, right, _ = by_patch(model, test, budget)
     return float((named & right).mean()), float((named & ~right).mean())
 
 
@@ -137,7 +137,7 @@ def _nothing(mine: Samples, value: float) -> None:
     del mine, value
 
 
-def _angle_told(mine: Samples, degrees: float) -> SceneErrors:
+def _angle_budget(mine: Samples, degrees: float) -> SceneErrors:
     """The budget of a scan whose angle is known to so many degrees (at least 0.05)."""
     std, angle = np.radians(max(degrees, 0.05)), np.radians(ANGLE_DEG)
     patches = np.unique(mine.patches)

@@ -36,12 +36,12 @@ from polysight.papers.sensys2026.table2 import Published, published
 
 SECOND_ANGLE_DEG = 55.0
 CHOICE, RESULT = 17, 20
-"""Seeds: the better model is chosen on one draw and judged on another."""
+"""Seeds: the better model is selected on one draw and judged on another."""
 TASKS = ("solids", "solids, two angles", "liquids", "powders")
 OTHER_DRAWS = tuple(range(21, 29))
-"""Seeds of more draws, for how much chance there is in one."""
+"""Seeds of further draws, for the random spread of one draw."""
 Panel = tuple[Score, npt.NDArray[np.float64], str]
-TRIALS = 4000  # draws behind a bound
+TRIALS = 4000  # draws for a bound
 
 
 def _draws(quick: bool) -> int:
@@ -50,7 +50,7 @@ def _draws(quick: bool) -> int:
 
 @cache
 def task_samples(task: str, seed: int, quick: bool) -> Samples:
-    """Pixels of a task of Fig. 18, seen under one angle or, for the second one, under both."""
+    """Return the pixels of a task of Fig. 18, under one angle, or under both for the task of two angles."""
     name, _, two = task.partition(", ")
     group, errors = groups()[name], calibrated_errors(name, _draws(quick))
     one = draw(group.materials, group.angle_deg, errors, seed).samples()
@@ -61,23 +61,23 @@ def task_samples(task: str, seed: int, quick: bool) -> Samples:
 
 @cache
 def judged(task: str, model: str, channels: str, by_pixel: bool, quick: bool) -> Score:
-    """Score of a model on the draw that results are made from."""
+    """Return the score of a model on the draw for the results."""
     return score(task_samples(task, RESULT, quick), model, channels, by_pixel)
 
 
 @cache
 def better_model(task: str, quick: bool) -> tuple[str, dict[str, float]]:
-    """The model that does best with whole scans left out, on a draw of its own, and the pixels' shares of all tried."""
+    """Return the best model with whole scans left out, on a separate draw, and the accuracies of all models."""
     name, scores = best_model(task_samples(task, CHOICE, quick))
     return name, {s.model: s.pixels for s in scores}
 
 
 def noise_text(tasks: Iterable[str], quick: bool) -> str:
-    """One sentence with the amplitude errors that the calibration found."""
+    """Return a sentence with the calibrated amplitude errors."""
     names = sorted({t.partition(", ")[0] for t in tasks})
-    told = ", ".join(f"{100 * calibrated_errors(n, _draws(quick)).amplitude:.2f} % ({n})" for n in names)
+    printed = ", ".join(f"{100 * calibrated_errors(n, _draws(quick)).amplitude:.2f} % ({n})" for n in names)
     return (
-        f"Amplitude errors set on H alone: {told}; phase error {published()['phase_std_rad']:g} rad. A scan is one"
+        f"Amplitude errors set on H alone: {printed}; phase error {published()['phase_std_rad']:g} rad. A scan is one"
         " placement of all materials with its own metal reference; eight scans, 12 pixels a patch."
     )
 
@@ -88,7 +88,7 @@ def _angles(task: str) -> tuple[float, ...]:
 
 
 def chance(quick: bool) -> Table:
-    """The better model's figures over more draws of the same noise, beside what no classifier can pass."""
+    """Return the better model's accuracy over further draws of the same noise, beside the Bayes limit."""
     rows = []
     for task in TASKS:
         name = task.partition(", ")[0]
@@ -116,7 +116,7 @@ def chance(quick: bool) -> Table:
 
 
 def sensitivity() -> Table:
-    """What the assumed share of the errors that a patch shares does to the 23 solids, noise set anew for each share."""
+    """Return the effect of the share of errors common to a patch on the 23 solids; noise is recalibrated each time."""
     group, rows = groups()["solids"], []
     for shared in (0.0, 0.25, 0.5, 0.75):
         errors = calibrated_errors("solids", 1, shared)
@@ -134,7 +134,7 @@ def sensitivity() -> Table:
 
 
 def unknowns(quick: bool) -> Table:
-    """What is called unknown: patches of known materials, and of materials that were never learnt."""
+    """Return the shares called unknown: patches of known materials, and of materials left out of training."""
     rows = []
     for task in TASKS[:1] if quick else TASKS:
         drawn = task_samples(task, RESULT, quick)
@@ -170,18 +170,18 @@ class TaskScores:
         return TaskScores(task, knn, knn_pixel, better, better_pixel, h, h_pixel)
 
     def row(self) -> tuple[str, ...]:
-        """A line of the table, published shares beside simulated ones."""
+        """Return a line of the table, published shares beside simulated ones."""
         name, _, two = self.task.partition(", ")
-        told = published()["classification"][name]
+        printed = published()["classification"][name]
         return (
-            f"{len(self.knn.names)} {self.task}", percent(None if two else told["h_percent"] / 100),
+            f"{len(self.knn.names)} {self.task}", percent(None if two else printed["h_percent"] / 100),
             percent(self.h_pixel.pixels), percent(_published_percent(self.task) / 100), percent(self.knn_pixel.pixels),
             percent(self.knn.pixels), self.better.model, percent(self.better_pixel.pixels),
             percent(self.better.pixels), percent(self.better.in_scan), percent(self.better.by_patch),
         )  # fmt: skip
 
     def plain(self, quick: bool) -> dict[str, Any]:
-        """The same for the JSON file."""
+        """Return the content of the JSON file."""
         return {
             "published_percent": _published_percent(self.task),
             "simulated": [asdict(s) for s in (self.knn_pixel, self.knn, self.better_pixel, self.better)],
@@ -191,7 +191,7 @@ class TaskScores:
         }
 
     def picture(self) -> Picture:
-        """Confusion matrices of H alone, of the better model by pixel, and by patch."""
+        """Return the confusion matrices of H alone, of the better model by pixel, and by patch."""
         task, h, better = self.task, self.h, self.better
         panels = (
             (h, h.confusion, f"H alone: {percent(h.pixels)}\n{PAPER}"),
@@ -250,7 +250,7 @@ def fig18(run: Run) -> Item:
 
 def fig20(run: Run) -> Item:
     """H, V, P alone and together: the paper's KNN under both splits."""
-    told, rows, data = published()["channels_percent"], [], {}
+    printed, rows, data = published()["channels_percent"], [], {}
     tasks = ("solids", "liquids", "powders")
     weight = [len(groups()[t].materials) for t in tasks]
     fig = new_figure(8.4, 4.2)
@@ -259,9 +259,9 @@ def fig20(run: Run) -> Item:
     for channel in CHANNELS:
         by_pixel, left_out = ([judged(t, PAPER, channel, p, run.quick).pixels for t in tasks] for p in (True, False))
         means = [float(np.average(x, weights=weight)) for x in (by_pixel, left_out)]
-        rows.append((channel, f"{told[channel]:.2f} %", *(percent(x) for x in (*means, *left_out))))
-        bars.append((told[channel], 100 * means[0], 100 * means[1]))
-        data[channel] = {"published_percent": told[channel], "by_pixel": means[0], "scans_left_out": means[1]}
+        rows.append((channel, f"{printed[channel]:.2f} %", *(percent(x) for x in (*means, *left_out))))
+        bars.append((printed[channel], 100 * means[0], 100 * means[1]))
+        data[channel] = {"published_percent": printed[channel], "by_pixel": means[0], "scans_left_out": means[1]}
         data[channel] |= {f"{t}_scans_left_out": x for t, x in zip(tasks, left_out, strict=True)}
     labels = ("published", "simulated, by pixel (optimistic)", "simulated, scans left out")
     for k, (label, colour, hatch) in enumerate(
@@ -349,7 +349,7 @@ def _confused(panels: Sequence[Panel], shown: int = 5) -> str:
 def pixel_bound(
     materials: tuple[Published, ...], angles_deg: Sequence[float], errors: Errors, reference: bool, pixels: int
 ) -> float:
-    """Share of pixels that Bayes' rule names right when it knows every material's mean and the errors' sizes.
+    """Return the share of pixels that Bayes' rule names right, knowing all means and the sizes of errors.
 
     On ln|H|, ln|V| and arg P the errors are normal up to their second order, and the same for all materials: Bayes'
     rule is the nearest mean. Found by drawing, `TRIALS` a material.
@@ -377,7 +377,7 @@ def pixel_bound(
         cost = np.zeros((TRIALS, len(materials)))
         for c, s in enumerate(std):
             noise = s * np.sqrt(variance) * rng.standard_normal((TRIALS, 1))
-            if c % 3 == 2:  # a direction: its angle to that of every material
+            if c % 3 == 2:  # a direction: its angle to each material's
                 apart = np.angle(mean[k, c] * np.exp(1j * noise) / mean[None, :, c])
             else:
                 apart = np.real(mean[k, c]) + noise - np.real(mean[None, :, c])

@@ -25,32 +25,32 @@ WATER = "Water (with glass)"
 
 
 def fig21(run: Run) -> Item:
-    """Water and five solutions, eight scans, a straight line that never saw the concentration it is asked for."""
+    """Water and five solutions in eight scans; each concentration is estimated by a line through the others."""
     group = groups()["liquids"]
     errors = calibrated_errors("liquids", 1 if run.quick else 3)
     materials = tuple(m for m in table2() if m.name == WATER or m.name.startswith("Cane Sugar"))
     library = draw(materials, group.angle_deg, errors, seed=21).library()
     result = fit_concentration(library, {WATER: 0.0})
-    told = published()["sugar_median_error_percent"]
+    printed = published()["sugar_median_error_percent"]
     value = concentrations(library.names, {WATER: 0.0})
     fig = new_figure(11.5, 4.2)
     left, centre, right = fig.subplots(1, 3)
     _draw_line(left, library, value, result)
     _draw_permittivity(centre, library, value, {value[m.name]: m.permittivity.real for m in materials})
-    _draw_errors(right, result, told)
+    _draw_errors(right, result, printed)
     return Item(
         "fig21",
         "Fig. 21: concentration of sugar in water",
         (
-            f"Published median error {told:g} %; simulated {result.median_error:.3f} % by weight, each concentration"
-            f" told by a line through the others. The 90 % intervals hold the truth in {100 * result.covered:.0f} % of"
+            f"Published median error {printed:g} %; simulated {result.median_error:.3f} % by weight, each concentration"
+            f" estimated from the others. The 90 % intervals hold the truth in {100 * result.covered:.0f} % of"
             " the patches. The paper does not say whether its percentage is by weight or of the concentration, nor"
             " whether the line had seen the concentration it was asked for.",
             f"Water and five solutions at {group.angle_deg:.0f} degrees with the errors of the liquids.",
         ),
         (
             Table(
-                "Each concentration as told by the others, mean over eight scans",
+                "Each concentration estimated from the others, mean over eight scans",
                 ("Solution", "true", "simulated", "90 % interval", "median error"),
                 _rows(value, result),
             ),
@@ -62,7 +62,7 @@ def fig21(run: Run) -> Item:
             )
         },
         {
-            "published_median_error_percent": told,
+            "published_median_error_percent": printed,
             "median_error_percent": result.median_error,
             "covered": result.covered,
             "line": asdict(result.line),
@@ -72,7 +72,7 @@ def fig21(run: Run) -> Item:
 
 
 def _draw_line(ax: Axes, library: Library, value: Mapping[str, float], result: ConcentrationResult) -> None:
-    """The calibration line with its interval, and the patches."""
+    """Draw the calibration line with its interval, and the patches."""
     x = np.array([np.degrees(np.median(polarisation_angle_rad(e.p))) for e in library.entries])
     ax.plot(x, [value[e.name] for e in library.entries], "o", ms=4, color=PALETTE[0], label="patches")
     at = np.linspace(x.min() - 0.1, x.max() + 0.1, 100)
@@ -86,30 +86,30 @@ def _draw_line(ax: Axes, library: Library, value: Mapping[str, float], result: C
 def _draw_permittivity(
     ax: Axes, library: Library, value: Mapping[str, float], published_eps: Mapping[float, float]
 ) -> None:
-    """Real part by Eq. 3 against concentration, beside the published one (by concentration)."""
+    """Draw the real part by Eq. 3 against concentration, beside the published values."""
     eps = [
         np.median(permittivity_from_ratio(e.p.astype(np.complex128), np.radians(e.incidence_deg)).real)
         for e in library.entries
     ]
     ax.plot([value[e.name] for e in library.entries], eps, "o", ms=4, color=PALETTE[0], label="patches, simulated")
-    told = zip(*sorted(published_eps.items()), strict=True)
-    ax.plot(*told, "x-", color=PALETTE[6], ms=7, lw=1.0, label="published, Table 2")
+    printed = zip(*sorted(published_eps.items()), strict=True)
+    ax.plot(*printed, "x-", color=PALETTE[6], ms=7, lw=1.0, label="published, Table 2")
     dress(ax, "Apparent permittivity", "sugar (% by weight)", "real part ε′")
     ax.legend(fontsize=8, frameon=False)
 
 
-def _draw_errors(ax: Axes, result: ConcentrationResult, told: float) -> None:
-    """Distribution of the errors, each concentration left out, and the published median (`told`, percent)."""
+def _draw_errors(ax: Axes, result: ConcentrationResult, printed: float) -> None:
+    """Draw the distribution of the errors, each concentration left out; `printed` is the published median, percent."""
     error = np.sort([abs(r.percent - r.true_percent) for r in result.left_out])
     ax.step(np.concatenate([[0], error]), np.arange(error.size + 1) / error.size, where="post", color=PALETTE[0])
-    ax.axvline(told, color=PALETTE[6], ls="--", lw=1.2, label=f"published median {told:g} %")
+    ax.axvline(printed, color=PALETTE[6], ls="--", lw=1.2, label=f"published median {printed:g} %")
     ax.axvline(result.median_error, color=INK, ls=":", lw=1.2, label=f"simulated median {result.median_error:.3f} %")
     dress(ax, "Error, each concentration left out", "error (% by weight)", "share of patches")
     ax.legend(fontsize=8, facecolor="white", framealpha=1.0, edgecolor="none", loc="lower right")
 
 
 def _rows(value: Mapping[str, float], result: ConcentrationResult) -> tuple[tuple[str, ...], ...]:
-    """A line for each solution, by concentration."""
+    """Return a table line for each solution, by concentration."""
     rows = []
     for name in sorted(value, key=lambda n: value[n]):
         of = [r for r in result.left_out if r.name == name]

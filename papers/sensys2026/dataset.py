@@ -34,29 +34,30 @@ from polysight.host.polarimetry import correct_leakage
 from polysight.host.store import COLLECTION, open_npz, read_settings, rig_of
 from polysight.papers.sensys2026.table2 import Published, table2
 from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.files import read_json
 from polysight.shared.geometry import incidence_deg
 
 T = TypeVar("T")
 SAME_ANGLE_DEG = 2.5
-"""The paper's angles, 55 and 60 degrees, are further apart; a scan's own differs from them by less."""
+"""Largest difference of a scan's incidence angle from the paper's angles, 55 and 60 degrees."""
 MATERIALS, LABELS, IMAGES = "materials/", "labels/", "images made here"
-_ALIKE = 0.35  # correlation of two images of one scan, at least
+_ALIKE = 0.35  # least correlation of two images of one scan
 
 # Names of materials.
 _FILLING = {"with", "w", "in", "on", "mm", "percent", "sample", "sheet", "plate", "the", "of", "box", "container"}
 _ALIASES = {"fibre": "fiber", "fiberglass": "fiber glass", "plywood": "wood", "soya": "soy", "salts": "salt"}
 _CONTAINERS = {"glass", "plastic"}
-_ENOUGH = 0.5  # of the words in common
+_ENOUGH = 0.5  # least share of common words
 
 PIXELS = 16
-"""Of a patch, at even intervals: as in a library that is trained here."""
+"""Pixels of a patch, at even intervals, as in our own libraries."""
 
 
 @dataclass(frozen=True)
 class AuthorsData:
-    """What was found.
+    """The data set that was read.
 
     Attributes
     ----------
@@ -78,11 +79,11 @@ class AuthorsData:
 
     @property
     def simulated(self) -> bool:
-        """Whether any of it was simulated."""
+        """True if any of it was simulated."""
         return any(library.simulated for library in self.sources.values())
 
     def at(self, source: str, numbers: range, angle_deg: float) -> Library:
-        """Entries of a source with these rows of Table 2, seen under about this angle."""
+        """Return the entries of a source for these rows of Table 2, under about this angle."""
         names = {m.name for m in table2() if m.number in numbers}
         library = self.sources[source]
         near = (e for e in library.entries if abs(e.incidence_deg - angle_deg) <= SAME_ANGLE_DEG)
@@ -109,7 +110,12 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
         when nothing of it can be used.
     """
     if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder", "the path is wrong", "give the folder that holds materials/")
+        raise DataError(
+            f"{folder}: no such folder",
+            "the path is wrong",
+            "give the folder with materials/",
+            code=ErrorCode.FILE_MISSING,
+        )
     base, notices, found = load_instrument(config), [], {}
     if pickles := sorted((folder / "materials").glob("*.pkl")):
         found[MATERIALS] = _readable(read_material, pickles, notices)
@@ -136,7 +142,7 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
 
 
 def _readable(read: Callable[[Path], T], paths: Sequence[Path], notices: list[str]) -> list[T]:
-    """What can be read of the paths; a file that is damaged or refused is named, and stops no other."""
+    """Read the files at these paths; damaged or refused files are listed in the notices and skipped."""
     out = []
     for path in paths:
         try:
@@ -157,23 +163,22 @@ def _entries(scans: list[LabelledScan], angles: Mapping[str, float], notices: li
 
 
 def _angle(folder: Path, scan: LabelledScan, base: Instrument, notices: list[str]) -> float:
-    """Incidence angle of a labelled scan: by the geometry of its raw data, else as its text tells, else the rig's."""
+    """Return the incidence angle of a labelled scan: from its raw data, else from its text, else the rig's."""
     for form in ("unsynced", "raw"):
         path = folder / form / scan.scan
         if (path / COLLECTION).exists():
-            rig, told = rig_of(read_settings(path), base, path)
-            notices += told
+            rig, found = rig_of(read_settings(path), base, path)
+            notices += found
             return incidence_deg(rig, rig.receivers[0])
-    told_here = angle_in_text([scan.description, scan.scan])
-    if told_here is not None:
-        return told_here
+    if (angle := angle_in_text([scan.description, scan.scan])) is not None:
+        return angle
     angle = incidence_deg(base, base.receivers[0])
-    notices.append(f"{scan.scan}: no file tells its incidence angle; the rig file's is taken, {angle:.1f} degrees")
+    notices.append(f"{scan.scan}: no file has its incidence angle; that of the rig file is used, {angle:.1f} degrees")
     return angle
 
 
 def _imaged_here(scan: LabelledScan, images: Path, notices: list[str]) -> LabelledScan | None:
-    """The scan's boxes with the images made here, turned so that they lie as the authors' own images do."""
+    """Return the scan's boxes with our own images, in the orientation of the authors' images."""
     file = images / scan.scan / "image.npz"
     try:
         with open_npz(file) as z:
@@ -205,7 +210,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 def _named(
     found: Mapping[str, list[Entry]], given: Mapping[str, int], notices: list[str]
 ) -> tuple[dict[str, int], dict[str, Library]]:
-    """The entries under Table 2's names; those whose names mean no row are left out and named."""
+    """Rename the entries as in Table 2; entries of unknown names are skipped and listed in the notices."""
     rows = rows_of(((e.name, e.thickness_mm) for entries in found.values() for e in entries), given)
     titles = {m.number: m.name for m in table2()}
     sources, unknown = {}, set()
@@ -220,9 +225,9 @@ def _named(
         if kept:
             sources[source] = Library(tuple(kept), {}, source)
     if unknown:
-        told = ", ".join(sorted(unknown))
+        skipped = ", ".join(sorted(unknown))
         notices.append(
-            f"not judged, as their names mean no row of Table 2: {told}; `polysight reproduce --names FILE` says what"
+            f"not judged, names without a row of Table 2: {skipped}; `polysight reproduce --names FILE` says what"
             " they mean"
         )
     meaning = {f"{n}, {t:g} mm" if t else n: number for (n, t), number in rows.items()}
@@ -230,7 +235,7 @@ def _named(
 
 
 def words(name: str) -> frozenset[str]:
-    """Words and numbers of a name, lower case; a metal's name is "metal"."""
+    """Return words and numbers of a name, in lower case; "metal" for metals."""
     text = re.sub(r"\\?\bw/?\s", " with ", name.lower().replace("_", " "))
     out: list[str] = []
     for word in re.findall(r"[a-z]+|\d+(?:\.\d+)?", text):
@@ -245,7 +250,7 @@ def words(name: str) -> frozenset[str]:
 
 
 def _alike(theirs: frozenset[str], row: Published) -> float:
-    """Shared words and numbers over all of them; a row's container need not be named."""
+    """Return the share of common words and numbers; the container of a row is optional."""
     ours = words(row.name)
     optional = ours & _CONTAINERS if " with " in row.name or "(with" in row.name else frozenset()
     union = (ours | theirs) - (optional - theirs)
@@ -253,7 +258,7 @@ def _alike(theirs: frozenset[str], row: Published) -> float:
 
 
 def row_of(name: str, thickness_mm: float | None = None) -> int | None:
-    """Number of the row of Table 2 that a name means, or None."""
+    """Return the number of the row of Table 2 for a name, or None."""
     theirs = words(name)
     if "metal" in theirs:
         return 1
@@ -266,22 +271,28 @@ def row_of(name: str, thickness_mm: float | None = None) -> int | None:
 
 
 def read_names(path: Path) -> dict[str, int]:
-    """A file that says what names mean: JSON, {their name: row of Table 2}. Raises DataError."""
+    """Read a file of names: JSON, {name: row of Table 2}. Raises DataError."""
     try:
         content = read_json(path)
         given = {str(name): int(number) for name, number in content.items()}
     except (OSError, ValueError, AttributeError, TypeError) as e:
-        raise DataError(f"{path}: not a list of names: {e}", 'expected JSON, {"their name": row of Table 2}') from None
+        raise DataError(
+            f"{path}: not a list of names: {e}",
+            'expected JSON, {"their name": row of Table 2}',
+            code=ErrorCode.FILE_UNREADABLE,
+        ) from None
     wrong = [n for n in given.values() if not 1 <= n <= len(table2())]
     if wrong:
-        raise DataError(f"{path}: Table 2 has no row {wrong[0]}", f"its rows are 1 to {len(table2())}")
+        raise DataError(
+            f"{path}: Table 2 has no row {wrong[0]}", f"its rows are 1 to {len(table2())}", code=ErrorCode.VALUE_INVALID
+        )
     return given
 
 
 def rows_of(
     names: Iterable[tuple[str, float | None]], given: Mapping[str, int] | None = None
 ) -> dict[tuple[str, float | None], int]:
-    """Rows of names with their thicknesses; those that mean none are left out."""
+    """Return the rows of names with their thicknesses; names without a row are skipped."""
     found = {(n, t): (given or {}).get(n) or row_of(n, t) for n, t in set(names)}
     return {key: number for key, number in found.items() if number is not None}
 
@@ -313,16 +324,16 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
         )
     library = Library(tuple(fitted), {"angles": fits}, library.note)
     library.save(out)
-    told = {a: {k: f[k] for k in ("model", "pixel_accuracy", "patch_accuracy")} for a, f in fits.items()}
+    scores = {a: {k: f[k] for k in ("model", "pixel_accuracy", "patch_accuracy")} for a, f in fits.items()}
     sys.stdout.write(
         f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans\n"
-        f"{json.dumps(told, indent=1)}\n"
+        f"{json.dumps(scores, indent=1)}\n"
     )
     return 0
 
 
 def authors_library(data: AuthorsData) -> Library:
-    """Patches of all sources but images made here, without leakage; one that two sources hold counts once."""
+    """Return the patches of all sources except our own images, without leakage and without duplicates."""
     a, b = complex(*data.base.polarimetry.leakage_h), complex(*data.base.polarimetry.leakage_v)
     kept: dict[tuple[str, str, int], list[Entry]] = {}
     for source, library in data.sources.items():
@@ -337,9 +348,9 @@ def authors_library(data: AuthorsData) -> Library:
 
 
 def _without_leakage(entry: Entry, leak_hv: complex, leak_vh: complex) -> Entry:
-    """An entry's pixels without cross-polar leakage, at most `PIXELS` of them."""
+    """Return an entry with at most `PIXELS` pixels, with the cross-polar leakage removed."""
     at = np.unique(np.linspace(0, entry.p.size - 1, min(PIXELS, entry.p.size)).round().astype(int))
-    v = entry.v[at].astype(np.complex128)  # the phase that H and V have in common does not matter
+    v = entry.v[at].astype(np.complex128)  # a common phase of H and V has no effect
     h, v = correct_leakage(entry.p[at] * v, v, leak_hv, leak_vh)
     return replace(
         entry,

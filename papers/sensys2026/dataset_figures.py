@@ -30,18 +30,19 @@ from polysight.papers.sensys2026.dataset import AuthorsData
 from polysight.papers.sensys2026.item import Item, Picture, Table, dress, new_figure, percent
 from polysight.papers.sensys2026.patches import groups
 from polysight.papers.sensys2026.table2 import published, table2
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 SECOND_ANGLE_DEG = 55.0
 TASKS = ("solids", "solids, two angles", "liquids", "powders")
 ALL, AT_LEAST = 1500, 6
-"""Pixels of a task, and of a patch whatever their number."""
+"""Pixels of a task, and least number of pixels of a patch."""
 LEFT_OUT = "scans left out"
 OPTIMISTIC = "by pixel (optimistic)"
 
 
 def task_samples(data: AuthorsData, source: str, task: str) -> Samples | None:
-    """Pixels of a task of Fig. 18; None where fewer than two materials are in the source."""
+    """Return the pixels of a task of Fig. 18; None with fewer than two materials in the source."""
     name, _, two = task.partition(", ")
     group = groups()[name]
     numbers = range(group.materials[0].number, group.materials[-1].number + 1)
@@ -59,7 +60,7 @@ def task_samples(data: AuthorsData, source: str, task: str) -> Samples | None:
 
 
 def _samples(library: Library) -> Samples:
-    """Pixels of a library, so few of each patch that all can be compared with all."""
+    """Return pixels of a library, of each patch so few that all can be compared with all."""
     return Samples.of(library, max(AT_LEAST, ALL // len(library.entries)))
 
 
@@ -102,7 +103,7 @@ def _halved(samples: Samples) -> Samples:
 
 
 class Judgements:
-    """The classifiers judged on a data set; what was judged once is kept."""
+    """Scores of the classifiers on a data set; each is computed once."""
 
     def __init__(self, data: AuthorsData) -> None:
         self.data = data
@@ -110,28 +111,29 @@ class Judgements:
         self._scores: dict[tuple[str, str, str, str], tuple[Score, Score | None]] = {}
 
     def samples(self, source: str, task: str) -> Samples | None:
-        """Pixels of a task; None where fewer than two materials are in the source."""
+        """Return the pixels of a task; None with fewer than two materials in the source."""
         if (source, task) not in self._samples:
             self._samples[source, task] = task_samples(self.data, source, task)
         return self._samples[source, task]
 
     def found(self, tasks: tuple[str, ...]) -> list[tuple[str, str, Samples]]:
-        """Sources, tasks and pixels of what can be judged. Raises DataError when that is nothing."""
+        """Return source, task and pixels of all that can be judged. Raises DataError if there is nothing."""
         found = [(s, t, x) for s in self.data.sources for t in tasks if (x := self.samples(s, t)) is not None]
         if not found:
             raise DataError(
                 "nothing to classify: no source holds two materials of one group under its angle",
                 "solids and powders are judged at 60 degrees, liquids at 55, as in the paper",
                 "see what the names were taken for, and --names",
+                code=ErrorCode.NO_DATA,
             )
         return found
 
     def judged(self, source: str, task: str, model: str, channels: str = "H+V+P") -> tuple[Score, Score | None]:
-        """A model by pixel, and with whole scans left out where that is possible."""
+        """Return the scores of a model by pixel, and with whole scans left out if possible."""
         key = source, task, model, channels
         samples = self.samples(source, task)
         if samples is None:
-            raise DataError(f"{source} holds no {task}")
+            raise DataError(f"{source} has no {task}", code=ErrorCode.NO_DATA)
         if key not in self._scores:
             several = repeated(samples)
             mixed = score(_halved(samples), model, channels, by_pixel=True)
@@ -144,17 +146,17 @@ class Judgements:
 
 def authors_fig18(judge: Judgements) -> Item:
     """Accuracy of the paper's KNN and of the discriminant, with confusion matrices. Raises DataError."""
-    told, rows, content, pictures = published()["classification"], [], {}, {}
+    printed, rows, content, pictures = published()["classification"], [], {}, {}
     for source, task, samples in judge.found(TASKS):
         name, _, two = task.partition(", ")
-        paper = told[name]["two_angles_percent" if two else "all_percent"] / 100
+        paper = printed[name]["two_angles_percent" if two else "all_percent"] / 100
         several = repeated(samples)
         scores = [s for m in (PAPER, DISCRIMINANT) for s in judge.judged(source, task, m)]
         h_only = judge.judged(source, task, PAPER, "H")
         names, held = np.unique(samples.names), 0 if several is None else np.unique(several.names).size
         rows.append((
             f"{names.size} {task}", source, str(np.unique(samples.groups).size),
-            "–" if two else percent(told[name]["h_percent"] / 100), *(_share(s) for s in h_only), percent(paper),
+            "–" if two else percent(printed[name]["h_percent"] / 100), *(_share(s) for s in h_only), percent(paper),
             *(_share(s) for s in scores), "–" if scores[3] is None else percent(scores[3].patches), str(held),
         ))  # fmt: skip
         content[f"{task}, {source}"] = {
@@ -200,12 +202,12 @@ def authors_fig18(judge: Judgements) -> Item:
 
 def authors_fig20(judge: Judgements) -> Item:
     """H, V, P alone and together by the paper's KNN. Raises DataError."""
-    told, tasks, rows, content = published()["channels_percent"], ("solids", "liquids", "powders"), [], {}
+    printed, tasks, rows, content = published()["channels_percent"], ("solids", "liquids", "powders"), [], {}
     found = judge.found(tasks)
     sources = list(dict.fromkeys(s for s, _, _ in found))
     fig = new_figure(8.4, 4.2)
     ax = fig.subplots()
-    bars = [("published", [told[c] for c in CHANNELS])]
+    bars = [("published", [printed[c] for c in CHANNELS])]
     for source in sources:
         mine = [(t, x) for s, t, x in found if s == source]
         means: dict[str, tuple[float, float | None]] = {}
@@ -216,10 +218,10 @@ def authors_fig20(judge: Judgements) -> Item:
             left = [(p[1], len(p[1].names)) for p in pairs if p[1] is not None]
             held = float(np.average([s.pixels for s, _ in left], weights=[n for _, n in left])) if left else None
             means[channel] = (mixed, held)
-            rows.append((channel, source, f"{told[channel]:.2f} %", percent(mixed), percent(held),
+            rows.append((channel, source, f"{printed[channel]:.2f} %", percent(mixed), percent(held),
                          ", ".join(f"{t} {_share(p[1])}" for (t, _), p in zip(mine, pairs, strict=True))))  # fmt: skip
             content[f"{channel}, {source}"] = {
-                "published_percent": told[channel], "by_pixel": mixed, "scans_left_out": held,
+                "published_percent": printed[channel], "by_pixel": mixed, "scans_left_out": held,
             }  # fmt: skip
         bars.append((f"{source}, {OPTIMISTIC}", [100 * means[c][0] for c in CHANNELS]))
         if all(means[c][1] is not None for c in CHANNELS):
@@ -251,7 +253,7 @@ def authors_fig20(judge: Judgements) -> Item:
 
 def authors_fig21(data: AuthorsData) -> Item:
     """Concentration of sugar by a line through the other concentrations. Raises DataError."""
-    told = published()["sugar_median_error_percent"]
+    printed = published()["sugar_median_error_percent"]
     tables, content, plots, why = [], {}, [], []
     for source, library in data.sources.items():
         known = concentrations(library.names, {WATER: 0.0})
@@ -274,13 +276,13 @@ def authors_fig21(data: AuthorsData) -> Item:
             error = np.median([abs(r.percent - r.true_percent) for r in of])
             rows.append((name, f"{known[name]:.1f} %", f"{np.mean([r.percent for r in of]):.2f} %", str(len(of)),
                          f"{error:.2f} %"))  # fmt: skip
-        rows.append(("median error, each concentration left out", f"published {told:g} %",
+        rows.append(("median error, each concentration left out", f"published {printed:g} %",
                      f"{result.median_error:.3f} %", str(len(result.left_out)), ""))  # fmt: skip
         rows.append(("median error, line has seen them (optimistic)", "", f"{seen:.3f} %", "", ""))
-        tables.append(Table(f"Concentration as told by the others, {source}, {best:.0f} degrees",
+        tables.append(Table(f"Concentration estimated from the others, {source}, {best:.0f} degrees",
                             ("Solution", "true", "found", "patches", "median error"), tuple(rows)))  # fmt: skip
         content[source] = {
-            "published_median_error_percent": told, "median_error_percent": result.median_error,
+            "published_median_error_percent": printed, "median_error_percent": result.median_error,
             "median_error_seen_percent": seen, "angle_deg": best, "line": asdict(result.line),
             "left_out": [asdict(r) for r in result.left_out],
         }  # fmt: skip
@@ -290,22 +292,23 @@ def authors_fig21(data: AuthorsData) -> Item:
             "no sugar solutions to draw a line through",
             "; ".join(why) or "none of the names means water or cane sugar",
             "see what the names were taken for, and --names",
+            code=ErrorCode.NO_DATA,
         )
     return Item(
         "fig21",
         "Fig. 21: concentration of sugar in water",
         (
-            "A straight line from the polarisation angle to the concentration, each concentration told by a line"
+            "A straight line from the polarisation angle to the concentration, each concentration estimated by a line"
             " through the others. The paper does not say whether its line had seen the concentration it was asked for;"
             " the last row is for a line that has.",
         ),
         tuple(tables),
-        {"sugar": Picture(_sugar_figure(plots, told), "The lines, and the distribution of errors.")},
+        {"sugar": Picture(_sugar_figure(plots, printed), "The lines, and the distribution of errors.")},
         content,
     )
 
 
-def _sugar_figure(plots: list[tuple[str, Any, Any, Any]], told: float) -> Any:
+def _sugar_figure(plots: list[tuple[str, Any, Any, Any]], printed: float) -> Any:
     fig = new_figure(11.0, 4.3)
     left, right = fig.subplots(1, 2)
     for k, (source, x, y, result) in enumerate(plots):
@@ -318,7 +321,7 @@ def _sugar_figure(plots: list[tuple[str, Any, Any, Any]], told: float) -> Any:
         share = np.arange(error.size + 1) / error.size
         label = f"{source}: median {result.median_error:.3f} %"
         right.step(np.concatenate([[0], error]), share, where="post", color=colour, label=label)
-    right.axvline(told, color=INK, ls="--", lw=1.2, label=f"published median {told:g} %")
+    right.axvline(printed, color=INK, ls="--", lw=1.2, label=f"published median {printed:g} %")
     dress(left, "Concentration by polarisation angle", "polarisation angle arctan |P| (degrees)", "sugar (% by weight)")
     dress(right, "Error, each concentration left out", "error (% by weight)", "share of patches")
     left.legend(fontsize=8, frameon=False)

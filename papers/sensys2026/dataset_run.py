@@ -26,6 +26,7 @@ from polysight.papers.sensys2026.item import Item, Picture, Table, dress, new_fi
 from polysight.papers.sensys2026.patches import groups
 from polysight.papers.sensys2026.run import Origin, write_item, write_page
 from polysight.papers.sensys2026.table2 import Published, table2
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, PolysightError
 
 Complex = npt.NDArray[np.complexfloating]
@@ -81,7 +82,9 @@ def reproduce_authors(
     try:
         out.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        raise ConfigError(f"{out} is a file", "the results need a folder", "give another --out") from None
+        raise ConfigError(
+            f"{out} is a file", "the results need a folder", "give another --out", code=ErrorCode.FILE_EXISTS
+        ) from None
     origin, judge = origin_of(data), Judgements(data)
     for notice in data.notices:
         sys.stderr.write(f"note: {notice}\n")
@@ -105,7 +108,7 @@ def reproduce_authors(
 
 
 def _check_keys(keys: Sequence[str]) -> None:
-    """Refuse what cannot be made from the published files. Raises ConfigError."""
+    """Raise ConfigError for items that cannot be made from the published files."""
     for key in keys:
         if key not in MAKERS:
             raise ConfigError(
@@ -116,7 +119,7 @@ def _check_keys(keys: Sequence[str]) -> None:
 
 
 def origin_of(data: AuthorsData) -> Origin:
-    """What the page says of the data."""
+    """Return the notes on the data for the page."""
     held = "; ".join(
         f"{source}: {len(lib.entries)} boxes of {len(lib.names)} materials in {len(lib.scans)} scans"
         for source, lib in data.sources.items()
@@ -144,7 +147,7 @@ def origin_of(data: AuthorsData) -> Origin:
 
 
 def text_of(table: Table) -> str:
-    """A table for the terminal: columns as wide as their cells, long heads over several lines."""
+    """Format a table for the terminal: columns as wide as their cells, long heads over several lines."""
     limit = [max([9, *(len(row[k]) for row in table.rows)]) for k in range(len(table.head))]
     heads = [_wrapped(head, width) for head, width in zip(table.head, limit, strict=True)]
     width = [max([n, *map(len, lines)]) for n, lines in zip(limit, heads, strict=True)]
@@ -169,12 +172,12 @@ def _wrapped(text: str, width: int) -> list[str]:
 
 
 def without_leakage(p: Complex, axial_ratio: float) -> Complex:
-    """Ratios P = (t + a) / (1 + a t) without the leakage a of both channels: t (metal stays 1)."""
+    """Remove the leakage a of both channels from ratios P = (t + a) / (1 + a t); return t (1 for metal)."""
     return (p - axial_ratio) / (1 - axial_ratio * p)
 
 
 def authors_recipe(p: Complex, angle_deg: float) -> complex:
-    """Permittivity as the authors compute it: their leakage, their factor, the middle pixels by |P|, mean of Eq. 3."""
+    """Return the permittivity by the authors' recipe: leakage, factor, the middle pixels by |P|, mean of Eq. 3."""
     used = without_leakage(p, AXIAL_RATIO) * METAL_FACTOR
     low, high = np.percentile(np.abs(used), PERCENTILES)
     kept = used[(np.abs(used) >= low) & (np.abs(used) <= high)]
@@ -198,7 +201,7 @@ def _seen(data: AuthorsData, source: str, m: Published) -> tuple[Complex, float,
 
 @dataclass(frozen=True)
 class Estimate:
-    """A material's permittivity from one source: by Eq. 3 as it is, without leakage, and by the authors' recipe."""
+    """Permittivities of a material from one source: by Eq. 3 as it is, without leakage, and by the authors' recipe."""
 
     material: Published
     angle_deg: float
@@ -210,7 +213,7 @@ class Estimate:
 
     @property
     def metal_like(self) -> bool:
-        """Whether there is no permittivity to speak of."""
+        """True if there is no permittivity."""
         return self.material.number == 1 or self.clean.value is None or self.clean.real_std is None
 
 
@@ -225,7 +228,7 @@ def authors_table2(data: AuthorsData) -> Item:
     leakage = float(np.mean([data.base.polarimetry.leakage_h[0], data.base.polarimetry.leakage_v[0]]))
     estimates = {source: _estimates(data, source, 0.0 if source == IMAGES else leakage) for source in data.sources}
     if not any(estimates.values()):
-        raise DataError("no material of Table 2 is in the data", "see what its names were taken for")
+        raise DataError("no material of Table 2 is in the data", "see the notices on its names", code=ErrorCode.NO_DATA)
     return Item(
         "table2",
         "Table 2: permittivity of 36 materials",
@@ -246,7 +249,7 @@ def authors_table2(data: AuthorsData) -> Item:
 
 
 def _estimates(data: AuthorsData, source: str, leakage: float) -> list[Estimate]:
-    """Every material of Table 2 that a source holds; `leakage` is what its ratios still have."""
+    """Estimate all materials of Table 2 in a source; `leakage` is still in its ratios."""
     found = []
     for m in table2():
         seen = _seen(data, source, m)
@@ -273,7 +276,7 @@ def _cells(value: complex | None) -> tuple[str, str]:
 
 
 def _plain(source: str, e: Estimate) -> dict[str, Any]:
-    """The same for the JSON file."""
+    """Return the content of the JSON file."""
     return {
         "source": source, "number": e.material.number, "name": e.material.name, "angle_deg": e.angle_deg,
         "scans": e.scans, "pixels": e.pixels, "published": e.material.permittivity, "as_is": e.as_is.value,
@@ -283,17 +286,17 @@ def _plain(source: str, e: Estimate) -> dict[str, Any]:
 
 
 def _figure(estimates: Mapping[str, Sequence[Estimate]]) -> Figure:
-    """Real part and loss of each source, without leakage, against the published ones."""
+    """Draw real part and loss of each source, without leakage, against the published values."""
     fig = new_figure(10.5, 4.6)
     axes = fig.subplots(1, 2)
     for colour, (source, found) in zip((PALETTE[0], PALETTE[6], PALETTE[3]), estimates.items(), strict=False):
         bars: dict[str, Any] = {"fmt": "o", "ms": 4, "color": colour, "lw": 1, "label": source}
         shown = [e for e in found if not e.metal_like]
-        told = [e.material.permittivity for e in shown]
+        true = [e.material.permittivity for e in shown]
         values = [e.clean.value or 0j for e in shown]
         std = [e.clean.real_std or 0.0 for e in shown]
-        axes[0].errorbar([t.real for t in told], [v.real for v in values], yerr=std, **bars)
-        axes[1].errorbar([-t.imag for t in told], [-v.imag for v in values], yerr=std, **bars)
+        axes[0].errorbar([t.real for t in true], [v.real for v in values], yerr=std, **bars)
+        axes[1].errorbar([-t.imag for t in true], [-v.imag for v in values], yerr=std, **bars)
     for ax, part in zip(axes, ("real part ε′", "loss ε″"), strict=True):
         dress(ax, part, f"published {part}", f"{part} without leakage")
         ax.axline((1, 1), slope=1, color=INK, lw=0.8, ls=":")

@@ -25,7 +25,7 @@ from polysight.papers.sensys2026.scenes import imaged, plate, scanned
 from polysight.papers.sensys2026.table2 import table2
 
 PLACES_MM = tuple((60.0 * x, -60.0 * y) for y, x in product((-1, 0, 1), repeat=2))
-"""Nine places; the metal reference lies in the middle."""
+"""Nine positions; the metal reference is in the middle."""
 SETS: dict[str, tuple[int, ...]] = {
     "solids": (13, 12, 19, 3, 14, 6, 15, 21),
     "liquids": (27, 25, 24, 26),
@@ -34,7 +34,7 @@ SETS: dict[str, tuple[int, ...]] = {
 """Rows of Table 2 beside the metal reference."""
 FIG13 = (13, 12, 18, 3, 14, 6)
 FIG13_DISTANCE_MM = 598.0
-"""Object plane at which the rig file's boards see 50 degrees."""
+"""Distance of the object plane with 50 degrees of incidence at the rig file's boards."""
 PHASE_DEG = 30.0
 """Range of the phase that Fig. 14 shows, to either side."""
 
@@ -49,15 +49,15 @@ FRONT_ON_PLACES_MM = ((-60.0, 0.0), (60.0, 0.0), (0.0, 60.0))
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A scan's images and what is known of its plates."""
+class ScanView:
+    """A scan's images and its known plates."""
 
     result: MaterialsResult
     context: ReportContext
 
 
 @cache
-def seen(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = 499.0) -> Seen:
+def view_scan(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = 499.0) -> ScanView:
     """Scan of plates with the permittivities of these rows of Table 2, and a copper plate in the middle."""
     around = [p for p in PLACES_MM if p != (0.0, 0.0)]
     step = len(around) // len(rows)
@@ -67,14 +67,14 @@ def seen(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = 499.0)
 
 def _scan(
     name: str, rows: Sequence[int], at: Sequence[tuple[float, float]], config: Path, seed: int, **more: object
-) -> Seen:
+) -> ScanView:
     """A copper plate in the middle and plates with the permittivities of these rows of Table 2 around it, mm."""
     plates = [plate("copper", None, 0.0, 0.0)]
     plates += [plate(table2()[n - 1].name, table2()[n - 1].permittivity, *xy) for n, xy in zip(rows, at, strict=True)]
     with scanned(name, plates, config, seed=seed, **more) as (source, truth):
         found = imaged(source, truth)
     context = context_of(found.result, found.x_m, found.y_m, title=name, simulated=True, plates=truth)
-    return Seen(found.result, context)
+    return ScanView(found.result, context)
 
 
 def _label_plates(ax: Any, ctx: ReportContext, size: float = 7.5) -> None:
@@ -91,15 +91,15 @@ def _label_plates(ax: Any, ctx: ReportContext, size: float = 7.5) -> None:
 
 
 def _reflects(ctx: ReportContext) -> npt.NDArray[np.float64]:
-    """Opacity of P: it is noise where nothing reflects, 20 dB below metal or less."""
+    """Return the opacity of P: pixels 20 dB below metal or less are noise."""
     power = (np.abs(ctx.h).astype(np.float64) ** 2 + np.abs(ctx.v).astype(np.float64) ** 2) / 2
     power = np.nan_to_num(power)
     level = 10 * np.log10(np.maximum(np.minimum(power, scipy.ndimage.gaussian_filter(power, 1.5)), 1e-12))
     return np.clip((level + 20) / 6, 0.0, 1.0)
 
 
-def draw_row(fig: Any, axes: Any, view: Seen, keys: tuple[str, ...], name: str) -> None:
-    """Images of a scan side by side, with colour bars and the plates' names."""
+def draw_row(fig: Any, axes: Any, view: ScanView, keys: tuple[str, ...], name: str) -> None:
+    """Draw images of a scan side by side, with colour bars and the plates' names."""
     for ax, key in zip(axes, keys, strict=True):
         shown, unit = draw_channel(ax, view.context, key)
         if key.endswith("_p"):
@@ -117,8 +117,8 @@ def draw_row(fig: Any, axes: Any, view: Seen, keys: tuple[str, ...], name: str) 
         _label_plates(ax, view.context)
 
 
-def ratio_table(views: dict[str, Seen]) -> Table:
-    """Ratio of each plate in each view beside Fresnel's."""
+def ratio_table(views: dict[str, ScanView]) -> Table:
+    """Return a table of each plate's ratio in each view, beside Fresnel's."""
     rows = []
     for name, view in views.items():
         theta = float(np.mean(view.result.theta_rad))
@@ -128,9 +128,9 @@ def ratio_table(views: dict[str, Seen]) -> Table:
             eps = patch.truth.permittivity
             true = 1.0 + 0j if eps is None else complex(ratio_from_permittivity(eps, theta))
             p = patch.permittivity.ratio
-            told = [f"{20 * np.log10(abs(z)):.2f} dB, {np.degrees(np.angle(z)) + 0.0:.1f}°" for z in (p, true)]
+            ratios = [f"{20 * np.log10(abs(z)):.2f} dB, {np.degrees(np.angle(z)) + 0.0:.1f}°" for z in (p, true)]
             error = abs(1 / p - 1 / true)
-            rows.append((f"{name}: {patch.truth.name}", f"{np.degrees(theta):.1f}°", *told, f"{error:.4f}"))
+            rows.append((f"{name}: {patch.truth.name}", f"{np.degrees(theta):.1f}°", *ratios, f"{error:.4f}"))
     return Table(
         "Ratio P of each plate, median of its interior, and Fresnel's at the scene's permittivity",
         ("Plate", "incidence", "simulated image", "Fresnel", "|Δ(1/P)|"),
@@ -138,8 +138,8 @@ def ratio_table(views: dict[str, Seen]) -> Table:
     )
 
 
-def ratio_data(views: dict[str, Seen]) -> dict[str, Any]:
-    """The same for the JSON file."""
+def ratio_data(views: dict[str, ScanView]) -> dict[str, Any]:
+    """Return the content of the JSON file."""
     return {
         name: {p.truth.name: p.permittivity.ratio for p in view.result.patches if p.truth is not None}
         for name, view in views.items()
@@ -148,7 +148,7 @@ def ratio_data(views: dict[str, Seen]) -> dict[str, Any]:
 
 def fig13(run: Run) -> Item:
     """Seven materials at 50 degrees."""
-    view = seen("seven materials at 50 degrees", FIG13, run, FIG13_DISTANCE_MM)
+    view = view_scan("seven materials at 50 degrees", FIG13, run, FIG13_DISTANCE_MM)
     fig = new_figure(11.5, 3.7)
     draw_row(fig, fig.subplots(1, 3), view, ("amplitude_h", "amplitude_v", "amplitude_p"), "50°")
     views = {"50°": view}
@@ -167,7 +167,7 @@ def fig13(run: Run) -> Item:
 
 def fig19(run: Run) -> Item:
     """Solids, liquids and powders at 55 degrees: H, V and P."""
-    views = {name: seen(name, rows, run) for name, rows in SETS.items()}
+    views = {name: view_scan(name, rows, run) for name, rows in SETS.items()}
     fig = new_figure(11.5, 10.2)
     for line, (name, view) in zip(fig.subplots(3, 3), views.items(), strict=True):
         draw_row(fig, line, view, ("amplitude_h", "amplitude_v", "amplitude_p"), name)
@@ -185,14 +185,14 @@ def fig19(run: Run) -> Item:
 
 
 def _spread_deg(values: npt.NDArray[np.complexfloating]) -> float:
-    """Circular standard deviation of the phase, degrees (Mardia and Jupp, Directional Statistics, section 2.3)."""
+    """Return the circular standard deviation of the phase, degrees (Mardia and Jupp, section 2.3)."""
     length = min(float(np.abs(np.mean(values / np.abs(values)))), 1.0)
     return float(np.degrees(np.sqrt(-2 * np.log(length))))
 
 
 def fig14(run: Run) -> Item:
     """Phase of H, V and P inside water, oil and metal."""
-    view = seen("liquids", SETS["liquids"], run)
+    view = view_scan("liquids", SETS["liquids"], run)
     shown = ("Water (with glass)", "Corn Oil (with glass)", "copper")
     fig = new_figure(11.5, 3.4)
     channels = {"H": view.result.calibrated.h, "V": view.result.calibrated.v, "P": view.result.calibrated.p}
@@ -251,7 +251,7 @@ def fig14(run: Run) -> Item:
 
 
 def front_on(config: Path, folder: Path) -> Path:
-    """The rig file with its boards side by side, written into a folder."""
+    """Write the rig file with its boards side by side into a folder."""
     rig = tomllib.loads(config.read_text(encoding="utf-8"))
     for board in rig["boards"]:
         shift = next(step["shift_mm"] for step in reversed(board["mount"]) if "shift_mm" in step)
@@ -262,7 +262,7 @@ def front_on(config: Path, folder: Path) -> Path:
 
 
 def fig4(run: Run) -> Item:
-    """H, V and P of copper, acrylic, PET and glass with the boards side by side, and with those of the rig file."""
+    """H, V and P of copper, acrylic, PET and glass, with boards side by side and as in the rig file."""
     with tempfile.TemporaryDirectory(prefix="polysight-reproduce-") as temporary:
         near = front_on(run.config, Path(temporary))
         views = {

@@ -1,4 +1,4 @@
-"""One table or figure of the paper, reproduced: what `polysight reproduce` makes and the report shows."""
+"""Structure of a reproduced table or figure, for `polysight reproduce` and its page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MARKERS = "osD^vP*X<>"
 
 @dataclass(frozen=True)
 class Run:
-    """What was asked for: a quick run or a full one, and the rig file of the scans to simulate."""
+    """Options of a run: quick or full, and the rig file of the scans to simulate."""
 
     quick: bool = False
     config: Path = Path("instrument.toml")
@@ -49,7 +49,7 @@ class Item:
     key, title
         Short name ("fig18") and heading.
     text
-        Paragraphs: what was done, and what it says against the published value.
+        Paragraphs: the method, and the comparison with the published values.
     tables, pictures
         Shown in this order; pictures by file name.
     data
@@ -65,14 +65,14 @@ class Item:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure, in inches, without global state or display."""
+    """Return an empty figure of this size, inches."""
     fig = Figure(figsize=(width, height), dpi=130, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
     return fig
 
 
 def dress(ax: Axes, title: str, x: str, y: str) -> None:
-    """Title, axis labels and a quiet grid."""
+    """Set the title, the axis labels and a light grid."""
     ax.set_title(title, loc="left", fontsize=10.5, color=INK, fontweight="bold")
     ax.set_xlabel(x, fontsize=9, color=MUTED)
     ax.set_ylabel(y, fontsize=9, color=MUTED)
@@ -82,5 +82,5 @@ def dress(ax: Axes, title: str, x: str, y: str) -> None:
 
 
 def percent(share: float | None) -> str:
-    """A share as a percentage with two decimals; a dash for None."""
+    """Format a share as a percentage with two decimals; a dash for None."""
     return "–" if share is None else f"{100 * share:.2f} %"

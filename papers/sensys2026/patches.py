@@ -31,7 +31,7 @@ SCANS, PIXELS = 8, 12
 
 @dataclass(frozen=True)
 class Group:
-    """Materials that are classified among each other, and the angle the paper saw them under."""
+    """Materials of one classification task, and the incidence angle in the paper."""
 
     name: str
     materials: tuple[Published, ...]
@@ -51,7 +51,7 @@ def groups() -> dict[str, Group]:
 
 @dataclass(frozen=True)
 class Errors:
-    """Relative amplitude error and phase error of a pixel, and the share of their variance that a patch shares.
+    """Relative amplitude error and phase error of a pixel, and the share of their variance common to a patch.
 
     `spread`: relative standard deviations of real part and loss between specimens; each scan has its own.
     """
@@ -72,7 +72,7 @@ class Pixels:
     v: Complex
 
     def samples(self) -> Samples:
-        """For a classifier; a scan is a group."""
+        """Return the pixels as samples for classifiers; a scan is a group."""
         scan, material, _ = np.indices(self.h.shape)
         names = np.array([m.name for m in self.materials])
         return Samples(
@@ -85,7 +85,7 @@ class Pixels:
         )
 
     def library(self) -> Library:
-        """One entry for each patch."""
+        """Return a library with one entry for each patch."""
         entries = [
             Entry(
                 name=m.name,
@@ -106,7 +106,7 @@ class Pixels:
 
 
 def specimens(materials: tuple[Published, ...], spread: tuple[float, float], z: npt.NDArray[np.float64]) -> Complex:
-    """Permittivities of specimens at z [2, ..., materials] standard deviations: normal real part, log-normal loss."""
+    """Return permittivities at z [2, ..., materials] standard deviations (real part normal, loss log-normal)."""
     eps = np.array([m.permittivity for m in materials], np.complex128)
     width = np.sqrt(np.log1p(spread[1] ** 2))
     real = np.maximum(eps.real * (1 + spread[0] * z[0]), 1.0)
@@ -121,7 +121,7 @@ def draw(
     scans: int = SCANS,
     pixels: int = PIXELS,
 ) -> Pixels:
-    """Pixels of every material in every scan; the same seed draws the same errors up to their size."""
+    """Draw pixels of every material in every scan; the same seed gives the same errors up to their size."""
     rng = np.random.default_rng([seed, round(angle_deg * 100)])
     own, common = np.sqrt(1 - errors.shared), np.sqrt(errors.shared)
 
@@ -141,14 +141,14 @@ def draw(
 
 
 def h_accuracy(group: Group, errors: Errors, seeds: tuple[int, ...]) -> float:
-    """Share of pixels the paper's KNN names right from |H| alone, split by pixel, mean over draws."""
+    """Return the share of pixels that the paper's KNN names right from |H| alone, split by pixel, mean over draws."""
     drawn = (draw(group.materials, group.angle_deg, errors, seed).samples() for seed in seeds)
     return float(np.mean([score(s, PAPER, "H", by_pixel=True).pixels for s in drawn]))
 
 
 @cache
 def calibrated_errors(group_name: str, draws: int = 3, shared: float = 0.5) -> Errors:
-    """The errors at which |H| alone gives the published accuracy of |H| alone; V and P are not looked at.
+    """Return the errors with which |H| alone has the published accuracy; V and P are not used.
 
     Bisection over the logarithm of the amplitude error, on draws that no result is made from.
     """

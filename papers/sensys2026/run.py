@@ -1,4 +1,4 @@
-"""`polysight reproduce`: what can be made, and making it: items, their files as they come, then the page."""
+"""`polysight reproduce`: make items (tables and figures), write their files, then the page."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from polysight.papers.sensys2026.images import fig4, fig13, fig14, fig19
 from polysight.papers.sensys2026.item import Item, Run, Table
 from polysight.papers.sensys2026.permittivities import fig3, fig16, fig17, table2_item
 from polysight.papers.sensys2026.synchronisation import fig9, fig12, fig15
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, PolysightError
 
 TITLES: dict[str, str] = {
@@ -61,27 +62,34 @@ MAKERS: dict[str, Callable[[Run], Item]] = {
 def reproduce(out: Path, keys: Sequence[str] = (), run: Run | None = None) -> int:
     """Make items (default: all) into a folder.
 
-    An item that fails is named on the page and on stderr, and the others are made all the same.
+    An item that fails is listed on the page and on stderr; the others are made.
 
     Returns
     -------
     int
-        Exit status, 0 only when every item was made.
+        Exit status; 0 if all items were made.
 
     Raises
     ------
     ConfigError
-        when an item's name is not known, or nothing makes it yet.
+        if an item's name is not known, or the item is not implemented.
     """
     run = run or Run()
     for key in keys:
         if key not in MAKERS:
             why = f"{TITLES[key]}: not reproduced yet" if key in TITLES else "the paper has no such item"
-            raise ConfigError(f"item {key!r} cannot be made", why, f"give some of: {' '.join(MAKERS)}")
+            raise ConfigError(
+                f"item {key!r} cannot be made",
+                why,
+                f"give some of: {' '.join(MAKERS)}",
+                code=ErrorCode.KEY_UNKNOWN,
+            )
     try:
         out.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        raise ConfigError(f"{out} is a file", "the results need a folder", "give another --out") from None
+        raise ConfigError(
+            f"{out} is a file", "the results need a folder", "give another --out", code=ErrorCode.FILE_EXISTS
+        ) from None
     items: list[Item] = []
     pictures: dict[str, bytes] = {}
     failed: dict[str, str] = {}
@@ -102,16 +110,16 @@ def reproduce(out: Path, keys: Sequence[str] = (), run: Run | None = None) -> in
 
 @dataclass(frozen=True)
 class Origin:
-    """Where the numbers of a page come from.
+    """Origin of the numbers of a page.
 
     Attributes
     ----------
     word, sentence
-        What every figure, table and heading is stamped with, and what the page says of it.
+        Stamp of figures, tables and headings, and its explanation on the page.
     title
-        Of the page.
+        Title of the page.
     simulated
-        Whether any of it was simulated.
+        True if any of it was simulated.
     notes
         Paragraphs above the items.
     """
@@ -133,13 +141,13 @@ SIMULATED = Origin(
 
 
 def stamped_png(figure: Figure, origin: Origin = SIMULATED) -> bytes:
-    """A figure as PNG with SIMULATED, or where else it is from, above it."""
+    """Return a figure as PNG with its origin, such as SIMULATED, above it."""
     figure.suptitle(origin.word.upper(), x=0.995, ha="right", fontsize=9, color=STAMP, fontweight="bold")
     return png(figure)
 
 
 def write_item(out: Path, item: Item, origin: Origin = SIMULATED) -> dict[str, bytes]:
-    """Write an item's JSON, CSV and PNG files; returns the pictures by file name."""
+    """Write an item's JSON, CSV and PNG files; return the pictures by file name."""
     pictures = {f"{item.key}-{name}.png": stamped_png(p.figure, origin) for name, p in item.pictures.items()}
     for name, data in pictures.items():
         write_atomically(out / "figures" / name, data)
@@ -167,9 +175,9 @@ def write_page(
     origin: Origin = SIMULATED,
     makers: Container[str] | None = None,
 ) -> Path:
-    """Write `reproduce.html`; returns its path. Items that are not on it are named on it.
+    """Write `reproduce.html` with the items and a list of missing ones; return its path.
 
-    `makers` holds the keys that could be on it; None: all there are.
+    `makers` are the keys of possible items; None: all.
     """
     makers = MAKERS if makers is None else makers
     environment = Environment(

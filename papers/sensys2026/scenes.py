@@ -1,4 +1,4 @@
-"""Scenes for the simulated rig, scanned and processed as a recorded scan is."""
+"""Simulate scenes with the simulated rig, and process them like recorded scans."""
 
 from __future__ import annotations
 
@@ -26,24 +26,25 @@ from polysight.host.materials import (
 )
 from polysight.host.pipeline import Pipeline
 from polysight.host.store import RawSource, ScanFolder
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ScanError
 
 PLATE_MM = 45.0
 GRID = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0}
-"""The sparse aperture of `examples/nine-materials.toml`, which says why it is enough."""
+"""The sparse aperture of `examples/nine-materials.toml`, explained there."""
 
 
 def plate(name: str, eps: complex | None, x_mm: float, y_mm: float) -> dict[str, Any]:
-    """A square plate of the scene file; without permittivity it is metal."""
-    what = {"metal": True} if eps is None else {"permittivity": [eps.real, -eps.imag]}
-    return {"name": name, "centre_mm": [x_mm, y_mm], "size_mm": [PLATE_MM, PLATE_MM], **what}
+    """Return a square plate for the scene file; without permittivity it is metal."""
+    material = {"metal": True} if eps is None else {"permittivity": [eps.real, -eps.imag]}
+    return {"name": name, "centre_mm": [x_mm, y_mm], "size_mm": [PLATE_MM, PLATE_MM], **material}
 
 
 @contextmanager
 def scanned(
     name: str, plates: Sequence[Mapping[str, Any]], config: Path, seed: int, **more: Any
 ) -> Iterator[tuple[ScanFolder, tuple[TruthPlate, ...]]]:
-    """The simulated scan of plates, all disturbances on, with its truth; its files are gone afterwards.
+    """Simulate a scan of plates with all disturbances; yield it with its truth. Its files are deleted afterwards.
 
     `more` are further keys of the scene file. Raises ScanError.
     """
@@ -52,13 +53,13 @@ def scanned(
         file, folder = Path(temporary) / "scene.toml", Path(temporary) / "scan"
         file.write_text(tomli_w.dumps(content), encoding="utf-8")
         if run_simulator(["simulate", str(file), "--config", str(config), "--out", str(folder)]):
-            raise ScanError(f"the scene {name!r} could not be simulated", "see above")
+            raise ScanError(f"the scene {name!r} could not be simulated", "see above", code=ErrorCode.VALUE_INVALID)
         yield ScanFolder.load(folder), read_truth(folder / TRUTH)
 
 
 @dataclass(frozen=True)
 class Imaged:
-    """What was found in a scan's images, and their axes in the rig frame (float64, metres)."""
+    """Result of a scan's images, and their axes in the rig frame (float64, metres)."""
 
     result: MaterialsResult
     x_m: npt.NDArray[np.float64]
@@ -66,7 +67,7 @@ class Imaged:
 
 
 def imaged(source: RawSource, plates: tuple[TruthPlate, ...]) -> Imaged:
-    """Images of a scan, its plates' places known (as the paper segments by hand), referenced to its metal plate."""
+    """Process a scan with known positions of its plates (the paper segments by hand), referenced to its metal plate."""
     pipeline = Pipeline(source)
     for row in source.rows():
         pipeline.add_row(row)

@@ -1,4 +1,4 @@
-"""What specimens' spread does to names: found beside the share that Bayes' rule cannot pass (a table of Fig. 18)."""
+"""Effect of the spread of specimens on names, beside the Bayes limit (a table of Fig. 18)."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ SPREADS = ((0.0, 0.0), (0.01, 0.05), (0.02, 0.1), (0.05, 0.2))
 """Relative standard deviations of real part and loss; Fig. 17 of the paper has 1 and 4 % / 23 and 14 %."""
 LIBRARY_SCANS = 24
 TEST_SCANS = 160
-"""So many that the calibration error of exact probabilities would be told as 0.01 to 0.03 (4 to 23 names a scan)."""
+"""Enough for a calibration error of 0.01 to 0.03 with exact probabilities (4 to 23 names a scan)."""
 _TEST_SEED = 500
 _GRID = 21  # nodes a dimension of the specimens' distribution, to 3.5 standard deviations
 Real = npt.NDArray[np.float64]
 
 
 class Found(NamedTuple):
-    """Patches named right, those that Bayes' rule would, expected calibration error, and strangers that got a name.
+    """Shares of patches named right, and by Bayes' rule; expected calibration error; unknown materials with a name.
 
     `strangers` is (named, of how many), of all and of those that lie outside every known material's 95 % region.
     """
@@ -48,28 +48,28 @@ def both_angles(group: str, angles_deg: tuple[float, ...], errors: Errors, seed:
 
 @cache
 def with_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, float], quick: bool) -> Found:
-    """Judge the discriminant on specimens and scans it has not seen, and Bayes' rule on the same errors."""
+    """Judge the discriminant on new specimens and scans, and Bayes' rule on the same errors."""
     errors = replace(calibrated_errors(group, 1 if quick else 3), spread=spread)
     taught = both_angles(group, angles_deg, errors, 41, LIBRARY_SCANS)
     test = both_angles(group, angles_deg, errors, _TEST_SEED, 6 if quick else TEST_SCANS)
     model = MODELS[DISCRIMINANT]("H+V+P").fit(taught)
     named, right, sure = by_patch(model, test)
-    told = calibration_error(sure[named], right[named])
+    calibration = calibration_error(sure[named], right[named])
     share = float((named & right).mean())
-    return Found(share, bayes(group, angles_deg, errors, quick), told, strangers_named(taught, test, quick))
+    return Found(share, bayes(group, angles_deg, errors, quick), calibration, strangers_named(taught, test, quick))
 
 
 def by_patch(
-    model: Model, test: Samples, told: Callable[[Samples], SceneErrors | None] = lambda _: None
+    model: Model, test: Samples, budget: Callable[[Samples], SceneErrors | None] = lambda _: None
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_], Real]:
-    """All patches, scan by scan: whether each got a name, whether that is (or would be) right, and how sure, [patch].
+    """Name all patches, scan by scan; return for each: named, right (by the nearest material), confidence, [patch].
 
-    `told` gives the error budget of a scan.
+    `budget` returns the error budget of a scan.
     """
     rows = []
     for scan in np.unique(test.groups):
         mine = test.take(test.groups == scan)
-        found = model.by_scan(mine.x, mine.patches, told(mine))
+        found = model.by_scan(mine.x, mine.patches, budget(mine))
         truth = mine.names[[np.flatnonzero(mine.patches == p)[0] for p in found.patches]]
         rows.append((found.distance <= 1, found.names == truth, found.confidence))
     named, right, sure = (np.concatenate(column) for column in zip(*rows, strict=True))
@@ -77,7 +77,7 @@ def by_patch(
 
 
 def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool = False) -> float:
-    """Share of patches of 12 pixels that Bayes' rule names right when it knows every distribution and the reference.
+    """Return the share of patches of 12 pixels that Bayes' rule names right, knowing all distributions.
 
     The specimens' distribution is integrated on a grid; on ln|H|, ln|V| and arg P the errors are normal.
     """
@@ -113,7 +113,7 @@ def _features(eps: npt.NDArray[np.complex128], angles_deg: tuple[float, ...]) ->
 
 
 def strangers_named(taught: Samples, test: Samples, quick: bool) -> tuple[int, int, int, int]:
-    """Patches of materials of which none was ever learnt: named of all, named of those outside every 95 % region.
+    """Count patches of unlearnt materials: named of all, named of those outside every 95 % region.
 
     Returns the two pairs (named, of how many).
     """
@@ -133,7 +133,7 @@ def strangers_named(taught: Samples, test: Samples, quick: bool) -> tuple[int, i
 
 
 def _outside(seen: Samples, known: Samples) -> npt.NDArray[np.bool_]:
-    """Whether each patch lies outside the region that holds 95 % of each known material's patches, [patch].
+    """Return true for patches outside the regions of 95 % of each known material's patches, [patch].
 
     Of ln|H|, ln|V| and arg P of patches, normal with mean and covariance from so many patches (Hotelling's law).
     """
@@ -150,7 +150,7 @@ def _outside(seen: Samples, known: Samples) -> npt.NDArray[np.bool_]:
 
 
 def _patch_features(samples: Samples) -> tuple[Real, npt.NDArray]:
-    """Mean ln|H|, ln|V| and arg P under each angle, [patch, 3 * angles], and the patches' names."""
+    """Return mean ln|H|, ln|V| and arg P under each angle, [patch, 3 * angles], and the patches' names."""
     h, v, inverse = by_angle(samples.x)
     x = np.concatenate([np.log(h), np.log(v), np.angle(inverse)], axis=1)
     order = np.unique(samples.patches)
@@ -159,16 +159,16 @@ def _patch_features(samples: Samples) -> tuple[Real, npt.NDArray]:
 
 
 def spread_table(quick: bool) -> Table:
-    """Found and bound for spreads and tasks."""
+    """Return the table of accuracy and bound for spreads and tasks."""
     tasks = (("solids", (60.0,)), ("solids", (60.0, 55.0)), ("liquids", (55.0,)), ("powders", (60.0,)))
     rows = []
     for group, angles in tasks[3:] if quick else tasks:
         for spread in SPREADS[:: 3 if quick else 1]:
             f = with_spread(group, angles, spread, quick)
             seen = f"{len(groups()[group].materials)} {group}{', two angles' if len(angles) > 1 else ''}"
-            told = f"{100 * spread[0]:g} / {100 * spread[1]:g} %"
+            label = f"{100 * spread[0]:g} / {100 * spread[1]:g} %"
             rows.append((
-                seen, told, percent(f.right), percent(f.bound), f"{f.calibration:.3f}",
+                seen, label, percent(f.right), percent(f.bound), f"{f.calibration:.3f}",
                 "{} of {}".format(*f.strangers[:2]), "{} of {}".format(*f.strangers[2:]),
             ))  # fmt: skip
     head = (

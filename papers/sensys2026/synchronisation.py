@@ -35,13 +35,13 @@ GRID = {"columns": 6, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
 OFFSETS_HZ = (200e3, 250e3, 350e3, 450e3, 600e3, 870e3, 1.1e6, 1.3e6, 1.5e6, 1.7e6)
 USUAL_HZ = 870e3
 SKIRT_HZ = (60e3, 200e3)
-"""Where the smear of a bent chirp lies, from its tone."""
-_PADDED = 4096  # points of a spectrum
+"""Range of the smear of a bent chirp, relative to its tone."""
+_PADDED = 4096  # length of spectra
 
 
 @dataclass(frozen=True)
 class SyncScan:
-    """What one scan of metal plates gives.
+    """Results of one scan of metal plates.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class SyncScan:
 
 @cache
 def sync_scan(run: Run) -> SyncScan:
-    """Three metal plates, all disturbances on.
+    """Simulate three metal plates with all disturbances.
 
     "Before" is one chirp of each position as the hardware trigger left it, mixed down by one frequency for the whole
     scan, so that the object lies in the range gate at all; "after" is the pipeline's.
@@ -109,7 +109,7 @@ def sync_scan(run: Run) -> SyncScan:
 
 
 def fig12(run: Run) -> Item:
-    """Range profiles of a row and the image of H, before and after."""
+    """Draw range profiles of a row and the image of H, before and after synchronisation."""
     scan = sync_scan(run)
     fig = new_figure(11.5, 8.4)
     contrast = []
@@ -155,8 +155,8 @@ def fig12(run: Run) -> Item:
 
 def fig15(run: Run) -> Item:
     """Standard deviation of frequency, phase and amplitude after each stage, and the Cramer-Rao bounds."""
-    told = published()
-    limits = {"frequency_hz": told["frequency_std_hz"], "phase_rad": told["phase_std_rad"]}
+    printed = published()
+    limits = {"frequency_hz": printed["frequency_std_hz"], "phase_rad": printed["phase_std_rad"]}
     summary: dict[str, Any] = {name: r.summary() for name, r in sync_scan(run).reports.items()}
     fig = new_figure(11.5, 4.4)
     chirps = " and ".join(f"{c['chirps']} chirps of {b}" for b, c in summary.items())
@@ -204,13 +204,13 @@ def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: flo
 
 
 def _stage_rows(summary: Mapping[str, Any], limits: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
-    """A line for each board and stage; published values stand beside the last stage."""
+    """Return table lines for each board and stage, with the published values beside the last stage."""
     rows = []
     for board, content in summary.items():
         for name, s in content["stages"].items():
-            told = [f"{limits[q]:g}" if name == "referenced" and q in limits else "" for q in QUANTITIES]
+            printed = [f"{limits[q]:g}" if name == "referenced" and q in limits else "" for q in QUANTITIES]
             own = [f"{s[f'{q}_std']:.4g}" for q in QUANTITIES]
-            cells = [x for pair in zip(own, told, strict=True) for x in pair]
+            cells = [x for pair in zip(own, printed, strict=True) for x in pair]
             rows.append((f"{board}, {name}: {STAGES[name]}", *cells[:-1]))
     return tuple(rows)
 
@@ -259,7 +259,7 @@ def _sweep(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
 
 
 def _draw_spectrogram(ax: Axes, one: Complex, chirp: Chirp) -> None:
-    """Spectrogram of one chirp [sample], and where the used part ends."""
+    """Draw the spectrogram of one chirp [sample], and the end of its used part."""
     f, t, power = scipy.signal.spectrogram(
         one, chirp.sample_rate_hz, nperseg=48, noverlap=44, nfft=256, return_onesided=False
     )
@@ -289,7 +289,7 @@ def _draw_skirts(ax: Axes, chirps: Complex, chirp: Chirp) -> dict[str, float]:
 
 
 def _draw_filter(ax: Axes, if_hz: npt.NDArray, amplitude: npt.NDArray, fitted: HighPass, programmed: HighPass) -> None:
-    """Amplitude against IF, the fitted filter's gain taken out, and both filters."""
+    """Draw amplitude against IF without the fitted filter's gain, and both filters."""
     at = np.linspace(if_hz.min(), if_hz.max(), 300)
     ax.plot(if_hz / 1e6, 20 * np.log10(amplitude), ".", ms=3, color=PALETTE[1], label="sweep, simulated")
     for model, colour, style, name in ((fitted, INK, "-", "fitted"), (programmed, PALETTE[6], "--", "programmed")):

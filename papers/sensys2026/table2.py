@@ -16,13 +16,13 @@ class Published:
     Attributes
     ----------
     number, name
-        As in the paper, thickness in the name included.
+        As in the paper, with the thickness in the name.
     permittivity
         eps' - j eps'', the apparent value of a single interface; loss zero where the paper gives none (see note).
     thickness_mm
-        From the name, None where it gives none.
+        Thickness in the name; None without one.
     note
-        What to know before using the value.
+        Remark on the value.
     """
 
     number: int
@@ -33,7 +33,7 @@ class Published:
 
 
 def table2() -> tuple[Published, ...]:
-    """The 36 rows of the paper's Table 2, in its order."""
+    """Return the 36 rows of the paper's Table 2, in its order."""
     raw = json.loads(resources.files("polysight.papers.sensys2026").joinpath("table2.json").read_text(encoding="utf-8"))
     return tuple(
         Published(m["number"], m["name"], complex(m["real"], -(m["loss"] or 0.0)), m["thickness_mm"], m["note"])
@@ -43,7 +43,7 @@ def table2() -> tuple[Published, ...]:
 
 @cache
 def published() -> dict[str, Any]:
-    """Content of `published.json`; percentages as the paper prints them."""
+    """Return the content of `published.json`; percentages as in the paper."""
     return json.loads(
         resources.files("polysight.papers.sensys2026").joinpath("published.json").read_text(encoding="utf-8")
     )

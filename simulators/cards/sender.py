@@ -61,7 +61,7 @@ class ReceiveQueue:
 
 
 class Pace(NamedTuple):
-    """How packets are sent: not faster than the receiver reads, and in calls of 44 or (as a real card) one by one."""
+    """Pacing of packets: not faster than the receiver reads, and in calls of 44 or (as a real card) one by one."""
 
     wait_for_receiver: bool = True
     single: bool = False

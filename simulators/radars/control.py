@@ -21,6 +21,7 @@ import socket
 import struct
 from collections.abc import Callable
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
 from polysight.simulators.faults import Faults
 from polysight.simulators.radars.board import RadarBoard
@@ -178,48 +179,77 @@ class UsbChannel:
         self.closed = True
 
 
-class RadarSocket:
-    """A USB chip at a TCP address, for one client at a time. Raises DeviceError if the address is not free."""
+class _Server:
+    """A TCP server for an event loop that polls `fileno` and calls `serve`. Raises DeviceError if it cannot listen."""
 
-    def __init__(self, address: str, board: RadarBoard) -> None:
+    def __init__(self, address: str, what: str) -> None:
         host, _, port = address.removeprefix("tcp://").rpartition(":")
         try:
             self._listener = socket.create_server((host, int(port)))
         except OSError as e:
             raise DeviceError(
-                f"simulated radar: cannot listen at {address}: {e.strerror}", "another program uses this address"
+                f"{what}: cannot listen at {address}: {e.strerror}",
+                "another program uses this address",
+                code=ErrorCode.BUSY,
             ) from None
         self._listener.setblocking(False)
         self.address = f"tcp://{host}:{self._listener.getsockname()[1]}"
-        self.chip = UsbChip(board)
-        self._client: socket.socket | None = None
-        self._unread = b""
+        self._clients: dict[int, tuple[socket.socket, bytes]] = {}  # by descriptor, with incomplete requests
         self._ready = select.epoll()
         self._ready.register(self._listener, select.EPOLLIN)
 
     def fileno(self) -> int:
-        """Return an epoll descriptor for the listener and its client."""
+        """Return an epoll descriptor for the listener and its clients."""
         return self._ready.fileno()
 
     def serve(self) -> None:
-        """Process pending requests."""
+        """Process pending connections and requests."""
         for descriptor, _ in self._ready.poll(0):
             if descriptor == self._listener.fileno():
-                self._drop()  # the new client replaces the old one
-                self._client = self._listener.accept()[0]
-                self._ready.register(self._client, select.EPOLLIN)
-            elif self._client is not None:
-                self._read(self._client)
+                self._accept()
+            elif descriptor in self._clients:
+                client, rest = self._clients[descriptor]
+                try:
+                    data = client.recv(65536)
+                    if data:
+                        self._clients[descriptor] = client, self._execute(client, rest + data)
+                        continue
+                except (OSError, DeviceError):
+                    pass  # disconnected or unplugged: close the connection
+                self._drop(descriptor)
 
-    def _read(self, client: socket.socket) -> None:
-        try:
-            data = client.recv(65536)
-            if data:
-                self._unread = self._execute(client, self._unread + data)
-                return
-        except (OSError, DeviceError):
-            pass  # disconnected or unplugged: close the connection
-        self._drop()
+    def _accept(self) -> None:
+        client, _ = self._listener.accept()
+        self._clients[client.fileno()] = client, b""
+        self._ready.register(client, select.EPOLLIN)
+
+    def _execute(self, client: socket.socket, data: bytes) -> bytes:
+        """Process the requests in `data` and return the incomplete rest. Raises OSError to close the connection."""
+        raise NotImplementedError
+
+    def _drop(self, descriptor: int) -> None:
+        self._ready.unregister(descriptor)
+        self._clients.pop(descriptor)[0].close()
+
+    def close(self) -> None:
+        """Close all sockets."""
+        for descriptor in list(self._clients):
+            self._drop(descriptor)
+        self._listener.close()
+        self._ready.close()
+
+
+class RadarSocket(_Server):
+    """A USB chip at a TCP address, for one client at a time."""
+
+    def __init__(self, address: str, board: RadarBoard) -> None:
+        super().__init__(address, "simulated radar")
+        self.chip = UsbChip(board)
+
+    def _accept(self) -> None:
+        for descriptor in list(self._clients):  # the new client replaces the old one
+            self._drop(descriptor)
+        super()._accept()
 
     def _execute(self, client: socket.socket, data: bytes) -> bytes:
         while len(data) >= _HEAD.size:
@@ -236,91 +266,26 @@ class RadarSocket:
             data = data[_HEAD.size + size :]
         return data
 
-    def _drop(self) -> None:
-        if self._client is not None:
-            self._ready.unregister(self._client)
-            self._client.close()
-            self._client, self._unread = None, b""
 
-    def close(self) -> None:
-        """Close all sockets."""
-        self._drop()
-        self._listener.close()
-        self._ready.close()
-
-
-class LineServer:
-    """Control server of a board at `address:port`; it calls `rearm` for each line that arms the radar.
-
-    Raises DeviceError if the address is not free.
-    """
+class LineServer(_Server):
+    """Control server of a board at `address:port`; it calls `rearm` for each line that arms the radar."""
 
     def __init__(self, address: str, rearm: Callable[[], None], faults: Faults) -> None:
-        host, _, port = address.rpartition(":")
-        try:
-            self._listener = socket.create_server((host, int(port)))
-        except OSError as e:
-            raise DeviceError(
-                f"simulated control server: cannot listen at {address}: {e.strerror}",
-                "another program uses this address",
-            ) from None
-        self._listener.setblocking(False)
+        super().__init__(address, "simulated control server")
         self._rearm, self._faults = rearm, faults
-        self._clients: dict[int, tuple[socket.socket, bytes]] = {}
-        self._ready = select.epoll()
-        self._ready.register(self._listener, select.EPOLLIN)
         self.lines = 0
         self.unknown_lines = 0
 
-    def fileno(self) -> int:
-        """Return an epoll descriptor for the listener and its clients."""
-        return self._ready.fileno()
-
-    def serve(self) -> None:
-        """Process pending connections and lines."""
-        for descriptor, _ in self._ready.poll(0):
-            if descriptor == self._listener.fileno():
-                client, _ = self._listener.accept()
-                client.setblocking(False)
-                self._clients[client.fileno()] = client, b""
-                self._ready.register(client, select.EPOLLIN)
-            else:
-                self._read(descriptor)
-
-    def _read(self, descriptor: int) -> None:
-        client, rest = self._clients[descriptor]
-        try:
-            data = client.recv(4096)
-        except OSError:
-            data = b""
-        *lines, rest = (rest + data).split(b"\n")
-        self._clients[descriptor] = client, rest
-        alive = bool(data)
+    def _execute(self, client: socket.socket, data: bytes) -> bytes:
+        *lines, rest = data.split(b"\n")
         for line in lines:
-            alive &= self._take(client, line)
-        if not alive:
-            self._drop(descriptor)
-
-    def _take(self, client: socket.socket, line: bytes) -> bool:
-        """Process one line; return False if the connection ends."""
-        if line.strip() != LINE:
-            self.unknown_lines += 1
-            return True
-        number, self.lines = self.lines, self.lines + 1
-        if number in self._faults.retrigger_resets:
-            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
-            return False
-        if number not in self._faults.retrigger_fails:
-            self._rearm()
-        return True
-
-    def _drop(self, descriptor: int) -> None:
-        self._ready.unregister(descriptor)
-        self._clients.pop(descriptor)[0].close()
-
-    def close(self) -> None:
-        """Close all sockets."""
-        for descriptor in list(self._clients):
-            self._drop(descriptor)
-        self._listener.close()
-        self._ready.close()
+            if line.strip() != LINE:
+                self.unknown_lines += 1
+                continue
+            number, self.lines = self.lines, self.lines + 1
+            if number in self._faults.retrigger_resets:
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
+                raise ConnectionResetError
+            if number not in self._faults.retrigger_fails:
+                self._rearm()
+        return rest

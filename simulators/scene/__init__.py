@@ -1,24 +1,17 @@
-"""From a scene file to what the radars send, and to whole scans on disk.
+"""Simulate radar data: from a scene file to the frames of the radars, and to whole scans on disk.
 
-`scene_file` declares what lies on the object plane, and `specimens` draws how it really is. `optics` says how plates
-reflect and sums their echo exactly but slowly; `field` (with `field_grid`, `spectral`) computes the same at every stage
-position fast; `receiver` adds what one board does to the signal; `radar` puts them together to frames for given stage
-offsets. `cubes` gives the samples after a perfect synchronisation without any frames. `simulated_scan` writes a scan
-of frames, in this project's scan folder (`layouts`) or in the published data set's forms (`published_layout`), and
-truth.json.
+`scene_file` defines the scene file: plates, points and disturbances; `specimens` draws the true permittivities and
+positions. `optics` has the reflection of plates and the exact but slow sum of their echo; `field` (with `field_grid`
+and `spectral`) computes the same echo fast at every stage position. `receiver` adds the effects of a board, and `radar`
+(`SimulatedRig`) gives the frames for stage offsets. `cubes` gives the samples after ideal synchronisation without
+frames. `simulate` writes a scan, as a scan folder (`layouts`) or in the published data set's layout
+(`published_layout`), with truth.json.
 """
 
 from polysight.simulators.scene.cubes import reference_cube, synced_cube
 from polysight.simulators.scene.layouts import OwnLayout
 from polysight.simulators.scene.optics import layered, strips
-from polysight.simulators.scene.published_layout import (
-    AuthorsLayout,
-    Errors,
-    Material,
-    write_cube,
-    write_labels,
-    write_material,
-)
+from polysight.simulators.scene.published_layout import AuthorsLayout, write_cube
 from polysight.simulators.scene.radar import PatternSource, SignalSource, SimulatedRig, pattern_frames
 from polysight.simulators.scene.scene_file import (
     Disturbances,
@@ -37,9 +30,7 @@ from polysight.simulators.scene.specimens import draw_specimens
 __all__ = [
     "AuthorsLayout",
     "Disturbances",
-    "Errors",
     "Layer",
-    "Material",
     "OwnLayout",
     "PatternSource",
     "Plate",
@@ -62,6 +53,4 @@ __all__ = [
     "truth",
     "without_offset",
     "write_cube",
-    "write_labels",
-    "write_material",
 ]

@@ -1,13 +1,12 @@
-"""Scenes without raw data: the samples of every position as a perfect synchronisation leaves them.
+"""Simulate samples after ideal synchronisation, without raw data.
 
-:func:`reference_cube` is the object's echo of an ideal rig. :func:`synced_cube` keeps what synchronisation cannot take
-away (leakage, gains, noise, the direct path, backlash) at the level of the averaged samples: hundreds of scenes in the
-time of one raw scan.
+:func:`reference_cube` is the object's echo for an ideal rig. :func:`synced_cube` adds the disturbances that
+synchronisation does not remove (leakage, gains, noise, the direct path, backlash) to the averaged samples: hundreds of
+scenes take the time of one raw scan.
 
-Beside a raw scan that the host synchronised (tests/simulators/test_cubes.py), a row of a synced cube differs by one
-complex factor, the same for all rows, channels and samples, and by less than 1 % rms of its samples without noise: what
-is left of motion within a burst, of the filter and of the object in the host's direct path. Noise agrees within 5 % in
-power.
+Compared with a raw scan that the host synchronised (tests/simulators/test_cubes.py), a synced cube differs by one
+complex factor, common to all rows, channels and samples, and by less than 1 % RMS without noise, due to residuals of
+motion within a burst, of the filter, and of the object in the host's direct path. The noise power agrees within 5 %.
 """
 
 from __future__ import annotations
@@ -30,18 +29,17 @@ from polysight.simulators.scene.scene_file import Scene, apply_scene
 
 
 def reference_cube(rig: Instrument, scene: Scene, remove_direct: bool = True) -> dict[str, NDArray[np.complex64]]:
-    """The object's echo as perfect synchronisation would leave it, at the plan's true positions.
+    """Return the object's echo after ideal synchronisation, at the true positions.
 
-    Every disturbance is off, whatever the scene says: no leakage, gains, noise or direct path. Each position is the
-    mean of its burst (x + direction x mean travel).
+    All disturbances of the scene are ignored: no leakage, gains, noise or direct path. Each position is the mean of its
+    burst (x + direction x mean travel).
 
     Parameters
     ----------
     rig, scene
         Rig file and scene; the scene's overrides are applied.
     remove_direct
-        Take the phase of each RX's own direct path away, so that the phase is 2 pi f (tau - tau_direct); otherwise it
-        is 2 pi f tau.
+        Reference each RX to its own direct path: phase 2 pi f (tau - tau_direct), otherwise 2 pi f tau.
 
     Returns
     -------
@@ -71,29 +69,29 @@ def synced_cube(
     seed: int | None = None,
     cache_dir: Path | None = None,
 ) -> NDArray[np.complex64]:
-    """Samples of a scan as a perfect synchronisation leaves them: referenced to the direct path, bursts averaged.
+    """Return the samples of a scan after ideal synchronisation: referenced to the direct path, bursts averaged.
 
-    Kept of the disturbances: leakage, gains and phases of the channels, H over V, noise, loss of the direct path,
-    backlash. Gone without a trace: timing, crystals, phases, chirp shape, filter, motion within a burst, ADC, lost
-    packets. An echo of excess path d is a exp(+j 2 pi f d / c), the direct path a constant.
+    Simulated disturbances: leakage, gains and phases of the channels, H over V, noise, loss of the direct path,
+    backlash. Not simulated: timing, crystals, phases, chirp shape, filter, motion within a burst, ADC, lost packets. An
+    echo of excess path d is a exp(+j 2 pi f d / c), the direct path is constant.
 
     Parameters
     ----------
     rig, scene, board_name
         Rig file and scene; the scene's overrides are applied. One of the receiving boards.
     frequencies_hz
-        Transmit frequencies wanted, ascending; None: those of all ADC samples. Few are fast.
+        Transmit frequencies, ascending; None: those of all ADC samples. Few are fast.
     rx
-        Channels wanted; None for all.
+        Channels; None for all.
     noise
-        rms magnitude of the noise of one averaged sample of a channel of gain 1, relative to the direct path; None:
-        what `direct_snr_db` leaves of a chirp's noise when the burst is averaged and the filter taken out.
+        RMS noise of an averaged sample of a channel of gain 1, relative to the direct path; None: from `direct_snr_db`,
+        averaging and filter compensation.
     direct
-        Leave the direct path in.
+        Include the direct path.
     seed
-        Of the power cycle: gains and noise; None takes the scene's. Specimens are drawn from the scene's own seed.
+        Seed of the power cycle (gains and noise); None: the scene's. Specimens always use the scene's seed.
     cache_dir
-        Where fields are kept between runs; None keeps nothing.
+        Folder that caches fields between runs; None: no cache.
 
     Returns
     -------
@@ -120,7 +118,7 @@ def synced_cube(
 
 
 def _burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int, echo_m: float) -> float:
-    """Rms noise of an averaged sample; taking the high-pass filter out raises it by the filter's loss at the IF."""
+    """Return the RMS noise of an averaged sample; compensating the high-pass filter divides by its gain at the IF."""
     d, chirp = scene.disturbances, rig.chirp
     if d.direct_snr_db is None:
         return 0.0
@@ -135,7 +133,7 @@ def _burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int, echo_m:
 def _read(
     field: ObjectField, rig: Instrument, f: Real, away_m: Real, gains: NDArray[np.complexfloating], backlash_mm: float
 ) -> NDArray[np.complex64]:
-    """The field at the plan's true positions, [rx, row, column, frequency]: phase of path `away_m` [rx] put back."""
+    """Return the field at the true positions, [rx, row, column, frequency], with the phase of path `away_m` [rx]."""
     base = np.eye(len(f)) if np.array_equal(field.nodes_hz, f) else node_matrix(field, f)[0]
     turn = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(away_m, f)) * gains[:, None]
     expand = (base * turn[:, None]).astype(np.complex64)

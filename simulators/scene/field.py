@@ -1,16 +1,15 @@
-"""The object's echo at every stage position, fast.
+"""Object field: the object's echo at every stage position, computed fast and cached.
 
-TX and RX move together and the stage's plane is the radars', so the echo depends on plate and stage position only
-through their difference: field(u) = integral A(v) g(v - u) dv, a convolution. It is done in the spectral domain:
+TX and RX move together in a plane, so the echo depends only on the difference of plate and stage position:
+field(u) = integral A(v) g(v - u) dv, a convolution. It is computed in the spectral domain:
 
-* plates and points enter through their analytic Fourier transforms, so edges are exact and lie anywhere;
-* the kernel g is sampled just finely enough for its phase gradient (per axis) and fades out beyond the scene's reach;
-* r(theta) of each plate is a short Chebyshev series in the local angle, one kernel for each order;
+* plates and points enter by their analytic Fourier transforms, so edges are exact at any position;
+* the kernel g is sampled finely enough for its phase gradient (per axis) and fades out beyond the scene;
+* r(theta) of each plate is a short Chebyshev series in the local angle, with one kernel per order;
 * only a few Chebyshev nodes of the IF band are computed, with the centre delay removed; the rest is interpolated;
-* the result is kept oversampled and read at any stage position through a windowed sinc.
+* the result is oversampled, and evaluated at any stage position with a windowed sinc.
 
-:mod:`polysight.simulators.scene.spectral` does it: how far the kernel must reach, how fine it must be, and plates that
-lie tilted, higher or lower, or rough.
+The computation is in :mod:`polysight.simulators.scene.spectral`, also for tilted, raised or rough plates.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from polysight.shared.config import Board, Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.tables import to_builtins
 from polysight.simulators.scene.field_grid import TAPS
@@ -35,19 +35,19 @@ from polysight.simulators.scene.scene_file import Scene
 from polysight.simulators.scene.specimens import draw_specimens
 from polysight.simulators.scene.spectral import cheb_nodes, compute
 
-_PHYSICS = 2  # counts changes of what a cached field holds
+_PHYSICS = 2  # version of the content of cached fields
 
 _KAISER_BETA = 8.0
 
 
 @dataclass(frozen=True)
 class ObjectField:
-    """Object field of one board on a regular grid of stage offsets.
+    """Object field of a board on a regular grid of stage offsets.
 
     Attributes
     ----------
     values
-        complex64 [ny, nx, rx, node], the phase of `centre_path_m` removed.
+        complex64 [ny, nx, rx, node], without the phase of `centre_path_m`.
     start_m, step_m
         First offset and pitch in (x, y), metres.
     nodes_hz
@@ -63,12 +63,12 @@ class ObjectField:
     centre_path_m: float
 
     def at(self, x_m: Real, y_m: Real) -> NDArray[np.complex64]:
-        """Field at stage offsets, complex64 [n, rx, node], centre path removed.
+        """Return the field at stage offsets, complex64 [n, rx, node], without the phase of the centre path.
 
         Raises
         ------
         DataError
-            when an offset lies outside the field's aperture.
+            if an offset lies outside the field's aperture.
         """
         x_m, y_m = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
         ix, wx = self._taps(x_m, 0)
@@ -82,7 +82,7 @@ class ObjectField:
         return out
 
     def covers(self, x_m: Real, y_m: Real) -> NDArray[np.bool_]:
-        """Whether offsets lie inside the aperture this field can be read at, bool [n]."""
+        """True for offsets inside the field's aperture, bool [n]."""
         inside = np.ones(len(x_m), dtype=np.bool_)
         for axis, u in enumerate((x_m, y_m)):
             low, high = self._reach(axis)
@@ -90,20 +90,21 @@ class ObjectField:
         return inside
 
     def _reach(self, axis: int) -> tuple[float, float]:
-        """First and last offset with all taps inside the grid, metres; 0 = x, 1 = y."""
+        """Return the first and last offset with all taps inside the grid, metres; 0 = x, 1 = y."""
         first, step = self.start_m[axis], self.step_m[axis]
         half, n = TAPS // 2, self.values.shape[1 - axis]
         return first + (half - 1) * step, first + (n - half - 1) * step
 
     def _taps(self, u: Real, axis: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-        """Grid indices [n, taps] and weights of the Kaiser-windowed sinc at offsets u."""
+        """Return grid indices [n, taps] and weights of the Kaiser-windowed sinc at offsets u."""
         low, high = self._reach(axis)
         if u.min() < low or u.max() > high:
             raise DataError(
                 f"stage offset {1e3 * u[np.argmax(np.abs(u))]:.2f} mm in {'xy'[axis]} is outside the simulated aperture"
                 f" {1e3 * low:.2f}..{1e3 * high:.2f} mm",
-                "the scan does not follow the grid the simulated rig was started with",
+                "the scan has another grid than the simulated rig",
                 "start the simulated rig with the same instrument.toml and scene as the scan",
+                code=ErrorCode.MISMATCH,
             )
         position = (u - self.start_m[axis]) / self.step_m[axis]
         index = np.floor(position).astype(np.intp)[:, None] + np.arange(1 - TAPS // 2, 1 + TAPS // 2)
@@ -114,9 +115,9 @@ class ObjectField:
 
 
 def node_matrix(field: ObjectField, frequencies_hz: Real) -> tuple[Real, Real]:
-    """Interpolation from the nodes to frequencies, and its derivative per Hz: two float64 [node, k].
+    """Return the interpolation from nodes to frequencies, and its derivative per Hz: two float64 [node, k].
 
-    Barycentric in effect: discrete orthogonality of the Chebyshev polynomials on their own nodes.
+    It uses the discrete orthogonality of the Chebyshev polynomials on their nodes.
     """
     q = len(field.nodes_hz)
     low, high = frequencies_hz[0], frequencies_hz[-1]
@@ -138,24 +139,24 @@ def build_field(
     cache_dir: Path | None = None,
     rx: Sequence[int] | None = None,
 ) -> ObjectField:
-    """Object field of one board over the aperture of the rig's grid.
+    """Compute the object field of a board over the aperture of the rig's grid, or read it from the cache.
 
     Parameters
     ----------
     rig, scene, board
         Rig with the scene applied, the scene, and one of the rig's receiving boards.
     samples_hz
-        Transmit frequency of the ADC samples, ascending; nodes span first to last. Where they are fewer than the nodes
-        that interpolation needs, the field is computed at them.
+        Transmit frequency of the ADC samples, ascending. If there are fewer than the nodes needed for interpolation,
+        the field is computed at the samples.
     cache_dir
-        Where fields are kept between runs, keyed by everything they depend on; None keeps nothing.
+        Folder that caches fields between runs, keyed by everything they depend on; None: no cache.
     rx
         Channels to compute; None for all.
 
     Raises
     ------
     DataError
-        when the cache holds a file that cannot be read.
+        if a cached file cannot be read.
     """
     scene = draw_specimens(scene)
     rx = range(len(rig.antennas.rx_mm)) if rx is None else rx
@@ -174,7 +175,9 @@ def build_field(
                     f["values"], (sx[0], sx[1]), (sy[0], sy[1]), f["nodes_hz"], float(f["centre_path_m"])
                 )
         except (OSError, ValueError, KeyError) as e:
-            raise DataError(f"{path}: not a field: {e}", "an interrupted write", "delete the file") from None
+            raise DataError(
+                f"{path}: not a field: {e}", "an interrupted write", "delete the file", code=ErrorCode.FILE_DAMAGED
+            ) from None
     field = ObjectField(*compute(rig, scene, board, samples_hz, rx))
     cache_dir.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(f".{board.name}.tmp.npz")

@@ -1,4 +1,4 @@
-"""Grids of the fast field: how far its kernel must reach, and how fine it must be, in x and in y."""
+"""Grids of the fast field: extent and pitch of its kernel in x and y."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from polysight.simulators.scene.optics import Antennas, Real
 from polysight.simulators.scene.scene_file import Scene
 
-FADE_M = 0.06  # the kernel's fade-out beyond the reach of the scene
-TAPS = 12  # of the windowed sinc
-MARGIN_M = 0.012  # offsets beyond the aperture that the sinc's taps need
+FADE_M = 0.06  # length of the kernel's fade-out beyond the scene
+TAPS = 12  # taps of the windowed sinc
+MARGIN_M = 0.012  # offsets beyond the aperture, for the taps of the sinc
 OVERSAMPLING = 2
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of the computation: spectral grid and the wanted offsets, metres."""
+    """One axis of the computation: range of offsets and spectral grid, metres."""
 
     low_u: float
     high_u: float
@@ -37,7 +37,7 @@ class Axis:
 
     @property
     def fade(self) -> Real:
-        """1 within reach of the scene, a smooth way to 0 outside."""
+        """Fade-out of the kernel: 1 within the scene, smoothly 0 outside."""
         w = self.w
         beyond = np.maximum(self.low_w - w, w - self.high_w) / FADE_M
         return np.cos(np.pi / 2 * np.clip(beyond, 0.0, 1.0)) ** 4
@@ -49,20 +49,20 @@ class Axis:
 
     @property
     def first_u(self) -> float:
-        """First offset of the output grid: some taps before the aperture."""
+        """First offset of the output grid, some taps before the aperture."""
         return self.low_u - (TAPS // 2) * self.step / OVERSAMPLING
 
     @property
     def outputs(self) -> int:
-        """Offsets of the output grid."""
+        """Number of offsets of the output grid."""
         return int(np.ceil((self.high_u - self.low_u) / self.step * OVERSAMPLING)) + TAPS + 1
 
 
 def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -> tuple[Axis, Axis]:
-    """Extent and pitch in x and y from the scene's reach and the kernel's steepest phase.
+    """Return extent and pitch in x and y from the extent of the scene and the steepest phase of the kernel.
 
-    A tilt moves a plate's specular point (26 mm for 1 degree) but needs no more room: the kernel reaches from every
-    offset to every plate's edges anyhow.
+    A tilt moves the specular point of a plate (26 mm per degree), but the kernel already extends from every offset to
+    the edges of every plate.
     """
     travel = 2 * mean_burst_travel_mm(rig.burst, rig.stage) + abs(scene.disturbances.backlash_mm)
     edges = [(*p.centre_mm, p.size_mm[0] / 2, p.size_mm[1] / 2) for p in scene.plates]

@@ -1,6 +1,6 @@
-"""The writer of this project's scan folder, and what every writer of simulated scans needs.
+"""Write simulated scans as scan folders; functions common to all writers of simulated scans.
 
-The byte format is docs/spec/scan-folder.md; written here independently of the host that reads it.
+Byte format: docs/spec/scan-folder.md, implemented here independently of the host.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from polysight.shared import __version__
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.files import named
 from polysight.shared.messages import AnyEvent, Capture, RowFinished, RowStarted, RunStarted, RunStopped, pack_with_crc
@@ -24,18 +25,18 @@ from polysight.shared.tables import to_builtins
 from polysight.shared.units import NS_PER_S, us_to_ns
 
 Gaps = list[tuple[int, int]]
-_HEADER_BYTES = 10  # sequence and byte count before each packet's payload
+_HEADER_BYTES = 10  # sequence number and byte count before each payload
 
 
 class Layout(Protocol):
-    """Where simulated rows go."""
+    """Writer of simulated rows."""
 
     def start(self) -> None:
-        """Begin the scan."""
+        """Start the scan."""
         ...
 
     def write_row(self, row: Row, payloads: dict[str, NDArray[np.int16]], gaps: dict[str, Gaps]) -> None:
-        """One row: int16 [frames, samples, 8] and the lost byte ranges of each board."""
+        """Write a row: int16 [frames, samples, 8] and the lost byte ranges of each board."""
         ...
 
     def end(self) -> None:
@@ -44,17 +45,17 @@ class Layout(Protocol):
 
 
 def versions() -> dict[str, str]:
-    """Release that made the data; the distributions are released together."""
+    """Return the release that makes the data."""
     return {"polysight": __version__}
 
 
 def packet_payload_bytes(rig: Instrument) -> int:
-    """Payload of a full data packet: what the card is told, less the header, at most 1456 (DCA1000)."""
+    """Return the payload of a full data packet: configured size without header, at most 1456 (DCA1000)."""
     return min(rig.card.packet_bytes - _HEADER_BYTES - 4, 1456)
 
 
 def blank(payload: NDArray[np.int16], gaps: Gaps) -> bytes:
-    """The payload's bytes with zeros where packets are lost."""
+    """Return the bytes of a payload with zeros in lost packets."""
     raw = bytearray(payload.astype("<i2", copy=False).tobytes())
     for start, stop in gaps:
         raw[start:stop] = bytes(stop - start)
@@ -62,14 +63,19 @@ def blank(payload: NDArray[np.int16], gaps: Gaps) -> bytes:
 
 
 def new_folder(path: Path) -> None:
-    """Make an empty folder. Raises DataError when it holds anything."""
+    """Create an empty folder. Raises DataError if it is not empty."""
     if path.exists() and any(path.iterdir()):
-        raise DataError(f"{path}: the folder is not empty", "an earlier run", "choose another --out, or empty it")
+        raise DataError(
+            f"{path}: the folder is not empty",
+            "an earlier run wrote it",
+            "choose another --out, or empty it",
+            code=ErrorCode.FILE_EXISTS,
+        )
     path.mkdir(parents=True, exist_ok=True)
 
 
 def _calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, str]]]:
-    """Copies in the scan of the files that `[calibration]` names; what they are, by kind."""
+    """Copy the files that `[calibration]` names into the scan; return the entry for the manifest."""
     facts = {}
     for kind, name in to_builtins(rig.calibration).items():
         if not name:
@@ -78,7 +84,7 @@ def _calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, s
         try:
             (path / copy).parent.mkdir(exist_ok=True)
             (path / copy).write_bytes(source.read_bytes())
-            images = source.with_suffix(".npz")  # of a metal reference
+            images = source.with_suffix(".npz")  # gains of a metal reference
             if images.exists():
                 (path / "calibration" / images.name).write_bytes(images.read_bytes())
         except OSError as e:
@@ -94,7 +100,7 @@ def _calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, s
 
 
 class OwnLayout:
-    """A scan folder of this project: manifest.jsonl, events.msgpack, raw/<board>/<row>.bin and .idx."""
+    """Writer of a scan folder: manifest.jsonl, events.msgpack, raw/<board>/<row>.bin and .idx."""
 
     def __init__(self, path: Path, rig: Instrument, plan: RasterPlan, scan_id: str, started_utc: str) -> None:
         self._path, self._rig, self._plan = path, rig, plan
@@ -103,7 +109,7 @@ class OwnLayout:
         self._lines, self._digest, self._rows = 0, "", 0
 
     def start(self) -> None:
-        """Make the folder; note the start in manifest and events. Raises DataError when it is not empty."""
+        """Create the folder, start manifest and events. Raises DataError if it is not empty."""
         new_folder(self._path)
         self._fact(
             "scan_started",
@@ -119,7 +125,7 @@ class OwnLayout:
         self._event(RunStarted(plan=self._plan, **self._stamp()))
 
     def write_row(self, row: Row, payloads: dict[str, NDArray[np.int16]], gaps: dict[str, Gaps]) -> None:
-        """Write one committed row and the events the Pi would have sent."""
+        """Write a committed row and the events of the Pi."""
         pulses = self._rig.burst.pulses
         boards = {}
         for name, payload in payloads.items():
@@ -155,7 +161,7 @@ class OwnLayout:
         self._rows += 1
 
     def end(self) -> None:
-        """Note the end."""
+        """Write the end of the scan to manifest and events."""
         self._event(RunStopped(exit_status="success", **self._stamp()))
         self._fact("scan_ended", exit_status="success", reason="", rows_committed=self._rows)
 
@@ -219,5 +225,5 @@ class OwnLayout:
 
 
 def _index(facts: dict[str, Any]) -> bytes:
-    """A row's index: one JSON line, then as many (arrival ns, bytes) pairs as it says: none, nothing arrived."""
+    """Return the index of a row: one JSON line, followed by no packet arrivals."""
     return json.dumps({**facts, "arrivals": 0}, sort_keys=True, separators=(",", ":")).encode() + b"\n"

@@ -1,15 +1,14 @@
-"""How flat plates reflect, the integrand of the object's echo, and its exact, slow sum.
+"""Reflection of flat plates, the integrand of the object's echo, and its exact but slow sum.
 
-Reflection is at 76..81 GHz, in both polarisations, and the simulators' own: independent of the host's. Media are
-eps' - j eps'' (time dependence exp(+j omega t)). Signs are those of the paper's Eq. 2: a perfect conductor has
-r_s = r_p = -1, so that P = r_s / r_p = 1. The echo is physical optics on flat plates, each at its own height and tilt.
+Reflection at 76..81 GHz in both polarisations, implemented independently of the host. Media are eps' - j eps'' (time
+dependence exp(+j omega t)). Signs of the paper's Eq. 2: a perfect conductor has r_s = r_p = -1, so that
+P = r_s / r_p = 1. The echo is physical optics on flat plates, each with its own height and tilt.
 
-A wave that comes later has an IF of phase +2 pi f tau: a receiver's samples are the conjugate of the wave (time
-dependence exp(+j omega t), so a delay is exp(-j 2 pi f tau)), and all that lies on its way is conjugated with it: what
-the wave met is multiplied by here as its conjugate, :func:`sampled`.
+A receiver's samples are the conjugate of the wave: a delay is exp(-j 2 pi f tau) in the wave and +2 pi f tau in the
+samples. So complex factors of the wave (reflection, leakage) enter here as their conjugate, :func:`sampled`.
 
 Amplitudes are relative to the direct path: a free path of length R has amplitude d / R, d the board's direct path to
-RX1. Antenna patterns are not modelled beyond one constant, the scene's `object_gain`.
+RX1. Antenna patterns are modelled only by one constant, the scene's `object_gain`.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ Reflectivity = Callable[[Plate, float, Real], Complex]
 
 
 def half_space(epsilon: complex, theta_rad: NDArray[np.floating] | float) -> tuple[Complex, Complex]:
-    """Reflection coefficients of one interface, air to `epsilon` (paper Eq. 2 with Snell's law).
+    """Return the reflection coefficients of one interface, air to `epsilon` (paper Eq. 2 with Snell's law).
 
     With q = sqrt(eps - sin^2 theta) = n_t cos(theta_t): r_s = (cos - q)/(cos + q), r_p = (q - eps cos)/(q + eps cos).
 
@@ -49,7 +48,7 @@ def half_space(epsilon: complex, theta_rad: NDArray[np.floating] | float) -> tup
     r_s, r_p : complex128, shape of theta_rad
     """
     cos = np.cos(np.asarray(theta_rad, dtype=np.float64))
-    # Principal root: the imaginary part is <= 0, so the transmitted wave exp(-j k q z) decays into the medium.
+    # Principal root: its imaginary part is <= 0, so the transmitted wave exp(-j k q z) decays.
     q: Complex = np.sqrt(np.asarray(epsilon - 1.0 + cos**2, dtype=np.complex128))
     return np.asarray((cos - q) / (cos + q)), np.asarray((q - epsilon * cos) / (q + epsilon * cos))
 
@@ -57,7 +56,7 @@ def half_space(epsilon: complex, theta_rad: NDArray[np.floating] | float) -> tup
 def slab(
     epsilon: complex, thickness_m: float, frequency_hz: float, theta_rad: NDArray[np.floating] | float
 ) -> tuple[Complex, Complex]:
-    """Reflection coefficients of a plate of finite thickness in air (Airy sum; Born and Wolf, section 1.6).
+    """Return the reflection coefficients of a plate of finite thickness in air (Airy sum; Born and Wolf, section 1.6).
 
     r = r1 (1 - e) / (1 - r1^2 e), e = exp(-2 j k d sqrt(eps - sin^2 theta)), r1 the single interface.
 
@@ -75,9 +74,9 @@ def slab(
 def layered(
     layers: Sequence[Layer], frequency_hz: float, theta_rad: NDArray[np.floating] | float
 ) -> tuple[Complex, Complex]:
-    """Reflection coefficients of a stack of layers seen from air, as of transmission lines in series.
+    """Return the reflection coefficients of a stack of layers in air, as transmission lines in series.
 
-    From the back to the front each layer turns the impedance behind it (Pozar, Microwave Engineering, eq. 2.44) into
+    From back to front, each layer transforms the impedance behind it (Pozar, Microwave Engineering, eq. 2.44) to
     Z (Z_b + j Z t) / (Z + j Z_b t), t = tan(k d q), with Z = 1 / q for s and q / eps for p, in units of free space.
 
     Returns
@@ -104,14 +103,14 @@ def layered(
 
 
 def strips(psi_rad: float, theta_rad: NDArray[np.floating] | float) -> tuple[Complex, Complex]:
-    """What a screen that conducts along one direction alone returns of a wave whose s and p are alike.
+    """Return the reflection of a screen that conducts in one direction, for a wave with equal s and p.
 
-    The current J along the strips u = (sin psi, cos psi) in (x, y) makes the total field along u zero; it meets the
-    wave impedances of the two polarisations, 1 / (2 cos) for s and cos / 2 for p in units of free space.
+    The current J along the strips u = (sin psi, cos psi) in (x, y) makes the total field along u zero. It radiates with
+    the wave impedances of the polarisations, 1 / (2 cos) for s and cos / 2 for p in units of free space.
 
     Returns
     -------
-    r_s, r_p : complex128, shape of theta_rad; both are -1 times what the wave has along u, split by u
+    r_s, r_p : complex128, shape of theta_rad
     """
     cos, u_x, u_y = np.cos(np.asarray(theta_rad, dtype=np.float64)), np.sin(psi_rad), np.cos(psi_rad)
     incident = u_y + u_x * cos  # tangential: E_y = 1, E_x = cos(theta)
@@ -122,7 +121,7 @@ def strips(psi_rad: float, theta_rad: NDArray[np.floating] | float) -> tuple[Com
 
 
 def plate_reflection(plate: Plate, frequency_hz: float, theta_rad: NDArray[np.floating]) -> tuple[Complex, Complex]:
-    """Reflection coefficients (r_s, r_p) of a plate of the scene: metal, strips, half space, slab or stack."""
+    """Return the reflection coefficients (r_s, r_p) of a plate: metal, strips, half space, slab or stack."""
     if plate.strips_deg is not None:
         return strips(np.radians(plate.strips_deg), theta_rad)
     if plate.metal:
@@ -138,7 +137,7 @@ def plate_reflection(plate: Plate, frequency_hz: float, theta_rad: NDArray[np.fl
 
 @dataclass(frozen=True)
 class Antennas:
-    """TX and the RX of one board at stage offset zero, metres, rig frame; z of the object plane; the image centre."""
+    """TX and RX of a board at stage offset zero, z of the object plane, and the image centre; metres, rig frame."""
 
     tx_m: Real
     rx_m: Real
@@ -147,17 +146,17 @@ class Antennas:
 
     @property
     def direct_m(self) -> Real:
-        """TX to each RX, metres, [rx]."""
+        """Direct path to each RX, metres, [rx]."""
         return np.linalg.norm(self.rx_m - self.tx_m, axis=1)
 
     def legs(
         self, x_m: Real, y_m: Real, rx: int, z_m: Real | float | None = None, slope: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[Real, Real, Real, Real]:
-        """Geometry of object points (x, y) relative to the stage: r1, r2 (m), local incidence (rad), obliquity.
+        """Return r1, r2 (m), local incidence (rad) and obliquity of object points (x, y) relative to the stage.
 
-        The points lie at z_m (None: on the object plane of the rig file), on a surface whose z grows by `slope` along
-        x and y. Local incidence is half the angle between the directions to TX and RX, whatever the surface's normal.
-        Obliquity is the mean cosine of both directions to that normal, times the surface's area over dx dy.
+        The points lie at z_m (None: object plane of the rig file) on a surface whose z grows by `slope` along x and y.
+        Local incidence is half the angle between the directions to TX and RX. Obliquity is the mean cosine of both
+        directions to the surface's normal, times the surface's area per dx dy.
         """
         z = self.plane_z_m if z_m is None else z_m
         ax, ay, az = x_m - self.tx_m[0], y_m - self.tx_m[1], z - self.tx_m[2]
@@ -170,21 +169,21 @@ class Antennas:
 
 
 def antennas(rig: Instrument, board: Board) -> Antennas:
-    """Antenna positions of the transmitter and one receiving board."""
+    """Return the antenna positions of the transmitter and a receiving board."""
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
     centre = np.array(specular_midpoint_m(rig, rig.by_role("receive_h")))
     return Antennas(tx, rx, rig.geometry.object_distance_mm / 1e3, centre)
 
 
 def sampled(factor: Any) -> Any:
-    """What samples show of a wave's complex factor (reflection, leakage): its conjugate."""
+    """Return a wave's complex factor (reflection, leakage) as it appears in samples: its conjugate."""
     return np.conj(factor)
 
 
 def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
-    """What a board's samples show of a plate: its own polarisation plus its cross-polar leakage of the other.
+    """Return the function that gives a plate's reflection in a board's samples, with cross-polar leakage.
 
-    H: r_s + leak_h r_p. V: r_p + leak_v r_s. TX is turned 45 degrees: both polarisations leave with the same strength.
+    H: r_s + leak_h r_p. V: r_p + leak_v r_s. TX is rotated by 45 degrees and sends both polarisations equally.
     """
     leak_h, leak_v = complex(*scene.disturbances.leakage_h), complex(*scene.disturbances.leakage_v)
 
@@ -200,13 +199,13 @@ def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
 
 
 def direct_factor(board: Board, scene: Scene) -> complex:
-    """The direct path in a board's samples: s and p parts are equal, so the wave is 1 + leakage."""
+    """Return the direct path in a board's samples: s and p are equal, so the wave is 1 + leakage."""
     d = scene.disturbances
     return sampled(1.0 + complex(*(d.leakage_h if board.role == "receive_h" else d.leakage_v)))
 
 
 def plate_scale(ant: Antennas, scene: Scene, frequency_hz: float) -> complex:
-    """Constant before the plates' integral: object_gain d / (j lambda), so that an endless mirror gives -gain d / R.
+    """Return the factor of the plates' integral, object_gain d / (j lambda): an infinite mirror gives -gain d / R.
 
     Kirchhoff's integral (Goodman, Introduction to Fourier Optics, section 3.5), which has phase +2 pi f tau as well:
     field = (1 / j lambda) integral conj(r(theta)) obliquity exp(+j 2 pi f (r1 + r2) / c) / (r1 r2) dA.
@@ -215,7 +214,7 @@ def plate_scale(ant: Antennas, scene: Scene, frequency_hz: float) -> complex:
 
 
 def point_scale(ant: Antennas) -> float:
-    """Constant before a point's 1 / (r1 r2), so that amplitude 1 at the specular midpoint equals the direct path."""
+    """Return the factor of a point's 1 / (r1 r2): amplitude 1 at the specular midpoint equals the direct path."""
     r1, r2, _, _ = ant.legs(ant.centre_m[0], ant.centre_m[1], 0)
     return float(r1 * r2)
 
@@ -223,11 +222,11 @@ def point_scale(ant: Antennas) -> float:
 def field_exact(
     rig: Instrument, scene: Scene, board: Board, offsets_m: Real, frequencies_hz: Real, rx: int = 0
 ) -> Complex:
-    """Object field by direct quadrature, point by point: slow, for tests and small jobs.
+    """Compute the object field by direct quadrature; slow, for tests and small scenes.
 
-    Gauss-Legendre over each facet of each plate (a smooth plate is one), with an order high enough for the phase's
-    change across it. Every point of the surface has its true height, so legs and incidence are exact, and the plate's
-    own normal for its obliquity; facets of a rough plate are steps parallel to it.
+    Gauss-Legendre quadrature over each facet of each plate (a smooth plate is one facet), with enough points for the
+    phase change across it. Every point has its true height, and the plate's normal for its obliquity; facets of a rough
+    plate are parallel to the plate.
 
     Parameters
     ----------
@@ -271,7 +270,7 @@ def field_exact(
 
 
 def _quadrature(size_m: tuple[float, float], top_hz: float) -> tuple[Real, Real, Real]:
-    """Points x, y about the centre of a rectangle and the area each stands for."""
+    """Return quadrature points x, y relative to the centre of a rectangle, and their areas."""
     # The phase changes at most by 2 k per metre; Gauss-Legendre needs about half a point per radian, plus a few.
     wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
     (nx, ax), (ny, ay) = (np.polynomial.legendre.leggauss(int(wave * s * 0.6) + 16) for s in size_m)

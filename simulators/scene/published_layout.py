@@ -1,17 +1,13 @@
-"""Writers of the published data set's forms: `unsynced/<scan>` folders, `raw/` cubes, `labels/` and `materials/`.
+"""Write the layouts of the published data set: `unsynced/<scan>` folders, and `raw/` cubes.
 
-The byte formats are the published data set's description; written here independently of the host that reads them.
-Cubes hold the simulated rig's echoes as perfect synchronisation leaves them. The images of `labels/` and the pixels of
-`materials/` are drawn, not imaged: Fresnel's reflection of each box, with speckle and phase errors; what they are for
-is to have files of the exact form with a known truth.
+The byte formats follow the description of the data set, implemented independently of the host. Cubes are simulated
+echoes after ideal synchronisation.
 """
 
 from __future__ import annotations
 
 import json
-import pickle
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,31 +20,29 @@ from polysight.shared.raster import Row
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from polysight.simulators.scene.cubes import reference_cube
 from polysight.simulators.scene.layouts import Gaps, blank, new_folder, packet_payload_bytes
-from polysight.simulators.scene.optics import antennas, direct_factor, half_space
+from polysight.simulators.scene.optics import antennas, direct_factor
 from polysight.simulators.scene.radar import sample_frequencies_hz
 from polysight.simulators.scene.scene_file import Scene, apply_scene
 
 Complex = NDArray[np.complexfloating]
 Skipped = Mapping[tuple[str, int], Collection[int]]
-PIXELS = 150  # of an image's side
-METAL = "copper"
 LATE_S = 2.0
-"""After its data has ended a card sends what is left, less than a packet (seen on a DCA1000)."""
+"""Delay after which a card sends the last, incomplete packet (observed on a DCA1000)."""
 
 
 class AuthorsLayout:
-    """The published data set's raw folder: `unsynced/<scan>/<board>/<x>_<y>.bin`, packet logs and three JSON files.
+    """Writer of the published raw layout: `unsynced/<scan>/<board>/<x>_<y>.bin`, packet logs and three JSON files.
 
     Parameters
     ----------
     path, rig, scan_id, started_s
-        Where, with which rig, under which name, and the unix time of the first packet.
+        Folder, rig, name of the scan, and Unix time of the first packet.
     zero_filling
-        Lost packets are zeros in the file; otherwise they are absent from it.
+        Write zeros for lost packets; otherwise leave them out.
     by_columns
-        The rows that are written are columns: the stage runs along y.
+        The stage runs along y: rows are columns of the grid.
     skipped
-        Points of a row, by board name and row, at which the radar did not start: nothing of them is in the file.
+        Points of a row, by board name and row, at which the radar did not start; the file has no data of them.
     """
 
     def __init__(
@@ -66,12 +60,12 @@ class AuthorsLayout:
         self._now_s, self._zero_filling = started_s, zero_filling
 
     def start(self) -> None:
-        """Make the folder and write the three JSON files. Raises DataError when it is not empty."""
+        """Create the folder and write the three JSON files. Raises DataError if it is not empty."""
         new_folder(self.folder)
         write_settings(self.folder, self._rig, self._zero_filling, self._by_columns)
 
     def write_row(self, row: Row, payloads: dict[str, NDArray[np.int16]], gaps: dict[str, Gaps]) -> None:
-        """One file for each board, named by the grid index where the row starts, and its packet log."""
+        """Write one file per board, named by the grid index of the row's start, and its packet log."""
         step_s = abs(row.step_mm) / self._rig.stage.speed_mm_s
         start = row.column(0)
         stem = f"{row.index}_{start}" if self._by_columns else f"{start}_{row.index}"
@@ -94,12 +88,12 @@ class AuthorsLayout:
         self._now_s += row.points * step_s + LATE_S + 2.0
 
     def end(self) -> None:
-        """Nothing more is written."""
+        """Write nothing more."""
 
     def _log(self, size: int, lost: Gaps, points: list[int], step_s: float) -> str:
-        """One line for each packet that arrived: sequence number, payload bytes, unix time.
+        """Return a line for each packet received: sequence number, payload bytes, Unix time.
 
-        The last one, which is not full, comes late: the card sends it by a timer. The authors' decoder lives on that.
+        The last, incomplete packet is late, for the card sends it after a timeout; the authors' decoder needs that.
         """
         full, frame = packet_payload_bytes(self._rig), self._rig.frame_bytes
         pulses, period_s = self._rig.burst.pulses, self._rig.burst.period_us * 1e-6
@@ -118,7 +112,7 @@ class AuthorsLayout:
 
 
 def write_settings(folder: Path, rig: Instrument, zero_filling: bool, by_columns: bool) -> None:
-    """The three JSON files of a scan."""
+    """Write the three JSON files of a scan."""
     for name, content in (
         ("data_collection_cfg", _collection(rig, folder.name, zero_filling, by_columns)),
         ("devices_comm_cfg", _devices(rig)),
@@ -183,43 +177,15 @@ def _radars(rig: Instrument) -> dict[str, Any]:
 
 
 def _turn(board: Board, axis: str, which: int) -> float:
-    """A mount's turn about an axis, degrees; 0 when it has none."""
+    """Return a mount's rotation about an axis, degrees; 0 without one."""
     turns = [s.turn_deg for s in board.mount if s.about == axis and s.turn_deg is not None]
     return turns[which] if turns else 0.0
 
 
 def _last_shift(board: Board) -> float:
-    """Last shift of a mount along x, mm: where the board's origin is."""
+    """Return the last shift of a mount along x, mm: the origin of the board."""
     shifts = [s.shift_mm[0] for s in board.mount if s.shift_mm is not None]
     return shifts[-1] if shifts else 0.0
-
-
-@dataclass(frozen=True)
-class Material:
-    """A material of the drawn forms; without permittivity it is metal."""
-
-    name: str
-    permittivity: complex | None
-    thickness_mm: float | None = None
-
-    def reflection(self, angle_deg: float) -> tuple[complex, complex]:
-        """r_s and r_p."""
-        if self.permittivity is None:
-            return -1.0 + 0j, -1.0 + 0j
-        r_s, r_p = half_space(self.permittivity, np.radians(angle_deg))
-        return complex(r_s), complex(r_p)
-
-
-@dataclass(frozen=True)
-class Errors:
-    """What is wrong with a drawn pixel: relative amplitude and phase (rad), half of the variance shared by a box.
-
-    `leakage` is the amplitude of p in H and of s in V.
-    """
-
-    amplitude: float = 0.009
-    phase_rad: float = 0.022
-    leakage: float = 0.0
 
 
 def write_cube(
@@ -232,22 +198,22 @@ def write_cube(
     common_reference: bool = False,
     by_columns: bool = False,
 ) -> Path:
-    """Write `out`/raw/<scan> and return it.
+    """Write a cube in `out`/raw/<scan> and return the folder.
 
     Parameters
     ----------
     rig, scene, out
-        Rig file and scene; the scene's overrides are applied, its disturbances are off. Where to write.
+        Rig and scene (its overrides are applied, its disturbances ignored), and the output folder.
     keep_direct
-        The direct path is still in the cube, beside the object's echo.
+        Include the direct path.
     from_transmitter
         Phases are 2 pi f tau; otherwise 2 pi f (tau - tau_direct) with each RX's own direct path.
     common_reference
-        With the direct path of RX1 for all RX instead.
+        Use the direct path of RX1 for all RX.
     conjugate
         Phases have the opposite sign.
     by_columns
-        The settings say so. The bursts' travel is still along x.
+        Write this into the settings; the travel in a burst is still along x.
     """
     name = "".join(c if c.isalnum() else "-" for c in scene.name).strip("-") or "scene"
     folder = out / "raw" / name
@@ -264,116 +230,3 @@ def write_cube(
         cube *= np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(away, f)).astype(np.complex64)[:, None, None]
         np.save(folder / f"{board_name}_synced.npy", cube.conj() if conjugate else cube)
     return folder
-
-
-def draw_pixels(
-    material: Material, angle_deg: float, n: int, errors: Errors, rng: np.random.Generator
-) -> tuple[Complex, Complex]:
-    """H and V of n pixels of one box, complex64 [n], with unit gain."""
-    r_s, r_p = material.reflection(angle_deg)
-    out = []
-    for signal in (r_s + errors.leakage * r_p, r_p + errors.leakage * r_s):
-        parts = [
-            std * np.sqrt(0.5) * (rng.standard_normal() + rng.standard_normal(n))
-            for std in (errors.amplitude, errors.phase_rad)
-        ]
-        out.append((signal * (1 + parts[0]) * np.exp(1j * parts[1])).astype(np.complex64))
-    return out[0], out[1]
-
-
-def write_material(
-    folder: Path, material: Material, angle_deg: float, scan: str, pixels: int, errors: Errors, seed: int
-) -> Path:
-    """Write `folder`/<name>_<angle>.pkl with its own metal reference; a second scan's file is numbered."""
-    rng = np.random.default_rng(seed)
-    gain_h, gain_v = (rng.uniform(0.5, 2.0) * np.exp(2j * np.pi * rng.uniform()) for _ in range(2))
-    values = []
-    for what in (material, Material(METAL, None)):
-        h, v = draw_pixels(what, angle_deg, pixels, errors, rng)
-        h, v = (h * gain_h).astype(np.complex64), (v * gain_v).astype(np.complex64)
-        values.append([h / v, h, v])
-    content = {
-        "name": material.name,
-        "thickness": material.thickness_mm,
-        "collection_name": scan,
-        "incident_angle": round(angle_deg),
-        "ref_name": METAL,
-        "ref_thickness": 1.0,
-        "values": values[0],
-        "ref_values": values[1],
-        "simulated": True,
-    }
-    folder.mkdir(parents=True, exist_ok=True)
-    safe = "".join(c if c.isalnum() or c in "-." else "-" for c in material.name).strip("-")
-    path = folder / f"{safe}_{angle_deg:.0f}.pkl"
-    for number in range(2, 1000):
-        if not path.exists():
-            break
-        path = folder / f"{safe}_{angle_deg:.0f}_{number}.pkl"
-    path.write_bytes(pickle.dumps(content))
-    return path
-
-
-def write_labels(
-    folder: Path,
-    scan: str,
-    boxes: Mapping[str, Sequence[int]],
-    materials: Mapping[str, Material],
-    angle_deg: float,
-    errors: Errors,
-    seed: int,
-    upside_down: bool = False,
-) -> Path:
-    """Write `folder`/<scan>: sar_h.npy, sar_v.npy and <scan>.json; returns it.
-
-    Parameters
-    ----------
-    folder, scan
-        Where, and the scan's name.
-    boxes, materials
-        Name to pixel corners [x0, y0, x1, y1], ends left out, and name to material.
-    angle_deg, errors, seed
-        Incidence angle, and what is drawn of errors.
-    upside_down
-        The images' rows count from the other end than the boxes' y.
-    """
-    rng = np.random.default_rng(seed)
-    path = folder / scan
-    path.mkdir(parents=True)
-    images = [
-        0.001 * (rng.standard_normal((PIXELS, PIXELS)) + 1j * rng.standard_normal((PIXELS, PIXELS))) for _ in "hv"
-    ]
-    gains = [rng.uniform(0.5, 2.0) * np.exp(2j * np.pi * rng.uniform()) for _ in "hv"]
-    distance = np.exp(2j * np.pi * np.add.outer(*2 * [np.arange(PIXELS) / 31.0]))  # a phase common to both channels
-    for name, (x0, y0, x1, y1) in boxes.items():
-        h, v = draw_pixels(materials[name], angle_deg, (x1 - x0) * (y1 - y0), errors, rng)
-        for image, pixels in zip(images, (h, v), strict=True):
-            image[y0:y1, x0:x1] += pixels.reshape(y1 - y0, x1 - x0)
-    for key, image, gain in zip(("sar_h", "sar_v"), images, gains, strict=True):
-        whole = (gain * image * distance).astype(np.complex64)
-        np.save(path / f"{key}.npy", whole[::-1] if upside_down else whole)
-    content = {
-        "description": f"simulated: {scan}, incidence {angle_deg:.0f} deg",
-        "labels": {name: list(box) for name, box in boxes.items()},
-        "sar_config": _sar_config(),
-    }
-    (path / f"{scan}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    return path
-
-
-def _sar_config() -> dict[str, Any]:
-    """The published files' keys."""
-    focus = {"alignment_configs": {}, "sar_focuse_center": [0.0, 0.0, 0.0]}
-    return {
-        "numX": 350,
-        "numY": 200,
-        "dx": 2,
-        "dy": 2,
-        "output_size_x": 2 * PIXELS,
-        "output_size_y": 2 * PIXELS,
-        "chirp_configs": [],
-        "ant_locs": {},
-        "tx_idx": 1,
-        "RH_config": focus,
-        "RV_config": focus,
-    }

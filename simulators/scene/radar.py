@@ -1,14 +1,14 @@
-"""The three radars: from stage offsets to the frames they send.
+"""Simulated radars: frames of the three boards for given stage offsets.
 
-A chirp is the sum of direct path and object, times a factor that is new for every chirp, through the filter:
+A chirp is the sum of direct path and object, times a factor per chirp, through the high-pass filter:
 
     s[n, k] = factor[n, k] (H(f_n,k) F[n, k] + H'(f_n,k) F1[n, k]) gain + noise
 
-F is the undisturbed signal, f_n,k the middle of the signal's band shifted by that chirp's offset, and
-F1 = (dF/dt) / (2 pi j) - middle F. This is the filter's response to first order about the middle of a signal that is
-only some 50 kHz wide; the error is H'' df^2 / 2, below 1e-3 for the published offset of about 1 MHz.
+F is the undisturbed signal, f_n,k the middle of its band shifted by that chirp's offset, and
+F1 = (dF/dt) / (2 pi j) - middle F. This is the filter's response to first order around the middle of a signal of about
+50 kHz bandwidth; the error is H'' df^2 / 2, below 1e-3 for the published offset of about 1 MHz.
 
-Another source of frames, for bit-exact tests, is a counting pattern: :class:`PatternSource`.
+:class:`PatternSource` gives frames with a counting pattern, for bit-exact tests.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from polysight.simulators.scene.optics import antennas, direct_factor
 from polysight.simulators.scene.receiver import high_pass, per_chirp, power_on, sync_delay_s
 from polysight.simulators.scene.scene_file import Scene, apply_scene
 
-_BATCH = 64  # chirps worked on at once: their arrays fit the cache
+_BATCH = 64  # chirps per batch: their arrays fit in the cache
 _FULL_SCALE = 32767
-_LEAKAGE_DELAY_S = 0.2e-9  # transmit board's own TX to RX: some centimetres on the board
+_LEAKAGE_DELAY_S = 0.2e-9  # from TX to RX on the transmit board: some centimetres
 _LEAKAGE_AMPLITUDE = 2.0
 
 
 class _ReceivingBoard:
-    """Everything about one receiving board that does not change from chirp to chirp."""
+    """Properties of a receiving board that are constant for all chirps."""
 
     def __init__(self, rig: Instrument, scene: Scene, board: Board, seed: int, cache_dir: Path | None) -> None:
         chirp = rig.chirp
@@ -64,26 +64,26 @@ class _ReceivingBoard:
 
 
 class SimulatedRig:
-    """The radars of a rig in front of a scene, for one power cycle.
+    """The radars of a rig with a scene, for one power cycle.
 
     Parameters
     ----------
     rig
-        The rig file; the scene's overrides are applied here.
+        The rig; the scene's overrides are applied here.
     scene
-        What lies on the plane, and the disturbances.
+        Plates, points and disturbances.
     seed
-        Draws gains, timing, phases and noise; None takes the scene's. The same seed gives the same data for the same
-        pulse numbers, however they are batched.
+        Seed of gains, timing, phases and noise; None: the scene's. The same seed gives the same data for the same pulse
+        numbers in any batches.
     cache_dir
-        Where object fields are kept between runs (polysight.simulators.scene.field); None keeps nothing.
+        Folder that caches object fields between runs; None: no cache.
 
     Attributes
     ----------
     clipped
-        Samples that hit the ADC's ends, for each board.
+        Number of clipped samples, by board.
     outside
-        Chirps asked for outside the simulated aperture, for each board: they hold the direct path only.
+        Number of chirps outside the simulated aperture, by board; they contain only the direct path.
     """
 
     def __init__(self, rig: Instrument, scene: Scene, seed: int | None = None, cache_dir: Path | None = None) -> None:
@@ -97,7 +97,7 @@ class SimulatedRig:
         self.outside = {b.name: 0 for b in rig.boards}
 
     def prepare(self, *board_names: str) -> None:
-        """Compute the object fields of these boards now (default: both receivers) instead of at their first chirp."""
+        """Compute the object fields of these boards (default: both receivers) now instead of at the first chirp."""
         for name in board_names or [b.name for b in self.rig.receivers]:
             if self.rig.by_name(name).role != "transmit":
                 self._receiving(name)
@@ -109,17 +109,17 @@ class SimulatedRig:
         y_mm: NDArray[np.floating],
         first_pulse: int | None = None,
     ) -> NDArray[np.int16]:
-        """Frames of one chirp each, exactly as the board sends them to its card.
+        """Return frames of one chirp each, as the board sends them to its card.
 
         Parameters
         ----------
         board_name
-            Board of the rig file.
+            Name of the board.
         x_mm, y_mm
             True stage offset during each chirp, millimetres from the middle of the grid, [n].
         first_pulse
-            Number of the first chirp's SYNC_IN pulse since power-up; keys timing, phase and noise. None goes on from
-            this board's last call.
+            Number of the first chirp's SYNC_IN pulse since power-up, which determines timing, phase and noise. None:
+            continue after this board's last call.
 
         Returns
         -------
@@ -128,7 +128,7 @@ class SimulatedRig:
         Raises
         ------
         KeyError
-            when the rig has no such board.
+            if the rig has no such board.
         """
         d = self.scene.disturbances
         signal = self.signals(board_name, x_mm, y_mm, first_pulse)
@@ -153,7 +153,7 @@ class SimulatedRig:
         y_mm: NDArray[np.floating],
         first_pulse: int | None = None,
     ) -> NDArray[np.complex64]:
-        """As :meth:`chirps` before the ADC: complex64 [n, rx, sample], direct path of RX1 about 1, noise included."""
+        """Return :meth:`chirps` before the ADC: complex64 [n, rx, sample], direct path of RX1 about 1, with noise."""
         board = self.rig.by_name(board_name)
         x_mm, y_mm = np.broadcast_arrays(np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64))
         first = self._next_pulse[board_name] if first_pulse is None else first_pulse
@@ -170,10 +170,10 @@ class SimulatedRig:
         return out
 
     def burst_mm(self, direction: int) -> NDArray[np.floating]:
-        """Stage travel from a trigger point to each of its pulses, millimetres [pulse], signed.
+        """Return the stage travel from a trigger point to each of its pulses, millimetres [pulse], signed.
 
-        Without burst motion every pulse is taken at the burst's mean position, so that true positions stay the same.
-        With backlash, rows towards -x lie further along +x.
+        Without burst motion every pulse is at the mean position of the burst. With backlash, rows towards -x are
+        shifted along +x.
         """
         burst, stage, d = self.rig.burst, self.rig.stage, self.scene.disturbances
         lost = d.backlash_mm if direction < 0 else 0.0
@@ -197,7 +197,7 @@ class SimulatedRig:
         out: NDArray[np.complex64],
     ) -> None:
         d, own, chirp = self.scene.disturbances, self._receiving(board.name), self.rig.chirp
-        frames = pulses // self.rig.burst.chirps  # the chirps of one frame hang on one pulse
+        frames = pulses // self.rig.burst.chirps  # all chirps of a frame start with one pulse
         delay = sync_delay_s(d, self.seed, board, frames) - sync_delay_s(d, self.seed, self.rig.transmitter, frames)
         turns = pulse_uniform(stream_key(self.seed, "phase", board.name), pulses) if d.random_phase else 0.0 * delay
         factor, shift = per_chirp(own.receiver, delay, 2 * np.pi * turns, d.hpf)
@@ -206,7 +206,7 @@ class SimulatedRig:
         nodes = np.zeros((len(x_m), *own.direct.shape[1:2], own.expand.shape[1]), dtype=np.complex64)
         if inside.any():
             nodes[inside] = own.field.at(x_m[inside], y_m[inside]) * own.receiver.gains[:, None]
-        # One small product for each chirp: BLAS would hand larger ones to threads, which other processes keep waiting.
+        # One small product per chirp: BLAS runs larger ones in threads, which is slow beside other processes.
         ideal = np.matmul(nodes[:, None], own.expand)  # [chirp, 2, rx, sample]
         ideal += own.direct
         if not d.hpf:
@@ -219,7 +219,7 @@ class SimulatedRig:
         out += ideal[:, 1]
 
     def _noise(self, board: Board, pulses: NDArray[np.int64], out: NDArray[np.complex64]) -> None:
-        """Fill `out` with receiver noise: each channel keeps its signal-to-noise ratio, whatever its gain."""
+        """Fill `out` with receiver noise: each channel has the same signal-to-noise ratio for any gain."""
         snr_db = self.scene.disturbances.direct_snr_db
         if snr_db is None:
             out[...] = 0
@@ -233,7 +233,7 @@ class SimulatedRig:
             out *= (sigma * np.abs(gains)).astype(np.float32)[:, None]
 
     def _own_leakage(self) -> NDArray[np.complex64]:
-        """What the transmitting board receives: its own leakage, a tone near zero IF through the filter."""
+        """Return the signal of the transmitting board: its own leakage, a tone near zero IF through the filter."""
         chirp = self.rig.chirp
         t = np.arange(chirp.samples) / chirp.sample_rate_hz
         tone_hz = chirp.slope_hz_per_s * _LEAKAGE_DELAY_S
@@ -244,40 +244,40 @@ class SimulatedRig:
 
 
 def sample_frequencies_hz(rig: Instrument) -> NDArray[np.floating]:
-    """Transmit frequency at each ADC sample, Hz [sample]."""
+    """Return the transmit frequency at each ADC sample, Hz [sample]."""
     return rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(rig.chirp.samples)
 
 
 class SignalSource(Protocol):
-    """Where the frames come from."""
+    """Source of frames."""
 
     def chirps(
         self, board_name: str, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], first_pulse: int | None = None
     ) -> NDArray[np.int16]:
-        """Frames of one chirp each, int16 [n, samples, 8], for stage offsets x_mm [n], y_mm [n].
+        """Return frames of one chirp each, int16 [n, samples, 8], for stage offsets x_mm [n], y_mm [n].
 
-        `first_pulse` numbers the first one's SYNC_IN pulse since power-up. The eight values of a sample are I of
+        `first_pulse` is the number of the first SYNC_IN pulse since power-up. The eight values of a sample are I of
         RX1..RX4, then Q of RX1..RX4.
         """
         ...
 
 
 def pattern_frames(board: int, first: int, n: int, samples: int) -> NDArray[np.int16]:
-    """Frames `first` .. `first + n - 1` of the pattern, int16 [n, samples, 8].
+    """Return frames `first` .. `first + n - 1` of the counting pattern, int16 [n, samples, 8].
 
-    Every 32-bit word is `board << 28 | word count since the first frame`, little-endian: any byte that is lost, doubled
-    or misplaced shows, in 1 GiB per board.
+    Every 32-bit word is `board << 28 | word count since the first frame`, little-endian, which detects any byte that is
+    lost, doubled or misplaced, in 1 GiB per board.
     """
     words = samples * 4
     count = np.arange(n * words, dtype="<u4")
-    count += np.uint32(first * words % (1 << 28))  # may wrap at 32 bits, which 28 bits do not notice
+    count += np.uint32(first * words % (1 << 28))  # may wrap at 32 bits without effect on 28 bits
     count &= np.uint32((1 << 28) - 1)
     count |= np.uint32(board << 28)
     return count.view("<i2").reshape(n, samples, 8)
 
 
 class PatternSource:
-    """Sends :func:`pattern_frames`, wherever the stage is: frame k comes from SYNC_IN pulse k."""
+    """Source of :func:`pattern_frames` at any stage position: frame k comes from SYNC_IN pulse k."""
 
     def __init__(self, rig: Instrument) -> None:
         self._samples = rig.chirp.samples
@@ -287,7 +287,7 @@ class PatternSource:
     def chirps(
         self, board_name: str, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], first_pulse: int | None = None
     ) -> NDArray[np.int16]:
-        """The frames of len(x_mm) pulses from `first_pulse` on; None goes on from this board's last call."""
+        """Return the frames of len(x_mm) pulses from `first_pulse` on; None: continue after the last call."""
         del y_mm
         first = self._next[board_name] if first_pulse is None else first_pulse
         self._next[board_name] = first + len(x_mm)

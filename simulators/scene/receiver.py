@@ -1,4 +1,4 @@
-"""What one receiving board does to the ideal IF signal: timing, crystal, chirp shape, filter, gains."""
+"""Effects of a receiving board on the ideal IF signal: timing, crystal, chirp shape, filter, gains."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Complex = NDArray[np.complexfloating]
 
 
 def sync_delay_s(d: Disturbances, seed: int, board: Board, pulses: NDArray[np.int64]) -> Real:
-    """From a SYNC_IN edge to the start of the board's chirp: fixed latency plus its own clock's sampling, [pulse]."""
+    """Return the delay from SYNC_IN edge to chirp start: fixed latency plus sampling by the board's clock, [pulse]."""
     jitter = pulse_uniform(stream_key(seed, "sync", board.name), pulses)
     return 1e-9 * (d.sync_latency_ns + getattr(d.sync_skew_ns, board.role) + d.sync_uncertainty_ns * jitter)
 
 
 def high_pass(if_hz: Real, chirp: Chirp) -> tuple[Complex, Complex]:
-    """IF high-pass filter and its derivative per Hz at IF frequencies, any shape.
+    """Return the IF high-pass filter and its derivative per Hz at IF frequencies, any shape.
 
     Two first-order sections, H = prod 1 / (1 - j f_c / f): -3 dB and +45 degrees at each section's corner.
     """
@@ -41,14 +41,14 @@ def high_pass(if_hz: Real, chirp: Chirp) -> tuple[Complex, Complex]:
 
 @dataclass(frozen=True)
 class Receiver:
-    """One receiving board in one power cycle.
+    """A receiving board in one power cycle.
 
     Attributes
     ----------
     gains
         complex64 [rx], relative to the nominal channel.
     phase
-        Phase of the chirp's shape error against the transmitter's, rad [sample].
+        Phase of the chirp relative to the transmitter's, rad [sample].
     if_error_hz
         Its derivative, Hz [sample]: crystal and programmed offsets, slope error, bend and ripple.
     """
@@ -61,7 +61,7 @@ class Receiver:
 
 
 def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver:
-    """A receiving board after power-up: gains and chirp shape are drawn once, from the seed and the board's name."""
+    """Return a receiving board after power-up, with gains and chirp shape from the seed and the board's name."""
     d, chirp = scene.disturbances, rig.chirp
     rng = np.random.default_rng(stream_key(seed, "power", board.name))
     spread_db = rng.uniform(-1, 1, len(rig.antennas.rx_mm)) * d.rx_gain_spread_db
@@ -71,8 +71,8 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
 
     t = np.arange(chirp.samples) / chirp.sample_rate_hz
     ppm = getattr(d.crystal_ppm, board.role) - d.crystal_ppm.transmit
-    # A crystal that is fast by p raises the start frequency by p f and, stepping higher and sooner, the slope by 2 p K.
-    # Under native control the host programs the start frequencies: what the rig file says is all there is.
+    # A relative crystal error p raises the start frequency by p f and the slope by 2 p K.
+    # Under native control the host programs the start frequencies of the rig file, without further offset.
     programmed_hz = 0.0 if rig.radar.control == "native" else d.if_offset_hz
     constant = programmed_hz + board.start_offset_hz - rig.transmitter.start_offset_hz
     constant += ppm * 1e-6 * chirp.first_sample_hz
@@ -80,7 +80,7 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
     phase = 2 * np.pi * (constant * t + slope * t**2 / 2)
     error = constant + slope * t
 
-    # Ripple after the ramp's start: a decaying swing of the IF. Bend before its end: a parabola. Both differ by board.
+    # Ripple after the start of the ramp: a decaying oscillation of the IF. Bend before its end: a parabola.
     ramp_s = chirp.adc_start_us * 1e-6 + t
     swing = d.ripple_hz * rng.uniform(0.7, 1.3) * np.exp((-1 / (d.ripple_us * 1e-6) + 2j * np.pi / 8e-6) * ramp_s)
     swing *= np.exp(2j * np.pi * rng.uniform())
@@ -94,9 +94,9 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
 
 
 def per_chirp(receiver: Receiver, delay_s: Real, phase_rad: Real, hpf: bool) -> tuple[NDArray[np.complex64], Real]:
-    """Factor of each chirp before the filter, and the IF shift it makes (0 without a filter), both [chirp, sample].
+    """Return the factor of each chirp before the filter, and its IF shift (0 without filter), both [chirp, sample].
 
-    A chirp of the receiver that starts `delay_s` after the transmitter's sees every path shorter by that time:
+    For a receiver that starts `delay_s` after the transmitter, all paths are shorter by that time:
     exp(-j 2 pi (f0 + K t) delay).
     """
     chirp = receiver.chirp
@@ -105,7 +105,7 @@ def per_chirp(receiver: Receiver, delay_s: Real, phase_rad: Real, hpf: bool) -> 
     turns = (receiver.phase + phase_rad[:, None]) / (2 * np.pi) - f * delay_s[:, None]
     turns -= np.rint(turns)
     factor = np.empty(turns.shape, np.complex64)
-    angle = (2 * np.pi * turns).astype(np.float32)  # less than a turn: single precision is enough from here
+    angle = (2 * np.pi * turns).astype(np.float32)  # less than a turn: single precision is enough
     factor.real, factor.imag = np.cos(angle), np.sin(angle)
     shift = receiver.if_error_hz - chirp.slope_hz_per_s * delay_s[:, None]
     return factor, shift if hpf else np.zeros_like(shift)

@@ -1,4 +1,4 @@
-"""The scene file: what lies on the object plane, and what disturbs the rig (docs/spec/scene-file.md)."""
+"""Scene files: plates and points on the object plane, and disturbances of the rig (docs/spec/scene-file.md)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from polysight.shared.config import Burst, Grid, Image, Instrument, Stage
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 from polysight.shared.tables import decode, read_toml, to_builtins
 from polysight.simulators.scene.draws import stream_key
@@ -26,7 +27,7 @@ _OVERRIDES: dict[str, type] = {"grid": Grid, "burst": Burst, "image": Image, "st
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of the scene file: frozen, unknown keys refused."""
+    """A table of the scene file: frozen, without unknown keys."""
 
 
 def _require(ok: bool, rule: str) -> None:
@@ -40,7 +41,7 @@ def _check_permittivity(pair: Pair) -> None:
 
 
 class Layer(_Table, frozen=True):
-    """One layer of a plate; without `thickness_mm` a half space (only the last)."""
+    """A layer of a plate; without `thickness_mm` a half space (only the last layer)."""
 
     permittivity: Pair
     thickness_mm: Positive | None = None
@@ -58,14 +59,14 @@ class Layer(_Table, frozen=True):
 class Plate(_Table, frozen=True):
     """A flat rectangular plate on the object plane, sides along x and y.
 
-    `centre_mm` counts from the image centre (specular midpoint of TX and H at stage offset zero). `permittivity` is
-    [eps', eps''] of eps' - j eps''; without `thickness_mm` the plate is a half space (one interface). Instead of it,
-    `layers` is a stack in the order the wave meets them, a liquid behind a wall say; air follows the last one unless
-    it is a half space. Metal with `strips_deg` is ideal thin strips, turned by so much from the vertical towards +x.
+    `centre_mm` is relative to the image centre (specular midpoint of TX and H at stage offset zero). `permittivity` is
+    [eps', eps''] of eps' - j eps''; without `thickness_mm` the plate is a half space (one interface). `layers` is a
+    stack from front to back instead, for example a liquid behind a wall; air follows the last layer unless that is a
+    half space. Metal with `strips_deg` is ideal thin strips, rotated by this angle from the vertical towards +x.
 
-    `height_mm` moves the plate away from the radars (+z), out of the object plane. `tilt_deg` [ax, ay] turns it about
-    its own centre: height grows along +x by tan(ax) and along +y by tan(ay). `rough_mm` is the standard deviation of
-    its surface's height, in facets of `rough_length_mm`.
+    `height_mm` moves the plate away from the radars (+z). `tilt_deg` [ax, ay] rotates it about its centre: height grows
+    along +x by tan(ax) and along +y by tan(ay). `rough_mm` is the standard deviation of the surface's height, in facets
+    of `rough_length_mm`.
     """
 
     name: str
@@ -98,17 +99,17 @@ class Plate(_Table, frozen=True):
 
     @property
     def stack(self) -> tuple[Layer, ...]:
-        """Its layers in the order the wave meets them; none for metal."""
+        """Layers from front to back; none for metal."""
         if self.permittivity is not None:
             return (Layer(self.permittivity, self.thickness_mm, self.name),)
         return self.layers
 
 
 class Point(_Table, frozen=True):
-    """An isotropic point scatterer, the same in both polarisations.
+    """An isotropic point scatterer, equal in both polarisations.
 
-    `amplitude` [re, im] is relative to the direct path, reached when the point lies at the specular midpoint.
-    `height_mm` moves it away from the radars, out of the object plane.
+    `amplitude` [re, im] is relative to the direct path, for a point at the specular midpoint. `height_mm` moves it away
+    from the radars.
     """
 
     position_mm: Pair
@@ -118,7 +119,7 @@ class Point(_Table, frozen=True):
 
 
 class PerRole(_Table, frozen=True):
-    """One number for each board's role."""
+    """One number per role of the boards."""
 
     transmit: float = 0.0
     receive_h: float = 0.0
@@ -126,7 +127,7 @@ class PerRole(_Table, frozen=True):
 
 
 class Disturbances(_Table, frozen=True):
-    """What separates the rig's data from the ideal. Defaults are those of the published rig; OFF is none of it."""
+    """Disturbances of the rig. Defaults are those of the published rig; OFF switches all off."""
 
     sync_uncertainty_ns: NonNegative = 5.0
     sync_latency_ns: NonNegative = 160.0
@@ -154,7 +155,7 @@ class Disturbances(_Table, frozen=True):
 
     @property
     def direct_gain(self) -> float:
-        """Amplitude of the direct path relative to a free one; 0 where there is none."""
+        """Amplitude of the direct path relative to a free path; 0 without direct path."""
         return 0.0 if isinstance(self.direct_loss_db, str) else 10 ** (-self.direct_loss_db / 20)
 
 
@@ -186,12 +187,12 @@ OFF: dict[str, Any] = {
 class Scene(_Table, frozen=True):
     """The whole scene file.
 
-    `object_gain` stands for the antenna patterns: gain of every object path over the direct path, which leaves and
-    arrives at the edge of the patterns. By default a 45 mm metal plate at the midpoint has 0.75 of the direct path.
+    `object_gain` models the antenna patterns: gain of object paths relative to the direct path, which lies at the edge
+    of the patterns. By default the echo of a 45 mm metal plate at the midpoint has 0.75 of the direct path's amplitude.
 
-    `plane_shift_mm` and `plane_tilt_deg` move and tilt the plane that holds all plates and points, about the image
-    centre; signs as of a plate. The rig file keeps its own `object_distance_mm`: nobody measured the true one.
-    `specimen_spread` [real, loss] are relative standard deviations of the plates' permittivities from those written.
+    `plane_shift_mm` and `plane_tilt_deg` shift and tilt the plane of all plates and points about the image centre, with
+    the signs of a plate. `object_distance_mm` in the rig file does not change, as if the true plane was not measured.
+    `specimen_spread` [real, loss] are relative standard deviations of the plates' permittivities from the given ones.
     """
 
     name: str
@@ -215,7 +216,7 @@ class Scene(_Table, frozen=True):
             _require(not unknown, f"[{table}] holds unknown keys {unknown}; known: {list(kind.__struct_fields__)}")  # type: ignore[attr-defined]
 
     def with_disturbances(self, **changes: Any) -> Scene:
-        """The same scene with single disturbances changed; `ideal=True` switches all off first."""
+        """Return the scene with some disturbances changed; `ideal=True` switches all off first."""
         base = msgspec.to_builtins(self.disturbances)
         if changes.pop("ideal", False):
             base = dict(OFF, bend_us=base["bend_us"], ripple_us=base["ripple_us"])
@@ -224,13 +225,18 @@ class Scene(_Table, frozen=True):
 
 
 def _switched(table: Any, source: str) -> Any:
-    """`ideal = true` and the words "off"/"on" (or false/true) of a [disturbances] table turned into plain values."""
+    """Replace `ideal = true` and "off"/"on" (or false/true) in a [disturbances] table by plain values."""
     if not isinstance(table, dict):
         return table
     given = dict(table)
     ideal = given.pop("ideal", False)
     if not isinstance(ideal, bool):
-        raise ConfigError(f"{source}: disturbances.ideal = {ideal!r}", "it is a switch", "write true or false")
+        raise ConfigError(
+            f"{source}: disturbances.ideal = {ideal!r}",
+            "it is a switch",
+            "write true or false",
+            code=ErrorCode.TYPE_WRONG,
+        )
     result: dict[str, Any] = dict(OFF) if ideal else {}
     for key, value in given.items():
         if value == "off" or value is False:
@@ -239,6 +245,7 @@ def _switched(table: Any, source: str) -> Any:
                     f"{source}: disturbances.{key} cannot be switched off",
                     "it only shapes another disturbance",
                     f"switch off disturbances.{key.partition('_')[0]}_hz instead",
+                    code=ErrorCode.VALUE_INVALID,
                 )
             result[key] = OFF.get(key, value)
         elif value == "on" or value is True:
@@ -251,16 +258,16 @@ def _switched(table: Any, source: str) -> Any:
 
 
 def decode_scene(raw: dict[str, Any], source: str) -> Scene:
-    """Check a parsed scene file.
+    """Convert and check a parsed scene file.
 
     Raises
     ------
     ConfigError
-        naming `source`, the key, its value and the rule that is broken.
+        with `source`, the key, its value and the violated rule.
     """
     if "disturbances" in raw:
         raw = {**raw, "disturbances": _switched(raw["disturbances"], source)}
-    return decode(raw, Scene, source, "docs/spec/scene-file.md names everything that a scene may hold")
+    return decode(raw, Scene, source, "docs/spec/scene-file.md lists all keys of a scene")
 
 
 def load_scene(path: Path) -> Scene:
@@ -269,21 +276,21 @@ def load_scene(path: Path) -> Scene:
 
 
 def without_offset(scene: Scene) -> Scene:
-    """The scene for a rig whose file tells the start frequencies: its own difference of them is in there."""
+    """Return the scene without its own IF offset, for a rig file that contains the start frequencies."""
     return msgspec.structs.replace(scene, disturbances=msgspec.structs.replace(scene.disturbances, if_offset_hz=0.0))
 
 
 def apply_scene(rig: Instrument, scene: Scene) -> Instrument:
-    """The rig with the scene's own grid, burst, image, stage and object distance.
+    """Return the rig with the scene's grid, burst, image, stage and object distance.
 
-    What the scene switches off, the filter and leakage, this rig does not have: its file says so, or processing would
-    take away what was never there. With `leakage_measured` it holds leakage as a calibration would have found it: the
-    truth with an error drawn from the scene's seed. Applying the same scene again changes nothing.
+    A filter or leakage that the scene switches off is also switched off in the rig, so that processing does not correct
+    it. With `leakage_measured` the rig contains leakage as from a calibration: the true value with an error drawn from
+    the scene's seed. Applying the same scene again changes nothing.
 
     Raises
     ------
     ConfigError
-        when an override has a wrong type or breaks a rule of the rig file.
+        if an override has a wrong type or violates a rule of the rig file.
     """
     table = to_builtins(rig)
     for name in _OVERRIDES:
@@ -293,12 +300,12 @@ def apply_scene(rig: Instrument, scene: Scene) -> Instrument:
     if not scene.disturbances.hpf:
         table["chirp"] = {**table["chirp"], "hpf1_khz": 0.0, "hpf2_khz": 0.0}
     table["polarimetry"] = {**table["polarimetry"], **_known_leakage(scene)}
-    told = f"its {', '.join(_OVERRIDES)} change the rig file's; docs/spec/scene-file.md names all keys"
-    return decode(table, Instrument, f"scene {scene.name}", told)
+    remedy = f"its {', '.join(_OVERRIDES)} override the rig file's; docs/spec/scene-file.md lists all keys"
+    return decode(table, Instrument, f"scene {scene.name}", remedy)
 
 
 def _known_leakage(scene: Scene) -> dict[str, Any]:
-    """Keys of the rig file's [polarimetry] that a scene sets: leakage as measured, or none at all."""
+    """Return the keys of the rig file's [polarimetry] that a scene sets: measured leakage, or zero."""
     d, parts = scene.disturbances, ("leakage_h", "leakage_v")
     if d.leakage_measured is not None:
         rng = np.random.default_rng(stream_key(scene.seed, "leakage"))

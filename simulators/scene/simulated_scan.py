@@ -1,4 +1,4 @@
-"""A whole scan of a scene without sockets: raw data in either layout, and truth.json beside it."""
+"""Simulate a whole scan without sockets: raw data in either layout, with truth.json."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ Progress = Callable[[int, int], None]
 
 
 def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
-    """What a simulated scan holds: plates and points as they really are, disturbances, scene, seed, versions.
+    """Return the content of truth.json: true plates and points, disturbances, scene, seed, versions.
 
-    `rig` has the scene applied. `centre_m` is in the rig frame, at the plate's true height; permittivity is
-    [eps', eps''] as drawn, or null (metal, layers), beside the nominal one of the scene file. Tilt and height are from
-    the plane of the rig file, those of the true plane included.
+    `rig` has the scene applied. `centre_m` is in the rig frame, at the plate's true height; permittivity is the drawn
+    [eps', eps''], or null (metal, layers), with the nominal one of the scene file. Tilt and height are relative to the
+    plane of the rig file and include those of the true plane.
     """
     centre, actual = specular_midpoint_m(rig, rig.by_role("receive_h")), draw_specimens(scene)
     plates = [_plate_truth(p, n, centre) for p, n in zip(actual.plates, scene.plates, strict=True)]
@@ -62,7 +62,7 @@ def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
 
 
 def _plate_truth(plate: Plate, nominal: Plate, centre_m: Vector) -> dict[str, Any]:
-    """A plate as it was drawn, and what the scene file says of its material."""
+    """Return the entry of a drawn plate, with the nominal values of the scene file."""
     return {
         "name": plate.name,
         "centre_mm": list(plate.centre_mm),
@@ -83,18 +83,18 @@ def _plate_truth(plate: Plate, nominal: Plate, centre_m: Vector) -> dict[str, An
 
 
 def _in_rig(at_mm: Pair, height_mm: float, centre_m: Vector) -> list[float]:
-    """A place on the plane, and its height above it, in the rig frame, metres."""
+    """Return a position on the plane with a height, in the rig frame, metres."""
     return [centre_m[0] + at_mm[0] / 1e3, centre_m[1] + at_mm[1] / 1e3, centre_m[2] + height_mm / 1e3]
 
 
 def row_offsets_mm(radar: SimulatedRig, row: Row) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """True stage offsets of every chirp of a row in the order they happen: x_mm, y_mm, [points * pulses]."""
+    """Return the true stage offsets of every chirp of a row in order of time: x_mm, y_mm, [points * pulses]."""
     x = (np.array(row.x_mm)[:, None] + radar.burst_mm(row.direction)).ravel()
     return x, np.full(len(x), row.y_mm)
 
 
 def lost_bytes(radar: SimulatedRig, board_name: str, row: Row) -> Gaps:
-    """Byte ranges of a row whose packets the network loses: sorted, touching ones joined."""
+    """Return the byte ranges of a row in lost packets, sorted and merged."""
     loss = radar.scene.disturbances.packet_loss
     size = row.points * radar.rig.burst.pulses * radar.rig.frame_bytes
     full = packet_payload_bytes(radar.rig)
@@ -131,14 +131,14 @@ def simulate(
     rig, scene
         Rig file and scene; the scene's overrides are applied.
     out, layout
-        Folder to write, made when absent. "own": a scan folder at `out`. "authors": `out`/unsynced/<scan>, with the
+        Output folder, created if missing. "own": a scan folder at `out`. "authors": `out`/unsynced/<scan>, with the
         transmitting board's data.
     seed
-        None takes the scene's. The same seed gives the same raw bytes.
+        None: the scene's. The same seed gives the same raw bytes.
     started_s
-        Unix time written as the scan's start; None is now.
+        Unix time of the scan's start; None: now.
     cache_dir, progress
-        Where object fields are kept between runs (None keeps nothing); called with rows done and rows in all.
+        Folder that caches object fields (None: no cache); callback with rows done and total rows.
     zero_filling, by_columns, skipped
         Authors' layout only: see :class:`polysight.simulators.scene.published_layout.AuthorsLayout`.
 
@@ -149,9 +149,9 @@ def simulate(
     Raises
     ------
     ConfigError
-        when the scene does not fit the rig, or a burst does not end before the next point.
+        if the scene does not fit the rig, or a burst does not end before the next point.
     DataError
-        when the folder is not empty.
+        if the folder is not empty.
     """
     radar = SimulatedRig(rig, _wider(scene, rig) if by_columns else scene, seed, cache_dir)
     rig = apply_scene(rig, scene)
@@ -166,7 +166,7 @@ def simulate(
         writer = AuthorsLayout(out, rig, scan_id, started_s, zero_filling, by_columns, skipped)
         _write_rows(writer, radar, plan, rig.boards, by_columns, progress)
         folder = writer.folder
-        # Their files tell neither geometry nor filter nor leakage; a scan folder's manifest does.
+        # The authors' files contain neither geometry nor filter nor leakage.
         (folder / "instrument.toml").write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
     facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id, "samples_clipped": radar.clipped}
     (folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
@@ -174,7 +174,7 @@ def simulate(
 
 
 def _plan(rig: Instrument, by_columns: bool) -> RasterPlan:
-    """The plan of the rig's grid. Raises ConfigError when a burst does not end before the next point."""
+    """Return the plan of the rig's grid. Raises ConfigError if a burst does not end before the next point."""
     grid = _by_columns(rig.grid) if by_columns else rig.grid
     check_burst_fits(grid, rig.burst, rig.stage)
     return plan_raster(grid)
@@ -188,7 +188,7 @@ def _write_rows(
     by_columns: bool,
     progress: Progress | None,
 ) -> None:
-    """Write every row of the plan, of these boards; `by_columns`: the stage runs along y."""
+    """Write every row of the plan for these boards; `by_columns`: the stage runs along y."""
     writer.start()
     for row in plan:
         x, y = row_offsets_mm(radar, row)
@@ -202,11 +202,11 @@ def _write_rows(
 
 
 def _by_columns(grid: Grid) -> Grid:
-    """The grid whose rows are the columns."""
+    """Return the grid with rows and columns swapped."""
     return Grid(columns=grid.rows, rows=grid.columns, step_x_mm=grid.step_y_mm, step_y_mm=grid.step_x_mm)
 
 
 def _wider(scene: Scene, rig: Instrument) -> Scene:
-    """The scene with a row more above and below, for bursts that travel along y."""
+    """Return the scene with one more row above and below, for bursts that travel along y."""
     grid = to_builtins(apply_scene(rig, scene).grid)
     return msgspec.structs.replace(scene, grid={**grid, "rows": grid["rows"] + 2})

@@ -1,8 +1,8 @@
-"""The specimens that a scene's seed draws: plates as they really are, and the facets of rough ones.
+"""Draw the specimens of a scene: true permittivities, heights and tilts of plates, and the facets of rough plates.
 
-A scene file says what was ordered; :func:`draw_specimens` says what lies there: each plate's own permittivity, and its
-height and tilt with those of the object plane in them. The draws depend on the scene's seed and the plate's place in
-the list alone: another power cycle (`--seed`) scans the same specimens.
+A scene file has nominal values; :func:`draw_specimens` draws each plate's permittivity and adds shift and tilt of the
+object plane to it. The draws depend only on the scene's seed and the plate's index: another power cycle (`--seed`)
+scans the same specimens.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _AIR = (1.0, 0.0)
 
 @dataclass(frozen=True)
 class Facets:
-    """A plate as rectangles of one height each, on top of its tilt; metres from the plate's own centre.
+    """Rectangles of constant height on a plate, in addition to its tilt; metres from the plate's centre.
 
     Attributes
     ----------
@@ -41,11 +41,11 @@ class Facets:
 
 
 def draw_specimens(scene: Scene) -> Scene:
-    """The scene with plates and points as they really are; doing it again changes nothing.
+    """Return the scene with true plates and points; applying it again changes nothing.
 
-    Permittivities are drawn with `specimen_spread`: the real part from a normal distribution (never below 1), the loss
-    from a log-normal one, both around what the file says; a layer of air stays air. Shift and tilt of the plane go into
-    each plate's and point's own.
+    Permittivities are drawn with `specimen_spread`: the real part from a normal distribution (at least 1), the loss
+    from a log-normal one, around the nominal values; a layer of air stays air. Shift and tilt of the plane are added to
+    those of each plate and point.
     """
     plates = tuple(_placed(_drawn(p, i, scene), scene) for i, p in enumerate(scene.plates))
     points = tuple(
@@ -62,9 +62,9 @@ def draw_specimens(scene: Scene) -> Scene:
 
 
 def facets(plate: Plate, index: int, seed: int) -> Facets:
-    """The facets of the plate with this index: normal heights, independent of each other, drawn from the scene's seed.
+    """Return the facets of the plate with this index: independent normal heights from the scene's seed.
 
-    Facets are as near to `rough_length_mm` as whole ones fit the plate.
+    A whole number of facets fits the plate, with sides near `rough_length_mm`.
     """
     n = [max(1, round(side / plate.rough_length_mm)) if plate.rough_mm else 1 for side in plate.size_mm]
     sx, sy = (side / 1e3 / count for side, count in zip(plate.size_mm, n, strict=True))
@@ -77,7 +77,7 @@ def facets(plate: Plate, index: int, seed: int) -> Facets:
 
 
 def slopes(plate: Plate) -> tuple[float, float]:
-    """Growth of the plate's height along x and y."""
+    """Return the growth of the plate's height along x and y."""
     return math.tan(math.radians(plate.tilt_deg[0])), math.tan(math.radians(plate.tilt_deg[1]))
 
 
@@ -87,7 +87,7 @@ def _plane_height_mm(scene: Scene, at_mm: Pair) -> float:
 
 
 def _placed(plate: Plate, scene: Scene) -> Plate:
-    """The plate with the plane's shift and tilt in its own."""
+    """Return the plate with shift and tilt of the plane added."""
     tilt = plate.tilt_deg
     if any(scene.plane_tilt_deg):
         both = [
@@ -100,7 +100,7 @@ def _placed(plate: Plate, scene: Scene) -> Plate:
 
 
 def _drawn(plate: Plate, index: int, scene: Scene) -> Plate:
-    """The plate with permittivities of its own."""
+    """Return the plate with drawn permittivities."""
     if not any(scene.specimen_spread) or plate.metal:
         return plate
     rng = np.random.default_rng([stream_key(scene.seed, "specimen"), index])

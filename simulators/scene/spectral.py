@@ -1,17 +1,17 @@
-"""The object's echo over all stage offsets by fast convolution, at each of a few frequencies.
+"""Compute the object's echo at all stage offsets by fast convolution, at a few frequencies.
 
-:mod:`polysight.simulators.scene.field` says how; here are the kernels and the plates' spectra.
+The method is described in :mod:`polysight.simulators.scene.field`; here are the kernels and the spectra of the plates.
 
-Plates and points out of the plane: those of about the same height share a kernel, whose legs are taken at that height
-(a :class:`_Level`). What is left of a point's height, z, from tilt, roughness and the rest of its plate's height, adds
-C z to the path, C = dpath/dz of about 2 cos(theta). exp(j k C z) does not separate into plate and kernel, for C
-changes over the kernel; but interpolated between a few values C_m it does,
+Plates and points of similar height share a kernel, computed at that height (a :class:`_Level`). The remaining height z
+of a point, from tilt, roughness and height of its plate, adds C z to the path, with C = dpath/dz of about 2 cos(theta).
+exp(j k C z) does not separate into plate and kernel, for C varies over the kernel, but its interpolation between a few
+values C_m does:
 
-    exp(j k C z) = sum over m of l_m(C) exp(j k C_m z),
+    exp(j k C z) = sum over m of l_m(C) exp(j k C_m z).
 
-l_m goes into the kernel and exp(j k C_m z) into the plate: a tilt shifts the spectrum of its rectangle, a facet's
-height turns its phase. Left out are the change of C itself across z (its mean over the plate's height is in), that of
-spreading and angle, and the turn of the plate's normal in the obliquity.
+l_m belongs to the kernel and exp(j k C_m z) to the plate: a tilt shifts the spectrum of its rectangle, the height of a
+facet changes its phase. Neglected are the change of C over z (except for its mean over the plate's height), the changes
+of spreading and angle, and the rotation of the plate's normal in the obliquity.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ from polysight.simulators.scene.optics import (
 from polysight.simulators.scene.scene_file import Plate, Scene
 from polysight.simulators.scene.specimens import Facets, facets, slopes
 
-_ANGLE_TOLERANCE = 1e-4  # of the Chebyshev series in the local angle
-_RELIEF_TOLERANCE = 2e-4  # of the interpolation in dpath/dz
-_LEVEL_MM = 2.0  # heights up to this far apart share a kernel
+_ANGLE_TOLERANCE = 1e-4  # error of the Chebyshev series in the local angle
+_RELIEF_TOLERANCE = 2e-4  # error of the interpolation in dpath/dz
+_LEVEL_MM = 2.0  # range of heights that share a kernel
 
 
 def cheb_nodes(q: int) -> Real:
-    """The q zeros of the Chebyshev polynomial of order q, from +1 down."""
+    """Return the q zeros of the Chebyshev polynomial of order q, descending."""
     return np.cos(np.pi * (np.arange(q) + 0.5) / q)
 
 
 def _angle_series(
     scene: Scene, reflect: Reflectivity, nodes_hz: Real, theta: tuple[float, float]
 ) -> NDArray[np.complexfloating]:
-    """Chebyshev coefficients of r(theta) for each plate and node, [plate, node, order]; as few orders as suffice."""
+    """Return the Chebyshev coefficients of r(theta) for each plate and node, [plate, node, order]."""
     centre, half = (theta[0] + theta[1]) / 2, max((theta[1] - theta[0]) / 2, 1e-9)
     many = 16
     x = cheb_nodes(many)
@@ -71,9 +71,9 @@ def _angle_series(
 
 
 def _spectra(axis: Axis, centres: Real, sizes: Real, shifts: Real | float = 0.0) -> Complex:
-    """Fourier transforms of intervals (or points, size 0) along one axis, [item, kappa], phase-shifted to the grid.
+    """Return the Fourier transforms of intervals (or points, size 0) along an axis, [item, kappa], on the grid.
 
-    `shifts` [item] are rad/m of linear phase over each interval, zero at its centre.
+    `shifts` [item] are linear phases over each interval, rad/m, zero at its centre.
     """
     k = axis.kappa
     width = np.where(sizes > 0, sizes, 1.0)[:, None]
@@ -85,29 +85,29 @@ def _spectra(axis: Axis, centres: Real, sizes: Real, shifts: Real | float = 0.0)
 def _outer(
     y: NDArray[np.complexfloating], weight: NDArray[np.complexfloating], x: NDArray[np.complexfloating]
 ) -> NDArray[np.complex64]:
-    """Weighted sum of outer products over items, [kappa_y, kappa_x]; without BLAS and its threads."""
+    """Return the weighted sum of outer products over items, [kappa_y, kappa_x]; without BLAS threads."""
     scaled = (y * weight[:, None]).astype(np.complex64)
     return np.einsum("py,px->yx", scaled, x.astype(np.complex64))
 
 
 @dataclass(frozen=True)
 class _Level:
-    """Plates and points of about the same height: they share a kernel.
+    """Plates and points of similar height, which share a kernel.
 
     Attributes
     ----------
     plates, points
         Indices of the members.
     lift_m, point_lift_m
-        Their heights above the level.
+        Their heights relative to the level.
     legs
         r1, r2, incidence and obliquity over the kernel at the level's height, for each RX.
     bend
         d2path/dz2 at the image centre, 1/m.
     steepness
-        Values C_m of dpath/dz that exp(j k C z) is interpolated between.
+        Interpolation nodes C_m of dpath/dz.
     middle, half
-        Of the range of dpath/dz over the kernel.
+        Middle and half width of the range of dpath/dz over the kernel.
     """
 
     plates: list[int]
@@ -121,7 +121,7 @@ class _Level:
     half: float
 
     def shares(self, oblique: Real) -> list[Real] | None:
-        """l_m of dpath/dz over the kernel, for each m; None where one value serves."""
+        """Return l_m of dpath/dz over the kernel for each m; None for a single node."""
         n = len(self.steepness)
         if n == 1:
             return None
@@ -131,7 +131,7 @@ class _Level:
         return [everywhere @ row for row in at_nodes]
 
     def lifted(self, lift_m: Real, wave: float, m: int) -> Complex | float:
-        """Phase factors of heights above the level, with their mean change of dpath/dz."""
+        """Return the phase factors of heights relative to the level, with the mean change of dpath/dz."""
         if not lift_m.any():
             return 1.0
         return np.exp(1j * wave * (self.steepness[m] * lift_m + 0.5 * self.bend * lift_m**2))
@@ -139,7 +139,7 @@ class _Level:
 
 @dataclass(frozen=True)
 class _Plane:
-    """What lies there, on the grid of the computation."""
+    """Scene and grid of the computation."""
 
     ant: Antennas
     scene: Scene
@@ -149,7 +149,7 @@ class _Plane:
     amplitudes: Complex
 
     def levels(self, rx: Sequence[int], top_hz: float) -> list[_Level]:
-        """Plates and points by height; at least one level, so that an empty scene has a field as well."""
+        """Group plates and points by height; at least one level, also for an empty scene."""
         plates, points = self.scene.plates, self.scene.points
         heights = np.array([p.height_mm for p in (*plates, *points)])
         groups: list[list[float]] = []
@@ -193,7 +193,7 @@ class _Plane:
         return _Level(members[0], members[1], lifts[0], lifts[1], legs, bend, nodes, (low + high) / 2, half)
 
     def plate_maps(self, level: _Level, series: Complex, f: float, m: int) -> list[NDArray[np.complex64]]:
-        """Spectrum of a level's plates for each order of the local angle, with the phases of C_m; series [plate, j]."""
+        """Return the spectra of a level's plates by order of the local angle, with the phases of C_m."""
         if not level.plates:
             return []
         wave, ant = 2 * np.pi * f / SPEED_OF_LIGHT_M_S, self.ant
@@ -213,7 +213,7 @@ class _Plane:
         return maps
 
     def _rough_map(self, parts: Facets, centre_m: Real, turn: Real, per_metre: float) -> NDArray[np.complex64]:
-        """Spectrum of a plate of facets: `turn` is its tilt's phase in rad/m, `per_metre` that of height."""
+        """Return the spectrum of a plate of facets: `turn` is the phase of its tilt in rad/m, `per_metre` of height."""
         x = _spectra(
             self.x, self.ant.centre_m[0] + centre_m[0] + parts.x_m, np.full(parts.x_m.shape, parts.size_m[0]), turn[0]
         )
@@ -225,7 +225,7 @@ class _Plane:
         return np.einsum("ry,rx->yx", y.astype(np.complex64), rows)
 
     def point_map(self, level: _Level, f: float, m: int) -> NDArray[np.complex64] | None:
-        """Spectrum of a level's points, with the phases of C_m."""
+        """Return the spectrum of a level's points, with the phases of C_m."""
         if not level.points:
             return None
         table = np.array([self.scene.points[i].position_mm for i in level.points]) / 1e3
@@ -237,14 +237,14 @@ class _Plane:
 
 
 def _range(legs: list[tuple[Real, Real, Real, Real]]) -> tuple[float, float]:
-    """Least and largest dpath/dz over the kernel."""
+    """Return the smallest and largest dpath/dz over the kernel."""
     return 2 * min(float(leg[3].min()) for leg in legs), 2 * max(float(leg[3].max()) for leg in legs)
 
 
 def compute(
     rig: Instrument, scene: Scene, board: Board, samples_hz: Real, rx: Sequence[int]
 ) -> tuple[NDArray[np.complex64], tuple[float, float], tuple[float, float], Real, float]:
-    """What :class:`polysight.simulators.scene.field.ObjectField` holds, for a scene of drawn specimens."""
+    """Return the fields of :class:`polysight.simulators.scene.field.ObjectField` for a scene of drawn specimens."""
     ant, reflect = antennas(rig, board), board_reflectivity(board, scene)
     ax, ay = spectral_axes(rig, scene, ant, float(samples_hz[-1]))
     amplitudes = sampled(np.array([complex(*p.amplitude) for p in scene.points])) * point_scale(ant)
@@ -270,10 +270,10 @@ def compute(
 def _frequencies(
     plates: Sequence[Plate], ax: Axis, ay: Axis, legs: list[tuple[Real, Real, Real, Real]], samples_hz: Real
 ) -> tuple[Real, float]:
-    """Nodes over the samples' band (the samples, where these are fewer) and the path whose phase is removed."""
+    """Return the nodes in the samples' band (the samples if they are fewer), and the path whose phase is removed."""
     reach = np.stack([r1 + r2 for r1, r2, _, _ in legs])[:, (ay.fade == 1)[:, None] & (ax.fade == 1)]
     inside = 0.0
-    for p in plates:  # inner echoes lengthen the response
+    for p in plates:  # inner echoes extend the response
         depth = sum((layer.thickness_mm or 0.0) / 1e3 * abs(np.sqrt(layer.epsilon)) for layer in p.stack)
         inside = max(inside, 4 * depth)
     spread = float(reach.max() - reach.min()) + 2 * inside
@@ -286,7 +286,7 @@ def _frequencies(
 
 
 def _factors(level: _Level, low: float, high: float, orders: int) -> tuple[Real, list[list[Real] | None]]:
-    """Chebyshev polynomials of the local angle over low..high, [rx, y, x, order], and shares of dpath/dz by RX."""
+    """Return Chebyshev polynomials of the local angle, [rx, y, x, order], and shares of dpath/dz by RX."""
     theta = np.stack([leg[2] for leg in level.legs])
     angle = chebyshev.chebvander((theta - (low + high) / 2) / max((high - low) / 2, 1e-9), orders - 1)
     return angle, [level.shares(leg[3]) for leg in level.legs]
@@ -321,7 +321,7 @@ def _add_level(
 
 
 def _oversampled(spectrum: NDArray[np.complex64], axis: Axis, along: int) -> NDArray[np.complex64]:
-    """Inverse DFT along one axis onto the finer output grid, cut to the wanted offsets."""
+    """Return the inverse DFT along an axis on the finer output grid, limited to its offsets."""
     n = axis.points
     shape = list(spectrum.shape)
     shape[along] = n * OVERSAMPLING

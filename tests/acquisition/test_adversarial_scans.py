@@ -1,4 +1,4 @@
-"""Scans with cards and a network at their worst: every committed byte is right or masked, the exit status honest.
+"""Scans with every trouble of cards and network: every committed byte is right or masked, the exit status correct.
 
 Real receivers over sockets, retakes, rows kept incomplete, resumes. `--long` takes 100 scans.
 """

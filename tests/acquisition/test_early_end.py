@@ -1,4 +1,4 @@
-"""A row that ends early leaves nothing behind in the cards that the next take could mistake for its own."""
+"""A row that ends early leaves no data in the cards that the next take could mistake for its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scan in which boards missed pulses, kept and processed, images like the clean one, not like a slipped one."""
+"""The image of a scan with missed pulses, kept incomplete, is that of the complete scan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scan in which boards miss pulses: found, named, taken again; or kept, each frame at its pulse or masked."""
+"""Scans in which boards miss pulses: the row is retaken, or kept with each frame at its pulse or masked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bar of a running scan: on a terminal rows and points, elsewhere a line at every tenth; notices on both."""
+"""Progress of a running scan: bars of rows and points on a terminal, otherwise a line per tenth; notices on both."""
 
 from __future__ import annotations
 

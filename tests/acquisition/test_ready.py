@@ -1,4 +1,4 @@
-"""Before a row: homing fails with the Pi's own reason, and the disk space checked is that of the rows."""
+"""Before the first row: homing, disk space, a Pi with the same [stage]; after the last: lost steps."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import shutil
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import pytest
 
 from polysight.host.acquisition import ready
 from polysight.host.acquisition.control import StopRequest
-from polysight.host.acquisition.ready import check_disk, make_ready
+from polysight.host.acquisition.ready import STAGE_NOT_REPORTED, check_disk, make_ready
+from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.doctor.check_host import check_time
 from polysight.host.plan.forecast import forecast
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.faults import PiFault
 from polysight.shared.stage_line import HOMING_TIMEOUT_S
@@ -81,3 +84,104 @@ def test_plan_and_doctor_tell_the_size_of_a_scan(make_instrument):
     assert forecast(rig).raw_bytes == rig.scan_bytes == rig.grid.rows * rig.recorded_row_bytes
     bench: Any = SimpleNamespace(rig=rig)
     assert check_time(bench).facts["bytes"] == rig.scan_bytes
+
+
+@pytest.mark.parametrize("key", ["steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2"])
+def test_a_pi_that_places_rows_elsewhere_is_refused_before_a_folder_is_made(rig, tmp_path, key):
+    own = rig.instrument.stage.placement_settings[key]
+    rig.pi.stage = {**rig.pi.stage, key: own + 0.5}
+    with refused(ErrorCode.STAGE_DIFFERS, key, f"{own:g}", f"{own + 0.5:g}"):
+        run_scan(rig.instrument, tmp_path / "s")
+    assert not (tmp_path / "s").exists()
+    assert rig.pi.commands[-1:] == rig.pi.commands[:1], "nothing but Hello was asked"
+
+
+def test_resuming_after_the_pis_rig_file_changed_is_refused_and_mended_by_its_old_one(rig, tmp_path):
+    stop, right = StopRequest(), rig.pi.stage
+    run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
+    scan = ScanFolder.load(tmp_path / "s")
+    assert scan.facts("scan_started")[0]["pi"]["stage"] == right == rig.instrument.stage.placement_settings
+    rows, facts = list(scan.rows()), len(scan.content.facts)
+    assert not scan.complete
+    rig.pi.stage = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
+    with refused(ErrorCode.STAGE_DIFFERS, "centre_x_mm", 400, 405):
+        resume_scan(tmp_path / "s")
+    scan.reload()
+    assert (list(scan.rows()), len(scan.content.facts)) == (rows, facts), "nothing was written"
+    rig.pi.stage = right
+    assert resume_scan(tmp_path / "s").folder.complete
+    scan.reload()
+    assert scan.facts("scan_resumed")[0]["pi"] == {"release": "t", "firmware": "t", "backend": "fake", "stage": right}
+
+
+def test_a_pi_that_does_not_report_its_stage_is_a_warning(rig, tmp_path):
+    """A Pi of an older release: the wire's version is the same."""
+    rig.pi.stage = {}
+    result = run_scan(rig.instrument, tmp_path / "s")
+    assert result.exit_status == "success"
+    assert STAGE_NOT_REPORTED in result.warnings
+
+
+def test_settings_that_do_not_place_rows_may_differ(rig):
+    stage = rig.instrument.stage
+    same = msgspec.structs.replace(stage, port="elsewhere", speed_mm_s=stage.speed_mm_s / 2, heartbeat_ms=2000)
+    assert same.placement_settings == stage.placement_settings
+
+
+def test_a_scan_begun_without_comparison_resumes_with_a_warning(rig, tmp_path):
+    """Its rows lie where that Pi had them; refusing it would have them put elsewhere."""
+    stop, right = StopRequest(), rig.pi.stage
+    rig.pi.stage = {}
+    run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
+    again = StopRequest()
+    assert STAGE_NOT_REPORTED in resume_scan(tmp_path / "s", on_row=lambda _: again.request(), stop=again).warnings
+    rig.pi.stage = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
+    result = resume_scan(tmp_path / "s")
+    assert result.folder.complete
+    assert any("not compared" in w and "centre_x_mm" in w for w in result.warnings)
+
+
+def scanned(rig, folder, **stage):
+    """The result, and the last `scan_ended`."""
+    replace = msgspec.structs.replace
+    result = run_scan(replace(rig.instrument, stage=replace(rig.instrument.stage, **stage)), folder)
+    return result, ScanFolder.load(folder).facts("scan_ended")[-1]
+
+
+@pytest.mark.parametrize(("lost_mm", "told"), [((0.0, 0.0), False), ((0.03, -0.04), False), ((0.0, -1.2), True)])
+def test_what_was_lost_is_in_the_manifest_and_what_matters_is_a_warning(rig, tmp_path, lost_mm, told):
+    rig.pi.lost_mm = lost_mm
+    result, ended = scanned(rig, tmp_path / "s")
+    assert (result.exit_status, rig.pi.homings) == ("success", 2)
+    assert ended["lost_mm"] == list(lost_mm)
+    assert any(f"{lost_mm[1]:.3f} mm in y" in w for w in result.warnings) == told
+
+
+def test_a_stage_without_switches_is_not_homed_again(rig, tmp_path):
+    result, ended = scanned(rig, tmp_path / "s", home_after_scan=False)
+    assert (result.exit_status, rig.pi.homings, "lost_mm" in ended) == ("success", 1, False)
+
+
+def test_homing_that_fails_after_the_last_row_ends_no_scan(rig, tmp_path):
+    rig.pi.home_fails = {2}
+    result, ended = scanned(rig, tmp_path / "s")
+    assert (result.exit_status, ended["exit_status"], "lost_mm" in ended) == ("success", "success", False)
+    assert any("switch was not found" in w for w in result.warnings)
+    assert ScanFolder.load(tmp_path / "s").complete
+
+
+def test_only_a_scan_that_has_all_its_rows_is_homed_after(rig, tmp_path):
+    """Who stopped it expects no more motion; and a scan that is whole already moves nothing."""
+    stop = StopRequest()
+
+    def after_the_first(progress):
+        if progress.phase == "committed":
+            stop.request()
+
+    assert run_scan(rig.instrument, tmp_path / "s", progress=after_the_first, stop=stop).exit_status == "abort"
+    assert rig.pi.homings == 1
+    assert resume_scan(tmp_path / "s").exit_status == "success"
+    homings = rig.pi.homings
+    assert "lost_mm" in ScanFolder.load(tmp_path / "s").facts("scan_ended")[-1]
+    assert resume_scan(tmp_path / "s").exit_status == "success"
+    assert rig.pi.homings == homings

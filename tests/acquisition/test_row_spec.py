@@ -1,4 +1,4 @@
-"""docs/spec/row.md says what the code does: states, transitions, messages."""
+"""docs/spec/row.md agrees with the code: states, transitions, messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""However a scan ends, the rig is left at rest, nothing moves unasked, and the error says what is safe."""
+"""Every end of a scan leaves the rig at rest; nothing moves without a request; errors name the rows that are safe."""
 
 from __future__ import annotations
 

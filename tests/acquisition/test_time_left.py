@@ -1,4 +1,4 @@
-"""Time left: what the rows took, whatever was waited for between them; the same in the terminal and in the page."""
+"""Time left: the duration of rows without pauses between them, the same in the terminal and on the page."""
 
 from __future__ import annotations
 

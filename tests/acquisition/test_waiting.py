@@ -1,4 +1,4 @@
-"""The scan waits between rows rather than lose data: for processing, for the disk; and it stops as it is told."""
+"""The scan waits between rows for processing and disk instead of losing data, and stops on request."""
 
 from __future__ import annotations
 

@@ -6,7 +6,8 @@ import pytest
 from polysight.host.api.layers import layer_dataset
 from polysight.host.materials.layers import Layer, Spectrum, predict
 from polysight.host.products import ProcessedScan
-from polysight.shared.errors import ConfigError
+from polysight.shared.error_codes import ErrorCode
+from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 CHIRP = published_rig().chirp
@@ -44,5 +45,5 @@ def test_a_free_thickness_by_one_band_is_told_ambiguous(done):
 
 
 def test_other_forms_of_a_layer_are_refused(done):
-    with pytest.raises(ConfigError, match="is no layer"):
+    with refused(ErrorCode.VALUE_INVALID):
         layer_dataset(done, CHIRP, ["sheet"], None, 10.0)

@@ -17,7 +17,9 @@ from polysight.host.products.files import read_image
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.shared.config import load_instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, PolysightError
+from tests.support.refusals import refused
 
 from .conftest import COPPER, PET, REPO, command, simulated
 
@@ -140,7 +142,7 @@ def test_the_unreferenced_image_is_what_image_writes(scan, folder, tmp_path):
     saved = open_scan(tmp_path / "out")
     xarray.testing.assert_allclose(saved.image(metal_referenced=False), scan.image(metal_referenced=False))
     for call in (saved.image, saved.patches, saved.plot):
-        with pytest.raises(DataError, match="not referenced to metal"):
+        with refused(ErrorCode.MISMATCH):
             call()
 
 
@@ -166,7 +168,7 @@ def test_saved_products_of_a_scan_folder_are_used_while_they_hold_its_rows(folde
     same_image(open_scan(scan).image(), saved / "image.npz")
     for asked in (open_scan(scan, fresh=True), open_scan(scan, model="none")):
         assert "recorded rows" in repr(asked)
-        with pytest.raises(DataError, match="cannot be read"):
+        with pytest.raises(DataError):
             asked.image()
 
 
@@ -297,7 +299,7 @@ def test_images_without_metal_have_files_too(tmp_path):
 def test_a_folder_that_is_no_store_is_not_replaced(scan, tmp_path):
     (tmp_path / "mine.zarr").mkdir()
     (tmp_path / "mine.zarr" / "thesis.txt").write_text("text")
-    with pytest.raises(ConfigError, match="not a Zarr store"):
+    with pytest.raises(ConfigError):
         scan.to_zarr(tmp_path / "mine.zarr")
     assert (tmp_path / "mine.zarr" / "thesis.txt").exists()
 
@@ -330,7 +332,7 @@ def test_a_scan_without_a_whole_row_says_so(folder, tmp_path):
     scan = open_scan(without_rows(folder, tmp_path / "scan", *range(27)))
     assert scan.rows.committed == ()
     for call in (scan.image, scan.patches, scan.plot, lambda: scan.image(metal_referenced=False)):
-        with pytest.raises(DataError, match="no row is recorded whole"):
+        with refused(ErrorCode.NO_DATA):
             call()
 
 
@@ -350,9 +352,9 @@ def test_parameters_that_cannot_be_used_are_errors(folder, wrong):
 
 
 def test_products_cannot_be_processed_again(products):
-    with pytest.raises(ConfigError, match="cannot be processed again"):
+    with refused(ErrorCode.VALUES_CONFLICT, products):
         open_scan(products, bands=3)
-    with pytest.raises(DataError, match="referenced to metal"):
+    with refused(ErrorCode.MISMATCH):
         open_scan(products).image(metal_referenced=False)
 
 
@@ -366,7 +368,7 @@ def test_products_that_say_nothing_of_the_scan_still_open(products, tmp_path):
     assert "incidence_deg" not in scan.image()
     assert scan.simulated is True  # materials.json says so
     for name in ("rig", "rows"):
-        with pytest.raises(DataError, match="do not say"):
+        with refused(ErrorCode.KEY_MISSING, name):
             getattr(scan, name)
 
 
@@ -394,5 +396,5 @@ def test_opening_a_scan_needs_neither_xarray_nor_matplotlib_s_state(folder):
 def test_every_public_name_is_there():
     for name in polysight.__all__:
         assert getattr(polysight, name)
-    with pytest.raises(AttributeError, match="no_such_name"):
+    with pytest.raises(AttributeError):
         _ = polysight.no_such_name

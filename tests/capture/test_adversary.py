@@ -1,4 +1,4 @@
-"""Rows of a card and a network that do their worst: data is original or masked, and what is decidable is not masked.
+"""Rows with every trouble of a card and a network: data is original or masked, and not masked without reason.
 
 A state machine takes record after record, each through drawn troubles; what one record leaves behind comes with the
 next. 2,000 records; `--long` takes 20,000 and draws new ones.

@@ -1,4 +1,4 @@
-"""`polysight card` as a user runs it, against simulated cards: which hop is silent, and what is written."""
+"""`polysight card` against simulated cards: the hop that does not work, and writing the EEPROM."""
 
 from __future__ import annotations
 

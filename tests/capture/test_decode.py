@@ -1,4 +1,4 @@
-"""Lane layouts: a known cube comes back, whichever layout carried it."""
+"""Lane layouts: a known cube is decoded from every layout."""
 
 from __future__ import annotations
 

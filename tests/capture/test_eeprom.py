@@ -1,4 +1,4 @@
-"""A card's addresses: the bytes of command 0x04, what is refused, and that nothing is written unconfirmed."""
+"""EEPROM of a card: bytes of command 0x04, refused settings, no write without confirmation."""
 
 from __future__ import annotations
 

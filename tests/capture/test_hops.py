@@ -1,4 +1,4 @@
-"""A silent card's error names the hop: no route, no link, no device, a mute card, a radar that does not stream."""
+"""Errors of a silent card name the hop: no route, no link, no device, a mute card, a radar that does not stream."""
 
 from __future__ import annotations
 

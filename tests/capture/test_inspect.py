@@ -13,7 +13,7 @@ from polysight.host.capture import dca1000, kind_of
 from polysight.host.capture.dca1000 import Status
 from polysight.host.capture.inspect import Known, Report, Shape, inspect_bin
 from polysight.host.capture.pcap import inspect_pcap, read_pcap
-from polysight.host.jobs.look import inspect_file, main_text, plot_profile
+from polysight.host.jobs.recordings import inspect_file, main_text, plot_profile
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from tests.support.capture.recordings import real_row, row, write_pcap

@@ -1,4 +1,4 @@
-"""What the project writes is read back without the project: numpy.fromfile, json and msgpack, nothing else."""
+"""Files of the project are readable without it: with numpy.fromfile, json and msgpack alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The receiving process over real sockets: bit-exact rows, masked losses, clear errors, a clean end."""
+"""The receiver process over real sockets: bit-exact rows, masked losses, clear errors, a clean end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""More than one record among a row's packets, and cards that begin anew near where they began before."""
+"""More than one record among a row's packets, and cards that restart near their former start."""
 
 from __future__ import annotations
 

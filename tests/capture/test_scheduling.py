@@ -1,4 +1,4 @@
-"""Where and how urgently a receiver runs, what buffer the kernel grants, and what is said when it is too little."""
+"""Core and priority of a receiver, the receive buffer, and warnings if the system grants less."""
 
 from __future__ import annotations
 

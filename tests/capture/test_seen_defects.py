@@ -1,4 +1,4 @@
-"""Rows that were placed wrongly once, each by itself: a late packet, a full last packet, counters that begin anew."""
+"""Rows that were once placed wrongly: a late packet, a full last packet, counters that restart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A row's file: memory taken again, a full disk, a damaged index."""
+"""A row's file: reused memory, a full disk, a damaged index."""
 
 from __future__ import annotations
 

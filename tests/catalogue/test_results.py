@@ -63,7 +63,7 @@ def test_metal_has_no_permittivity_and_says_why(processed):
 
 def test_places_outside_the_image_are_refused(processed):
     for place in ((1000.0, 0.0), (0.0, -500.0), (float("nan"), 0.0)):
-        with pytest.raises(DataError, match="outside"):
+        with refused(ErrorCode.VALUE_INVALID):
             probe(processed / "one", *place)
 
 
@@ -133,7 +133,7 @@ def test_errors_that_both_scans_share_do_not_hide_a_change():
 
 def test_scans_that_cannot_be_compared_say_so(processed, tmp_path):
     judged_products(tmp_path / "none", "none")
-    with pytest.raises(DataError, match="cannot be compared"):
+    with refused(ErrorCode.NO_DATA):
         compare(processed / "one", tmp_path / "none")
 
 
@@ -176,7 +176,7 @@ def test_images_whose_arrays_do_not_belong_together_are_refused(tmp_path, change
         lambda: compare(folder, folder),
         lambda: thumbnail(Pixels(read_products(folder))),
     ):
-        with pytest.raises(DataError, match="not an image product"):
+        with pytest.raises(DataError):
             look()
 
 

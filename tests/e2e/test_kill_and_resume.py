@@ -1,4 +1,4 @@
-"""A scan that is interrupted, or whose disk is full, goes on where it was, and what was committed stays as it is.
+"""A scan that is interrupted, or whose Pi has a full disk, resumes, and its committed rows stay as they are.
 
 Kills are in test_killed_processes.py.
 """

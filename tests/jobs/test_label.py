@@ -90,10 +90,10 @@ def test_a_box_where_nothing_shines_is_pointed_out(products, capsys):
     [
         (["--box", "oak=0,0,100,10"], "outside the image"),
         (["--box", "oak=0,0,10,10", "--box", "glass=5,5,15,15"], "overlap by 5.0 x 5.0 mm"),
-        (["--box", "oak=nan,0,10,10"], "holds nothing"),
-        (["--box", "oak=0,0,10,10", "--box", "oak=20,0,30,10"], "the name oak is there twice"),
-        (["--from-patches", "--rename", "1=oak", "--rename", "2=oak"], "the name oak is there twice"),
-        (["--box", "oak=0,0,10,10", "--box", "glass=20,0,30,10"], "the metal reference is not told"),
+        (["--box", "oak=nan,0,10,10"], "box of oak, nan"),
+        (["--box", "oak=0,0,10,10", "--box", "oak=20,0,30,10"], "the name oak"),
+        (["--from-patches", "--rename", "1=oak", "--rename", "2=oak"], "the name oak"),
+        (["--box", "oak=0,0,10,10", "--box", "glass=20,0,30,10"], "--metal NAME: oak, glass"),
         (["--box", "oak=0,0,10,10", "--metal", "copper"], "no box is called copper"),
         (["--rename", "1=oak"], "no box is called 1"),
         (["--remove", "oak"], "no box is called oak"),
@@ -122,7 +122,7 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
     assert list(boxes(products).boxes) == ["metal", "PET", "PET#2"]
     assert boxes(products).metal == "metal"
     assert "named PET 80 %" in questions[1]
-    assert "is there twice" in capsys.readouterr().out  # pet beside PET
+    assert "the name pet" in capsys.readouterr().out  # pet beside PET
     before = (products / "labels.json").read_bytes()
     ask, questions = answering("no")
     assert main_error(products, ask) == "nothing was changed"

@@ -111,5 +111,6 @@ def test_labels_win_over_the_truth_and_drawn_specimens_are_told_apart(tmp_path):
     assert told == [("tin", None), (MINE, "left")]
     boxes = {"tin": [-60, -10, 30, 30], MINE: [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
-    with pytest.raises(DataError, match=f"labels.json: the boxes of tin and {MINE} overlap by 10.0 x 20.0 mm"):
+    with pytest.raises(DataError) as caught:
         training_scan(scan, RIG_FILE)
+    assert all(value in str(caught.value) for value in ("labels.json", "tin", MINE, "10.0 x 20.0 mm"))

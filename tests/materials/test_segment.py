@@ -1,7 +1,5 @@
 """Segmentation finds every plate and nothing else; boxes by hand; the metal reference."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -18,7 +16,8 @@ from polysight.host.materials import (
 )
 from polysight.host.materials.segment import box_mask
 from polysight.host.materials.truth import match_truth
-from polysight.shared.errors import DataError
+from polysight.shared.error_codes import ErrorCode
+from tests.support.refusals import refused
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -109,9 +108,9 @@ def test_invalid_part_is_left_out(synthetic):
     found = segment(scene.h, scene.v, scene.x_m, scene.y_m, valid)
     assert found.patches
     assert not found.labels[:, :75].any()
-    with pytest.raises(DataError, match="no valid pixel"):
+    with refused(ErrorCode.NO_DATA):
         segment(scene.h, scene.v, scene.x_m, scene.y_m, np.zeros_like(valid))
-    with pytest.raises(DataError, match="axes"):
+    with refused(ErrorCode.MISMATCH):
         segment(scene.h, scene.v, scene.x_m[:-1], scene.y_m)
 
 
@@ -154,9 +153,9 @@ def test_metal_by_box_and_label(synthetic):
     by_box = metal_in_box(copper.box_mm, found, scene.x_m, scene.y_m)
     assert by_box.label is not None
     assert (by_box.mask == metal_by_label(by_box.label, found).mask).all()
-    with pytest.raises(DataError, match="no valid pixel"):
+    with refused(ErrorCode.NO_DATA):
         metal_in_box((1e3, 1e3, 2e3, 2e3), found, scene.x_m, scene.y_m)
-    with pytest.raises(DataError, match="no patch 99"):
+    with refused(ErrorCode.NO_DATA, 99):
         metal_by_label(99, found)
 
 
@@ -172,15 +171,22 @@ def test_label_files_round_trip_and_make_patches(tmp_path, synthetic):
     assert found.labels[35, 10] == 0
     flipped, _ = patches_from_labels(boxes, scene.x_m, scene.y_m, flip_y=True)
     np.testing.assert_array_equal(flipped.labels, found.labels[::-1])
-    with pytest.raises(DataError, match="holds no pixel"):
+    with refused(ErrorCode.NO_DATA, "far"):
         patches_from_labels({"far": (500.0, 0.0, 600.0, 10.0)}, scene.x_m, scene.y_m)
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", '{"labels": 3}', '{"labels": {"a": [1, 2, 3]}}', json.dumps({"labels": [1]})]
+    ("text", "code"),
+    [
+        ("", ErrorCode.FILE_UNREADABLE),
+        ("[]", ErrorCode.VALUE_INVALID),
+        ('{"labels": 3}', ErrorCode.VALUE_INVALID),
+        ('{"labels": {"a": [1, 2, 3]}}', ErrorCode.VALUE_INVALID),
+        ('{"labels": [1]}', ErrorCode.VALUE_INVALID),
+    ],
 )
-def test_bad_label_files_are_refused(tmp_path, text):
+def test_bad_label_files_are_refused(tmp_path, text, code):
     path = tmp_path / "bad.json"
     path.write_text(text)
-    with pytest.raises(DataError, match=r"bad\.json"):
+    with refused(code, path):
         read_labels(path)

@@ -18,9 +18,10 @@ from polysight.papers.sensys2026.dataset_figures import Judgements, authors_fig2
 from polysight.papers.sensys2026.dataset_run import authors_recipe, text_of, without_leakage
 from polysight.papers.sensys2026.item import Table
 from polysight.papers.sensys2026.table2 import table2
-from polysight.shared.errors import DataError
-from polysight.simulators.scene import Errors, Material, write_labels, write_material
+from polysight.shared.error_codes import ErrorCode
+from tests.support.drawn_files import Errors, Material, write_labels, write_material
 from tests.support.paths import RIG_FILE
+from tests.support.refusals import refused
 
 CHOSEN = (1, 3, 12, 15, 27, 28, 30, 32, 34, 36)
 ERRORS = Errors(0.004, 0.01, leakage=0.05)
@@ -118,7 +119,7 @@ def test_what_a_name_means_can_be_said(dataset, tmp_path):
     data = read_authors(dataset, _rig(), names=names)
     assert ROWS[20].name in data.sources[MATERIALS].names
     names.write_text('{"unobtainium": 99}')
-    with pytest.raises(DataError, match="no row 99"):
+    with refused(ErrorCode.VALUE_INVALID, 99):
         read_names(names)
 
 
@@ -189,7 +190,7 @@ def test_what_is_judged_is_kept(dataset):
     judge.data.sources.pop(LABELS)
     a = judge.judged(MATERIALS, "powders", "weighted KNN (paper)", "H")
     assert judge.judged(MATERIALS, "powders", "weighted KNN (paper)", "H") is a
-    with pytest.raises(DataError, match="nothing to classify"):
+    with refused(ErrorCode.NO_DATA):
         authors_fig20(Judgements(type(judge.data)(judge.data.folder, judge.data.base, {}, {}, ())))
 
 

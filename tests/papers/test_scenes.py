@@ -11,8 +11,9 @@ from polysight.papers.sensys2026.permittivities import APART_MM, REACH_MM, place
 from polysight.papers.sensys2026.scenes import plate, scanned
 from polysight.papers.sensys2026.synchronisation import tones
 from polysight.shared.config import load_instrument
-from polysight.shared.errors import ScanError
+from polysight.shared.error_codes import ErrorCode
 from tests.support.paths import RIG_FILE
+from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 
@@ -72,7 +73,7 @@ def test_a_simulated_scan_is_there_and_gone_again():
 
 def test_a_scene_that_cannot_be_simulated_is_named():
     with (
-        pytest.raises(ScanError, match="'broken'"),
+        refused(ErrorCode.VALUE_INVALID, "broken"),
         scanned("broken", [plate("x", 0.5 + 0j, 0, 0)], RIG_FILE, seed=1),
     ):
         pass

@@ -75,7 +75,7 @@ def test_a_pulse_too_early_for_the_radar_is_never_sent(k, late):
     assert sent.pulses == len(lines.rises)
 
 
-def test_the_last_burst_counts_for_the_spacing_too():
+def test_the_spacing_includes_the_previous_burst():
     sent = send_burst(FakeLines(), SPEC, 1_000_000, previous_rise_ns=1_000_000 - MIN_PERIOD_NS + 1)
     assert (sent.pulses, sent.fault) == (0, PiFault.PERIOD_TOO_SHORT)
 
@@ -138,7 +138,7 @@ def test_fault_table_of_the_loop(edges, number, bursts):
 
 
 @pytest.mark.parametrize("number", [PiFault.PULSE_TOO_LONG, PiFault.PERIOD_TOO_SHORT])
-def test_a_burst_that_fails_is_told_and_then_faulted(number):
+def test_a_failed_burst_is_reported_and_then_a_fault(number):
     long = number == PiFault.PULSE_TOO_LONG
     lines = FakeLines(
         long=lambda n: 5_000 if long and n == 4 else 0, late=lambda n: 0 if long or n != 2 else PERIOD - 100_000
@@ -163,14 +163,14 @@ def test_edges_from_before_arming_or_while_disarmed_are_no_points():
         assert x.loop.strays == 2
 
 
-def test_lines_that_vanish_are_told():
+def test_lines_that_vanish_are_a_fault():
     with Loop() as x:
         x.lines.edges.put(gone())
         fault = x.next()
         assert (fault.number, fault.job) == (PiFault.TRIGGER_LINE_LOST, None)
 
 
-def test_an_exception_inside_a_pulse_leaves_the_outputs_low_and_is_told(monkeypatch):
+def test_an_exception_inside_a_pulse_leaves_the_outputs_low_and_is_a_fault(monkeypatch):
     raised = queue.SimpleQueue()
     monkeypatch.setattr("threading.excepthook", lambda args: raised.put(args.exc_value))
 

@@ -1,4 +1,4 @@
-"""Laws of the journal: whatever is cut off or damaged, what is read back is a prefix of what was written."""
+"""Laws of the journal: after any cut or damage, the records read back are a prefix of those written."""
 
 import errno
 import os
@@ -75,23 +75,7 @@ def test_a_damaged_byte_loses_only_what_lies_behind_it(tmp_path_factory, records
     assert len(MAGIC) + sum(12 + len(r) for r in records[: len(found)]) <= at
 
 
-@given(first=payloads, second=payloads, seq=st.integers(1, 30), limit=st.integers(1, 30))
-@settings(max_examples=40, deadline=None)
-def test_replay_from_any_sequence_over_a_restart(tmp_path_factory, first, second, seq, limit):
-    path = tmp_path_factory.mktemp("j") / "a.journal"
-    written(path, first)
-    j = JournalFile(path)
-    assert j.last_seq == len(first)
-    j.write(second)
-    assert j.last_seq == len(first + second)
-    assert j.read(seq, limit) == (first + second)[seq - 1 : seq - 1 + limit]
-    j.close()
-    folder = Journal(path.parent)
-    assert folder.read("a", seq, limit) == ((first + second)[seq - 1 : seq - 1 + limit], len(first + second))
-    folder.close()
-
-
-def test_what_is_in_the_batch_is_neither_kept_nor_published_until_committed(tmp_path):
+def test_a_batch_is_neither_stored_nor_published_until_committed(tmp_path):
     published = []
     journal = Journal(tmp_path, published.extend)
     journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
@@ -128,7 +112,7 @@ def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
     assert reopened(tmp_path / "a.journal") == [b"kept", b"again"]
 
 
-def test_a_stranger_file_is_refused_and_kept(tmp_path):
+def test_a_file_of_another_program_is_refused_and_kept(tmp_path):
     path = tmp_path / "a.journal"
     path.write_bytes(b"somebody's notes")
     with refused(ErrorCode.FILE_FOREIGN, path):
@@ -149,8 +133,8 @@ def test_one_process_a_folder(tmp_path):
 
 @given(first=payloads, passed=st.integers(0, 40), second=payloads, seq=st.integers(1, 60), limit=st.integers(1, 30))
 @settings(max_examples=40, deadline=None)
-def test_numbers_go_on_behind_what_the_host_has(tmp_path_factory, first, passed, second, seq, limit):
-    """Whatever the journal has lost, no number is used twice, also after another restart."""
+def test_numbers_continue_after_the_hosts_last_event(tmp_path_factory, first, passed, second, seq, limit):
+    """No number is used twice, even if the journal has lost events; replay works from any number."""
     path = tmp_path_factory.mktemp("j") / "a.journal"
     written(path, first)
     j = JournalFile(path)
@@ -161,12 +145,16 @@ def test_numbers_go_on_behind_what_the_host_has(tmp_path_factory, first, passed,
     j = JournalFile(path)
     numbered = {i + 1: r for i, r in enumerate(first)} | {begin + i: r for i, r in enumerate(second)}
     assert j.last_seq == max(numbered, default=0)
-    assert j.read(seq, limit) == [r for n, r in numbered.items() if n >= seq][:limit]
+    expected = [r for n, r in numbered.items() if n >= seq][:limit]
+    assert j.read(seq, limit) == expected
     j.close()
+    folder = Journal(path.parent)
+    assert folder.read("a", seq, limit) == (expected, max(numbered, default=0))
+    folder.close()
 
 
 @pytest.mark.parametrize("left", [b"", MAGIC[:3], MAGIC[:3] + bytes(5), MAGIC[:1] + bytes(1), bytes(8), bytes(4096)])
-def test_what_a_power_cut_leaves_of_a_new_journal_is_an_empty_one(tmp_path, left):
+def test_a_new_journal_torn_by_a_power_cut_is_empty(tmp_path, left):
     path = tmp_path / "a.journal"
     path.write_bytes(left)
     j = JournalFile(path)
@@ -177,7 +165,7 @@ def test_what_a_power_cut_leaves_of_a_new_journal_is_an_empty_one(tmp_path, left
     assert reopened(path) == [b"x"]
 
 
-def test_damage_in_the_middle_is_told_and_the_file_as_it_was_is_kept(tmp_path):
+def test_damage_in_the_middle_is_reported_and_the_original_kept(tmp_path):
     path = tmp_path / "a.journal"
     raw = bytearray(written(path, [b"one", b"two", b"three", b"four"]))
     at = raw.index(b"two")
@@ -195,7 +183,7 @@ def test_damage_in_the_middle_is_told_and_the_file_as_it_was_is_kept(tmp_path):
 
 @given(records=st.lists(st.binary(min_size=1, max_size=40), min_size=1, max_size=6), data=st.data())
 @settings(max_examples=40, deadline=None)
-def test_what_a_power_cut_leaves_is_no_damage(tmp_path_factory, records, data):
+def test_a_torn_tail_is_not_damage(tmp_path_factory, records, data):
     path = tmp_path_factory.mktemp("j") / "a.journal"
     raw = written(path, records)
     path.write_bytes(raw[: data.draw(st.integers(0, len(raw)))] + bytes(data.draw(st.sampled_from([0, 1, 4096]))))
@@ -205,7 +193,7 @@ def test_what_a_power_cut_leaves_is_no_damage(tmp_path_factory, records, data):
     assert not list(path.parent.glob("*" + DAMAGED + "*"))
 
 
-def test_a_damaged_journal_is_a_line_of_the_log(tmp_path):
+def test_a_damaged_journal_is_logged(tmp_path):
     said: list[str] = []
     journal = Journal(tmp_path, warn=said.append)
     journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
@@ -220,7 +208,7 @@ def test_a_damaged_journal_is_a_line_of_the_log(tmp_path):
     journal.close()
 
 
-def test_no_scan_begins_without_room_for_its_journal(tmp_path, monkeypatch):
+def test_no_scan_begins_without_space_for_its_journal(tmp_path, monkeypatch):
     folder = Journal(tmp_path)
     folder.check_room("scan", 70_000)
     free = SPARE_BYTES + 70_000 * CAPTURE_BYTES

@@ -58,7 +58,7 @@ def test_a_full_disk_refuses_the_beginning_and_the_end_of_a_run(pi, monkeypatch)
     assert [type(e) for e in host.replay()] == [m.RunStarted, m.RunStopped] * 2
 
 
-def test_no_run_begins_on_a_disk_without_room(pi, monkeypatch):
+def test_no_run_begins_on_a_full_disk(pi, monkeypatch):
     monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=1 << 20))
     assert pi.host.refused(pi.host.begin()) == PiFault.JOURNAL_FULL
     assert pi.host.replay() == []

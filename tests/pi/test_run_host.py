@@ -1,4 +1,4 @@
-"""Whose silence ends a row: the run's host, and nobody else; and what others may ask meanwhile. On a clock of its own.
+"""Only the silence of the run's host ends a row; commands of other clients meanwhile. On a clock that tests turn.
 
 The executor's turns are taken by hand, so that what blocks it takes exactly as long as the test says.
 """

@@ -14,6 +14,7 @@ from polysight.host.polarimetry import fresnel, multilayer
 from polysight.shared.errors import PolysightError
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from polysight.simulators.scene import Layer, layered
+from polysight.simulators.scene.optics import half_space, slab
 
 media = st.tuples(st.floats(1.0, 12.0), st.floats(0.0, 20.0)).map(lambda e: complex(e[0], -e[1]))
 lossless = st.floats(1.0, 12.0).map(complex)
@@ -34,10 +35,19 @@ def by_tmm(eps, thickness_m, frequency_hz, theta):
 @settings(max_examples=60)
 @given(st.lists(st.tuples(media, thickness), max_size=4), media, frequency, angle)
 def test_random_stacks_agree_with_tmm(layers, last, f, theta):
+    """The host sums echoes, the simulator calculates transmission lines in series."""
     eps, inside = [e for e, _ in layers] + [last], [d for _, d in layers]
     expected, _ = by_tmm(eps, inside, f, theta)
-    got = multilayer(eps, inside, f, theta)
-    np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(multilayer(eps, inside, f, theta), expected, rtol=1e-8, atol=1e-10)
+    stack = [Layer((e.real, -e.imag), 1e3 * d) for e, d in layers] + [Layer((last.real, -last.imag))]
+    np.testing.assert_allclose(layered(stack, f, theta), expected, rtol=1e-8, atol=1e-10)
+
+
+@settings(max_examples=60)
+@given(media, thickness, frequency, angle)
+def test_interfaces_and_plates_of_the_simulator_agree_with_tmm(eps, d, f, theta):
+    np.testing.assert_allclose(half_space(eps, theta), by_tmm([eps], [], f, theta)[0], rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(slab(eps, d, f, theta), by_tmm([eps, 1.0], [d], f, theta)[0], rtol=1e-8, atol=1e-10)
 
 
 @settings(max_examples=40)
@@ -61,8 +71,8 @@ def test_a_passive_stack_reflects_at_most_all_power(layers, last, f, theta):
 @settings(max_examples=40)
 @given(media, media, frequency, angle)
 def test_an_infinite_or_invisible_second_medium_is_fresnel(eps, second, f, theta):
-    for half_space in (multilayer(eps, np.inf, f, theta), multilayer([eps], [], f, theta)):
-        np.testing.assert_allclose(half_space, fresnel(eps, theta), rtol=1e-12)
+    for endless in (multilayer(eps, np.inf, f, theta), multilayer([eps], [], f, theta)):
+        np.testing.assert_allclose(endless, fresnel(eps, theta), rtol=1e-12)
     np.testing.assert_allclose(multilayer([eps, eps], [1e-3], f, theta), fresnel(eps, theta), rtol=1e-9, atol=1e-12)
     # A thick lossy layer hides the media behind it.
     dark = complex(eps.real, min(eps.imag, -1.0))
@@ -73,16 +83,6 @@ def test_water_behind_glass():
     """Water at 75 GHz behind 3 mm of glass, 55 degrees, 78.6 GHz."""
     expected, _ = by_tmm([5.5 - 0.05j, 9.37 - 18j], [3e-3], 78.6e9, np.radians(55.0))
     assert multilayer([5.5 - 0.05j, 9.37 - 18j], [3e-3], 78.6e9, np.radians(55.0)) == pytest.approx(expected)
-
-
-def test_a_stack_agrees_with_the_simulator():
-    """The simulator calculates transmission lines in series, the host sums of echoes."""
-    theta = np.radians(np.linspace(0, 75, 16))
-    stack = [Layer((5.5, 0.05), 3.0), Layer((2.2, 0.3), 0.4), Layer((9.37, 18.0))]
-    simulated = layered(stack, 78.5e9, theta)
-    np.testing.assert_allclose(
-        simulated, multilayer([x.epsilon for x in stack], [3e-3, 0.4e-3], 78.5e9, theta), rtol=1e-9
-    )
 
 
 def test_shapes_broadcast():

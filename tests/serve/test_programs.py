@@ -16,11 +16,13 @@ from polysight.host.jobs.live_scan import _check_new
 from polysight.host.serve import launcher
 from polysight.host.serve.programs import Programs, program_of
 from polysight.host.store import validate
-from polysight.shared.errors import ConfigError, DeviceError, ScanError
+from polysight.shared.error_codes import ErrorCode
+from polysight.shared.errors import ConfigError, DeviceError
 from tests.support.page.asking import TOKEN, get, post
 from tests.support.page.live_view import served_folder
 from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
+from tests.support.refusals import refused
 
 
 @pytest.fixture
@@ -65,7 +67,7 @@ def test_a_program_is_known_by_its_number_and_its_begin(tmp_path):
 def test_one_program_of_a_kind_runs_in_a_folder(programs, tmp_path):
     child = launcher.launch(["/bin/sleep", "60"], str(tmp_path), str(tmp_path / PROGRAM / "scan"))
     try:
-        with pytest.raises(ScanError, match="runs already"):
+        with refused(ErrorCode.BUSY):
             programs.start(tmp_path, "scan", ["--version"])
     finally:
         os.killpg(child.pid, 9)

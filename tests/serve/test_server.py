@@ -17,21 +17,10 @@ from polysight.host.serve.app import STATIC
 from polysight.host.serve.control import FORMATS, ExportRequest
 from polysight.host.serve.guard import TOKEN_HEADER
 from polysight.host.serve.server import is_loopback
+from tests.support.page.asking import TOKEN, ask
 from tests.support.page.live_view import served
 from tests.support.paths import REPO
 from tests.support.processes import LIMIT_S, wait_for
-
-TOKEN = "the-right-token"
-
-
-def ask(view, path: str, method: str = "GET", **headers: str) -> tuple[int, bytes, dict[str, str]]:
-    connection = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
-    try:
-        connection.request(method, path, headers={k.replace("_", "-"): v for k, v in headers.items()})
-        reply = connection.getresponse()
-        return reply.status, reply.read(), dict(reply.getheaders())
-    finally:
-        connection.close()
 
 
 class Page:
@@ -144,7 +133,7 @@ def test_other_sites_get_no_permission(finished, watching):
             status, _, headers = ask(view, path, Origin="https://evil.example")
             assert status == expected
             assert not [h for h in headers if h.lower().startswith("access-control")]
-            policy = {k.lower(): v for k, v in headers.items()}["content-security-policy"]
+            policy = headers["content-security-policy"]
             assert "default-src 'self'" in policy
             assert "unsafe" not in policy
 

@@ -1,4 +1,4 @@
-"""The cards' process from end to end: a test client plays host and Pi, over the real sockets and the real hub."""
+"""The process of the simulated cards: a test client is host and Pi, over real sockets and the real hub."""
 
 from __future__ import annotations
 

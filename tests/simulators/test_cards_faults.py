@@ -1,4 +1,4 @@
-"""Faults of a card at work: over real sockets, with a clock that the test moves; what is counted is what happened."""
+"""Faults of a simulated card over real sockets, with the test's own clock; the counts are the truth."""
 
 from __future__ import annotations
 

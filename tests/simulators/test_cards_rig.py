@@ -1,4 +1,4 @@
-"""The launcher: everything starts, the rig file reaches it, everything ends."""
+"""The launcher of the simulated rig: everything starts with its rig file, and everything ends."""
 
 from __future__ import annotations
 

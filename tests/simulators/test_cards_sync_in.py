@@ -1,4 +1,4 @@
-"""Laws of SYNC_IN: which pulses start frames, and where the stage is at each."""
+"""SYNC_IN of the simulated radars: the pulses that start frames, and the stage's position at each."""
 
 from __future__ import annotations
 

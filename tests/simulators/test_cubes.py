@@ -1,4 +1,4 @@
-"""Samples without raw data equal those of a raw scan that the host synchronised, up to one factor and the noise."""
+"""Simulated samples equal those of a raw scan that the host synchronised, except for one factor and the noise."""
 
 from pathlib import Path
 
@@ -48,12 +48,12 @@ def rows_by_the_host(scene: Scene, folder: Path) -> dict[str, np.ndarray]:
 
 
 def off_by(raw: np.ndarray, cube: np.ndarray) -> np.ndarray:
-    """What one common factor cannot explain, relative to the cube."""
+    """Deviation from one common factor, relative to the cube."""
     cube = cube[..., : raw.shape[-1]]
     return raw / (np.vdot(cube, raw) / np.vdot(cube, cube)) - cube
 
 
-def test_a_synced_cube_is_what_the_host_makes_of_the_raw_scan(tmp_path: Path) -> None:
+def test_a_synced_cube_equals_the_synchronised_raw_scan(tmp_path: Path) -> None:
     scene = SCENE.with_disturbances(direct_snr_db="off", leakage_h=[0.1, 0.15], leakage_v=[-0.1, 0.1])
     assert RIG.chirp.linear_samples[0] == 0
     for board, raw in rows_by_the_host(scene, tmp_path).items():
@@ -62,10 +62,10 @@ def test_a_synced_cube_is_what_the_host_makes_of_the_raw_scan(tmp_path: Path) ->
         )
         own, unlike = (np.sqrt(np.mean(np.abs(off_by(raw, c)) ** 2) / np.mean(np.abs(c) ** 2)) for c in (cube, other))
         assert own < 0.01
-        assert unlike > 3 * own, "the bound cannot tell leakage from none"
+        assert unlike > 3 * own, "the bound is too wide to detect leakage"
 
 
-def test_its_noise_is_that_of_averaged_bursts(tmp_path: Path) -> None:
+def test_the_noise_is_that_of_averaged_bursts(tmp_path: Path) -> None:
     for board, raw in rows_by_the_host(SCENE, tmp_path).items():
         quiet = synced_cube(RIG, SCENE, board, noise=0.0)
         drawn = (synced_cube(RIG, SCENE, board) - quiet)[..., : raw.shape[-1]]
@@ -77,7 +77,7 @@ def test_its_noise_is_that_of_averaged_bursts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [3, 20])
-def test_few_frequencies_and_channels_are_a_part_of_the_whole(count: int) -> None:
+def test_few_frequencies_and_channels_are_a_subset_of_all(count: int) -> None:
     at = np.linspace(0, 191, count).astype(int)
     whole = synced_cube(RIG, SCENE, "RV", noise=0.0)[[2]][..., at]
     part = synced_cube(RIG, SCENE, "RV", sample_frequencies_hz(RIG)[at], rx=[2], noise=0.0)
@@ -85,7 +85,7 @@ def test_few_frequencies_and_channels_are_a_part_of_the_whole(count: int) -> Non
     assert np.abs(part - whole).max() < 1e-3 * np.abs(whole).max()
 
 
-def test_an_ideal_rig_has_the_reference_cube_and_the_direct_path_is_a_constant() -> None:
+def test_an_ideal_rig_gives_the_reference_cube_and_a_constant_direct_path() -> None:
     ideal = SCENE.with_disturbances(ideal=True)
     echo = synced_cube(RIG, ideal, "RH", direct=False)
     assert np.abs(echo - reference_cube(RIG, SCENE)["RH"]).max() < 1e-5

@@ -1,4 +1,4 @@
-"""Laws of the card's faults: seeded, the same however packets are grouped, and exactly what was asked for."""
+"""Faults of the simulated card: from a seed, independent of grouping, and as configured."""
 
 from __future__ import annotations
 

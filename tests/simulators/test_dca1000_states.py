@@ -1,4 +1,4 @@
-"""Any interleaving of commands, LVDS data and waiting: what the card sends is always the stream it was given."""
+"""Any order of commands, LVDS data and waiting: the card sends the stream that it was given."""
 
 from __future__ import annotations
 

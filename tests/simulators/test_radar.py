@@ -1,4 +1,4 @@
-"""The simulated radars: exact when nothing disturbs, and each disturbance does what it says, alone."""
+"""Simulated radars: exact without disturbances, and each disturbance has its effect alone."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ POINT = {"position_mm": [12.0, -9.0], "amplitude": [0.5, 0.0]}
 
 
 def radar(seed: int = 1, tables: dict[str, Any] | None = None, **disturbances: Any) -> SimulatedRig:
-    """A rig with only the given disturbances on."""
+    """A rig with only the given disturbances."""
     raw = {"name": "t", "grid": GRID, **(tables or {}), "disturbances": {"ideal": True, **disturbances}}
     return SimulatedRig(RIG, decode_scene(raw, "t"), seed)
 
@@ -94,7 +94,7 @@ def test_an_undisturbed_chirp_repeats() -> None:
 # --- determinism -----------------------------------------------------------------------------------------------------
 
 
-def test_pulses_are_the_same_however_they_are_batched() -> None:
+def test_pulses_do_not_depend_on_the_batch() -> None:
     x, y = np.linspace(-30, 30, 70), np.full(70, 5.0)
     whole = default_radar().chirps("RH", x, y)
     other = default_radar()
@@ -144,7 +144,7 @@ def test_a_common_latency_cancels() -> None:
     assert np.abs(a - b).max() < 1e-5
 
 
-def test_h_and_v_draw_their_own_timing_against_one_transmitter() -> None:
+def test_h_and_v_have_independent_timing_relative_to_the_transmitter() -> None:
     rig = radar(sync_uncertainty_ns=5.0)
     n = 2000
     d, pulses = rig.scene.disturbances, np.arange(n)
@@ -195,7 +195,7 @@ def test_phase_is_uniform_from_chirp_to_chirp() -> None:
 
 
 @pytest.mark.parametrize("board", ["RH", "RV"])
-def test_the_chirp_bends_late_and_is_clean_in_the_linear_samples(board: str) -> None:
+def test_the_chirp_bends_only_after_the_linear_samples(board: str) -> None:
     for seed in range(3):
         on, off = radar(seed, bend_hz=300e3, ripple_hz=3e3), radar(seed)
         turn = np.unwrap(np.angle(on.signals(board, ZERO, ZERO)[0, 0] / off.signals(board, ZERO, ZERO)[0, 0]))
@@ -288,7 +288,7 @@ def test_noise_has_the_set_ratio_on_every_channel_and_averages_down() -> None:
 # --- bytes -----------------------------------------------------------------------------------------------------------
 
 
-def test_frames_hold_i_of_the_four_rx_then_q() -> None:
+def test_frames_contain_i_of_the_four_rx_then_q() -> None:
     rig = radar(tables={"plates": [PLATE]}, adc_full_scale=4.0)
     signal = rig.signals("RH", np.zeros(2), np.zeros(2))
     frames = rig.chirps("RH", np.zeros(2), np.zeros(2))
@@ -335,7 +335,7 @@ def test_a_burst_moves_with_the_stage_or_stays_at_its_mean() -> None:
         assert np.isclose(moving.burst_mm(direction).mean(), still.burst_mm(direction).mean())
 
 
-def test_outside_the_aperture_only_the_direct_path_is_left_and_counted() -> None:
+def test_chirps_outside_the_aperture_contain_only_the_direct_path_and_are_counted() -> None:
     rig, empty = radar(tables={"plates": [PLATE]}), radar()
     far = np.array([0.0, -400.0])
     signal = rig.signals("RH", far, np.zeros(2))

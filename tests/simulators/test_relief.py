@@ -1,4 +1,4 @@
-"""Plates that lie tilted, higher or rough: the fast field equals the exact sum, and both follow the laws of optics."""
+"""Tilted, raised and rough plates: the fast field equals the exact sum, and both agree with optics."""
 
 from pathlib import Path
 from typing import Any
@@ -69,7 +69,7 @@ def test_a_rough_plate_is_the_same_in_both() -> None:
     assert rms_error(*fields(n=6, plates=[rough])) < 0.002
 
 
-def test_zero_relief_changes_no_bit() -> None:
+def test_zero_relief_is_bit_exact() -> None:
     flat = setup(plates=[PLATE])[1]
     zero = setup(
         plates=[{**PLATE, "tilt_deg": [0.0, 0.0], "height_mm": 0.0}], plane_tilt_deg=[0.0, 0.0], plane_shift_mm=0.0
@@ -90,7 +90,7 @@ def test_height_turns_the_phase_by_2_k_cos_theta() -> None:
     assert np.angle(high / flat) == pytest.approx(2 * WAVE * cos * 0.2e-3, abs=0.01)  # positive is farther: later
 
 
-def test_a_shifted_plane_is_another_object_distance_that_the_rig_file_does_not_know() -> None:
+def test_a_shifted_plane_equals_another_object_distance_but_does_not_change_the_rig() -> None:
     rig, shifted = setup(plates=[PLATE], plane_shift_mm=1.5)
     assert rig.geometry.object_distance_mm == 499.0
     there, distant = setup(plates=[PLATE], object_distance_mm=500.5)
@@ -121,7 +121,7 @@ def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitu
 
 
 def test_a_tilted_plates_image_stays_where_it_is() -> None:
-    """The direct sum over the aperture, at the true plane, has its middle at the plate's centre whatever the tilt."""
+    """The direct sum over the aperture, at the true plane, has its middle at the plate's centre for any tilt."""
     centre = np.array([20.0, -12.0])
     found = [middle_of_image({**PLATE, "centre_mm": centre.tolist(), "tilt_deg": [t, t]}) for t in (0.0, 1.0)]
     for middle in found:

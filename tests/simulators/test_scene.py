@@ -1,4 +1,4 @@
-"""Laws of the scene file: unknown keys refused, switches switch, overrides merge and are checked."""
+"""Scene files: invalid keys are refused, disturbances can be switched, overrides are merged and checked."""
 
 from pathlib import Path
 from typing import Any
@@ -26,16 +26,17 @@ PLATE = {"name": "a", "centre_mm": [0.0, 0.0], "size_mm": [10.0, 10.0]}
         ({"name": "t", "plate": []}, "plate"),
         ({"name": "t", "plates": [{**PLATE, "metal": True, "colour": "red"}]}, "colour"),
         ({"name": "t", "plates": [PLATE]}, "permittivity"),
-        ({"name": "t", "plates": [{**PLATE, "metal": True, "permittivity": [3.0, 0.1]}]}, "one of"),
+        ({"name": "t", "plates": [{**PLATE, "metal": True, "permittivity": [3.0, 0.1]}]}, "metal"),
+        ({"name": "t", "plates": [{**PLATE, "permittivity": [4.0, 0.4], "strips_deg": 0.0}]}, "strips_deg"),
         (
             {
                 "name": "t",
                 "plates": [{**PLATE, "layers": [{"permittivity": [3.0, 0.1]}, {"permittivity": [2.0, 0.1]}]}],
             },
-            "only the last",
+            "layers",
         ),
-        ({"name": "t", "plates": [{**PLATE, "permittivity": [0.5, 0.1]}]}, "at least 1"),
-        ({"name": "t", "plates": [{**PLATE, "permittivity": [3.0, -0.1]}]}, "eps''"),
+        ({"name": "t", "plates": [{**PLATE, "permittivity": [0.5, 0.1]}]}, "permittivity"),
+        ({"name": "t", "plates": [{**PLATE, "permittivity": [3.0, -0.1]}]}, "permittivity"),
         ({"name": "t", "plates": [{**PLATE, "metal": True, "thickness_mm": 1.0}]}, "thickness_mm"),
         ({"name": "t", "plates": [{**PLATE, "metal": True, "size_mm": [0.0, 1.0]}]}, "size_mm"),
         ({"name": "t", "grid": {"columns": 3, "colums": 4}}, "colums"),
@@ -48,8 +49,9 @@ PLATE = {"name": "a", "centre_mm": [0.0, 0.0], "size_mm": [10.0, 10.0]}
     ],
 )
 def test_a_wrong_key_or_value_is_refused_by_name(raw: dict[str, Any], named: str) -> None:
-    with pytest.raises(ConfigError, match=named) as e:
+    with pytest.raises(ConfigError) as e:
         decode_scene(raw, "t.toml")
+    assert named in str(e.value)
     assert "t.toml" in str(e.value)
 
 
@@ -90,9 +92,10 @@ def test_overrides_merge_with_the_rig_and_twice_is_once(rig: Instrument) -> None
 
 
 @pytest.mark.parametrize("grid", [{"columns": "many"}, {"columns": 9000}, {"step_x_mm": -1.0}])
-def test_an_override_must_keep_the_rules_of_the_rig_file(rig: Instrument, grid: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError, match="grid"):
+def test_an_invalid_override_is_refused(rig: Instrument, grid: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError) as caught:
         apply_scene(rig, scene(grid=grid))
+    assert next(iter(grid)) in str(caught.value)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").rglob("*.toml")), ids=lambda p: p.stem)
@@ -105,7 +108,7 @@ def test_every_example_fits_the_published_rig(rig: Instrument, path: Path) -> No
             assert max(abs(a[0] - b[0]) - (a[2] + b[2]) / 2, abs(a[1] - b[1]) - (a[3] + b[3]) / 2) > 0, "plates overlap"
 
 
-def test_the_library_never_holds_the_demo_scan() -> None:
+def test_the_library_does_not_contain_the_demo_scan() -> None:
     demo = load_scene(ROOT / "examples" / "nine-materials.toml")
     library = [load_scene(p) for p in sorted((ROOT / "examples" / "library").glob("*.toml"))]
     assert len(library) >= 4
@@ -120,6 +123,6 @@ def test_an_error_in_a_scenes_tables_names_the_scene_and_its_key(rig: Instrument
     scene = decode_scene({"name": "wide", "grid": {"columns": 1.5}, "points": []}, "wide.toml")
     with pytest.raises(ConfigError) as e:
         apply_scene(rig, scene)
-    assert "scene wide: grid.columns = 1.5" in str(e.value)
-    assert "scene-file.md" in str(e.value)
+    for value in ("scene wide", "grid.columns", 1.5):
+        assert str(value) in str(e.value)
     assert "instrument.toml" not in str(e.value)

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from polysight.shared.config import load_instrument
-from polysight.shared.errors import ConfigError, DataError
+from polysight.shared.error_codes import ErrorCode
+from polysight.shared.errors import ConfigError
 from polysight.shared.messages import Capture, RowFinished, RunStarted, RunStopped, unpack_event
 from polysight.shared.raster import FIRST_PULSE_DELAY_S, plan_raster
 from polysight.simulators.__main__ import main
 from polysight.simulators.scene import SimulatedRig, decode_scene, lost_bytes, row_offsets_mm, simulate
+from tests.support.refusals import refused
 
 ROOT = Path(__file__).parents[2]
 RIG = load_instrument(ROOT / "instrument.toml")
@@ -31,7 +33,7 @@ SCENE = decode_scene(RAW, "t")
 LOSSY = SCENE.with_disturbances(packet_loss=0.02)
 
 
-def test_rows_hold_the_radars_bytes_at_true_positions(tmp_path: Path) -> None:
+def test_rows_contain_the_radars_bytes_at_true_positions(tmp_path: Path) -> None:
     folder = simulate(RIG, SCENE, tmp_path / "scan", started_s=0.0)
     radar = SimulatedRig(RIG, SCENE)
     row = plan_raster(radar.rig.grid).row(1)
@@ -46,7 +48,7 @@ def test_rows_hold_the_radars_bytes_at_true_positions(tmp_path: Path) -> None:
     assert np.array_equal(np.frombuffer(raw, "<i2").reshape(expected.shape), expected)
 
 
-def test_every_manifest_line_carries_its_crc(tmp_path: Path) -> None:
+def test_every_manifest_line_has_its_crc(tmp_path: Path) -> None:
     folder = simulate(RIG, LOSSY, tmp_path / "scan", started_s=0.0)
     facts = []
     for line in (folder / "manifest.jsonl").read_text().splitlines():
@@ -69,7 +71,7 @@ def test_every_manifest_line_carries_its_crc(tmp_path: Path) -> None:
             assert board["frames_received"] == board["frames_expected"] - len(hit)
 
 
-def test_events_tell_the_same_story_in_sequence(tmp_path: Path) -> None:
+def test_events_agree_with_the_rows_in_sequence(tmp_path: Path) -> None:
     folder = simulate(RIG, SCENE, tmp_path / "scan", started_s=0.0)
     unpacker = msgpack.Unpacker()
     unpacker.feed((folder / "events.msgpack").read_bytes())
@@ -92,7 +94,7 @@ def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
     assert (a / "raw/RH/0000.bin").read_bytes() != (c / "raw/RH/0000.bin").read_bytes()
 
 
-def test_truth_says_what_lies_where(tmp_path: Path) -> None:
+def test_truth_json_has_plates_and_points(tmp_path: Path) -> None:
     folder = simulate(RIG, SCENE, tmp_path / "scan", started_s=0.0)
     truth = json.loads((folder / "truth.json").read_text())
     assert truth["simulated"] is True
@@ -105,7 +107,7 @@ def test_truth_says_what_lies_where(tmp_path: Path) -> None:
     assert decode_scene(truth["scene"], "truth.json") == SCENE
 
 
-def test_the_authors_layout_holds_the_same_bytes(tmp_path: Path) -> None:
+def test_the_authors_layout_contains_the_same_bytes(tmp_path: Path) -> None:
     own = simulate(RIG, LOSSY, tmp_path / "own", started_s=0.0)
     theirs = simulate(RIG, LOSSY, tmp_path / "theirs", layout="authors", started_s=100.0)
     assert theirs.parent == tmp_path / "theirs" / "unsynced"
@@ -133,7 +135,7 @@ def test_the_authors_layout_holds_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("zero_filling", [True, False])
-def test_logs_name_the_packets_that_came(tmp_path: Path, zero_filling: bool) -> None:
+def test_logs_list_the_received_packets(tmp_path: Path, zero_filling: bool) -> None:
     folder = simulate(RIG, LOSSY, tmp_path, layout="authors", started_s=100.0, zero_filling=zero_filling)
     radar = SimulatedRig(RIG, LOSSY)
     row = plan_raster(radar.rig.grid).row(0)
@@ -159,14 +161,16 @@ def test_a_row_with_backlash_is_within_the_aperture() -> None:
 
 def test_a_full_folder_and_a_burst_that_does_not_fit_are_refused(tmp_path: Path) -> None:
     (tmp_path / "note").write_text("mine")
-    with pytest.raises(DataError, match="not empty"):
+    with refused(ErrorCode.FILE_EXISTS, tmp_path):
         simulate(RIG, SCENE, tmp_path)
     fast = decode_scene({**RAW, "stage": {"speed_mm_s": 600.0, "accel_mm_s2": 20000.0}}, "t")
-    with pytest.raises(ConfigError, match="burst"):
+    with pytest.raises(ConfigError):
         simulate(RIG, fast, tmp_path / "fast")
 
 
-def test_the_command_says_where_it_wrote_and_fails_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_its_folder_and_refuses_invalid_arguments(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     scene = tmp_path / "s.toml"
     scene.write_text('name = "s"\n[grid]\ncolumns = 2\nrows = 1\n')
     common = ["--config", str(ROOT / "instrument.toml"), "--out", str(tmp_path / "o")]
@@ -177,9 +181,9 @@ def test_the_command_says_where_it_wrote_and_fails_in_words(tmp_path: Path, caps
     assert main(["simulate", str(scene), *common]) == 3
     for of_the_authors in ("--columns", "--absent"):
         assert main(["simulate", str(scene), *common, of_the_authors]) == 2
-        assert f"{of_the_authors} with --layout own" in capsys.readouterr().err
+        assert of_the_authors in capsys.readouterr().err
     assert main(["simulate", str(scene), *common[:-1], str(scene)]) == 5
-    assert f"{scene}: " in capsys.readouterr().err.splitlines()[-3], "a file where a folder belongs is no trace"
+    assert str(scene) in capsys.readouterr().err
     scene.write_text('name = "s"\nplate = 1\n')
     assert main(["simulate", str(scene), *common]) == 2
     assert "plate" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A small scan, done once without any fault, to compare others with."""
+"""A small scan without any fault, as the reference for others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is missing in the published raw rows is masked and counted; what is not masked is what was sent."""
+"""Missing data of the published raw rows is masked and counted; unmasked data is as sent."""
 
 import msgspec
 import numpy as np

@@ -1,4 +1,4 @@
-"""The chain of a manifest: every line carries its count and the digest of the line before, so that none goes unseen."""
+"""The chain of a manifest: count and digest of the line before in every line, so that missing lines are found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scan goes on with a rig file that says otherwise how the rig is reached, and with nothing else otherwise."""
+"""A scan resumes with a rig file that differs in the connection settings only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The host and the Pi are killed, or lose their power, at everything they do to a disk; the scan goes on behind it.
+"""The host and the Pi are killed, or lose power, at every disk operation; the scan resumes.
 
 In one process, with the code that writes in the instrument; tests/e2e kills real ones.
 """

@@ -1,4 +1,4 @@
-"""SIGKILL of a process that scans, at random instants of the whole scan and of its resumes: the scan goes on.
+"""SIGKILL of a scanning process at random times of the scan and of its resumes; the scan resumes.
 
 The scan is that of tests/support/store: every file is written by the code of the instrument. 30 kills; `--long`: 1,000.
 """

@@ -1,4 +1,4 @@
-"""Raw rows dropped by choice: only what saved products were made from, and each written down before it goes."""
+"""Raw data is dropped only if saved products were made from it, and recorded in the manifest before."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the simulators write, the host reads: two independent programs, one format."""
+"""The host reads the files of the simulators: two independent programs, one format."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Rows placed again from their packets: what changes is committed anew, what does not is not touched."""
+"""Rows placed again from their packets: different results are committed, equal ones not touched."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from polysight.host.capture import PACKETS, Evidence, place_record, read_packets, write_index, write_packets
 from polysight.host.capture.earlier_records import Past
-from polysight.host.jobs.placement import inspect_placement, replace_folder
+from polysight.host.jobs.recordings import inspect_placement, replace_folder
 from polysight.host.store import ManifestWriter, ScanFolder, replace_rows
 from polysight.host.store.append_only import crc32
 from polysight.shared.error_codes import ErrorCode

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import zlib
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.host.store import manifest
+from polysight.host.store.append_only import crc32
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import ManifestWriter, encode_line, parse
 from polysight.host.store.scan_folder import ScanFolder, new_scan_id
@@ -246,3 +249,9 @@ def test_start_that_died_before_its_first_line_is_repeated(tmp_path):
         (tmp_path / "manifest.jsonl").write_bytes(torn)
         assert ScanFolder.create(tmp_path, instrument, plan_raster(instrument.grid)).committed() == {}
         (tmp_path / "manifest.jsonl").unlink()
+
+
+@given(st.binary(max_size=3000))
+def test_it_is_that_of_zlib(data):
+    assert crc32(data) == zlib.crc32(data)
+    assert crc32(np.frombuffer(data, np.uint8).data) == zlib.crc32(data)

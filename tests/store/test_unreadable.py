@@ -1,4 +1,4 @@
-"""A disk that does not answer is an error; only what it says wrongly is taken again, and only a scan is 'in use'."""
+"""Read errors of the disk are errors, never a reason to retake a row; a disk without locks is not a scan in use."""
 
 from __future__ import annotations
 

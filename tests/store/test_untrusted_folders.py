@@ -1,4 +1,4 @@
-"""Scan folders and files from elsewhere: no path leads out of the folder, and no small file takes much memory."""
+"""Untrusted scan folders and files: no path leads out of the folder, and no small file takes much memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames on their way from radar to receiver, as on loopback: delays, stalls of either side, batches of packets."""
+"""Model of frames between radar and receiver: delays, stalls of either side, batches of packets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The receiving processes that this test's scan has started, by board."""
+"""The receiver processes that this test's scan has started, by board."""
 
 from __future__ import annotations
 

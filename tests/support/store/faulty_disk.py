@@ -1,4 +1,4 @@
-"""A disk that fails, or a program that is killed, at the n-th thing that is done to one folder.
+"""A disk that fails, or a program that is killed, at the n-th operation on one folder.
 
 Only what Python does in this process is seen: every write, fsync, reservation, truncation, and every name made, moved
 or removed below the folder. So a test can count them once and then fail each of them.

@@ -1,6 +1,7 @@
-"""Commands that only look: `validate` names every fault of a scan folder, `inspect` says what is in a capture.
+"""Commands that check recordings: `validate` lists all faults of a scan folder, `inspect` describes a recording.
 
-They load nothing of the processing, so that they answer at once.
+`inspect --placement` shows how the packets of a row are placed, `validate --replace` places all rows again. Nothing of
+the processing is loaded, so that these commands start at once.
 """
 
 from __future__ import annotations
@@ -13,12 +14,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.capture import CardReport, Code, Known, Report, inspect_bin, inspect_pcap, is_pcap
-from polysight.host.store import MANIFEST, ScanFolder, to_json, validate
+from polysight.host.capture import PACKETS, CardReport, Code, Known, Report, inspect_bin, inspect_pcap, is_pcap
+from polysight.host.store import (
+    MANIFEST,
+    PlacedAgain,
+    Replaced,
+    ScanFolder,
+    damage_of,
+    place_again,
+    replace_rows,
+    to_json,
+    validate,
+)
 from polysight.shared.config import load_instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, PolysightError
 
 GUESSES = 3  # layouts that are named
+_SHOWN = 8  # missing ranges that are printed
 BOTTOM_DB = -20.0  # of the plot of a range profile
 
 
@@ -49,8 +62,8 @@ def _guess_lines(r: Report) -> list[str]:
     """The layouts that were tried, where there was a choice: the likeliest few."""
     if len(r.guesses) < 2:
         return []
-    told = (f"{g.shape} {100 * g.likelihood:.0f} %" for g in r.guesses[:GUESSES])
-    return [f"likely     {'; '.join(told)}"]
+    shapes = (f"{g.shape} {100 * g.likelihood:.0f} %" for g in r.guesses[:GUESSES])
+    return [f"likely     {'; '.join(shapes)}"]
 
 
 def _card_lines(card: CardReport) -> list[str]:
@@ -175,3 +188,77 @@ def plot_profile(report: Report, path: Path) -> None:
         figure.savefig(path, format="png", dpi=120)
     except OSError as e:
         raise DataError(f"{path}: cannot be written: {e.strerror}", "no such folder, or no permission") from None
+
+
+# --- placement of packets ---
+
+
+def inspect_placement(file: Path, as_json: bool) -> int:
+    """Print how the packets of a row are placed; return 0 if the row was committed so.
+
+    `file` is the row's file, or one of those beside it. Raises DataError when a file is damaged, or is not the one that
+    the scan's manifest has committed.
+    """
+    row = file.with_suffix(".bin")
+    if scan := scan_of(row):
+        if strange := damage_of(scan, row):
+            why, remedy = "a damaged file, or one of another row", "`polysight validate SCAN`"
+            raise DataError(f"{row}: {strange}", why, remedy, code=ErrorCode.FILE_DAMAGED)
+        if not row.with_suffix(PACKETS).exists():
+            why = "the scan was simulated without cards, or recorded by an older release"
+            raise DataError(
+                f"{row}: its packets were not kept", why, "`polysight validate SCAN` says whether it is whole"
+            )
+    again = place_again(row)
+    same = again.moved or again.missing == again.placed.missing
+    if as_json:
+        said = {**again.placed.facts(), "committed_missing": again.missing, "same": same}
+        sys.stdout.write(json.dumps(said, indent=1) + "\n")
+    else:
+        sys.stdout.write("\n".join(_placement_lines(file, again, same)) + "\n")
+    return 0 if same else 1
+
+
+def _placement_lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
+    p, e = again.placed, again.evidence
+    counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in vars(p.counts).items() if n)
+    if e.past.base is None:
+        start = "not known from the records before"
+    elif len(e.past.ends) == 1:
+        start = "known from the record before"
+    else:
+        start = f"one of {len(e.past.ends)} places behind the record before"
+    missing = ", ".join(f"{a}..{b}" for a, b in p.missing[:_SHOWN]) + (", ..." if len(p.missing) > _SHOWN else "")
+    lines = [
+        f"{file}: {p.received} of {p.expected} bytes in place",
+        f"packets    {counts or 'none'}",
+        f"start      {start}",
+        f"located    {'yes' if p.located else f'no: {p.reason}'}",
+        f"missing    {missing or 'nothing'}",
+    ]
+    if e.dropped_by_card:
+        lines.append(f"card       dropped data before numbering it ({e.dropped_by_card})")
+    if again.moved:
+        lines.append("committed  with its frames at their pulses")
+    else:
+        result = "the same" if same else "differently: `polysight validate SCAN --replace` commits it as it is here"
+        lines.append(f"committed  {result}")
+    return lines
+
+
+def replace_folder(folder: Path, as_json: bool) -> int:
+    """Place every row of a scan again, and commit those that change; return 0 if no row is damaged."""
+    rows = replace_rows(ScanFolder.load(folder))
+    if as_json:
+        sys.stdout.write(json.dumps([asdict(r) for r in rows], indent=1) + "\n")
+    else:
+        sys.stdout.write("".join(f"{line}\n" for line in _replaced_lines(folder, rows)))
+    return 1 if any(r.damaged for r in rows) else 0
+
+
+def _replaced_lines(folder: Path, rows: list[Replaced]) -> list[str]:
+    lines = [f"row {r.row} of {r.board}: {r.before} bytes missing before, {r.after} now" for r in rows if r.changed] + [
+        f"row {r.row} of {r.board}: left as it is: {r.left}" for r in rows if r.left
+    ]
+    same = sum(not (r.changed or r.left) for r in rows)
+    return [*lines, f"{folder}: {same} of {len(rows)} files come out as they were committed"]

@@ -1,0 +1,31 @@
+"""Send packets as a capture card does: `python -I send_packets.py CARD CARD_PORT HOST PORT FIRST PACKETS RATE BYTES`.
+
+Prints the seconds it took. A program without imports from this package, so that it starts at once on a busy machine.
+"""
+
+import socket
+import struct
+import sys
+import time
+
+_MAX_LAG_S = 0.005  # a card catches up no more than its own buffer
+
+
+def main(card: str, card_port: int, host: str, port: int, first: int, packets: int, rate: float, size: int) -> None:
+    """Send packets of `size` payload bytes with consecutive counters from packet `first` on, at `rate` packets/s."""
+    period_s = 1 / rate
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((card, card_port))
+        began = due = time.perf_counter()
+        for k in range(first, first + packets):
+            count = k * size
+            sock.sendto(struct.pack("<IIH", k + 1, count & 0xFFFFFFFF, count >> 32) + bytes(size), (host, port))
+            due = max(due + period_s, time.perf_counter() - _MAX_LAG_S)
+            if (ahead := due - time.perf_counter()) > 0.0005:
+                time.sleep(ahead)
+        sys.stdout.write(f"{time.perf_counter() - began}\n")
+
+
+if __name__ == "__main__":
+    _, card, card_port, host, port, first, packets, rate, size = sys.argv
+    main(card, int(card_port), host, int(port), int(first), int(packets), float(rate), int(size))

@@ -32,15 +32,12 @@ from polysight.host.materials.concentration import (
 from polysight.host.materials.discriminant import REJECTED
 from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, ImagePair, KnownScene, MetalChoice, Optics
 from polysight.host.materials.inversion import (
-    Inversion,
     PatchEstimate,
     PatchMeasurement,
-    RigPrior,
     invert,
     measured_ratio,
-    ratio_error,
 )
-from polysight.host.materials.knn import Fit, Weights, fit_weights
+from polysight.host.materials.knn import Weights
 from polysight.host.materials.label_checks import (
     box_name,
     check_labels,
@@ -66,13 +63,10 @@ from polysight.host.materials.layer_fit import LayerFit, fit_layer
 from polysight.host.materials.layer_rows import LAYER_FORMS, fit_row, incidence_std_rad, layer_content, parse_layer
 from polysight.host.materials.layers import METAL, Layer
 from polysight.host.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Entry, Library
-from polysight.host.materials.measure import NOT_PASSIVE, Refused
+from polysight.host.materials.measure import NOT_PASSIVE
 from polysight.host.materials.metal import (
-    MetalEvidence,
-    MetalReference,
     find_metal,
     metal_by_label,
-    metal_evidence,
     metal_in_box,
 )
 from polysight.host.materials.patch_files import (
@@ -94,11 +88,10 @@ from polysight.host.materials.published import (
     read_material,
     read_materials,
 )
-from polysight.host.materials.result import MaterialsResult, PatchResult
+from polysight.host.materials.result import MaterialsResult
 from polysight.host.materials.samples import CHANNELS, Model, Samples, SceneErrors, by_angle, feature_matrix
 from polysight.host.materials.segment import (
     Box,
-    Patch,
     Segmentation,
     SegmentSettings,
     axis_mm,
@@ -153,9 +146,7 @@ __all__ = [
     "Classifier",
     "ConcentrationResult",
     "Entry",
-    "Fit",
     "ImagePair",
-    "Inversion",
     "KnownScene",
     "LabelledScan",
     "Labels",
@@ -165,20 +156,14 @@ __all__ = [
     "MatchedPatch",
     "MaterialsResult",
     "MetalChoice",
-    "MetalEvidence",
-    "MetalReference",
     "Model",
     "NamedPatch",
     "Optics",
-    "Patch",
     "PatchEstimate",
     "PatchMeasurement",
     "PatchName",
-    "PatchResult",
     "Permittivity",
     "Plates",
-    "Refused",
-    "RigPrior",
     "Samples",
     "ScanPatches",
     "SceneErrors",
@@ -211,7 +196,6 @@ __all__ = [
     "fit_layer",
     "fit_library",
     "fit_row",
-    "fit_weights",
     "format_box",
     "format_permittivity",
     "image_centre_mm",
@@ -231,7 +215,6 @@ __all__ = [
     "measured_ratio",
     "median_ratio",
     "metal_by_label",
-    "metal_evidence",
     "metal_in_box",
     "name_taken",
     "no_box",
@@ -243,7 +226,6 @@ __all__ = [
     "permittivity_change",
     "pixel_accuracy",
     "polarisation_angle_rad",
-    "ratio_error",
     "read_labelled_scan",
     "read_labels",
     "read_material",

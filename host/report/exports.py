@@ -227,7 +227,6 @@ def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:
     return paths
 
 
-FORMATS = ("hdf5", "netcdf", "zarr", "mat", "png", "csv")
 _FOLDER = "export"
 
 

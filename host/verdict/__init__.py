@@ -19,12 +19,11 @@ from polysight.host.verdict.rules import (
     signal_reasons,
     tilt_reasons,
 )
-from polysight.host.verdict.verdict import LEVELS, Level, NoResult, Reason, Verdict, read_verdict, verdict_of
+from polysight.host.verdict.verdict import LEVELS, NoResult, Reason, Verdict, read_verdict, verdict_of
 
 __all__ = [
     "LEVELS",
     "Coverage",
-    "Level",
     "NoResult",
     "Reason",
     "Verdict",

@@ -25,7 +25,7 @@ WATER = "Water (with glass)"
 
 
 def fig21(run: Run) -> Item:
-    """Water and five solutions, eight scans, a straight line that never saw the concentration it is asked for."""
+    """Water and five solutions in eight scans; each concentration is estimated by a line through the others."""
     group = groups()["liquids"]
     errors = calibrated_errors("liquids", 1 if run.quick else 3)
     materials = tuple(m for m in table2() if m.name == WATER or m.name.startswith("Cane Sugar"))
@@ -72,7 +72,7 @@ def fig21(run: Run) -> Item:
 
 
 def _draw_line(ax: Axes, library: Library, value: Mapping[str, float], result: ConcentrationResult) -> None:
-    """The calibration line with its interval, and the patches."""
+    """Draw the calibration line with its interval, and the patches."""
     x = np.array([np.degrees(np.median(polarisation_angle_rad(e.p))) for e in library.entries])
     ax.plot(x, [value[e.name] for e in library.entries], "o", ms=4, color=PALETTE[0], label="patches")
     at = np.linspace(x.min() - 0.1, x.max() + 0.1, 100)
@@ -86,7 +86,7 @@ def _draw_line(ax: Axes, library: Library, value: Mapping[str, float], result: C
 def _draw_permittivity(
     ax: Axes, library: Library, value: Mapping[str, float], published_eps: Mapping[float, float]
 ) -> None:
-    """Real part by Eq. 3 against concentration, beside the published one (by concentration)."""
+    """Draw the real part by Eq. 3 against concentration, beside the published values."""
     eps = [
         np.median(permittivity_from_ratio(e.p.astype(np.complex128), np.radians(e.incidence_deg)).real)
         for e in library.entries
@@ -99,7 +99,7 @@ def _draw_permittivity(
 
 
 def _draw_errors(ax: Axes, result: ConcentrationResult, printed: float) -> None:
-    """Distribution of the errors, each concentration left out, and the published median (`told`, percent)."""
+    """Draw the distribution of the errors, each concentration left out; `printed` is the published median, percent."""
     error = np.sort([abs(r.percent - r.true_percent) for r in result.left_out])
     ax.step(np.concatenate([[0], error]), np.arange(error.size + 1) / error.size, where="post", color=PALETTE[0])
     ax.axvline(printed, color=PALETTE[6], ls="--", lw=1.2, label=f"published median {printed:g} %")
@@ -109,7 +109,7 @@ def _draw_errors(ax: Axes, result: ConcentrationResult, printed: float) -> None:
 
 
 def _rows(value: Mapping[str, float], result: ConcentrationResult) -> tuple[tuple[str, ...], ...]:
-    """A line for each solution, by concentration."""
+    """Return a table line for each solution, by concentration."""
     rows = []
     for name in sorted(value, key=lambda n: value[n]):
         of = [r for r in result.left_out if r.name == name]

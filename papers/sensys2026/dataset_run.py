@@ -177,7 +177,7 @@ def without_leakage(p: Complex, axial_ratio: float) -> Complex:
 
 
 def authors_recipe(p: Complex, angle_deg: float) -> complex:
-    """Permittivity as the authors compute it: their leakage, their factor, the middle pixels by |P|, mean of Eq. 3."""
+    """Return the permittivity by the authors' recipe: leakage, factor, the middle pixels by |P|, mean of Eq. 3."""
     used = without_leakage(p, AXIAL_RATIO) * METAL_FACTOR
     low, high = np.percentile(np.abs(used), PERCENTILES)
     kept = used[(np.abs(used) >= low) & (np.abs(used) <= high)]
@@ -201,7 +201,7 @@ def _seen(data: AuthorsData, source: str, m: Published) -> tuple[Complex, float,
 
 @dataclass(frozen=True)
 class Estimate:
-    """A material's permittivity from one source: by Eq. 3 as it is, without leakage, and by the authors' recipe."""
+    """Permittivities of a material from one source: by Eq. 3 as it is, without leakage, and by the authors' recipe."""
 
     material: Published
     angle_deg: float
@@ -249,7 +249,7 @@ def authors_table2(data: AuthorsData) -> Item:
 
 
 def _estimates(data: AuthorsData, source: str, leakage: float) -> list[Estimate]:
-    """Every material of Table 2 that a source holds; `leakage` is what its ratios still have."""
+    """Estimate all materials of Table 2 in a source; `leakage` is still in its ratios."""
     found = []
     for m in table2():
         seen = _seen(data, source, m)
@@ -286,7 +286,7 @@ def _plain(source: str, e: Estimate) -> dict[str, Any]:
 
 
 def _figure(estimates: Mapping[str, Sequence[Estimate]]) -> Figure:
-    """Real part and loss of each source, without leakage, against the published ones."""
+    """Draw real part and loss of each source, without leakage, against the published values."""
     fig = new_figure(10.5, 4.6)
     axes = fig.subplots(1, 2)
     for colour, (source, found) in zip((PALETTE[0], PALETTE[6], PALETTE[3]), estimates.items(), strict=False):

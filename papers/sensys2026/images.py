@@ -185,7 +185,7 @@ def fig19(run: Run) -> Item:
 
 
 def _spread_deg(values: npt.NDArray[np.complexfloating]) -> float:
-    """Circular standard deviation of the phase, degrees (Mardia and Jupp, Directional Statistics, section 2.3)."""
+    """Return the circular standard deviation of the phase, degrees (Mardia and Jupp, section 2.3)."""
     length = min(float(np.abs(np.mean(values / np.abs(values)))), 1.0)
     return float(np.degrees(np.sqrt(-2 * np.log(length))))
 
@@ -251,7 +251,7 @@ def fig14(run: Run) -> Item:
 
 
 def front_on(config: Path, folder: Path) -> Path:
-    """The rig file with its boards side by side, written into a folder."""
+    """Write the rig file with its boards side by side into a folder."""
     rig = tomllib.loads(config.read_text(encoding="utf-8"))
     for board in rig["boards"]:
         shift = next(step["shift_mm"] for step in reversed(board["mount"]) if "shift_mm" in step)
@@ -262,7 +262,7 @@ def front_on(config: Path, folder: Path) -> Path:
 
 
 def fig4(run: Run) -> Item:
-    """H, V and P of copper, acrylic, PET and glass with the boards side by side, and with those of the rig file."""
+    """H, V and P of copper, acrylic, PET and glass, with boards side by side and as in the rig file."""
     with tempfile.TemporaryDirectory(prefix="polysight-reproduce-") as temporary:
         near = front_on(run.config, Path(temporary))
         views = {

@@ -39,7 +39,7 @@ def _rows(numbers: tuple[int, ...]) -> tuple[Published, ...]:
 
 
 def fig3(run: Run) -> Item:
-    """Reflectances |r_s|^2 and |r_p|^2 and their ratio over the incidence angle; nothing is random here."""
+    """Reflectances |r_s|^2 and |r_p|^2 and their ratio over the incidence angle (no random errors)."""
     del run
     materials = (*_rows(COMMON), WATER)
     angle = np.arange(0.0, 90.0, 0.25)
@@ -88,7 +88,7 @@ def fig3(run: Run) -> Item:
 
 
 def _d_prime(a: np.ndarray, b: np.ndarray) -> float:
-    """Distance of two means in units of the pooled standard deviation."""
+    """Return the distance of two means in pooled standard deviations."""
     return float(abs(a.mean() - b.mean()) / np.sqrt((a.var() + b.var()) / 2))
 
 
@@ -136,7 +136,7 @@ def fig16(run: Run) -> Item:
 
 
 def table2_item(run: Run) -> Item:
-    """Pixels drawn at the published permittivities go through Eq. 3 as measured ones would."""
+    """Estimate Table 2 by Eq. 3 from pixels drawn at the published permittivities."""
     rows, data = [], []
     fig = new_figure(10.5, 4.6)
     axes = fig.subplots(1, 2)
@@ -193,7 +193,7 @@ def table2_item(run: Run) -> Item:
 
 
 def places(seed: int, count: int = 3) -> list[tuple[float, float]]:
-    """Random centres of plates, mm, at least `APART_MM` from each other in x or in y."""
+    """Draw random centres of plates, mm, at least `APART_MM` from each other in x or in y."""
     rng = np.random.default_rng(seed)
     found: list[tuple[float, float]] = []
     while len(found) < count:
@@ -206,7 +206,7 @@ def places(seed: int, count: int = 3) -> list[tuple[float, float]]:
 
 
 def fig17(run: Run) -> Item:
-    """Eps of every pixel of PET and ceramic in scans with the plates at other places."""
+    """Return the permittivities of all pixels of PET and ceramic in scans with other placements."""
     count = 3 if run.quick else PLACEMENTS
     true = {name: table2()[n - 1].permittivity for name, n in MATERIALS.items()}
     pixels: dict[str, list[Complex]] = {name: [] for name in true}

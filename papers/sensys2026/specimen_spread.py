@@ -20,7 +20,7 @@ SPREADS = ((0.0, 0.0), (0.01, 0.05), (0.02, 0.1), (0.05, 0.2))
 """Relative standard deviations of real part and loss; Fig. 17 of the paper has 1 and 4 % / 23 and 14 %."""
 LIBRARY_SCANS = 24
 TEST_SCANS = 160
-"""So many that the calibration error of exact probabilities would be told as 0.01 to 0.03 (4 to 23 names a scan)."""
+"""Enough for a calibration error of 0.01 to 0.03 with exact probabilities (4 to 23 names a scan)."""
 _TEST_SEED = 500
 _GRID = 21  # nodes a dimension of the specimens' distribution, to 3.5 standard deviations
 Real = npt.NDArray[np.float64]

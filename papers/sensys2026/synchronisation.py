@@ -109,7 +109,7 @@ def sync_scan(run: Run) -> SyncScan:
 
 
 def fig12(run: Run) -> Item:
-    """Range profiles of a row and the image of H, before and after."""
+    """Draw range profiles of a row and the image of H, before and after synchronisation."""
     scan = sync_scan(run)
     fig = new_figure(11.5, 8.4)
     contrast = []
@@ -204,7 +204,7 @@ def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: flo
 
 
 def _stage_rows(summary: Mapping[str, Any], limits: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
-    """A line for each board and stage; published values stand beside the last stage."""
+    """Return table lines for each board and stage, with the published values beside the last stage."""
     rows = []
     for board, content in summary.items():
         for name, s in content["stages"].items():
@@ -259,7 +259,7 @@ def _sweep(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
 
 
 def _draw_spectrogram(ax: Axes, one: Complex, chirp: Chirp) -> None:
-    """Spectrogram of one chirp [sample], and where the used part ends."""
+    """Draw the spectrogram of one chirp [sample], and the end of its used part."""
     f, t, power = scipy.signal.spectrogram(
         one, chirp.sample_rate_hz, nperseg=48, noverlap=44, nfft=256, return_onesided=False
     )
@@ -289,7 +289,7 @@ def _draw_skirts(ax: Axes, chirps: Complex, chirp: Chirp) -> dict[str, float]:
 
 
 def _draw_filter(ax: Axes, if_hz: npt.NDArray, amplitude: npt.NDArray, fitted: HighPass, programmed: HighPass) -> None:
-    """Amplitude against IF, the fitted filter's gain taken out, and both filters."""
+    """Draw amplitude against IF without the fitted filter's gain, and both filters."""
     at = np.linspace(if_hz.min(), if_hz.max(), 300)
     ax.plot(if_hz / 1e6, 20 * np.log10(amplitude), ".", ms=3, color=PALETTE[1], label="sweep, simulated")
     for model, colour, style, name in ((fitted, INK, "-", "fitted"), (programmed, PALETTE[6], "--", "programmed")):

@@ -30,7 +30,7 @@ def samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=0, an
 
 
 def permuted(data, seed=0):
-    """The same pixels with the names dealt out anew among the patches."""
+    """The same pixels with the names shuffled among the patches."""
     first = np.unique(data.patches, return_index=True)[1]
     dealt = np.random.default_rng(seed).permutation(data.names[first])
     return Samples(data.x, dealt[np.searchsorted(data.patches[first], data.patches)], data.groups, data.patches)
@@ -49,14 +49,12 @@ def test_no_model_finds_what_is_not_there(model):
     assert score(noise, model).pixels == pytest.approx(0.25, abs=0.08)
 
 
-@pytest.mark.parametrize("model", [PAPER, DISCRIMINANT])
-def test_with_names_dealt_anew_nothing_is_left_but_what_a_patch_knows_of_itself(model):
+def test_with_shuffled_names_the_discriminant_is_as_good_as_chance():
+    """The same of the KNN, and its gain by a split by pixel, is in test_materials."""
     data = samples(groups=8, pixels=12, offset=0.02, noise=0.002)
-    held = [score(permuted(data, seed), model) for seed in range(2 if model == PAPER else 4)]
+    held = [score(permuted(data, seed), DISCRIMINANT) for seed in range(4)]
     assert np.mean([s.pixels for s in held]) == pytest.approx(1 / 6, abs=0.1)
     assert np.mean([s.patches for s in held]) == pytest.approx(1 / 6, abs=0.12)
-    if model == PAPER:
-        assert score(permuted(data), model, by_pixel=True).pixels > 0.45
 
 
 @pytest.mark.parametrize("folds", [2, 3, 8])
@@ -112,8 +110,9 @@ def test_no_pixel_of_a_test_scan_is_ever_trained_on(monkeypatch):
     assert any(seen)
 
 
-@pytest.mark.parametrize("model", [PAPER, DISCRIMINANT])
-def test_a_second_angle_helps(model):
+def test_a_second_angle_helps():
+    """The KNN; the discriminant is in test_discriminant."""
+    model = PAPER
     one = samples(groups=6, pixels=12, offset=0.02, seed=1)
     both = one.joined(samples(groups=6, pixels=12, offset=0.02, seed=2, angle=0.05))
     assert both.x.shape[1] == 2 * one.x.shape[1]

@@ -13,10 +13,10 @@ from polysight.host.cli.main import main
 from polysight.host.products import write_image, write_json
 
 PATCH = {
-    "label": 4, "name": "PET", "confidence": 0.75, "metal_reference": False, "metal_like": True,
+    "label": 4, "name": 'PET, "0.5 mm"', "confidence": 0.75, "metal_reference": False, "metal_like": True,
     "box_mm": [10.0, -20.0, 50.0, 40.0], "outline_mm": [], "pixels": 99, "interior_pixels": 77, "incidence_deg": 54.5,
     "ratio": {"real": 0.0, "imag": 10.0}, "inverse_ratio_std": 0.004,
-    "permittivity": {"real": 3.5, "imag": -0.25, "real_std": 0.0625, "imag_std": 0.125,
+    "permittivity": {"real": 1 / 3 + 3.5, "imag": -0.25, "real_std": 0.0625, "imag_std": 0.125,
                      "covariance": [[0.0625**2, -0.002], [-0.002, 0.125**2]], "dominated_by": "leakage"},
     "truth": {"name": "vinyl", "permittivity": {"real": 3.75, "imag": -0.5}},
 }  # fmt: skip
@@ -28,7 +28,7 @@ METAL = {
 }  # fmt: skip
 EXPECTED = {
     "patch": [4, 5],
-    "name": ["PET", None],
+    "name": ['PET, "0.5 mm"', None],
     "confidence": [0.75, None],
     "metal_reference": [False, True],
     "metal_like": [True, False],
@@ -38,7 +38,7 @@ EXPECTED = {
     "height_mm": [60.0, 2.0],
     "pixels": [77, 7],
     "incidence_deg": [54.5, 55.0],
-    "permittivity_real": [3.5, None],
+    "permittivity_real": [1 / 3 + 3.5, None],
     "permittivity_real_standard_error": [0.0625, None],
     "permittivity_loss": [0.25, None],
     "permittivity_loss_standard_error": [0.125, None],
@@ -68,7 +68,7 @@ def exported(tmp_path):
     return tmp_path / "out"
 
 
-def test_csv(exported):
+def test_csv_keeps_every_digit(exported):
     with (exported / "materials.csv").open(newline="", encoding="utf-8") as f:
         header, *rows = csv.reader(f)
     assert dict(zip(header, map(list, zip(*rows, strict=True)), strict=True)) == {

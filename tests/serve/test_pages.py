@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from polysight.host.catalogue import read_notes
+from polysight.host.catalogue import Notes, read_notes, write_notes
 from polysight.host.materials import Library, read_labels
 from polysight.host.products import SavedProducts
 from polysight.host.serve.programs import program_of
@@ -159,6 +159,19 @@ def test_every_page_fits_and_can_be_read(page, path, size, tmp_path):
         page.browser.screenshot(tmp_path / "page.png")
         assert (tmp_path / "page.png").stat().st_size > 15_000
     page.browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
+
+
+@SIZES
+def test_long_names_and_tags_fit(page, scans, size):
+    long = "n" * 200
+    shutil.copytree(scans / "one", scans / long)
+    write_notes(scans / long, Notes("", ("t" * 40,)))
+    for path in ("/", "/compare?a=one&b=two", f"/scan?scan={long}"):
+        page.browser.size(*size)
+        page.browser.open(f"{page.view.address}{path}#token={TOKEN}")
+        ready = "document.querySelectorAll('#list li').length == 3" if path == "/" else PAGES.get(path)
+        page.browser.wait(ready or PAGES["/scan?scan=one"], path, LIMIT_S)
+        assert page.browser.value("document.documentElement.scrollWidth - innerWidth") <= 0, path
 
 
 def test_a_scan_that_is_not_there_shows_the_error_alone(page):

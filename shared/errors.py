@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
@@ -99,7 +100,8 @@ def os_error(
 ) -> DeviceError:
     """Turn an OSError into a DeviceError with cause and remedy, so that a command ends without a traceback."""
     where = f"{e.filename}: " if e.filename else ""
-    return DeviceError(f"{where}{e.strerror or e}", why, advice(remedy, *getattr(e, "__notes__", ())))
+    code = ErrorCode.DISK_FULL if e.errno in (errno.ENOSPC, errno.EDQUOT) else ErrorCode.OTHER
+    return DeviceError(f"{where}{e.strerror or e}", why, advice(remedy, *getattr(e, "__notes__", ())), code=code)
 
 
 class ScanError(PolysightError):

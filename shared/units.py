@@ -11,13 +11,3 @@ NS_PER_US = 1_000
 def us_to_ns(us: float) -> int:
     """Convert microseconds to whole nanoseconds, rounded."""
     return round(us * NS_PER_US)
-
-
-def ms_to_ns(ms: float) -> int:
-    """Convert milliseconds to whole nanoseconds, rounded."""
-    return round(ms * NS_PER_MS)
-
-
-def s_to_ns(s: float) -> int:
-    """Convert seconds to whole nanoseconds, rounded."""
-    return round(s * NS_PER_S)

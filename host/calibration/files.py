@@ -28,7 +28,7 @@ from polysight.shared.tables import decode, read_toml, to_builtins
 FORMAT = 1
 IMAGES = ("h", "v", "valid")
 MIN_METAL_LEVEL = 0.02
-"""Of a mirror's echo relative to the direct path; antenna patterns may take some 20 dB."""
+"""Smallest echo of a mirror relative to the direct path; antenna patterns may take some 20 dB."""
 Vector = tuple[float, float, float]
 F = TypeVar("F", bound="CalibrationFile")
 

@@ -19,6 +19,7 @@ Real = NDArray[np.float64]
 DIFFERENCE = "RdBu"
 SIGNIFICANT = 3.0
 """Standard deviations above which a difference is significant."""
+_LEAST_SCATTER = 0.1  # smallest scatter of two scans in their stated errors: a copy has none at all
 _NEAR_MM = 15.0  # largest distance of the centres of one patch in both scans
 
 
@@ -31,7 +32,9 @@ class Comparison:
     p, permittivity
         complex128; nan where one of the scans has no value.
     sigmas
-        float64: |difference of P| in standard deviations; nan where the error is not known.
+        float64: |difference of P| in standard deviations of such differences; nan where the error is not known.
+    scatter
+        Those standard deviations in stated errors, :func:`scatter_of`; nan if the errors are not known.
     patches
         For each pair of patches at one place: names, permittivities, difference.
     notes
@@ -43,6 +46,7 @@ class Comparison:
     p: NDArray[np.complex128]
     permittivity: NDArray[np.complex128]
     sigmas: Real
+    scatter: float
     patches: tuple[dict[str, Any], ...]
     notes: tuple[str, ...]
 
@@ -56,6 +60,7 @@ class Comparison:
             "extent_mm": list(self.first.extent_mm),
             "compared": int(np.isfinite(self.p).sum()),
             "significant_share": share,
+            "scatter": None if np.isnan(self.scatter) else round(self.scatter, 3),
             "significant_sigmas": SIGNIFICANT,
         }
 
@@ -87,8 +92,22 @@ def compare(first: Path, second: Path) -> Comparison:
     p = np.where(both, a.p - b.p[at], np.nan).astype(np.complex128)
     eps = np.where(both, a.permittivity - b.permittivity[at], np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
-        sigmas = np.abs(p) / np.hypot(a.p_sigma, b.p_sigma[at])
-    return Comparison(a, b, p, eps, sigmas, tuple(_pairs(a, b)), tuple(_notes(a, b)))
+        stated = np.abs(p) / np.hypot(a.p_sigma, b.p_sigma[at])
+    scatter = scatter_of(stated)
+    return Comparison(a, b, p, eps, stated / scatter, scatter, tuple(_pairs(a, b)), tuple(_notes(a, b, scatter)))
+
+
+def scatter_of(differences: Real) -> float:
+    """Estimate the scatter of unchanged pixels, 0.1 to 1, from |differences| in stated errors; nan without any.
+
+    Stated errors include those that both scans share (leakage, metal reference, sidelobes), which cancel in a
+    difference. Taken from the median, so that changes of less than half of the image hardly matter: the median of a
+    complex normal error with unit variance in each part is sqrt(2 ln 2).
+    """
+    known = differences[np.isfinite(differences)]
+    if known.size == 0:
+        return float("nan")
+    return float(np.clip(np.median(known) / np.sqrt(2 * np.log(2)), _LEAST_SCATTER, 1.0))
 
 
 def _places(mine: Real, other: Real) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -97,8 +116,13 @@ def _places(mine: Real, other: Real) -> tuple[NDArray[np.intp], NDArray[np.bool_
     return nearest, np.abs(mine - other[nearest]) <= max(abs(other[1] - other[0]), abs(mine[1] - mine[0])) * 0.51
 
 
-def _notes(a: Pixels, b: Pixels) -> list[str]:
+def _notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
     notes = []
+    if scatter < 1:
+        notes.append(
+            f"P of unchanged pixels scatters by {scatter:.2f} of the stated errors, of which the scans share a part:"
+            " significance counts from that scatter"
+        )
     degrees = [float(np.degrees(x.theta_rad)) for x in (a, b)]
     if abs(degrees[0] - degrees[1]) > 0.5:
         notes.append(f"the incidence angles differ: {degrees[0]:.1f} and {degrees[1]:.1f} degrees; P depends on them")

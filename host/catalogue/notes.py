@@ -79,7 +79,6 @@ def write_notes(folder: Path, notes: Notes) -> Notes:
             wrong, "lists have to stay readable", "shorten it; longer texts go into a file of their own",
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
-    (folder / f".{NOTES}.part").unlink(missing_ok=True)  # a link there would have another file written
     content = {"notes": text, "tags": list(tags)}
     write_atomically(folder / NOTES, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
     return Notes(text, tags)

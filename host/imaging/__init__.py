@@ -8,7 +8,7 @@ row. `move_to_plane` estimates the plane of the plates and images on it, `focus_
 settings that the gains of an image depend on.
 """
 
-from polysight.host.imaging.aperture import Aperture, Window, window_weights
+from polysight.host.imaging.aperture import Aperture, window_weights
 from polysight.host.imaging.direct import backproject, project
 from polysight.host.imaging.focus import Focus, focus_sweep
 from polysight.host.imaging.gain_conditions import ImagedWith
@@ -24,7 +24,7 @@ from polysight.host.imaging.images import (
     needed_gate_m,
     sub_bands,
 )
-from polysight.host.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, find_plane, move_to_plane
+from polysight.host.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, move_to_plane
 from polysight.host.imaging.reduce import reduction, scene_gate_m
 from polysight.host.imaging.resolution import PointResponse, imaging_facts, point_response
 from polysight.host.imaging.samples import ReducedRow
@@ -50,10 +50,8 @@ __all__ = [
     "SubBand",
     "SubBandImages",
     "View",
-    "Window",
     "backproject",
     "correct_tilt",
-    "find_plane",
     "focus_sweep",
     "image_grid",
     "imaging_facts",

@@ -138,13 +138,13 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     with np.errstate(invalid="ignore", divide="ignore"):
         heights = sum(precision[i] * np.nan_to_num(ranges[i][0]) for i in range(len(ranges))) / total
     stds = np.sqrt(1 / np.where(total > 0, total, np.nan))
-    tells = np.isfinite(heights)
-    if not tells.any():
+    determined = np.isfinite(heights)
+    if not determined.any():
         return replace(UNKNOWN_PLANE, heights_m=np.full(len(masks), np.nan))
     places = np.array([(x[m.any(axis=0)].mean(), y[m.any(axis=1)].mean()) if m.any() else (0.0, 0.0) for m in masks])
-    plane, covariance = _fit(places[tells], heights[tells], np.hypot(stds[tells], _MIN_STD_M))
+    plane, covariance = _fit(places[determined], heights[determined], np.hypot(stds[determined], _MIN_STD_M))
     phase = _heights_by_phase(next(iter(builder.boards.values())), masks, places, plane)
-    fine = tells & np.isfinite(phase[0])
+    fine = determined & np.isfinite(phase[0])
     by_phase = False
     if fine.sum() >= 2:
         finer, fine_covariance = _fit(places[fine], phase[0][fine], np.full(int(fine.sum()), _PHASE_STD_M))
@@ -162,7 +162,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
         (float(std[1]), float(std[2])),
         np.asarray(heights, np.float64),
         by_phase,
-        int(tells.sum()),
+        int(determined.sum()),
     )
 
 

@@ -6,10 +6,10 @@ the reduced samples in the scan folder, so that images can be formed again witho
 on the result; `save_images` and `save_materials` write the products. `host/pipeline.py` calls them in this order.
 """
 
-from polysight.host.process.judge import error_budget, judge, recording_verdict
+from polysight.host.process.judge import judge
 from polysight.host.process.parallel import cores, map_boards, map_rows
 from polysight.host.process.quality import Quality, masked_runs
-from polysight.host.process.request import DrawnBoxes, Options, ProcessRequest
+from polysight.host.process.request import Options, ProcessRequest
 from polysight.host.process.samples import Choices, KeptSamples
 from polysight.host.process.save import (
     Findings,
@@ -25,7 +25,6 @@ from polysight.host.process.save import (
 
 __all__ = [
     "Choices",
-    "DrawnBoxes",
     "Findings",
     "KeptSamples",
     "Options",
@@ -35,7 +34,6 @@ __all__ = [
     "Quality",
     "cores",
     "coverage_lines",
-    "error_budget",
     "judge",
     "map_boards",
     "map_rows",
@@ -43,7 +41,6 @@ __all__ = [
     "materials_content",
     "no_progress",
     "quality_content",
-    "recording_verdict",
     "save_images",
     "save_materials",
 ]

@@ -46,7 +46,6 @@ from polysight.host.products.folder import (
     scan_folder_of,
 )
 from polysight.host.products.material_table import (
-    PermittivitySpread,
     material_columns,
     permittivity_spread,
     refused_text,
@@ -63,7 +62,6 @@ __all__ = [
     "QUALITY",
     "RAW_DROPPED",
     "SCAN",
-    "PermittivitySpread",
     "ProcessedScan",
     "Rows",
     "SavedProducts",

@@ -10,6 +10,7 @@ import io
 import json
 import math
 import os
+import secrets
 import shutil
 import zipfile
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, no_such
-from polysight.shared.files import named, open_to_write, read_json
+from polysight.shared.files import named, read_json
 from polysight.shared.tables import decode, to_builtins
 
 SCAN = "scan.json"
@@ -58,14 +59,19 @@ def temporary_path(path: Path) -> Path:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name, flush it to disk, and rename it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
-    with named(path), open_to_write(part) as f:
-        f.write(data)
-        f.flush()
-        os.fsync(f.fileno())
-    part.replace(path)
+    """Write a file under a temporary name of its own, flush it to disk, and rename it. Raises OSError."""
+    with named(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")  # two may write the same file at once
+        try:
+            with part.open("xb") as f:
+                f.write(data)
+                f.flush()
+                os.fsync(f.fileno())
+            part.replace(path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
 
 
 def write_image(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, RedirectResponse, Response
 from starlette.routing import Route
 
@@ -18,8 +18,9 @@ from polysight.host.serve.guard import Guard, refused
 from polysight.host.serve.reading import reading_routes
 from polysight.host.serve.site import Site
 from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
+from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError, os_error
 
+_WRONG_REQUEST = (ErrorCode.VALUE_INVALID, ErrorCode.VALUES_CONFLICT, ErrorCode.TYPE_WRONG, ErrorCode.KEY_MISSING)
 STATIC = Path(__file__).parent / "static"
 PAGES = {
     "/": "catalogue.html",
@@ -49,7 +50,13 @@ def make_app(site: Site) -> Starlette:
     return Starlette(
         routes=routes,
         middleware=[Middleware(Guard, access=site.access)],
-        exception_handlers={PolysightError: _error, 404: _not_found, Exception: _fault},
+        exception_handlers={
+            PolysightError: _error,
+            OSError: _os_error,
+            ClientDisconnect: _gone,
+            404: _not_found,
+            Exception: _fault,
+        },
     )
 
 
@@ -62,12 +69,26 @@ def _static(name: str) -> Callable[[Request], Awaitable[Response]]:
 
 
 async def _error(request: Request, e: Exception) -> Response:
-    del request
     if not isinstance(e, PolysightError):
         raise e
     status = 400 if isinstance(e, ConfigError) else 404 if isinstance(e, DataError) else 409
+    if request.method == "POST" and e.code in _WRONG_REQUEST:
+        status = 400
     silent = isinstance(e, DeviceError) and e.code is ErrorCode.NO_ANSWER
     return refused(503 if silent else status, e.code, e.what, e.why, e.remedy)
+
+
+async def _os_error(request: Request, e: Exception) -> Response:
+    """A file that cannot be written or read: not a defect of this program."""
+    if not isinstance(e, OSError):
+        raise e
+    return await _error(request, os_error(e))
+
+
+async def _gone(request: Request, e: Exception) -> Response:
+    """The client hung up in the middle of its request: nobody reads this answer."""
+    del request, e
+    return Response(status_code=400)
 
 
 async def _not_found(request: Request, e: Exception) -> Response:

@@ -336,8 +336,14 @@ async def _export(site: Site, request: Request, body: ExportRequest) -> dict[str
         )  # fmt: skip
 
     def start(folder: Path) -> None:
+        out = folder.absolute() / "export"
+        if not out.resolve().is_relative_to(folder.resolve()):
+            raise DataError(
+                f"{out}: leads out of the scan", "it is a link", "remove the link, or use `polysight export --out`",
+                code=ErrorCode.PATH_OUTSIDE,
+            )  # fmt: skip
         words = ["export", folder.absolute(), *(f"--{name}" for name in body.formats)]
-        _programs(site).start(folder, "export", [*words, "--out", folder.absolute() / "export"])
+        _programs(site).start(folder, "export", [*words, "--out", out])
 
     await site.read_scan(request, start)
     return {"what": "started"}

@@ -21,7 +21,7 @@ from starlette.requests import cookie_parser
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from polysight.host.serve.connections import HEAD_BYTES
+from polysight.host.serve.connections import HEAD_BYTES, TRUSTED
 from polysight.shared.error_codes import ErrorCode
 
 TOKEN_HEADER = "X-Polysight-Token"
@@ -96,6 +96,10 @@ def cookie_name(port: int) -> str:
     return f"polysight-{port}"
 
 
+def _port(scope: Scope) -> int:
+    return int((scope.get("server") or ("", 0))[1] or 0)
+
+
 def _name_of(host: str) -> str:
     """`Host` without its port."""
     if host.startswith("["):
@@ -136,7 +140,9 @@ class Guard:
         """Refuse the request, or pass it on."""
         if scope["type"] != "http":
             return
-        refusal = self._refusal(scope, Headers(scope=scope))
+        headers = Headers(scope=scope)
+        refusal = self._refusal(scope, headers)
+        scope[TRUSTED] = self._access.holds_token(headers) or self._access.holds_session(headers, _port(scope))
         if refusal is not None:
             await _closing(refusal)(scope, receive, _with_headers(send))
             return
@@ -149,7 +155,8 @@ class Guard:
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
         """The refusal of a request; None if it is allowed."""
         method, path = scope["method"], scope["path"]
-        if sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_BYTES:
+        line = len(scope.get("raw_path") or path) + len(scope.get("query_string", b""))
+        if line + sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_BYTES:
             what = f"The head is longer than {HEAD_BYTES} bytes"
             return refused(431, ErrorCode.MESSAGE_INVALID, what, "no page sends so much", "send less")
         if not self._access.knows_host(headers.get("host", "")):
@@ -181,8 +188,8 @@ class Guard:
             )  # fmt: skip
         if not writes and (access.loopback or not access.token or scope["path"] in _OPEN_PATHS):
             return None
-        port, client = int((scope.get("server") or ("", 0))[1] or 0), str((scope.get("client") or ("",))[0])
-        session = access.holds_session(headers, port)
+        client = str((scope.get("client") or ("",))[0])
+        session = access.holds_session(headers, _port(scope))
         if not writes and session:
             return None
         if not session and self._wrong.spent(client):

@@ -69,8 +69,10 @@ def main() -> int:
             try:
                 running.append(launch(**json.loads(line)))
                 answer = ""
-            except (OSError, ValueError, TypeError) as e:
-                answer = f"{type(e).__name__}: {e}"
+            except OSError as e:  # a full disk has no file name
+                answer = f"{e.filename or json.loads(line)['base']}: {e.strerror or e}"
+            except (ValueError, TypeError) as e:
+                answer = str(e)
             sys.stdout.write(json.dumps(answer) + "\n")
             sys.stdout.flush()
 

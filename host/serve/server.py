@@ -9,6 +9,7 @@ import os
 import resource
 import secrets
 import socket
+import ssl
 import sys
 import threading
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from polysight.host.serve.guard import Access
 from polysight.host.serve.programs import Programs
 from polysight.host.serve.site import Site
 from polysight.host.serve.watches import Watches
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError
 
 NICE = 10  # priority of the server, below capture and scan
@@ -57,12 +59,27 @@ class Place:
         return is_loopback(self.host)
 
     def check(self) -> None:
-        """Raise ConfigError for missing files of TLS."""
-        if (self.certificate is None) != (self.key is None):
+        """Raise ConfigError for files of TLS that are missing, do not belong together or need a passphrase."""
+        if self.certificate is None and self.key is None:
+            return
+        if self.certificate is None or self.key is None:
             raise ConfigError("--certificate and --key", "TLS needs both", "give both, or none")
         for path in (self.certificate, self.key):
-            if path is not None and not path.is_file():
-                raise ConfigError(f"{path}: no such file", "TLS needs a certificate and its key", "give PEM files")
+            if not path.is_file():
+                raise ConfigError(
+                    f"{path}: no such file", "TLS needs a certificate and its key", "give PEM files",
+                    code=ErrorCode.FILE_MISSING,
+                )  # fmt: skip
+        try:
+            # An empty passphrase, or OpenSSL would ask for one at the terminal.
+            ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(self.certificate, self.key, password="")
+        except (OSError, ValueError) as e:
+            raise ConfigError(
+                f"{self.certificate} and {self.key}: cannot be used for TLS: {getattr(e, 'reason', None) or e}",
+                "they are not PEM, do not belong together, are swapped, or the key has a passphrase",
+                "give a certificate and its key without passphrase (openssl rsa -in KEY -out PLAIN)",
+                code=ErrorCode.FILE_FOREIGN,
+            ) from None
 
 
 def serve(root: Path, place: Place, config: Path | None, control: bool = True) -> int:

@@ -112,7 +112,7 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
     absolute = np.exp(-2j * np.pi * np.outer(direct_m, sweep) / SPEED_OF_LIGHT_M_S)
     conjugate, counted_from_tx = _sign_and_origin(cube, absolute, gate, (a, b))
     turn = absolute if counted_from_tx else np.ones_like(absolute)
-    said = ["conjugated"] * conjugate + ["delays counted from the transmitter"] * counted_from_tx
+    form = ["conjugated"] * conjugate + ["delays counted from the transmitter"] * counted_from_tx
     cube = (cube.conj() if conjugate else cube) * turn[:, None]
 
     constant, path = np.zeros(len(rx)), None
@@ -122,20 +122,20 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
         phasors = mean / np.abs(mean)
         if abs((phasors * lag[:, (a + b) // 2].conj()).sum()) > abs(phasors.sum()):
             turn = turn * lag.conj()
-            said.append("all RX referenced to the direct path of one")
+            form.append("all RX referenced to the direct path of one")
         else:
-            said.append("each RX referenced to its own direct path")
+            form.append("each RX referenced to its own direct path")
     else:
         own = prepare(rig, board)
         _, found, _, _ = _referenced(cube.astype(np.complex64), np.ones(cube.shape[1], bool), own, chirp)
         if found.mean() > _MIN_FOUND and _share(cube[..., a:b], gate) < _ALONE:
             path = own
-            said.append("not referenced to a direct path; referenced here")
+            form.append("not referenced to a direct path; referenced here")
         else:
             level = np.sqrt(np.mean(np.abs(cube) ** 2))
             constant = level * direct_m[0] / direct_m
-            said.append("the direct path was taken out; the RX are taken to be alike")
-    how = "; ".join(said) + "; the receiver's filter is left as it is"
+            form.append("the direct path was removed; equal RX are assumed")
+    how = "; ".join(form) + "; the receiver's filter is not compensated"
     return CubeForm(conjugate, turn.astype(np.complex64), constant.astype(np.complex64), path, chirp, how)
 
 

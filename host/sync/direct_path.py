@@ -224,7 +224,7 @@ def _try_others(
     how: tuple[Loops, NDArray[np.complex64], NDArray[np.complex64]],
     *found: NDArray[np.generic],
 ) -> None:
-    """Where the amplitude is an outlier in its row, use the second peak if it is not; changes `found` in place.
+    """Use the second peak where the amplitude is an outlier in its row; changes `found` in place.
 
     `how` are the loops, the steering and the estimator; `found` are frequency, estimate and last step from `refine`.
     An outlier is beyond `_OUTLIER` standard deviations, estimated from the median absolute deviation of the row.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from polysight.host.catalogue import MAPS, Pixels, compare, draw_comparison, draw_products, probe, result_of, thumbnail
+from polysight.host.catalogue.compare import SIGNIFICANT, scatter_of
 from polysight.host.polarimetry import permittivity_from_ratio
 from polysight.host.products import read_products
 from polysight.shared.error_codes import ErrorCode
@@ -86,7 +87,7 @@ def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed):
     told = [pair["sigmas"] for pair in found.patches if pair["sigmas"] is not None]
     assert told
     assert max(told) < 3
-    assert found.to_dict()["significant_share"] < 0.05
+    assert (found.sigmas > 5).mean() < 0.05  # few pixels that are independent of each other
     back = compare(processed / "two", processed / "one")
     both = np.isfinite(found.p) & np.isfinite(back.p)
     assert np.array_equal(found.p[both], -back.p[both])
@@ -109,11 +110,25 @@ def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
     write_image(tmp_path / "changed" / "image.npz", saved.h, v, p, saved.x_m, saved.y_m, saved.valid, saved.p_sigma)
     found = compare(processed / "one", tmp_path / "changed")
     told = np.nan_to_num(found.sigmas)
-    expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.p_sigma)
+    assert found.scatter == 0.1  # a copy, which shares its errors
+    expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.p_sigma) / found.scatter
     assert np.allclose(told[inside], expected[inside], rtol=1e-4)
     assert told[inside].min() > 0.5
     told[inside] = 0
     assert told.max() == 0
+
+
+def test_errors_that_both_scans_share_do_not_hide_a_change():
+    """Stated errors are three times the scatter of unchanged pixels: of these 5 % lie beyond their 95 % region."""
+    rng = np.random.default_rng(3)
+    stated = np.abs(rng.standard_normal(20_000) + 1j * rng.standard_normal(20_000)) / 3
+    stated[:4000] += 5 / 3
+    sigmas = stated / scatter_of(stated)
+    assert scatter_of(stated[4000:]) == pytest.approx(1 / 3, rel=0.03)
+    assert (sigmas[4000:] > 2.448).mean() == pytest.approx(0.03, abs=0.025)
+    assert (sigmas[:4000] > SIGNIFICANT).mean() > 0.95
+    assert scatter_of(3 * stated) == 1.0
+    assert np.isnan(scatter_of(np.array([np.nan])))
 
 
 def test_scans_that_cannot_be_compared_say_so(processed, tmp_path):

@@ -213,4 +213,4 @@ def test_a_scan_that_cannot_begin_says_why(lab):
     assert _program(folder).status not in (0, None)
     lab.rig.start_pi()
     lab.open("/")
-    lab.browser.wait("document.getElementById('list').innerText.includes('not begun')", "its state")
+    lab.browser.wait("/failed[^]*did not answer/.test(document.getElementById('list').innerText)", "state and reason")

@@ -23,10 +23,6 @@ def shows(rows: int):
     return lambda state: (state.get("pictures") or {}).get("rows") == rows
 
 
-def without_revision(state: dict) -> dict:
-    return state | {"pictures": {k: v for k, v in state["pictures"].items() if k != "revision"}}
-
-
 @pytest.fixture(scope="module")
 def truth(finished):
     """Pictures of the finished folder, by the instrument's own pipeline."""
@@ -76,19 +72,6 @@ def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
     assert told(watch)["status"]["level"] == "good"
     growing.grow_to("scan_ended")
     assert watch.wait_for(lambda s: s["status"]["level"] == "done", LIMIT_S)
-
-
-def test_who_comes_late_is_told_the_same(growing, watching):
-    early = watching(growing.path, lapse_s=1e6)
-    growing.live()
-    for fact in ("scan_started", "row_committed", "row_committed"):
-        growing.grow_to(fact)
-        assert early.wait_for(lambda s: s.get("scan") is not None, LIMIT_S)
-    assert early.wait_for(shows(2), LIMIT_S)
-    late = watching(growing.path, lapse_s=1e6)
-    assert late.wait_for(shows(2), LIMIT_S)
-    wait_for(lambda: without_revision(told(early)) == without_revision(told(late)), "both tell the same")
-    assert {n: p.png for n, p in early.shown.pictures.items()} == {n: p.png for n, p in late.shown.pictures.items()}
 
 
 def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):

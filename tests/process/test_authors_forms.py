@@ -38,7 +38,7 @@ def images(folder):
     return pipeline.form_images(), pipeline
 
 
-def alike(a, b, channel):
+def correlation(a, b, channel):
     """Normalised correlation of two images where both are valid; 1 is the same up to a factor."""
     at = a.valid & b.valid
     x, y = getattr(a, channel)[at], getattr(b, channel)[at]
@@ -62,7 +62,7 @@ def test_a_scan_by_columns_makes_the_image_of_one_by_rows(quiet, tmp_path):
     np.testing.assert_allclose(made.x_m, quiet.x_m, atol=1e-12)
     np.testing.assert_allclose(made.y_m, quiet.y_m, atol=1e-12)
     for channel in ("h", "v"):
-        assert alike(made, quiet, channel) > 0.98
+        assert correlation(made, quiet, channel) > 0.98
     facts = pipeline.quality.notes["recording"]
     assert facts["direction"] == "col"
     assert facts["boards"]["RV"]["positions_missing"] == 2
@@ -78,7 +78,7 @@ def test_a_synchronised_cube_of_any_convention_makes_the_same_image(quiet, tmp_p
     folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path, **form)
     made, pipeline = images(folder)
     for channel in ("h", "v"):
-        assert alike(made, quiet, channel) > 0.999
+        assert correlation(made, quiet, channel) > 0.999
     assert set(pipeline.quality.notes["recording"]["cubes"]) == {"RH", "RV"}
     assert pipeline.quality.to_dict()["boards"]["RH"]["positions_masked"] == 0
 
@@ -97,7 +97,7 @@ def test_a_cube_without_reference_is_referenced_to_the_direct_path_and_its_zeros
         np.save(file, cube)
     made, pipeline = images(folder)
     for channel in ("h", "v"):
-        assert alike(made, quiet, channel) > 0.99
+        assert correlation(made, quiet, channel) > 0.99
     assert pipeline.quality.to_dict()["boards"]["RH"]["positions_masked"] == 2
 
 

@@ -84,7 +84,7 @@ def test_leakage_of_both_boards_is_recovered_from_metal_at_two_orientations(scan
     assert main(["leakage", str(plate), "--strips", f"90={lying}"]) == 0
     out = capsys.readouterr().out
     assert "simulated" in out
-    assert "axial ratio" in out  # one orientation: both boards are taken to leak alike
+    assert "axial ratio" in out  # one orientation: equal leakage of both boards is assumed
 
 
 @pytest.fixture(scope="module")

@@ -141,7 +141,7 @@ def test_at_another_angle_than_the_librarys_nothing_is_named(made, other_angle, 
     assert materials["model"] is None
     other = next(s for s in materials["segments"] if not s["metal_reference"])
     assert other["name"] is None
-    assert (other["permittivity"] is None) == (other["refused"] is not None)  # so coarse a scan may not tell
+    assert (other["permittivity"] is None) == (other["refused"] is not None)  # so coarse a scan may give no result
     assert "other.npz" in (made / "out" / "report.html").read_text()
 
 

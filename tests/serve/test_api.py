@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
+import socket
 import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from polysight.host.serve import control, site
+from polysight.host.serve.guard import TOKEN_HEADER
 from polysight.host.serve.programs import program_of
 from polysight.shared.error_codes import ErrorCode
 from tests.support.page.asking import TOKEN, ask, get, post
@@ -140,3 +146,45 @@ def test_a_scan_that_did_not_begin_says_why(view, scans):
     assert "polysight" not in listed["three"]["reason"]
     assert len(listed["three"]["reason"]) > 10
     assert listed["three"]["reason"] in program_of(scans / "three", "scan").log
+
+
+def test_exports_stay_in_the_scan(view, scans, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (scans / "one" / "export").symlink_to(tmp_path / "elsewhere")
+    status, body = post(view, "/api/export?scan=one", {"formats": ["csv"]})
+    assert (status, body["code"]) == (404, ErrorCode.PATH_OUTSIDE)
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_two_who_write_the_same_notes_are_both_answered(view, scans):
+    with ThreadPoolExecutor(2) as both:
+        answers = both.map(lambda k: post(view, "/api/notes?scan=one", {"notes": f"{k}"})[0], range(40))
+        assert set(answers) == {200}
+    assert [p.name for p in (scans / "one").glob(".*.part")] == []
+
+
+@pytest.mark.parametrize(("number", "code"), [(errno.ENOSPC, ErrorCode.DISK_FULL), (errno.EROFS, ErrorCode.OTHER)])
+def test_a_disk_that_takes_nothing_is_named(view, scans, monkeypatch, number, code):
+    def fail(_: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", fail)
+    status, body = post(view, "/api/notes?scan=one", {"notes": "n"})
+    assert (status, body["code"]) == (409, code)
+    assert str(scans / "one" / "operator.json") in body["what"]
+    assert not list((scans / "one").glob("*operator.json*"))
+
+
+def test_a_client_that_hangs_up_is_no_fault_of_the_server(view, capfd):
+    head = f"POST /api/notes?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n{TOKEN_HEADER}: {TOKEN}\r\n"
+    for _ in range(3):
+        with socket.create_connection(("127.0.0.1", view.port)) as s:
+            s.sendall(f"{head}Content-Length: 90\r\n\r\n{{".encode())
+    assert get(view, "/api/scans")
+    time.sleep(0.2)
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("line", ["/api/scan?scan=" + "a" * 20_000, "/" + "b" * 20_000])
+def test_a_long_request_line_is_refused(view, line):
+    assert ask(view, line)[0] in (400, 431)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import shutil
 import socket
@@ -22,6 +23,7 @@ from tests.support.page.asking import TOKEN, ask, digest_of, get, post, raw
 from tests.support.page.live_view import served_folder
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.products import judged_products
+from tests.support.refusals import refused
 
 SECRET = "nobody may read this"
 
@@ -142,6 +144,27 @@ def test_half_open_connections_lock_nobody_out(scans, many):
             assert get(view, "/api/scans")["scans"]
             assert post(view, "/api/notes?scan=one", {"notes": "n"})[0] == 200
         for one in held:
+            one.close()
+
+
+def test_answers_that_nobody_reads_lock_nobody_out(scans):
+    """250 clients ask for 300 pages each and read none, while the operator keeps a connection and opens others."""
+    ask_for = b"GET /common.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 300
+    with served_folder(scans, TOKEN) as view:
+        cookie = f"{cookie_name(view.port)}={view.site.access.session}"
+        kept = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
+        held = []
+        for k in range(250 + connections.MOST):
+            held.append(socket.create_connection(("127.0.0.1", view.port), LIMIT_S))
+            held[-1].setblocking(False)
+            held[-1].send(ask_for)
+            if k % 50 == 0:
+                kept.request("GET", "/api/scans", headers={"Cookie": cookie})
+                assert kept.getresponse().read()
+        for _ in range(5):
+            assert get(view, "/api/scans")["scans"]
+            assert post(view, "/api/notes?scan=one", {"notes": "n"})[0] == 200
+        for one in (kept, *held):
             one.close()
 
 
@@ -350,6 +373,9 @@ def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
     from polysight.host.serve import Place
     from tests.support.page.live_view import served_place
 
+    for wrong in ("key.pem", "certificate.pem"):  # twice the same, and so neither belongs to the other
+        with refused(ErrorCode.FILE_FOREIGN, tmp_path / wrong):
+            Place("127.0.0.1", 0, (), tmp_path / wrong, tmp_path / wrong).check()
     place = Place("127.0.0.1", 0, (), tmp_path / "certificate.pem", tmp_path / "key.pem")
     with served_place(scans, place, Access(TOKEN, control=True, secure=True)) as view:
         trusted = ssl.create_default_context(cafile=str(tmp_path / "certificate.pem"))

@@ -10,7 +10,6 @@ from polysight.host.acquisition.control import ALIVE, CONTROL, ControlFolder, St
 from polysight.simulators.loopback import on_free_subnet
 from tests.support.page.chromium import DESK, PHONE, Browser
 from tests.support.page.live_view import GrowingScan, served
-from tests.support.paths import REPO
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.rigs import published_rig
 
@@ -120,11 +119,3 @@ def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, wa
     with served(watch, host=host, port=int(port)):
         browser.wait("!document.body.classList.contains('lost')", "the way back")
         browser.wait("document.getElementById('headline').innerText == 'The scan is finished'", "the state")
-
-
-def test_how_to_shows_pictures_that_are_there():
-    docs = REPO / "docs"
-    page = (docs / "how-to/live-view.md").read_text(encoding="utf-8")
-    assert "../images/preview.png" in page
-    assert (docs / "images/preview.png").exists()
-    assert (docs / "images/preview-phone.png").exists()

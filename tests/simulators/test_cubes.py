@@ -62,7 +62,7 @@ def test_a_synced_cube_equals_the_synchronised_raw_scan(tmp_path: Path) -> None:
         )
         own, unlike = (np.sqrt(np.mean(np.abs(off_by(raw, c)) ** 2) / np.mean(np.abs(c) ** 2)) for c in (cube, other))
         assert own < 0.01
-        assert unlike > 3 * own, "the bound cannot tell leakage from none"
+        assert unlike > 3 * own, "the bound is too wide to detect leakage"
 
 
 def test_the_noise_is_that_of_averaged_bursts(tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitu
 
 
 def test_a_tilted_plates_image_stays_where_it_is() -> None:
-    """The direct sum over the aperture, at the true plane, has its middle at the plate's centre whatever the tilt."""
+    """The direct sum over the aperture, at the true plane, has its middle at the plate's centre for any tilt."""
     centre = np.array([20.0, -12.0])
     found = [middle_of_image({**PLATE, "centre_mm": centre.tolist(), "tilt_deg": [t, t]}) for t in (0.0, 1.0)]
     for middle in found:

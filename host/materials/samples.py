@@ -222,7 +222,7 @@ class SceneErrors:
     covariance: Real
 
     def of(self, at: npt.NDArray) -> SceneErrors:
-        """Of some of the patches."""
+        """Return the errors of some of the patches."""
         return SceneErrors(self.own[at], self.design[at], self.covariance)
 
 
@@ -230,9 +230,9 @@ class Model(ABC):
     """A classifier of metal-referenced pixels, features [n, 4 * angles] as in `polysight.host.materials.samples`."""
 
     knows_scans = False
-    """Whether `by_scan` makes use of what the patches of a scan have in common."""
+    """True if `by_scan` uses errors common to the patches of a scan."""
     distributions: Any
-    """The materials' distributions (`discriminant.py`), by which every model knows what is none of them."""
+    """The materials' distributions (`discriminant.py`), used by every model to recognise unknown patches."""
 
     @abstractmethod
     def fit(self, samples: Samples) -> Model:

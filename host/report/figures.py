@@ -176,8 +176,9 @@ def _write_ratios(ax: Axes, ctx: ReportContext, key: str) -> None:
         if ratio:
             x0, y0, x1, y1 = row["box_mm"]
             p = complex(ratio["real"], ratio["imag"])
-            number = f"{np.degrees(np.angle(p)) + 0.0:.0f}°" if key == "phase_p" else f"{20 * np.log10(abs(p)):.1f}"
-            write_label(ax, (x0 + x1) / 2, (y0 + y1) / 2, number.replace("-0°", "0°"), 9, on_dark=True)
+            degrees, level = round(float(np.degrees(np.angle(p)))), round(20 * float(np.log10(abs(p))), 1) + 0.0
+            number = f"{degrees}°" if key == "phase_p" else f"{level:.1f}"
+            write_label(ax, (x0 + x1) / 2, (y0 + y1) / 2, number, 9, on_dark=True)
 
 
 def draw_overview(fig: Figure, axes: Sequence[Axes], ctx: ReportContext, bar_labels: bool = False) -> None:

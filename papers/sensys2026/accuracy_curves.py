@@ -70,7 +70,7 @@ def _taught(errors: Errors) -> Model:
 
 
 def _known(at: Sequence[float], errors: Sequence[Errors], quick: bool) -> Curve:
-    """Of conditions that library and scans have alike; beside Bayes' bound."""
+    """Return the curve of a condition that is equal for library and scans, with Bayes' bound."""
     judged = [_judge(_taught(e), _drawn(e, ANGLE_DEG, quick)) for e in errors]
     bounds = tuple(bayes("solids", (ANGLE_DEG,), e, quick) for e in errors)
     return Curve("found", tuple(at), *_columns(judged), bounds)
@@ -86,7 +86,7 @@ def _changed(
     budget: Budget,
     off: bool = False,
 ) -> Curve:
-    """Of conditions that the library does not know; with `off` scans look from another angle, on either side."""
+    """Return the curve of a condition that only scans have; `off`: scans have a larger or smaller incidence angle."""
     judged = []
     for value in at:
         right = wrong = 0.0

@@ -357,9 +357,9 @@ def pixel_bound(
     Parameters
     ----------
     materials, angles_deg, errors
-        As they are drawn.
+        As for drawing the pixels.
     reference
-        Whether the error of the scan's metal reference is in the pixels, or known and taken off.
+        True if the error of the scan's metal reference is in the pixels; False if it is known and removed.
     pixels
         Pixels a decision is taken from: their own errors average out, those of the patch do not.
     """

@@ -1,7 +1,7 @@
-"""The published data set as libraries: its `materials/`, its `labels/`, and images made here from its raw data.
+"""The published data set as libraries: its `materials/`, its `labels/`, and our own images of its raw data.
 
-Each source is judged on its own. Materials carry the names of Table 2's rows, where their own names mean one
-(`row_of`). `train_authors` makes one library of the first two for `polysight train`.
+Each source is judged separately. Materials get the names of Table 2's rows, if `row_of` finds a row for their names.
+`train_authors` makes one library of the first two sources for `polysight train`.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ class AuthorsData:
     Attributes
     ----------
     folder, base
-        Of the data set, and the rig file for what it does not tell.
+        Folder of the data set, and the rig file for values that it lacks.
     sources
-        `materials/`, `labels/`, `images made here` to a library, names as in Table 2; only those that hold anything.
+        `materials/`, `labels/`, `images made here` to a library with the names of Table 2; without empty ones.
     meaning
         Their names to the rows of Table 2.
     notices
-        What was left out, and what had to be assumed.
+        Skipped files and names, and assumptions.
     """
 
     folder: Path

@@ -34,7 +34,7 @@ HEAD = (
     "No.", "Material", "angle", "scans", "pixels", "published ε′", "published ε″", "Eq. 3 ε′", "Eq. 3 ε″",
     "without leakage ε′", "without leakage ε″", "±", "authors' recipe ε′", "authors' recipe ε″",
 )  # fmt: skip
-"""Of Table 2."""
+"""Head of the comparison with Table 2."""
 
 MAKERS: dict[str, Callable[[Judgements], Item]] = {
     "table2": lambda judge: authors_table2(judge.data),
@@ -43,7 +43,7 @@ MAKERS: dict[str, Callable[[Judgements], Item]] = {
     "fig21": lambda judge: authors_fig21(judge.data),
 }
 AXIAL_RATIO, METAL_FACTOR, PERCENTILES = 0.05, 1 / 0.8, (30, 70)
-"""What the authors apply before Eq. 3: leakage, a factor on |P| relative to metal, and the pixels by |P| they keep."""
+"""Corrections of the authors before Eq. 3: leakage, a factor on |P| relative to metal, percentiles of |P| to keep."""
 
 
 def reproduce_authors(

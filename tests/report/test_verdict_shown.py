@@ -17,7 +17,7 @@ from polysight.host.api.plot import plot_scan
 from polysight.host.products import permittivity_spread, read_processed, read_products
 from polysight.host.report import ReportContext, write_report
 from polysight.host.report.ellipses import SHARES, ellipse_of, place_numbers
-from polysight.host.report.figures import phase_limits_deg
+from polysight.host.report.figures import channel_figure, phase_limits_deg
 from polysight.host.report.maps import draw_materials, permittivity_map
 from polysight.host.report.style import shorten_labels
 from polysight.host.report.tables import budget_table
@@ -164,6 +164,13 @@ def test_the_phase_of_p_has_the_range_of_the_patches_across_180_degrees(tmp_path
     assert phase_limits_deg(replace(ctx, materials=[])) is None
     random = np.exp(2j * np.pi * np.random.default_rng(1).uniform(size=p.shape))
     assert phase_limits_deg(replace(ctx, p=random)) is None
+
+
+def test_a_ratio_of_nearly_one_has_no_negative_zero(tmp_path):
+    ctx = context(judged_products(tmp_path, "good"))
+    ctx = replace(ctx, materials=[{**ctx.materials[0], "ratio": {"real": 0.9999, "imag": -1e-4}}])
+    text = drawn_text(lambda: [channel_figure(ctx, key) for key in ("amplitude_p", "phase_p")])
+    assert {"0.0", "0°"} <= set(text.split("\n"))
 
 
 @pytest.mark.parametrize("key", BUDGET)

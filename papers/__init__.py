@@ -1,1 +1,1 @@
-"""What reproduces published papers with this instrument, one folder a paper."""
+"""Reproductions of published papers with this instrument, one folder a paper."""

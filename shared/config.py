@@ -175,7 +175,7 @@ class NativeRadar(Section, frozen=True):
 
 
 class Radar(Section, frozen=True):
-    """How the radars are armed for the pulses of a row; paths are relative to the rig file's folder.
+    """Settings of arming the radars for the pulses of a row; paths are relative to the rig file's folder.
 
     `control`: `endless`: another program started the radars with an infinite number of frames. `line_server`: a line
     is sent to each board's control server before each row; `servers` has its `address:port` by board name. `native`:

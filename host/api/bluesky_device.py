@@ -34,7 +34,7 @@ from polysight.shared.errors import ConfigError, ScanError
 
 ROWS = "rows"
 _KEYS = ("row", "take", "pulses", "missing_bytes")
-"""Of an event: index of the row, how often it was taken, SYNC_IN pulses sent, bytes that no packet brought."""
+"""Keys of an event: index of the row, number of takes, SYNC_IN pulses sent, missing bytes."""
 _LOOK_S = 0.2
 
 
@@ -114,7 +114,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
-        """Start; done when the first row is being taken. Raises PolysightError if it is not."""
+        """Start; done when the first row begins. Raises PolysightError if it does not begin."""
         if self._place is None or self._scanning is not None:
             raise ScanError(
                 f"{self.name}: not prepared, or a scan runs",
@@ -166,10 +166,10 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
             yield {"data": data, "timestamps": dict.fromkeys(data, at), "time": at}
 
     def _scan(self, folder: Path, loop: asyncio.AbstractEventLoop) -> ScanResult:
-        """The scan, in a thread of its own."""
+        """Run the scan; called in its own thread."""
         with ControlFolder(folder, self._stop) as desk:
 
-            def told(progress: ScanProgress) -> None:
+            def show(progress: ScanProgress) -> None:
                 if progress.phase != "connect":
                     desk.open()
                 if progress.phase == "row":
@@ -180,7 +180,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
                 loop.call_soon_threadsafe(self._show, progress.phase, progress.committed, folder)
 
             rig = load_instrument(self._config)
-            return run_scan(rig, folder, progress=told, keep_incomplete=self._keep_incomplete, stop=self._stop)
+            return run_scan(rig, folder, progress=show, keep_incomplete=self._keep_incomplete, stop=self._stop)
 
     def _show(self, phase: str, committed: int, folder: Path) -> None:
         self._set_state(phase)
@@ -209,10 +209,10 @@ def radar_scan(scan: RadarScan, folder: Path | str, md: dict[str, Any] | None = 
     md
         More metadata for the start document.
     """
-    told = {"plan_name": "radar_scan", "scan_folder": str(Path(folder).resolve()), "rig_file": str(scan._config)}
+    metadata = {"plan_name": "radar_scan", "scan_folder": str(Path(folder).resolve()), "rig_file": str(scan._config)}
 
     @bpp.stage_decorator([scan])
-    @bpp.run_decorator(md={**told, **(md or {})})
+    @bpp.run_decorator(md={**metadata, **(md or {})})
     def run() -> Iterator[Any]:
         yield from bps.prepare(scan, folder, wait=True)
         yield from bps.clear_checkpoint()  # rows cannot be replayed

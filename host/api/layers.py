@@ -1,4 +1,4 @@
-"""A stack of layers fitted to every patch of a scan, as a dataset."""
+"""Fit of a stack of layers to every patch of a scan, as a dataset."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def layer_dataset(
     done: ProcessedScan, chirp: Chirp, stack: Sequence[str | Layer], bands: int | None, amplitude_percent: float
 ) -> xarray.Dataset:
-    """The unknown layer of a stack at each patch; parameters and errors as `Scan.layers`."""
+    """Fit the unknown layer of a stack at each patch; parameters and errors as `Scan.layers`."""
     import xarray
 
     if done.verdict is not None and not done.verdict.usable:

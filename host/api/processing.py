@@ -20,7 +20,7 @@ from polysight.shared.errors import DataError
 
 
 class Processing:
-    """Processes one source; each step is done once, when its result is first asked for.
+    """Processes one source; each step runs once, when its result is first used.
 
     Parameters
     ----------

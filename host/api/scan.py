@@ -1,4 +1,4 @@
-"""A scan opened for notebooks: results as datasets, computed when they are asked for."""
+"""A scan opened for notebooks: results as datasets, computed on first use."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def _products_only(path: Path, options: Options, anew: bool) -> Scan:
 
 
 def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:
-    """Recorded data of any layout. Raises DataError or ConfigError."""
+    """Open recorded data of any layout. Raises DataError or ConfigError."""
     if not path.is_dir():
         raise no_such(path)
     if (path / MANIFEST).exists():
@@ -343,13 +343,13 @@ class Scan:
     def __repr__(self) -> str:
         try:
             rows = self.rows
-            told = f"{len(rows.committed)} of {rows.planned} rows"
-            told += f" (missing {ranges_text(rows.missing)})" if rows.missing else ""
+            count = f"{len(rows.committed)} of {rows.planned} rows"
+            count += f" (missing {ranges_text(rows.missing)})" if rows.missing else ""
         except DataError:
-            told = "number of rows not known"
+            count = "number of rows not known"
         simulated = "SIMULATED, " if self.simulated else ""
         kind = "saved products" if self._saved_products is not None else "recorded rows"
-        return f"<Scan {self.scan_id or 'without a name'}: {simulated}{told}, {kind} in {self.folder}>"
+        return f"<Scan {self.scan_id or 'without a name'}: {simulated}{count}, {kind} in {self.folder}>"
 
     @cached_property
     def _processing(self) -> Processing:

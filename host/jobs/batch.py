@@ -33,7 +33,7 @@ SUMMARY = "processed.json"
 Status = Literal["done", "skipped", "failed", "stopped"]
 _PRODUCTS = ("image.npz", "quality.json")
 PROGRAM = (sys.executable, "-m", "polysight.host.jobs.batch_worker")
-"""Processes the one job on its standard input."""
+"""Module that processes the job on its standard input."""
 ALIVE = "POLYSIGHT_PARENT_ALIVE"
 """Environment of the program: number of a pipe that ends with the program that started it."""
 _FREE = 0.8  # of the free memory is used
@@ -41,7 +41,7 @@ _POLL_S = 0.2
 
 
 class Job(msgspec.Struct, frozen=True):
-    """One scan to process, as plain data: what is asked, what the products will depend on, rows at a time."""
+    """One scan to process, as plain data: request, dependencies of its products, rows at a time."""
 
     request: ProcessRequest
     made_with: dict[str, Any]
@@ -70,7 +70,7 @@ class Outcome:
 
 
 def scans_of(paths: Sequence[Path]) -> list[Path]:
-    """The scans behind paths: a scan folder is itself, any other folder the scans in it, if it holds any."""
+    """Return the scans at paths: scan folders themselves, and the scans in other folders."""
     out: list[Path] = []
     for path in paths:
         inside = [] if is_source(path) or not path.is_dir() else sorted(p for p in path.iterdir() if is_source(p))
@@ -79,7 +79,7 @@ def scans_of(paths: Sequence[Path]) -> list[Path]:
 
 
 def jobs_of(requests: Sequence[ProcessRequest]) -> list[Job]:
-    """A job for each request.
+    """Make a job for each request.
 
     Raises
     ------
@@ -107,7 +107,7 @@ NOT_DATA = ("samples", "products", ".products.new", ".products.old", "products-e
 
 
 def made_with(request: ProcessRequest) -> dict[str, Any]:
-    """All that products depend on: releases, options (files by digest), and the data's files by size and time."""
+    """Return the dependencies of products: releases, options (files by digest), data files by size and time."""
     data = Path(request.data)
     choices = {**request.choices(), **{name: _digest(path) for name, path in request.paths().items()}}
     files = sorted(p for p in data.rglob("*") if p.is_file() and p.relative_to(data).parts[0] not in NOT_DATA)
@@ -117,7 +117,7 @@ def made_with(request: ProcessRequest) -> dict[str, Any]:
 
 
 def _digest(path: Path) -> Any:
-    """A file by its content, a folder (a scan, products) by its files' names, sizes and times."""
+    """Digest of a file's content, or of the names, sizes and times of a folder's files."""
     if path.is_file():
         return hashlib.sha256(path.read_bytes()).hexdigest()
     if path.is_dir():
@@ -126,7 +126,7 @@ def _digest(path: Path) -> Any:
 
 
 def finished(job: Job) -> bool:
-    """True if the products exist and were made with exactly this."""
+    """True if the products exist and have exactly these dependencies."""
     try:
         mark = read_json(job.out / FINISHED)
     except (OSError, ValueError, PolysightError):
@@ -136,7 +136,7 @@ def finished(job: Job) -> bool:
 
 
 def run_scan(job: Job, stop: Event | None = None) -> Outcome:
-    """Process one scan in a program of its own; what it says goes to `<out>.log`. Never raises for what it does.
+    """Process one scan in a program of its own; its output goes to `<out>.log`. Failures are part of the result.
 
     That program ends when this one does, however this one ends. A scan that carries its mark is done: a Dask worker
     may have been killed between the mark and its answer.
@@ -167,7 +167,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
 
 
 def _follow(child: subprocess.Popen[bytes], job: Job, stop: Event | None) -> None:
-    """Give a program its job, and wait for its end; end it when `stop` is set."""
+    """Send a program its job and wait for its end; terminate it when `stop` is set."""
     if child.stdin is not None:
         with suppress(BrokenPipeError):  # it ended before it read; its log says why
             child.stdin.write(msgspec.msgpack.encode(job))
@@ -194,7 +194,7 @@ def _why(log: Path, status: int) -> str:
 
 
 def run_here(jobs: Sequence[Job], at_once: int) -> Iterator[Outcome]:
-    """Outcomes as they come, `at_once` programs at a time. Ended early, the programs are ended too."""
+    """Yield outcomes as they come, `at_once` programs at a time; terminate the programs if stopped early."""
     stop = Event()
     with ThreadPoolExecutor(at_once) as pool:
         try:
@@ -207,7 +207,7 @@ def run_here(jobs: Sequence[Job], at_once: int) -> Iterator[Outcome]:
 
 
 def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iterator[Outcome]:
-    """Outcomes as they come from a Dask cluster whose workers see the same folders.
+    """Yield outcomes as they come from a Dask cluster whose workers see the same folders.
 
     Raises
     ------
@@ -245,7 +245,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
 
 
 def memory_bytes(positions: int) -> int:
-    """Memory that processing one scan takes, by its number of positions: measured, see docs/how-to/authors-data.md."""
+    """Estimate the memory of processing one scan from its positions (measured, docs/how-to/authors-data.md)."""
     return 400_000_000 + 6_000 * positions
 
 
@@ -255,7 +255,7 @@ def at_once(positions: int, cores: int, free_bytes: int) -> int:
 
 
 def free_memory_bytes() -> int:
-    """Memory that programs can have without swapping."""
+    """Available memory without swapping."""
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
@@ -268,7 +268,7 @@ def free_memory_bytes() -> int:
 def process_many(
     jobs: Sequence[Job], out: Path, jobs_at_once: int, dask: str | None = None, again: bool = False
 ) -> list[Outcome]:
-    """Process what is not finished; says what becomes of each on stderr, and writes `processed.json` as it goes.
+    """Process unfinished scans; report each on stderr and update `processed.json` after each.
 
     Raises
     ------
@@ -316,7 +316,7 @@ def process_several(
 
 
 def _positions(data: Path) -> int:
-    """Positions of a scan, or of the published grid where its files do not say it at a glance."""
+    """Number of positions of a scan; of the published grid if it cannot be read quickly."""
     try:
         if (data / COLLECTION).exists():
             s = read_json(data / COLLECTION)
@@ -358,7 +358,7 @@ def _verdict(products: Path) -> str:
 
 
 def _found(products: Path) -> tuple[str, str]:
-    """Share of positions that are masked or were never recorded, and number of patches, as the products say."""
+    """Share of masked or missing positions and number of patches, from the products."""
     saved = SavedProducts(products)
     try:
         boards = saved.quality["boards"].values()

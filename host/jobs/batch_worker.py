@@ -18,7 +18,7 @@ from polysight.shared.errors import PolysightError
 
 
 def end_with(pipe: str | None) -> None:
-    """End this program when the one that holds the other end of a pipe does: a killed worker leaves nothing running."""
+    """Exit when the other end of a pipe closes, so that a killed worker leaves nothing running."""
     if pipe is None:
         return
 
@@ -30,7 +30,7 @@ def end_with(pipe: str | None) -> None:
 
 
 def main() -> int:
-    """Process one job; returns the exit status. What it says goes to stdout and stderr."""
+    """Process one job; returns the exit status. Output goes to stdout and stderr."""
     end_with(os.environ.get(ALIVE))
     job = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=Job)
     began = time.monotonic()

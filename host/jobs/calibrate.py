@@ -1,4 +1,4 @@
-"""`polysight calibrate` and `polysight leakage`: what recorded scans say of the rig.
+"""`polysight calibrate` and `polysight leakage`: calibration of the rig from recorded scans.
 
 Each `calibrate` command looks at scans, writes one dated file, and says what that changes; neither the scans nor the
 rig file are written. `leakage` prints what belongs into the rig file's [polarimetry].
@@ -59,7 +59,7 @@ def _print_result(
 
 
 def with_places_of(scanned: Instrument, other: Instrument) -> Instrument:
-    """A scan's rig with another rig file's antennas, mounts and object plane. Raises ConfigError."""
+    """Return a scan's rig with antennas, mounts and object plane of another rig file. Raises ConfigError."""
     mounts = {b.name: b.mount for b in other.boards}
     if set(mounts) != {b.name for b in scanned.boards}:
         raise ConfigError(f"the rig file has the boards {sorted(mounts)}", "it is of another rig", "give the scan's")
@@ -72,7 +72,7 @@ def _key(kind: str, path: Path) -> list[str]:
 
 
 def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, out: Path, as_json: bool) -> int:
-    """Places of boards and plane from a scan of known points. Raises PolysightError."""
+    """Calibrate positions of boards and plane with a scan of known points. Raises PolysightError."""
     from polysight.host.calibration import Prior, calibration_of_scan, fit_places, load_echoes, places_file, read_target
 
     points = read_target(target)
@@ -108,7 +108,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
 
 
 def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) -> int:
-    """The receivers' filters from scans at several start frequencies. Raises PolysightError."""
+    """Calibrate the receivers' high-pass filters with scans at several start frequencies. Raises PolysightError."""
     from polysight.host.calibration import fit_filter
 
     rig = None if config is None else load_instrument(config)
@@ -136,7 +136,7 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
 
 
 def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool) -> int:
-    """Gains at every pixel from a scan of a metal plate over the plane, in sub-bands too. Raises PolysightError."""
+    """Calibrate gains per pixel and sub-band with a scan of a metal plate. Raises PolysightError."""
     from polysight.host.calibration import MetalFile, read_calibration, write_metal
     from polysight.host.imaging import sub_bands
 
@@ -160,7 +160,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
 
 
 def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
-    """Start offsets that put the direct paths in the middle of the band. Raises PolysightError."""
+    """Choose start offsets that centre the direct paths in the IF band. Raises PolysightError."""
     from polysight.host.calibration import fit_start
 
     source = open_raw(scan, None if config is None else load_instrument(config))
@@ -187,7 +187,7 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
 def leakage_of_scans(
     plate: Path, strips: Sequence[tuple[float, Path]], config: Path | None = None
 ) -> tuple[Leakage, dict[str, Any]]:
-    """Leakage and gains' imbalance from scans of a metal plate and of metal strips in its place.
+    """Estimate leakage and gain imbalance from scans of a metal plate and of metal strips in its place.
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ def _leakage_std(
 
 
 def leakage(plate: Path, strips: Sequence[tuple[float, Path]], config: Path | None, as_json: bool) -> int:
-    """`polysight leakage`: print what belongs into the rig file's [polarimetry]; returns the exit status."""
+    """`polysight leakage`: print the keys for the rig file's [polarimetry]; return the exit status."""
     found, facts = leakage_of_scans(plate, strips, config)
     rows = {key: [round(z.real, 5), round(z.imag, 5)] for key, z in (("leakage_h", found.h), ("leakage_v", found.v))}
     imbalance = {"db": 20 * float(np.log10(abs(found.imbalance))), "deg": float(np.degrees(np.angle(found.imbalance)))}

@@ -1,4 +1,4 @@
-"""`polysight card`: how every hop to the capture cards is, writing a card's addresses, resetting a card."""
+"""`polysight card`: check the network path to the cards, write a card's addresses, reset a card."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _PAUSE_S = 0.2
 
 
 def confirm(what: str, word: str, yes: bool) -> str:
-    """Print what would be done and return the typed answer; with `yes` return `word` without asking."""
+    """Print the planned action and return the typed answer; with `yes` return `word` without asking."""
     sys.stdout.write(f"{what}\n")
     if yes:
         return word
@@ -28,7 +28,7 @@ def confirm(what: str, word: str, yes: bool) -> str:
 
 
 def show_cards(config: Path, listen_s: float, as_json: bool) -> int:
-    """Try every hop to every card; 0 when each card that is recorded can be used. Raises ConfigError."""
+    """Check every hop to every card; return 0 if all recorded cards can be used. Raises ConfigError."""
     rig = load_instrument(config)
     if listen_s:
         sys.stderr.write(f"listening for at most {listen_s:g} s: let the radars be triggered now\n")
@@ -41,7 +41,7 @@ def show_cards(config: Path, listen_s: float, as_json: bool) -> int:
 
 
 def _facts(survey: CardSurvey) -> dict[str, object]:
-    """A survey for programs."""
+    """Survey results as plain data."""
     board = survey.board
     keys = ("name", "role", "record", "card_address", "host_address", "command_port", "data_port")
     return {
@@ -54,7 +54,7 @@ def _facts(survey: CardSurvey) -> dict[str, object]:
 
 
 def _text(survey: CardSurvey) -> str:
-    """A survey for people."""
+    """Survey results as text."""
     b = survey.board
     unused = "" if b.record else ", not recorded: only asked"
     head = (
@@ -82,7 +82,7 @@ def _board(rig: Instrument, name: str, config: Path) -> Board:
 
 
 def _present(board: Board, at: str) -> Board:
-    """The board where its card answers now: `ADDRESS` or `ADDRESS:PORT`. Raises ConfigError."""
+    """Return the board with its card's present address, `ADDRESS` or `ADDRESS:PORT`. Raises ConfigError."""
     address, _, port = at.partition(":")
     number = int(port) if port.isdigit() else board.command_port
     if (port and not port.isdigit()) or not 1 <= number <= 65535:
@@ -93,7 +93,7 @@ def _present(board: Board, at: str) -> Board:
 
 
 def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: float) -> int:
-    """Write a board's addresses into the card that is reached now, once confirmed, and look for it afterwards.
+    """Write a board's addresses into its card after confirmation, and check that it answers there.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
     if twins:
         raise ConfigError(
             f"{config} gives {board.card_address} to {', '.join(twins)} too",
-            "two cards of one address cannot be told apart",
+            "two cards share one address",
             "give each its own card_address",
         )
     now = _present(board, at)
@@ -131,7 +131,7 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
 
 
 def _seen_again(board: Board, wait_s: float, same_place: bool) -> str:
-    """The FPGA version the card says at its new place. Where that is its old one, it must have been silent before."""
+    """Return the FPGA version that the card reports at its new address."""
     sys.stdout.write(f"{board.name}: looking for it at {board.card_address} for at most {wait_s:g} s\n")
     sys.stdout.flush()
     deadline, was_off = time.monotonic() + wait_s, not same_place

@@ -178,7 +178,7 @@ def _contradictions(
     matched: Sequence[MatchedPatch],
     named: Sequence[NamedPatch],
 ) -> list[str]:
-    """A line for each unknown patch that is one material under one angle and another under the next."""
+    """Describe unknown patches that match different materials at different angles, one line each."""
     if len(angles_deg) < 2 or all(n.verdict.name != UNKNOWN for n in named):
         return []
     alone = [
@@ -197,7 +197,7 @@ def _contradictions(
 
 
 def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
-    """How many were named right; unknown ones of a material that the library lacks are neither right nor wrong."""
+    """Count right names; unknown patches of materials that the library lacks do not count."""
     strange = [r for r in rows if r["truth"] and r["truth"] not in names]
     known = [r for r in rows if r["truth"] and not (r in strange and r["name"] == UNKNOWN)]
     if strange:
@@ -211,12 +211,12 @@ def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
 
 
 def _without(scan: ScanPatches, refused: Container[int]) -> ScanPatches:
-    """The patches of a scan that may be judged."""
+    """Patches of a scan that can be classified."""
     return replace(scan, patches=tuple(p for p in scan.patches if p.label not in refused))
 
 
 def _nothing_named(products: Sequence[SavedProducts]) -> dict[str, Any]:
-    """What `classify` prints as JSON when one of the scans has no result: its patches without names."""
+    """JSON of `classify` if a scan has no result: its patches without names."""
     scan = next(p for p in products if p.verdict is not None and not p.verdict.usable)
     nothing = {"name": None, "confidence": None, "votes": {}, "probabilities": {}}
     return {

@@ -23,7 +23,7 @@ _MARK = ".polysight-demo"
 _START_LIMIT_S = 60.0
 _STOP_LIMIT_S = 10.0
 TIME_SCALE = 40.0
-"""Simulated seconds a second: the demo's rows of 18 s pass in about half a second each."""
+"""Simulated seconds per second: a row of 18 s takes about half a second."""
 
 
 def run_simulator(arguments: Sequence[str]) -> int:
@@ -32,7 +32,7 @@ def run_simulator(arguments: Sequence[str]) -> int:
 
 
 def check_scenes(scenes: Iterable[Path], config: Path) -> None:
-    """Have the simulators read scene files, and see that they fit the rig, before anything is begun with them.
+    """Check scene files against the rig before they are used.
 
     Raises
     ------
@@ -46,13 +46,13 @@ def check_scenes(scenes: Iterable[Path], config: Path) -> None:
 
 
 def _error_of(status: int, said: str) -> PolysightError:
-    """The error that a simulator ended with: its words, which say what, why and what to do, and its exit status."""
+    """Return the error of a simulator that failed: its message and exit status."""
     kind = {e.exit_status: e for e in (ConfigError, DataError)}.get(status, DeviceError)
     return kind(said.strip().removeprefix("error: ") or f"a simulator ended with status {status}, without a word")
 
 
 def _check_folder(out: Path) -> None:
-    """Refuse a folder that holds anything but an earlier demo. Raises ConfigError."""
+    """Raise ConfigError if a folder contains anything but an existing demo."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out} is a file", "a demo needs a folder", "give another --out")
     if out.exists() and any(out.iterdir()) and not (out / _MARK).exists():
@@ -60,7 +60,7 @@ def _check_folder(out: Path) -> None:
 
 
 def _fresh_folder(out: Path) -> None:
-    """Make an empty folder; an earlier demo's is replaced."""
+    """Make an empty folder; an existing demo folder is overwritten."""
     if out.exists() and any(out.iterdir()):
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -69,7 +69,7 @@ def _fresh_folder(out: Path) -> None:
 
 @contextmanager
 def simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) -> Iterator[Path]:
-    """The simulated rig with its Pi process, running; yields the rig file that reaches it.
+    """Run the simulated rig with its Pi process; yield the rig file with their addresses.
 
     It runs in a session of its own, so that Ctrl-C ends the scan first and the rig after it.
 
@@ -93,7 +93,7 @@ def simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) ->
 
 
 def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
-    """The rig file named by the rig's `ready` line."""
+    """Return the rig file named by the rig's `ready` line."""
     if rig.stdout is None or rig.stderr is None:
         raise DeviceError("the simulated rig has no output to read")
     deadline = time.monotonic() + _START_LIMIT_S
@@ -152,7 +152,7 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
 
 
 def _run_to_its_end(command: Sequence[str]) -> int:
-    """Run a program and return its status. Ctrl-C ends it first: at once, cleanly, and with one signal only."""
+    """Run a program and return its status. Ctrl-C stops the program first, cleanly, with a single signal."""
     child = subprocess.Popen(command, start_new_session=True)
     try:
         return child.wait()

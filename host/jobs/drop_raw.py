@@ -1,4 +1,4 @@
-"""`polysight drop-raw`: delete raw rows once saved products were made from them, after a word typed in confirmation."""
+"""`polysight drop-raw`: delete raw data of processed rows after a typed confirmation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WORD = "drop"  # confirms the removal of raw rows
 
 
 def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
-    """Remove every raw row that saved products were made from, once confirmed; returns the exit status.
+    """Delete the raw data of processed rows after confirmation; return the exit status.
 
     Raises
     ------
@@ -55,13 +55,13 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
 
 
 def _keep(products: Path, scan: ScanFolder) -> None:
-    """Mark the products as all that is left of the scan, so that they are never replaced."""
+    """Mark the products as the only remaining data of the scan, so that they are never overwritten."""
     mark = {"scan_id": scan.scan_id, "scan": str(scan.path.resolve()), "dropped_utc": utc_now()}
     write_json(products / QUALITY, {**read_products(products).quality, RAW_DROPPED: mark})
 
 
 def processed_digests(folder: Path) -> Digests:
-    """CRCs of the rows that saved products were made from, by board. Raises DataError."""
+    """Return the CRCs of the processed rows, by board. Raises DataError."""
     products = read_products(folder)
     _ = products.image  # raises when it cannot be read
     try:

@@ -46,14 +46,14 @@ from polysight.shared.errors import ConfigError, DataError
 
 METAL, REFERENCE = "metal", "the metal reference"
 FEW = 16
-"""Pixels of a box that a library takes at most; of fewer it learns speckle."""
+"""Largest number of pixels of a box that a library uses; with fewer it would learn speckle."""
 _LARGEST_MARGIN = 0.3  # of a patch's side
 Ask = Callable[[str], str]
 
 
 @dataclass(frozen=True)
 class FoundPatch:
-    """A patch of the products: its number, a box inside it in millimetres, and what it was called."""
+    """A patch of the products: its number, a box inside it in millimetres, and its name."""
 
     number: int
     box: Box
@@ -62,7 +62,7 @@ class FoundPatch:
 
 @dataclass(frozen=True)
 class Edits:
-    """Changes by the options, in this order.
+    """Changes to labels, applied in this order.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class Edits:
 
     @property
     def given(self) -> bool:
-        """True if anything is changed."""
+        """True if there is any change."""
         several = (self.removed, self.renames, self.boxes, self.specimens)
         return self.from_patches or self.metal is not None or any(several)
 
@@ -140,7 +140,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
 
 
 def _save(place: Path, products: SavedProducts, labels: Labels, left_out: Sequence[str]) -> int:
-    """Check, write and tell the boxes; 0."""
+    """Check, write and print the boxes; return 0."""
     checked, notes = save_labels(place, products, labels)
     sys.stdout.write("".join(f"{line}\n" for line in _table(checked)))
     if left_out:
@@ -151,7 +151,7 @@ def _save(place: Path, products: SavedProducts, labels: Labels, left_out: Sequen
 
 
 def save_labels(place: Path, products: SavedProducts, labels: Labels) -> tuple[Labels, list[str]]:
-    """Check the boxes a person drew on products, and write them with their picture into `place`.
+    """Check boxes drawn on products, and write them with their picture into `place`.
 
     Returns
     -------
@@ -184,7 +184,7 @@ def save_labels(place: Path, products: SavedProducts, labels: Labels) -> tuple[L
 
 
 def _dark(products: SavedProducts, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
-    """Names of boxes that are darker in both channels together than any plate that would be found by itself."""
+    """Names of boxes too dark in both channels to be detected as plates automatically."""
     power = np.where(products.valid, np.abs(products.h) ** 2 + np.abs(products.v) ** 2, np.nan)
     if not np.isfinite(power).any():
         return []
@@ -194,7 +194,7 @@ def _dark(products: SavedProducts, masks: Mapping[str, npt.NDArray[np.bool_]]) -
 
 
 def found_patches(products: SavedProducts) -> list[FoundPatch]:
-    """The patches of materials.json, each with a box inside it: its edges are kept free as far as it is wide enough."""
+    """Patches of materials.json, each with a box inside it that avoids its edges if it is wide enough."""
     margin_mm, out = SegmentSettings().margin_mm, []
     for row in products.segments:
         x0, y0, x1, y1 = row["box_mm"]
@@ -208,7 +208,7 @@ def found_patches(products: SavedProducts) -> list[FoundPatch]:
 
 
 def edited(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tuple[Labels, list[str]]:
-    """Boxes after the edits, and the numbers of patches that were left out because nobody named them.
+    """Return boxes after the edits, and the numbers of unnamed patches.
 
     Raises
     ------
@@ -262,7 +262,7 @@ def _refuse_twin(name: str, boxes: Mapping[str, Box]) -> None:
 
 
 def _known(name: str, boxes: Mapping[str, Box]) -> str:
-    """The box that an option means. Raises DataError when there is none."""
+    """Find the box that an option names. Raises DataError if there is none."""
     if name in boxes:
         return name
     clean = box_name(name) if not name.strip().isdecimal() else name.strip()
@@ -272,7 +272,7 @@ def _known(name: str, boxes: Mapping[str, Box]) -> str:
 
 
 def _split(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
-    """`NAME=TEXT`, where NAME is a box; it may hold `=` itself. Raises DataError."""
+    """Split `NAME=TEXT`, where NAME is a box and may contain `=`. Raises DataError."""
     parts = text.split("=")
     for at in range(len(parts) - 1, 0, -1):
         name = "=".join(parts[:at])
@@ -283,7 +283,7 @@ def _split(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
 
 
 def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
-    """Boxes of the patches that a person names. Raises DataError without patches, ConfigError when the input ends."""
+    """Ask for the names of patches. Raises DataError without patches, ConfigError when the input ends."""
     if not found:
         raise DataError("no patch was found", "only images were made, or nothing is in them", "draw it: --box")
     boxes: dict[str, Box] = {}
@@ -306,7 +306,7 @@ def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
 
 
 def _asked_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missing: bool) -> tuple[str, bool]:
-    """A name that can be used and is not there yet, or nothing; and whether it is the metal."""
+    """Ask until the answer is a valid new name or empty; return it, and True if it is the metal."""
     while True:
         answer = ask(question).strip()
         is_metal = answer in ("m", "M") and metal_missing
@@ -327,7 +327,7 @@ def _asked_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missing
 
 
 def _asked_metal(boxes: Mapping[str, Box], ask: Ask) -> str | None:
-    """The box that is metal; None leaves it to the names."""
+    """Return the metal box; None if no option names it."""
     while answer := ask("which of them is the metal reference (Enter: the one with a metal's name): ").strip():
         try:
             return _known(answer, boxes)

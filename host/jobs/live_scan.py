@@ -40,7 +40,7 @@ from polysight.shared.errors import ConfigError, PolysightError, ScanError, advi
 
 PRODUCTS = "products"
 _BESIDE = ("program", "operator.json")
-"""Entries that may be in a folder before its scan begins: a program's log, notes."""
+"""Entries allowed in a folder before its scan begins: a program's log, notes."""
 Take = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
 
 
@@ -54,16 +54,16 @@ def _clock(seconds: float | None) -> str:
 
 
 class _PlainConsole(Console):
-    """A console whose closed pipe is an error like any other; rich's own ends the program and silences stdout."""
+    """Console that raises OSError for a closed pipe; rich's own would exit and silence stdout."""
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError("nobody reads the messages any more")
 
 
 class ScanBar:
-    """Shows :class:`ScanProgress`; on anything but a terminal, a line at every tenth of the scan instead of bars.
+    """Shows :class:`ScanProgress`: bars on a terminal, elsewhere a line at every tenth of the scan.
 
-    What cannot be written is an OSError of `update`, and of nothing else.
+    Only `update` raises OSError if the output cannot be written.
     """
 
     def __init__(self, console: Console | None = None) -> None:
@@ -89,7 +89,7 @@ class ScanBar:
             self._bars.stop()
 
     def update(self, p: ScanProgress) -> None:
-        """Show where the scan is."""
+        """Show the progress of the scan."""
         self._bars.update(self._rows, total=p.rows, completed=p.committed, left=_clock(p.remaining_s))
         if p.row_points:
             text = f"row {p.row}" + (f" take {p.take}" if p.take > 1 else "")
@@ -106,7 +106,7 @@ class ScanBar:
 
 
 class _Live:
-    """Feeds committed rows to a pipeline, made with the first row; behind the last one the images are written."""
+    """Feeds committed rows to a pipeline (made with the first row) and writes the images after the last one."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -150,14 +150,14 @@ def _run(folder: Path, options: Options, process: bool, take: Take) -> int:
 
 
 def _print(text: str) -> None:
-    """Say something on stdout; that nobody reads it is no reason not to make the products."""
+    """Print to stdout; a closed stdout does not stop processing."""
     with suppress(OSError):
         sys.stdout.write(text)
         sys.stdout.flush()
 
 
 def _unprocessed(folder: Path, result: ScanResult, e: BaseException) -> PolysightError:
-    """The error to raise when processing failed beside a scan that went on."""
+    """Return the error to raise if processing failed while the scan continued."""
     again = f"the rows are safe: `polysight process {folder} --out DIR` processes them again"
     if result.exit_status != "success":
         again = f"{result.reason}: `polysight resume {folder}` goes on, and processes all of them again"
@@ -173,7 +173,7 @@ def _unprocessed(folder: Path, result: ScanResult, e: BaseException) -> Polysigh
 
 
 def _check_options(options: Options, rig: Instrument, calibration: Calibration) -> None:
-    """Refuse what could not be used when the scan is over, before the rig is touched. Raises PolysightError."""
+    """Check before the rig moves that the options can be used after the scan. Raises PolysightError."""
     placed = calibration.rig(rig)
     grid = image_grid(placed)
     metal = check_options(options, placed, (grid.x_m, grid.y_m))
@@ -184,7 +184,7 @@ def _check_options(options: Options, rig: Instrument, calibration: Calibration) 
 
 
 def _check_new(folder: Path) -> None:
-    """Refuse a folder that holds something, before the rig is touched. Raises ConfigError."""
+    """Raise ConfigError before the rig moves if the folder is not empty."""
     if not folder.exists():
         return
     if (folder / MANIFEST).exists() and manifest.read(folder / MANIFEST).length:
@@ -225,7 +225,7 @@ def scan(config: Path, request: ProcessRequest, truth: Path | None, keep_incompl
 
 
 def resume(request: ProcessRequest, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
-    """Take the scan `data` up at its first row that is not committed; returns the exit status. Raises PolysightError.
+    """Resume the scan `data` at its first uncommitted row; return the exit status. Raises PolysightError.
 
     `config` is a rig file that says how the rig is reached from now on; the scan's own, where it is None.
     """

@@ -1,4 +1,4 @@
-"""Commands that process data which is already there: process, image, focus, sync-report."""
+"""Commands that process recorded data: process, image, focus, sync-report."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def all_rows(
     view: View = AS_IN_RIG_FILE,
     threads: int | None = None,
 ) -> Pipeline:
-    """A pipeline with all rows of a source, `threads` at a time (None: one a core), with a progress bar.
+    """Run a pipeline over all rows of a source, `threads` at a time (None: one a core), with a progress bar.
 
     What `options` cannot use is refused first. Rows whose samples the scan folder keeps are not synchronised again;
     others are, and then kept.
@@ -93,13 +93,13 @@ def axes_of(pipeline: Pipeline) -> Axes:
 
 
 def imaged(data: Path, config: Path | None, bands: int = 1) -> tuple[Pipeline, ChannelImages]:
-    """A recorded scan of any layout, processed up to its images. Raises PolysightError."""
+    """Process a recorded scan of any layout up to its images. Raises PolysightError."""
     pipeline = all_rows(open_source(data, config, dropped=True), data, bands=bands)
     return pipeline, pipeline.form_images()
 
 
 def truth_of(data: Path) -> tuple[TruthPlate, ...]:
-    """Plates of the truth.json beside the data; none, and a note on stderr, when it is not a truth file."""
+    """Read the plates of truth.json beside the data; none, with a note on stderr, if it is not a truth file."""
     plates, note = find_truth(data)
     if note:
         sys.stderr.write(f"note: {note}\n")
@@ -107,7 +107,7 @@ def truth_of(data: Path) -> tuple[TruthPlate, ...]:
 
 
 def check_options(options: Options, rig: Instrument, axes_m: Axes) -> int | None:
-    """Refuse now, not after hours, what could not be used at the end; say on stderr when nothing will be named.
+    """Check inputs that are needed at the end before the work begins; note on stderr if nothing will be named.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def check_options(options: Options, rig: Instrument, axes_m: Axes) -> int | None
 
 
 def publish_images(pipeline: Pipeline, out: Path) -> None:
-    """The images alone, and what was recorded, unless `out` holds a report: nothing else is waited for.
+    """Write images and recording quality first, unless `out` contains a report.
 
     Raises PolysightError.
     """
@@ -149,7 +149,7 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
 
 
 def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple[TruthPlate, ...]) -> Products:
-    """All products, which take the place of those in `out`; the current step is shown on stderr.
+    """Write all products, replacing those in `out`; show the current step on stderr.
 
     When the metal that was given is none, the images alone do, unless `out` holds a report; the error says where they
     are. Raises PolysightError.
@@ -168,7 +168,7 @@ def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple
 
 
 def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
-    """Images of a metal plate as the reference of other scans. Raises DataError when they show none."""
+    """Make a reference from images of a metal plate. Raises DataError if they show none."""
     name = pipeline.source.scan_id
     h, v = images.level(images.valid)
     found = plane_reference(h, v, images.x_m, images.y_m, images.valid, name=name)
@@ -178,7 +178,7 @@ def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
 def load_reference(
     folder: Path, config: Path | None = None, by_position: bool = True, bands: int = 1
 ) -> PlaneReference:
-    """The reference from a scan of a metal plate that covers the plane.
+    """Make a reference from a scan of a metal plate that covers the plane.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def load_reference(
 
 
 def load_options(request: ProcessRequest) -> Options:
-    """The options of a request: its label file is read, its reference scan is processed. Raises PolysightError."""
+    """Load the options of a request: read its label file, process its reference scan. Raises PolysightError."""
     reference = None
     if request.reference is not None:
         config = None if request.config is None else Path(request.config)
@@ -221,7 +221,7 @@ def load_options(request: ProcessRequest) -> Options:
 
 
 def process(request: ProcessRequest, threads: int | None = None) -> int:
-    """Images, materials and report of one scan, rows on `threads` (None: all cores); returns the exit status.
+    """Make images, materials and report of one scan on `threads` (None: all cores); return the exit status.
 
     Raises PolysightError.
     """
@@ -237,7 +237,7 @@ def process(request: ProcessRequest, threads: int | None = None) -> int:
 
 
 def image(data: Path, out: Path, config: Path | None, view: View = AS_IN_RIG_FILE) -> int:
-    """image.npz and quality.json only; returns the exit status. Raises PolysightError."""
+    """Make image.npz and quality.json only; return the exit status. Raises PolysightError."""
     source = open_source(data, config, dropped=True)
     check_products_folder(out, source.scan_id)
     if isinstance(source, ScanFolder) and SavedProducts(out).quality.get(RAW_DROPPED):

@@ -1,4 +1,4 @@
-"""`polysight radar`: one board by itself, for its first days. Not run on hardware yet."""
+"""`polysight radar`: bring-up of one board. Not run on hardware yet."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _WORDS = {True: "ok", False: "FAILED"}
 
 
 def plan_radars(config: Path) -> int:
-    """Every constraint, and each board's settings as bytes; touches no board; 1 when one is broken.
+    """Print all constraints and each board's settings as bytes, without a board; return 1 if one is violated.
 
     Raises ConfigError.
     """
@@ -41,7 +41,7 @@ def plan_radars(config: Path) -> int:
 
 
 def check_radar(config: Path, name: str, trace: Path | None, slow: bool, as_json: bool) -> int:
-    """One board from USB to one frame, step by step; 0 when every step holds. Raises ConfigError, OSError."""
+    """Check one board from USB to one frame, step by step; return 0 if all pass. Raises ConfigError, OSError."""
     rig = _checked(config, name)
     _fresh(trace)
     clock = SystemClock()
@@ -49,7 +49,7 @@ def check_radar(config: Path, name: str, trace: Path | None, slow: bool, as_json
 
 
 def replay_radar(config: Path, trace: Path, as_json: bool) -> int:
-    """The same check against a trace instead of a board; 0 when every step holds. Raises ConfigError, OSError."""
+    """Run the same check against a trace; return 0 if all steps pass. Raises ConfigError, OSError."""
     words = ReplayedWords(trace)
     name = str(words.facts.get("board", ""))
     if not as_json:
@@ -58,7 +58,7 @@ def replay_radar(config: Path, trace: Path, as_json: bool) -> int:
 
 
 def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path | None, slow: bool) -> int:
-    """Start a board from an image in its RAM, or write its flash and start it from there; verified either way.
+    """Load firmware into a board's RAM, or write its flash, start it, and verify.
 
     Raises ConfigError, DeviceError, OSError.
     """
@@ -114,7 +114,7 @@ def _text(name: str, row: Row) -> str:
 
 
 def _write_flash(board: RadarBoard, file: Path, image: Image) -> str:
-    """Write it, and say how much of it is there when somebody stops it. Raises DeviceError, ConfigError."""
+    """Write the flash; report the progress if stopped. Raises DeviceError, ConfigError."""
     done = [0, 0]
 
     def progress(sent: int, of: int) -> None:
@@ -127,8 +127,8 @@ def _write_flash(board: RadarBoard, file: Path, image: Image) -> str:
         sent, of = done
         again = f"`polysight radar firmware {board.name} {file} --flash`"
         if of and sent < of:
-            told = f"stopped after {sent} of {of} parts: its flash holds no whole image now; again: {again}"
-            sys.stderr.write(f"\n{board.name}: {told}\n")
+            note = f"stopped after {sent} of {of} parts: its flash holds no whole image now; again: {again}"
+            sys.stderr.write(f"\n{board.name}: {note}\n")
         elif of:
             sys.stderr.write(f"\n{board.name}: stopped: its flash was written, not verified; again: {again}\n")
         raise

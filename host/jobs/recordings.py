@@ -36,7 +36,7 @@ BOTTOM_DB = -20.0  # of the plot of a range profile
 
 
 def main_text(report: Report) -> str:
-    """The report for people."""
+    """The report as text."""
     r = report
     lines = [f"{r.path}: {r.bytes} bytes{' of a simulated scan' if r.simulated else ''}"]
     if r.card is not None:
@@ -59,7 +59,7 @@ def main_text(report: Report) -> str:
 
 
 def _guess_lines(r: Report) -> list[str]:
-    """The layouts that were tried, where there was a choice: the likeliest few."""
+    """The most likely layouts, if several were tried."""
     if len(r.guesses) < 2:
         return []
     shapes = (f"{g.shape} {100 * g.likelihood:.0f} %" for g in r.guesses[:GUESSES])
@@ -95,7 +95,7 @@ def _sparkline(profile_db: NDArray[np.float64], width: int = 64) -> str:
 
 
 def validate_folder(folder: Path, as_json: bool) -> int:
-    """Print every fault of a scan folder; 0 when there is none."""
+    """Print all faults of a scan folder; return 0 if there are none."""
     findings = validate(folder)
     if as_json:
         sys.stdout.write(to_json(findings) + "\n")
@@ -105,7 +105,7 @@ def validate_folder(folder: Path, as_json: bool) -> int:
 
 
 def _refuse_text(file: Path) -> None:
-    """Text would be taken for samples: payload has no mark by which it is known. Raises DataError."""
+    """Raise DataError for a text file: raw payload has no magic number, so text would pass as samples."""
     with file.open("rb") as f:
         head = f.read(4096)
     if head.strip() and all(byte >= 0x20 or byte in b"\t\n\r\f" for byte in head) and head.isascii():
@@ -115,13 +115,13 @@ def _refuse_text(file: Path) -> None:
 
 
 def _is_pcap(file: Path) -> bool:
-    """By its first bytes; or by its name, so that one that is cut off says so."""
+    """True if the first bytes, or the file name, are those of a packet capture."""
     with file.open("rb") as f:
         return is_pcap(f.read(4)) or file.suffix == ".pcap"
 
 
 def scan_of(file: Path) -> ScanFolder | None:
-    """The scan a row's file belongs to, where its manifest can be read."""
+    """The scan of a row's file, if its manifest can be read."""
     folders = file.resolve().parents
     if len(folders) < 3 or folders[1].name != "raw" or not (folders[2] / MANIFEST).is_file():
         return None
@@ -132,7 +132,7 @@ def scan_of(file: Path) -> ScanFolder | None:
 
 
 def inspect_file(file: Path, config: Path | None, plot: Path | None, card_address: str, as_json: bool) -> int:
-    """Say what is in a capture, and draw its range profile; returns the exit status, that of DataError if it is none.
+    """Describe a capture and draw its range profile; return the exit status, that of DataError if it is none.
 
     `config` is the rig file it was recorded with; a row of a scan folder brings its own. Raises PolysightError.
     """
@@ -247,7 +247,7 @@ def _placement_lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
 
 
 def replace_folder(folder: Path, as_json: bool) -> int:
-    """Place every row of a scan again, and commit those that change; return 0 if no row is damaged."""
+    """Repeat the placement of all rows of a scan and commit changed rows; return 0 if no row is damaged."""
     rows = replace_rows(ScanFolder.load(folder))
     if as_json:
         sys.stdout.write(json.dumps([asdict(r) for r in rows], indent=1) + "\n")

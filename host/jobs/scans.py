@@ -1,4 +1,4 @@
-"""Commands that look at scans that are there, as the operator's page does: scans, note, ask, probe, compare."""
+"""Commands on existing scans, as on the operator's page: scans, note, ask, probe, compare."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> i
 
 
 def ask_scan(folder: Path, wish: str) -> int:
-    """Ask a running scan for something; returns 0 when it has heard. Raises ScanError."""
+    """Send a command to a running scan; return 0 when it has received it. Raises ScanError."""
     if not folder.is_dir():
         raise no_such(folder)
     send_command(folder, ScanCommand(wish))
@@ -86,7 +86,7 @@ def ask_scan(folder: Path, wish: str) -> int:
 
 
 def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None, as_json: bool) -> int:
-    """Print what a processed scan says of one place; returns 0. Raises DataError."""
+    """Print the results of a processed scan at one place; return 0. Raises DataError."""
     found = probe(folder, *place_mm, library)
     if as_json:
         sys.stdout.write(json.dumps(found, indent=1, ensure_ascii=False) + "\n")
@@ -112,7 +112,7 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
 def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool) -> int:
     """Print the differences of two processed scans; returns 0. Raises DataError."""
     found = compare(first, second)
-    told = found.to_dict()
+    values = found.to_dict()
     if picture is not None:
         from polysight.host.catalogue import draw_comparison
 
@@ -121,13 +121,13 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
         except OSError as e:
             raise DataError(f"{picture}: cannot be written: {e.strerror}", "no such folder, or no permission") from None
     if as_json:
-        sys.stdout.write(json.dumps(told, indent=1, ensure_ascii=False) + "\n")
+        sys.stdout.write(json.dumps(values, indent=1, ensure_ascii=False) + "\n")
         return 0
-    lines = [f"{first} minus {second}: {told['compared']} pixels", *(f"note: {n}" for n in told["notes"])]
-    if told["significant_share"] is not None:
-        share = f"{100 * told['significant_share']:.1f} %"
-        lines.append(f"P differs by more than {told['significant_sigmas']:g} standard deviations in {share} of them")
-    for pair in told["patches"]:
+    lines = [f"{first} minus {second}: {values['compared']} pixels", *(f"note: {n}" for n in values["notes"])]
+    if values["significant_share"] is not None:
+        share = f"{100 * values['significant_share']:.1f} %"
+        lines.append(f"P differs by more than {values['significant_sigmas']:g} standard deviations in {share} of them")
+    for pair in values["patches"]:
         names = " and ".join(map(_called, pair["names"]))
         where = f"x {pair['place_mm'][0]:g}, y {pair['place_mm'][1]:g} mm ({names})"
         d = pair["difference"]

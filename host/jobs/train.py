@@ -1,7 +1,7 @@
 """`polysight train`: a reference library from scans whose materials are known.
 
-What lies where is told by a person (`labels.json` of `polysight label`), or by the truth of a simulated scan. Labels
-win. Rows are processed as `polysight process` does; where they are gone, the saved images serve.
+The materials come from labels (`labels.json` of `polysight label`) or, without labels, from the truth of a simulated
+scan. Rows are processed as by `polysight process`; if the raw rows are deleted, the saved images are used.
 """
 
 from __future__ import annotations
@@ -61,41 +61,41 @@ EDGE_MM = 9.0
 
 
 def training_scan(data: Path, config: Path) -> TrainingScan:
-    """A scan for the library, with the names that a person or the truth gives its patches.
+    """Return a scan for the library, its patches named by labels or truth.
 
     Parameters
     ----------
     data
         A scan folder of any layout, or a folder of products.
     config
-        Rig file for layouts that bring none.
+        Rig file of layouts without one.
 
     Raises
     ------
     DataError
-        when nothing says what lies where, no metal is told, or the labels cannot be used.
+        if neither labels nor truth exist, no metal is marked, or the labels cannot be used.
     NoResult
-        when the verdict on a labelled scan is that it shows nothing.
+        if the verdict of a labelled scan is "no result".
     """
     scan = scan_folder_of(data) or data
-    check_told(data)
+    check_labelled(data)
     if (there := find_labels(data)) is not None:
         path, labels = there
         try:
-            saved = _saved_alone(data, scan)
+            saved = _products_without_rows(data, scan)
             return _from_images(saved, labels) if saved is not None else _from_rows(scan, config, labels)
         except DataError as e:
             raise DataError(f"{path}: {e.what}" if str(path) not in e.what else e.what, e.why, e.remedy) from None
     return _from_truth(scan, config)
 
 
-def check_told(data: Path) -> None:
-    """Refuse a scan whose materials are not told, or whose boxes cannot be used, before any row is read.
+def check_labelled(data: Path) -> None:
+    """Check labels or truth of a scan before any row is read.
 
     Raises
     ------
     DataError
-        as :func:`training_scan` does, as far as the saved image tells.
+        as :func:`training_scan`, as far as the saved image shows it.
     """
     scan = scan_folder_of(data) or data
     if not data.is_dir():
@@ -105,7 +105,7 @@ def check_told(data: Path) -> None:
             return
         raise DataError(
             f"{data}: neither {LABELS} nor {TRUTH} is in it",
-            "what lies where in this scan is not told",
+            "the materials of this scan are not known",
             f"polysight label {data}; then train again",
         )
     if (saved := find_products(data)) is not None:
@@ -116,8 +116,8 @@ def check_told(data: Path) -> None:
             raise DataError(f"{path}: {e.what}", e.why, e.remedy) from None
 
 
-def _saved_alone(data: Path, scan: Path) -> SavedProducts | None:
-    """The products, where the rows they were made from are not there; None where they are. Raises DataError."""
+def _products_without_rows(data: Path, scan: Path) -> SavedProducts | None:
+    """Return the products if the raw rows are deleted, else None. Raises DataError."""
     if scan_folder_of(data) is None:
         return read_products(data)
     if (scan / "products" / IMAGE).exists():
@@ -127,7 +127,7 @@ def _saved_alone(data: Path, scan: Path) -> SavedProducts | None:
 
 
 def _from_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
-    """A labelled scan, imaged again from its rows as `polysight process --labels` does it."""
+    """Process a labelled scan from its rows, as `polysight process --labels`."""
     source = open_source(data, config)
     pipeline = all_rows(source, data)
     images = pipeline.form_images()
@@ -142,7 +142,7 @@ def _from_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
 
 
 def _from_images(saved: SavedProducts, labels: Labels) -> TrainingScan:
-    """A labelled scan of which the images alone are there."""
+    """Use the saved images of a labelled scan."""
     if saved.verdict is not None and not saved.verdict.usable:
         raise saved.verdict.error("no library was written")
     checked = check_labels(labels, saved.x_m, saved.y_m, saved.valid)
@@ -156,7 +156,7 @@ def _from_images(saved: SavedProducts, labels: Labels) -> TrainingScan:
 
 
 def _optics_of(saved: SavedProducts) -> Optics:
-    """Angle and leakage of saved images; leakage that the products say is removed is none any more."""
+    """Return incidence angle and leakage of saved images; leakage that processing removed is zero here."""
     path = saved.folder / SCAN
     if "instrument" not in saved.scan:
         raise DataError(f"{path}: names no rig", "an earlier release processed the scan", "process the scan again")
@@ -177,7 +177,7 @@ def _optics_of(saved: SavedProducts) -> Optics:
 
 
 def _labelled(scan: str, found: MaterialsResult, simulated: bool, labels: Labels) -> TrainingScan:
-    """Names and specimens of the patches, in the order of the boxes."""
+    """Return the training scan with names and specimens of the boxes."""
     boxes = dict(enumerate(labels.boxes, 1))
     for patch in found.patches:
         if patch.patch.label in boxes and not (patch.patch.interior & (found.p != 0)).any():
@@ -188,7 +188,7 @@ def _labelled(scan: str, found: MaterialsResult, simulated: bool, labels: Labels
 
 
 def _from_truth(data: Path, config: Path) -> TrainingScan:
-    """A simulated scan whose plates are known."""
+    """Process a simulated scan with known plates."""
     source = open_source(data, config)
     plates = read_truth(data / TRUTH)
     metal = next((t for t in plates if t.metal), None)
@@ -206,34 +206,34 @@ def _from_truth(data: Path, config: Path) -> TrainingScan:
 def _no_metal(folder: Path) -> DataError:
     return DataError(
         f"{folder}: no box is metal",
-        "all that is learnt of a material is relative to metal",
+        "features of materials are relative to metal",
         f"polysight label {folder} --metal NAME, or measure the rig with `polysight calibrate metal`",
     )
 
 
 def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, times: int = 1) -> int:
-    """Make a library from labelled scans, from scans with known plates, or from scenes that are simulated first.
+    """Make a library from labelled scans, simulated scans with truth, or scenes; return the exit status.
 
-    Each scene is simulated so many `times`, each time with other specimens and other noise.
+    Each scene is simulated `times` times, with other specimens and noise each time.
 
     Raises
     ------
     PolysightError
-        when a file is wrong, found out before anything is simulated; or a scan cannot be learnt from.
+        if a file is wrong (checked before anything is simulated), or a scan cannot be used.
     """
     data, files = list(data), [] if scenes is None else sorted(scenes.glob("*.toml"))
     if not data and scenes is None:
         raise ConfigError(
-            "no scans to learn from",
+            "no scans to train on",
             "neither DATA nor --simulate was given",
-            "polysight train SCAN... --out FILE; polysight label SCAN says what lies where",
+            "polysight train SCAN... --out FILE; polysight label SCAN names the materials",
         )
     if scenes is not None and not files:
         raise DataError(f"{scenes}: no scene files", "the folder is wrong", "give a folder of scene files (*.toml)")
     if not out.parent.is_dir():
         raise ConfigError(f"{out}: no such folder {out.parent}", "the library would be lost", "make it first")
     for folder in data:
-        check_told(folder)
+        check_labelled(folder)
     if files:
         check_scenes(files, config)
     scans = [training_scan(folder, config) for folder in steps(data, [str(folder) for folder in data])]
@@ -253,20 +253,20 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
         if all(s.simulated for s in scans)
         else ""
     )
-    library = make_library(told_apart(scans), note)
+    library = make_library(with_unique_names(scans), note)
     library.save(out)
     sys.stdout.write("".join(f"{line}\n" for line in _summary(out, library)))
     sys.stdout.write(f"{json.dumps(library.fit, indent=1)}\n")
     return 0
 
 
-def told_apart(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
-    """The scans, each with a name of its own: those of one scene are called alike.
+def with_unique_names(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
+    """Number the scans of equal names.
 
     Raises
     ------
     DataError
-        when two are the same scan: it would be judged on what it taught.
+        if a scan is given twice: cross-validation would test it on itself.
     """
     out: list[TrainingScan] = []
     for scan in scans:
@@ -274,7 +274,7 @@ def told_apart(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
         if any(np.array_equal(s.result.h, scan.result.h, equal_nan=True) for s in alike):
             raise DataError(
                 f"scan {scan.scan} is given twice",
-                "it would be judged on what it taught",
+                "cross-validation would test it on itself",
                 "leave one out (a scan folder and its products are one scan)",
             )
         out.append(replace(scan, scan=f"{scan.scan} ({len(alike) + 1})") if alike else scan)
@@ -282,19 +282,19 @@ def told_apart(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
 
 
 def _summary(out: Path, library: Library) -> list[str]:
-    """Contents of a library by material; with a note on names that differ only in case."""
+    """Describe the contents of a library by material; note names that differ only in case."""
     lines = [f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans"]
     for name in library.names:
         mine = [e for e in library.entries if e.name == name]
         pieces = len({e.specimen for e in mine if e.specimen is not None})
-        told = f", {pieces} pieces told apart" if pieces > 1 else ""
+        specimens = f", {pieces} specimens" if pieces > 1 else ""
         scans = len({e.scan for e in mine})
         patches = "1 patch" if len(mine) == 1 else f"{len(mine)} patches"
-        lines.append(f"  {name}: {patches} in {scans} scan{'s' * (scans > 1)}{told}")
+        lines.append(f"  {name}: {patches} in {scans} scan{'s' * (scans > 1)}{specimens}")
     if all(e.specimen is None for e in library.entries):
         lines.append(
-            "note: no box says which piece lies in it, so how pieces differ is mixed with how they lie, and"
-            " probabilities will be more careful than they need be; polysight label SCAN --specimen NAME=WHICH"
+            "note: no box names its specimen, so differences between specimens and placements cannot be"
+            " separated and probabilities are more cautious than necessary; polysight label SCAN --specimen NAME=WHICH"
         )
     for one, other in combinations(library.names, 2):
         if one.casefold() == other.casefold():

@@ -1,4 +1,4 @@
-"""What the requests of one server share: scans, access, live views, threads for reads, caches, sizes on the disk."""
+"""State shared by all requests: scans, access, live views, threads for reads, caches, sizes on the disk."""
 
 from __future__ import annotations
 

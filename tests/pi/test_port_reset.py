@@ -11,6 +11,7 @@ import pytest
 
 from polysight.pi_controller.cli import main
 from polysight.simulators.builds import sketch_compiler
+from tests.support.processes import wait_for
 from tests.support.stage.processes import StageProcess
 
 
@@ -30,5 +31,5 @@ def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys
         assert place("jog", "--dx", "10") == {"x_mm": 10.0, "y_mm": 0.0}
         assert place("jog", "--dx", "-4", "--dy", "1.5") == {"x_mm": 6.0, "y_mm": 1.5}
         subprocess.run(["stty", "-F", port, "hupcl"], check=True)
-        assert main(["jog", *arguments, "--dx", "1"]) != 0
+        wait_for(lambda: main(["jog", *arguments, "--dx", "1"]) != 0, "the stage's reset")
         assert "polysight-pi home" in capsys.readouterr().err

@@ -77,7 +77,7 @@ def test_with_the_token_the_scan_hears(desk, watching):
             assert stop.paused is holds
         assert ask(view, "/api/control/abort", "POST", **{TOKEN_HEADER: TOKEN})[0] == 200
         assert stop.now
-        assert ask(view, "/api/control/destroy", "POST", **{TOKEN_HEADER: TOKEN})[0] == 404
+        assert ask(view, "/api/control/destroy", "POST", **{TOKEN_HEADER: TOKEN})[0] == 400
 
 
 def test_only_post_asks(desk, watching):

@@ -7,6 +7,7 @@ import json
 import os
 import pickle
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -190,7 +191,7 @@ def test_nothing_is_written_through_a_link(write, tmp_path):
     victim.write_bytes(b"mine")
     (tmp_path / "there").symlink_to(victim)
     (tmp_path / ".there.part").symlink_to(victim)
-    with pytest.raises((OSError, DeviceError)):
+    with suppress(OSError, DeviceError):  # or the link itself is replaced
         write(tmp_path / "there", b"theirs")
     assert victim.read_bytes() == b"mine"
 

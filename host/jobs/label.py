@@ -42,6 +42,7 @@ from polysight.host.products import (
     write_atomically,
 )
 from polysight.host.report import label_figure
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError
 
 METAL, REFERENCE = "metal", "the metal reference"
@@ -181,6 +182,23 @@ def save_labels(place: Path, products: SavedProducts, labels: Labels) -> tuple[L
     if checked.metal is None:
         notes.append("no box is metal; train then needs a rig with `polysight calibrate metal`")
     return checked, notes
+
+
+def remove_labels(folder: Path) -> Path:
+    """Delete the boxes drawn by hand of a scan or its products, and their picture; return the deleted label file.
+
+    Raises
+    ------
+    DataError
+        if there are none.
+    """
+    found = find_labels(folder)
+    if found is None:
+        raise DataError(f"{folder}: has no boxes", "none were saved", "draw some first", code=ErrorCode.FILE_MISSING)
+    path = found[0]
+    path.unlink()
+    path.with_name(LABELS_PICTURE).unlink(missing_ok=True)
+    return path
 
 
 def _dark(products: SavedProducts, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:

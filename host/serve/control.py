@@ -17,7 +17,7 @@ from starlette.routing import Route
 
 from polysight.host.acquisition import ScanCommand
 from polysight.host.catalogue import NOTES, PROGRAM, Notes, Summary, write_notes
-from polysight.host.jobs.label import save_labels
+from polysight.host.jobs.label import remove_labels, save_labels
 from polysight.host.materials import Labels
 from polysight.host.plan import Changes, forecast, forecast_values
 from polysight.host.products import find_labels, label_folder, read_products
@@ -300,6 +300,8 @@ async def _labels(site: Site, request: Request, body: LabelRequest) -> dict[str,
     labels = Labels(body.boxes, "mm", body.metal or None, body.specimens, by_hand=True)
 
     def save(folder: Path) -> dict[str, Any]:
+        if not labels.boxes:
+            return {"what": "removed", "file": str(remove_labels(folder)), "metal": None, "notes": []}
         products = read_products(folder)
         place = label_folder(products.folder)
         checked, notes = save_labels(place, products, labels)

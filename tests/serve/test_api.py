@@ -188,3 +188,15 @@ def test_a_client_that_hangs_up_is_no_fault_of_the_server(view, capfd):
 @pytest.mark.parametrize("line", ["/api/scan?scan=" + "a" * 20_000, "/" + "b" * 20_000])
 def test_a_long_request_line_is_refused(view, line):
     assert ask(view, line)[0] in (400, 431)
+
+
+def test_the_last_box_can_be_removed(view):
+    extent = get(view, "/api/result?scan=one")["extent_mm"]
+    box = [extent[0], extent[2], 0.0, 0.0]
+    assert post(view, "/api/labels?scan=one", {"boxes": {}})[0] == 404
+    status, saved = post(view, "/api/labels?scan=one", {"boxes": {"oak": box}})
+    assert status == 200, saved
+    assert Path(saved["file"]).exists()
+    assert post(view, "/api/labels?scan=one", {"boxes": {}})[1]["what"] == "removed"
+    assert not Path(saved["file"]).exists()
+    assert not get(view, "/api/result?scan=one")["labels"]

@@ -89,9 +89,11 @@ export class Labels {
     try {
       const told = await post("labels", this.scan, { boxes, metal: this.boxes.find((b) => b.metal)?.name.trim() ?? null, specimens });
       this.touched = false;
-      by("label-told").textContent = ["Saved. Process again to use them.", ...told.notes.map((n) => `Note: ${n}.`)].join(" ");
-      by("use-labels").disabled = false;
-      by("use-labels").checked = true;
+      const left = told.what === "saved";
+      const done = left ? "Saved. Process again to use them." : "No box is left: the saved ones are deleted.";
+      by("label-told").textContent = [done, ...told.notes.map((n) => `Note: ${n}.`)].join(" ");
+      by("use-labels").disabled = !left;
+      by("use-labels").checked = left;
     } catch (error) { complain("label-told", error); }
   }
 }

@@ -35,7 +35,7 @@ test-uml: $(VENV)/installed  ## the chain on a kernel's GPIO chip, in user-mode 
 	@./tests/install-tools.sh kernel
 	$(BIN)/python -m pytest tests/uml --uml -rP
 
-test-pi: $(VENV)/installed  ## a Raspberry Pi 3B in a box: Debian's kernel on QEMU, the real installation (15 minutes, once)
+test-pi: $(VENV)/installed  ## a Raspberry Pi 3B in a box: Debian's kernel on QEMU, the real installation (a quarter of an hour, or more)
 	@./tests/install-tools.sh pi
 	$(BIN)/python -m pytest tests/pi_box --pi-box -rP
 

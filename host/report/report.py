@@ -160,7 +160,7 @@ def _row(r: dict[str, Any], colours: dict[str, str]) -> dict[str, Any]:
         out["true_real"], out["true_loss"] = f"{true_eps['real']:.2f}", f"{-true_eps['imag']:.2f}"
         if e:
             out["relative_error"] = e["real"] / true_eps["real"] - 1
-            out["error"] = f"{100 * out['relative_error']:+.1f} %"
+            out["error"] = f"{round(100 * out['relative_error'], 1) + 0.0:+.1f} %"  # + 0.0: no -0.0
     return out
 
 

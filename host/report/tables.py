@@ -142,10 +142,11 @@ def key_numbers(ctx: ReportContext, rows: list[dict[str, Any]]) -> list[dict[str
         out.append({"value": value, "text": what})
 
     if ctx.truth and any(m.get("name") for m in ctx.materials):
-        right = sum(r["right"] for r in rows)
+        right = sum(r["right"] and r["true_real"] != "metal" for r in rows)  # metal is the reference, not a result
         strange = sum(r["strange"] for r in rows)
+        plates = sum(t["permittivity"] is not None for t in ctx.truth) - strange
         aside = f", {strange} recognised as not in the library" if strange else ""
-        add(f"{right} of {len(ctx.truth) - strange}", f"plates named right{aside}")
+        add(f"{right} of {plates}", f"plates named right{aside}")
     elif rows:
         add(str(len(rows)), "patches found")
     if ctx.pixel_accuracy is not None:

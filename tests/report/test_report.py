@@ -182,7 +182,7 @@ def test_measured_data_is_not_called_simulated(ctx, tmp_path):
 def test_results_stand_beside_the_truth(page):
     _, html = page
     words = Page(html).words
-    assert "1 of 3 plates named right" in words
+    assert "0 of 2 plates named right" in words  # the metal is a reference, not a result
     assert "50.0 % of interior pixels named right; their own confidence expects 96.0 %" in words
     assert "✗ acrylic" in words
     assert "✓ copper" in words

@@ -1,6 +1,6 @@
 """SIGKILL of a scanning process at random times of the scan and of its resumes; the scan resumes.
 
-The scan is that of tests/support/store: every file is written by the code of the instrument. 30 kills; `--long`: 1,000.
+The scan is that of tests/support/store: every file is written by the code of the instrument. 16 kills; `--long`: 1,000.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def committed(scan: SmallScan) -> dict[str, str]:
 
 
 def test_committed_rows_are_those_of_the_undisturbed_scan(samples, undisturbed, tmp_path, request):
-    wanted, kills, seen, chance = 1000 if request.config.getoption("--long") else 30, 0, set(), random.Random(15)
+    wanted, kills, seen, chance = 1000 if request.config.getoption("--long") else 16, 0, set(), random.Random(15)
     (tmp_path / "whole").mkdir()
     _, whole_s = run_killed(samples, tmp_path / "whole", 60.0)
     number = 0

@@ -40,11 +40,11 @@ def test_card_that_sent_nothing_is_set_up_again_before_the_retake(rig, tmp_path)
     """It was without power for a moment, and answers again, but has forgotten what it was told at the start."""
     card = rig.cards["RH"]
 
-    def told(p) -> None:
+    def answer(p) -> None:
         if (p.state, p.row, p.phase) == ("running", 1, "state"):
             card.silent_data = card.seen.count(CONFIGURE) == 1
 
-    result = run_scan(rig.instrument, tmp_path / "s", progress=told)
+    result = run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert (result.exit_status, result.retakes) == ("success", 1)
     assert (card.seen.count(CONFIGURE), rig.cards["RV"].seen.count(CONFIGURE)) == (2, 1)
 

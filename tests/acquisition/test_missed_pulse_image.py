@@ -42,8 +42,8 @@ class Missed:
         missed = sorted(rng.choice(pulses.size, 2, replace=False).tolist())
         slots = np.delete(np.arange(pulses.size), missed)
         if self._place:
-            arrivals, told = receive(pulses, missed, frame, rng, Load())
-            placed = place_frames(pulses, told, arrivals, frame, PAYLOAD)
+            arrivals, answer = receive(pulses, missed, frame, rng, Load())
+            placed = place_frames(pulses, answer, arrivals, frame, PAYLOAD)
             assert placed.reason == ""
             received = slots[placed.slots >= 0]
             to = placed.slots[placed.slots >= 0]

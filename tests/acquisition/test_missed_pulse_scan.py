@@ -45,18 +45,18 @@ def test_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(paced, payload, 
     for name, slots in missed.items():
         for take in (1, 2):
             paced.cards[name].missed[0, take] = slots
-    told: set[str] = set()
+    answer: set[str] = set()
     for number in range(20):  # a machine too busy to tell masks the whole row
-        told |= _kept(paced, payload, tmp_path / str(number), missed)
-        if told == set(missed):
+        answer |= _kept(paced, payload, tmp_path / str(number), missed)
+        if answer == set(missed):
             return
-    pytest.fail(f"only of {sorted(told)} were the frames told apart, in 20 scans")
+    pytest.fail(f"only of {sorted(answer)} were the frames told apart, in 20 scans")
 
 
 def _kept(paced, payload, folder: Path, missed: dict[str, set[int]]) -> set[str]:
     """Scans, and checks row 0 of every board; those whose frames were told apart."""
     paced.pi.rows_run.clear()  # the rows of the scan before
-    result, told = run_scan(paced.instrument, folder, keep_incomplete=True), set()
+    result, answer = run_scan(paced.instrument, folder, keep_incomplete=True), set()
     assert (result.exit_status, result.incomplete_rows) == ("success", [0])
     assert [f for f in validate(folder) if f.severity == "error"] == []
     frame = paced.instrument.frame_bytes
@@ -68,10 +68,10 @@ def _kept(paced, payload, folder: Path, missed: dict[str, set[int]]) -> set[str]
         np.testing.assert_array_equal(data.payload[~data.mask], want[~data.mask])
         if not data.mask.all():
             assert not data.payload[data.mask].any()
-            told.add(name)
+            answer.add(name)
         fact = result.folder.facts("row_committed")[0]["boards"][name]
         assert fact["pulses_missed"] == len(slots)
-    return told
+    return answer
 
 
 def test_row_with_a_spurious_edge_is_not_complete(paced, payload, tmp_path):

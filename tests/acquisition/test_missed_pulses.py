@@ -35,8 +35,8 @@ missed_sets = st.one_of(
 def placed(missed: set[int], load: Load, seed: int, drift: float = 0.0, **more) -> tuple[PlacedFrames, np.ndarray]:
     pulses = pulse_times(BURSTS)
     rng = np.random.default_rng(seed)
-    arrivals, told = receive(pulses, sorted(missed), FRAME, rng, load, drift, **more)
-    return place_frames(pulses, told, arrivals, FRAME, PAYLOAD), np.delete(np.arange(ALL), sorted(missed))
+    arrivals, answer = receive(pulses, sorted(missed), FRAME, rng, load, drift, **more)
+    return place_frames(pulses, answer, arrivals, FRAME, PAYLOAD), np.delete(np.arange(ALL), sorted(missed))
 
 
 def check(result: PlacedFrames, truth: np.ndarray, missed: set[int]) -> None:
@@ -89,8 +89,8 @@ def test_a_busy_machine_costs_no_more_than_the_bursts_around():
     assert all(r.reason == "" and r.uncertain < PULSES for r in results)
 
 
-def undecided(pulses, told, arrivals, frame=FRAME) -> str:
-    result = place_frames(pulses, told, arrivals, frame, PAYLOAD)
+def undecided(pulses, answer, arrivals, frame=FRAME) -> str:
+    result = place_frames(pulses, answer, arrivals, frame, PAYLOAD)
     assert (result.slots == -1).all()
     assert result.missed == [] or result.reason == ""
     return result.reason
@@ -98,22 +98,22 @@ def undecided(pulses, told, arrivals, frame=FRAME) -> str:
 
 def test_undetermined_frames_are_masked_each_for_its_own_reason():
     pulses, rng = pulse_times(BURSTS), np.random.default_rng(1)
-    arrivals, told = receive(pulses, [9], FRAME, rng, QUIET)
+    arrivals, answer = receive(pulses, [9], FRAME, rng, QUIET)
     each = sorted(16 * b + b for b in range(BURSTS))  # a pulse of every burst
     merged = arrivals.copy()
     merged[:, 0] = arrivals[-1, 0]  # the machine slept through the row
     reasons = [
-        undecided(pulses * 40, told, arrivals),  # simulated time
-        undecided(pulses, told, arrivals, frame=1024),  # several frames in a packet
-        undecided(pulse_times(BURSTS, between_ms=25), told, arrivals),  # no pause between bursts
-        undecided(pulses, told + (np.arange(BURSTS) > 0) * 100 * MS, arrivals),  # late events
-        undecided(pulses[:1], told[:1], arrivals[:20]),  # a single burst
-        undecided(pulses[:6], told[:6], arrivals),  # more frames than pulses
-        undecided(pulses, told, arrivals[:0]),  # no frame
+        undecided(pulses * 40, answer, arrivals),  # simulated time
+        undecided(pulses, answer, arrivals, frame=1024),  # several frames in a packet
+        undecided(pulse_times(BURSTS, between_ms=25), answer, arrivals),  # no pause between bursts
+        undecided(pulses, answer + (np.arange(BURSTS) > 0) * 100 * MS, arrivals),  # late events
+        undecided(pulses[:1], answer[:1], arrivals[:20]),  # a single burst
+        undecided(pulses[:6], answer[:6], arrivals),  # more frames than pulses
+        undecided(pulses, answer, arrivals[:0]),  # no frame
         undecided(pulses, *receive(pulses, each, FRAME, rng, QUIET)[::-1]),  # no complete burst
     ]
     assert len(set(reasons)) == len(reasons)
-    assert all([*reasons, undecided(pulses, told, merged)])
+    assert all([*reasons, undecided(pulses, answer, merged)])
 
 
 @settings(max_examples=60)
@@ -175,13 +175,13 @@ def test_real_sockets_on_this_machine_idle_and_overloaded(make_instrument, tmp_p
 
     A machine too busy to tell masks the whole row; where nothing burns here, one of many rows is told.
     """
-    tries, told = 1 if burners else 40, False
+    tries, answer = 1 if burners else 40, False
     for number in range(tries):
         (tmp_path / str(number)).mkdir()
-        told = _placed_or_masked(make_instrument, tmp_path / str(number), burners)
-        if told:
+        answer = _placed_or_masked(make_instrument, tmp_path / str(number), burners)
+        if answer:
             break
-    assert told or burners, f"not one of {tries} rows was told"
+    assert answer or burners, f"not one of {tries} rows was told"
 
 
 def _placed_or_masked(make_instrument, folder: Path, burners: int) -> bool:
@@ -199,7 +199,7 @@ def _placed_or_masked(make_instrument, folder: Path, burners: int) -> bool:
             receiver.begin_row(0, 1, bursts * PULSES * FRAME, FRAME, path)
             begin = time.monotonic_ns() + 50 * MS
             pulses = begin + (pulse_times(bursts, between_ms=80) - 1_000 * MS)
-            told = _play(out, (board.host_address, board.data_port), pulses, missed)
+            answer = _play(out, (board.host_address, board.data_port), pulses, missed)
             row = receiver.end_row()
     finally:
         stop.set()
@@ -208,7 +208,7 @@ def _placed_or_masked(make_instrument, folder: Path, burners: int) -> bool:
     assert row.slipped
     _, arrivals = read_index(path.with_suffix(".idx"))
     offset = 123_456_789_000  # the Pi's clock
-    result = place_frames(pulses - offset, told, arrivals, FRAME, PAYLOAD)
+    result = place_frames(pulses - offset, answer, arrivals, FRAME, PAYLOAD)
     truth = np.delete(np.arange(bursts * PULSES), missed)
     check(result, truth, set(missed))
     assert result.slots.size == truth.size
@@ -226,7 +226,7 @@ def _placed_or_masked(make_instrument, folder: Path, burners: int) -> bool:
 
 def _play(out: socket.socket, to: tuple[str, int], pulses: np.ndarray, missed: list[int]) -> np.ndarray:
     """Send each frame 0.1 ms after its pulse, full of its number + 1; when the host would hear of each burst."""
-    sequence, sent, rest, told = 1, 0, b"", []
+    sequence, sent, rest, answer = 1, 0, b"", []
     times = pulses.reshape(-1)
     for slot, t in enumerate(times.tolist()):
         while (left := t + 100 * US - time.monotonic_ns()) > 0:
@@ -237,9 +237,9 @@ def _play(out: socket.socket, to: tuple[str, int], pulses: np.ndarray, missed: l
             out.sendto(struct.pack("<IIH", sequence, sent & 0xFFFFFFFF, sent >> 32) + rest[:PAYLOAD], to)
             rest, sent, sequence = rest[PAYLOAD:], sent + PAYLOAD, sequence + 1
         if slot % PULSES == PULSES - 1:
-            told.append(time.monotonic_ns())
+            answer.append(time.monotonic_ns())
     out.sendto(struct.pack("<IIH", sequence, sent & 0xFFFFFFFF, sent >> 32) + rest, to)
-    return np.array(told, dtype=np.int64)
+    return np.array(answer, dtype=np.int64)
 
 
 def arrivals_of(edges: np.ndarray, pulses: np.ndarray, load: Load, seed: int, drift: float = 0.0):
@@ -248,16 +248,16 @@ def arrivals_of(edges: np.ndarray, pulses: np.ndarray, load: Load, seed: int, dr
     rng = np.random.default_rng(seed)
     arrivals, _ = receive(counted, [], FRAME, rng, load, drift)
     rng = np.random.default_rng(seed)  # the same offset
-    _, told = receive(pulses, [], FRAME, rng, load, drift)
-    return arrivals, told
+    _, answer = receive(pulses, [], FRAME, rng, load, drift)
+    return arrivals, answer
 
 
 @settings(max_examples=40, derandomize=True)
 @given(loads, st.integers(0, 2**32), st.sampled_from([0.0, 50e-6, -50e-6]))
 def test_whole_row_is_never_taken_for_a_slipped_one(load, seed, drift):
     pulses = pulse_times(BURSTS)
-    arrivals, told = arrivals_of(pulses.reshape(-1), pulses, load, seed, drift)
-    assert slipped_frames(pulses, told, arrivals, FRAME, PAYLOAD) is None
+    arrivals, answer = arrivals_of(pulses.reshape(-1), pulses, load, seed, drift)
+    assert slipped_frames(pulses, answer, arrivals, FRAME, PAYLOAD) is None
 
 
 @settings(max_examples=40, derandomize=True)
@@ -276,8 +276,8 @@ def test_one_edge_too_many_is_found_and_frames_are_at_their_pulses_or_masked(bur
         edges, truth = np.delete(edges, gone), np.delete(truth, gone)
     at = int(np.searchsorted(edges, extra))
     edges, truth = np.insert(edges, at, extra)[:ALL], np.insert(truth, at, -2)[:ALL]
-    arrivals, told = arrivals_of(edges, pulses, QUIET, seed, drift)
-    result = slipped_frames(pulses, told, arrivals, FRAME, PAYLOAD)
+    arrivals, answer = arrivals_of(edges, pulses, QUIET, seed, drift)
+    result = slipped_frames(pulses, answer, arrivals, FRAME, PAYLOAD)
     assert result is not None
     sure = result.slots >= 0
     np.testing.assert_array_equal(result.slots[sure], truth[sure])
@@ -287,6 +287,6 @@ def test_one_edge_too_many_is_found_and_frames_are_at_their_pulses_or_masked(bur
 
 def test_slip_is_not_looked_for_where_times_do_not_tell():
     pulses = pulse_times(BURSTS)
-    arrivals, told = arrivals_of(pulses.reshape(-1), pulses, QUIET, 1)
-    assert slipped_frames(pulses * 40, told, arrivals, FRAME, PAYLOAD) is None
-    assert slipped_frames(pulses[:1], told[:1], arrivals[:20], FRAME, PAYLOAD) is None
+    arrivals, answer = arrivals_of(pulses.reshape(-1), pulses, QUIET, 1)
+    assert slipped_frames(pulses * 40, answer, arrivals, FRAME, PAYLOAD) is None
+    assert slipped_frames(pulses[:1], answer[:1], arrivals[:20], FRAME, PAYLOAD) is None

@@ -43,9 +43,9 @@ def test_time_left_in_words():
 
 def test_notices_are_shown_and_steps_are_not():
     step = {"rows": ROWS, "committed": 3, "row": 4, "take": 1}
-    told = ("warning", "retake", "home", "check", "connect", "stop", "held", "wait", "end")
-    said = shown(*(ScanProgress(phase, f"so {phase}", **step) for phase in (*told, "row", "state")), terminal=False)
-    assert said.splitlines() == [f"{phase}: so {phase}" for phase in told]
+    answer = ("warning", "retake", "home", "check", "connect", "stop", "held", "wait", "end")
+    said = shown(*(ScanProgress(phase, f"so {phase}", **step) for phase in (*answer, "row", "state")), terminal=False)
+    assert said.splitlines() == [f"{phase}: so {phase}" for phase in answer]
 
 
 def test_bars_over_rows_and_points_on_a_terminal():

@@ -40,13 +40,13 @@ class HomingPi:
         self._began = self.now + 10.0  # accepted, and begun later
 
     def status(self) -> SimpleNamespace:
-        told = {"homed": False, "scan_id": "", "fault": 0, "reason": ""}
+        answer = {"homed": False, "scan_id": "", "fault": 0, "reason": ""}
         if self._began is None:
-            return SimpleNamespace(**told | {"state": "idle"})
+            return SimpleNamespace(**answer | {"state": "idle"})
         if self.now > self._began + self._limit_s:
             lost = {"fault": int(PiFault.STAGE_LOST), "reason": f"not homed after {self._limit_s} s"}
-            return SimpleNamespace(**told | {"state": "fault"} | lost)
-        return SimpleNamespace(**told | {"state": "homing"})
+            return SimpleNamespace(**answer | {"state": "fault"} | lost)
+        return SimpleNamespace(**answer | {"state": "homing"})
 
     def events(self) -> list:
         return []
@@ -148,13 +148,13 @@ def scanned(rig, folder, **stage):
     return result, ScanFolder.load(folder).facts("scan_ended")[-1]
 
 
-@pytest.mark.parametrize(("lost_mm", "told"), [((0.0, 0.0), False), ((0.03, -0.04), False), ((0.0, -1.2), True)])
-def test_what_was_lost_is_in_the_manifest_and_what_matters_is_a_warning(rig, tmp_path, lost_mm, told):
+@pytest.mark.parametrize(("lost_mm", "answer"), [((0.0, 0.0), False), ((0.03, -0.04), False), ((0.0, -1.2), True)])
+def test_what_was_lost_is_in_the_manifest_and_what_matters_is_a_warning(rig, tmp_path, lost_mm, answer):
     rig.pi.lost_mm = lost_mm
     result, ended = scanned(rig, tmp_path / "s")
     assert (result.exit_status, rig.pi.homings) == ("success", 2)
     assert ended["lost_mm"] == list(lost_mm)
-    assert any(f"{lost_mm[1]:.3f} mm in y" in w for w in result.warnings) == told
+    assert any(f"{lost_mm[1]:.3f} mm in y" in w for w in result.warnings) == answer
 
 
 def test_a_stage_without_switches_is_not_homed_again(rig, tmp_path):

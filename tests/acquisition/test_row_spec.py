@@ -69,12 +69,12 @@ def test_radar_backends_and_states_are_described():
 @pytest.mark.parametrize("state", list(RowState))
 def test_only_the_transitions_of_the_table_are_made(state):
     for then in RowState:
-        told: list[RowState] = []
-        transaction = RowTransaction(told.append)
+        answer: list[RowState] = []
+        transaction = RowTransaction(answer.append)
         transaction.state = state
         if then in TRANSITIONS[state]:
             transaction.to(then)
-            assert told == [RowState.WAITING, then]
+            assert answer == [RowState.WAITING, then]
         else:
             with refused(ErrorCode.OTHER, state, then):
                 transaction.to(then)

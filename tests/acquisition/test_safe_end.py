@@ -86,12 +86,12 @@ def test_fault_of_a_row_alone_is_retaken_without_homing(rig, tmp_path):
 
 
 def test_pi_that_restarted_between_rows_ends_the_scan_at_once(rig, tmp_path):
-    def told(p) -> None:
+    def answer(p) -> None:
         if p.phase == "committed" and p.row == 1:
             rig.pi.run, rig.pi.homed, rig.pi.state = None, False, "idle"
 
     with refused(ErrorCode.STAGE_NOT_READY) as e:
-        run_scan(rig.instrument, tmp_path / "s", progress=told)
+        run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert "2 of 4 rows are safe" in e.value.remedy
     assert commands(rig.pi).count(m.Home) == 1
     assert resume_scan(tmp_path / "s").exit_status == "success"
@@ -99,23 +99,23 @@ def test_pi_that_restarted_between_rows_ends_the_scan_at_once(rig, tmp_path):
 
 
 def test_run_that_another_host_has_begun_is_left_alone(rig, tmp_path):
-    def told(p) -> None:
+    def answer(p) -> None:
         if p.phase == "committed" and p.row == 1:
             rig.pi.run = msgspec.structs.replace(rig.pi.run, scan_id="another")
 
     with refused(ErrorCode.STAGE_NOT_READY, "another"):
-        run_scan(rig.instrument, tmp_path / "s", progress=told)
+        run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert m.Abort not in commands(rig.pi)
 
 
 @pytest.mark.parametrize("state", ["idle", "homed"])
 def test_stage_that_is_not_ready_between_rows_is_not_homed(rig, tmp_path, state):
-    def told(p) -> None:
+    def answer(p) -> None:
         if p.phase == "committed" and p.row == 1:
             rig.pi.homed, rig.pi.state = state == "homed", state
 
     with refused(ErrorCode.STAGE_NOT_READY, repr(state)) as e:
-        run_scan(rig.instrument, tmp_path / "s", progress=told)
+        run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert "polysight-pi home" in e.value.remedy
     assert commands(rig.pi).count(m.Home) == 1
 
@@ -139,11 +139,11 @@ def test_homing_that_another_program_started_is_waited_for():
 def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, tmp_path, board):
     """Whichever board it is of; the Pi is told, and rows that wait for processing come after the message."""
     rig.pi.hang_at = {1}
-    told, said_at_end = [], []
+    answer, said_at_end = [], []
     release = threading.Event()
 
     def progress(p) -> None:
-        told.append(p.phase)
+        answer.append(p.phase)
         if p.phase == "state" and (p.state, p.row) == ("running", 1):
             os.kill(receiver_of(board), signal.SIGKILL)
         if p.phase == "end":
@@ -173,12 +173,12 @@ def test_every_error_names_the_rows_that_are_safe(rig, tmp_path, monkeypatch):
 
 
 def test_pi_that_is_lost_in_mid_scan(rig, tmp_path):
-    def told(p) -> None:
+    def answer(p) -> None:
         if p.phase == "committed" and p.row == 1:
             rig.pi.lose_replies = 10_000
 
     with refused(ErrorCode.NO_ANSWER) as e:
-        run_scan(rig.instrument, tmp_path / "s", progress=told)
+        run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert f"2 of 4 rows are safe; `polysight resume {tmp_path / 's'}`" in e.value.remedy
 
 
@@ -188,12 +188,12 @@ def test_pi_that_is_lost_in_mid_scan(rig, tmp_path):
 def test_failing_progress_output_ends_no_scan(rig, tmp_path):
     calls = []
 
-    def told(p) -> None:
+    def answer(p) -> None:
         calls.append(p)
         if p.state == "running":
             raise OSError(28, "No space left on device")
 
-    result = run_scan(rig.instrument, tmp_path / "s", progress=told)
+    result = run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert result.exit_status == "success"
     assert calls[-1].state == "running", "told no more"
     assert [w for w in result.warnings if "No space left" in w]

@@ -103,8 +103,8 @@ def test_a_row_kept_incomplete_has_the_kind_and_board_of_its_fault(rig, tmp_path
     for take in (1, 2, 3):
         rig.cards["RV"].drop[1, take] = {3}
     result = run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
-    told = {f["row"]: f.get("faults") for f in result.folder.facts("row_committed")}
-    assert told == {0: None, 1: [{"kind": "lost_on_the_way", "board": "RV"}], 2: None, 3: None}
+    answer = {f["row"]: f.get("faults") for f in result.folder.facts("row_committed")}
+    assert answer == {0: None, 1: [{"kind": "lost_on_the_way", "board": "RV"}], 2: None, 3: None}
 
 
 def test_every_kind_has_its_words_and_its_line_in_the_specification():
@@ -120,14 +120,14 @@ def test_every_kind_has_its_words_and_its_line_in_the_specification():
 
 def test_words_follow_the_kind_alone():
     """Reasons are for people: whatever they say, the cause is that of the kind."""
-    told = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
+    answer = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
     for kind, (why, do) in CAUSES.items():
-        notice = notice_of_rejection(0, 1, [told], [TakeFault(kind, told, "RV").fact()], "")
+        notice = notice_of_rejection(0, 1, [answer], [TakeFault(kind, answer, "RV").fact()], "")
         assert (notice.why, notice.do) == (why, do)
     pulse_too_long = TakeFault(FaultKind.PI_FAULT, "a pulse was too long", number=int(PiFault.PULSE_TOO_LONG))
     notice = notice_of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.fact()], "")
     assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).why.lower()
     for unknown in ([], [{"kind": "of_a_newer_release", "board": "RV"}]):
-        notice = notice_of_rejection(0, 1, [told], unknown, "")
-        assert (notice.why, notice.detail) == ("", told)
+        notice = notice_of_rejection(0, 1, [answer], unknown, "")
+        assert (notice.why, notice.detail) == ("", answer)
         assert notice.do

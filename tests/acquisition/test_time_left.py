@@ -47,7 +47,7 @@ class Clock:
 
 def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
     """Rows of 12 s, the first after homing, the third after a pause of two hours."""
-    stop, told = StopRequest(), []
+    stop, answer = StopRequest(), []
     clock = Clock(stop)
     monkeypatch.setattr(running, "time", clock)
 
@@ -57,16 +57,16 @@ def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
         if p.state == "checking" and p.phase == "state":
             clock.now += ROW_S
         if p.phase == "committed":
-            told.append((p.committed, p.remaining_s))
+            answer.append((p.committed, p.remaining_s))
             stop.paused = p.committed == 2
         if p.phase == "wait":
-            told.append((p.message, p.remaining_s))
+            answer.append((p.message, p.remaining_s))
 
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
     assert result.exit_status == "success"
     assert [f["fact"] for f in result.folder.facts("scan_paused")] == ["scan_paused"]
-    assert [t for t in told if isinstance(t[0], int)] == [(n, (4 - n) * ROW_S) for n in (1, 2, 3, 4)]
-    assert [left for word, left in told if isinstance(word, str)] == [2 * ROW_S] * 2, "before the pause and after it"
+    assert [t for t in answer if isinstance(t[0], int)] == [(n, (4 - n) * ROW_S) for n in (1, 2, 3, 4)]
+    assert [left for word, left in answer if isinstance(word, str)] == [2 * ROW_S] * 2, "before the pause and after it"
 
 
 def test_the_page_has_the_same_time_left(rig, tmp_path):

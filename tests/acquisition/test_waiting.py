@@ -174,13 +174,13 @@ def test_held_row_that_is_whole_counts_with_a_note(rig, tmp_path):
 def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
     monkeypatch.setattr(row, "row_limit_s", lambda *_: 3.0)  # of every row
     rig.pi.hang_at = {1}
-    told = []
+    answer = []
 
     def progress(p) -> None:
         if p.state == "running" and (p.row, p.take) == (1, 1) and p.phase == "state":
             rig.pi.state = "held"
         if p.phase == "held":
-            told.append(time.monotonic())
+            answer.append(time.monotonic())
             threading.Timer(4.0, end).start()
 
     def end() -> None:
@@ -190,7 +190,7 @@ def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
 
     result = run_scan(rig.instrument, tmp_path / "s", progress=progress)
     assert result.exit_status == "success"
-    assert len(told) == 1
+    assert len(answer) == 1
 
 
 def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):

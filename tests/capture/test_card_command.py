@@ -148,8 +148,8 @@ def test_a_wrong_confirmation_writes_nothing(cards, card, rig):
 
 def programmed(made, name: str, folder: Path, typed: str, *words: str) -> str:
     """What `polysight card program` says while the card `name` is switched off and on once it asks for that."""
-    told = folder / "told.txt"
-    with told.open("w") as out:
+    answer = folder / "told.txt"
+    with answer.open("w") as out:
         command = [str(POLYSIGHT), "card", "program", *words, "--mac", NEW_MAC, "--wait", str(LIMIT_S)]
         done = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=out, stderr=subprocess.STDOUT, text=True, cwd=folder
@@ -158,13 +158,13 @@ def programmed(made, name: str, folder: Path, typed: str, *words: str) -> str:
         with done.stdin:
             done.stdin.write(typed + "\n")
         deadline = time.monotonic() + LIMIT_S
-        while "looking for it" not in told.read_text():
-            assert done.poll() is None, told.read_text()
+        while "looking for it" not in answer.read_text():
+            assert done.poll() is None, answer.read_text()
             assert time.monotonic() < deadline
             time.sleep(0.02)
         made.power_cycle(name)
-        assert done.wait(LIMIT_S) == 0, told.read_text()
-    return told.read_text()
+        assert done.wait(LIMIT_S) == 0, answer.read_text()
+    return answer.read_text()
 
 
 def test_a_new_card_gets_its_boards_addresses(cards, rig, tmp_path):

@@ -24,14 +24,14 @@ def test_a_place_tells_its_own_pixel(processed):
     saved = read_products(processed / "one")
     pixels = Pixels(saved)
     row, column = pixels.nearest(*CENTRE)
-    told = probe(processed / "one", *CENTRE)
+    answer = probe(processed / "one", *CENTRE)
     p = complex(saved.p[row, column])
-    assert complex(told["p"]["real"], told["p"]["imag"]) == pytest.approx(p, abs=1e-4)
+    assert complex(answer["p"]["real"], answer["p"]["imag"]) == pytest.approx(p, abs=1e-4)
     eps = complex(permittivity_from_ratio(p, pixels.theta_rad))
-    assert complex(told["permittivity"]["real"], told["permittivity"]["imag"]) == pytest.approx(eps, abs=1e-3)
-    assert told["place_mm"] == pytest.approx([pixels.x_mm[column], pixels.y_mm[row]], abs=0.01)
-    assert told["patch"]["truth"]["name"] == "PET"
-    assert told["nearest"][0]["name"].startswith("PET")
+    assert complex(answer["permittivity"]["real"], answer["permittivity"]["imag"]) == pytest.approx(eps, abs=1e-3)
+    assert answer["place_mm"] == pytest.approx([pixels.x_mm[column], pixels.y_mm[row]], abs=0.01)
+    assert answer["patch"]["truth"]["name"] == "PET"
+    assert answer["nearest"][0]["name"].startswith("PET")
 
 
 def test_the_error_of_a_pixel_is_that_of_draws(processed):
@@ -49,16 +49,16 @@ def test_the_error_of_a_pixel_is_that_of_draws(processed):
 
 def test_the_range_profile_has_its_peak_at_the_plate(processed):
     for plate in (COPPER, PET):
-        told = probe(processed / "one", *plate["centre_mm"])["profile"]
-        for levels in told["boards"].values():
-            assert abs(told["path_m"][int(np.argmax(levels))]) < 0.03
+        answer = probe(processed / "one", *plate["centre_mm"])["profile"]
+        for levels in answer["boards"].values():
+            assert abs(answer["path_m"][int(np.argmax(levels))]) < 0.03
 
 
 def test_metal_has_no_permittivity_and_says_why(processed):
-    told = probe(processed / "one", *COPPER["centre_mm"])
-    assert told["permittivity"] is None
-    assert "metal" in told["why"]
-    assert told["patch"]["metal_reference"]
+    answer = probe(processed / "one", *COPPER["centre_mm"])
+    assert answer["permittivity"] is None
+    assert "metal" in answer["why"]
+    assert answer["patch"]["metal_reference"]
 
 
 def test_places_outside_the_image_are_refused(processed):
@@ -69,8 +69,8 @@ def test_places_outside_the_image_are_refused(processed):
 
 def test_without_a_result_nothing_is_told_of_materials(tmp_path):
     judged_products(tmp_path, "none", careless=True)
-    told = probe(tmp_path, 0.0, 0.0)
-    assert (told["permittivity"], told["patch"], told["nearest"]) == (None, None, [])
+    answer = probe(tmp_path, 0.0, 0.0)
+    assert (answer["permittivity"], answer["patch"], answer["nearest"]) == (None, None, [])
     assert result_of(tmp_path)["referenced"] is False
     assert {p["name"] for p in result_of(tmp_path)["pictures"]} <= {n for n in MAPS if n[0] in "hvp" and n != "p_sigma"}
 
@@ -84,9 +84,9 @@ def test_a_scan_does_not_differ_from_itself(processed):
 
 def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed):
     found = compare(processed / "one", processed / "two")
-    told = [pair["sigmas"] for pair in found.patches if pair["sigmas"] is not None]
-    assert told
-    assert max(told) < 3
+    answer = [pair["sigmas"] for pair in found.patches if pair["sigmas"] is not None]
+    assert answer
+    assert max(answer) < 3
     assert (found.sigmas > 5).mean() < 0.05  # few pixels that are independent of each other
     back = compare(processed / "two", processed / "one")
     both = np.isfinite(found.p) & np.isfinite(back.p)
@@ -109,13 +109,13 @@ def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
         p = saved.h / v
     write_image(tmp_path / "changed" / "image.npz", saved.h, v, p, saved.x_m, saved.y_m, saved.valid, saved.p_sigma)
     found = compare(processed / "one", tmp_path / "changed")
-    told = np.nan_to_num(found.sigmas)
+    answer = np.nan_to_num(found.sigmas)
     assert found.scatter == 0.1  # a copy, which shares its errors
     expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.p_sigma) / found.scatter
-    assert np.allclose(told[inside], expected[inside], rtol=1e-4)
-    assert told[inside].min() > 0.5
-    told[inside] = 0
-    assert told.max() == 0
+    assert np.allclose(answer[inside], expected[inside], rtol=1e-4)
+    assert answer[inside].min() > 0.5
+    answer[inside] = 0
+    assert answer.max() == 0
 
 
 def test_errors_that_both_scans_share_do_not_hide_a_change():

@@ -49,10 +49,10 @@ def scan(tmp_path) -> Path:
 )
 def test_options_that_would_do_nothing_are_refused(words, said, capsys):
     assert main(words) == 2
-    told = capsys.readouterr().err
-    assert said in told
-    assert "\n  why: " in told
-    assert "\n  do: " in told
+    answer = capsys.readouterr().err
+    assert said in answer
+    assert "\n  why: " in answer
+    assert "\n  do: " in answer
 
 
 def refusal(*words: str) -> str:

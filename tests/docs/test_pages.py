@@ -33,8 +33,8 @@ def test_fault_numbers_and_exit_statuses_are_told():
         e = EXPLANATIONS[fault]
         assert f"| {int(fault)} | {e.what} | {e.why} | {e.remedy} |" in text
     kinds = {PolysightError, NoResult, *PolysightError.__subclasses__()}
-    told = set(map(int, re.findall(r"^\| (\d+) \|", text.split("## Messages")[0], re.MULTILINE)))
-    assert {kind.exit_status for kind in kinds} | {0, 130} == told
+    answer = set(map(int, re.findall(r"^\| (\d+) \|", text.split("## Messages")[0], re.MULTILINE)))
+    assert {kind.exit_status for kind in kinds} | {0, 130} == answer
 
 
 def test_the_drawing_shows_the_rig_file_and_the_sketch():

@@ -99,12 +99,12 @@ def test_types_follow_from_names_as_the_page_says():
 
 
 def test_what_may_be_left_out():
-    told = text("wire.md").split("These may be left out:")[1].split("\n*")[0]
+    answer = text("wire.md").split("These may be left out:")[1].split("\n*")[0]
     for union in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply):
         for message in declared(union):
             for field in msgspec.structs.fields(message):
                 if field.default is not msgspec.NODEFAULT and field.name != "version":
-                    assert f"`{field.name}`" in told, (message.__name__, field.name)
+                    assert f"`{field.name}`" in answer, (message.__name__, field.name)
 
 
 # --- stage line -------------------------------------------------------------------------------------------------------
@@ -185,8 +185,8 @@ def test_sub_blocks_are_those_of_the_published_rig():
     table = {row[0]: row[3] for row in rows("mmwavelink.md", "Sub-blocks")}
     for one in sent:
         number = f"0x{one.ID:04X}"
-        told = table[number]
-        raw = shown("mmwavelink.md", number) if told == "see below" else bytes.fromhex(told.strip("`"))
+        answer = table[number]
+        raw = shown("mmwavelink.md", number) if answer == "see below" else bytes.fromhex(answer.strip("`"))
         assert raw == one.block().data, number
     order = [row[0] for row in rows("mmwavelink.md", "Sub-blocks")]
     places = [order.index(f"0x{one.ID:04X}") for one in sent]
@@ -203,9 +203,9 @@ def test_the_page_names_every_sub_block_that_is_sent():
 
 def test_whole_messages():
     for label, number, what in (("frame start", 3, 1), ("stop 4", 4, 4)):
-        told = decode(shown("mmwavelink.md", f"{label}, sequence {number}"))
-        assert (told.direction, told.kind, told.sequence) == (Direction.HOST_TO_RF, Kind.COMMAND, number)
-        assert told.blocks == (SubBlock(0x0140, struct.pack("<HH", what, 0)),)
+        answer = decode(shown("mmwavelink.md", f"{label}, sequence {number}"))
+        assert (answer.direction, answer.kind, answer.sequence) == (Direction.HOST_TO_RF, Kind.COMMAND, number)
+        assert answer.blocks == (SubBlock(0x0140, struct.pack("<HH", what, 0)),)
 
 
 def test_events():
@@ -214,8 +214,8 @@ def test_events():
         number: name for number, (name, _) in events._EVENTS.items()
     }
     for number, (*_, fatal) in table.items():
-        told = any(events.decode_event(SubBlock(int(number, 16), bytes([k, 0, 0, 0] * 6))).fatal for k in range(255))
-        assert told == (fatal != "no"), number
+        answer = any(events.decode_event(SubBlock(int(number, 16), bytes([k, 0, 0, 0] * 6))).fatal for k in range(255))
+        assert answer == (fatal != "no"), number
 
 
 def test_pages_name_files_that_exist():

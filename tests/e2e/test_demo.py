@@ -53,9 +53,9 @@ def test_from_boards_with_an_empty_flash_to_the_report(bench, scene_file):
     scan = bench.folder / "demo" / "scan"
     lines = [decode_line(line) for line in (scan / "manifest.jsonl").read_bytes().splitlines(keepends=True)]
     first = next(line for line in lines if line["fact"] == "radars")
-    for told in first["boards"].values():
-        assert any("no image header" in line for line in told["events"])
-        assert told["main_firmware"].endswith("patch 2.2.2.0")
-        assert told["die_id"]
+    for answer in first["boards"].values():
+        assert any("no image header" in line for line in answer["events"])
+        assert answer["main_firmware"].endswith("patch 2.2.2.0")
+        assert answer["die_id"]
     assert (scan / "products" / "report.html").is_file()
     assert ended.status in (0, 7), ended.err  # 7: a scan as small as this one has no result, and says so

@@ -26,12 +26,12 @@ def test_rows_come_whole_and_the_manifest_holds_what_the_radars_were_told(bench)
     assert validate(bench.folder / "scan") == []
     first, *rows = result.folder.facts("radars")
     assert set(first["boards"]) == {"LS", "RH", "RV"}
-    for told in first["boards"].values():
-        assert told["state"] == "configured"
-        assert told["rf_firmware"] != ""
-        assert told["calibration"]["passed"]
-        assert told["boot"] == {"power_up_us": 1856.08, "boot_errors": 0, "tests_failed": 0, "cure": ""}  # from RAM
-    assert len({told["die_id"] for told in first["boards"].values()}) == 3
+    for answer in first["boards"].values():
+        assert answer["state"] == "configured"
+        assert answer["rf_firmware"] != ""
+        assert answer["calibration"]["passed"]
+        assert answer["boot"] == {"power_up_us": 1856.08, "boot_errors": 0, "tests_failed": 0, "cure": ""}  # from RAM
+    assert len({answer["die_id"] for answer in first["boards"].values()}) == 3
     assert any("no image header" in line for line in first["boards"]["RH"]["events"])  # its flash was empty
     assert "direct_if_hz" in first
     assert [r["row"] for r in rows if all(b["state"] == "done" for b in r["boards"].values())] == [0, 1, 2]

@@ -59,8 +59,8 @@ def test_own_scene_then_own_material(folder, capsys):
     mine = next(s for s in segments if s["truth"] and s["truth"]["name"] == "my material")
     assert mine["permittivity"]["real"] == pytest.approx(6.0, rel=0.1)
     capsys.readouterr()
-    told = run("own_material")
-    assert abs(told["expected"]) == pytest.approx(np.hypot(mine["ratio"]["real"], mine["ratio"]["imag"]), rel=0.1)
+    answer = run("own_material")
+    assert abs(answer["expected"]) == pytest.approx(np.hypot(mine["ratio"]["real"], mine["ratio"]["imag"]), rel=0.1)
     assert "expected: |P|" in capsys.readouterr().out
     assert "my material" in Library.load(folder / "out" / "own-library.npz").names
 

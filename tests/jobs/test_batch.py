@@ -84,9 +84,9 @@ def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not
     first = process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
     assert {o.name: o.status for o in first} == {"a": "done", "bad": "failed", "c": "done", "killed": "failed"}
     assert [o.name for o in first] == list(names)
-    told = {o.name: o.message for o in first}
-    assert told["bad"] == "no row is recorded whole"
-    assert "signal 9" in told["killed"]
+    answer = {o.name: o.message for o in first}
+    assert answer["bad"] == "no row is recorded whole"
+    assert "signal 9" in answer["killed"]
     assert first[0].memory_gb == 0.5
     assert runs(tmp_path) == sorted(names)
     summary = json.loads((tmp_path / "out" / "processed.json").read_text())
@@ -241,13 +241,13 @@ batch.run_scan(batch.jobs_of([batch.ProcessRequest(data=sys.argv[1], out=sys.arg
 @pytest.mark.timeout(900)
 def test_the_program_of_a_killed_worker_ends_with_it(tmp_path):
     scans(tmp_path / "in", "a")
-    told = tmp_path / "pid"
-    starter = subprocess.Popen([sys.executable, "-c", STARTER, str(tmp_path / "in" / "a"), str(told)])
+    answer = tmp_path / "pid"
+    starter = subprocess.Popen([sys.executable, "-c", STARTER, str(tmp_path / "in" / "a"), str(answer)])
     try:
-        while not (told.exists() and told.read_text()):
+        while not (answer.exists() and answer.read_text()):
             assert starter.poll() is None
             time.sleep(0.1)
-        child = Path("/proc") / told.read_text()
+        child = Path("/proc") / answer.read_text()
         assert child.exists()
     finally:
         starter.kill()
@@ -302,10 +302,10 @@ def test_real_scans_end_to_end(tmp_path, capsys):
     (broken / "data_collection_cfg.json").write_text("{")
     command = ["process", str(tmp_path / "unsynced"), "--out", str(tmp_path / "out")]
     assert main(command) == 1
-    told = capsys.readouterr().out
-    assert "broken  failed" in told
-    assert "not JSON" in told
-    assert "plate   done" in told
+    answer = capsys.readouterr().out
+    assert "broken  failed" in answer
+    assert "not JSON" in answer
+    assert "plate   done" in answer
     assert (tmp_path / "out" / "plate" / "report.html").exists()
     mark = json.loads((tmp_path / "out" / "plate" / FINISHED).read_text())
     assert {"versions", "products", "options", "data"} == set(mark["made_with"])

@@ -41,13 +41,13 @@ def answering(*answers):
 
 def test_patches_get_names_by_their_numbers(products, capsys):
     assert main(["label", str(products), *NAMED]) == 0
-    told = capsys.readouterr().out
+    answer = capsys.readouterr().out
     found = boxes(products)
     assert list(found.boxes) == ["copper", "\u6a61\u6728"]
     assert (found.unit, found.metal, found.by_hand) == ("mm", "copper", True)
     assert found.boxes["copper"] == pytest.approx((-41.0, -11.0, -29.0, 11.0))  # 9 mm inside the patch
-    assert "left out, without a name: 3" in told
-    assert "\u6a61\u6728" in told
+    assert "left out, without a name: 3" in answer
+    assert "\u6a61\u6728" in answer
     assert (products / "labels.png").read_bytes().startswith(b"\x89PNG")
     assert find_labels(products)[1] == found
 
@@ -104,10 +104,10 @@ def test_a_box_where_nothing_shines_is_pointed_out(products, capsys):
 )
 def test_what_nothing_could_be_learnt_from_is_refused_and_nothing_is_written(products, capsys, words, said):
     assert main(["label", str(products), *words]) in (2, 3)
-    told = capsys.readouterr().err
-    assert said in told
-    assert "\n  why: " in told
-    assert "\n  do: " in told
+    answer = capsys.readouterr().err
+    assert said in answer
+    assert "\n  why: " in answer
+    assert "\n  do: " in answer
     assert not (products / "labels.json").exists()
 
 
@@ -141,9 +141,9 @@ def main_error(products, ask):
 
 def test_without_a_terminal_patches_are_listed(products, capsys):
     assert main(["label", str(products)]) == 0  # pytest's stdin is no terminal
-    told = capsys.readouterr().out
-    assert "x -41.0 to -29.0, y -11.0 to 11.0 mm  the metal reference" in told
-    assert "--from-patches" in told
+    answer = capsys.readouterr().out
+    assert "x -41.0 to -29.0, y -11.0 to 11.0 mm  the metal reference" in answer
+    assert "--from-patches" in answer
     assert not (products / "labels.json").exists()
 
 

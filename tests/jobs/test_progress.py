@@ -10,10 +10,10 @@ from polysight.host.jobs.progress import counted, steps
 
 
 def test_every_step_is_named_before_it_begins(capsys):
-    told = [(thing, capsys.readouterr().err) for thing in steps(["a", "b"], ["first", "second"])]
-    assert [thing for thing, _ in told] == ["a", "b"]
-    assert told[0][1] == "[1/2] first ..."
-    assert "[2/2] second ..." in told[1][1]
+    answer = [(thing, capsys.readouterr().err) for thing in steps(["a", "b"], ["first", "second"])]
+    assert [thing for thing, _ in answer] == ["a", "b"]
+    assert answer[0][1] == "[1/2] first ..."
+    assert "[2/2] second ..." in answer[1][1]
     assert capsys.readouterr().err.endswith("s\n")
 
 

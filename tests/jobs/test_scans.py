@@ -27,7 +27,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "scans"
 
 
-def told(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
+def answer(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
     """What a command prints that works."""
     capsys.readouterr()
     assert main([str(word) for word in words]) == 0
@@ -35,19 +35,19 @@ def told(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
 
 
 def test_scans_are_listed_and_found_by_their_notes_and_tags(root, capsys):
-    told(capsys, "note", root / "one", "--text", "Eiche, zweites Brett", "--tag", "oak", "--tag", "new")
+    answer(capsys, "note", root / "one", "--text", "Eiche, zweites Brett", "--tag", "oak", "--tag", "new")
     assert read_notes(root / "one") == Notes("Eiche, zweites Brett", ("oak", "new"))
-    assert "oak" in told(capsys, "note", root / "one", "--untag", "new")
+    assert "oak" in answer(capsys, "note", root / "one", "--untag", "new")
     assert read_notes(root / "one").tags == ("oak",)
-    rows = json.loads(told(capsys, "scans", root, "--json"))["scans"]
+    rows = json.loads(answer(capsys, "scans", root, "--json"))["scans"]
     assert {r["name"]: (r["state"], r["bytes"] > 1000) for r in rows} == {
         "one": ("finished", True),
         "two": ("products", True),
     }
     for words, names in ((["--tag", "oak"], {"one"}), (["--find", "BRETT"], {"one"}), (["--find", "pet"], {"two"})):
-        found = json.loads(told(capsys, "scans", root, "--json", *words))["scans"]
+        found = json.loads(answer(capsys, "scans", root, "--json", *words))["scans"]
         assert {r["name"] for r in found} == names
-    assert "2 scans" in told(capsys, "scans", root)
+    assert "2 scans" in answer(capsys, "scans", root)
 
 
 def test_names_and_tags_reach_the_terminal_without_control_and_direction_marks(root, capsys):
@@ -56,9 +56,9 @@ def test_names_and_tags_reach_the_terminal_without_control_and_direction_marks(r
     materials = root / "two" / "materials.json"
     materials.write_text(materials.read_text().replace("PET", "P\u202eET"))
     for words in (["scans", root], ["note", root / "two"], ["probe", root / "two", "0,0"]):
-        text = told(capsys, *words)
+        text = answer(capsys, *words)
         assert all(c.isprintable() or c == "\n" for c in text), ascii(text)
-    lines = told(capsys, "scans", root).splitlines()
+    lines = answer(capsys, "scans", root).splitlines()
     assert max(len(line) for line in lines if not line.startswith("long")) < 120
 
 
@@ -67,20 +67,20 @@ def test_a_running_scan_is_asked(root, capsys):
     with ControlFolder(root / "one", stop) as desk:
         desk.open()
         wait_for((root / "one" / CONTROL / ALIVE).exists, "the first sign of life")
-        assert "pause" in told(capsys, "ask", root / "one", "pause")
+        assert "pause" in answer(capsys, "ask", root / "one", "pause")
         assert stop.paused
     assert main(["ask", str(root / "one"), "pause"]) == 6
     assert "polysight resume" in capsys.readouterr().err
 
 
 def test_a_place_and_two_scans_are_told(root, capsys, tmp_path):
-    text = told(capsys, "probe", root / "two", "0,0")
+    text = answer(capsys, "probe", root / "two", "0,0")
     assert "|H|" in text
-    assert json.loads(told(capsys, "probe", root / "two", "0,0", "--json"))["referenced"] is True
+    assert json.loads(answer(capsys, "probe", root / "two", "0,0", "--json"))["referenced"] is True
     shutil.copytree(root / "two", root / "three")
-    assert "0.0 %" in told(capsys, "compare", root / "two", root / "three", "--png", tmp_path / "d.png")
+    assert "0.0 %" in answer(capsys, "compare", root / "two", root / "three", "--png", tmp_path / "d.png")
     assert (tmp_path / "d.png").read_bytes().startswith(b"\x89PNG")
-    assert json.loads(told(capsys, "compare", root / "two", root / "three", "--json"))["significant_share"] == 0
+    assert json.loads(answer(capsys, "compare", root / "two", root / "three", "--json"))["significant_share"] == 0
 
 
 @pytest.mark.parametrize("words", [["probe", "one", "0,0"], ["compare", "one", "two"], ["probe", "two", "900,0"]])

@@ -54,9 +54,9 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
     for folder in (first, elsewhere):  # a scan folder, and products without their rows
         assert main(["label", str(folder), *drawn(), "--specimen", f"{MINE}=board 7"]) == 0
     assert main(["train", str(first), str(elsewhere), "--out", str(library)]) == 0
-    told = capsys.readouterr().out
-    assert f"  {MINE}: 2 patches in 2 scans" in told
-    assert "which piece" not in told
+    answer = capsys.readouterr().out
+    assert f"  {MINE}: 2 patches in 2 scans" in answer
+    assert "which piece" not in answer
     known = Library.load(library)
     assert known.names == ("copper", MINE)
     assert known.scans == ("small", "small (2)")
@@ -99,16 +99,16 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
 def test_labels_win_over_the_truth_and_drawn_specimens_are_told_apart(tmp_path):
     spread = {**scene(4), "specimen_spread": [0.02, 0.1]}
     scan = simulate(published_rig(), decode_scene(spread, "test"), tmp_path / "scan")
-    told = [(e.name, e.specimen, e.permittivity is None) for e in entries_of(training_scan(scan, RIG_FILE))]
-    assert [(name, unknown) for name, _, unknown in told] == [("copper", True), ("board", False)]
-    assert len({specimen for _, specimen, _ in told}) == 2
+    answer = [(e.name, e.specimen, e.permittivity is None) for e in entries_of(training_scan(scan, RIG_FILE))]
+    assert [(name, unknown) for name, _, unknown in answer] == [("copper", True), ("board", False)]
+    assert len({specimen for _, specimen, _ in answer}) == 2
     again = simulate(published_rig(), decode_scene({**spread, "seed": 1004}, "test"), tmp_path / "again")
     others = {e.specimen for e in entries_of(training_scan(again, RIG_FILE))}
-    assert not others & {specimen for _, specimen, _ in told}, "another simulation of a scene draws other specimens"
+    assert not others & {specimen for _, specimen, _ in answer}, "another simulation of a scene draws other specimens"
     boxes = {"tin": [-60, -10, -20, 30], f"{MINE}#left": [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
-    told = [(e.name, e.specimen) for e in entries_of(training_scan(scan, RIG_FILE))]
-    assert told == [("tin", None), (MINE, "left")]
+    answer = [(e.name, e.specimen) for e in entries_of(training_scan(scan, RIG_FILE))]
+    assert answer == [("tin", None), (MINE, "left")]
     boxes = {"tin": [-60, -10, 30, 30], MINE: [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
     with pytest.raises(DataError) as caught:

@@ -77,11 +77,11 @@ def test_models_are_judged_for_each_angle_and_for_both_and_the_one_with_probabil
         fit = library.fit_of(angles)
         classifier = Classifier(library, angles_deg=angles)
         assert classifier.model == fit["model"]
-        told = classifier_sentence(classifier)
-        assert fit["model"] in told
-        assert f"{100 * fit['pixel_accuracy']:.1f} % of the pixels" in told
-        assert "optimistic" in told
-        assert "simulated" in told
+        answer = classifier_sentence(classifier)
+        assert fit["model"] in answer
+        assert f"{100 * fit['pixel_accuracy']:.1f} % of the pixels" in answer
+        assert "optimistic" in answer
+        assert "simulated" in answer
 
 
 def test_two_scans_are_enough_to_learn_from():
@@ -143,11 +143,11 @@ def test_a_pixel_that_cannot_be_used_is_unknown_and_an_empty_patch_too(seen, sca
 def test_two_scans_as_typed(folders, capsys):
     arguments = ["classify", str(folders / "55"), str(folders / "60"), "--library", str(folders / "library.npz")]
     assert main([*arguments, "--model", "discriminant", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["source"] == "simulated"
-    assert told["incidence_deg"] == pytest.approx(ANGLES)
-    assert told["model"] == DISCRIMINANT
-    assert sum(p["name"] == p["truth"] for p in told["patches"]) >= 8
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["source"] == "simulated"
+    assert answer["incidence_deg"] == pytest.approx(ANGLES)
+    assert answer["model"] == DISCRIMINANT
+    assert sum(p["name"] == p["truth"] for p in answer["patches"]) >= 8
     assert main([*arguments, "--model", "knn"]) == 0
     out = capsys.readouterr().out
     assert out.startswith("simulated: 9 patches at 55.0 and 60.0 degrees")
@@ -173,10 +173,10 @@ def test_patches_exchanged_between_two_angles_are_told(folders, scans, capsys):
     np.savez(folders / angle / PATCHES, **content)
     command = ["classify", str(folders / "55"), str(folders / angle), "--library", str(folders / "library.npz")]
     assert main([*command, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    unknown = [p for p in told["patches"] if p["truth"] in swap]
+    answer = json.loads(capsys.readouterr().out)
+    unknown = [p for p in answer["patches"] if p["truth"] in swap]
     assert [p["name"] for p in unknown] == ["unknown", "unknown"]
-    assert len(told["contradictions"]) == 2
+    assert len(answer["contradictions"]) == 2
     assert main(command) == 0
     assert capsys.readouterr().out.count("contradicts itself") == 2
 

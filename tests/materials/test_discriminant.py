@@ -226,9 +226,9 @@ def test_the_report_and_the_table_of_models_name_what_was_not_judged(tmp_path, m
         entries.append(Entry(str(name), str(scan), *plain, 55.0, True))
     fit = {"model": DISCRIMINANT, "judged": {DISCRIMINANT: {"pixels": 1.0, "patches": 1.0}}}
     library = Library(tuple(entries), {**fit, "materials": 6, "not_judged": ["lonely"]})
-    told = classifier_sentence(Classifier(library))
-    assert "6 materials" in told
-    assert "lonely" in told
+    answer = classifier_sentence(Classifier(library))
+    assert "6 materials" in answer
+    assert "lonely" in answer
     library.save(tmp_path / "library.npz")
     monkeypatch.setattr("polysight.host.materials.classify.MODELS", {DISCRIMINANT: MODELS[DISCRIMINANT]})
     assert main(["classify", str(tmp_path / "library.npz")]) == 0

@@ -97,9 +97,9 @@ def test_two_thicknesses_that_fit_are_both_told_in_millimetres():
 
 
 def test_a_thickness_that_is_not_determined_is_told_ambiguous():
-    told = LayerFit(4 - 0.1j, 2e-3, 0.02, 0.02, 0.1e-3, 5.0, 9)
-    assert told.ambiguous
-    assert any("ambiguous" in words for words in told.warnings())
+    answer = LayerFit(4 - 0.1j, 2e-3, 0.02, 0.02, 0.1e-3, 5.0, 9)
+    assert answer.ambiguous
+    assert any("ambiguous" in words for words in answer.warnings())
     assert not LayerFit(4 - 0.1j, 2e-3, 0.02, 0.02, 0.02e-3, 5.0, 9).ambiguous
 
 

@@ -101,11 +101,11 @@ def test_classifiers_are_judged_under_both_splits_as_typed(tmp_path, capsys):
     entries = [entry(i, name, q) for i in range(3) for name, q in (("near", 0.2), ("far", 0.4 + 0.1j))]
     Library(tuple(entries)).save(tmp_path / "two.npz")
     assert main(["classify", str(tmp_path / "two.npz"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["source"] == "simulated"
-    assert {s["split"] for s in told["scores"]} == {"whole scans left out, 3 scans", "by pixel (optimistic)"}
-    assert all(s["pixels"] > 0.95 for s in told["scores"])
-    assert np.shape(told["confusion_of_best"]) == (2, 2)
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["source"] == "simulated"
+    assert {s["split"] for s in answer["scores"]} == {"whole scans left out, 3 scans", "by pixel (optimistic)"}
+    assert all(s["pixels"] > 0.95 for s in answer["scores"])
+    assert np.shape(answer["confusion_of_best"]) == (2, 2)
     assert main(["classify", str(tmp_path / "two.npz")]) == 0
     out = capsys.readouterr().out
     assert out.startswith("simulated: 2 materials, 3 scans")

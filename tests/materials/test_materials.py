@@ -255,9 +255,9 @@ def test_rows_are_plain_json(synthetic, library):
 def test_truth_is_carried_but_never_used(synthetic, library):
     scene = synthetic(4)
     classifier = Classifier(library)
-    told = scene.analyse(classifier=classifier)
+    answer = scene.analyse(classifier=classifier)
     blind = analyse(scene.pair, Optics(THETA), classifier=classifier)
-    assert [r.verdict for r in told.patches] == [r.verdict for r in blind.patches]
+    assert [r.verdict for r in answer.patches] == [r.verdict for r in blind.patches]
     assert all(r.truth is None for r in blind.patches)
     assert pixel_accuracy(blind) is None
 

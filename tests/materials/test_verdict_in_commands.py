@@ -73,10 +73,10 @@ def test_json_without_a_result_is_printed_with_nulls(tmp_path, capsys, command):
 def test_no_layer_is_fitted_without_a_result(tmp_path, capsys):
     folder = judged_products(tmp_path, "none", careless=True)
     status = main(["permittivity", str(folder), "--layer", "sheet,?,0.5"])
-    told = capsys.readouterr()
+    answer = capsys.readouterr()
     assert status == NoResult.exit_status
-    assert told.out == ""
-    assert REASON["what"] in told.err
+    assert answer.out == ""
+    assert REASON["what"] in answer.err
 
 
 @pytest.mark.parametrize("level", LEVELS)

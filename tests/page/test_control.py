@@ -119,12 +119,12 @@ def scan_with(samples, folder: Path, stop: StopRequest, at_row_1) -> SmallScan:
     """A scan with its stop request; `at_row_1` is called when row 0 is committed."""
     scan = SmallScan(samples, folder)
 
-    def told(progress) -> None:
+    def answer(progress) -> None:
         if progress.phase == "committed" and progress.row == 0:
             at_row_1()
 
     with scan._connected():
-        host_run.run_scan(samples.instrument, scan.path, stop=stop, progress=told)
+        host_run.run_scan(samples.instrument, scan.path, stop=stop, progress=answer)
     return scan
 
 
@@ -140,9 +140,9 @@ def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished, t
         stop.paused = False
 
     scan = scan_with(samples, tmp_path, stop, pause)
-    told = [f for f in facts(scan.path) if f != "radars"]
-    assert told[:4] == ["scan_started", "row_committed", "scan_paused", "scan_continued"]
-    assert told[4:] == ["row_committed", "row_committed", "scan_ended"]
+    answer = [f for f in facts(scan.path) if f != "radars"]
+    assert answer[:4] == ["scan_started", "row_committed", "scan_paused", "scan_continued"]
+    assert answer[4:] == ["row_committed", "row_committed", "scan_ended"]
     assert validate(scan.path) == []
     rows, others = ScanFolder.load(scan.path).committed(), ScanFolder.load(finished).committed()
     assert {r: c.boards for r, c in rows.items()} == {r: c.boards for r, c in others.items()}

@@ -18,7 +18,7 @@ def facts_of(folder):
     return manifest.read(folder / MANIFEST).facts
 
 
-def told(facts):
+def answer(facts):
     history = ScanHistory(facts[0])
     for fact in facts[1:]:
         history.add_fact(fact)
@@ -37,7 +37,7 @@ def begun(finished):
 
 
 def test_counts_are_those_of_the_scan_folder(finished):
-    history, scan = told(facts_of(finished)), ScanFolder.load(finished)
+    history, scan = answer(facts_of(finished)), ScanFolder.load(finished)
     rows = scan.committed()
     assert history.takes == {row: r.take for row, r in rows.items()}
     assert history.ended is not None
@@ -49,7 +49,7 @@ def test_counts_are_those_of_the_scan_folder(finished):
 
 
 def test_trigger_health_is_the_worst_of_each_row(finished):
-    history, events = told(facts_of(finished)), read_events(finished / EVENTS).events
+    history, events = answer(facts_of(finished)), read_events(finished / EVENTS).events
     history.add_events(events)
     captures = [e for e in events if isinstance(e, Capture)]
     for row, health in history.trigger.items():
@@ -58,7 +58,7 @@ def test_trigger_health_is_the_worst_of_each_row(finished):
 
 
 def test_a_fault_told_twice_is_one(finished):
-    history = told(facts_of(finished))
+    history = answer(facts_of(finished))
     fault = Fault(scan_id="s", seq=9, t_mono_ns=1, number=103, what="a trigger edge was lost")
     history.add_events([fault])
     history.add_events([fault])
@@ -125,7 +125,7 @@ def test_withdrawn_is_missing_until_taken_again(begun):
 
 
 def test_resumed_is_not_ended(finished):
-    history = told(facts_of(finished))
+    history = answer(facts_of(finished))
     history.add_fact({"fact": "scan_resumed", "resumed_utc": UTC.format(5, 0), "rows_missing": 0})
     assert history.ended is None
 

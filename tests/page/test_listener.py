@@ -36,8 +36,8 @@ def pi(tmp_path):
     instrument = msgspec.structs.replace(RIG, pi=msgspec.structs.replace(RIG.pi, **addresses))
     listener = PiListener(instrument, "mine")
 
-    def tell(*told: m.AnyEvent) -> None:
-        for event in told:
+    def tell(*answer: m.AnyEvent) -> None:
+        for event in answer:
             events.send_multipart([EVENT_TOPIC, m.pack(event)])
 
     def beat() -> float:

@@ -32,8 +32,8 @@ def test_it_is_shown_when_the_scan_has_ended(growing: GrowingScan, watching):
     assert json.loads(watch.state.data)["verdict"] is None  # of an earlier run of the scan
     growing.grow_to("scan_ended")
     assert watch.wait_for(lambda s: s["verdict"] is not None, LIMIT_S)
-    told = json.loads(watch.state.data)["verdict"]
-    assert told == {"level": "care", "text": "usable with care", "reasons": [REASON]}
+    answer = json.loads(watch.state.data)["verdict"]
+    assert answer == {"level": "care", "text": "usable with care", "reasons": [REASON]}
 
 
 def test_the_page_shows_it(browser, finished, watching, tmp_path):

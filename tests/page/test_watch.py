@@ -15,7 +15,7 @@ from tests.support.page.live_view import GrowingScan
 from tests.support.processes import LIMIT_S, wait_for
 
 
-def told(watch: Watch) -> dict:
+def answer(watch: Watch) -> dict:
     return json.loads(watch.state.data)
 
 
@@ -37,7 +37,7 @@ def test_a_finished_folder_is_shown_as_it_is(finished, truth, watching):
     scan, pipeline, pictures = truth
     watch = watching(finished)
     assert watch.wait_for(shows(scan.plan.rows), LIMIT_S)
-    state = told(watch)
+    state = answer(watch)
     assert (state["status"]["level"], state["marks"]) == ("done", "ccc")
     assert state["progress"] == {"rows": 3, "committed": 3}
     assert state["scan"]["simulated"] is True
@@ -55,21 +55,21 @@ def test_a_finished_folder_is_shown_as_it_is(finished, truth, watching):
 
 def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
     watch = watching(growing.path, lapse_s=1e6)
-    assert told(watch)["scan"] is None
+    assert answer(watch)["scan"] is None
     growing.live()
     growing.grow_to("scan_started")
     assert watch.wait_for(lambda s: s["scan"] is not None, LIMIT_S)
-    assert told(watch)["marks"] == "..."
+    assert answer(watch)["marks"] == "..."
     revision = 0
     for row in range(3):
         growing.grow_to("row_committed")
         assert watch.wait_for(shows(row + 1), LIMIT_S)
-        state = told(watch)
+        state = answer(watch)
         assert state["marks"] == "c" * (row + 1) + "." * (2 - row)
         assert state["pictures"]["revision"] > revision
         assert state["profile"]["row"] == row
         revision = state["pictures"]["revision"]
-    assert told(watch)["status"]["level"] == "good"
+    assert answer(watch)["status"]["level"] == "good"
     growing.grow_to("scan_ended")
     assert watch.wait_for(lambda s: s["status"]["level"] == "done", LIMIT_S)
 
@@ -80,12 +80,12 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
 
     def lives() -> bool:
         growing.live()
-        state = told(watch)
+        state = answer(watch)
         return state["status"]["level"] == "good" and state["control"]["running"]
 
     wait_for(lives, "that it lives")
     assert watch.wait_for(lambda s: s["status"]["headline"] == "The scan program has ended", LIMIT_S)
-    state = told(watch)
+    state = answer(watch)
     assert not state["control"]["running"]
     assert "polysight resume" in state["status"]["do"]
     assert json.loads(watch.motion.data)["left_s"] is None
@@ -94,7 +94,7 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
 
 def test_an_unfinished_folder_without_a_program_is_said_to_be_at_once(growing, watching):
     growing.grow_to("row_committed")
-    assert told(watching(growing.path))["status"]["headline"] == "The scan program has ended"
+    assert answer(watching(growing.path))["status"]["headline"] == "The scan program has ended"
 
 
 def test_a_damaged_row_is_named_and_the_others_are_shown(growing, watching):
@@ -105,7 +105,7 @@ def test_a_damaged_row_is_named_and_the_others_are_shown(growing, watching):
     watch = watching(growing.path)
     assert watch.wait_for(shows(2), LIMIT_S)
     assert watch.wait_for(lambda s: len(s["notices"]) == 1, LIMIT_S)
-    assert "0001.bin" in told(watch)["notices"][0]["what"]
+    assert "0001.bin" in answer(watch)["notices"][0]["what"]
 
 
 def test_another_scan_in_the_same_place_begins_afresh(growing, finished, watching):
@@ -115,7 +115,7 @@ def test_another_scan_in_the_same_place_begins_afresh(growing, finished, watchin
     shutil.rmtree(growing.path)
     shutil.copytree(finished, growing.path)
     assert watch.wait_for(shows(3), LIMIT_S)
-    assert told(watch)["status"]["level"] == "done"
+    assert answer(watch)["status"]["level"] == "done"
 
 
 def test_looking_on_changes_nothing_in_the_folder(finished, watching, tmp_path):
@@ -135,6 +135,6 @@ def test_looking_on_changes_nothing_in_the_folder(finished, watching, tmp_path):
 def test_a_manifest_of_another_release_is_not_taken_for_none(growing, watching):
     growing.write({"fact": "scan_started", "scan_id": "s", "simulated": True, "instrument": {"new": 1}})
     watch = watching(growing.path)
-    status = told(watch)["status"]
+    status = answer(watch)["status"]
     assert (status["level"], status["headline"]) == ("bad", "This scan cannot be shown")
     assert "polysight validate" in status["do"]

@@ -51,8 +51,8 @@ def test_h_and_v_err_independently():
 
 @pytest.mark.parametrize("name", ["liquids", "powders"])
 def test_the_noise_reaches_the_published_accuracy_of_h_on_draws_it_was_not_set_on(name):
-    told = published()["classification"][name]["h_percent"] / 100
-    assert h_accuracy(groups()[name], calibrated_errors(name, 1), (5, 6, 7)) == pytest.approx(told, abs=0.06)
+    answer = published()["classification"][name]["h_percent"] / 100
+    assert h_accuracy(groups()[name], calibrated_errors(name, 1), (5, 6, 7)) == pytest.approx(answer, abs=0.06)
 
 
 def test_the_phase_error_is_the_published_residual_and_nothing_but_h_was_looked_at(monkeypatch):

@@ -40,7 +40,7 @@ def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
         at += 1
         path = tmp_path / str(at)
         published = []
-        journal = Journal(path, lambda raws, told=published: told.extend(map(m.unpack_event, raws)))
+        journal = Journal(path, lambda raws, out=published: out.extend(map(m.unpack_event, raws)))
         try:
             with FaultyDisk(path, "power cut", at, seed)():
                 journal.open("s", PLAN, 0)

@@ -321,8 +321,8 @@ def test_the_page_shows_the_rules():
     shown = [cells(row) for row in SPEC_PAGE.splitlines() if row.startswith("| `")]
     rules = [(e[0], tuple(s), tuple(to)) for e, s, to, *_ in (r for r in shown if len(r) == 4)]
     assert rules == [(r.event, tuple(r.states.split()), tuple(r.leads_to.split())) for r in RULES]
-    told = {s[0]: (to[0] if to else s[0]) for s, to, *_ in (r for r in shown if len(r) == 3)}
-    assert told == {s: WIRE_STATE.get(s, s) for s in get_args(State)}
+    answer = {s[0]: (to[0] if to else s[0]) for s, to, *_ in (r for r in shown if len(r) == 3)}
+    assert answer == {s: WIRE_STATE.get(s, s) for s in get_args(State)}
     limits = {
         row[0][0]: float(n[0]) for row in shown if len(row) == 3 for n in [row_seconds(SPEC_PAGE, row[0][0])] if n
     }

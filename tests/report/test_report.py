@@ -303,13 +303,13 @@ def test_runs_and_their_mask_are_the_same(ctx):
 
 def test_the_report_says_what_was_masked_the_gains_and_the_whole_rig_file(ctx):
     boards = {"RH": {"masked_columns": {"2": [[0, 3]]}, "rows_recorded": [0, 1, 2, 3], "raw_crc32": {"0": "deadbeef"}}}
-    told = replace(
+    answer = replace(
         scanned(ctx, boards),
         rx_gains={"RH": [{"gain_db": 0.0, "phase_deg": 0.0}, {"gain_db": 1.25, "phase_deg": -8.1}]},
         rig_file='name = "a <rig>"',
     )
-    picture = png(coverage_figure(told, masked_positions(told)))
-    page = Page(render(told, {"coverage": picture}))
+    picture = png(coverage_figure(answer, masked_positions(answer)))
+    page = Page(render(answer, {"coverage": picture}))
     assert base64.b64encode(picture).decode() in page.sources[0]
     assert "RH 3 of 24 (12.50%)" in page.words
     assert "+1.25 dB" in page.words

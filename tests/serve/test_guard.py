@@ -61,8 +61,8 @@ def test_other_sites_may_not_ask(scans):
     with served_folder(scans, TOKEN) as view:
         before = digest_of(scans)
         for origin in ("https://evil.example", "null", own, f"{own}:1", f"https://127.0.0.1:{view.port}"):
-            status, told = post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=origin)
-            assert (status, told["code"]) == (403, ErrorCode.ORIGIN_FOREIGN), origin
+            status, reported = post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=origin)
+            assert (status, reported["code"]) == (403, ErrorCode.ORIGIN_FOREIGN), origin
         for where in ("cross-site", "same-site"):  # same-site: another port of this machine
             assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Sec_Fetch_Site=where)[0] == 403
             assert ask(view, "/api/scans", Sec_Fetch_Site=where)[0] == 403

@@ -232,11 +232,11 @@ def test_a_place_is_probed_by_keyboard_alone(page):
 def test_what_is_named_to_harm_is_shown_as_text(page, scans):
     evil = "<img src=x onerror=\"document.title='broken'\">"
     products = scans / "one" / "products"
-    told = json.loads((products / "materials.json").read_text())
-    for segment in told["segments"]:
+    answer = json.loads((products / "materials.json").read_text())
+    for segment in answer["segments"]:
         segment["name"], segment["why"] = evil, evil
-    told["metal_reference"]["how"] = evil
-    (products / "materials.json").write_text(json.dumps(told))
+    answer["metal_reference"]["how"] = evil
+    (products / "materials.json").write_text(json.dumps(answer))
     (scans / "one" / "operator.json").write_text(json.dumps({"notes": evil, "tags": [evil[:40]]}))
     shutil.move(scans / "two", scans / "<b onclick=x>two")
     page.open("/")

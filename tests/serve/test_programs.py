@@ -56,8 +56,8 @@ def test_a_program_is_known_by_its_number_and_its_begin(tmp_path):
         found = program_of(tmp_path, "scan")
         assert found is not None
         assert found.running
-        told = json.loads((tmp_path / PROGRAM / "scan.json").read_text())
-        (tmp_path / PROGRAM / "scan.json").write_text(json.dumps(told | {"ticks": told["ticks"] - 1}))
+        answer = json.loads((tmp_path / PROGRAM / "scan.json").read_text())
+        (tmp_path / PROGRAM / "scan.json").write_text(json.dumps(answer | {"ticks": answer["ticks"] - 1}))
         assert not program_of(tmp_path, "scan").running  # another process has the number now
     finally:
         os.killpg(child.pid, 9)
@@ -88,8 +88,8 @@ def test_a_made_up_number_is_no_program_that_runs(tmp_path, content):
 
 def test_a_log_is_shown_without_what_moves_a_terminal(tmp_path):
     (tmp_path / PROGRAM).mkdir()
-    told = {"pid": 0, "ticks": 0, "words": ["x"], "started_utc": ""}
-    (tmp_path / PROGRAM / "scan.json").write_text(json.dumps(told))
+    answer = {"pid": 0, "ticks": 0, "words": ["x"], "started_utc": ""}
+    (tmp_path / PROGRAM / "scan.json").write_text(json.dumps(answer))
     (tmp_path / PROGRAM / "scan.log").write_bytes(b"--- t x\n\x1b[31mred\x1b[0m\x07 \xe2\x80\xaeback\xff\n")
     assert program_of(tmp_path, "scan").log == "red back\ufffd"
 

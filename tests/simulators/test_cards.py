@@ -216,9 +216,9 @@ def test_the_report_has_all_counts_and_a_power_cycle_moves_the_card(
         pytest.fail("the card does not answer at its new address")
     cards.send_signal(signal.SIGTERM)
     assert cards.wait(5) == 0
-    told = json.loads(report.read_text())
-    assert told["simulated"] is True
-    counts = told["boards"]["RH"]
+    answer = json.loads(report.read_text())
+    assert answer["simulated"] is True
+    counts = answer["boards"]["RH"]
     assert {"pulses": 16, "missed": 1, "frames": 15, "lost": 2, "lost_bytes": 2 * 1456, "records": 1}.items() <= (
         counts.items()
     )

@@ -123,11 +123,11 @@ def test_the_ddr_overflow_has_its_own_bit_and_leaves_no_gap_in_the_sequence(
     bench.request(*START)
     bench.pulses(50)
     bench.end()
-    told = bench.messages()
+    answer = bench.messages()
     packets = bench.packets()
     lost = int(bench.counts["overflows"] or 0)
     assert lost > 0
-    assert told == [reply(0x0A, 1 << 7)] * lost + [reply(0x0A, 1 << 8)]
+    assert answer == [reply(0x0A, 1 << 7)] * lost + [reply(0x0A, 1 << 8)]
     assert [struct.unpack_from("<I", p)[0] for p in packets] == list(range(1, len(packets) + 1))
     assert len(payload(packets)) == 50 * FRAME - lost * FRAME // 2
 

@@ -98,8 +98,8 @@ def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, 
         bursts = [at_point(track, index, row.column(i), 10**9 + i * 10**8) for i in range(row.points)]
         sent = [pulse for burst in bursts for pulse in burst]
         at = track.offsets_mm([pulse.t_ns for pulse in sent])
-        for told, true in zip(at, row_offsets_mm(radar, row), strict=True):
-            np.testing.assert_allclose(told, true, atol=1e-3)
+        for answer, true in zip(at, row_offsets_mm(radar, row), strict=True):
+            np.testing.assert_allclose(answer, true, atol=1e-3)
         first = index * row.points * RIG.burst.pulses
         assert [p.number for p in track.places(sent)] == list(range(first, first + len(sent)))
 

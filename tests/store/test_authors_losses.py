@@ -85,13 +85,13 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
             assert mask.reshape(plan.columns, -1)[sorted(gone)].all()
             assert mask.sum() in (missing, mask.size)  # the transmitter's board was never missing: it tells all places
             assert mask.sum() == missing or len(gone) > plan.columns - 3
-    told = scan.recording_facts()["recording"]["boards"]
+    answer = scan.recording_facts()["recording"]["boards"]
     for board in ("RH", "RV"):
-        assert told[board]["positions_short"] == 0
-        if not told[board]["rows_not_placed"]:
-            assert told[board]["positions_missing"] == sum(len(skipped[board, r.index]) for r in plan)
+        assert answer[board]["positions_short"] == 0
+        if not answer[board]["rows_not_placed"]:
+            assert answer[board]["positions_missing"] == sum(len(skipped[board, r.index]) for r in plan)
             count = sum((b - a) // PACKET for r in plan for a, b in lost[board, r.index])
-            assert told[board]["packets_lost"] == count
+            assert answer[board]["packets_lost"] == count
 
 
 @pytest.mark.parametrize("gone", [{0}, {COLUMNS - 1}, {0, 1, 5}])
@@ -147,8 +147,8 @@ def test_without_a_log_zeros_are_lost_packets_and_a_short_row_is_masked(tmp_path
     assert mask.sum() == 3 * PACKET
     assert check(scan.read_row("RV", 0), sent["RV", 0]).all()
     assert check(scan.read_row("RV", 2), sent["RV", 2]).sum() == 0
-    told = scan.recording_facts()["recording"]["boards"]["RV"]
-    assert (told["packets_lost"], told["rows_not_placed"], told["rows_absent"]) == (3, 1, 0)
+    answer = scan.recording_facts()["recording"]["boards"]["RV"]
+    assert (answer["packets_lost"], answer["rows_not_placed"], answer["rows_absent"]) == (3, 1, 0)
 
 
 def test_columns_are_rows_of_the_mirrored_rig(tmp_path):

@@ -38,8 +38,8 @@ def lines(tmp_path_factory) -> list[bytes]:
 def test_every_line_carries_its_count_and_the_digest_of_the_line_before(lines):
     before = ""
     for count, line in enumerate(lines):
-        told = json.loads(line)
-        assert (told["count"], told["previous"]) == (count, before)
+        answer = json.loads(line)
+        assert (answer["count"], answer["previous"]) == (count, before)
         before = hashlib.sha256(line.rstrip(b"\n")).hexdigest()[:16]
 
 

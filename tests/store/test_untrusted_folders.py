@@ -196,19 +196,19 @@ def test_nothing_is_written_through_a_link(write, tmp_path):
     assert victim.read_bytes() == b"mine"
 
 
-def begun_with(scan: ScanFolder, **told: object) -> Path:
+def begun_with(scan: ScanFolder, **answer: object) -> Path:
     """The scan's folder, whose first line says something else."""
     first, *rest = (scan.path / "manifest.jsonl").read_bytes().splitlines(keepends=True)
-    fact = {**manifest.decode_line(first.rstrip()), **told}
+    fact = {**manifest.decode_line(first.rstrip()), **answer}
     (scan.path / "manifest.jsonl").write_bytes(manifest.encode_line(fact) + b"".join(rest))
     return scan.path
 
 
 @pytest.mark.parametrize("file", ["../hpf.toml", "/etc/passwd"])
 def test_calibration_outside_the_scan_is_not_read(scan, file):
-    told = {"hpf": {"file": file, "crc32": "0", "copied_from": ""}}
+    answer = {"hpf": {"file": file, "crc32": "0", "copied_from": ""}}
     with refused(ErrorCode.PATH_OUTSIDE):
-        calibration_of_scan(ScanFolder.load(begun_with(scan, calibration=told)))
+        calibration_of_scan(ScanFolder.load(begun_with(scan, calibration=answer)))
 
 
 def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
@@ -221,10 +221,10 @@ def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
         )
 
 
-@pytest.mark.parametrize("told", ["text", ["a"], {"hpf": "a"}, {"hpf": {"file": 3}}])
-def test_a_manifest_with_another_form_of_calibration_is_refused(scan, told):
+@pytest.mark.parametrize("answer", ["text", ["a"], {"hpf": "a"}, {"hpf": {"file": 3}}])
+def test_a_manifest_with_another_form_of_calibration_is_refused(scan, answer):
     with refused(ErrorCode.FILE_DAMAGED, "manifest.jsonl"):
-        calibration_of_scan(ScanFolder.load(begun_with(scan, calibration=told)))
+        calibration_of_scan(ScanFolder.load(begun_with(scan, calibration=answer)))
 
 
 def test_a_row_that_is_larger_than_was_committed_is_refused_by_its_size(scan):

@@ -25,10 +25,10 @@ def small_table(**limits: float) -> dict[str, Any]:
 def start_rig(bench, table: dict[str, Any], *faults: str) -> tuple[Any, Instrument]:
     """The simulated rig, running with faults `[BOARD.]KEY=VALUE`, and its rig file."""
     (bench.folder / "rig.toml").write_text(tomli_w.dumps(table))
-    told = [word for fault in faults for word in ("--fault", fault)]
+    answer = [word for fault in faults for word in ("--fault", fault)]
     rig = bench.start(
         "python", "-m", "polysight.simulators.rig", "--config", "rig.toml", "--dir", bench.folder / "rig", "--pattern",
-        "--time-scale", "40", "--with-pi", *told,
+        "--time-scale", "40", "--with-pi", *answer,
     )  # fmt: skip
     return rig, load_instrument(bench.folder / rig.wait_ready())
 

@@ -86,5 +86,5 @@ def receive(
             pairs.append((int(now), extent))
             now += 2 * US
         now = _awake(now + 1 * MS, receiver)
-    told = host.reshape(pulses_ns.shape)[:, -1] + rng.exponential(max(load.stall_ms, 1.0) * MS, len(pulses_ns))
-    return np.array(pairs, dtype=np.int64).reshape(-1, 2), told.astype(np.int64)
+    answer = host.reshape(pulses_ns.shape)[:, -1] + rng.exponential(max(load.stall_ms, 1.0) * MS, len(pulses_ns))
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2), answer.astype(np.int64)

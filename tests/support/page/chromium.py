@@ -78,14 +78,14 @@ class Browser:
             features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}],
         )
 
-    def _page(self, told: Path) -> str:
+    def _page(self, answer: Path) -> str:
         """Address of the first page's DevTools socket."""
         deadline = time.monotonic() + LIMIT_S
-        while not (told.exists() and told.read_text().count("\n")):
+        while not (answer.exists() and answer.read_text().count("\n")):
             assert self._process.poll() is None, "Chromium ended; see chromium.log"
             assert time.monotonic() < deadline, "Chromium does not start"
             time.sleep(0.05)
-        port = told.read_text().split()[0]
+        port = answer.read_text().split()[0]
         while time.monotonic() < deadline:
             with urlopen(f"http://127.0.0.1:{port}/json/list", timeout=LIMIT_S) as reply:
                 for target in json.load(reply):
@@ -99,13 +99,13 @@ class Browser:
         self._count += 1
         self._socket.send(json.dumps({"id": self._count, "method": method, "params": parameters}))
         while True:
-            told = json.loads(self._socket.recv(timeout=LIMIT_S))
-            if told.get("id") == self._count:
-                if "navigated" in str(told.get("error", "")):
+            answer = json.loads(self._socket.recv(timeout=LIMIT_S))
+            if answer.get("id") == self._count:
+                if "navigated" in str(answer.get("error", "")):
                     raise NavigatedError(method)
-                assert "error" not in told, (method, told["error"])
-                return told["result"]
-            self._note(told.get("method", ""), told.get("params", {}))
+                assert "error" not in answer, (method, answer["error"])
+                return answer["result"]
+            self._note(answer.get("method", ""), answer.get("params", {}))
 
     def _note(self, event: str, what: dict[str, Any]) -> None:
         if event == "Runtime.exceptionThrown":
@@ -131,9 +131,9 @@ class Browser:
 
     def value(self, expression: str) -> Any:
         """What a JavaScript expression is in the page."""
-        told = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
-        assert "exceptionDetails" not in told, told["exceptionDetails"]
-        return told["result"].get("value")
+        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
 
     def text(self, element: str) -> str:
         """What an element, by its id, says."""
@@ -154,8 +154,8 @@ class Browser:
 
     def screenshot(self, path: Path) -> None:
         """The whole page as PNG."""
-        told = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)
-        path.write_bytes(base64.b64decode(told["data"]))
+        answer = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)
+        path.write_bytes(base64.b64decode(answer["data"]))
 
     def _end(self) -> None:
         self._process.terminate()

@@ -1,9 +1,9 @@
 """HTTP connections with timeouts and a limit on their number.
 
-uvicorn has no timeout for a request's head: eighty half-open connections would lock everybody out. Here the head must
-come within `HEAD_S`, an answer must be taken within `STALLED_S`, and above `MOST` connections one is closed: before
-those of open sessions the others, and of them answers that are not taken before slow bodies, and these before idle
-ones; the oldest connection first.
+uvicorn has no timeout for the head of a request: eighty half-open connections would lock everybody out. Here the head
+must arrive within `HEAD_S`, and the client must read its answer within `STALLED_S`. Above `MAX_CONNECTIONS` each new
+connection closes an old one, in this order: unread answers, slow bodies, idle connections. Connections of open sessions
+are closed last. Among equals the oldest is closed first.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ TRUSTED = "polysight.trusted"  # in the scope of a request with the token or a s
 
 HEAD_S = 8.0
 STALLED_S = 60.0
-FRESH_S = 1.0  # in which a new connection is not closed for others
-MOST, MOST_IN_BURSTS = 256, 2048
+FRESH_S = 1.0  # a new connection is not closed within this time, unless there are `MAX_IN_BURSTS`
+MAX_CONNECTIONS, MAX_IN_BURSTS = 256, 2048
 HEAD_BYTES = 16384
+_UNREAD, _SLOW_BODY, _IDLE, _FRESH, _ANSWERING = range(5)  # uses of a connection, the first to be closed first
 KEEP_ALIVE_S = 5
 
 
@@ -39,25 +40,31 @@ class TimeoutProtocol(H11Protocol):
         return self.cycle is None or self.cycle.response_complete
 
     @property
-    def _worth(self) -> tuple[bool, int, float]:
-        """Order in which connections are closed when there are too many."""
+    def _priority(self) -> tuple[bool, int, float]:
+        """Sort key: of too many connections the one with the lowest priority is closed."""
         if self._stalled is not None:
-            use = 0
+            use = _UNREAD
         elif self.idle:
-            use = 3 if self.loop.time() - self._since < FRESH_S else 2
+            use = _FRESH if self.loop.time() - self._since < FRESH_S else _IDLE
         else:
-            use = 1 if self.cycle.more_body else 4
+            use = _SLOW_BODY if self.cycle.more_body else _ANSWERING
         return self._trusted, use, self._since
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start the timeout of the head; of too many connections, close one."""
         super().connection_made(transport)
         self._wait_for_head()
-        open_ones = [c for c in self.connections if isinstance(c, TimeoutProtocol) and not c.transport.is_closing()]
-        if len(open_ones) > MOST:
-            least = min(open_ones, key=lambda c: c._worth)
-            if least._worth[1] < 3 or len(open_ones) > MOST_IN_BURSTS:
-                least.transport.abort()
+        if len(self.connections) > MAX_CONNECTIONS:
+            self._make_room()
+
+    def _make_room(self) -> None:
+        """Close the connection with the lowest priority, unless all without a session are fresh or being answered."""
+        left = [c for c in self.connections if isinstance(c, TimeoutProtocol) and not c.transport.is_closing()]
+        if len(left) <= MAX_CONNECTIONS:
+            return
+        lowest = min(left, key=lambda c: c._priority)
+        if lowest._priority[1] < _FRESH or len(left) > MAX_IN_BURSTS:
+            lowest.transport.abort()
 
     def data_received(self, data: bytes) -> None:
         """Receive bytes."""

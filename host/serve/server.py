@@ -21,7 +21,7 @@ from starlette.applications import Starlette
 from polysight.host.catalogue import Scans
 from polysight.host.page import Watch
 from polysight.host.serve.app import make_app
-from polysight.host.serve.connections import HEAD_BYTES, KEEP_ALIVE_S, MOST, TimeoutProtocol
+from polysight.host.serve.connections import HEAD_BYTES, KEEP_ALIVE_S, MAX_CONNECTIONS, TimeoutProtocol
 from polysight.host.serve.guard import Access
 from polysight.host.serve.programs import Programs
 from polysight.host.serve.site import Site
@@ -174,7 +174,7 @@ def _bind(place: Place) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((place.host, place.port))
-        listener.listen(MOST)
+        listener.listen(MAX_CONNECTIONS)
     except OSError as e:
         listener.close()
         raise DeviceError(

@@ -133,7 +133,7 @@ def test_slow_bodies_and_slow_heads_are_let_go(scans, monkeypatch):
         assert raw(view, whole + b"GET / HT").count(b"HTTP/1.1 200") == 1
 
 
-@pytest.mark.parametrize("many", [80, connections.MOST + 60])
+@pytest.mark.parametrize("many", [80, connections.MAX_CONNECTIONS + 60])
 def test_half_open_connections_lock_nobody_out(scans, many):
     with served_folder(scans, TOKEN) as view:
         held = []
@@ -154,7 +154,7 @@ def test_answers_that_nobody_reads_lock_nobody_out(scans):
         cookie = f"{cookie_name(view.port)}={view.site.access.session}"
         kept = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
         held = []
-        for k in range(250 + connections.MOST):
+        for k in range(250 + connections.MAX_CONNECTIONS):
             held.append(socket.create_connection(("127.0.0.1", view.port), LIMIT_S))
             held[-1].setblocking(False)
             held[-1].send(ask_for)
@@ -173,7 +173,9 @@ def test_an_open_stream_is_not_what_makes_room(scans):
         stream = socket.create_connection(("127.0.0.1", view.port), LIMIT_S)
         stream.sendall(b"GET /api/events?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         assert b"event: state" in _read_until(stream, b"event: state")
-        held = [socket.create_connection(("127.0.0.1", view.port), LIMIT_S) for _ in range(connections.MOST + 40)]
+        held = [
+            socket.create_connection(("127.0.0.1", view.port), LIMIT_S) for _ in range(connections.MAX_CONNECTIONS + 40)
+        ]
         for _ in range(3):
             assert b"event: " in _read_until(stream, b"event: ")
         for one in (stream, *held):

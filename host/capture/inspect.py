@@ -32,7 +32,7 @@ from polysight.shared.config import Instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
-MOST_BYTES = 256 << 20
+MAX_BYTES = 256 << 20
 """Part of a file that is read: eleven rows of the published scan."""
 _HEADERS_READ = 16  # to recognise a file of whole packets
 _FULL_SCALE = 32767  # ADC counts
@@ -192,15 +192,15 @@ def inspect_bin(path: Path, known: Known = Known()) -> Report:
     """
     try:
         size = path.stat().st_size
-        payload = np.fromfile(path, dtype=np.uint8, count=MOST_BYTES)
+        payload = np.fromfile(path, dtype=np.uint8, count=MAX_BYTES)
     except OSError as e:
         raise unreadable(path, e) from None
     packets = packets_in_file(payload)
     report = inspect_payload(path, place_packets(packets)[0] if packets else payload, known)
     if packets:
         report.remarks.append("whole packets, not payload: programs must remove the counters of each packet first")
-    if size > MOST_BYTES:
-        report.remarks.append(f"only the first {MOST_BYTES >> 20} MiB of {size >> 20} MiB were read")
+    if size > MAX_BYTES:
+        report.remarks.append(f"only the first {MAX_BYTES >> 20} MiB of {size >> 20} MiB were read")
     return report
 
 

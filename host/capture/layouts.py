@@ -15,7 +15,7 @@ Samples = NDArray[np.complex64] | NDArray[np.float32]
 SAMPLES_TRIED = (256, 512, 128, 1024, 64)
 DRAW = 0.02
 """Difference in disorder below which layouts are not distinguished: the likelier one is taken."""
-MOST_CHIRPS = 4096  # enough for the statistics
+MAX_CHIRPS = 4096  # enough for the statistics
 _CHIRPS_TRIED = 512
 _PRIOR = 0.9  # ratio of prior likelihoods of consecutive layouts of `candidates`
 
@@ -55,7 +55,7 @@ class Shape:
         return f"{self.lanes}-lane {kind}, {self.samples} samples x {self.rx} RX{pairs}"
 
 
-def decode(payload: NDArray[np.uint8], shape: Shape, q_first: bool = False, most: int = MOST_CHIRPS) -> Samples:
+def decode(payload: NDArray[np.uint8], shape: Shape, q_first: bool = False, most: int = MAX_CHIRPS) -> Samples:
     """Decode the first chirps in a layout: complex64 or float32 [rx, chirp, sample]."""
     chirps = min(payload.size // shape.chirp_bytes, most)
     if not shape.is_complex:

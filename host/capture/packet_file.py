@@ -30,7 +30,7 @@ RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), 
 `place` is an offset in the row's file; or, below zero, `-1 - offset` in this file's own payload.
 """
 BATCH = np.dtype("<i8")  # pairs: time (CLOCK_MONOTONIC of the host, ns), packets received by then
-_MOST_RUN_BYTES = 256 << 20  # of batches and runs
+_MAX_RUN_BYTES = 256 << 20  # of batches and runs
 Bytes = NDArray[np.uint8]
 
 
@@ -90,7 +90,7 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
         if the file is missing or damaged, or does not belong to the row.
     """
     try:
-        line, _, tail = read_bounded(path, PacketLog.most_kept(row.size) + _MOST_RUN_BYTES).partition(b"\n")
+        line, _, tail = read_bounded(path, PacketLog.most_kept(row.size) + _MAX_RUN_BYTES).partition(b"\n")
         head: dict[str, Any] = json.loads(line)
         evidence = msgspec.convert(head["evidence"], Evidence)
         size = 2 * BATCH.itemsize * head["batches"]

@@ -23,7 +23,7 @@ from polysight.shared.files import read_bounded
 _MAGIC = {0xA1B2C3D4: 1_000, 0xA1B23C4D: 1}  # microseconds or nanoseconds, as ns a tick
 _PCAPNG = 0x0A0D0D0A
 _RECORD_AGAIN = "record again: end tcpdump with Ctrl-C"
-_MOST_BYTES = 4 << 30  # half an hour of three boards
+_MAX_BYTES = 4 << 30  # half an hour of three boards
 _ETHERNET, _IPV4, _VLAN, _UDP = 1, 0x0800, 0x8100, 17
 
 
@@ -50,7 +50,7 @@ def read_pcap(path: Path) -> Iterator[Datagram]:
         if the file is not a classic pcap file of Ethernet packets, or ends within a packet.
     """
     try:
-        raw = read_bounded(path, _MOST_BYTES)
+        raw = read_bounded(path, _MAX_BYTES)
     except OSError as e:
         raise unreadable(path, e) from None
     for order in "<>":

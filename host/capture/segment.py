@@ -22,7 +22,7 @@ from polysight.shared.errors import DataError, DeviceError
 from polysight.shared.files import open_to_write, read_bounded
 
 PAIR = np.dtype("<i8")
-MOST_INDEX_BYTES = 256 << 20  # sixteen million batches of packets
+MAX_INDEX_BYTES = 256 << 20  # sixteen million batches of packets
 
 
 def _scan_of(path: Path) -> Path:
@@ -118,7 +118,7 @@ def write_durably(path: Path, raw: bytes) -> int:
 def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
     """Read the facts and arrivals (int64 [n, 2]) of a row's index. Raises DataError if missing or damaged."""
     try:
-        head, _, tail = read_bounded(path, MOST_INDEX_BYTES).partition(b"\n")
+        head, _, tail = read_bounded(path, MAX_INDEX_BYTES).partition(b"\n")
         facts = json.loads(head)
         pairs = np.frombuffer(tail, dtype=PAIR).reshape(-1, 2).astype(np.int64)
     except (OSError, ValueError, RecursionError) as e:

@@ -14,8 +14,8 @@ from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError
 
 NOTES = "operator.json"
-LONGEST_NOTES, LONGEST_TAG, MOST_TAGS = 10_000, 40, 20
-_MOST_BYTES = 1 << 17
+LONGEST_NOTES, LONGEST_TAG, MAX_TAGS = 10_000, 40, 20
+_MAX_BYTES = 1 << 17
 
 
 class Notes(msgspec.Struct, frozen=True):
@@ -38,8 +38,8 @@ def read_notes(folder: Path) -> Notes:
         return Notes()
     try:
         with path.open("rb") as f:
-            raw = f.read(_MOST_BYTES + 1)
-        return Notes() if len(raw) > _MOST_BYTES else msgspec.json.decode(raw, type=Notes)
+            raw = f.read(_MAX_BYTES + 1)
+        return Notes() if len(raw) > _MAX_BYTES else msgspec.json.decode(raw, type=Notes)
     except FileNotFoundError:
         return Notes()
     except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as e:
@@ -70,8 +70,8 @@ def write_notes(folder: Path, notes: Notes) -> Notes:
     wrong = ""
     if len(text) > LONGEST_NOTES:
         wrong = f"the notes have {len(text)} characters, {LONGEST_NOTES} are allowed"
-    elif len(tags) > MOST_TAGS:
-        wrong = f"{len(tags)} tags, {MOST_TAGS} are allowed"
+    elif len(tags) > MAX_TAGS:
+        wrong = f"{len(tags)} tags, {MAX_TAGS} are allowed"
     elif long := next((tag for tag in tags if len(tag) > LONGEST_TAG), ""):
         wrong = f"the tag {long[:LONGEST_TAG]!r}... has {len(long)} characters, {LONGEST_TAG} are allowed"
     if wrong:

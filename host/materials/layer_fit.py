@@ -38,7 +38,7 @@ STARTS = 24
 RIVAL = 9.0
 """A second solution is a rival if its chi-square is within this of the best: three standard deviations, enlarged as the
 error bars if the model misses the data."""
-MOST_THICKNESS_M = 30e-3
+MAX_THICKNESS_M = 30e-3
 """Largest thickness to fit."""
 UNLIKELY = 1e-3
 """Probability of a larger chi-square below which the stack does not explain the data."""
@@ -181,10 +181,10 @@ def fit_layer(
 
 def check_range(thickness_range_m: tuple[float, float] | None) -> None:
     """Raise PolysightError if the search range is too large for a sweep of a few GHz."""
-    if thickness_range_m is not None and thickness_range_m[1] > MOST_THICKNESS_M:
+    if thickness_range_m is not None and thickness_range_m[1] > MAX_THICKNESS_M:
         raise PolysightError(
             f"a thickness of up to {1e3 * thickness_range_m[1]:g} mm",
-            f"above {1e3 * MOST_THICKNESS_M:g} mm a layer has too many half waves to distinguish them",
+            f"above {1e3 * MAX_THICKNESS_M:g} mm a layer has too many half waves to distinguish them",
             "narrow the range, or measure the thickness; a thick lossy layer is a half space",
             code=ErrorCode.VALUE_INVALID,
         )

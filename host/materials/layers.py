@@ -135,7 +135,7 @@ class Bands:
         )
 
 
-MOST_PERMITTIVITY = 1000.0
+MAX_PERMITTIVITY = 1000.0
 """Largest permittivity and loss of a known layer."""
 
 
@@ -220,10 +220,10 @@ def check_stack(stack: Sequence[Layer]) -> None:
         eps = layer.permittivity
         if eps is None or np.isinf(eps):
             continue
-        if not (1.0 <= eps.real <= MOST_PERMITTIVITY and 0.0 <= -eps.imag <= MOST_PERMITTIVITY):
+        if not (1.0 <= eps.real <= MAX_PERMITTIVITY and 0.0 <= -eps.imag <= MAX_PERMITTIVITY):
             raise PolysightError(
                 f"{layer.name}: permittivity {eps.real:g}, loss {-eps.imag:g}",
-                f"no passive material has less than 1 or a negative loss; more than {MOST_PERMITTIVITY:g} is a metal",
+                f"no passive material has less than 1 or a negative loss; more than {MAX_PERMITTIVITY:g} is a metal",
                 "give eps' of at least 1 and eps'' of at least 0; a metal layer as the word metal",
                 code=ErrorCode.VALUE_INVALID,
             )

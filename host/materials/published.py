@@ -229,7 +229,7 @@ def angle_in_text(texts: Iterable[str]) -> float | None:
     return None
 
 
-_MOST_BYTES = 1 << 30
+_MAX_BYTES = 1 << 30
 
 
 class _Restricted(pickle.Unpickler):
@@ -251,7 +251,7 @@ def read_pickle(path: Path) -> Any:
         if the file is missing, damaged, or would call anything but numpy's array constructors.
     """
     try:
-        return _Restricted(io.BytesIO(read_bounded(path, _MOST_BYTES))).load()
+        return _Restricted(io.BytesIO(read_bounded(path, _MAX_BYTES))).load()
     except DataError:
         raise
     except OSError as e:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from polysight.host.products.files import temporary_path
-from polysight.host.store import MOST_BYTES
+from polysight.host.store import MAX_BYTES
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError
 
@@ -137,9 +137,9 @@ def _check_hdf5(path: Path) -> None:
             "it was not written by this program",
             code=ErrorCode.PATH_OUTSIDE,
         )
-    if sum(sizes) > MOST_BYTES:
+    if sum(sizes) > MAX_BYTES:
         raise DataError(
-            f"{path}: its arrays take {sum(sizes)} bytes, more than the limit of {MOST_BYTES} bytes",
+            f"{path}: its arrays take {sum(sizes)} bytes, more than the limit of {MAX_BYTES} bytes",
             "it was not written by this program, or is damaged",
             "export the products again",
             code=ErrorCode.FILE_TOO_LARGE,

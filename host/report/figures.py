@@ -48,7 +48,7 @@ FIGURES: dict[str, str] = {
 }
 _INSIDE = 0.6  # of a patch's box: what lies further out is its edge
 _PERCENTILES = (5.0, 95.0)
-_LEAST_DEG, _MOST_DEG = 20.0, 300.0
+_LEAST_DEG, _MAX_DEG = 20.0, 300.0
 _METAL, _OTHER = "#ff9e3d", "#ffffff"  # boxes drawn by hand
 _FOCUS_RANGE_DB = 30.0
 Limits = tuple[float, float]
@@ -87,7 +87,7 @@ def phase_limits_deg(ctx: ReportContext) -> Limits | None:
     low, high = np.percentile(turned, _PERCENTILES) + np.degrees(middle)
     margin = max(0.15 * (high - low), (_LEAST_DEG - (high - low)) / 2)
     low, high = float(np.floor((low - margin) / 5) * 5), float(np.ceil((high + margin) / 5) * 5)
-    return (low, high) if high - low < _MOST_DEG else None
+    return (low, high) if high - low < _MAX_DEG else None
 
 
 def _decibels(ctx: ReportContext) -> str:

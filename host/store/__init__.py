@@ -27,14 +27,14 @@ from polysight.host.store.scan_folder import (
 from polysight.host.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
 from polysight.host.store.sources.open import is_source, open_source
 from polysight.host.store.sources.published_settings import COLLECTION, mirrored, read_settings, rig_of
-from polysight.host.store.untrusted import MOST_BYTES, check_links, inside, open_npz
+from polysight.host.store.untrusted import MAX_BYTES, check_links, inside, open_npz
 from polysight.host.store.validation import damaged_rows, to_json, validate
 
 __all__ = [
     "COLLECTION",
     "EVENTS",
     "MANIFEST",
-    "MOST_BYTES",
+    "MAX_BYTES",
     "PART",
     "CubeRow",
     "Digests",

@@ -18,7 +18,7 @@ from polysight.shared.errors import DataError
 from polysight.shared.files import open_regular
 
 _MAY_BE_LINK = "products"
-MOST_BYTES = 2 << 30
+MAX_BYTES = 2 << 30
 """Largest size of the arrays in one archive: a hundred times the images of the published scan."""
 
 
@@ -91,7 +91,7 @@ def open_npz(path: Path) -> Iterator[Any]:
     Raises
     ------
     DataError
-        if it is no regular file, or its arrays exceed :data:`MOST_BYTES`.
+        if it is no regular file, or its arrays exceed :data:`MAX_BYTES`.
     OSError, ValueError, KeyError, EOFError
         if it is not an archive of arrays, as numpy does.
     """
@@ -104,9 +104,9 @@ def open_npz(path: Path) -> Iterator[Any]:
         except zipfile.BadZipFile as e:
             f.seek(0)
             raise ValueError(f"it is {kind_of(f.read(512))}, not an archive of arrays ({e})") from None
-        if size > MOST_BYTES:
+        if size > MAX_BYTES:
             raise DataError(
-                f"{path}: its arrays take {size} bytes, the limit is {MOST_BYTES} bytes",
+                f"{path}: its arrays take {size} bytes, the limit is {MAX_BYTES} bytes",
                 "it was not made by this program, or is damaged",
                 "process the scan again, or cut the image area ([image] of the rig file)",
                 code=ErrorCode.FILE_TOO_LARGE,

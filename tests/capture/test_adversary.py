@@ -33,7 +33,7 @@ GRIDS = [  # bytes of a frame, frames of a row
     (1456, 7),
     (512, 30),
 ]
-MOST_REFUSED = 8  # perfect records in a row, after anything that may have happened
+MAX_REFUSED = 8  # perfect records in a row, after anything that may have happened
 
 
 def logged(sent: Sent, expected: int, batch: int) -> PacketLog:
@@ -124,7 +124,7 @@ class Rows(RuleBasedStateMachine):
         if sure or (first and alone):
             assert placed.complete, placed.reason
         self.refused = 0 if placed.complete or not alone else self.refused + 1
-        assert self.refused <= MOST_REFUSED, placed.reason
+        assert self.refused <= MAX_REFUSED, placed.reason
 
     @rule()
     def resume(self):

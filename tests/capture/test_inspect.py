@@ -220,7 +220,7 @@ def test_plot(tmp_path, kind):
 
 
 def test_of_a_huge_file_only_the_beginning_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("polysight.host.capture.inspect.MOST_BYTES", 1 << 20)
+    monkeypatch.setattr("polysight.host.capture.inspect.MAX_BYTES", 1 << 20)
     path = tmp_path / "x.bin"
     row(4, False).tofile(path)
     with path.open("r+b") as f:

@@ -10,19 +10,19 @@ from tests.support.capture.records import FULL, Card, Record, is_original_or_mas
 FRAME = 4096
 FULL_ENDS = 91 * FRAME
 SHORT_END = 62 * FRAME
-MOST_REFUSED = 8  # perfect records in a row, after anything that may have happened (docs/spec/placement.md)
+MAX_REFUSED = 8  # perfect records in a row, after anything that may have happened (docs/spec/placement.md)
 
 
 def rows_until_accepted(card: Card, size: int, past: Past) -> int:
     """Perfect rows that are refused before one is accepted; none may be wrong."""
-    for refused in range(MOST_REFUSED + 1):
+    for refused in range(MAX_REFUSED + 1):
         record = card.record()
         placed, out = place(size, record.packets, past, FRAME, batch=64)
         assert is_original_or_masked(record, placed, out)
         if placed.complete:
             return refused
         past = placed.past
-    return MOST_REFUSED + 1
+    return MAX_REFUSED + 1
 
 
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
@@ -34,7 +34,7 @@ def test_a_card_that_restarts_soon_after_power_up_is_accepted_again(size, resets
     disturbed = card.record(tuple(k % many for k in resets))
     placed, out = place(size, disturbed.packets, past, FRAME, batch=64)
     assert is_original_or_masked(disturbed, placed, out)
-    assert rows_until_accepted(card, size, placed.past) <= MOST_REFUSED
+    assert rows_until_accepted(card, size, placed.past) <= MAX_REFUSED
 
 
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])

@@ -1,5 +1,6 @@
-/* Burst alignment, position by position: `align.align_in_numpy` in one pass over the card's words. The words of
-   some positions lie in the cache, where they were read to (`rows.py`); those of a position (64 KB) are unpacked first. The method is described in `align.py` and `numpy_passes.py`. */
+/* Burst alignment, position by position: `align.align_in_numpy` in one pass over the card's words. The words of a
+   position (64 KB) come from the cache, where they were read to (`rows.py`). The method is described in `align.py` and
+   `numpy_passes.py`. */
 #include "passes.h"
 
 #define REFERENCES 4       /* `align.REFERENCES` */

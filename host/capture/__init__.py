@@ -5,13 +5,13 @@
   writes a row's file and index (`segment`); `RowCapture` lists missing bytes and counts dropped packets.
 * Placement: `record_search` finds the row's record among its packets, `placement` puts their payload in place,
   `earlier_records` keeps what is known of earlier records; `packet_file` stores packets to place a row again.
-* Decoding: `row_words` converts payload to samples; `inspect_bin` and `inspect_pcap` examine any recording.
+* Decoding: `row_words` converts payload to samples; `inspect_bin` and `inspect_pcap` examine a recording.
 """
 
 from polysight.host.capture.card import CardClient, EepromSettings, program_eeprom
 from polysight.host.capture.dca1000 import CARD_SOURCE_PORT, MAX_PAYLOAD_BYTES, Code, Status, Version
 from polysight.host.capture.decode import decode_row, raw_words, row_words, valid_frames
-from polysight.host.capture.inspect import CardReport, Known, Report, inspect_bin, kind_of
+from polysight.host.capture.inspect import CardReport, Layout, Report, inspect_bin, kind_of
 from polysight.host.capture.network import check_receive_buffer, route_interface, silent_radar
 from polysight.host.capture.packet_file import PACKETS, Evidence, read_packets, write_packets
 from polysight.host.capture.pcap import inspect_pcap, is_pcap
@@ -33,7 +33,7 @@ __all__ = [
     "EepromSettings",
     "Evidence",
     "HopFinding",
-    "Known",
+    "Layout",
     "Placed",
     "Progress",
     "ReceiverProcess",

@@ -92,38 +92,6 @@ def decode_two_lane(
     return _complex(words.transpose(3, 1, 0, 2, 4).reshape(2, rx, chirps, samples), swap_iq)
 
 
-def decode_real(
-    payload: bytes | memoryview | NDArray[np.uint8], lanes: int, chirps: int, samples: int, rx: int = 4
-) -> NDArray[np.float32]:
-    """Decode a recording of real samples: with 4 lanes sample by sample, with 2 a whole chirp of RX0, then RX1...
-
-    Returns float32 [rx, chirp, sample], ADC counts. Raises DataError as :func:`decode_row`.
-    """
-    words = _words(payload, chirps * samples * rx)
-    if lanes == 4:
-        return words.reshape(chirps, samples, rx).transpose(2, 0, 1).astype(np.float32)
-    return words.reshape(chirps, rx, samples).transpose(1, 0, 2).astype(np.float32)
-
-
-def decode_adjacent(
-    payload: bytes | memoryview | NDArray[np.uint8],
-    lanes: int,
-    chirps: int,
-    samples: int,
-    rx: int = 4,
-    swap_iq: bool = False,
-) -> NDArray[np.complex64]:
-    """Decode a recording with adjacent I and Q of each sample: `I0 Q0 I1 Q1`.
-
-    With 2 lanes a whole chirp of RX0, then RX1...; with 4 lanes every RX of a sample, then the next sample. Returns
-    complex64 [rx, chirp, sample], ADC counts. Raises DataError as :func:`decode_row`.
-    """
-    words = _words(payload, chirps * samples * rx * 2)
-    if lanes == 4:
-        return _complex(words.reshape(chirps, samples, rx, 2).transpose(3, 2, 0, 1), swap_iq)
-    return _complex(words.reshape(chirps, rx, samples, 2).transpose(3, 1, 0, 2), swap_iq)
-
-
 def _complex(parts: NDArray[np.int16], swap_iq: bool = False) -> NDArray[np.complex64]:
     """Join I and Q, int16 [2, rx, chirp, sample] (with `swap_iq` Q and I)."""
     out = np.empty(parts.shape[1:], dtype=np.complex64)

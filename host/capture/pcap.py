@@ -15,7 +15,7 @@ import numpy as np
 
 from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import Code, Status
-from polysight.host.capture.inspect import CardReport, Known, Report, inspect_payload, place_packets, unreadable
+from polysight.host.capture.inspect import CardReport, Layout, Report, inspect_payload, place_packets, unreadable
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, ProtocolError
 from polysight.shared.files import read_bounded
@@ -98,10 +98,10 @@ def _udp(frame: bytes) -> tuple[tuple[str, int], tuple[str, int], bytes] | None:
     return (source, source_port), (destination, destination_port), frame[udp + 8 : udp + length]
 
 
-def inspect_pcap(path: Path, known: Known = Known(), card_address: str = "") -> Report:  # noqa: B008 - immutable
+def inspect_pcap(path: Path, layout: Layout = Layout(), card_address: str = "") -> Report:  # noqa: B008 - immutable
     """Inspect a packet capture (of `tcpdump -w`) with one record of a card.
 
-    `known` is the known layout of the recording, `card_address` selects one of several cards.
+    `card_address` selects one of several cards.
 
     Raises
     ------
@@ -118,12 +118,12 @@ def inspect_pcap(path: Path, known: Known = Known(), card_address: str = "") -> 
                 "record on the card's interface",
                 code=ErrorCode.NO_DATA,
             )
-        return _empty(path, card)
+        return _empty(path, layout, card)
     payload, card.record = place_packets([d.payload for d in data])
     if len(data) > 1 and len(data[-1].payload) < len(data[0].payload):
         card.tail_bytes = len(data[-1].payload) - dca1000.PACKET_HEADER_BYTES
         card.tail_after_s = (data[-1].t_ns - data[-2].t_ns) / 1e9
-    report = inspect_payload(path, payload, known)
+    report = inspect_payload(path, payload, layout)
     report.card = card
     if card.record.missing:
         report.remarks.append(f"{sum(b - a for a, b in card.record.missing)} bytes are missing")
@@ -158,8 +158,6 @@ def _from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram
     return card, packets
 
 
-def _empty(path: Path, card: CardReport) -> Report:
+def _empty(path: Path, layout: Layout, card: CardReport) -> Report:
     none = np.zeros(0)
-    return Report(
-        path, 0, 0, False, 0, 0, 0, False, 0, 0.0, 0, [], [], 0, none, none, remarks=["no data packets"], card=card
-    )
+    return Report(path, 0, layout, 0, 0, 0.0, 0, [], [], 0, none, none, remarks=["no data packets"], card=card)

@@ -205,7 +205,8 @@ def _inspect(args: argparse.Namespace) -> int:
 
     if args.placement:
         return inspect_placement(args.file, args.json)
-    return inspect_file(args.file, args.config, args.plot, args.card, args.json)
+    given = {name: value for name in ("lanes", "samples", "q_first") if (value := getattr(args, name)) is not None}
+    return inspect_file(args.file, args.config, args.plot, args.card, args.json, given)
 
 
 def _add_inspect(add: Add) -> None:
@@ -214,11 +215,17 @@ def _add_inspect(add: Add) -> None:
     )
     sub.add_argument("file", type=Path, metavar="FILE", help="payload (.bin), or packets recorded by tcpdump (.pcap)")
     sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the range profile of every antenna")
-    sub.add_argument(
-        "--config", type=Path, metavar="RIG", help="rig file of the recording (default: the scan's, or a guess)"
-    )
+    sub.add_argument("--config", type=Path, metavar="RIG", help="rig file of the recording (default: the scan's)")
     sub.add_argument("--placement", action="store_true", help="show how the packets of a scan's row are placed")
     sub.add_argument("--card", default="", metavar="ADDRESS", help="the card, in a recording of several")
+    sub.add_argument(
+        "--samples",
+        type=number(int, "an even number, 8 or more", lambda n: n >= 8 and n % 2 == 0),
+        metavar="N",
+        help="samples of a chirp (default: the rig file's, or 256)",
+    )
+    sub.add_argument("--lanes", type=int, choices=(2, 4), help="LVDS lanes (default: 4)")
+    sub.add_argument("--q-first", action="store_true", default=None, help="Q precedes I in the recording")
     add_json_option(sub)
 
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.capture import PACKETS, CardReport, Code, Known, Report, inspect_bin, inspect_pcap, is_pcap
+from polysight.host.capture import PACKETS, CardReport, Code, Layout, Report, inspect_bin, inspect_pcap, is_pcap
 from polysight.host.store import (
     MANIFEST,
     PlacedAgain,
@@ -30,7 +31,6 @@ from polysight.shared.config import load_instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, PolysightError
 
-GUESSES = 3  # layouts that are named
 _SHOWN = 8  # missing ranges that are printed
 BOTTOM_DB = -20.0  # of the plot of a range profile
 
@@ -42,28 +42,16 @@ def main_text(report: Report) -> str:
     if r.card is not None:
         lines += _card_lines(r.card)
     if r.chirps:
-        order = ("Q first" if r.q_first else "I first") if r.is_complex else "real"
-        order += ", adjacent" if r.adjacent else ""
+        shape = r.layout
         lines += [
-            f"shape      {r.chirps} chirps x {r.rx} RX x {r.samples} samples, {r.lanes}-lane, {order}"
-            + (f" (guessed: {', '.join(r.guessed)})" if r.guessed else ""),
-            *_guess_lines(r),
-            f"peak       {r.peak_db:.1f} dB over the median at bin {r.peak_bin} of {r.samples}",
+            f"shape      {r.chirps} chirps x {shape.rx} RX x {shape.samples} samples, {shape.lanes}-lane,"
+            f" {'Q' if shape.q_first else 'I'} first",
+            f"peak       {r.peak_db:.1f} dB over the median at bin {r.peak_bin} of {shape.samples}",
             f"level      rms {', '.join(f'{v:.0f}' for v in r.rx_rms)} counts on RX 0.., DC {max(r.rx_dc):.1f}",
             f"clipping   {r.clipped} values at full scale",
             f"profile    {_sparkline(r.profile_db)}",
         ]
-    if r.not_a_capture:
-        lines.append(f"not a capture: {r.not_a_capture}")
     return "\n".join(lines + [f"note       {remark}" for remark in r.remarks]) + "\n"
-
-
-def _guess_lines(r: Report) -> list[str]:
-    """The most likely layouts, if several were tried."""
-    if len(r.guesses) < 2:
-        return []
-    shapes = (f"{g.shape} {100 * g.likelihood:.0f} %" for g in r.guesses[:GUESSES])
-    return [f"likely     {'; '.join(shapes)}"]
 
 
 def _card_lines(card: CardReport) -> list[str]:
@@ -104,16 +92,6 @@ def validate_folder(folder: Path, as_json: bool) -> int:
     return 1 if any(f.severity == "error" for f in findings) else 0
 
 
-def _refuse_text(file: Path) -> None:
-    """Raise DataError for a text file: raw payload has no magic number, so text would pass as samples."""
-    with file.open("rb") as f:
-        head = f.read(4096)
-    if head.strip() and all(byte >= 0x20 or byte in b"\t\n\r\f" for byte in head) and head.isascii():
-        raise DataError(
-            f"{file}: a text file", "a card records bytes, not text", "give a row (.bin) or a capture (.pcap)"
-        )
-
-
 def _is_pcap(file: Path) -> bool:
     """True if the first bytes, or the file name, are those of a packet capture."""
     with file.open("rb") as f:
@@ -131,29 +109,37 @@ def scan_of(file: Path) -> ScanFolder | None:
         return None  # `polysight validate` says what is wrong with it
 
 
-def inspect_file(file: Path, config: Path | None, plot: Path | None, card_address: str, as_json: bool) -> int:
-    """Describe a capture and draw its range profile; return the exit status, that of DataError if it is none.
+def inspect_file(
+    file: Path,
+    config: Path | None,
+    plot: Path | None,
+    card_address: str,
+    as_json: bool,
+    given: dict[str, Any] | None = None,
+) -> int:
+    """Describe a capture and draw its range profile; return the exit status, that of DataError if it holds no signal.
 
-    `config` is the rig file it was recorded with; a row of a scan folder brings its own. Raises PolysightError.
+    `config` is the rig file it was recorded with; a row of a scan folder brings its own. `given` are fields of `Layout`
+    that replace the rig's. Raises PolysightError.
     """
-    if file.is_file():
-        _refuse_text(file)
     scan = scan_of(file)
     rig = load_instrument(config) if config is not None else None if scan is None else scan.instrument
-    known = Known() if rig is None else Known.of_instrument(rig)
+    layout = replace(Layout() if rig is None else Layout(samples=rig.chirp.samples), **(given or {}))
     pcap = file.is_file() and _is_pcap(file)
-    report = inspect_pcap(file, known, card_address) if pcap else inspect_bin(file, known)
+    report = inspect_pcap(file, layout, card_address) if pcap else inspect_bin(file, layout)
     report.simulated = scan is not None and scan.simulated
     if as_json:
         from polysight.host.products import plain
 
-        sys.stdout.write(json.dumps(plain(asdict(report)), indent=1) + "\n")
+        content = asdict(report)
+        content |= content.pop("layout")
+        sys.stdout.write(json.dumps(plain(content), indent=1) + "\n")
     else:
         sys.stdout.write(main_text(report))
     if plot is not None:
         plot_profile(report, plot)
         sys.stderr.write(f"range profile: {plot}\n")
-    return DataError.exit_status if report.not_a_capture else 0
+    return DataError.exit_status if report.chirps and not any(report.rx_rms) else 0
 
 
 def plot_profile(report: Report, path: Path) -> None:
@@ -177,7 +163,7 @@ def plot_profile(report: Report, path: Path) -> None:
         axes.plot(profile, linewidth=0.8, label=f"RX{rx}{silent}")
     axes.plot(report.profile_db, color="black", linewidth=1.4, label="mean")
     axes.axvline(report.peak_bin, color="grey", linestyle=":", linewidth=1.0)
-    axes.set_xlabel(f"range bin of {report.samples} samples")
+    axes.set_xlabel(f"range bin of {report.layout.samples} samples")
     axes.set_ylabel("power over the median [dB]")
     name = f"{'simulated ' if report.simulated else ''}{report.path.name}"
     axes.set_title(f"{name}: {report.chirps} chirps, peak {report.peak_db:.1f} dB at bin {report.peak_bin}")

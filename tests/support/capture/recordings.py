@@ -1,4 +1,4 @@
-"""Recordings made by formula: rows of every layout, and packet captures."""
+"""Recordings made by formula: rows of both layouts, and packet captures."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ def row(
     chirps: int = 32,
     samples: int = 256,
     dead: int | None = None,
-    adjacent: bool = False,
 ) -> np.ndarray:
-    """Two tones a chirp at positive frequencies, noise, int16 words. `adjacent`: I0 Q0 I1 Q1."""
+    """Two tones a chirp at positive frequencies, noise, int16 words."""
     rng = np.random.default_rng(5)
     t = np.arange(samples)
     x = np.zeros((4, chirps, samples), dtype=complex)
@@ -31,25 +30,11 @@ def row(
     if dead is not None:
         x[dead] = 0
     parts = np.stack([x.imag, x.real] if q_first else [x.real, x.imag])  # [part, rx, chirp, sample]
-    if adjacent:
-        words = parts.transpose(2, 3, 1, 0) if lanes == 4 else parts.transpose(2, 1, 3, 0)
-    elif lanes == 4:
+    if lanes == 4:
         words = parts.transpose(2, 3, 0, 1)
     else:
         words = parts.reshape(2, 4, chirps, samples // 2, 2).transpose(2, 1, 3, 0, 4)
     return np.round(words).astype("<i2").reshape(-1)
-
-
-def real_row(lanes: int, chirps: int = 32, samples: int = 256) -> np.ndarray:
-    """Real samples: with 4 lanes every RX a sample, with 2 chirp after chirp of each RX."""
-    rng = np.random.default_rng(6)
-    t = np.arange(samples)
-    x = np.zeros((4, chirps, samples))
-    for c in range(chirps):
-        f = rng.uniform(0.1, 0.3)
-        for r in range(4):
-            x[r, c] = 900 * np.cos(2 * np.pi * f * t + 1.1 * r) + rng.normal(scale=5, size=samples)
-    return np.round(x.transpose(1, 2, 0) if lanes == 4 else x.transpose(1, 0, 2)).astype("<i2").reshape(-1)
 
 
 def udp_frame(source_port: int, payload: bytes, card: bytes = CARD) -> bytes:

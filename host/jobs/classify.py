@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Container, Sequence
 from dataclasses import asdict, replace
@@ -13,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.jobs.materials import print_verdict
+from polysight.host.jobs.output import print_json
 from polysight.host.materials import (
     PATCHES,
     SIMULATED_LIBRARY,
@@ -28,6 +28,7 @@ from polysight.host.materials import (
 )
 from polysight.host.products import SavedProducts, find_products, refused_text
 from polysight.host.report import classifier_sentence
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError
 
 
@@ -76,6 +77,7 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
             f"{data[0]}: no patches of a scan, so --library and --model would do nothing",
             "they choose what names patches; on a library every model is judged",
             "leave them out, or give a folder that polysight process wrote",
+            code=ErrorCode.VALUES_CONFLICT,
         )
     return _judge(data[0], as_json)
 
@@ -95,7 +97,7 @@ def _judge(data: Path, as_json: bool) -> int:
         best = max(scores[::2], key=lambda s: s.pixels + s.patches)
         content = {"source": source, "names": best.names, "scores": rows}
         content |= {"best_with_scans_left_out": best.model, "confusion_of_best": best.confusion.tolist()}
-        sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        print_json(content)
         return 0
     sys.stdout.write(
         f"{source}: {len(library.names)} materials, {len(library.scans)} scans, {samples.names.size} pixels\n"
@@ -115,7 +117,7 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
     status = max(print_verdict(p, to_terminal=not as_json) for p in products)
     if status:
         if as_json:
-            sys.stdout.write(json.dumps(_nothing_named(products), indent=1) + "\n")
+            print_json(_nothing_named(products))
         return status
     library = Library.load(library_path)
     refused = [{s["label"]: s for s in p.segments if s.get("refused")} for p in products]
@@ -151,7 +153,7 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
                 for label, s in found.items()
             ],
         }
-        sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        print_json(content)
         return 0
     angles = " and ".join(f"{s.angle_deg:.1f}" for s in scans)
     sys.stdout.write(f"{'simulated: ' if simulated else ''}{len(rows)} patches at {angles} degrees\n")

@@ -20,7 +20,7 @@ from polysight.host.serve import connections, guard
 from polysight.host.serve.guard import TOKEN_HEADER, TRIES, Access, cookie_name
 from polysight.shared.error_codes import ErrorCode
 from tests.support.page.asking import TOKEN, ask, digest_of, get, post, raw
-from tests.support.page.live_view import served_folder
+from tests.support.page.live_view import Served, served_folder
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.products import judged_products
 from tests.support.refusals import refused
@@ -36,6 +36,11 @@ def scans(finished: Path, tmp_path: Path) -> Path:
     (tmp_path / "secret.txt").write_text(SECRET)
     (tmp_path / "scans" / "out").symlink_to(tmp_path)
     return tmp_path / "scans"
+
+
+def session_of(view: Served) -> str:
+    """The cookie of its session."""
+    return f"{cookie_name({'server': ('', view.port)})}={view.site.access.session}"
 
 
 def test_names_of_others_are_not_answered_to(scans):
@@ -92,6 +97,7 @@ def test_beyond_loopback_reading_needs_the_token_too(scans):
         assert get(view, "/api/scans", Cookie=cookie)["scans"]
         assert ask(view, "/api/notes?scan=one", "POST", {}, Cookie=cookie)[0] == 403  # it reads, and does nothing else
         assert get(view, "/api/scans", Host=f"192.168.7.7:{view.port}", Cookie=cookie)["scans"]
+        assert get(view, "/api/page", Host="192.168.7.7:9000", Cookie=cookie)["known"]  # a port that is forwarded
 
 
 def test_wrong_tokens_are_slowed_down_and_a_session_is_not(scans):
@@ -100,7 +106,7 @@ def test_wrong_tokens_are_slowed_down_and_a_session_is_not(scans):
         assert answers[0] == 403
         assert 429 in answers
         wait_for(lambda: post(view, "/api/session")[0] == 200, "that the right token is compared again")
-        cookie = f"{cookie_name(view.port)}={view.site.access.session}"
+        cookie = session_of(view)
         for n in range(int(TRIES) * 2):
             post(view, "/api/notes?scan=one", token=f"guess {n}")
         assert post(view, "/api/notes?scan=one", {"notes": "still here"}, Cookie=cookie)[0] == 200
@@ -151,7 +157,7 @@ def test_answers_that_nobody_reads_lock_nobody_out(scans):
     """250 clients ask for 300 pages each and read none, while the operator keeps a connection and opens others."""
     ask_for = b"GET /common.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 300
     with served_folder(scans, TOKEN) as view:
-        cookie = f"{cookie_name(view.port)}={view.site.access.session}"
+        cookie = session_of(view)
         kept = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
         held = []
         for k in range(250 + connections.MAX_CONNECTIONS):
@@ -339,7 +345,7 @@ def misshapen(host: bytes, good: bytes) -> list[bytes]:
 @pytest.mark.slow
 def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, tmp_path):
     with served_folder(scans, TOKEN) as view:
-        before, cookie = digest_of(tmp_path), f"{cookie_name(view.port)}={view.site.access.session}"
+        before, cookie = digest_of(tmp_path), session_of(view)
         requests = list(islice(cycle(hostile(view.port)), 1000))
         held: list[socket.socket] = []
 

@@ -1,12 +1,13 @@
-"""Progress of commands that take seconds or minutes, on stderr: bars on a terminal, a line now and then elsewhere."""
+"""What commands print: results on stdout; progress on stderr, as bars on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from time import monotonic
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rich.console import Console
 from rich.progress import track
@@ -15,6 +16,16 @@ from polysight.host.process import Progress
 
 T = TypeVar("T")
 _LINE_S = 5.0  # at least, from one line to the next
+
+
+def print_json(content: Any) -> None:
+    """Print a result for programs."""
+    sys.stdout.write(json.dumps(content, indent=1) + "\n")
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print a result for people."""
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
 
 
 def say(step: str) -> None:

@@ -7,12 +7,10 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from time import monotonic
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from rich.console import Console
-from rich.progress import track
-
-from polysight.host.process import Progress
+if TYPE_CHECKING:
+    from polysight.host.process import Progress
 
 T = TypeVar("T")
 _LINE_S = 5.0  # at least, from one line to the next
@@ -47,6 +45,9 @@ def steps(things: Sequence[T], names: Sequence[str]) -> Iterator[T]:
 
 def counted(things: Iterable[T], total: int, name: str) -> Iterator[T]:
     """Yield the things with a bar; without a terminal a line at the start, then at tenths, 5 s apart or more."""
+    from rich.console import Console
+    from rich.progress import track
+
     console = Console(stderr=True)
     if console.is_terminal:
         yield from track(things, name, total=total, console=console)
@@ -63,6 +64,8 @@ def counted(things: Iterable[T], total: int, name: str) -> Iterator[T]:
 @contextmanager
 def current_step(first: str) -> Iterator[Progress]:
     """Show the current step, beginning with `first`: on a terminal as a status line, elsewhere as lines."""
+    from rich.console import Console
+
     console = Console(stderr=True)
     if console.is_terminal:
         with console.status(first) as status:

@@ -72,15 +72,7 @@ def all_rows(
     if options is not None:
         metal = check_options(options, pipeline.rig, axes_of(pipeline))
         pipeline.metal_plane(options, metal is not None)
-    rows = list(source.rows())
-    if not rows:
-        raise DataError(
-            f"{data}: no row is recorded whole",
-            "the scan was stopped in its first row, or files are missing",
-            f"`polysight resume {data}` takes the missing rows of a scan folder",
-        )
-    if isinstance(source, ScanFolder) and not pipeline.samples.holds(rows):
-        require_raw(source)
+    rows = pipeline.samples.processable(source, data)
     for _ in counted(map_rows(pipeline.add_row, rows, threads), len(rows), "rows"):
         pass
     return pipeline

@@ -8,7 +8,7 @@ import pytest
 from polysight.host.acquisition.missed_pulses import place_frames
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.source import RowData
+from polysight.host.store.source import RowData, pieces_of
 from polysight.simulators.scene import load_scene, simulate
 from tests.support.acquisition.arrival_model import PAYLOAD, Load, pulse_times, receive
 from tests.support.rigs import published_rig
@@ -55,7 +55,7 @@ class Missed:
         absent = np.setdiff1d(np.arange(pulses.size), to)
         self.lost += len(missed)
         self.masked += absent.size
-        return RowData(out.reshape(-1), [(int(s) * frame, int(s + 1) * frame) for s in absent], pulses.size)
+        return RowData(pieces_of(out.reshape(-1)), [(int(s) * frame, int(s + 1) * frame) for s in absent], pulses.size)
 
 
 def image(source) -> tuple[np.ndarray, np.ndarray]:

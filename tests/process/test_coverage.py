@@ -77,7 +77,7 @@ class Lossy:
     def read_row(self, board: str, row: int) -> RowData:
         whole, size = self._scan.read_row(board, row), self.instrument.burst.pulses * self.instrument.frame_bytes
         missing = [(point * size, (point + 1) * size) for point in LOST.get(row, ())]
-        return RowData(whole.payload, missing, whole.frames_expected)
+        return RowData(whole.pieces, missing, whole.frames_expected)
 
 
 def test_lost_positions_of_odd_rows_are_counted_by_column(scan_of, tmp_path):

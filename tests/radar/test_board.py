@@ -315,12 +315,6 @@ def test_an_ignored_fault_is_named_after_the_cause_of_a_failure(radar, board, fa
     assert caught.value.why.index("main core fault: register read-back error") > 20
 
 
-def test_a_board_with_another_die_id_is_refused(rig, words, clock):
-    radar = RadarBoard("LS", words, clock, program(rig, rig.by_name("LS")), die_id="5eed0002-0-0-0")
-    with refused(ErrorCode.MISMATCH, "5eed0001", "5eed0002"):
-        radar.configure()
-
-
 def test_events_without_end_delay_a_poll_only_briefly(radar, board, clock):
     radar.arm(FRAMES)
     for _ in range(5000):

@@ -89,16 +89,6 @@ def test_the_reset_is_released_in_functional_mode_only(board, chip):
     assert board.executed == []
 
 
-def test_unplugging_during_a_row_is_a_fault(rig, board, usb, clock):
-    radar = RadarBoard("RH", usb, clock, program(rig, rig.by_name("RH")))
-    radar.arm(4)
-    board.plugged = False
-    assert radar.poll() is State.FAULT
-    assert "no such USB device" in radar.reason
-    with pytest.raises(DeviceError, match="no such USB device"):
-        radar.arm(4)
-
-
 def test_a_short_read_is_an_error(chip, usb, monkeypatch):
     monkeypatch.setattr(chip, "give", lambda name, size: b"\0" * (size - 1))  # noqa: ARG005
     with pytest.raises(DeviceError, match="3 of 4 bytes"):

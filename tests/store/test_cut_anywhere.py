@@ -197,7 +197,7 @@ def test_committed_row_cut_short(undisturbed, tmp_path, sample, suffix):
         assert [name in f for f in faults(scan)] == [True]
         if suffix == ".bin":
             with refused(ErrorCode.FILE_DAMAGED):
-                ScanFolder.load(scan.path).read_row("RV", 1)
+                _ = ScanFolder.load(scan.path).read_row("RV", 1).payload
         assert resumed(scan, undisturbed, image=not cut) == {1}  # row 1 is taken last now
         withdrawn = ScanFolder.load(scan.path).facts("row_withdrawn")
         assert [(f["row"], f["take"]) for f in withdrawn] == [(1, 1)]

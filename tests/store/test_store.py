@@ -17,7 +17,7 @@ from polysight.host.store.append_only import crc32
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import ManifestWriter, encode_line, parse
 from polysight.host.store.scan_folder import ScanFolder, new_scan_id
-from polysight.host.store.source import RawSource
+from polysight.host.store.source import RawSource, pieces_of
 from polysight.host.store.validation import to_json, validate
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, PolysightError
@@ -181,11 +181,21 @@ def test_read_row_refuses_damage(whole):
     flip(whole / "raw/RH/0002.bin")
     scan = ScanFolder.load(whole)
     with refused(ErrorCode.FILE_DAMAGED, "0002.bin"):
-        scan.read_row("RH", 2)
+        _ = scan.read_row("RH", 2).payload
+    with refused(ErrorCode.FILE_DAMAGED, "0002.bin"):
+        for _ in scan.read_row("RH", 2).pieces(100):
+            pass
     with refused(ErrorCode.NO_DATA):
         scan.read_row("LS", 2)
     with refused(ErrorCode.NO_DATA):
         scan.read_row("RH", 17)
+
+
+@pytest.mark.parametrize("size", [1, 7, 100, 1 << 20, 0])
+def test_pieces_of_any_size_are_the_payload(whole, size):
+    row = ScanFolder.load(whole).read_row("RH", 1)
+    assert b"".join(piece.tobytes() for piece in row.pieces(size)) == (whole / "raw/RH/0001.bin").read_bytes()
+    assert row.payload.tobytes() == b"".join(piece.tobytes() for piece in pieces_of(row.payload)(size))
 
 
 def test_other_folders_are_refused(whole, tmp_path):

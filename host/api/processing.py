@@ -13,7 +13,7 @@ from polysight.host.materials import find_truth, pixel_accuracy
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import ratio
 from polysight.host.process import Options, materials_content
-from polysight.host.products import ProcessedScan, plain, scan_facts
+from polysight.host.products import ProcessedScan, plain, scan_facts, withhold
 from polysight.host.store import ScanFolder, Source, require_raw
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
@@ -92,11 +92,12 @@ class Processing:
         return self._processed(images, pixels, materials, labels, interior)
 
     def _processed(self, images: ChannelImages, pixels, materials, labels, interior) -> ProcessedScan:
-        return ProcessedScan(
-            {**pixels, "x_m": images.x_m, "y_m": images.y_m},
-            plain(scan_facts(self.source, self.pipeline.rig, images)),
-            plain(self.pipeline.quality.to_dict()),
-            materials,
+        return ProcessedScan.computed(
+            self.folder,
             labels,
             interior,
+            image={**pixels, "x_m": images.x_m, "y_m": images.y_m},
+            scan=plain(scan_facts(self.source, self.pipeline.rig, images)),
+            quality=plain(self.pipeline.quality.to_dict()),
+            materials=withhold(materials),
         )

@@ -121,10 +121,14 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
             f"{folder}: no {IMAGE} to draw on",
             "the scan was not processed yet, its products lie elsewhere, or the path is wrong",
             f"polysight process {folder} --out {out}; or give the folder of its products",
+            code=ErrorCode.FILE_MISSING,
         )
     there, found = find_labels(folder), found_patches(products)
     if edits.given and list_only:
-        raise ConfigError("--list with other options would not do them", "it writes nothing", "leave --list out")
+        raise ConfigError(
+            "--list with other options would not do them", "it writes nothing", "leave --list out",
+            code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
     labels = there[1].in_mm(products.x_m, products.y_m) if there else Labels({}, "mm")
     if edits.given:
         labels, left_out = edited(labels, found, edits)
@@ -134,14 +138,12 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     else:
         sys.stdout.write(_listing(folder, products, there, found))
         if there and ask("name the patches anew, in place of the boxes drawn by hand? type yes: ").strip() != "yes":
-            raise ConfigError("nothing was changed", "yes was asked for", "options edit boxes: polysight label --help")
+            raise ConfigError(
+                "nothing was changed", "yes was asked for", "options edit boxes: polysight label --help",
+                code=ErrorCode.VALUE_INVALID,
+            )  # fmt: skip
         labels, left_out = asked(found, ask), []
     place = label_folder(products.folder)
-    return _save(place, products, labels, left_out)
-
-
-def _save(place: Path, products: SavedProducts, labels: Labels, left_out: Sequence[str]) -> int:
-    """Check, write and print the boxes; return 0."""
     checked, notes = save_labels(place, products, labels)
     sys.stdout.write("".join(f"{line}\n" for line in _table(checked)))
     if left_out:
@@ -166,7 +168,10 @@ def save_labels(place: Path, products: SavedProducts, labels: Labels) -> tuple[L
     """
     if not labels.boxes:
         raise DataError(
-            "no box is left", "every patch was left out, or every box removed", f"to have none, delete {place / LABELS}"
+            "no box is left",
+            "every patch was left out, or every box removed",
+            f"to have none, delete {place / LABELS}",
+            code=ErrorCode.NO_DATA,
         )
     checked = check_labels(labels, products.x_m, products.y_m, products.valid)
     checked = replace(
@@ -318,8 +323,9 @@ def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
             metal = _asked_metal(boxes, ask)
     except EOFError:
         raise ConfigError(
-            "nothing was written: the answers ended", "the input was closed", "give options instead"
-        ) from None
+            "nothing was written: the answers ended", "the input was closed", "give options instead",
+            code=ErrorCode.KEY_MISSING,
+        ) from None  # fmt: skip
     return Labels(boxes, "mm", metal)
 
 

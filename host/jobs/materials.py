@@ -58,14 +58,14 @@ def print_verdict(products: SavedProducts, to_terminal: bool = True) -> int:
 
 def _chirp(products: SavedProducts, config: Path | None) -> Chirp:
     """The chirp of the products, or that of `config` if given. Raises DataError, ConfigError."""
-    chirp = load_instrument(config).chirp if config is not None else products.chirp
-    if chirp is None:
+    rig = load_instrument(config) if config is not None else products.rig
+    if rig is None:
         raise DataError(
             f"{products.folder}: no {SCAN}, which names the chirp",
             "an earlier release processed the scan",
             "process the scan again, or give its rig file: --config FILE",
         )
-    return chirp
+    return rig.chirp
 
 
 def _check_bands(row: Mapping[str, Any], chirp: Chirp, source: str) -> None:

@@ -52,9 +52,7 @@ from polysight.host.products import (
     scan_folder_of,
 )
 from polysight.host.store import open_source, versions
-from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DataError, ScanError
-from polysight.shared.tables import decode
 
 EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
@@ -157,10 +155,9 @@ def _from_images(saved: SavedProducts, labels: Labels) -> TrainingScan:
 
 def _optics_of(saved: SavedProducts) -> Optics:
     """Return incidence angle and leakage of saved images; leakage that processing removed is zero here."""
-    path = saved.folder / SCAN
-    if "instrument" not in saved.scan:
+    rig, path = saved.rig, saved.folder / SCAN
+    if rig is None:
         raise DataError(f"{path}: names no rig", "an earlier release processed the scan", "process the scan again")
-    rig = decode(saved.scan["instrument"], Instrument, f"{path}: instrument")
     optics = Optics.of(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
     budget = saved.materials.get("error_budget") or {}
     if not budget:

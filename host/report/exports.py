@@ -16,10 +16,10 @@ import scipy
 
 from polysight.host.products import (
     CONVENTION,
+    ProcessedScan,
     SavedProducts,
     full_dataset,
     material_columns,
-    read_processed,
     read_products,
     temporary_path,
     verdict_attributes,
@@ -275,8 +275,8 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
             continue
         writer, name = {
             "hdf5": (write_hdf5, "image.h5"),
-            "netcdf": (lambda path, saved: write_netcdf(path, full_dataset(read_processed(saved))), "image.nc"),
-            "zarr": (lambda path, saved: write_zarr(path, full_dataset(read_processed(saved))), "image.zarr"),
+            "netcdf": (lambda path, saved: write_netcdf(path, full_dataset(ProcessedScan(saved.folder))), "image.nc"),
+            "zarr": (lambda path, saved: write_zarr(path, full_dataset(ProcessedScan(saved.folder))), "image.zarr"),
             "mat": (write_mat, "image.mat"),
             "csv": (write_csv, "materials.csv"),
         }[kind]

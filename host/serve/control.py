@@ -31,7 +31,7 @@ from polysight.shared.tables import decode, to_builtins
 
 RIG = "instrument.toml"
 FORMATS = ("csv", "mat", "png", "hdf5", "netcdf", "cphd")
-"""Formats of exports, which are written into `<scan>/export`."""
+"""Formats of exports, which are written into `<scan>/export`: files; a Zarr store is a folder, for no download."""
 _LARGEST = 2000  # positions of a row, rows
 Text = Annotated[str, msgspec.Meta(max_length=200)]
 Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
@@ -104,10 +104,11 @@ class LabelRequest(Body, frozen=True):
 
 
 class NotesRequest(Body, frozen=True):
-    """The operator's notes and tags."""
+    """The operator's notes and tags; they are refused if the present ones are not `base`."""
 
     notes: Annotated[str, msgspec.Meta(max_length=20_000)] = ""
     tags: Annotated[tuple[Annotated[str, msgspec.Meta(max_length=1000)], ...], msgspec.Meta(max_length=100)] = ()
+    base: Notes | None = None
 
 
 class TrainRequest(Body, frozen=True):
@@ -311,7 +312,7 @@ async def _labels(site: Site, request: Request, body: LabelRequest) -> dict[str,
 
 
 async def _notes(site: Site, request: Request, body: NotesRequest) -> dict[str, Any]:
-    written = await site.read_scan(request, write_notes, Notes(body.notes, body.tags))
+    written = await site.read_scan(request, write_notes, Notes(body.notes, body.tags), body.base)
     return {"what": "saved", "notes": written.notes, "tags": list(written.tags)}
 
 

@@ -11,16 +11,16 @@ import socket
 import msgspec
 import pytest
 
-from polysight.host.acquisition.control import ALIVE, CONTROL, ControlFolder, ScanCommand, StopRequest
+from polysight.host.acquisition.control import ScanCommand
 from polysight.host.cli.main import build_parser
 from polysight.host.serve.app import STATIC
 from polysight.host.serve.control import FORMATS, ExportRequest
 from polysight.host.serve.guard import TOKEN_HEADER
 from polysight.host.serve.server import is_loopback
 from tests.support.page.asking import TOKEN, ask
-from tests.support.page.live_view import served
+from tests.support.page.live_view import open_desk, served
 from tests.support.paths import REPO
-from tests.support.processes import LIMIT_S, wait_for
+from tests.support.processes import LIMIT_S
 
 
 class Page:
@@ -50,10 +50,7 @@ class Page:
 def desk(growing):
     """A running scan of which nothing has come yet: its folder and what hears of wishes."""
     growing.grow_to("scan_started")
-    stop = StopRequest()
-    with ControlFolder(growing.path, stop) as made:
-        made.open()
-        wait_for((growing.path / CONTROL / ALIVE).exists, "the first sign of life")
+    with open_desk(growing.path) as stop:
         yield growing.path, stop
 
 
@@ -157,7 +154,6 @@ def test_late_pages_are_told_what_early_ones_are(growing, watching):
         while (json.loads(heard).get("pictures") or {}).get("rows") != 2:
             heard = early.next("state")
         late = Page(view)
-        wait_for(lambda: watch.state.version == watch.state.version, "quiet")
         assert json.loads(late.next("state")) == json.loads(ask(view, "/api/state")[1])
         assert {k: v for k, v in json.loads(heard).items() if k != "status"} == {
             k: v for k, v in json.loads(ask(view, "/api/state")[1]).items() if k != "status"

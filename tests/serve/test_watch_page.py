@@ -6,10 +6,9 @@ import time
 
 import pytest
 
-from polysight.host.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
 from polysight.simulators.loopback import on_free_subnet
 from tests.support.page.chromium import DESK, PHONE, Browser
-from tests.support.page.live_view import GrowingScan, served
+from tests.support.page.live_view import GrowingScan, open_desk, served
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.rigs import published_rig
 
@@ -69,10 +68,7 @@ def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watc
 
 def test_buttons_reach_the_scan(browser, growing, watching):
     growing.grow_to("row_committed")
-    stop = StopRequest()
-    with ControlFolder(growing.path, stop) as desk, served(watching(growing.path, control=True), TOKEN) as view:
-        desk.open()
-        wait_for((growing.path / CONTROL / ALIVE).exists, "the first sign of life")
+    with open_desk(growing.path) as stop, served(watching(growing.path, control=True), TOKEN) as view:
         opened(browser, view, token=TOKEN)
         browser.wait("!document.getElementById('buttons').hidden", "buttons")
         assert TOKEN not in browser.value("location.href")
@@ -95,10 +91,7 @@ def test_buttons_reach_the_scan(browser, growing, watching):
 
 def test_a_wrong_token_is_said(browser, growing, watching):
     growing.grow_to("row_committed")
-    stop = StopRequest()
-    with ControlFolder(growing.path, stop) as desk, served(watching(growing.path, control=True), TOKEN) as view:
-        desk.open()
-        wait_for((growing.path / CONTROL / ALIVE).exists, "the first sign of life")
+    with open_desk(growing.path) as stop, served(watching(growing.path, control=True), TOKEN) as view:
         opened(browser, view, token="guessed")
         browser.wait("!document.getElementById('buttons').hidden", "buttons")
         browser.value("document.getElementById('stop').click()")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from polysight.host.acquisition import scan as host_run
 from polysight.host.acquisition.control import (
-    ALIVE,
     CONTROL,
     ControlFolder,
     ScanCommand,
@@ -21,6 +21,7 @@ from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.host.store.validation import validate
 from polysight.shared.error_codes import ErrorCode
+from tests.support.page.live_view import open_desk
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
 from tests.support.store.small_scan import SmallScan
@@ -29,10 +30,7 @@ from tests.support.store.small_scan import SmallScan
 @pytest.fixture
 def desk(tmp_path):
     """A desk that is open for the folder of the test."""
-    stop = StopRequest()
-    with ControlFolder(tmp_path, stop) as made:
-        made.open()
-        wait_for((tmp_path / CONTROL / ALIVE).exists, "the first sign of life")
+    with open_desk(tmp_path) as stop:
         yield tmp_path, stop
 
 
@@ -47,12 +45,6 @@ def test_commands_are_obeyed_once(desk):
     assert (stop.after_row, stop.now) == (True, False)
     send_command(folder, ScanCommand.STOP)  # a double click, or two phones
     assert (stop.after_row, stop.now) == (True, False)
-    send_command(folder, ScanCommand.ABORT)
-    assert stop.now
-
-
-def test_abort_is_now(desk):
-    folder, stop = desk
     send_command(folder, ScanCommand.ABORT)
     assert stop.now
 
@@ -78,10 +70,7 @@ def test_commands_for_an_earlier_scan_are_deleted(tmp_path):
     (tmp_path / CONTROL).mkdir()
     for wish in ScanCommand:
         (tmp_path / CONTROL / wish).touch()
-    stop = StopRequest()
-    with ControlFolder(tmp_path, stop) as desk:
-        desk.open()
-        wait_for(lambda: last_alive_s(tmp_path), "the first sign")
+    with open_desk(tmp_path) as stop:
         send_command(tmp_path, ScanCommand.CONTINUE)
     assert (stop.after_row, stop.paused) == (False, False)
 
@@ -128,16 +117,22 @@ def scan_with(samples, folder: Path, stop: StopRequest, at_row_1) -> SmallScan:
     return scan
 
 
+def when_paused(folder: Path, act: Callable[[], None]) -> None:
+    """Call `act` in a thread once the manifest says that the scan is paused."""
+
+    def wait() -> None:
+        wait_for(lambda: "scan_paused" in facts(folder), "the pause in the manifest")
+        act()
+
+    threading.Thread(target=wait).start()
+
+
 def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished, tmp_path):
     stop = StopRequest()
 
     def pause() -> None:
         stop.paused = True
-        threading.Thread(target=go_on).start()
-
-    def go_on() -> None:
-        wait_for(lambda: "scan_paused" in facts(tmp_path / "scan"), "the pause in the manifest")
-        stop.paused = False
+        when_paused(tmp_path / "scan", lambda: setattr(stop, "paused", False))
 
     scan = scan_with(samples, tmp_path, stop, pause)
     answer = [f for f in facts(scan.path) if f != "radars"]
@@ -153,11 +148,7 @@ def test_a_paused_scan_can_be_stopped(samples, tmp_path):
 
     def pause() -> None:
         stop.paused = True
-        threading.Thread(target=end).start()
-
-    def end() -> None:
-        wait_for(lambda: "scan_paused" in facts(tmp_path / "scan"), "the pause in the manifest")
-        stop.request()
+        when_paused(tmp_path / "scan", stop.request)
 
     scan = scan_with(samples, tmp_path, stop, pause)
     assert facts(scan.path)[-1] == "scan_ended"

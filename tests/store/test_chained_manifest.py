@@ -81,20 +81,6 @@ def test_a_damaged_line_is_one_fault_and_the_chain_goes_on_behind_it(tmp_path, d
     assert [f.line for f in found.faults] == [4]
 
 
-@given(st.data())
-def test_after_a_torn_tail_the_chain_goes_on(tmp_path_factory, data):
-    path = tmp_path_factory.mktemp("torn")
-    raw = b"".join(chained(path))
-    (path / MANIFEST).write_bytes(raw[: data.draw(st.integers(0, len(raw)))])
-    for fact in ({"fact": "scan_resumed"}, {"fact": "scan_ended"}):
-        with ManifestWriter(path / MANIFEST, create=False) as writer:
-            writer.append(fact)
-    found = manifest.read(path / MANIFEST)
-    assert (found.faults, found.torn) == ([], False)
-    counts = [json.loads(line)["count"] for line in (path / MANIFEST).read_bytes().splitlines()]
-    assert counts == list(range(len(counts)))
-
-
 def test_a_manifest_without_chain_reads_as_before_and_goes_on_with_one(tmp_path):
     path = tmp_path / MANIFEST
     path.write_bytes(b"".join(map(encode_line, SOME)))

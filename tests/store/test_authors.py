@@ -244,7 +244,7 @@ def test_contradictions_are_refused(write, base):
     with refused(ErrorCode.MISMATCH):
         open_source(folder, base).read_row("RH", 0)
     (folder / "RH" / "0_0_log.csv").write_text("1,1456,1.0\nnonsense\n")
-    with refused(ErrorCode.FILE_DAMAGED, "line 2"):
+    with refused(ErrorCode.FILE_DAMAGED, "0_0_log.csv", "nonsense"):
         open_source(folder, base).read_row("RH", 0)
     (folder / "RH" / "0_0.bin").rename(folder / "RH" / "6_0.bin")
     with refused(ErrorCode.FILE_FOREIGN, "column 6"):

@@ -112,18 +112,13 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
     assert not finished(job())
     process_many([job()], tmp_path / "out", 1)
     assert finished(job())
-    assert not finished(job(metal_box_mm=(0.0, 0.0, 1.0, 1.0)))
-    assert not finished(job(library=None))
-    assert not finished(job(config=None))
-    library.write_bytes(b"2")
-    assert not finished(job())
-    library.write_bytes(b"1")
-    assert finished(job())
-    rig.write_text("2")
-    assert not finished(job())
-    rig.write_text("1")
-    (folder / "0_0.bin").write_bytes(b"more")
-    assert not finished(job())
+    for change in ({"metal_box_mm": (0.0, 0.0, 1.0, 1.0)}, {"library": None}, {"config": None}):
+        assert not finished(job(**change)), change
+    for path in (library, rig, folder / "0_0.bin"):
+        before = path.read_bytes() if path.exists() else b""
+        path.write_bytes(b"2")
+        assert not finished(job()), path
+        path.write_bytes(before)
     (folder / "0_0.bin").unlink()
     assert finished(job())
     (tmp_path / "out" / "a" / "image.npz").unlink()

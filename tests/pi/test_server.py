@@ -177,12 +177,6 @@ def test_losing_the_stage_is_a_fault(host_in_row, stage):
     assert host.until_state("fault").fault == PiFault.STAGE_LOST
 
 
-def test_a_silent_stage_is_lost(host_in_row, stage):
-    stage.pace_s, stage.deaf = 0.3, True
-    done = host_in_row.wait(m.RowFinished)
-    assert (done.status, done.fault) == ("fault", PiFault.STAGE_LOST)
-
-
 def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
     """The heartbeat keeps the row for longer than silence would; without it the row ends with fault 108."""
     host = pi.host

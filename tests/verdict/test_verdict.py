@@ -5,7 +5,6 @@ import itertools
 import pytest
 
 from polysight.host.verdict import (
-    LEVELS,
     Coverage,
     NoResult,
     Reason,
@@ -61,10 +60,6 @@ def test_no_result_has_an_exit_status_of_its_own():
     assert error.exit_status == 7
     assert "c" in error.what
     assert "the images are kept" in error.remedy
-
-
-def test_every_level_has_words():
-    assert LEVELS == {"good": "good", "care": "usable with care", "none": "no result"}
 
 
 def level(reasons):

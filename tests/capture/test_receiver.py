@@ -16,13 +16,14 @@ import numpy as np
 import pytest
 
 from polysight.host.acquisition.capture_rig import record_ended
-from polysight.host.capture.dca1000 import Status, encode_packet
+from polysight.host.capture.dca1000 import Status
 from polysight.host.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
 from polysight.host.capture.receiver import Progress, ReceiverProcess
 from polysight.host.capture.segment import read_index
 from polysight.shared.config import Board
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
+from tests.support.capture.records import encode_packet
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
 

@@ -18,7 +18,6 @@ import pytest
 
 from polysight.host.acquisition import scan as host_run
 from polysight.host.acquisition.scan import ScanProgress, ScanResult, resume_scan, run_scan
-from polysight.host.capture.dca1000 import encode_packet
 from polysight.host.capture.packet_file import PACKETS, Evidence, write_packets
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import place_record
@@ -33,6 +32,7 @@ from polysight.shared.errors import PolysightError
 from polysight.shared.raster import plan_raster
 from polysight.shared.tables import decode, to_builtins
 from polysight.simulators.scene import SimulatedRig, load_scene, row_offsets_mm
+from tests.support.capture.records import encode_packet
 from tests.support.pipelines import pipeline_of
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene

@@ -14,9 +14,7 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import ratio
 from polysight.host.process import Options, materials_content
 from polysight.host.products import ProcessedScan, plain, scan_facts, withhold
-from polysight.host.store import ScanFolder, Source, require_raw
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DataError
+from polysight.host.store import Source
 
 
 class Processing:
@@ -43,17 +41,7 @@ class Processing:
     @cached_property
     def _images(self) -> ChannelImages:
         """Both channels from all rows that hold data. Raises DataError when there are none."""
-        rows = list(self.source.rows())
-        if isinstance(self.source, ScanFolder) and not self.pipeline.samples.holds(rows):
-            require_raw(self.source)
-        if not rows:
-            raise DataError(
-                f"{self.folder}: no row is recorded whole",
-                "the scan was stopped in its first row, or files are missing",
-                f"`polysight resume {self.folder}` takes the missing rows of a scan folder",
-                code=ErrorCode.NO_DATA,
-            )
-        for row in rows:
+        for row in self.pipeline.samples.processable(self.source, self.folder):
             self.pipeline.add_row(row)
         images = self.pipeline.form_images()
         self.pipeline.quality.note_imaging(self.pipeline.images, images)

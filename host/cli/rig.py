@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from polysight.host.cli.options import Add, add_action, add_config_option, add_json_option, count, number, positive
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 
 
@@ -86,8 +87,9 @@ def _doctor(args: argparse.Namespace) -> int:
 
     if args.move and not args.pulse:
         raise ConfigError(
-            "--move and --no-pulse", "each point of the row is a burst of SYNC_IN pulses", "leave one of them out"
-        )
+            "--move and --no-pulse", "each point of the row is a burst of SYNC_IN pulses", "leave one of them out",
+            code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
     options = DoctorOptions(args.config, args.out, args.move, args.pulse, args.bursts)
     return run_doctor(options, args.json, bundle=args.bundle)
 

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.cells import cell_len
 
+from polysight.host.jobs.output import print_lines
 from polysight.host.materials import (
     SPECIMEN,
     Box,
@@ -145,7 +146,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
         labels, left_out = asked(found, ask), []
     place = label_folder(products.folder)
     checked, notes = save_labels(place, products, labels)
-    sys.stdout.write("".join(f"{line}\n" for line in _table(checked)))
+    print_lines(_table(checked))
     if left_out:
         sys.stdout.write(f"left out, without a name: {', '.join(left_out)}\n")
     sys.stdout.write("".join(f"note: {note}\n" for note in notes))

@@ -20,7 +20,7 @@ from polysight.host.imaging import (
     View,
     focus_sweep,
 )
-from polysight.host.jobs.progress import counted, current_step, say
+from polysight.host.jobs.output import counted, current_step, print_lines, say
 from polysight.host.materials import (
     TruthPlate,
     find_truth,
@@ -72,15 +72,7 @@ def all_rows(
     if options is not None:
         metal = check_options(options, pipeline.rig, axes_of(pipeline))
         pipeline.metal_plane(options, metal is not None)
-    rows = list(source.rows())
-    if not rows:
-        raise DataError(
-            f"{data}: no row is recorded whole",
-            "the scan was stopped in its first row, or files are missing",
-            f"`polysight resume {data}` takes the missing rows of a scan folder",
-        )
-    if isinstance(source, ScanFolder) and not pipeline.samples.holds(rows):
-        require_raw(source)
+    rows = pipeline.samples.processable(source, data)
     for _ in counted(map_rows(pipeline.add_row, rows, threads), len(rows), "rows"):
         pass
     return pipeline
@@ -175,9 +167,7 @@ def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
     return replace(found, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 
-def load_reference(
-    folder: Path, config: Path | None = None, by_position: bool = True, bands: int = 1
-) -> PlaneReference:
+def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> PlaneReference:
     """Make a reference from a scan of a metal plate that covers the plane.
 
     Parameters
@@ -186,8 +176,6 @@ def load_reference(
         Scan folder, or the authors' unsynced/<scan>.
     config
         Rig file for the latter.
-    by_position
-        A value for each pixel; else one number a channel.
     bands
         Sub-bands to image too.
 
@@ -198,8 +186,7 @@ def load_reference(
     """
     pipeline, images = imaged(folder, config, bands)
     parts = tuple(plane_of(pipeline, band) for band in pipeline.sub_bands.finish(pipeline.source.mirrored))
-    found = replace(plane_of(pipeline, images), bands=parts)
-    return found if by_position else found.mean()
+    return replace(plane_of(pipeline, images), bands=parts)
 
 
 def load_options(request: ProcessRequest) -> Options:
@@ -207,8 +194,7 @@ def load_options(request: ProcessRequest) -> Options:
     reference = None
     if request.reference is not None:
         config = None if request.config is None else Path(request.config)
-        by_position = request.reference_by == "position"
-        reference = load_reference(Path(request.reference), config, by_position, request.bands)
+        reference = load_reference(Path(request.reference), config, request.bands)
     return Options(
         metal_box_mm=request.metal_box_mm,
         library=None if request.library is None else Path(request.library),
@@ -247,7 +233,7 @@ def image(data: Path, out: Path, config: Path | None, view: View = AS_IN_RIG_FIL
     with making_products(out, source.scan_id) as new:
         save_images(new, source, pipeline.rig, images, pipeline.quality)
     lines = (*coverage_lines(pipeline.quality.coverage()), f"image: {out / IMAGE}")
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    print_lines(lines)
     sys.stdout.flush()
     pipeline.quality.note_imaging(pipeline.images, images)
     write_json(out / QUALITY, quality_content(pipeline.quality))
@@ -278,7 +264,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *axes_of(pipeline), source.simulated))
     head = f"{'simulated ' if source.simulated else ''}scan {source.scan_id}"
     at = pipeline.rig.geometry.object_distance_mm
-    sys.stdout.write("".join(f"{line}\n" for line in _focus_lines(head, at, found, plates)))
+    print_lines(_focus_lines(head, at, found, plates))
     sys.stdout.write(f"figure: {out / 'focus.png'}\n")
     return 0
 

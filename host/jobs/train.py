@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from polysight.host.jobs.demo import check_scenes, run_simulator
+from polysight.host.jobs.output import print_lines, steps
 from polysight.host.jobs.process import all_rows
-from polysight.host.jobs.progress import steps
 from polysight.host.materials import (
     TRUTH,
     ImagePair,
@@ -252,7 +252,7 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
     )
     library = make_library(with_unique_names(scans), note)
     library.save(out)
-    sys.stdout.write("".join(f"{line}\n" for line in _summary(out, library)))
+    print_lines(_summary(out, library))
     sys.stdout.write(f"{json.dumps(library.fit, indent=1)}\n")
     return 0
 

@@ -228,10 +228,8 @@ class Watch:
             self._close_parts()
             self._begin()
             facts = self._manifest.look()
-        if facts:
-            self._grown_at = (
-                time.monotonic() if self._looked else self._grown_at
-            )  # at the first look nothing is known to be new
+        if facts and self._looked:  # at the first look nothing is known to be new
+            self._grown_at = time.monotonic()
         self._looked = True
         self._content.facts += facts
         for fact in facts:

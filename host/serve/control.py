@@ -170,8 +170,8 @@ def _decode_body(body: bytes, kind: type[Body]) -> Body:
 def _session(site: Site) -> Callable[[Request], Awaitable[Response]]:
     async def session(request: Request) -> Response:
         answer = JSONResponse({"what": "opened"})
-        name = cookie_name(int((request.scope.get("server") or ("", 0))[1] or 0))
-        answer.set_cookie(name, site.access.session, httponly=True, samesite="strict", secure=site.access.secure)
+        name, access = cookie_name(request.scope), site.access
+        answer.set_cookie(name, access.session, httponly=True, samesite="strict", secure=access.secure)
         return answer
 
     return session

@@ -56,7 +56,10 @@ class Place:
     @property
     def loopback(self) -> bool:
         """True if only this machine can reach the address."""
-        return is_loopback(self.host)
+        try:
+            return self.host == "localhost" or ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
 
     def check(self) -> None:
         """Raise ConfigError for files of TLS that are missing, do not belong together or need a passphrase."""
@@ -156,16 +159,6 @@ def server(app: Starlette, site: Site, place: Place | None = None) -> uvicorn.Se
     made = uvicorn.Server(config)
     site.ending = lambda: made.should_exit
     return made
-
-
-def is_loopback(host: str) -> bool:
-    """True if only this machine can reach an address to bind."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _bind(place: Place) -> socket.socket:

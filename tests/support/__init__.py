@@ -2,7 +2,7 @@
 
 paths, rigs, scenes
     Where things are; the published rig and changed ones; scene files small enough for a test.
-processes, simulated_rig, pattern_rig, killed_at
+processes, simulated_rig, killed_at
     Commands, in this process or as processes of their own; the whole simulated rig as processes.
 acquisition, capture, doctor, page, pi, radar, stage, store
     Stand-ins and helpers of the test folder of the same name, used by other folders too.

@@ -18,7 +18,7 @@ from polysight.host.serve.control import FORMATS, ExportRequest
 from polysight.host.serve.guard import TOKEN_HEADER
 from polysight.host.serve.server import Place
 from tests.support.page.asking import TOKEN, ask
-from tests.support.page.live_view import open_desk, served
+from tests.support.page.live_view import open_control, served
 from tests.support.processes import LIMIT_S
 
 
@@ -49,7 +49,7 @@ class Page:
 def desk(growing):
     """A running scan of which nothing has come yet: its folder and what hears of wishes."""
     growing.grow_to("scan_started")
-    with open_desk(growing.path) as stop:
+    with open_control(growing.path) as stop:
         yield growing.path, stop
 
 

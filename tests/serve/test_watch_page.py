@@ -8,7 +8,7 @@ import pytest
 
 from polysight.simulators.loopback import on_free_subnet
 from tests.support.page.chromium import DESK, PHONE, Browser
-from tests.support.page.live_view import GrowingScan, open_desk, served
+from tests.support.page.live_view import GrowingScan, open_control, served
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.rigs import published_rig
 
@@ -61,7 +61,7 @@ def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watc
 
 def test_buttons_reach_the_scan(browser, growing, watching):
     growing.grow_to("row_committed")
-    with open_desk(growing.path) as stop, served(watching(growing.path, control=True), TOKEN) as view:
+    with open_control(growing.path) as stop, served(watching(growing.path, control=True), TOKEN) as view:
         opened(browser, view, token=TOKEN)
         browser.click("#pause")
         assert TOKEN not in browser.value("location.href")
@@ -82,7 +82,7 @@ def test_buttons_reach_the_scan(browser, growing, watching):
 
 def test_a_wrong_token_is_said(browser, growing, watching):
     growing.grow_to("row_committed")
-    with open_desk(growing.path) as stop, served(watching(growing.path, control=True), TOKEN) as view:
+    with open_control(growing.path) as stop, served(watching(growing.path, control=True), TOKEN) as view:
         opened(browser, view, token="guessed")
         browser.click("#stop")
         browser.wait("document.getElementById('answer').innerText.includes('token is wrong')", "the refusal")

@@ -10,7 +10,6 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -276,15 +275,6 @@ class Watch:
         send_command(self.folder, wish)
         paused = self._history is not None and self._history.paused
         self._asked = None if wish is ScanCommand.CONTINUE and not paused else (wish, before)
-
-    def wait_for(self, condition: Callable[[dict[str, Any]], bool], limit_s: float) -> bool:
-        """Wait until a snapshot meets a condition; False after the limit."""
-        deadline = time.monotonic() + limit_s
-        while not condition(json.loads(self.state.data)):
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(_TURN_S / 4)
-        return True
 
     def _close_parts(self) -> None:
         for part in (self._viewer, self._listener):

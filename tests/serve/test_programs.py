@@ -121,6 +121,11 @@ def test_a_scan_starts_with_its_plan_and_without_a_pi_says_why(tmp_path):
         ended(folder, "scan")
         wait_for(lambda: program_of(folder, "scan").status is not None, "its status")
         assert program_of(folder, "scan").status != 0
+        wait_for(lambda: get(view, "/api/scan?scan=week/one")["state"] == "failed", "the state")
+        reason = get(view, "/api/scan?scan=week/one")["reason"]
+        assert len(reason) > 10
+        assert "polysight" not in reason
+        assert reason in program_of(folder, "scan").log
         assert get(view, "/api/scans")["scans"][0]["tags"] == ["t"]
         assert post(view, "/api/start", {"name": "week/one"})[0] == 200  # once more, by the same name
         assert get(view, "/api/scan?scan=week/one")["notes"] == "n"

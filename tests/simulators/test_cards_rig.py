@@ -15,8 +15,7 @@ import pytest
 
 from polysight.shared.config import load_instrument
 from polysight.simulators.cards import bound_udp
-from polysight.simulators.rig import card_groups, derive
-from polysight.simulators.scene import load_scene
+from polysight.simulators.rig import card_groups
 from tests.support.scenes import small_scene
 
 ROOT = Path(__file__).parents[2]
@@ -118,19 +117,6 @@ def test_a_process_that_dies_ends_the_rig_and_is_named(launch: Launch, tmp_path:
     assert str(tmp_path / "rig" / "logs") in message
     assert "Traceback" not in message
     assert not any(alive(pid) for pid in pids.values())
-
-
-def test_the_derived_rig_keeps_everything_else(tmp_path: Path) -> None:
-    rig = load_instrument(ROOT / "instrument.toml")
-    scene = tmp_path / "scene.toml"
-    scene.write_text(SCENE)
-    derived = derive(rig, load_scene(scene), tmp_path)
-    assert derived.chirp == rig.chirp
-    assert derived.antennas == rig.antennas
-    assert derived.limits == rig.limits
-    assert [b.mount for b in derived.boards] == [b.mount for b in rig.boards]
-    assert derived.stage.port == str(tmp_path / "ttySTAGE")
-    assert derived.pi.journal_dir == str(tmp_path / "journal")
 
 
 def test_each_recorded_board_has_a_process_and_no_board_is_left_out() -> None:

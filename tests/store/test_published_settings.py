@@ -1,4 +1,4 @@
-"""The published settings make a rig; its synchronised cubes are read. Raw rows are in test_authors_losses.py."""
+"""The published settings make a rig; its synchronised cubes are read. Raw rows are in test_published_rows.py."""
 
 import json
 

@@ -23,7 +23,6 @@ from polysight.simulators.cards.sender import ReceiveQueue, bound_udp
 from polysight.simulators.loopback import is_free, on_subnet
 from polysight.simulators.scene import pattern_frames
 
-ROOT = Path(__file__).parents[2]
 TIME_SCALE = 20.0
 FRAME = 4096
 PERIOD_NS = 1_500_000

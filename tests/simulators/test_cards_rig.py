@@ -16,9 +16,10 @@ import pytest
 from polysight.shared.config import load_instrument
 from polysight.simulators.cards import bound_udp
 from polysight.simulators.rig import card_groups
+from tests.support.paths import RIG_FILE
+from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 
-ROOT = Path(__file__).parents[2]
 SCENE = small_scene(10, 4)
 Launch = Callable[..., subprocess.Popen[str]]
 
@@ -28,7 +29,7 @@ def launch(tmp_path: Path) -> Iterator[Launch]:
     started: list[subprocess.Popen[str]] = []
 
     def begin(*arguments: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(ROOT / "instrument.toml")]
+        command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(RIG_FILE)]
         command += ["--dir", str(tmp_path / "rig"), *arguments]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         started.append(process)
@@ -120,4 +121,4 @@ def test_a_process_that_dies_ends_the_rig_and_is_named(launch: Launch, tmp_path:
 
 
 def test_each_recorded_board_has_a_process_and_no_board_is_left_out() -> None:
-    assert card_groups(load_instrument(ROOT / "instrument.toml")) == ["RH,LS", "RV"]
+    assert card_groups(published_rig()) == ["RH,LS", "RV"]

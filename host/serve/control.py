@@ -30,7 +30,7 @@ from polysight.shared.errors import ConfigError, DataError, DeviceError, ScanErr
 from polysight.shared.tables import decode, to_builtins
 
 RIG = "instrument.toml"
-FORMATS = ("csv", "mat", "png", "hdf5", "netcdf", "cphd")
+FORMATS = ("csv", "mat", "hdf5", "netcdf", "cphd")
 """Formats of exports, which are written into `<scan>/export`: files; a Zarr store is a folder, for no download."""
 _LARGEST = 2000  # positions of a row, rows
 Text = Annotated[str, msgspec.Meta(max_length=200)]

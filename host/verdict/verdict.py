@@ -96,13 +96,13 @@ def read_verdict(content: Mapping[str, Any]) -> Verdict | None:
     raw = content.get("verdict")
     if not isinstance(raw, Mapping):
         return None
-    level = next((known for known in LEVELS if raw.get("level") == known), None)
-    if level is None:
+    levels: list[Level] = [level for level in LEVELS if level == raw.get("level")]
+    if not levels:
         return None
     listed = raw.get("reasons")
     reasons = [
-        Reason(level, str(r.get("what", "")), str(r.get("why", "")), str(r.get("do", "")))
+        Reason(levels[0], str(r.get("what", "")), str(r.get("why", "")), str(r.get("do", "")))
         for r in (listed if isinstance(listed, list) else [])
         if isinstance(r, Mapping)
     ]
-    return Verdict(level, tuple(reasons))
+    return Verdict(levels[0], tuple(reasons))

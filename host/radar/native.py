@@ -23,6 +23,7 @@ from polysight.host.radar.spi import Clock, SystemClock, WordLink
 from polysight.host.radar.trace import TracedWords, new_trace, traced
 from polysight.host.radar.usb import SCHEME, open_tcp, open_usb
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError
 
 _POLL_S = 0.005
@@ -95,7 +96,7 @@ class _LostLink:
         self._error = error
 
     def _fail(self, *_: object, **__: object) -> Any:
-        raise DeviceError(self._error.what, self._error.why, self._error.remedy)
+        raise DeviceError(self._error.what, self._error.why, self._error.remedy, code=self._error.code)
 
     write = read = interrupt = reset = _fail
 
@@ -181,6 +182,7 @@ class NativeRadars(RadarControl):
                     f"{found[die]} and {name} have the same die id {die}",
                     "both names in radar.native refer to one board",
                     "correct usb_serial or usb_path of one of them",
+                    code=ErrorCode.VALUES_CONFLICT,
                 )
             found[die] = name
 

@@ -132,7 +132,7 @@ def test_a_board_in_fault_is_not_done(radars, usb):
 
 def test_two_names_for_one_board_are_refused(rig, usb, clock):
     usb.boards["FTRV"].cores.die = 2
-    with pytest.raises(DeviceError, match="RH and RV"):
+    with refused(ErrorCode.VALUES_CONFLICT, "RH and RV"):
         NativeRadars(rig, usb.open, clock)
 
 

@@ -23,7 +23,6 @@ from polysight.simulators.cards.sender import ReceiveQueue, bound_udp
 from polysight.simulators.loopback import is_free, on_subnet
 from polysight.simulators.scene import pattern_frames
 
-ROOT = Path(__file__).parents[2]
 TIME_SCALE = 20.0
 FRAME = 4096
 PERIOD_NS = 1_500_000
@@ -187,15 +186,7 @@ def test_a_record_goes_on_while_the_stage_moves_or_owes_a_burst(
 def test_wrong_arguments_are_one_message(rig: Instrument, tmp_path: Path, arguments: list[str], words: str) -> None:
     config = tmp_path / "rig.toml"
     config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
-    command = [
-        sys.executable,
-        "-m",
-        "polysight.simulators.cards",
-        "--config",
-        str(config),
-        "--wires",
-        str(tmp_path / "w.sock"),
-    ]
+    command = [sys.executable, "-m", "polysight.simulators.cards", "--config", config, "--wires", tmp_path / "w.sock"]
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=20, check=False)
     assert done.returncode == 2
     assert words in done.stderr

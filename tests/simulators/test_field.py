@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from polysight.simulators.scene import Scene, apply_scene, decode_scene
@@ -14,8 +14,8 @@ from polysight.simulators.scene.field import ObjectField, build_field, node_matr
 from polysight.simulators.scene.optics import antennas, direct_factor, field_exact
 from polysight.simulators.scene.radar import sample_frequencies_hz
 from tests.support.refusals import refused
+from tests.support.rigs import published_rig
 
-ROOT = Path(__file__).parents[2]
 GRID = {"columns": 29, "rows": 21, "step_x_mm": 10.0, "step_y_mm": 10.0}
 PLATES = [
     {"name": "metal", "centre_mm": [0.0, 0.0], "size_mm": [45.0, 45.0], "metal": True},
@@ -25,7 +25,7 @@ PLATES = [
 
 def setup(**tables: Any) -> tuple[Instrument, Scene]:
     scene = decode_scene({"name": "t", "object_distance_mm": 499.0, "grid": GRID, **tables}, "t")
-    return apply_scene(load_instrument(ROOT / "instrument.toml"), scene), scene
+    return apply_scene(published_rig(), scene), scene
 
 
 def read(field: ObjectField, offsets_m: np.ndarray, f: np.ndarray, rx: int, samples: np.ndarray) -> np.ndarray:

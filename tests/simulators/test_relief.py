@@ -1,12 +1,11 @@
 """Tilted, raised and rough plates: the fast field equals the exact sum, and both agree with optics."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
 from polysight.shared.raster import mean_burst_travel_mm, plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
@@ -14,8 +13,9 @@ from polysight.simulators.scene import Scene, apply_scene, decode_scene, synced_
 from polysight.simulators.scene.field import build_field, node_matrix
 from polysight.simulators.scene.optics import antennas, field_exact
 from polysight.simulators.scene.radar import sample_frequencies_hz
+from tests.support.rigs import published_rig
 
-RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+RIG = published_rig()
 GRID = {"columns": 21, "rows": 15, "step_x_mm": 10.0, "step_y_mm": 10.0}
 PLATE = {"name": "a", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "permittivity": [4.0, 0.4]}
 SIX = [

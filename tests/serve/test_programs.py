@@ -50,29 +50,29 @@ def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
     assert "--version" not in found.log  # the log of the earlier one stays in the file
 
 
-def test_a_program_is_known_by_its_number_and_its_begin(tmp_path):
+@pytest.fixture
+def sleeping(tmp_path: Path) -> Iterator[Path]:
+    """A folder for which a program runs, which is killed in the end."""
     child = launcher.launch(["/bin/sleep", "60"], str(tmp_path), str(tmp_path / PROGRAM / "scan"))
     try:
-        found = program_of(tmp_path, "scan")
-        assert found is not None
-        assert found.running
-        answer = json.loads((tmp_path / PROGRAM / "scan.json").read_text())
-        (tmp_path / PROGRAM / "scan.json").write_text(json.dumps(answer | {"ticks": answer["ticks"] - 1}))
-        assert not program_of(tmp_path, "scan").running  # another process has the number now
-    finally:
-        os.killpg(child.pid, 9)
-        child.wait()
-
-
-def test_one_program_of_a_kind_runs_in_a_folder(programs, tmp_path):
-    child = launcher.launch(["/bin/sleep", "60"], str(tmp_path), str(tmp_path / PROGRAM / "scan"))
-    try:
-        with refused(ErrorCode.BUSY):
-            programs.start(tmp_path, "scan", ["--version"])
+        yield tmp_path
     finally:
         os.killpg(child.pid, 9)
         child.wait()
     assert program_of(tmp_path, "scan").status is None  # killed: it could not say
+
+
+def test_a_program_is_known_by_its_number_and_its_begin(sleeping):
+    assert program_of(sleeping, "scan").running
+    file = sleeping / PROGRAM / "scan.json"
+    answer = json.loads(file.read_text())
+    file.write_text(json.dumps(answer | {"ticks": answer["ticks"] - 1}))
+    assert not program_of(sleeping, "scan").running  # another process has the number now
+
+
+def test_one_program_of_a_kind_runs_in_a_folder(programs, sleeping):
+    with refused(ErrorCode.BUSY):
+        programs.start(sleeping, "scan", ["--version"])
 
 
 @pytest.mark.parametrize(

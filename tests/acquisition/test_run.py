@@ -169,7 +169,7 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
 
 
 def test_killed_host_resumes_and_committed_rows_stay(rig, payload, tmp_path):
-    """SIGKILL within row 2, of which half has come. The Pi goes on and ends the row; that end is not the new take's."""
+    """SIGKILL in the middle of row 2. The Pi finishes that row; the new take must not use its end."""
     (tmp_path / "rig.toml").write_text(tomli_w.dumps(to_builtins(rig.instrument)))
     code = (
         "import sys\nfrom pathlib import Path\nfrom polysight.shared.config import load_instrument\n"

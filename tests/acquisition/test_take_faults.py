@@ -113,7 +113,7 @@ def test_every_kind_has_its_words_and_its_line_in_the_specification():
 
 
 def test_words_follow_the_kind_alone():
-    """Reasons are for people: whatever they say, the cause is that of the kind."""
+    """The cause shown depends on the kind of the fault, not on the text of the reason."""
     answer = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
     for kind, (why, do) in CAUSES.items():
         notice = notice_of_rejection(0, 1, [answer], [TakeFault(kind, answer, "RV").fact()], "")

@@ -88,7 +88,7 @@ def test_commands_without_the_service(command, instrument, write_config, hub, st
 
 
 def test_commands_beside_the_service(command, instrument, write_config, start, hub):
-    """Those that need its lines, stage or ports are refused with its address, and not because a line is in use."""
+    """Commands that need lines, stage or ports are refused because the service runs; the error has its address."""
     rig = on_free_subnet(instrument)  # ports that stay the same from one program to the next
     start(rig, "--wires", hub)
     config = write_config(rig)

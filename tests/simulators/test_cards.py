@@ -1,4 +1,4 @@
-"""The process of the simulated cards: a test client is host and Pi, over real sockets and the real hub."""
+"""The process of the simulated cards; the test is host and Pi, over real sockets and the real hub."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def growing(finished: Path, tmp_path: Path) -> GrowingScan:
 
 @pytest.fixture
 def watching() -> Iterator[Callable[..., Watch]]:
-    """Makes watches, as `Watch`, that look on until the test ends."""
+    """Makes `Watch`es that run until the test ends."""
     made: list[Watch] = []
 
     def watch(*arguments: object, **options: object) -> Watch:

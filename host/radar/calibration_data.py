@@ -101,14 +101,22 @@ class CalibrationFiles:
         return data
 
     def save(self, die_id: str, data: bytes) -> None:
-        """Write a die's file atomically. Raises OSError."""
+        """Write a die's file atomically. Raises ConfigError if it cannot be written."""
         path = self.path(die_id)
-        self._folder.mkdir(parents=True, exist_ok=True)
         temperature = struct.unpack_from("<h", data, 16)[0]
         content = {"die_id": die_id, "temperature_c": temperature, "crc32": zlib.crc32(data), "data": data.hex()}
         part = path.with_suffix(".part")
-        part.write_text(json.dumps(content), encoding="utf-8")
-        part.replace(path)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            part.write_text(json.dumps(content), encoding="utf-8")
+            part.replace(path)
+        except OSError as error:
+            raise ConfigError(
+                f"radar.calibration_dir: {path} cannot be written: {error.strerror}",
+                "the path is wrong, a permission is missing, or the disk is full",
+                "correct calibration_dir, or remove it",
+                code=ErrorCode.FILE_UNWRITABLE,
+            ) from None
 
 
 def read_calibration(link: Link, name: str) -> bytes:

@@ -79,6 +79,12 @@ def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp
     assert 0x0100 not in board.executed
 
 
+def test_a_calibration_folder_that_cannot_be_written_is_named(made, tmp_path):
+    (tmp_path / "kept").write_text("a file in place of the folder")
+    with refused(ErrorCode.FILE_UNWRITABLE, tmp_path / "kept", "calibration_dir"):
+        made(CalibrationFiles(tmp_path / "kept", b"settings")).configure()
+
+
 def test_other_settings_and_other_dies_have_their_own_calibration(made, board, tmp_path):
     made(CalibrationFiles(tmp_path, b"settings")).configure()
     made(CalibrationFiles(tmp_path, b"others")).configure()

@@ -126,10 +126,18 @@ def read_calibration(link: Link, name: str) -> bytes:
         blocks = link.call(SaveCalibration(part)).blocks
         if not blocks or len(blocks[0].data) != PART_BYTES + 4:
             raise DeviceError(
-                f"{name}: the answer has no calibration data", "unknown firmware", "remove calibration_dir"
+                f"{name}: the answer has no calibration data",
+                "unknown firmware",
+                "remove calibration_dir",
+                code=ErrorCode.MESSAGE_INVALID,
             )
         if struct.unpack_from("<2H", blocks[0].data) != (PARTS, part):
-            raise DeviceError(f"{name}: the answer has not part {part} of the calibration", "unknown firmware", _REMEDY)
+            raise DeviceError(
+                f"{name}: the answer has not part {part} of the calibration",
+                "unknown firmware",
+                _REMEDY,
+                code=ErrorCode.MESSAGE_INVALID,
+            )
         data += blocks[0].data[4:]
     return data
 
@@ -146,7 +154,10 @@ def restore_calibration(link: Link, name: str, data: bytes, timeout_s: float, no
     passed = event.values.get("passed")
     if not isinstance(passed, int) or passed & RESTORED != RESTORED:
         raise DeviceError(
-            f"{name}: does not accept its calibration data: {event}", "the firmware has changed since", _REMEDY
+            f"{name}: does not accept its calibration data: {event}",
+            "the firmware has changed since",
+            _REMEDY,
+            code=ErrorCode.REFUSED_BY_PEER,
         )
     link.call(InitCalibrations(ALL & ~RESTORED))
     return f"calibration restored, made at {struct.unpack_from('<h', data, 16)[0]} C"

@@ -17,7 +17,6 @@ from polysight.host.radar.calibration_data import (
 )
 from polysight.host.radar.program import program
 from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DeviceError
 from tests.support.refusals import refused
 
 FRAMES = 4
@@ -73,7 +72,7 @@ def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp
     if name == "RH" and bit in OF_TX:
         radar.configure()
         return
-    with pytest.raises(DeviceError, match=text):
+    with refused(ErrorCode.RADAR_FAULT, text):
         radar.configure()
     assert not (tmp_path / "kept").exists()
     assert 0x0100 not in board.executed

@@ -173,19 +173,6 @@ def test_an_unplugged_board_is_a_fault_and_recovers_when_plugged_in(radar, board
     assert radar.state is State.ARMED
 
 
-def test_a_refused_setting_is_a_fault_with_its_name(radar, board):
-    board.inject(Fault.REFUSE)
-    with refused(ErrorCode.REFUSED_BY_PEER, "DeviceConfiguration"):
-        radar.configure()
-    assert "refuses DeviceConfiguration" in radar.reason
-
-
-def test_a_board_that_does_not_answer_is_an_error(radar, board):
-    board.cores.destroyed = True
-    with refused(ErrorCode.NO_ANSWER, "LS", "0x5000"):
-        radar.configure()
-
-
 def test_the_report_has_versions_temperatures_calibration_and_every_byte_sent(radar):
     radar.configure()
     radar.arm(FRAMES)

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -107,9 +108,21 @@ class RepeatedRows:
         """A row's bytes."""
         files = self.files[board_name]
         frames = self.plan.columns * self.instrument.burst.pulses
-        wanted = frames * self.instrument.frame_bytes
-        payload = np.fromfile(files[row % len(files)], dtype=np.uint8, count=wanted)
-        return RowData(np.resize(payload, wanted) if payload.size != wanted else payload, [], frames)
+        return RowData(partial(_repeated, files[row % len(files)], frames * self.instrument.frame_bytes), [], frames)
+
+
+def _repeated(path: Path, wanted: int, size: int) -> Iterator[NDArray[np.uint8]]:
+    """Read pieces of a file, from its start again where it ends, `wanted` bytes in all."""
+    memory = np.empty(min(size, wanted) or wanted, np.uint8)
+    with path.open("rb") as file:
+        while wanted:
+            piece, filled = memory[:wanted], 0
+            while filled < piece.size:
+                filled += file.readinto(piece[filled:].data)
+                if filled < piece.size:
+                    file.seek(0)
+            yield piece
+            wanted -= piece.size
 
 
 def point_row(

@@ -36,9 +36,8 @@ class Pipeline:
         return process.map_boards(self.quality.boards, lambda board: self._synchronise(board, row), self.images.live)
 
     def _synchronise(self, board: str, row: int) -> sync.SyncedRow:
-        with self.quality.timed("read and decode"):
+        with self.quality.timed("read and synchronise"):
             recorded = self.source.read_row(board, row)
-        with self.quality.timed("synchronise"):
             synced, frames_whole = self.synchroniser.synchronise(board, recorded)
         with self.quality.timed("reduce"):
             self.images.add_row(board, row, synced)

@@ -43,14 +43,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
 
     Signals: `folder`, `scan_id`, `rows_committed`, `rows_planned`, `state` (what `polysight scan` is doing).
 
-    Parameters
-    ----------
-    config
-        Rig file.
-    name
-        Of the device; begins the names of its signals and data keys.
-    keep_incomplete
-        Keep rows with gaps after all retakes, instead of ending.
+    `name` begins the names of signals and data keys. `keep_incomplete`: keep rows with gaps after all retakes.
     """
 
     def __init__(self, config: Path | str, name: str = "radar_scan", keep_incomplete: bool = False) -> None:

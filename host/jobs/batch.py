@@ -54,7 +54,7 @@ class Job(msgspec.Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """Of the scan's folder."""
+        """Name of the scan's folder."""
         return self.out.name
 
 

@@ -132,16 +132,7 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
     _fresh_folder(out)
     sys.stderr.write(f"simulated rig: no hardware is involved. Scene {scene}\n")
     with simulated_rig(config, scene, out / "rig", time_scale or TIME_SCALE) as rig_file:
-        scan = [
-            sys.executable,
-            "-m",
-            "polysight.host",
-            "scan",
-            "--config",
-            str(rig_file),
-            "--out",
-            str(out / "scan"),
-        ]
+        scan = [sys.executable, "-m", "polysight.host", "scan", "--config", str(rig_file), "--out", str(out / "scan")]
         scan += ["--truth", str(rig_file.parent / "truth.json")]
         status = _run_to_its_end(scan)
     if status in (0, NoResult.exit_status):

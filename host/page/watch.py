@@ -117,13 +117,7 @@ class EventTail:
 
 
 class ProductsTail:
-    """The verdict of a scan's products, read again when they change.
-
-    Parameters
-    ----------
-    folder
-        The scan folder.
-    """
+    """The verdict of the products of a scan folder, read again when they change."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -157,16 +151,9 @@ class Versioned(NamedTuple):
 
 
 class Watch:
-    """Follows a scan folder in a thread of its own, until :meth:`close`.
+    """Follows a scan folder, which may not exist yet, in a thread of its own; only :meth:`ask` writes into it.
 
-    Parameters
-    ----------
-    folder
-        The scan folder; it may not exist yet. Only :meth:`ask` writes into it.
-    control
-        True if the scan may be controlled.
-    lapse_s
-        Timeout of the scan program's signs of life.
+    `lapse_s` is the timeout of the scan program's signs of life.
     """
 
     def __init__(self, folder: Path, control: bool = False, lapse_s: float = _LAPSE_S) -> None:
@@ -228,10 +215,8 @@ class Watch:
             self._close_parts()
             self._begin()
             facts = self._manifest.look()
-        if facts:
-            self._grown_at = (
-                time.monotonic() if self._looked else self._grown_at
-            )  # at the first look nothing is known to be new
+        if facts and self._looked:  # at the first look nothing is known to be new
+            self._grown_at = time.monotonic()
         self._looked = True
         self._content.facts += facts
         for fact in facts:

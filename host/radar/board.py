@@ -199,23 +199,12 @@ class RadarBoard:
         """Read back profile, chirp and frame of a board that was armed; return the differences. Raises DeviceError."""
         sent = {one.ID: one.block().data for one in (*self._program.waveform, *self._sent_frames)}
         differences = []
-        for question, of in ((c.ReadProfile(), 0x0100), (c.ReadChirp(), 0x0101), (c.READ_FRAME, 0x0102)):
+        for question, of in ((c.READ_PROFILE, 0x0100), (c.READ_CHIRP, 0x0101), (c.READ_FRAME, 0x0102)):
             blocks = self._link.call(question).blocks
             found = blocks[0].data if blocks else b""
             if found != sent[of]:
                 differences.append(f"0x{of:04X}: sent {sent[of].hex()}, read back {found.hex()}")
         return differences
-
-    def stream_tone(self, tone: c.StreamTone, on: bool) -> None:
-        """Start or end continuous streaming of one frequency, for RF tests; frames must not run.
-
-        Configure the board again before the next row. Raises DeviceError.
-        """
-        with self._fault_on_error():
-            if on:
-                self._link.call(tone)
-            for command in c.stream_commands(on):
-                self._link.call(command)
 
     def reconnect(self, words: WordLink) -> None:
         """Replace a lost link; the next `arm` resets and configures the board."""

@@ -98,14 +98,6 @@ class CalibrationFiles:
                 _REMEDY,
                 code=ErrorCode.FILE_DAMAGED,
             )
-        passed = int.from_bytes(data[:4], "little")  # of the RF init that was saved (ICD 71)
-        if passed & RESTORED != RESTORED:
-            raise ConfigError(
-                f"{path}: is from a failed RF init",
-                "an earlier release saved it without this check",
-                _REMEDY,
-                code=ErrorCode.VALUE_INVALID,
-            )
         return data
 
     def save(self, die_id: str, data: bytes) -> None:

@@ -80,7 +80,7 @@ def reading_routes(site: Site) -> list[Route]:
 
 async def _page(site: Site, request: Request) -> Response:
     access = site.access
-    inside = not access.token or access.loopback or access.holds_session(request.headers, request.url.port or 80)
+    inside = not access.token or access.loopback or access.holds_session(request.scope)
     facts = {
         "version": __version__,
         "control": access.control,

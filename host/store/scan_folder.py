@@ -7,17 +7,19 @@ Only the connection may change: `connection_of` and `with_connection` take addre
 
 from __future__ import annotations
 
+import os
 import platform
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from polysight.host.capture import read_index
 from polysight.host.store import manifest
@@ -309,12 +311,12 @@ class ScanFolder:
         return self.path / "raw" / board / f"{row:04d}.bin"
 
     def read_row(self, board_name: str, row: int) -> RowData:
-        """Read one board's payload of a committed row and check its CRC.
+        """Return one board's recording of a committed row; its payload is read, and its CRC checked, when it is used.
 
         Raises
         ------
         DataError
-            if the row is not committed, or its files are missing or damaged.
+            if the row is not committed or its index is damaged; when the payload is used: if it is missing or damaged.
         """
         found = self._committed().get(row)
         board = None if found is None else found.boards.get(board_name)
@@ -326,21 +328,31 @@ class ScanFolder:
                 code=ErrorCode.NO_DATA,
             )
         path = self.path / board.file
+        chirps = board.frames_expected * self.instrument.burst.chirps
+        missing = self._missing(path.with_suffix(".idx"), board)
+        return RowData(partial(self._read_pieces, path, board), missing, chirps, board.crc32)
+
+    def _read_pieces(self, path: Path, board: BoardRow, size: int) -> Iterator[NDArray[np.uint8]]:
+        """Read a payload in pieces of `size` bytes (0: everything), all in the same memory, and check its CRC."""
+        digest, memory = 0, np.empty(min(size, board.bytes) or board.bytes or 1, np.uint8)
         try:
-            size = path.stat().st_size
-            payload = np.fromfile(path, dtype=np.uint8, count=-1 if size == board.bytes else 0)
+            with path.open("rb") as file:
+                found = os.fstat(file.fileno()).st_size
+                for start in range(0, board.bytes if found == board.bytes else 0, memory.size):
+                    piece = memory[: board.bytes - start]
+                    file.readinto(piece.data)
+                    digest = crc32(piece, digest)
+                    yield piece
         except OSError as e:
             what = f"{path}: cannot be read: {e.strerror}"
             raise DataError(what, "the file was removed", self._remedy(), code=ErrorCode.FILE_MISSING) from None
-        if payload.size != board.bytes or f"{crc32(payload.data):08x}" != board.crc32:
+        if found != board.bytes or f"{digest:08x}" != board.crc32:
             raise DataError(
-                f"{path}: differs from the committed data ({size} bytes, {board.bytes} expected)",
+                f"{path}: differs from the committed data ({found} bytes, {board.bytes} expected)",
                 "the file was changed, truncated or damaged after the scan",
                 self._remedy(),
                 code=ErrorCode.FILE_DAMAGED,
             )
-        chirps = board.frames_expected * self.instrument.burst.chirps
-        return RowData(payload, self._missing(path.with_suffix(".idx"), board), chirps, board.crc32)
 
     def _missing(self, path: Path, board: BoardRow) -> list[tuple[int, int]]:
         if board.missing_bytes == 0:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -16,15 +17,33 @@ from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.raster import RasterPlan
 
+Pieces = Callable[[int], Iterator[NDArray[np.uint8]]]
+"""Given a size in bytes (0: everything), iterates over a payload in pieces of this size; each is valid until the next.
+
+Raises DataError if the payload cannot be read or is damaged, at the latest after the last piece.
+"""
+
+
+def pieces_of(payload: NDArray[np.uint8]) -> Pieces:
+    """Return the pieces of a payload in memory."""
+    return lambda size: (
+        payload[i : i + (size or payload.size)] for i in range(0, payload.size, size or payload.size or 1)
+    )
+
 
 @dataclass(frozen=True)
 class RowData:
-    """One board's recording of one row."""
+    """One board's recording of one row. It is read when needed: in pieces, which stay in the cache, or as a whole."""
 
-    payload: NDArray[np.uint8]  # [frames_expected * bytes of a chirp], as sent by the card; zero where missing
+    pieces: Pieces  # of the payload as sent by the card, [frames_expected * bytes of a chirp]; zero where missing
     missing: list[tuple[int, int]]  # byte ranges (start, stop) that never arrived: sorted, not touching, half open
     frames_expected: int  # chirps in `payload`: points of the row x chirps of a position; most frames are one chirp
     crc32: str = ""  # digest of the recorded payload, hexadecimal; "" if the recording has none
+
+    @cached_property
+    def payload(self) -> NDArray[np.uint8]:
+        """The whole payload."""
+        return ([*self.pieces(0)] or [np.empty(0, np.uint8)])[0]
 
     @property
     def missing_bytes(self) -> int:

@@ -12,6 +12,7 @@ the final average of the chirps is computed at the full sample rate.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +50,7 @@ class AlignedRow(NamedTuple):
     gain
         float64 [position, chirp]: gain of the filter compensation at the chirp's centre.
     error
-        float64 [2, position, chirp]: frequency (cycles per sample) and phase (rad) error of a chirp after alignment:
+        float64 [position, 2, chirp]: frequency (cycles per sample) and phase (rad) error of a chirp after alignment:
         half the difference between two halves of the RX; zero where not good.
     coherence
         float64 [position, chirp]: normalised correlation with the average, 0..1.
@@ -68,6 +69,17 @@ class AlignedRow(NamedTuple):
     error: NDArray[np.float64]
     coherence: NDArray[np.float64]
     peak: NDArray[np.int32]
+
+    def part(self, positions: slice) -> AlignedRow:
+        """Return views of some positions."""
+        return AlignedRow._make(field[positions] for field in self)
+
+
+Loops = Callable[
+    [NDArray[np.int16], NDArray[np.bool_], tuple[int, int], hpf.Equaliser | None, int, AlignedRow],
+    None,
+]
+"""Aligns positions: words, valid, linear samples in whole blocks, filter compensation, full scale; into a row."""
 
 
 def align_row(
@@ -92,29 +104,77 @@ def align_row(
     full_scale
         Value of a clipped sample; clipped chirps are left out, for clipping creates false tones.
     """
-    loops = compiled.library() if words.shape[-1] == compiled.RX else None
-    if loops is None:
-        return align_in_numpy(words, valid, linear, equaliser, full_scale)
-    return AlignedRow(*loops.align(words, valid, whole_blocks(linear), equaliser, full_scale))
+    return align_pieces([words], valid, linear, equaliser, full_scale)
+
+
+def align_pieces(
+    pieces: Iterable[NDArray[np.int16]],
+    valid: NDArray[np.bool_],
+    linear: tuple[int, int],
+    equaliser: hpf.Equaliser | None = None,
+    full_scale: int = 32767,
+    by: Loops | None = None,
+) -> AlignedRow:
+    """Align and average a row that comes in pieces of some positions; parameters as of :func:`align_row`.
+
+    A piece is not used after the next one is taken, so all may share their memory. `by` is compiled or
+    :func:`align_in_numpy`, with equal results; None: compiled if possible.
+
+    Raises
+    ------
+    ValueError
+        if there is no piece.
+    """
+    linear, row, done = whole_blocks(linear), None, 0
+    for words in pieces:
+        if row is None:
+            row = _empty_row(valid.shape, words.shape, (linear[1] - linear[0]) // FOLD)
+        here = slice(done, done + len(words))
+        align = by or _loops(words.shape[-1])
+        align(words, valid[here], linear, equaliser, full_scale, row.part(here))
+        done = here.stop
+    if row is None:
+        raise ValueError("a row without pieces")
+    return row
+
+
+def _loops(rx: int) -> Loops:
+    library = compiled.library() if rx == compiled.RX else None
+    return library.align if library else align_in_numpy
 
 
 def align_in_numpy(
     words: NDArray[np.int16],
     valid: NDArray[np.bool_],
     linear: tuple[int, int],
-    equaliser: hpf.Equaliser | None = None,
-    full_scale: int = 32767,
-) -> AlignedRow:
-    """Align and average in NumPy, for any number of RX: the readable form of `burst.c`, with equal results."""
+    equaliser: hpf.Equaliser | None,
+    full_scale: int,
+    into: AlignedRow,
+) -> None:
+    """Align and average positions in NumPy, for any number of RX: the readable form of `burst.c`."""
     words = np.ascontiguousarray(words)
-    pieces = [
-        _align(words[i : i + passes.CHUNK], valid[i : i + passes.CHUNK], linear, equaliser, full_scale)
-        for i in range(0, valid.shape[0], passes.CHUNK)
-    ]
-    if len(pieces) == 1:
-        return pieces[0]
-    columns = zip(AlignedRow._fields, zip(*pieces, strict=True), strict=True)
-    return AlignedRow(*(np.concatenate(column, axis=1 if name == "error" else 0) for name, column in columns))
+    for i in range(0, len(valid), passes.CHUNK):
+        here = slice(i, i + passes.CHUNK)
+        for field, values in zip(into, _align(words[here], valid[here], linear, equaliser, full_scale), strict=True):
+            field[here] = values
+
+
+def _empty_row(bursts: tuple[int, ...], words: tuple[int, ...], blocks: int) -> AlignedRow:
+    """Return memory for the row: bursts [position, chirp], words [position, chirp, sample, 2, rx]."""
+    (positions, chirps), samples, rx = bursts, words[2], words[-1]
+    return AlignedRow(
+        mean=np.empty((positions, rx, samples), np.complex64),
+        halves=np.empty((positions, 2, rx, blocks), np.complex64),
+        centre=np.empty(positions),
+        good=np.empty(bursts, np.bool_),
+        frequency=np.empty(bursts),
+        phase=np.empty(bursts),
+        amplitude=np.empty(bursts),
+        gain=np.empty(bursts),
+        error=np.empty((positions, 2, chirps)),
+        coherence=np.empty(bursts),
+        peak=np.empty(bursts, np.int32),
+    )
 
 
 def _align(
@@ -125,7 +185,6 @@ def _align(
     full_scale: int,
 ) -> AlignedRow:
     """Align and average a few positions."""
-    linear = whole_blocks(linear)
     first, centre, coherence, usable, peak = _against_one(words, valid, linear, full_scale)
     good = _coherent(coherence, usable)
     frequency = centre[:, None] + first.frequency
@@ -161,7 +220,7 @@ def _align(
         np.angle(cis(start + shift)),
         amplitude,
         np.abs(taps.sum(axis=-1)),
-        _centred(apart / 2, good),
+        _centred(apart / 2, good).swapaxes(0, 1),
         coherence,
         peak,
     )

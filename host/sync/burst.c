@@ -1,6 +1,6 @@
 /* Burst alignment, position by position: `align.align_in_numpy` in one pass over the card's words. The words of a
-   position (64 KB) are read from memory once and stay in the second-level cache; each chirp is unpacked from there into
-   the first-level cache. The method is described in `align.py` and `numpy_passes.py`. */
+   position (64 KB) come from the cache, where they were read to (`rows.py`). The method is described in `align.py` and
+   `numpy_passes.py`. */
 #include "passes.h"
 
 #define REFERENCES 4       /* `align.REFERENCES` */
@@ -130,11 +130,9 @@ static void align_position(Work *w, Chirps *c, const Equaliser *e, const int16_t
                            int full_scale, Aligned out)
 {
     int chirps = w->chirps, count = 0, half = 0;
-    for (int k = 0; k < chirps; k++) {
-        const int16_t *chirp = words + 2 * RX * k * w->samples;
-        out.peak[k] = largest(chirp, 2 * RX * w->samples);
-        part_iq(chirp, w->samples, w->i + RX * k * w->samples, w->q + RX * k * w->samples);
-    }
+    for (int k = 0; k < chirps; k++)
+        out.peak[k] = largest(words + 2 * RX * k * w->samples, 2 * RX * w->samples);
+    part_iq(words, chirps * w->samples, w->i, w->q);
     *out.centre = against_one(w, c, valid, full_scale, out.peak);
     choose_coherent(c->coherence, c->usable, chirps, c->sorted, out.good);
     for (int k = 0; k < chirps; k++) {
@@ -280,8 +278,8 @@ int NAME(align)(const int16_t *words, const uint8_t *valid, int positions, int c
                        .phase = phase + at,
                        .amplitude = amplitude + at,
                        .gain = gain + at,
-                       .frequency_error = error + at,
-                       .phase_error = error + (size_t)positions * chirps + at,
+                       .frequency_error = error + 2 * at,
+                       .phase_error = error + 2 * at + chirps,
                        .peak = peak + at};
         out.coherence = coherence + at;
         align_position(&w, &c, &e, words + at * samples * 2 * RX, valid + at, full_scale, out);

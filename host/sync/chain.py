@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from polysight.host.capture import raw_words
 from polysight.host.sync import direct_path, residuals
 from polysight.host.sync import high_pass_filter as hpf
-from polysight.host.sync.align import align_row
+from polysight.host.sync.align import align_pieces
 from polysight.host.sync.numpy_passes import FOLD
 from polysight.shared.config import Board, Chirp, Instrument
 from polysight.shared.error_codes import ErrorCode
@@ -109,38 +110,57 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
         if the frames are not whole bursts of the configured chirp.
     """
     words = raw_words(frames) if np.iscomplexobj(frames) else frames
-    count, samples, _, rx = words.shape
-    expected = setup.path.steering.shape
-    if (rx, samples) != expected or count % setup.pulses or valid.shape != (count,):
-        raise DataError(
-            f"{count} frames of {rx} RX x {samples} samples are not bursts of {setup.pulses} frames"
-            f" of {expected[0]} RX x {expected[1]} samples",
-            "the data were recorded with another rig file",
-            "use the rig file of this scan",
-            code=ErrorCode.MISMATCH,
-        )
-    shape = (count // setup.pulses, setup.pulses)
-    aligned = align_row(
-        words.reshape(*shape, samples, 2, rx),
-        valid.reshape(shape),
+    return synchronise_pieces([words], valid, setup)
+
+
+def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bool_], setup: BoardSetup) -> SyncedRow:
+    """As :func:`synchronise_row`, for a row that comes in pieces of whole bursts; they may share their memory."""
+    if valid.size % setup.pulses:
+        raise _mismatch(valid.size, setup.path.steering.shape, setup)
+    aligned = align_pieces(
+        _bursts(pieces, valid.size, setup),
+        valid.reshape(-1, setup.pulses),
         setup.chirp.linear_samples,
         setup.equaliser,
         _FULL_SCALE,
     )
     done = direct_path.reference(aligned, setup.path, setup.chirp)
     chirps, rate = aligned.good.sum(axis=1), setup.chirp.sample_rate_hz
-    residual = np.sqrt((aligned.error**2).sum(axis=-1) / np.maximum(chirps, 1))
+    residual = np.sqrt((aligned.error**2).sum(axis=-1) / np.maximum(chirps, 1)[:, None])
     return SyncedRow(
         done.samples,
         done.found,
         chirps,
         done.frequency * rate,
         np.abs(done.amplitude),
-        residual[0] * rate,
-        residual[1],
+        residual[:, 0] * rate,
+        residual[:, 1],
         residuals.errors(aligned, done, setup.path, rate, setup.examined),
         residuals.noise_power(aligned),
         turn_along(done),
+    )
+
+
+def _bursts(pieces: Iterable[NDArray[np.int16]], frames: int, setup: BoardSetup) -> Iterator[NDArray[np.int16]]:
+    """Return pieces [frame, sample, 2, rx] as bursts [position, chirp, sample, 2, rx]; check that they are whole."""
+    for words in pieces:
+        found, samples, _, rx = words.shape
+        frames -= found
+        if (rx, samples) != setup.path.steering.shape or found % setup.pulses or frames < 0:
+            raise _mismatch(found, (rx, samples), setup)
+        yield words.reshape(-1, setup.pulses, samples, 2, rx)
+    if frames:
+        raise _mismatch(frames, setup.path.steering.shape, setup)  # missing
+
+
+def _mismatch(frames: int, shape: tuple[int, ...], setup: BoardSetup) -> DataError:
+    rx, samples = setup.path.steering.shape
+    return DataError(
+        f"{frames} frames of {shape[0]} RX x {shape[1]} samples are not bursts of {setup.pulses} frames"
+        f" of {rx} RX x {samples} samples",
+        "the data were recorded with another rig file",
+        "use the rig file of this scan",
+        code=ErrorCode.MISMATCH,
     )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.sync.high_pass_filter import Equaliser
-from polysight.host.sync.numpy_passes import FOLD
 from polysight.host.sync.tone import search_size
 
 RX = 4
@@ -65,27 +65,21 @@ class Library:
         linear: tuple[int, int],
         equaliser: Equaliser | None,
         full_scale: int,
-    ) -> tuple[Any, ...]:
-        """Return the fields of `align.AlignedRow`; parameters as in `align.align_row`, `linear` in whole blocks."""
+        into: Sequence[NDArray[Any]],
+    ) -> None:
+        """Align positions into the fields of an `align.AlignedRow`; parameters as in `align.align_in_numpy`."""
         positions, chirps, samples, _, _ = words.shape
         a, b = linear
         filters = [0.0, 0.0, 0.0]
         if equaliser is not None:
             filters = [equaliser.sample_rate_hz, equaliser.reach, equaliser.signed, *equaliser.model.corners_hz]
-        each = (positions, chirps)
-        mean = np.empty((positions, RX, samples), np.complex64)
-        halves = np.empty((positions, 2, RX, (b - a) // FOLD), np.complex64)
-        centre, good = np.empty(positions), np.empty(each, np.bool_)
-        frequency, phase, amplitude, gain, coherence = (np.empty(each) for _ in range(5))
-        error, peak = np.empty((2, *each)), np.empty(each, np.int32)
         self._call(
             "align",
             *(words, valid),
             *(positions, chirps, samples, a, b, search_size(b - a), full_scale),
             *(np.array(filters), len(filters) - 3, equaliser is not None),
-            *(mean, halves, centre, good, frequency, phase, amplitude, gain, error, coherence, peak),
+            *into,
         )
-        return mean, halves, centre, good, frequency, phase, amplitude, gain, error, coherence, peak
 
     def search(
         self,

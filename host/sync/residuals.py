@@ -55,7 +55,7 @@ def errors(
     received[2] = received[2] / received[2].mean() - 1
 
     own = (aligned.amplitude[found] * good).sum(axis=1) / good.sum(axis=1)
-    one = np.stack([*aligned.error[:, found], aligned.amplitude[found] / own[:, None] - 1])[:, good]
+    one = np.stack([*aligned.error[found].swapaxes(0, 1), aligned.amplitude[found] / own[:, None] - 1])[:, good]
 
     two = found & (aligned.good.sum(axis=1) > 1)
     n = aligned.good[two].sum(axis=1)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from polysight.host.capture import row_words
+from polysight.host.capture import row_words, valid_frames
 from polysight.host.store import CubeRow, RowData, Source
-from polysight.host.sync.chain import BoardSetup, SyncedRow, synchronise_row
+from polysight.host.sync.chain import BoardSetup, SyncedRow, synchronise_pieces
 from polysight.host.sync.cubes import CubeForm, detect_form
 from polysight.host.sync.high_pass_filter import HighPass
 from polysight.shared.config import Instrument
 
 _CUBE_ROWS = 7  # rows used to detect the form of a cube
+_POSITIONS = 16  # read at a time: 1 MB, which stays in the processor's cache
 
 
 class RowSynchroniser:
@@ -41,8 +43,15 @@ class RowSynchroniser:
         if isinstance(recorded, CubeRow):
             synced = self._form(board).synced(recorded.cube, rig.burst.chirps_a_position)
             return synced, int(synced.valid.sum())
-        words, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, rig.chirp.samples)
-        return synchronise_row(words, valid, self.setups[board]), int(valid.sum())
+        valid = valid_frames(recorded.missing, recorded.frames_expected, rig.frame_bytes // rig.burst.chirps)
+        return synchronise_pieces(self._words(recorded), valid, self.setups[board]), int(valid.sum())
+
+    def _words(self, recorded: RowData) -> Iterator[NDArray[np.int16]]:
+        """Iterate over the words of a row, [frame, sample, 2, rx], some positions at a time."""
+        rig = self._source.instrument
+        frame = rig.frame_bytes // rig.burst.chirps
+        for piece in recorded.pieces(_POSITIONS * rig.burst.chirps_a_position * frame):
+            yield row_words(piece, (), piece.size // frame, rig.chirp.samples)[0]
 
     @property
     def direct_path_known(self) -> bool:

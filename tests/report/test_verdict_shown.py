@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from polysight.host.api.plot import plot_scan
-from polysight.host.products import permittivity_spread, read_processed, read_products
+from polysight.host.products import ProcessedScan, permittivity_spread, read_products
 from polysight.host.report import ReportContext, write_report
 from polysight.host.report.ellipses import SHARES, ellipse_of, place_numbers
 from polysight.host.report.figures import channel_figure, phase_limits_deg
@@ -78,7 +78,7 @@ def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_
     folder = judged_products(tmp_path, "none", careless)
     with unrendered():
         text = drawn_text(lambda: write_report(folder, context(folder)))
-    text += drawn_text(lambda: plot_scan(read_processed(read_products(folder))))
+    text += drawn_text(lambda: plot_scan(ProcessedScan(folder)))
     page = unescape((folder / "report.html").read_text(encoding="utf-8"))
     for part in (text, page[page.index("<main>") :]):
         assert [word for word in RESULTS if word in part] == []

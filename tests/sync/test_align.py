@@ -110,7 +110,7 @@ def test_the_residual_is_the_true_error(burst):
     frames, df, phase, _ = burst(60, 12)
     aligned = align_row(frames, np.ones(df.shape, bool), LINEAR)
     for k, error in enumerate(_errors(aligned, df, phase)):
-        assert aligned.error[k].std() == pytest.approx(error.std(), rel=0.15)
+        assert aligned.error[:, k].std() == pytest.approx(error.std(), rel=0.15)
 
 
 @pytest.mark.parametrize("bad", [0, 7])

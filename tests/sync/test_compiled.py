@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from polysight.host.sync import build, compiled, direct_path, numpy_direct_path
-from polysight.host.sync.align import AlignedRow, align_in_numpy, align_row, whole_blocks
+from polysight.host.sync.align import AlignedRow, align_in_numpy, align_pieces, align_row
 from polysight.host.sync.high_pass_filter import Equaliser, HighPass, high_pass
 
 WIDTHS = (128, 256, 512)
@@ -45,8 +45,8 @@ def bursts(positions=5, chirps=6, samples=256, seed=4):
     return np.rint(1000 * np.stack([tones.real, tones.imag], axis=3)).astype(np.int16)
 
 
-def align(loops, words, valid, linear, equaliser=None, full_scale=32767):
-    return AlignedRow(*loops.align(words, valid, whole_blocks(linear), equaliser, full_scale))
+def align(by, words, valid, linear, equaliser=None):
+    return align_pieces([words], valid, linear, equaliser, by=by)
 
 
 def same(one: AlignedRow, other: AlignedRow):
@@ -72,12 +72,29 @@ def equaliser_of(rig):
     return Equaliser.of(high_pass(rig.chirp), rig.chirp, 4)
 
 
+def test_a_row_in_pieces_is_the_same_row(loops):
+    words, valid = bursts(7), np.ones((7, 6), bool)
+    valid[2:4, 1] = False
+    memory = np.empty_like(words[:3])
+
+    def pieces():
+        for i in range(0, 7, 3):
+            memory[: 7 - i] = words[i : i + 3]
+            yield memory[: 7 - i]
+            memory[:] = 0  # a piece is used only until the next
+
+    for one, other in zip(
+        align_pieces(pieces(), valid, (0, 192), by=loops.align), align(loops.align, words, valid, (0, 192)), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.parametrize("linear", [(0, 192), (8, 204), (3, 243), (10, 90), (4, 44)])
 @pytest.mark.parametrize("filtered", [True, False])
 def test_any_linear_part(loops, rig, linear, filtered):
     words, valid = bursts(), np.ones((5, 6), bool)
     equaliser = equaliser_of(rig) if filtered else None
-    same(align(loops, words, valid, linear, equaliser), align_in_numpy(words, valid, linear, equaliser))
+    same(align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser))
 
 
 @pytest.mark.parametrize(("samples", "linear"), [(255, (0, 192)), (193, (1, 193)), (198, (5, 181)), (37, (0, 36))])
@@ -85,7 +102,7 @@ def test_any_number_of_samples(loops, rig, samples, linear):
     """Also if samples do not fill whole vectors or blocks."""
     words, valid = bursts(samples=samples), np.ones((5, 6), bool)
     equaliser = equaliser_of(rig)
-    same(align(loops, words, valid, linear, equaliser), align_in_numpy(words, valid, linear, equaliser))
+    same(align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser))
 
 
 @pytest.mark.parametrize("chirps", [1, 2, 3, 16, 19, 40])
@@ -93,7 +110,10 @@ def test_any_number_of_chirps(loops, rig, chirps):
     """Sixteen are transformed at once; a single one has no reference."""
     words, valid = bursts(positions=3, chirps=chirps), np.ones((3, chirps), bool)
     equaliser = equaliser_of(rig)
-    same(align(loops, words, valid, (0, 192), equaliser), align_in_numpy(words, valid, (0, 192), equaliser))
+    same(
+        align(loops.align, words, valid, (0, 192), equaliser),
+        align(align_in_numpy, words, valid, (0, 192), equaliser),
+    )
 
 
 def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
@@ -106,8 +126,8 @@ def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
     words[4, 0] = rng.integers(-1000, 1000, words[4, 0].shape)  # matches no other chirp, so another reference is tried
     words[5, :5] = rng.integers(-1000, 1000, words[5, :5].shape)
     words[6] = 0
-    done = align(loops, words, valid, (0, 192), equaliser_of(rig))
-    same(done, align_in_numpy(words, valid, (0, 192), equaliser_of(rig)))
+    done = align(loops.align, words, valid, (0, 192), equaliser_of(rig))
+    same(done, align(align_in_numpy, words, valid, (0, 192), equaliser_of(rig)))
     assert not done.good[1].any()
     assert not done.good[6].any()
     assert not done.good[3, [2, 5]].any()
@@ -121,22 +141,25 @@ def test_any_filter(loops, mode):
     words, valid = bursts(), np.ones((5, 6), bool)
     for corners in [(), (175e3,), (700e3, 1400e3), (350e3, 700e3, 2800e3)]:
         equaliser = Equaliser(HighPass(corners), 10e6, mode == "complex2x", 4, 3 / 192)
-        same(align(loops, words, valid, (0, 192), equaliser), align_in_numpy(words, valid, (0, 192), equaliser))
+        same(
+            align(loops.align, words, valid, (0, 192), equaliser),
+            align(align_in_numpy, words, valid, (0, 192), equaliser),
+        )
 
 
 def test_words_in_another_order_in_memory(loops):
     words, valid = bursts()[:, :, :, ::-1], np.ones((5, 6), bool)
     assert not words.flags.c_contiguous
-    same(align(loops, words, valid, (0, 192)), align_in_numpy(words, valid, (0, 192)))
+    same(align(loops.align, words, valid, (0, 192)), align(align_in_numpy, words, valid, (0, 192)))
 
 
 def test_any_number_of_positions_and_none(loops):
     for positions in (0, 1, 17):
         words, valid = bursts(positions=positions), np.ones((positions, 6), bool)
-        got = align(loops, words, valid, (0, 192))
+        got = align(loops.align, words, valid, (0, 192))
         assert got.mean.shape == (positions, 4, 256)
         if positions:
-            same(got, align_in_numpy(words, valid, (0, 192)))
+            same(got, align(align_in_numpy, words, valid, (0, 192)))
 
 
 def test_the_direct_path(loops, rig, paths, noise, counts):
@@ -147,7 +170,7 @@ def test_the_direct_path(loops, rig, paths, noise, counts):
     frames = (ideal + noise(ideal.shape, -20, rng))[:, None] * np.exp(2j * np.pi * rng.uniform(size=(37, 4, 1, 1)))
     words, valid = counts(frames.transpose(2, 0, 1, 3)), np.ones((37, 4), bool)
     valid[11] = False
-    aligned = align_in_numpy(words, valid, rig.chirp.linear_samples, equaliser_of(rig))
+    aligned = align(align_in_numpy, words, valid, rig.chirp.linear_samples, equaliser_of(rig))
     path = direct_path.prepare(rig, board)
     expected = direct_path.reference(aligned, path, rig.chirp, numpy_direct_path)
     got = direct_path.reference(aligned, path, rig.chirp, loops)

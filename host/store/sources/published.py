@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.store.manifest import ManifestFault
-from polysight.host.store.source import CubeRow, RowData
+from polysight.host.store.source import CubeRow, RowData, pieces_of
 from polysight.host.store.sources.published_packets import (
     Bursts,
     RowShape,
@@ -140,7 +140,7 @@ class PublishedScan(_Published):
         if stream.data.size >= shape.bytes:  # nothing slipped
             self._note(board_name, row, RowLosses(lost))
             gaps = [(a, min(b, shape.bytes)) for a, b in stream.lost if a < shape.bytes]
-            return RowData(stream.data[: shape.bytes], gaps, frames)
+            return RowData(pieces_of(stream.data[: shape.bytes]), gaps, frames)
         bursts = find_bursts(stream, shape)
         at = None
         if bursts is not None:
@@ -149,12 +149,12 @@ class PublishedScan(_Published):
             at = positions_of(bursts, others, shape.positions, min(periods, default=None))
         if bursts is None or at is None:
             self._note(board_name, row, RowLosses(lost, rows_not_placed=1))
-            return RowData(np.zeros(shape.bytes, np.uint8), [(0, shape.bytes)], frames)
+            return RowData(pieces_of(np.zeros(shape.bytes, np.uint8)), [(0, shape.bytes)], frames)
         payload, there, short = _place(stream, bursts, at, shape)
         self._note(board_name, row, RowLosses(lost, shape.positions - at.size, short))
         edges = np.flatnonzero(np.diff(np.concatenate([[1], there, [1]]).astype(np.int8)))
         gaps = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-        return RowData(payload, gaps, frames)
+        return RowData(pieces_of(payload), gaps, frames)
 
     def _stream(self, board_name: str, row: int) -> Stream | None:
         file = self._files.get(board_name, {}).get(row)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -39,13 +42,26 @@ def growing(finished: Path, tmp_path: Path) -> GrowingScan:
     return GrowingScan(finished, tmp_path / "scan")
 
 
-@pytest.fixture
-def watching() -> Iterator[Callable[..., Watch]]:
-    """Makes watches, as `Watch`, that look on until the test ends."""
-    made: list[Watch] = []
+class Watched(Watch):
+    """A watch whose snapshots are waited for."""
 
-    def watch(*arguments: object, **options: object) -> Watch:
-        made.append(Watch(*arguments, **options))  # pyright: ignore[reportArgumentType]
+    def wait_for(self, condition: Callable[[dict[str, Any]], bool], limit_s: float) -> bool:
+        """Wait until a snapshot meets a condition; False after the limit."""
+        deadline = time.monotonic() + limit_s
+        while not condition(json.loads(self.state.data)):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.05)
+        return True
+
+
+@pytest.fixture
+def watching() -> Iterator[Callable[..., Watched]]:
+    """Makes watches, as `Watch`, that look on until the test ends."""
+    made: list[Watched] = []
+
+    def watch(*arguments: Any, **options: Any) -> Watched:
+        made.append(Watched(*arguments, **options))
         made[-1].start()
         return made[-1]
 

@@ -36,7 +36,7 @@ def main(argv: list[str]) -> int:
     threading.Thread(target=answer, daemon=True).start()
     while not ended.is_set():
         payload = np.fromfile(path, dtype=np.uint8, count=frames * rig.frame_bytes)
-        synchronise_row(*decode_row(payload, None, frames, rig.chirp.samples), setups[done % len(setups)])
+        synchronise_row(*decode_row(payload, (), frames, rig.chirp.samples), setups[done % len(setups)])
         done += 1
     return 0
 

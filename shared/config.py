@@ -20,6 +20,7 @@ Vector = tuple[float, float, float]
 HPF_FIRST_KHZ = (175.0, 235.0, 350.0, 700.0)
 HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
 DEBOUNCE_TICKS_US = 5_000
+CARD_TAIL_S = 2.0  # silence after which a card sends a packet that is not full (docs/spec/dca1000.md, observed)
 _MOSI = {"/dev/spidev0": 10, "/dev/spidev1": 20}  # GPIO lines of a Pi's header
 
 
@@ -149,6 +150,11 @@ class Card(Section, frozen=True):
     packet_bytes: Annotated[int, msgspec.Meta(ge=24, le=1470)] = 1470
     packet_delay_us: NonNegative = 25.0
     receive_buffer_bytes: Count = 8 << 20
+
+    @property
+    def payload_bytes(self) -> int:
+        """Samples in a full packet, bytes: all but 14 bytes of headers (docs/spec/dca1000.md)."""
+        return self.packet_bytes - 14
 
 
 class NativeRadar(Section, frozen=True):

@@ -1,6 +1,6 @@
 """Capture cards and receiver processes of all recorded boards.
 
-`CaptureRig` starts and stops the records of a row; `record_ending` decides if one board's record has ended.
+`CaptureRig` starts and stops the records of a row; `record_ended` decides if one board's record has ended.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Collection
 from contextlib import ExitStack, suppress
-from enum import Enum
 from pathlib import Path
 
 from polysight.host.capture import (
@@ -22,56 +21,29 @@ from polysight.host.capture import (
     receiver_cores,
 )
 from polysight.host.store import PART
-from polysight.shared.config import Instrument
+from polysight.shared.config import CARD_TAIL_S, Instrument
 from polysight.shared.errors import PolysightError
 
-TAIL_S = 2.0
-"""Silence after which a card sends a last packet that is not full (observed)."""
 GRACE_NS = 200_000_000
 """Silence after which a record that the card reported as completed has ended: status and data use different ports."""
 _COMPLETED_TIMEOUT_S = 0.2  # from a record's stop to its last packet and its status
 
 
-class Ending(Enum):
-    """Reasons why a record counts as ended."""
+def record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int, silence_ns: int) -> bool:
+    """Return True if one board's record has ended: all bytes are there, the card reports it, or the card is silent.
 
-    BYTES = "every expected byte has arrived"
-    STATUS = "the card reports the record as completed"
-    TAIL = "the record's short last packet has arrived"
-    SILENCE = "no data for the configured time"
-
-
-def record_ending(progress: Progress, status: Status, since_ns: int, now_ns: int, silence_ns: int) -> Ending | None:
-    """Return why one board's record has ended (the first reason that applies), or None if it has not.
-
-    Parameters
-    ----------
-    progress
-        Latest report of its receiver.
-    status
-        Status bits that its card reported since the record started.
-    since_ns, now_ns
-        Time of the last pulse and the present time, monotonic clock.
-    silence_ns
-        Silence that ends a record.
+    `progress` is the receiver's latest report, `status` what the card reported since the record started. `since_ns`
+    (last pulse) and `now_ns` are on the monotonic clock; `silence_ns` is the silence that ends a record.
     """
-    if progress.complete:
-        return Ending.BYTES
     silent_ns = now_ns - max(progress.last_arrival_ns, since_ns)
-    if silent_ns >= GRACE_NS and Status.RECORD_COMPLETED in status:
-        return Ending.STATUS
-    if silent_ns >= GRACE_NS and progress.ended:
-        return Ending.TAIL
-    return Ending.SILENCE if silent_ns >= silence_ns else None
+    reported = progress.ended or Status.RECORD_COMPLETED in status  # its short last packet, or its status
+    return progress.complete or silent_ns >= (min(GRACE_NS, silence_ns) if reported else silence_ns)
 
 
 class CaptureRig:
     """Cards and receivers of the recorded boards; `warnings` lists what differs from the request but suffices to scan.
 
-    Raises
-    ------
-    DeviceError
-        if a port is in use, or the receive buffer is smaller than two bursts.
+    Raises DeviceError if a port is in use, or the receive buffer is smaller than two bursts.
     """
 
     def __init__(self, instrument: Instrument) -> None:
@@ -92,9 +64,9 @@ class CaptureRig:
                 self.warnings += receiver.warnings
                 if warning := check_receive_buffer(board.name, receiver.granted_bytes, wanted, burst_bytes):
                     self.warnings.append(warning)
-            if (silence_s := instrument.limits.end_of_record_s) <= TAIL_S:
+            if (silence_s := instrument.limits.end_of_record_s) <= CARD_TAIL_S:
                 self.warnings.append(
-                    f"limits.end_of_record_s is {silence_s:g}: a card sends the last packet after {TAIL_S:g} s of"
+                    f"limits.end_of_record_s is {silence_s:g}: a card sends the last packet after {CARD_TAIL_S:g} s of"
                     " silence or when the record is stopped, but not every card may do the latter; 3 s is safe"
                 )
             self._stack = stack.pop_all()

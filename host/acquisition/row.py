@@ -13,7 +13,7 @@ from pathlib import Path
 
 import zmq
 
-from polysight.host.acquisition.capture_rig import CaptureRig, record_ending
+from polysight.host.acquisition.capture_rig import CaptureRig, record_ended
 from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.pi_client import PiClient
 from polysight.host.acquisition.slipped_row import ReceivedCapture, find_frames, find_slip, first_pulse_ns
@@ -114,10 +114,7 @@ class RowTaker:
     def take(self, row: Row, number: int, transaction: RowTransaction) -> Take:
         """Run and receive a row; leaves `transaction` in `checking`.
 
-        Raises
-        ------
-        PolysightError
-            if the Pi, a card, a receiver or a radar does not respond.
+        Raises PolysightError if the Pi, a card, a receiver or a radar does not respond.
         """
         take = Take(row, number)
         transaction.to(RowState.ARMING)
@@ -232,7 +229,7 @@ class RowTaker:
         while not self._rig.complete and not self._stop.now:
             self._poller.poll(_POLL_MS)
             now, statuses, reports = time.monotonic_ns(), self._rig.statuses(), self._rig.reports()
-            if all(record_ending(r, statuses[n], finished_ns, now, limit_ns) for n, r in reports.items()):
+            if all(record_ended(r, statuses[n], finished_ns, now, limit_ns) for n, r in reports.items()):
                 return
 
     def _end_records(self, take: Take) -> None:

@@ -25,7 +25,6 @@ from polysight.shared.config import Instrument
 from polysight.shared.messages import Capture
 from polysight.shared.raster import Row
 
-HEADERS_BYTES = 14  # of `card.packet_bytes` are not payload (docs/spec/dca1000.md)
 _SHOWN = 4
 Gap = tuple[int, int]
 
@@ -47,7 +46,7 @@ def find_frames(path: Path, row: Row, events: list[ReceivedCapture], rig: Instru
     if times is None:
         none = np.full(0, -1, dtype=np.int64)
         return PlacedFrames(none, [], row.points * rig.burst.pulses, "capture events of the row are missing")
-    return place_frames(*times, rig.frame_bytes, rig.card.packet_bytes - HEADERS_BYTES)
+    return place_frames(*times, rig.frame_bytes, rig.card.payload_bytes)
 
 
 def find_slip(path: Path, row: Row, events: list[ReceivedCapture], rig: Instrument) -> PlacedFrames | None:
@@ -56,7 +55,7 @@ def find_slip(path: Path, row: Row, events: list[ReceivedCapture], rig: Instrume
     Parameters and errors as :func:`find_frames`.
     """
     times = _times(path, row, events, rig)
-    return slipped_frames(*times, rig.frame_bytes, rig.card.packet_bytes - HEADERS_BYTES) if times else None
+    return slipped_frames(*times, rig.frame_bytes, rig.card.payload_bytes) if times else None
 
 
 def first_pulse_ns(events: list[ReceivedCapture]) -> int | None:
@@ -99,14 +98,7 @@ def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_byt
     """Rewrite a slipped row with each frame at its pulse and everything else masked; durable on return.
 
     The index keeps its arrivals and gains `pulses_missed` and `frames`: runs of frames as [number of the first frame
-    received, number of its pulse, length].
-
-    Raises
-    ------
-    DeviceError
-        if the disk fails.
-    DataError
-        if the index is not readable.
+    received, number of its pulse, length]. Raises DeviceError if the disk fails, DataError if the index is unreadable.
     """
     facts, arrivals = read_index(path.with_suffix(".idx"))
     received = np.fromfile(path, dtype=np.uint8)

@@ -30,21 +30,9 @@ def plot_scan(done: ProcessedScan) -> Figure:
     size = (columns * (_PANEL_IN + 1.2), rows * (height_in + 0.4) + 0.5)
     fig = NotebookFigure(figsize=size, dpi=100, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
-    context = ReportContext(
-        title=done.scan_id,
-        simulated=done.simulated is not False,
-        x_m=done.image["x_m"],
-        y_m=done.image["y_m"],
-        h=done.image["h"],
-        v=done.image["v"],
-        p=done.image["p"],
-        valid=done.image["valid"],
-        metal_referenced=named,
-        materials=done.segments,
-        segments=done.labels,
-        verdict=done.verdict,
+    draw_overview(
+        fig, list(fig.subplots(rows, columns).flat), ReportContext.of_products(done, done.labels), bar_labels=True
     )
-    draw_overview(fig, list(fig.subplots(rows, columns).flat), context, bar_labels=True)
     stamp = {True: " (simulated)", False: "", None: " (not known whether simulated)"}[done.simulated]
     title = figure_label(f"Scan {done.scan_id}{stamp}", "title")
     fig.suptitle(title, fontsize=12, family=list(font_families()), parse_math=False)

@@ -13,23 +13,14 @@ from polysight.host.materials import find_truth, pixel_accuracy
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import ratio
 from polysight.host.process import Options, materials_content
-from polysight.host.products import ProcessedScan, plain, scan_facts
-from polysight.host.store import ScanFolder, Source, require_raw
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DataError
+from polysight.host.products import ProcessedScan, plain, scan_facts, withhold
+from polysight.host.store import Source
 
 
 class Processing:
     """Processes one source; each step runs once, when its result is first used.
 
-    Parameters
-    ----------
-    source
-        Recorded scan.
-    folder
-        Where it was read; `truth.json` there holds the truth of a simulated scene.
-    options
-        Library, model, metal box, sub-bands, incidence.
+    `folder` is where the source was read; `truth.json` there holds the truth of a simulated scene.
     """
 
     def __init__(self, source: Source, folder: Path, options: Options) -> None:
@@ -43,17 +34,7 @@ class Processing:
     @cached_property
     def _images(self) -> ChannelImages:
         """Both channels from all rows that hold data. Raises DataError when there are none."""
-        rows = list(self.source.rows())
-        if isinstance(self.source, ScanFolder) and not self.pipeline.samples.holds(rows):
-            require_raw(self.source)
-        if not rows:
-            raise DataError(
-                f"{self.folder}: no row is recorded whole",
-                "the scan was stopped in its first row, or files are missing",
-                f"`polysight resume {self.folder}` takes the missing rows of a scan folder",
-                code=ErrorCode.NO_DATA,
-            )
-        for row in rows:
+        for row in self.pipeline.samples.processable(self.source, self.folder):
             self.pipeline.add_row(row)
         images = self.pipeline.form_images()
         self.pipeline.quality.note_imaging(self.pipeline.images, images)
@@ -92,11 +73,12 @@ class Processing:
         return self._processed(images, pixels, materials, labels, interior)
 
     def _processed(self, images: ChannelImages, pixels, materials, labels, interior) -> ProcessedScan:
-        return ProcessedScan(
-            {**pixels, "x_m": images.x_m, "y_m": images.y_m},
-            plain(scan_facts(self.source, self.pipeline.rig, images)),
-            plain(self.pipeline.quality.to_dict()),
-            materials,
+        return ProcessedScan.computed(
+            self.folder,
             labels,
             interior,
+            image={**pixels, "x_m": images.x_m, "y_m": images.y_m},
+            scan=plain(scan_facts(self.source, self.pipeline.rig, images)),
+            quality=plain(self.pipeline.quality.to_dict()),
+            materials=withhold(materials),
         )

@@ -22,7 +22,6 @@ from polysight.host.products import (
     image_dataset,
     patch_dataset,
     ranges_text,
-    read_processed,
     write_netcdf,
     write_zarr,
 )
@@ -366,7 +365,7 @@ class Scan:
             raise DataError(
                 f"{self.folder}: holds no products", "it was not processed", "polysight process", code=ErrorCode.NO_DATA
             )
-        return read_processed(self._saved_products)
+        return ProcessedScan(self._saved_products.folder)
 
     def _processed(self, metal_referenced: bool) -> ProcessedScan:
         """The saved products if they are of this kind, otherwise processed rows. Raises DataError."""

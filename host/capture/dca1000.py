@@ -1,4 +1,4 @@
-"""Formats of the DCA1000: requests, replies, asynchronous status and data packet headers, without sockets.
+"""Formats of the DCA1000: requests, replies, asynchronous status and data packet headers, as the host uses them.
 
 Specification: docs/spec/dca1000.md. Everything is little-endian.
 """
@@ -106,23 +106,6 @@ def encode_request(code: int, data: bytes = b"") -> bytes:
     return _HEAD.pack(REQUEST_MAGIC, code, len(data)) + data + _FOOTER.pack(FOOTER)
 
 
-def decode_request(raw: bytes) -> tuple[int, bytes]:
-    """Decode a request to (code, data). Raises ProtocolError if the bytes are not a request."""
-    what = f"not a DCA1000 request of {len(raw)} bytes: {raw[:16].hex(' ')}"
-    if len(raw) < _HEAD.size + _FOOTER.size:
-        raise ProtocolError(what, code=ErrorCode.MESSAGE_INVALID)
-    magic, code, size = _HEAD.unpack_from(raw)
-    data = raw[_HEAD.size : -_FOOTER.size]
-    if magic != REQUEST_MAGIC or _FOOTER.unpack(raw[-_FOOTER.size :])[0] != FOOTER or size != len(data):
-        raise ProtocolError(what, code=ErrorCode.MESSAGE_INVALID)
-    return code, data
-
-
-def encode_reply(code: int, status: int) -> bytes:
-    """Encode a reply as the card sends it."""
-    return _REPLY.pack(REQUEST_MAGIC, code, status, FOOTER)
-
-
 def decode_reply(raw: bytes) -> Reply:
     """Decode a reply or asynchronous status. Raises ProtocolError if the bytes are not one."""
     if len(raw) == _REPLY.size:
@@ -152,12 +135,6 @@ def configure_packet_data(packet_bytes: int, delay_us: float) -> bytes:
 def decode_version(status: int) -> Version:
     """Decode the FPGA version in the status of the reply to 0x0E: bits 0-6 major, 7-13 minor, 14 playback."""
     return Version(status & 0x7F, (status >> 7) & 0x7F, bool(status >> 14 & 1))
-
-
-def encode_packet(sequence: int, byte_count: int, payload: bytes) -> bytes:
-    """Encode a data packet; both counters wrap."""
-    count = byte_count & ((1 << BYTE_COUNT_BITS) - 1)
-    return _PACKET.pack(sequence & 0xFFFFFFFF, count & 0xFFFFFFFF, count >> 32) + payload
 
 
 def decode_packet_header(packet: bytes | memoryview) -> tuple[int, int]:

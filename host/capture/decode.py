@@ -10,16 +10,15 @@ from numpy.typing import NDArray
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
-Mask = NDArray[np.bool_] | Sequence[tuple[int, int]] | None
+Gaps = Sequence[tuple[int, int]]
 
 
 def row_words(
     payload: bytes | memoryview | NDArray[np.uint8],
-    mask: Mask,
+    missing: Gaps,
     frames: int,
     samples: int,
     rx: int = 4,
-    swap_iq: bool = False,
 ) -> tuple[NDArray[np.int16], NDArray[np.bool_]]:
     """Return the words of a 4-lane recording in their own order, without a copy, as `polysight.host.sync` takes them.
 
@@ -27,7 +26,7 @@ def row_words(
     undefined for invalid frames.
     """
     words = _words(payload, frames * samples * rx * 2).reshape(frames, samples, 2, rx)
-    return words[:, :, ::-1] if swap_iq else words, valid_frames(mask, frames, samples * rx * 4)
+    return words, valid_frames(missing, frames, samples * rx * 4)
 
 
 def raw_words(frames: NDArray[np.complex64]) -> NDArray[np.int16]:
@@ -41,7 +40,7 @@ def raw_words(frames: NDArray[np.complex64]) -> NDArray[np.int16]:
 
 def decode_row(
     payload: bytes | memoryview | NDArray[np.uint8],
-    mask: Mask,
+    missing: Gaps,
     frames: int,
     samples: int,
     rx: int = 4,
@@ -53,8 +52,8 @@ def decode_row(
     ----------
     payload
         Bytes as sent, int16 little-endian, at least frames x samples x rx x 4; more are ignored.
-    mask
-        Missing bytes: bool per byte (True = missing), or byte ranges (start, stop), or None.
+    missing
+        Byte ranges (start, stop) that are missing.
     frames, samples, rx
         Frames of one chirp, ADC samples of a chirp, RX antennas.
     swap_iq
@@ -72,8 +71,8 @@ def decode_row(
     DataError
         if the payload is shorter than the shape requires.
     """
-    words, valid = row_words(payload, mask, frames, samples, rx, swap_iq)
-    out = _complex(words.transpose(2, 3, 0, 1))
+    words, valid = row_words(payload, missing, frames, samples, rx)
+    out = _complex(words.transpose(2, 3, 0, 1), swap_iq)
     out[:, ~valid] = 0
     return out, valid
 
@@ -99,17 +98,10 @@ def _complex(parts: NDArray[np.int16], swap_iq: bool = False) -> NDArray[np.comp
     return out
 
 
-def valid_frames(mask: Mask, frames: int, frame_bytes: int) -> NDArray[np.bool_]:
-    """Return bool [frame], True if no byte of the frame is missing. `mask` as in :func:`decode_row`."""
+def valid_frames(missing: Gaps, frames: int, frame_bytes: int) -> NDArray[np.bool_]:
+    """Return bool [frame], True if no byte of the frame is missing. `missing` as in :func:`decode_row`."""
     valid = np.ones(frames, dtype=np.bool_)
-    if mask is None:
-        return valid
-    if isinstance(mask, np.ndarray):
-        if mask.size < frames * frame_bytes:
-            what = f"mask of {mask.size} bytes is shorter than {frames} frames of {frame_bytes} bytes"
-            raise DataError(what, code=ErrorCode.MISMATCH)
-        return np.logical_not(np.any(mask[: frames * frame_bytes].reshape(frames, frame_bytes), axis=1))
-    for start, stop in mask:
+    for start, stop in missing:
         if stop > start:
             valid[start // frame_bytes : (stop - 1) // frame_bytes + 1] = False
     return valid

@@ -180,7 +180,7 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
     words = payload[: payload.size // 2 * 2].view("<i2")
     shape = min(chirps, MAX_CHIRPS), layout.samples, layout.rx
     if layout.lanes == 4:
-        cube = decode_row(payload, None, *shape, layout.q_first)[0]
+        cube = decode_row(payload, (), *shape, layout.q_first)[0]
     else:
         cube = decode_two_lane(payload, *shape, layout.q_first)
     power = (np.abs(np.fft.fft(cube * np.hanning(layout.samples), axis=-1)) ** 2).mean(axis=1)

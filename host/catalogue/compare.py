@@ -73,7 +73,7 @@ def compare(first: Path, second: Path) -> Comparison:
     DataError
         if one of them has no products or is not referenced to metal, or they show different places.
     """
-    a, b = Pixels(read_products(first)), Pixels(read_products(second))
+    a, b = (Pixels(read_products(folder).folder) for folder in (first, second))
     for folder, pixels in ((first, a), (second, b)):
         if not pixels.referenced:
             raise DataError(
@@ -92,7 +92,7 @@ def compare(first: Path, second: Path) -> Comparison:
     p = np.where(both, a.p - b.p[at], np.nan).astype(np.complex128)
     eps = np.where(both, a.permittivity - b.permittivity[at], np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
-        stated = np.abs(p) / np.hypot(a.p_sigma, b.p_sigma[at])
+        stated = np.abs(p) / np.hypot(a.p_std, b.p_std[at])
     scatter = scatter_of(stated)
     return Comparison(a, b, p, eps, stated / scatter, scatter, tuple(_pairs(a, b)), tuple(_notes(a, b, scatter)))
 
@@ -126,9 +126,9 @@ def _notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
     degrees = [float(np.degrees(x.theta_rad)) for x in (a, b)]
     if abs(degrees[0] - degrees[1]) > 0.5:
         notes.append(f"the incidence angles differ: {degrees[0]:.1f} and {degrees[1]:.1f} degrees; P depends on them")
-    if a.products.simulated != b.products.simulated:
+    if a.simulated != b.simulated:
         notes.append("one of the two is simulated")
-    if not (np.isfinite(a.p_sigma).any() and np.isfinite(b.p_sigma).any()):
+    if not (np.isfinite(a.p_std).any() and np.isfinite(b.p_std).any()):
         notes.append("the errors of one are not known (processed by an earlier release): significance cannot be judged")
     return notes
 
@@ -136,8 +136,8 @@ def _notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
 def _pairs(a: Pixels, b: Pixels) -> list[dict[str, Any]]:
     """Pairs of patches with their centres at one place."""
     out = []
-    others = [s for s in b.products.segments if not s.get("metal_reference")]
-    for one in a.products.segments:
+    others = [s for s in b.segments if not s.get("metal_reference")]
+    for one in a.segments:
         if one.get("metal_reference"):
             continue
         near = [(float(np.hypot(*np.subtract(_middle(one), _middle(s)))), s) for s in others]

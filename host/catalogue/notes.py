@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import stat
+import threading
 import unicodedata
 from pathlib import Path
 
@@ -11,11 +12,12 @@ import msgspec
 
 from polysight.host.products import write_atomically
 from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, DataError
+from polysight.shared.errors import ConfigError, DataError, ScanError
 
 NOTES = "operator.json"
 LONGEST_NOTES, LONGEST_TAG, MAX_TAGS = 10_000, 40, 20
 _MAX_BYTES = 1 << 17
+_writing = threading.Lock()  # from the comparison with the present notes until they are replaced
 
 
 class Notes(msgspec.Struct, frozen=True):
@@ -57,13 +59,15 @@ def is_plain(path: Path) -> bool:
         return False
 
 
-def write_notes(folder: Path, notes: Notes) -> Notes:
+def write_notes(folder: Path, notes: Notes, base: Notes | None = None) -> Notes:
     """Check and write the notes of a scan; return them as written.
 
     Raises
     ------
     ConfigError
         if a text is too long, or there are too many tags.
+    ScanError
+        if the present notes differ from `base`, from which these were edited; None: not checked.
     """
     text = printable(notes.notes, keep="\n")
     tags = tuple(dict.fromkeys(tag for tag in (printable(t).strip() for t in notes.tags) if tag))
@@ -80,7 +84,13 @@ def write_notes(folder: Path, notes: Notes) -> Notes:
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     content = {"notes": text, "tags": list(tags)}
-    write_atomically(folder / NOTES, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
+    with _writing:
+        if base is not None and read_notes(folder) != base:
+            raise ScanError(
+                f"the notes of {folder.name} have changed", "somebody saved them after they were read here",
+                "copy your text, load the page again, and add it", code=ErrorCode.MISMATCH,
+            )  # fmt: skip
+        write_atomically(folder / NOTES, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
     return Notes(text, tags)
 
 

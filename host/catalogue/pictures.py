@@ -7,39 +7,23 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.catalogue.pixels import Pixels
+from polysight.host.imaging import ChannelImages
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
+Channels = ChannelImages | Pixels
+"""Both channels of an image and the illuminated pixels: `h`, `v`, `valid` [ny, nx]."""
 AMPLITUDE, PHASE = "cividis", "twilight"
 _RANGE_DB = 35.0
 _RATIO_PERCENTILES = (5.0, 95.0)
 _FAINT_DB, _CLEAR_DB = -26.0, -18.0  # relative to the brightest: between them phases fade out
 _THUMBNAIL = 96  # pixels at most
-
-
-class Channels(Protocol):
-    """Both channels of an image and the illuminated pixels, [ny, nx]."""
-
-    @property
-    def h(self) -> NDArray[np.complex64]:
-        """s-polarised."""
-        ...
-
-    @property
-    def v(self) -> NDArray[np.complex64]:
-        """p-polarised."""
-        ...
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """Illuminated pixels."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -137,7 +121,7 @@ def _derived(pixels: Pixels, name: str) -> _Values:
             "process the scan with metal", code=ErrorCode.NO_DATA,
         )  # fmt: skip
     eps = pixels.permittivity
-    values = {"p_sigma": pixels.p_sigma, "permittivity": eps.real, "loss": -eps.imag}[name]
+    values = {"p_sigma": pixels.p_std, "permittivity": eps.real, "loss": -eps.imag}[name]
     seen = pixels.clear & np.isfinite(values)
     if name != "p_sigma":
         seen &= ~pixels.metal_like

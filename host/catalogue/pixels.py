@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from polysight.host.materials import axis_mm
 from polysight.host.polarimetry import permittivity_from_ratio, specular_incidence_rad
 from polysight.host.products import SavedProducts
-from polysight.shared.config import Instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
-from polysight.shared.tables import decode
 
 Real = NDArray[np.float64]
 _FAINT_DB = -26.0  # relative to the brightest; fainter pixels are noise
@@ -22,42 +20,13 @@ _STEP = 1e-5
 
 
 @dataclass(frozen=True)
-class Pixels:
-    """Images of saved products. Arrays are [ny, nx], row 0 the smallest y.
-
-    Attributes
-    ----------
-    products
-        The folder they come from.
-    """
-
-    products: SavedProducts
-
-    @property
-    def h(self) -> NDArray[np.complex64]:
-        """s-polarised channel."""
-        return self.products.h
-
-    @property
-    def v(self) -> NDArray[np.complex64]:
-        """p-polarised channel."""
-        return self.products.v
-
-    @property
-    def p(self) -> NDArray[np.complex64]:
-        """Their ratio."""
-        return self.products.p
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """Illuminated pixels."""
-        return self.products.valid
+class Pixels(SavedProducts):
+    """Saved products with permittivity and errors of each pixel. Arrays are [ny, nx], row 0 the smallest y."""
 
     @property
     def referenced(self) -> bool:
         """True if the images are relative to metal and the verdict allows a result."""
-        verdict = self.products.verdict
-        return bool(self.products.materials) and (verdict is None or verdict.usable)
+        return self.metal_referenced and (self.verdict is None or self.verdict.usable)
 
     @cached_property
     def clear(self) -> NDArray[np.bool_]:
@@ -71,12 +40,12 @@ class Pixels:
     @cached_property
     def x_mm(self) -> Real:
         """Pixel centres from the middle of the image, [nx]."""
-        return axis_mm(self.products.x_m)
+        return axis_mm(self.x_m)
 
     @cached_property
     def y_mm(self) -> Real:
         """The same, [ny]."""
-        return axis_mm(self.products.y_m)
+        return axis_mm(self.y_m)
 
     @property
     def extent_mm(self) -> tuple[float, float, float, float]:
@@ -86,26 +55,25 @@ class Pixels:
         return float(x[0] - hx), float(x[-1] + hx), float(y[0] - hy), float(y[-1] + hy)
 
     @cached_property
-    def p_sigma(self) -> Real:
+    def p_std(self) -> Real:
         """Standard deviation of each part of P; nan where unknown."""
-        sigma = self.products.p_sigma
+        sigma = self.p_sigma
         return np.full(self.valid.shape, np.nan) if sigma is None else np.asarray(sigma, np.float64)
 
     @cached_property
     def theta_rad(self) -> float:
         """Incidence angle, from the error budget or the rig. Raises DataError."""
-        budget = self.products.materials.get("error_budget") or {}
+        budget = self.materials.get("error_budget") or {}
         try:
             return float(np.radians(budget["incidence"]["deg"]))
         except (KeyError, TypeError):
             pass
-        if "instrument" not in self.products.scan:
+        if self.rig is None:
             raise DataError(
-                f"{self.products.folder}: the incidence angle is not known", "an earlier release made these products",
+                f"{self.folder}: the incidence angle is not known", "an earlier release made these products",
                 "process the scan again", code=ErrorCode.KEY_MISSING,
             )  # fmt: skip
-        rig = decode(self.products.scan["instrument"], Instrument, f"{self.products.folder}/scan.json: instrument")
-        return specular_incidence_rad(rig)
+        return specular_incidence_rad(self.rig)
 
     @cached_property
     def permittivity(self) -> NDArray[np.complex128]:
@@ -121,14 +89,14 @@ class Pixels:
         with np.errstate(invalid="ignore", over="ignore"):
             near = permittivity_from_ratio(p + _STEP, self.theta_rad)
             slope = np.abs((near - permittivity_from_ratio(p, self.theta_rad)) / _STEP)
-            return np.where(np.isfinite(slope), slope, np.nan) * self.p_sigma
+            return np.where(np.isfinite(slope), slope, np.nan) * self.p_std
 
     @cached_property
     def metal_like(self) -> NDArray[np.bool_]:
         """Pixels so close to metal that their permittivity is only known to be large."""
         size = np.abs(self.permittivity)
         with np.errstate(invalid="ignore"):
-            unsure = np.isfinite(self.p_sigma) & (self.permittivity_sigma > 0.5 * size)
+            unsure = np.isfinite(self.p_std) & (self.permittivity_sigma > 0.5 * size)
             return unsure | (np.abs(self.p - 1) < 0.2) | ~np.isfinite(size)
 
     def nearest(self, x_mm: float, y_mm: float) -> tuple[int, int]:

@@ -23,16 +23,9 @@ _FLOOR_DB = -50.0
 
 
 def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -> dict[str, Any]:
-    """Read all results of a processed scan at one place.
+    """Read all results of a processed scan at one place, in mm from the middle of the image.
 
-    Parameters
-    ----------
-    folder
-        A scan folder, or a folder of products.
-    x_mm, y_mm
-        The place, from the middle of the image.
-    library
-        Reference library; the simulated one if not given.
+    `library` names materials (None: the simulated one).
 
     Returns
     -------
@@ -46,8 +39,7 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
     DataError
         if there are no products, or the place lies outside the image.
     """
-    products = read_products(folder)
-    pixels = Pixels(products)
+    pixels = Pixels(read_products(folder).folder)
     row, column = pixels.nearest(x_mm, y_mm)
     place = (float(pixels.x_mm[column]), float(pixels.y_mm[row]))
     h, v, p = (complex(a[row, column]) for a in (pixels.h, pixels.v, pixels.p))
@@ -57,13 +49,13 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
         "h_db": _db(h),
         "v_db": _db(v),
         "p": _parts(p),
-        "p_sigma": _number(pixels.p_sigma[row, column]),
+        "p_sigma": _number(pixels.p_std[row, column]),
         "referenced": pixels.referenced,
         **_permittivity(pixels, row, column),
-        "patch": _patch(products.segments, *place) if pixels.referenced else None,
+        "patch": _patch(pixels.segments, *place) if pixels.referenced else None,
     }
     found["nearest"] = _nearest(pixels, row, column, library) if found["permittivity"] else []
-    return found | _profile(folder, float(products.x_m[column]), float(products.y_m[row]))
+    return found | _profile(folder, float(pixels.x_m[column]), float(pixels.y_m[row]))
 
 
 def _permittivity(pixels: Pixels, row: int, column: int) -> dict[str, Any]:
@@ -112,7 +104,7 @@ def _nearest(pixels: Pixels, row: int, column: int, library: Path | None) -> lis
         known = _library(path, path.stat().st_mtime_ns, float(np.degrees(pixels.theta_rad)))
     except (PolysightError, OSError):  # a library of another angle
         return []
-    p, sigma = complex(pixels.p[row, column]), float(pixels.p_sigma[row, column])
+    p, sigma = complex(pixels.p[row, column]), float(pixels.p_std[row, column])
     own = sigma / max(abs(p) ** 2, 1e-9) if np.isfinite(sigma) else 0.0
     out = []
     for name, (mean, spread) in known.items():

@@ -7,13 +7,24 @@ from typing import Any
 
 from polysight.host.catalogue.pictures import MAPS
 from polysight.host.catalogue.pixels import Pixels
-from polysight.host.products import find_labels, label_folder, read_products
+from polysight.host.materials import PATCHES
+from polysight.host.products import (
+    IMAGE,
+    MATERIALS,
+    QUALITY,
+    REPORT,
+    SCAN,
+    SavedProducts,
+    find_labels,
+    label_folder,
+    read_products,
+)
 from polysight.shared.errors import PolysightError
 
 EXPORT = "export"
 """Folder of a scan that a page has exports written into."""
-FILES = ("report.html", "image.npz", "materials.json", "quality.json", "scan.json", "patches.npz")
-EXPORTS = (".h5", ".hdf5", ".mat", ".csv", ".nc", ".cphd", ".png")
+FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES)
+EXPORTS = (".h5", ".mat", ".csv", ".nc", ".cphd")
 _KEYS = (
     "label", "name", "confidence", "probabilities", "why", "metal_reference", "metal_like", "box_mm", "outline_mm",
     "pixels", "incidence_deg", "ratio", "permittivity", "refused", "box", "truth", "bands", "tilt_across_deg",
@@ -29,38 +40,38 @@ def result_of(folder: Path) -> dict[str, Any]:
     DataError
         if there are none, or one is damaged.
     """
-    products = read_products(folder)
-    pixels, verdict = Pixels(products), products.verdict
-    left, right, low, high = pixels.extent_mm
-    names = [n for n in MAPS if pixels.referenced or n not in _NO_PERMITTIVITY]
+    products = Pixels(read_products(folder).folder)
+    verdict = products.verdict
+    left, right, low, high = products.extent_mm
+    names = [n for n in MAPS if products.referenced or n not in _NO_PERMITTIVITY]
     return {
         "folder": str(products.folder),
         "scan_id": products.scan_id,
         "simulated": products.simulated,
         "processed_utc": products.scan.get("processed_utc", ""),
         "extent_mm": [left, right, low, high],
-        "shape": list(pixels.valid.shape),
+        "shape": list(products.valid.shape),
         "pictures": [{"name": n, "title": MAPS[n].title, "colours": MAPS[n].colours} for n in names],
-        "referenced": pixels.referenced,
+        "referenced": products.referenced,
         "metal_reference": products.materials.get("metal_reference", {}),
         "library": products.materials.get("library", ""),
         "budget": products.materials.get("error_budget") or {},
         "verdict": None if verdict is None else {**verdict.to_dict(), "text": verdict.text},
         "patches": [{key: s[key] for key in _KEYS if key in s} for s in products.segments],
         "coverage": products.quality.get("coverage", {}),
-        "labels": labels_of(folder, pixels),
+        "labels": labels_of(folder, products),
         "files": files_of(folder),
     }
 
 
-def labels_of(folder: Path, pixels: Pixels) -> dict[str, Any] | None:
+def labels_of(folder: Path, products: SavedProducts) -> dict[str, Any] | None:
     """Boxes drawn by hand, in millimetres, or the `problem` of their file; None if there are none."""
     try:
         found = find_labels(folder)
         if found is None:
             return None
         path, labels = found
-        labels = labels.in_mm(pixels.products.x_m, pixels.products.y_m)
+        labels = labels.in_mm(products.x_m, products.y_m)
     except PolysightError as e:
         return {"boxes": {}, "metal": None, "specimens": {}, "file": str(label_folder(folder)), "problem": e.what}
     boxes = {name: list(box) for name, box in labels.boxes.items()}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -183,7 +183,7 @@ def as_of_now(folder: Path, s: Summary) -> Summary:
     else:
         alive = now - life < _LAPSE_S
     state = s.state if alive and s.state == "paused" else "running" if alive else "lost"
-    return Summary(**{**s.__dict__, "state": state})
+    return replace(s, state=state)
 
 
 def _processed(folder: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from polysight.data import packaged
 from polysight.host.cli.options import Add, add_config_option, add_json_option, add_model_option, count, number
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ def _permittivity(args: argparse.Namespace) -> int:
             f"{' and '.join(useless)} without --layer would do nothing",
             "it says how layers are fitted; one interface needs none of it",
             "add the layers (--layer), or leave it out",
+            code=ErrorCode.VALUES_CONFLICT,
         )
     amplitude = 10.0 if args.amplitude is None else args.amplitude
     return permittivity(args.products, args.config, args.layer, args.segment, args.json, args.bands, amplitude / 100)
@@ -183,6 +185,7 @@ def _train(args: argparse.Namespace) -> int:
             f"{'DATA' if args.data else '--simulate'} and --authors together",
             "a library is made of scans of this rig, or of the published files: not of both",
             "give one of them",
+            code=ErrorCode.VALUES_CONFLICT,
         )
     if args.authors is not None:
         from polysight.papers.sensys2026.dataset import train_authors
@@ -214,7 +217,6 @@ def _add_train(add: Add) -> None:
 
 _FORMATS = {
     "csv": "materials.csv: a line a patch, permittivity with standard errors",
-    "png": "amplitude (dB) and phase (degrees) of H, V and P, and the materials",
     "hdf5": "image.h5: arrays with axes, units, config, versions (needs h5py)",
     "netcdf": "image.nc: an xarray dataset; complex variables as h_real, h_imag (needs h5netcdf)",
     "zarr": "image.zarr: the same dataset as a Zarr store (needs zarr)",
@@ -239,9 +241,9 @@ def _add_export(add: Add) -> None:
     sub = add(
         "export",
         _export,
-        "export a processed scan to HDF5, NetCDF, Zarr, MATLAB, PNG, CSV or CPHD",
+        "export a processed scan to HDF5, NetCDF, Zarr, MATLAB, CSV or CPHD",
         "polysight export out/one --hdf5 --csv",
-        ("--csv", "--png", "--hdf5"),
+        ("--csv", "--hdf5", "--netcdf"),
     )
     sub.add_argument("products", type=Path, metavar="DIR", help="folder of products, or a scan folder")
     for name, text in _FORMATS.items():

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from polysight.data import packaged
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 
 RIG = Path("instrument.toml")
@@ -113,9 +114,13 @@ def material_request(args: argparse.Namespace) -> dict[str, Any]:
             f"{' and '.join(asked)} with --no-process would do nothing",
             "it says how the scan is processed, and it will only be recorded",
             "give it to `polysight process` later, or leave --no-process out",
+            code=ErrorCode.VALUES_CONFLICT,
         )
     if args.library is not None and args.model == "none":
-        raise ConfigError("--library with --model none would do nothing", "nothing is named", "leave one of them out")
+        raise ConfigError(
+            "--library with --model none would do nothing", "nothing is named", "leave one of them out",
+            code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
     return {
         "metal_box_mm": args.metal,
         "library": text_of(args.library),

@@ -16,7 +16,6 @@ from polysight.host.cli.options import (
     rig_file,
     text_of,
 )
-from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
     from polysight.host.process import ProcessRequest
@@ -26,18 +25,11 @@ def request_of(args: argparse.Namespace, data: Path, out: Path) -> ProcessReques
     """The request of `polysight process` for one scan. Raises ConfigError."""
     from polysight.host.process import ProcessRequest
 
-    if args.reference is None and args.reference_by is not None:
-        raise ConfigError(
-            f"--reference-by {args.reference_by} without --reference would do nothing",
-            "it says how the metal scan named by --reference is used",
-            "add --reference SCAN, or leave it out",
-        )
     return ProcessRequest(
         data=str(data),
         out=str(out),
         config=text_of(rig_file(args.config, data)),
         reference=text_of(args.reference),
-        reference_by=args.reference_by or "position",
         incidence=args.incidence,
         bands=args.bands,
         **material_request(args),
@@ -157,11 +149,6 @@ def _add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="SCAN",
         help="scan of a metal plate as reference (default: metal in the scene)",
-    )
-    sub.add_argument(
-        "--reference-by",
-        choices=["position", "mean"],
-        help="divide by --reference pixel by pixel (default), or by its mean in each channel",
     )
     sub.add_argument(
         "--incidence",

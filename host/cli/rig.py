@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 from polysight.host.cli.options import Add, add_action, add_config_option, add_json_option, count, number, positive
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 
 
@@ -47,8 +49,8 @@ def _plan(args: argparse.Namespace) -> int:
 
 def _size(text: str) -> tuple[float, float]:
     try:
-        width, height = (float(part) for part in text.split(","))
-    except ValueError:
+        width, height = (positive(part) for part in text.split(","))
+    except (ValueError, argparse.ArgumentTypeError):
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form WIDTH,HEIGHT in mm, e.g. 170,170") from None
     return width, height
 
@@ -67,10 +69,16 @@ def _add_plan(add: Add) -> None:
     sub.add_argument("--like", type=Path, metavar="SCAN", help="take noise and standstill between rows from this scan")
     sub.add_argument("--scene-mm", type=_size, metavar="W,H", help="size of the scene (default: the image's)")
     sub.add_argument(
-        "--snr-db", type=float, metavar="DB", help="direct path over noise per channel, sample and chirp (default: 5.5)"
+        "--snr-db",
+        type=number(float, "a finite number", math.isfinite),
+        metavar="DB",
+        help="direct path over noise per channel, sample and chirp (default: 5.5)",
     )
     sub.add_argument(
-        "--row-overhead-s", type=float, metavar="S", help="standstill between rows (default: 0.3, simulated)"
+        "--row-overhead-s",
+        type=number(float, "a number, 0 or more", lambda s: 0 <= s < math.inf),
+        metavar="S",
+        help="standstill between rows (default: 0.3, simulated)",
     )
     add_json_option(sub)
     group = sub.add_argument_group("numbers of the plan", "instead of the rig file's")
@@ -86,8 +94,9 @@ def _doctor(args: argparse.Namespace) -> int:
 
     if args.move and not args.pulse:
         raise ConfigError(
-            "--move and --no-pulse", "each point of the row is a burst of SYNC_IN pulses", "leave one of them out"
-        )
+            "--move and --no-pulse", "each point of the row is a burst of SYNC_IN pulses", "leave one of them out",
+            code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
     options = DoctorOptions(args.config, args.out, args.move, args.pulse, args.bursts)
     return run_doctor(options, args.json, bundle=args.bundle)
 

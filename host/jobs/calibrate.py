@@ -6,7 +6,6 @@ rig file are written. `leakage` prints what belongs into the rig file's [polarim
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,8 +23,8 @@ from polysight.host.calibration import (
     source_scan,
     write_calibration,
 )
+from polysight.host.jobs.output import print_json, say, steps
 from polysight.host.jobs.process import imaged, load_reference, plane_of
-from polysight.host.jobs.progress import say, steps
 from polysight.host.polarimetry import (
     Image,
     Leakage,
@@ -46,9 +45,7 @@ def _print_result(
 ) -> int:
     """Print the result and the keys to set; return 0."""
     if as_json:
-        sys.stdout.write(
-            json.dumps({"file": str(path), "simulated": file.simulated, **to_builtins(file)}, indent=1) + "\n"
-        )
+        print_json({"file": str(path), "simulated": file.simulated, **to_builtins(file)})
         return 0
     head_line = "SIMULATED data: of no use for a real rig" if file.simulated else "measured"
     scans = ", ".join(f"{s.scan_id} ({s.rows} rows)" for s in file.sources)
@@ -79,8 +76,8 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     given = None if config is None else load_instrument(config)
     source = open_raw(scan, given)
     rig = source.instrument if given is None else with_places_of(source.instrument, given)
-    in_force = calibration_of_scan(source)
-    filters = {b.name: in_force.high_pass(b.name) for b in rig.receivers}
+    calibration = calibration_of_scan(source)
+    filters = {b.name: calibration.high_pass(b.name) for b in rig.receivers}
     say("places of boards and plane")
     fit = fit_places(load_echoes(source, rig, filters), rig, points, Prior(prior_mm, prior_mm))
     file = places_file(rig, fit, len(points), [source_scan(source, scan)])
@@ -264,9 +261,7 @@ def leakage(plate: Path, strips: Sequence[tuple[float, Path]], config: Path | No
     imbalance = {"db": 20 * float(np.log10(abs(found.imbalance))), "deg": float(np.degrees(np.angle(found.imbalance)))}
     if as_json:
         out = {**facts, **rows, "imbalance_db": imbalance["db"], "imbalance_deg": imbalance["deg"]}
-        sys.stdout.write(
-            json.dumps({**out, "residual_rad": found.residual, "alike": len(strips) == 1}, indent=1) + "\n"
-        )
+        print_json({**out, "residual_rad": found.residual, "alike": len(strips) == 1})
         return 0
     source = "# simulated scans\n" if facts["simulated"] else ""
     alike = "# one orientation: both boards are taken to leak alike (the axial ratio)\n" if len(strips) == 1 else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from polysight.host.capture import CardClient, CardSurvey, EepromSettings, HopFinding, program_eeprom, survey_cards
+from polysight.host.jobs.output import print_json
 from polysight.shared.config import Board, Instrument, load_instrument
 from polysight.shared.errors import ConfigError, DeviceError
 
@@ -34,7 +34,7 @@ def show_cards(config: Path, listen_s: float, as_json: bool) -> int:
         sys.stderr.write(f"listening for at most {listen_s:g} s: let the radars be triggered now\n")
     surveys = survey_cards(rig, listen_s)
     if as_json:
-        sys.stdout.write(json.dumps([_facts(s) for s in surveys], indent=1) + "\n")
+        print_json([_facts(s) for s in surveys])
     else:
         sys.stdout.write("\n".join(_text(s) for s in surveys))
     return 0 if all(s.ok for s in surveys if s.board.record) else 1

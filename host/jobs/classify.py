@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Container, Sequence
 from dataclasses import asdict, replace
@@ -13,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.jobs.materials import print_verdict
+from polysight.host.jobs.output import print_json, print_lines
 from polysight.host.materials import (
     PATCHES,
     SIMULATED_LIBRARY,
@@ -28,21 +28,15 @@ from polysight.host.materials import (
 )
 from polysight.host.products import SavedProducts, find_products, refused_text
 from polysight.host.report import classifier_sentence
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError
 
 
 def classify(data: Sequence[Path], library: Path | None, model: str | None, as_json: bool) -> int:
-    """Name the patches of processed scans together, or judge the models on one library; returns the exit status.
+    """Name the patches of processed scans together, or judge the models on one library; return the exit status.
 
-    Parameters
-    ----------
-    data
-        Folders that `polysight process` wrote, or scan folders, one for each incidence angle; or a library (.npz), or a
-        folder of the published material files.
-    library, model
-        Of the naming; without: the simulated library, and the model that was chosen for it.
-    as_json
-        Print JSON.
+    `data` are processed scans, one for each incidence angle; or one library (.npz), or a folder of the published
+    material files. Names come from `library` (None: the simulated one) and `model` (None: the library's default).
 
     Raises
     ------
@@ -64,7 +58,7 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
             "give scans of the same patches under different angles",
         )
     if len(found) == len(scans):
-        return _name(found, library or SIMULATED_LIBRARY, model, as_json)
+        return _name_patches(found, library or SIMULATED_LIBRARY, model, as_json)
     if len(data) > 1:
         other = data[scans.index(None)]
         raise ConfigError(
@@ -76,11 +70,13 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
             f"{data[0]}: no patches of a scan, so --library and --model would do nothing",
             "they choose what names patches; on a library every model is judged",
             "leave them out, or give a folder that polysight process wrote",
+            code=ErrorCode.VALUES_CONFLICT,
         )
-    return _judge(data[0], as_json)
+    return _score_models(data[0], as_json)
 
 
-def _judge(data: Path, as_json: bool) -> int:
+def _score_models(data: Path, as_json: bool) -> int:
+    """Cross-validate every model on a library; print shares of right names."""
     from polysight.host.materials import MODELS, Samples, score
 
     library = read_materials(data) if data.is_dir() else Library.load(data)
@@ -95,7 +91,7 @@ def _judge(data: Path, as_json: bool) -> int:
         best = max(scores[::2], key=lambda s: s.pixels + s.patches)
         content = {"source": source, "names": best.names, "scores": rows}
         content |= {"best_with_scans_left_out": best.model, "confusion_of_best": best.confusion.tolist()}
-        sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        print_json(content)
         return 0
     sys.stdout.write(
         f"{source}: {len(library.names)} materials, {len(library.scans)} scans, {samples.names.size} pixels\n"
@@ -111,17 +107,15 @@ def _judge(data: Path, as_json: bool) -> int:
     return 0
 
 
-def _name(products: Sequence[SavedProducts], library_path: Path, model: str | None, as_json: bool) -> int:
+def _name_patches(products: Sequence[SavedProducts], library_path: Path, model: str | None, as_json: bool) -> int:
+    """Name the patches that lie at the same place in all scans; print names with shares of their pixels."""
     status = max(print_verdict(p, to_terminal=not as_json) for p in products)
     if status:
         if as_json:
-            sys.stdout.write(json.dumps(_nothing_named(products), indent=1) + "\n")
+            print_json(_nothing_named(products))
         return status
     library = Library.load(library_path)
-    refused = [{s["label"]: s for s in p.segments if s.get("refused")} for p in products]
-    # The metal reference is never judged by itself.
-    metal = [{s["label"] for s in p.segments if s.get("metal_reference")} for p in products]
-    scans = [_without(p.patches, r.keys() | m) for p, r, m in zip(products, refused, metal, strict=True)]
+    scans = [_classifiable(p) for p in products]
     classifier = Classifier(library, model=model, angles_deg=[s.angle_deg for s in scans])
     matched = match_patches(scans)
     if not matched:
@@ -132,43 +126,54 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
         )
     errors = scans[0].errors_of([m.label for m in matched]) if len(scans) == 1 else None
     named = classifier.scan([m.features for m in matched], errors)
-    contradictions = _contradictions(library, model, classifier.angles_deg, matched, named)
-    rows = [_row(m, n.verdict, n.names) for m, n in zip(matched, named, strict=True)]
-    simulated = any(s.simulated for s in scans)
-    once = sum(len(s.patches) for s in scans) - len(scans) * len(matched)
+    content = {
+        "source": "simulated" if any(s.simulated for s in scans) else "measured",
+        "incidence_deg": [s.angle_deg for s in scans],
+        "model": classifier.model,
+        "library": classifier_sentence(classifier),
+        "patches": [_row(m, n.verdict, n.names) for m, n in zip(matched, named, strict=True)],
+        "contradictions": _contradictions(library, model, classifier.angles_deg, matched, named),
+        "patches_not_in_every_scan": sum(len(s.patches) for s in scans) - len(scans) * len(matched),
+        "refused": [
+            {"products": str(p.folder), "label": s["label"], **s["refused"]}
+            for p in products
+            for s in p.segments
+            if s.get("refused")
+        ],
+    }
     if as_json:
-        content = {
-            "source": "simulated" if simulated else "measured",
-            "incidence_deg": [s.angle_deg for s in scans],
-            "model": classifier.model,
-            "library": classifier_sentence(classifier),
-            "patches": rows,
-            "contradictions": contradictions,
-            "patches_not_in_every_scan": once,
-            "refused": [
-                {"products": str(p.folder), "label": label, **s["refused"]}
-                for p, found in zip(products, refused, strict=True)
-                for label, s in found.items()
-            ],
-        }
-        sys.stdout.write(json.dumps(content, indent=1) + "\n")
-        return 0
-    angles = " and ".join(f"{s.angle_deg:.1f}" for s in scans)
-    sys.stdout.write(f"{'simulated: ' if simulated else ''}{len(rows)} patches at {angles} degrees\n")
-    for row in rows:
+        print_json(content)
+    else:
+        _print_names(content, several=len(scans) > 1)
+        _print_right(content["patches"], library.names)
+        if once := content["patches_not_in_every_scan"]:
+            sys.stdout.write(f"{once} patches were not seen in every scan and are not named\n")
+        sys.stdout.write(content["library"] + "\n")
+    return 0
+
+
+def _classifiable(products: SavedProducts) -> ScanPatches:
+    """Patches of a scan without the refused ones and the metal reference, which is never judged by itself."""
+    left_out = {s["label"] for s in products.segments if s.get("refused") or s.get("metal_reference")}
+    scan = products.patches
+    return replace(scan, patches=tuple(p for p in scan.patches if p.label not in left_out))
+
+
+def _print_names(content: dict[str, Any], several: bool) -> None:
+    """Print a line for each named patch, contradiction and refused patch."""
+    angles = " and ".join(f"{a:.1f}" for a in content["incidence_deg"])
+    source = "simulated: " if content["source"] == "simulated" else ""
+    sys.stdout.write(f"{source}{len(content['patches'])} patches at {angles} degrees\n")
+    for row in content["patches"]:
         votes = ", ".join(f"{name} {share:.0%}" for name, share in list(row["votes"].items())[:2])
         truth = f"   truly {row['truth']}" if row["truth"] else ""
         sure = f"{row['confidence']:6.1%}" if row["pixels"] else "no pixel of it can be used"
         sys.stdout.write(f"{row['label']:>3}  {row['name']:28s} {sure}   pixels: {votes}{truth}\n")
-    sys.stdout.write("".join(f"note: {line}\n" for line in contradictions))
-    for p, found in zip(products, refused, strict=True):
-        where = f" in {p.folder}" if len(products) > 1 else ""
-        sys.stdout.write("".join(f"{n:>3}  not judged{where}: {refused_text(s)}\n" for n, s in found.items()))
-    _print_right(rows, library.names)
-    if once:
-        sys.stdout.write(f"{once} patches were not seen in every scan and are not named\n")
-    sys.stdout.write(classifier_sentence(classifier) + "\n")
-    return 0
+    print_lines(f"note: {line}" for line in content["contradictions"])
+    for refused in content["refused"]:
+        where = f" in {refused['products']}" if several else ""
+        text = refused_text({"refused": refused})
+        sys.stdout.write(f"{refused['label']:>3}  not judged{where}: {text}\n")
 
 
 def _contradictions(
@@ -208,11 +213,6 @@ def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
     if known:
         right, share = sum(r["name"] == r["truth"] for r in known), np.mean([r["pixels_right"] for r in known])
         sys.stdout.write(f"{right} of {len(known)} patches named right, {share:.1%} of their pixels\n")
-
-
-def _without(scan: ScanPatches, refused: Container[int]) -> ScanPatches:
-    """Patches of a scan that can be classified."""
-    return replace(scan, patches=tuple(p for p in scan.patches if p.label not in refused))
 
 
 def _nothing_named(products: Sequence[SavedProducts]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.cells import cell_len
 
+from polysight.host.jobs.output import print_lines
 from polysight.host.materials import (
     SPECIMEN,
     Box,
@@ -65,20 +66,8 @@ class FoundPatch:
 class Edits:
     """Changes to labels, applied in this order.
 
-    Attributes
-    ----------
-    from_patches
-        Begin with a box inside each patch that was found, called by its number.
-    removed
-        Names of boxes to leave out.
-    renames
-        `OLD=NEW`.
-    boxes
-        Name and corners, millimetres from the image centre, of new boxes.
-    specimens
-        `NAME=WHICH`.
-    metal
-        Name of the metal reference.
+    `from_patches` begins with a box inside each patch that was found, called by its number; `renames` are `OLD=NEW`,
+    `specimens` `NAME=WHICH`; corners of `boxes` are millimetres from the image centre.
     """
 
     from_patches: bool = False
@@ -96,18 +85,10 @@ class Edits:
 
 
 def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None = None) -> int:
-    """Draw, name and save the boxes of a scan; returns the exit status.
+    """Draw, name and save the boxes of a scan or of its products; return the exit status.
 
-    Parameters
-    ----------
-    folder
-        A scan folder, or a folder of products.
-    edits
-        What the options ask for. Without any, the person is asked.
-    list_only
-        Print what is there, and write nothing.
-    ask
-        Asks a question and returns the answer; None where nobody can be asked.
+    Without `edits` the person is asked for the name of each patch; where nobody can be asked (`ask` is None), and with
+    `list_only`, boxes and patches are printed and nothing is written.
 
     Raises
     ------
@@ -121,10 +102,14 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
             f"{folder}: no {IMAGE} to draw on",
             "the scan was not processed yet, its products lie elsewhere, or the path is wrong",
             f"polysight process {folder} --out {out}; or give the folder of its products",
+            code=ErrorCode.FILE_MISSING,
         )
     there, found = find_labels(folder), found_patches(products)
     if edits.given and list_only:
-        raise ConfigError("--list with other options would not do them", "it writes nothing", "leave --list out")
+        raise ConfigError(
+            "--list with other options would not do them", "it writes nothing", "leave --list out",
+            code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
     labels = there[1].in_mm(products.x_m, products.y_m) if there else Labels({}, "mm")
     if edits.given:
         labels, left_out = edited(labels, found, edits)
@@ -134,16 +119,14 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     else:
         sys.stdout.write(_listing(folder, products, there, found))
         if there and ask("name the patches anew, in place of the boxes drawn by hand? type yes: ").strip() != "yes":
-            raise ConfigError("nothing was changed", "yes was asked for", "options edit boxes: polysight label --help")
+            raise ConfigError(
+                "nothing was changed", "yes was asked for", "options edit boxes: polysight label --help",
+                code=ErrorCode.VALUE_INVALID,
+            )  # fmt: skip
         labels, left_out = asked(found, ask), []
     place = label_folder(products.folder)
-    return _save(place, products, labels, left_out)
-
-
-def _save(place: Path, products: SavedProducts, labels: Labels, left_out: Sequence[str]) -> int:
-    """Check, write and print the boxes; return 0."""
     checked, notes = save_labels(place, products, labels)
-    sys.stdout.write("".join(f"{line}\n" for line in _table(checked)))
+    print_lines(_table(checked))
     if left_out:
         sys.stdout.write(f"left out, without a name: {', '.join(left_out)}\n")
     sys.stdout.write("".join(f"note: {note}\n" for note in notes))
@@ -152,12 +135,7 @@ def _save(place: Path, products: SavedProducts, labels: Labels, left_out: Sequen
 
 
 def save_labels(place: Path, products: SavedProducts, labels: Labels) -> tuple[Labels, list[str]]:
-    """Check boxes drawn on products, and write them with their picture into `place`.
-
-    Returns
-    -------
-    labels, notes
-        as written, and what the person should know.
+    """Check boxes drawn on products, and write them with their picture into `place`; return them with notes on them.
 
     Raises
     ------
@@ -166,7 +144,10 @@ def save_labels(place: Path, products: SavedProducts, labels: Labels) -> tuple[L
     """
     if not labels.boxes:
         raise DataError(
-            "no box is left", "every patch was left out, or every box removed", f"to have none, delete {place / LABELS}"
+            "no box is left",
+            "every patch was left out, or every box removed",
+            f"to have none, delete {place / LABELS}",
+            code=ErrorCode.NO_DATA,
         )
     checked = check_labels(labels, products.x_m, products.y_m, products.valid)
     checked = replace(
@@ -318,8 +299,9 @@ def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
             metal = _asked_metal(boxes, ask)
     except EOFError:
         raise ConfigError(
-            "nothing was written: the answers ended", "the input was closed", "give options instead"
-        ) from None
+            "nothing was written: the answers ended", "the input was closed", "give options instead",
+            code=ErrorCode.KEY_MISSING,
+        ) from None  # fmt: skip
     return Labels(boxes, "mm", metal)
 
 

@@ -41,7 +41,7 @@ from polysight.shared.errors import ConfigError, PolysightError, ScanError, advi
 PRODUCTS = "products"
 _BESIDE = ("program", "operator.json")
 """Entries allowed in a folder before its scan begins: a program's log, notes."""
-Take = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
+RunScan = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
 
 
 def _clock(seconds: float | None) -> str:
@@ -125,17 +125,17 @@ class _Live:
 
 
 @ignore_hangup()
-def _run(folder: Path, options: Options, process: bool, take: Take) -> int:
+def _run(folder: Path, options: Options, process: bool, run_rows: RunScan) -> int:
     live = _Live(folder)
     stop = StopRequest()
-    with ScanBar() as bar, ControlFolder(folder, stop) as desk:
+    with ScanBar() as bar, ControlFolder(folder, stop) as control:
 
         def show(progress: ScanProgress) -> None:
             if progress.phase != "connect":
-                desk.open()  # the scan folder is there, and locked by this program
+                control.open()  # the scan folder is there, and locked by this program
             bar.update(progress)
 
-        result = take(live.add_row if process else None, show, stop)
+        result = run_rows(live.add_row if process else None, show, stop)
     if result.exit_status == "success":
         _print(f"{folder}: every row is committed\n")
     if result.processing_error is not None:
@@ -209,10 +209,10 @@ def scan(config: Path, request: ProcessRequest, truth: Path | None, keep_incompl
         if truth is not None:
             read_truth(truth)
 
-    def take(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
+    def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
         def show(progress: ScanProgress) -> None:
             if truth is not None and progress.phase == "row" and not (folder / TRUTH).exists():
-                with suppress(OSError):  # said below: a row is worth more
+                with suppress(OSError):  # noted below: a row is worth more
                     shutil.copyfile(truth, folder / TRUTH)
             on_progress(progress)
 
@@ -221,7 +221,7 @@ def scan(config: Path, request: ProcessRequest, truth: Path | None, keep_incompl
             sys.stderr.write(f"note: {truth} was not copied into {folder}; a report does without\n")
         return result
 
-    return _run(folder, options, process, take)
+    return _run(folder, options, process, run_rows)
 
 
 def resume(request: ProcessRequest, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
@@ -239,9 +239,9 @@ def resume(request: ProcessRequest, keep_incomplete: bool, process: bool, config
         _check_options(options, source.instrument, calibration_of_scan(source))
         check_products_folder(folder / PRODUCTS, source.scan_id)
 
-    def take(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
+    def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
         return resume_scan(
             folder, on_row=on_row, progress=on_progress, keep_incomplete=keep_incomplete, stop=stop, rig_now=rig_now
         )
 
-    return _run(folder, options, process, take)
+    return _run(folder, options, process, run_rows)

@@ -5,7 +5,6 @@ Each prints the verdict first, and no patches if it is `none`.
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,6 +16,7 @@ import numpy as np
 from rich.cells import cell_len
 
 from polysight.host.imaging import sub_bands
+from polysight.host.jobs.output import print_json, print_lines
 from polysight.host.materials import (
     AMPLITUDE_ERROR,
     Layer,
@@ -30,6 +30,7 @@ from polysight.host.materials import (
 )
 from polysight.host.products import (
     MATERIALS,
+    REPORT,
     SCAN,
     SavedProducts,
     find_products,
@@ -43,7 +44,6 @@ from polysight.shared.errors import ConfigError, DataError
 
 _SAME_FREQUENCY = 1e-6  # relative: far above rounding, far below any other chirp
 _REASONS = 3  # of a verdict, for the terminal
-REPORT = "report.html"
 
 
 def print_verdict(products: SavedProducts, to_terminal: bool = True) -> int:
@@ -52,20 +52,20 @@ def print_verdict(products: SavedProducts, to_terminal: bool = True) -> int:
     if verdict is None:
         return 0
     if to_terminal:
-        sys.stdout.write("".join(f"{line}\n" for line in verdict.lines(_REASONS)))
+        print_lines(verdict.lines(_REASONS))
     return 0 if verdict.usable else NoResult.exit_status
 
 
 def _chirp(products: SavedProducts, config: Path | None) -> Chirp:
     """The chirp of the products, or that of `config` if given. Raises DataError, ConfigError."""
-    chirp = load_instrument(config).chirp if config is not None else products.chirp
-    if chirp is None:
+    rig = load_instrument(config) if config is not None else products.rig
+    if rig is None:
         raise DataError(
             f"{products.folder}: no {SCAN}, which names the chirp",
             "an earlier release processed the scan",
             "process the scan again, or give its rig file: --config FILE",
         )
-    return chirp
+    return rig.chirp
 
 
 def _check_bands(row: Mapping[str, Any], chirp: Chirp, source: str) -> None:
@@ -129,7 +129,7 @@ def permittivity(
         if found is not None:
             out[-1]["layer"] = layer_content(found)
     if as_json:
-        sys.stdout.write(json.dumps(out, indent=1) + "\n")
+        print_json(out)
         return print_verdict(products, to_terminal=False)
     status = print_verdict(products)
     if status == 0:
@@ -191,7 +191,7 @@ def concentration(data: Path, given: Mapping[str, float], confidence: float, as_
             "median_error_percent": result.median_error,
             "covered": result.covered,
         }
-        sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        print_json(content)
         return 0
     line = result.line
     rows = [
@@ -219,7 +219,7 @@ def materials(data: Sequence[Path], as_json: bool) -> int:
     """
     scans = [read_products(folder, MATERIALS) for folder in data]
     if as_json:
-        sys.stdout.write(json.dumps([{"products": str(s.folder), **s.materials} for s in scans], indent=1) + "\n")
+        print_json([{"products": str(s.folder), **s.materials} for s in scans])
         return max((print_verdict(s, to_terminal=False) for s in scans), default=0)
     worst = 0
     for scan in scans:

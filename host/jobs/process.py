@@ -20,7 +20,7 @@ from polysight.host.imaging import (
     View,
     focus_sweep,
 )
-from polysight.host.jobs.progress import counted, current_step, say
+from polysight.host.jobs.output import counted, current_step, print_lines, say
 from polysight.host.materials import (
     TruthPlate,
     find_truth,
@@ -41,6 +41,7 @@ from polysight.host.products import (
     IMAGE,
     QUALITY,
     RAW_DROPPED,
+    REPORT,
     SavedProducts,
     check_products_folder,
     making_products,
@@ -51,7 +52,6 @@ from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError, advice
 
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
-REPORT = "report.html"
 
 
 def all_rows(
@@ -72,15 +72,7 @@ def all_rows(
     if options is not None:
         metal = check_options(options, pipeline.rig, axes_of(pipeline))
         pipeline.metal_plane(options, metal is not None)
-    rows = list(source.rows())
-    if not rows:
-        raise DataError(
-            f"{data}: no row is recorded whole",
-            "the scan was stopped in its first row, or files are missing",
-            f"`polysight resume {data}` takes the missing rows of a scan folder",
-        )
-    if isinstance(source, ScanFolder) and not pipeline.samples.holds(rows):
-        require_raw(source)
+    rows = pipeline.samples.processable(source, data)
     for _ in counted(map_rows(pipeline.add_row, rows, threads), len(rows), "rows"):
         pass
     return pipeline
@@ -107,21 +99,10 @@ def truth_of(data: Path) -> tuple[TruthPlate, ...]:
 
 
 def check_options(options: Options, rig: Instrument, axes_m: Axes) -> int | None:
-    """Check inputs that are needed at the end before the work begins; note on stderr if nothing will be named.
+    """Check library, model and drawn boxes before the work begins; note on stderr if nothing will be named.
 
-    Parameters
-    ----------
-    options
-        Whose library, model and drawn boxes are looked at.
-    rig
-        Of the images, as calibrated.
-    axes_m
-        x and y of the images.
-
-    Returns
-    -------
-    int or None
-        Which of the drawn boxes is the metal reference.
+    `rig` is that of the images, as calibrated, `axes_m` are their x and y. Returns the number of the drawn box that is
+    the metal reference, or None.
 
     Raises
     ------
@@ -175,21 +156,10 @@ def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
     return replace(found, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 
-def load_reference(
-    folder: Path, config: Path | None = None, by_position: bool = True, bands: int = 1
-) -> PlaneReference:
-    """Make a reference from a scan of a metal plate that covers the plane.
+def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> PlaneReference:
+    """Make a reference from a scan of a metal plate that covers the plane, and one for each of `bands` sub-bands.
 
-    Parameters
-    ----------
-    folder
-        Scan folder, or the authors' unsynced/<scan>.
-    config
-        Rig file for the latter.
-    by_position
-        A value for each pixel; else one number a channel.
-    bands
-        Sub-bands to image too.
+    `config` is the rig file of scans in the authors' layout.
 
     Raises
     ------
@@ -198,8 +168,7 @@ def load_reference(
     """
     pipeline, images = imaged(folder, config, bands)
     parts = tuple(plane_of(pipeline, band) for band in pipeline.sub_bands.finish(pipeline.source.mirrored))
-    found = replace(plane_of(pipeline, images), bands=parts)
-    return found if by_position else found.mean()
+    return replace(plane_of(pipeline, images), bands=parts)
 
 
 def load_options(request: ProcessRequest) -> Options:
@@ -207,8 +176,7 @@ def load_options(request: ProcessRequest) -> Options:
     reference = None
     if request.reference is not None:
         config = None if request.config is None else Path(request.config)
-        by_position = request.reference_by == "position"
-        reference = load_reference(Path(request.reference), config, by_position, request.bands)
+        reference = load_reference(Path(request.reference), config, request.bands)
     return Options(
         metal_box_mm=request.metal_box_mm,
         library=None if request.library is None else Path(request.library),
@@ -247,7 +215,7 @@ def image(data: Path, out: Path, config: Path | None, view: View = AS_IN_RIG_FIL
     with making_products(out, source.scan_id) as new:
         save_images(new, source, pipeline.rig, images, pipeline.quality)
     lines = (*coverage_lines(pipeline.quality.coverage()), f"image: {out / IMAGE}")
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    print_lines(lines)
     sys.stdout.flush()
     pipeline.quality.note_imaging(pipeline.images, images)
     write_json(out / QUALITY, quality_content(pipeline.quality))
@@ -278,7 +246,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *axes_of(pipeline), source.simulated))
     head = f"{'simulated ' if source.simulated else ''}scan {source.scan_id}"
     at = pipeline.rig.geometry.object_distance_mm
-    sys.stdout.write("".join(f"{line}\n" for line in _focus_lines(head, at, found, plates)))
+    print_lines(_focus_lines(head, at, found, plates))
     sys.stdout.write(f"figure: {out / 'focus.png'}\n")
     return 0
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from polysight.host.jobs.output import print_json
 from polysight.host.radar import (
     Clock,
     Image,
@@ -99,7 +99,7 @@ def _check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], Wo
         board.close()
     if as_json:
         steps = [row._asdict() for row in rows]
-        sys.stdout.write(json.dumps({"board": name, "steps": steps, "report": report}, indent=1) + "\n")
+        print_json({"board": name, "steps": steps, "report": report})
     else:
         for line in report.get("warnings", []):
             sys.stdout.write(f"      note: {line}\n")

@@ -6,7 +6,6 @@ the processing is loaded, so that these commands start at once.
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.capture import PACKETS, CardReport, Code, Layout, Report, inspect_bin, inspect_pcap, is_pcap
+from polysight.host.jobs.output import print_json, print_lines
 from polysight.host.store import (
     MANIFEST,
     PlacedAgain,
@@ -133,7 +133,7 @@ def inspect_file(
 
         content = asdict(report)
         content |= content.pop("layout")
-        sys.stdout.write(json.dumps(plain(content), indent=1) + "\n")
+        print_json(plain(content))
     else:
         sys.stdout.write(main_text(report))
     if plot is not None:
@@ -198,8 +198,7 @@ def inspect_placement(file: Path, as_json: bool) -> int:
     again = place_again(row)
     same = again.moved or again.missing == again.placed.missing
     if as_json:
-        said = {**again.placed.facts(), "committed_missing": again.missing, "same": same}
-        sys.stdout.write(json.dumps(said, indent=1) + "\n")
+        print_json({**again.placed.facts(), "committed_missing": again.missing, "same": same})
     else:
         sys.stdout.write("\n".join(_placement_lines(file, again, same)) + "\n")
     return 0 if same else 1
@@ -236,9 +235,9 @@ def replace_folder(folder: Path, as_json: bool) -> int:
     """Repeat the placement of all rows of a scan and commit changed rows; return 0 if no row is damaged."""
     rows = replace_rows(ScanFolder.load(folder))
     if as_json:
-        sys.stdout.write(json.dumps([asdict(r) for r in rows], indent=1) + "\n")
+        print_json([asdict(r) for r in rows])
     else:
-        sys.stdout.write("".join(f"{line}\n" for line in _replaced_lines(folder, rows)))
+        print_lines(_replaced_lines(folder, rows))
     return 1 if any(r.damaged for r in rows) else 0
 
 

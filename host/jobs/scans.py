@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -20,6 +19,7 @@ from polysight.host.catalogue import (
     read_notes,
     write_notes,
 )
+from polysight.host.jobs.output import print_json
 from polysight.host.materials import UNKNOWN
 from polysight.shared.errors import DataError, no_such
 
@@ -37,7 +37,7 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
     found = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _searched(s)]
     if as_json:
         rows = [asdict(s) | {"bytes": _bytes_of(root, s)} for s in found]
-        sys.stdout.write(json.dumps({"scans": rows}, indent=1, ensure_ascii=False) + "\n")
+        print_json({"scans": rows})
         return 0
     width = min(max((len(s.name) for s in found), default=0), _NAME_WIDTH)
     for s in found:
@@ -76,12 +76,12 @@ def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> i
     return 0
 
 
-def ask_scan(folder: Path, wish: str) -> int:
+def ask_scan(folder: Path, command: str) -> int:
     """Send a command to a running scan; return 0 when it has received it. Raises ScanError."""
     if not folder.is_dir():
         raise no_such(folder)
-    send_command(folder, ScanCommand(wish))
-    sys.stdout.write(f"{folder}: heard {wish}\n")
+    send_command(folder, ScanCommand(command))
+    sys.stdout.write(f"{folder}: heard {command}\n")
     return 0
 
 
@@ -89,7 +89,7 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
     """Print the results of a processed scan at one place; return 0. Raises DataError."""
     found = probe(folder, *place_mm, library)
     if as_json:
-        sys.stdout.write(json.dumps(found, indent=1, ensure_ascii=False) + "\n")
+        print_json(found)
         return 0
     lines = [f"x {found['place_mm'][0]:g} mm, y {found['place_mm'][1]:g} mm from the image's centre"]
     if not found["lit"]:
@@ -121,7 +121,7 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
         except OSError as e:
             raise DataError(f"{picture}: cannot be written: {e.strerror}", "no such folder, or no permission") from None
     if as_json:
-        sys.stdout.write(json.dumps(values, indent=1, ensure_ascii=False) + "\n")
+        print_json(values)
         return 0
     lines = [f"{first} minus {second}: {values['compared']} pixels", *(f"note: {n}" for n in values["notes"])]
     if values["significant_share"] is not None:

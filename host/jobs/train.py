@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from polysight.host.jobs.demo import check_scenes, run_simulator
+from polysight.host.jobs.output import print_lines, steps
 from polysight.host.jobs.process import all_rows
-from polysight.host.jobs.progress import steps
 from polysight.host.materials import (
     TRUTH,
     ImagePair,
@@ -52,9 +52,7 @@ from polysight.host.products import (
     scan_folder_of,
 )
 from polysight.host.store import open_source, versions
-from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DataError, ScanError
-from polysight.shared.tables import decode
 
 EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
@@ -63,12 +61,7 @@ EDGE_MM = 9.0
 def training_scan(data: Path, config: Path) -> TrainingScan:
     """Return a scan for the library, its patches named by labels or truth.
 
-    Parameters
-    ----------
-    data
-        A scan folder of any layout, or a folder of products.
-    config
-        Rig file of layouts without one.
+    `data` is a scan folder of any layout, or a folder of products; `config` the rig file of layouts without one.
 
     Raises
     ------
@@ -157,10 +150,9 @@ def _from_images(saved: SavedProducts, labels: Labels) -> TrainingScan:
 
 def _optics_of(saved: SavedProducts) -> Optics:
     """Return incidence angle and leakage of saved images; leakage that processing removed is zero here."""
-    path = saved.folder / SCAN
-    if "instrument" not in saved.scan:
+    rig, path = saved.rig, saved.folder / SCAN
+    if rig is None:
         raise DataError(f"{path}: names no rig", "an earlier release processed the scan", "process the scan again")
-    rig = decode(saved.scan["instrument"], Instrument, f"{path}: instrument")
     optics = Optics.of(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
     budget = saved.materials.get("error_budget") or {}
     if not budget:
@@ -255,7 +247,7 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
     )
     library = make_library(with_unique_names(scans), note)
     library.save(out)
-    sys.stdout.write("".join(f"{line}\n" for line in _summary(out, library)))
+    print_lines(_summary(out, library))
     sys.stdout.write(f"{json.dumps(library.fit, indent=1)}\n")
     return 0
 

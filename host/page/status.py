@@ -37,7 +37,7 @@ class Status:
 
 @dataclass(frozen=True)
 class LifeSigns:
-    """LifeSigns of life.
+    """Signs of life of the scan program and the Pi.
 
     Attributes
     ----------

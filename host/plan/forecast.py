@@ -26,7 +26,7 @@ from polysight.host.imaging import (
     window_weights,
 )
 from polysight.host.plan.field import FieldLimits, PhaseSlope, field_limits
-from polysight.host.plan.timing import ROW_OVERHEAD_S, ScanTime, payload_bytes, scan_time, tail_s, whole_packets
+from polysight.host.plan.timing import ROW_OVERHEAD_S, ScanTime, scan_time, tail_s, whole_packets
 from polysight.host.process import Options
 from polysight.host.radar import constraints
 from polysight.shared.config import Instrument
@@ -137,18 +137,10 @@ def forecast(
     row_overhead_s: float = ROW_OVERHEAD_S,
     scene_mm: tuple[float, float] | None = None,
 ) -> Forecast:
-    """Predict a scan.
+    """Predict a scan of a rig file to which `Changes` were applied.
 
-    Parameters
-    ----------
-    rig
-        Rig file, with `Changes` applied.
-    noise
-        Default: the simulated rig's.
-    row_overhead_s
-        Standstill for each row apart from motion, seconds.
-    scene_mm
-        Width and height of the scene in the object plane; default: the image's.
+    `noise`: default the simulated rig's. `row_overhead_s`: standstill for each row apart from motion. `scene_mm`: width
+    and height of the scene in the object plane; default: the image's.
     """
     noise = noise or Noise()
     aperture, taper = aperture_of(rig)
@@ -288,12 +280,12 @@ def _card_warnings(rig: Instrument) -> Iterator[PlanWarning]:
         nearest = min(whole, key=lambda n: abs(n - rig.burst.pulses), default=0)
         yield PlanWarning(
             "card",
-            f"a row of {rig.row_bytes} bytes does not fill whole packets of {payload_bytes(rig)}: the card delays its"
-            f" last packet, {tail * rig.grid.rows / 60:.1f} min in total"
+            f"a row of {rig.row_bytes} bytes does not fill whole packets of {rig.card.payload_bytes}: the card delays"
+            f" its last packet, {tail * rig.grid.rows / 60:.1f} min in total"
             + (f"; {nearest} pulses avoid this" if nearest else ""),
         )
     packet_us = max(rig.card.packet_delay_us, _WIRE_BYTES / _ETHERNET_BYTES_PER_US)
-    frame_us = rig.frame_bytes / payload_bytes(rig) * packet_us
+    frame_us = rig.frame_bytes / rig.card.payload_bytes * packet_us
     if frame_us > rig.burst.period_us:
         text = f"a card needs {frame_us:.0f} us to send a frame and gets one every {rig.burst.period_us:g} us"
         yield PlanWarning("card", text)

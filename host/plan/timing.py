@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from polysight.host.capture import MAX_PAYLOAD_BYTES
-from polysight.shared.config import Grid, Instrument, Stage
+from polysight.shared.config import CARD_TAIL_S, Grid, Instrument, Stage
 from polysight.shared.raster import burst_duration_s
 
 ROW_OVERHEAD_S = 0.3
@@ -18,11 +17,6 @@ ROW_OVERHEAD_S = 0.3
 Simulated: 0.14 and 0.29 s between rows of 350 points x 13 and 16 chirps on the simulated rig at real time, on a busy
 machine. Not measured on hardware; `polysight plan --like SCAN` measures it in a scan.
 """
-
-TAIL_S = 2.0
-"""Delay with which a card sends a record's short last packet (docs/spec/dca1000.md, observed)."""
-
-_PACKET_OVERHEAD_BYTES = 14
 
 
 @dataclass(frozen=True)
@@ -85,14 +79,9 @@ def turn_s(grid: Grid, stage: Stage) -> float:
     return sum(straight_move_s(leg, stage.travel_speed_mm_s, stage.accel_mm_s2) for leg in legs)
 
 
-def payload_bytes(rig: Instrument) -> int:
-    """Return the payload of a full packet: the configured size minus a header of 14 bytes, at most 1456."""
-    return min(rig.card.packet_bytes - _PACKET_OVERHEAD_BYTES, MAX_PAYLOAD_BYTES)
-
-
 def whole_packets(rig: Instrument, pulses: int | None = None) -> bool:
     """Return True if a row with `pulses` pulses a position fills whole packets, so that no short one is delayed."""
-    return rig.row_bytes // rig.burst.pulses * (pulses or rig.burst.pulses) % payload_bytes(rig) == 0
+    return rig.row_bytes // rig.burst.pulses * (pulses or rig.burst.pulses) % rig.card.payload_bytes == 0
 
 
 def tail_s(rig: Instrument) -> float:
@@ -101,7 +90,7 @@ def tail_s(rig: Instrument) -> float:
         return 0.0
     grid, stage = rig.grid, rig.stage
     run_out = (row_motion_s(grid, stage) - (grid.columns - 1) * grid.step_x_mm / stage.speed_mm_s) / 2
-    return max(0.0, burst_duration_s(rig.burst) + TAIL_S - run_out)
+    return max(0.0, burst_duration_s(rig.burst) + CARD_TAIL_S - run_out)
 
 
 def scan_time(rig: Instrument, row_overhead_s: float = ROW_OVERHEAD_S) -> ScanTime:

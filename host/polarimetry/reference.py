@@ -8,7 +8,7 @@ direct path, so the reference stays valid after a power cycle; geometry and boar
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,8 +38,7 @@ class PlaneReference:
     x_m, y_m
         Pixel centres, rig frame, metres.
     spread
-        Standard deviation of the real and the imaginary part of V / H over the plate: noise and speckle; for
-        :meth:`mean` also the variation over the plane.
+        Standard deviation of the real and the imaginary part of V / H over the plate: noise and speckle.
     how
         One sentence for the report.
     bands
@@ -57,23 +56,6 @@ class PlaneReference:
     how: str
     bands: tuple[PlaneReference, ...] = ()
     made_with: ImagedWith | None = None
-
-    def mean(self) -> PlaneReference:
-        """Return the reference averaged to one number per channel (Eq. 9), valid at every pixel."""
-        at = self.valid
-        cross = complex(np.mean(self.h[at] * np.conj(self.v[at])))
-        metal_v = float(np.sqrt(np.mean(np.abs(self.v[at]) ** 2)))
-        metal_h = float(np.sqrt(np.mean(np.abs(self.h[at]) ** 2))) * cross / abs(cross)
-        apart = _spread(self.h[at] / metal_h, self.v[at] / metal_v)
-        return replace(
-            self,
-            h=np.full(self.h.shape, metal_h, self.h.dtype),
-            v=np.full(self.v.shape, metal_v, self.v.dtype),
-            valid=np.ones_like(self.valid),
-            spread=float(np.hypot(self.spread, apart)),
-            how=self.how.replace("by position", "as one number a channel"),
-            bands=tuple(band.mean() for band in self.bands),
-        )
 
     def apply(self, h: Image, v: Image) -> Calibrated:
         """Divide both channels of another scan by the reference; NaN where it is not valid."""

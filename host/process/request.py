@@ -41,8 +41,8 @@ class ProcessRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         Box of the metal reference: x0, y0, x1, y1 in millimetres from the image centre; None: find it.
     labels
         File of boxes drawn by hand, used instead of detected patches.
-    reference, reference_by
-        Scan of a metal plate, used as reference instead of metal in the scene: per pixel, or one number per channel.
+    reference
+        Scan of a metal plate, used as reference at each pixel instead of metal in the scene.
     incidence
         One incidence angle for the image, or one per pixel.
     bands
@@ -57,7 +57,6 @@ class ProcessRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     metal_box_mm: tuple[float, float, float, float] | None = None
     labels: str | None = None
     reference: str | None = None
-    reference_by: Literal["position", "mean"] = "position"
     incidence: Literal["one", "pixel"] = "one"
     bands: int = 1
 
@@ -68,7 +67,7 @@ class ProcessRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
     def choices(self) -> dict[str, Any]:
         """Return the other settings that affect the products, by field."""
-        return {name: getattr(self, name) for name in ("model", "metal_box_mm", "reference_by", "incidence", "bands")}
+        return {name: getattr(self, name) for name in ("model", "metal_box_mm", "incidence", "bands")}
 
     def absolute(self) -> ProcessRequest:
         """Return the request with absolute paths, for a worker in another folder."""

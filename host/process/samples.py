@@ -33,9 +33,10 @@ from polysight.host.imaging import (
     needed_gate_m,
 )
 from polysight.host.process.quality import Quality
-from polysight.host.store import ScanFolder, Source, crc32, inside, manifest
+from polysight.host.store import ScanFolder, Source, crc32, inside, manifest, require_raw
 from polysight.host.sync import HighPass
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.files import read_json
 
@@ -136,6 +137,26 @@ class KeptSamples:
     def holds(self, rows: Sequence[int]) -> bool:
         """True if all these rows can be restored from disk."""
         return all(self._line(row) is not None for row in rows)
+
+    def processable(self, source: Source, folder: Path) -> list[int]:
+        """Rows of a source with data; `folder` is for messages.
+
+        Raises
+        ------
+        DataError
+            if there are none, or raw data that is needed was dropped.
+        """
+        rows = list(source.rows())
+        if isinstance(source, ScanFolder) and not self.holds(rows):
+            require_raw(source)
+        if not rows:
+            raise DataError(
+                f"{folder}: no row is recorded whole",
+                "the scan was stopped in its first row, or files are missing",
+                f"`polysight resume {folder}` takes the missing rows of a scan folder",
+                code=ErrorCode.NO_DATA,
+            )
+        return rows
 
     def restore(self, row: int) -> bool:
         """Restore a row into the images; return False if it must be synchronised instead."""

@@ -1,9 +1,9 @@
 """Products of processed scans: write a folder of products, read it back, and convert it to xarray datasets.
 
 `making_products` is a context manager: products are written to a temporary folder, which replaces the old one when
-all are complete. `read_products` returns `SavedProducts`, the content of each file. `read_processed` returns a
-`ProcessedScan` in memory, from which `image_dataset`, `patch_dataset` and `full_dataset` make datasets. Names and
-permittivities of scans whose verdict is "no result" are never returned (`withhold`).
+all are complete. `read_products` returns `SavedProducts`, the content of each file. `ProcessedScan` adds the patch of
+each pixel, also for results that are not saved; `image_dataset`, `patch_dataset` and `full_dataset` make datasets of
+it. Names and permittivities of scans whose verdict is "no result" are never returned (`withhold`).
 """
 
 from polysight.host.products.dataset_files import read_netcdf, write_netcdf, write_zarr
@@ -21,6 +21,7 @@ from polysight.host.products.files import (
     LABELS,
     MATERIALS,
     QUALITY,
+    REPORT,
     SCAN,
     SavedProducts,
     find_products,
@@ -50,7 +51,7 @@ from polysight.host.products.material_table import (
     permittivity_spread,
     refused_text,
 )
-from polysight.host.products.processed import ProcessedScan, Rows, read_processed
+from polysight.host.products.processed import ProcessedScan, Rows
 
 __all__ = [
     "CONVENTION",
@@ -61,6 +62,7 @@ __all__ = [
     "MATERIALS",
     "QUALITY",
     "RAW_DROPPED",
+    "REPORT",
     "SCAN",
     "ProcessedScan",
     "Rows",
@@ -79,7 +81,6 @@ __all__ = [
     "ranges_text",
     "read_image",
     "read_netcdf",
-    "read_processed",
     "read_products",
     "refused_text",
     "rx_gains",

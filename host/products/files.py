@@ -26,7 +26,7 @@ from polysight.host.imaging import ChannelImages
 from polysight.host.materials import PATCHES, ScanPatches, read_patches
 from polysight.host.store import Scan, open_npz, versions
 from polysight.host.verdict import Verdict, read_verdict
-from polysight.shared.config import Chirp, Instrument
+from polysight.shared.config import Instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, no_such
 from polysight.shared.files import named, read_json
@@ -34,6 +34,7 @@ from polysight.shared.tables import decode, to_builtins
 
 SCAN = "scan.json"
 IMAGE, QUALITY, MATERIALS, LABELS = "image.npz", "quality.json", "materials.json", "labels.json"
+REPORT = "report.html"
 FINISHED = ".finished.json"  # settings of the products, written by batch processing
 _OPTIONAL = ("p_sigma",)  # arrays of image.npz that earlier releases did not write
 _PRODUCTS = "products"  # in a scan folder
@@ -290,6 +291,11 @@ class SavedProducts:
         return list(found)
 
     @property
+    def metal_referenced(self) -> bool:
+        """True if h, v and p are relative to metal."""
+        return bool(self.materials)
+
+    @property
     def verdict(self) -> Verdict | None:
         """Verdict on the results; None in products of earlier releases."""
         return read_verdict(self.materials) or read_verdict(self.quality)
@@ -309,17 +315,14 @@ class SavedProducts:
         """Name of the scan; "" if unknown."""
         return str(self.scan.get("scan_id", self.materials.get("scan_id", "")))
 
-    @property
-    def chirp(self) -> Chirp | None:
-        """Chirp of the products, from the rig file in scan.json; None if unknown."""
-        rig = self.scan.get("instrument")
-        if rig is None:
-            return None
-        path = self.folder / SCAN
+    @cached_property
+    def rig(self) -> Instrument | None:
+        """Rig of the images, from scan.json; None if unknown."""
+        raw, path = self.scan.get("instrument"), self.folder / SCAN
         try:
-            return decode(rig["chirp"], Chirp, f"{path}: instrument.chirp")
-        except (ConfigError, KeyError, TypeError) as e:
-            raise _damaged(path, e.what if isinstance(e, ConfigError) else "it has no chirp") from None
+            return None if raw is None else decode(raw, Instrument, f"{path}: instrument")
+        except ConfigError as e:
+            raise _damaged(path, e.what) from None
 
 
 def find_products(folder: Path, needs: str = IMAGE) -> SavedProducts | None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from polysight.host.products.files import SavedProducts
 
 _COLUMNS = (
     "patch", "name", "confidence", "metal_reference", "metal_like", "centre_x_mm", "centre_y_mm", "width_mm",
@@ -17,15 +19,6 @@ _COLUMNS = (
     "refused", "p_real", "p_imag", "p_abs_db", "p_phase_deg", "inverse_p_standard_error", "true_name",
     "true_permittivity_real", "true_permittivity_loss", "drawn_as",
 )  # fmt: skip
-
-
-class HasSegments(Protocol):
-    """An object with the patches of materials.json."""
-
-    @property
-    def segments(self) -> list[dict[str, Any]]:
-        """One dict per patch."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -72,7 +65,7 @@ def refused_text(segment: Mapping[str, Any]) -> str:
     return "; ".join(part for part in (head, refused.get("do")) if part)
 
 
-def material_columns(products: HasSegments) -> dict[str, list[Any]]:
+def material_columns(products: SavedProducts) -> dict[str, list[Any]]:
     """Return the columns by name, with one entry per patch; None for unknown values.
 
     Permittivity is `permittivity_real` - j `permittivity_loss`; `dominated_by` is the largest source of its error,

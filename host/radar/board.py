@@ -19,6 +19,7 @@ from polysight.host.radar.calibration_data import CalibrationFiles
 from polysight.host.radar.firmware import Image
 from polysight.host.radar.program import Program
 from polysight.host.radar.spi import Clock, Link, WordLink
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, PolysightError
 
 _READY_TIMEOUT_S = 1.0
@@ -164,7 +165,10 @@ class RadarBoard:
                 self._stop()
             if self._state is State.FAULT:
                 raise DeviceError(
-                    f"{self.name}: {self.reason}", "a fatal event while it was stopped", "resume the scan"
+                    f"{self.name}: {self.reason}",
+                    "a fatal event while it was stopped",
+                    "resume the scan",
+                    code=ErrorCode.RADAR_FAULT,
                 )
             self.read_temperatures()
             if frames != self._frames:
@@ -180,7 +184,12 @@ class RadarBoard:
                     "measure SYNC_IN while no pulse is sent (docs/how-to/wiring.md); the row is retaken",
                 )
             if self._state is not State.ARMED:
-                raise DeviceError(f"{self.name}: {self.reason}", "a fatal event while it was armed", "resume the scan")
+                raise DeviceError(
+                    f"{self.name}: {self.reason}",
+                    "a fatal event while it was armed",
+                    "resume the scan",
+                    code=ErrorCode.RADAR_FAULT,
+                )
 
     def run_one_frame(self) -> str:
         """Run one frame of a configured board with a software trigger; return its end event. Raises DeviceError."""
@@ -199,23 +208,12 @@ class RadarBoard:
         """Read back profile, chirp and frame of a board that was armed; return the differences. Raises DeviceError."""
         sent = {one.ID: one.block().data for one in (*self._program.waveform, *self._sent_frames)}
         differences = []
-        for question, of in ((c.ReadProfile(), 0x0100), (c.ReadChirp(), 0x0101), (c.READ_FRAME, 0x0102)):
+        for question, of in ((c.READ_PROFILE, 0x0100), (c.READ_CHIRP, 0x0101), (c.READ_FRAME, 0x0102)):
             blocks = self._link.call(question).blocks
             found = blocks[0].data if blocks else b""
             if found != sent[of]:
                 differences.append(f"0x{of:04X}: sent {sent[of].hex()}, read back {found.hex()}")
         return differences
-
-    def stream_tone(self, tone: c.StreamTone, on: bool) -> None:
-        """Start or end continuous streaming of one frequency, for RF tests; frames must not run.
-
-        Configure the board again before the next row. Raises DeviceError.
-        """
-        with self._fault_on_error():
-            if on:
-                self._link.call(tone)
-            for command in c.stream_commands(on):
-                self._link.call(command)
 
     def reconnect(self, words: WordLink) -> None:
         """Replace a lost link; the next `arm` resets and configures the board."""
@@ -297,7 +295,10 @@ class RadarBoard:
         if event.fatal:
             self.fail(str(event))
             raise DeviceError(
-                f"{self.name}: {event}", "the radar stopped with a fault", "the retake of the row resets it"
+                f"{self.name}: {event}",
+                "the radar stopped with a fault",
+                "the retake of the row resets it",
+                code=ErrorCode.RADAR_FAULT,
             )
 
     def _keep(self, line: str) -> None:

@@ -86,7 +86,10 @@ GET_RF_VERSION = Fixed(0x0220, "GetRfVersion")
 GET_DIE_ID = Fixed(0x0223, "GetDieId")  # ICD 188
 GET_MAIN_VERSION = Fixed(0x40E0, "GetMainVersion")
 GET_TEMPERATURES = Fixed(0x02EA, "GetTemperatures")
-READ_FRAME = Fixed(0x0122, "ReadFrame")  # the answer has the form of Frame (ICD 176)
+# Read back profile 0, chirp 0 and the frame; the answers have the form of Profile, Chirp and Frame (ICD 175-176).
+READ_PROFILE = Fixed(0x0120, "ReadProfile", struct.pack("<2H", 0, 0))
+READ_CHIRP = Fixed(0x0121, "ReadChirp", struct.pack("<2H", 0, 0))
+READ_FRAME = Fixed(0x0122, "ReadFrame")
 
 # Regular ADC mode; low power would limit the IF to 7.5 MHz (ICD 54).
 LOW_POWER_OFF = Fixed(0x0083, "LowPower", struct.pack("<2H", 0, 0))
@@ -195,17 +198,14 @@ class Profile(Command):
 
 @dataclass(frozen=True)
 class Chirp(Command):
-    """Chirps `first` to `last` (0..511) of a profile, unchanged, with the transmitters of a bit mask (ICD 88)."""
+    """Chirp 0 of profile 0, unchanged, with the transmitters of a bit mask (ICD 88)."""
 
     ID = 0x0101
     tx: int
-    first: int = 0
-    last: int = 0
-    profile: int = 0
 
     def data(self) -> bytes:
-        """Pack the range of indices, profile, four variations of zero, TX."""
-        return struct.pack("<4HI4H", self.first, self.last, self.profile, 0, 0, 0, 0, 0, self.tx)
+        """Pack first and last index, profile, four variations, all zero, and TX."""
+        return struct.pack("<4HI4H", 0, 0, 0, 0, 0, 0, 0, 0, self.tx)
 
 
 @dataclass(frozen=True)
@@ -280,53 +280,3 @@ class FileChunk(Command):
     def data(self) -> bytes:
         """Return the part."""
         return self.part
-
-
-@dataclass(frozen=True)
-class ReadProfile(Command):
-    """Read back a profile; the answer has the form of `Profile` (ICD 175)."""
-
-    ID = 0x0120
-    index: int = 0
-
-    def data(self) -> bytes:
-        """Pack the index."""
-        return struct.pack("<2H", self.index, 0)
-
-
-@dataclass(frozen=True)
-class ReadChirp(Command):
-    """Read back a chirp; the answer has the form of `Chirp` (ICD 176)."""
-
-    ID = 0x0121
-    index: int = 0
-
-    def data(self) -> bytes:
-        """Pack first and last index."""
-        return struct.pack("<2H", self.index, self.index)
-
-
-@dataclass(frozen=True)
-class StreamTone(Command):
-    """Frequency of continuous streaming without a ramp, for RF tests (ICD 94)."""
-
-    ID = 0x0103
-    start_hz: float
-    sample_rate_hz: float
-    rx_gain_db: int
-    hpf1_khz: float = HPF_FIRST_KHZ[0]
-    hpf2_khz: float = HPF_SECOND_KHZ[0]
-    tx_backoff_db: int = 0
-    rf_gain_target_db: int = 30
-
-    def data(self) -> bytes:
-        """Pack start, back-off, phase, rate, filters, gain; the firmware selects the VCO."""
-        hpf = HPF_FIRST_KHZ.index(self.hpf1_khz), HPF_SECOND_KHZ.index(self.hpf2_khz)
-        back_off, gain = self.tx_backoff_db * 0x010101, gain_code(self.rx_gain_db, self.rf_gain_target_db)
-        rate = round(self.sample_rate_hz / 1e3)
-        return struct.pack("<3IH4BH", start_code(self.start_hz), back_off, 0, rate, *hpf, gain, 0, 0)
-
-
-def stream_commands(on: bool) -> tuple[Fixed, Fixed]:
-    """Return the commands that start or end continuous streaming: main core (ICD 279), then RF core (ICD 97)."""
-    return Fixed(0x4046, "StreamData", struct.pack("<2H", on, 0)), Fixed(0x0104, "Stream", struct.pack("<2H", on, 0))

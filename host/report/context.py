@@ -134,7 +134,7 @@ class ReportContext:
             v=products.v,
             p=products.p,
             valid=products.valid,
-            metal_referenced=bool(products.materials),
+            metal_referenced=products.metal_referenced,
             materials=products.segments,
             segments=segments,
             verdict=products.verdict,

@@ -30,8 +30,8 @@ from polysight.shared.errors import ConfigError, DataError, DeviceError, ScanErr
 from polysight.shared.tables import decode, to_builtins
 
 RIG = "instrument.toml"
-FORMATS = ("csv", "mat", "png", "hdf5", "netcdf", "cphd")
-"""Formats of exports, which are written into `<scan>/export`."""
+FORMATS = ("csv", "mat", "hdf5", "netcdf", "cphd")
+"""Formats of exports, which are written into `<scan>/export`: files; a Zarr store is a folder, for no download."""
 _LARGEST = 2000  # positions of a row, rows
 Text = Annotated[str, msgspec.Meta(max_length=200)]
 Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
@@ -104,10 +104,11 @@ class LabelRequest(Body, frozen=True):
 
 
 class NotesRequest(Body, frozen=True):
-    """The operator's notes and tags."""
+    """The operator's notes and tags; they are refused if the present ones are not `base`."""
 
     notes: Annotated[str, msgspec.Meta(max_length=20_000)] = ""
     tags: Annotated[tuple[Annotated[str, msgspec.Meta(max_length=1000)], ...], msgspec.Meta(max_length=100)] = ()
+    base: Notes | None = None
 
 
 class TrainRequest(Body, frozen=True):
@@ -141,7 +142,7 @@ def control_routes(site: Site) -> list[Route]:
 
     return [
         Route("/api/session", _session(site), methods=["POST"]),
-        route("control/{wish}", Body, _control),
+        route("control/{command}", Body, _control),
         route("plan", PlanRequest, _plan),
         route("doctor", Body, _doctor),
         route("start", StartRequest, _start),
@@ -169,8 +170,8 @@ def _decode_body(body: bytes, kind: type[Body]) -> Body:
 def _session(site: Site) -> Callable[[Request], Awaitable[Response]]:
     async def session(request: Request) -> Response:
         answer = JSONResponse({"what": "opened"})
-        name = cookie_name(int((request.scope.get("server") or ("", 0))[1] or 0))
-        answer.set_cookie(name, site.access.session, httponly=True, samesite="strict", secure=site.access.secure)
+        name, access = cookie_name(request.scope), site.access
+        answer.set_cookie(name, access.session, httponly=True, samesite="strict", secure=access.secure)
         return answer
 
     return session
@@ -178,7 +179,7 @@ def _session(site: Site) -> Callable[[Request], Awaitable[Response]]:
 
 async def _control(site: Site, request: Request, body: Body) -> dict[str, Any]:
     del body
-    name, given = site.name(request), request.path_params["wish"]
+    name, given = site.name(request), request.path_params["command"]
     if given not in list(ScanCommand):
         raise DataError(
             f"a scan cannot be asked to {given[:40]!r}", "the name is wrong", f"one of {', '.join(ScanCommand)}",
@@ -311,7 +312,7 @@ async def _labels(site: Site, request: Request, body: LabelRequest) -> dict[str,
 
 
 async def _notes(site: Site, request: Request, body: NotesRequest) -> dict[str, Any]:
-    written = await site.read_scan(request, write_notes, Notes(body.notes, body.tags))
+    written = await site.read_scan(request, write_notes, Notes(body.notes, body.tags), body.base)
     return {"what": "saved", "notes": written.notes, "tags": list(written.tags)}
 
 

@@ -85,19 +85,15 @@ class Access:
         given = headers.get(TOKEN_HEADER, "")
         return bool(self.token) and hmac.compare_digest(given.encode(), self.token.encode())
 
-    def holds_session(self, headers: Headers, port: int) -> bool:
+    def holds_session(self, scope: Scope) -> bool:
         """True if the request has the cookie of an open session."""
-        given = cookie_parser(headers.get("cookie", "")).get(cookie_name(port), "")
+        given = cookie_parser(Headers(scope=scope).get("cookie", "")).get(cookie_name(scope), "")
         return hmac.compare_digest(given.encode(), self.session.encode())
 
 
-def cookie_name(port: int) -> str:
-    """Of the session: servers on other ports of a machine share its cookies."""
-    return f"polysight-{port}"
-
-
-def _port(scope: Scope) -> int:
-    return int((scope.get("server") or ("", 0))[1] or 0)
+def cookie_name(scope: Scope) -> str:
+    """Name of the session's cookie, with the port that is served: servers on other ports of a machine share cookies."""
+    return f"polysight-{(scope.get('server') or ('', 0))[1] or 0}"
 
 
 def _name_of(host: str) -> str:
@@ -142,7 +138,7 @@ class Guard:
             return
         headers = Headers(scope=scope)
         refusal = self._refusal(scope, headers)
-        scope[TRUSTED] = self._access.holds_token(headers) or self._access.holds_session(headers, _port(scope))
+        scope[TRUSTED] = self._access.holds_token(headers) or self._access.holds_session(scope)
         if refusal is not None:
             await _closing(refusal)(scope, receive, _with_headers(send))
             return
@@ -189,7 +185,7 @@ class Guard:
         if not writes and (access.loopback or not access.token or scope["path"] in _OPEN_PATHS):
             return None
         client = str((scope.get("client") or ("",))[0])
-        session = access.holds_session(headers, _port(scope))
+        session = access.holds_session(scope)
         if not writes and session:
             return None
         if not session and self._wrong.spent(client):

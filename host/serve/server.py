@@ -35,17 +35,7 @@ _END_S = 1  # to close connections
 
 @dataclass(frozen=True)
 class Place:
-    """Address of a server.
-
-    Attributes
-    ----------
-    host, port
-        To bind; port 0: any that is free.
-    hosts
-        Further names that it answers to.
-    certificate, key
-        PEM files of TLS; None: plain HTTP.
-    """
+    """Address of a server: port 0 is any that is free, `hosts` are further names, `certificate` and `key` PEM files."""
 
     host: str = "127.0.0.1"
     port: int = 8080
@@ -56,7 +46,10 @@ class Place:
     @property
     def loopback(self) -> bool:
         """True if only this machine can reach the address."""
-        return is_loopback(self.host)
+        try:
+            return self.host == "localhost" or ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
 
     def check(self) -> None:
         """Raise ConfigError for files of TLS that are missing, do not belong together or need a passphrase."""
@@ -156,16 +149,6 @@ def server(app: Starlette, site: Site, place: Place | None = None) -> uvicorn.Se
     made = uvicorn.Server(config)
     site.ending = lambda: made.should_exit
     return made
-
-
-def is_loopback(host: str) -> bool:
-    """True if only this machine can reach an address to bind."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _bind(place: Place) -> socket.socket:

@@ -13,7 +13,7 @@ import anyio
 from starlette.requests import Request
 
 from polysight.host.catalogue import Comparison, Pixels, Scans, compare, folder_bytes
-from polysight.host.products import SavedProducts, read_products
+from polysight.host.products import read_products
 from polysight.host.serve.guard import Access
 from polysight.host.serve.programs import Programs
 from polysight.host.serve.watches import Watches
@@ -36,18 +36,7 @@ T = TypeVar("T")
 class Site:
     """Shared state of the requests to one server.
 
-    Parameters
-    ----------
-    scans
-        The scans that are shown.
-    access
-        Access rules.
-    watches
-        Live views.
-    programs
-        Starts programs; None: nothing can be started.
-    config
-        Rig file of new scans; None: there is none.
+    Without `programs` nothing can be started; `config` is the rig file of new scans.
     """
 
     def __init__(
@@ -92,7 +81,7 @@ class Site:
     def draw(self, folder: Path, what: tuple[Any, ...], draw: Callable[[Pixels], T]) -> T:
         """A picture of a scan's products, drawn again only when these have changed."""
         products, key = _stamped(folder)
-        return self._pictures.get((key, *what), lambda: draw(Pixels(SavedProducts(products))))
+        return self._pictures.get((key, *what), lambda: draw(Pixels(products)))
 
     def compare(self, first: Path, second: Path) -> Comparison:
         """Two processed scans compared, computed again only when their products have changed. Raises DataError."""

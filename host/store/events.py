@@ -18,7 +18,7 @@ from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, DeviceError, ProtocolError
 from polysight.shared.messages import AnyEvent, pack_with_crc, unpack_with_crc
 
-DAMAGED = ".damaged"  # suffix of the copy of a damaged file
+DAMAGED = ".damaged"  # suffix of the file with the data that was cut off
 
 
 @dataclass
@@ -87,7 +87,7 @@ def _ends(raw: bytes) -> Iterator[int]:
 class EventWriter:
     """Appends events to a file; they are durable after :meth:`sync`. `last_seq` is the newest sequence number.
 
-    Torn or damaged data behind the last complete event is cut off, and the file kept as a copy.
+    Torn or damaged data behind the last complete event is moved to `events.msgpack.damaged`.
 
     Raises
     ------
@@ -100,7 +100,7 @@ class EventWriter:
         if log.damage or log.torn:
             copy = AppendFile(path.with_name(path.name + DAMAGED), create=True)
             try:
-                copy.append(_bytes_of(path))
+                copy.append(_bytes_of(path)[log.length :])
             finally:
                 copy.close()
         self._file = AppendFile(path, create=True)

@@ -51,7 +51,7 @@ class RowSynchroniser:
         rig = self._source.instrument
         frame = rig.frame_bytes // rig.burst.chirps
         for piece in recorded.pieces(_POSITIONS * rig.burst.chirps_a_position * frame):
-            yield row_words(piece, None, piece.size // frame, rig.chirp.samples)[0]
+            yield row_words(piece, (), piece.size // frame, rig.chirp.samples)[0]
 
     @property
     def direct_path_known(self) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from polysight.host.jobs.progress import steps
+from polysight.host.jobs.output import steps
 from polysight.host.materials import Permittivity, estimate_permittivity
 from polysight.host.polarimetry import permittivity_from_ratio
 from polysight.host.report import INK, PALETTE

@@ -13,7 +13,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from matplotlib.figure import Figure
 
-from polysight.host.jobs.progress import steps
+from polysight.host.jobs.output import steps
 from polysight.host.products import write_atomically, write_json
 from polysight.host.report import STAMP, png
 from polysight.papers.sensys2026.classification import fig18, fig20

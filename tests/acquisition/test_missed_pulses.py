@@ -2,13 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import multiprocessing
-import socket
-import struct
-import time
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,7 +9,6 @@ from hypothesis import strategies as st
 
 from polysight.host.acquisition.missed_pulses import PlacedFrames, place_frames, slipped_frames
 from polysight.host.acquisition.slipped_row import describe, rewrite_row
-from polysight.host.capture.receiver import ReceiverProcess
 from polysight.host.capture.segment import read_index, write_index
 from tests.support.acquisition.arrival_model import MS, PAYLOAD, US, Load, pulse_times, receive
 
@@ -162,84 +154,6 @@ def _capture(expected, holes):
     return RowCapture(
         **{**zeros, "expected": expected, "missing": [(0, expected)], "located": False, "reason": "", "holes": holes},
     )
-
-
-def _burn(stop) -> None:
-    while not stop.is_set():
-        sum(range(1000))
-
-
-@pytest.mark.parametrize("burners", [0, 4])
-def test_real_sockets_on_this_machine_idle_and_overloaded(make_instrument, tmp_path, burners):
-    """Frames sent at their pulses' times, some left out, into a real receiver: right or masked, whatever the load.
-
-    A machine too busy to tell masks the whole row; where nothing burns here, one of many rows is told.
-    """
-    tries, answer = 1 if burners else 40, False
-    for number in range(tries):
-        (tmp_path / str(number)).mkdir()
-        answer = _placed_or_masked(make_instrument, tmp_path / str(number), burners)
-        if answer:
-            break
-    assert answer or burners, f"not one of {tries} rows was told"
-
-
-def _placed_or_masked(make_instrument, folder: Path, burners: int) -> bool:
-    """Sends one row, and checks what is made of it; whether its frames were told apart."""
-    board = make_instrument().by_role("receive_h")
-    bursts, path = 8, folder / "0000.part"
-    missed = [5, 37, 38, 100]
-    stop = multiprocessing.Event()
-    others = [multiprocessing.Process(target=_burn, args=(stop,), daemon=True) for _ in range(burners)]
-    for process in others:
-        process.start()
-    try:
-        with ReceiverProcess(board, 1 << 20) as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            out.bind((board.card_address, 1024))
-            receiver.begin_row(0, 1, bursts * PULSES * FRAME, FRAME, path)
-            begin = time.monotonic_ns() + 50 * MS
-            pulses = begin + (pulse_times(bursts, between_ms=80) - 1_000 * MS)
-            answer = _play(out, (board.host_address, board.data_port), pulses, missed)
-            row = receiver.end_row()
-    finally:
-        stop.set()
-        for process in others:
-            process.join()
-    assert row.slipped
-    _, arrivals = read_index(path.with_suffix(".idx"))
-    offset = 123_456_789_000  # the Pi's clock
-    result = place_frames(pulses - offset, answer, arrivals, FRAME, PAYLOAD)
-    truth = np.delete(np.arange(bursts * PULSES), missed)
-    check(result, truth, set(missed))
-    assert result.slots.size == truth.size
-    if result.reason:  # too busy to tell
-        assert (result.slots == -1).all()
-        return False
-    moved = rewrite_row(path, row, result, FRAME)
-    got = np.fromfile(path, dtype="<u4").reshape(-1, FRAME // 4)[:, 0]
-    sure = result.slots[result.slots >= 0]
-    np.testing.assert_array_equal(got[sure], sure + 1)
-    assert moved.missing_bytes == (bursts * PULSES - sure.size) * FRAME
-    json.dumps(moved.missing)
-    return True
-
-
-def _play(out: socket.socket, to: tuple[str, int], pulses: np.ndarray, missed: list[int]) -> np.ndarray:
-    """Send each frame 0.1 ms after its pulse, full of its number + 1; when the host would hear of each burst."""
-    sequence, sent, rest, answer = 1, 0, b"", []
-    times = pulses.reshape(-1)
-    for slot, t in enumerate(times.tolist()):
-        while (left := t + 100 * US - time.monotonic_ns()) > 0:
-            time.sleep(left * 1e-9 if left > 2 * MS else 0)
-        if slot not in missed:
-            rest += struct.pack("<I", slot + 1) * (FRAME // 4)
-        while len(rest) >= PAYLOAD:
-            out.sendto(struct.pack("<IIH", sequence, sent & 0xFFFFFFFF, sent >> 32) + rest[:PAYLOAD], to)
-            rest, sent, sequence = rest[PAYLOAD:], sent + PAYLOAD, sequence + 1
-        if slot % PULSES == PULSES - 1:
-            answer.append(time.monotonic_ns())
-    out.sendto(struct.pack("<IIH", sequence, sent & 0xFFFFFFFF, sent >> 32) + rest, to)
-    return np.array(answer, dtype=np.int64)
 
 
 def arrivals_of(edges: np.ndarray, pulses: np.ndarray, load: Load, seed: int, drift: float = 0.0):

@@ -7,7 +7,6 @@ import json
 import socket
 import subprocess
 import sys
-import threading
 import time
 import zlib
 
@@ -223,13 +222,6 @@ def test_processing_error_does_not_stop_the_scan(rig, tmp_path):
     assert isinstance(result.processing_error, ScanError)
 
 
-def test_on_row_runs_beside_the_scan(rig, tmp_path):
-    names = set()
-    run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: names.add(threading.current_thread().name))
-    assert len(names) == 1
-    assert threading.current_thread().name not in names
-
-
 def test_no_pi(make_instrument, tmp_path):
     instrument = make_instrument(command_timeout_s=0.3)
     with refused(ErrorCode.NO_ANSWER, 5601, "polysight-pi run"):
@@ -271,10 +263,3 @@ def test_existing_scan_is_not_overwritten(rig, tmp_path):
     with refused(ErrorCode.FILE_EXISTS, "manifest"):
         run_scan(rig.instrument, tmp_path / "s")
     assert digests(ScanFolder.load(tmp_path / "s")) == before
-
-
-def test_full_disk_is_refused_before_the_first_row(rig, tmp_path):
-    big = msgspec.structs.replace(rig.instrument.limits, free_disk_bytes=1 << 60)
-    with refused(ErrorCode.DISK_FULL):
-        run_scan(msgspec.structs.replace(rig.instrument, limits=big), tmp_path / "s")
-    assert rig.pi.rows_run == []

@@ -5,7 +5,7 @@ import pytest
 
 from polysight.host.api.layers import layer_dataset
 from polysight.host.materials.layers import Layer, Spectrum, predict
-from polysight.host.products import ProcessedScan
+from polysight.host.products import ProcessedScan, write_json
 from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
@@ -15,14 +15,14 @@ SHEET = Layer("sheet", 3.4 - 0.1j, 1.7e-3)
 
 
 @pytest.fixture
-def done():
+def done(tmp_path):
     """A metal reference, and a sheet in air."""
     q, h = predict([SHEET], Spectrum.of(CHIRP), np.radians(55.0))
     ratio = complex(1 / q[0])
     sheet = {"label": 2, "incidence_deg": 55.0, "ratio": {"real": ratio.real, "imag": ratio.imag}}
     sheet |= {"inverse_ratio_std": 0.003, "amplitude_h": float(h[0]), "metal_reference": False}
-    materials = {"segments": [{"label": 1, "metal_reference": True}, sheet]}
-    return ProcessedScan({}, {}, {}, materials, np.zeros((2, 2), np.int32), None)
+    write_json(tmp_path / "materials.json", {"segments": [{"label": 1, "metal_reference": True}, sheet]})
+    return ProcessedScan(tmp_path)
 
 
 def test_the_unknown_layer_of_each_patch(done):

@@ -42,17 +42,11 @@ def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
     """Starts cards of the named boards (or of other boards given whole)."""
     with ExitStack() as stack:
 
-        def start(
-            *names: str,
-            streams: Path | None = None,
-            more: tuple[Board, ...] = (),
-            time_scale: float = 1.0,
-            **faults: Faults,
-        ) -> Cards:
+        def start(*names: str, streams: Path | None = None, more: tuple[Board, ...] = (), **faults: Faults) -> Cards:
             made = Cards()
             stack.callback(made.close)
             for board in (*(rig.by_name(n) for n in names), *more):
-                made.add(board.name, made.network_of(board), faults.get(board.name, Faults()), streams, time_scale)
+                made.add(board.name, made.network_of(board), faults.get(board.name, Faults()), streams)
             made.start()
             return made
 

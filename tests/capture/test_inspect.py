@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 
-from polysight.host.capture import dca1000, kind_of
+from polysight.host.capture import kind_of
 from polysight.host.capture.dca1000 import Status
 from polysight.host.capture.inspect import Layout, inspect_bin
 from polysight.host.capture.pcap import inspect_pcap, read_pcap
@@ -15,6 +15,7 @@ from polysight.host.jobs.recordings import inspect_file, main_text
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from tests.support.capture.recordings import row, write_pcap
+from tests.support.capture.records import encode_packet
 from tests.support.paths import REAL_CAPTURES
 from tests.support.refusals import refused
 
@@ -76,7 +77,7 @@ def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):
     """A program that writes packets as they come leaves ten bytes of counters before every 1456 of payload."""
     data = row(4, False).tobytes()
     starts = range(0, len(data), 1456)
-    packets = [dca1000.encode_packet(9 + k, 70_000 + a, data[a : a + 1456]) for k, a in enumerate(starts)]
+    packets = [encode_packet(9 + k, 70_000 + a, data[a : a + 1456]) for k, a in enumerate(starts)]
     path = tmp_path / "x.bin"
     path.write_bytes(b"".join(packets))
     r = inspect_bin(path)
@@ -125,7 +126,7 @@ def test_lost_packets_of_a_pcap_are_masked_and_reported(tmp_path):
     data = row(4, False).tobytes()
     count, sequence = 2**48 - 30_000, 2**32 - 3
     starts = range(0, len(data), 1456)
-    packets = [dca1000.encode_packet(sequence + k, count + a, data[a : a + 1456]) for k, a in enumerate(starts)]
+    packets = [encode_packet(sequence + k, count + a, data[a : a + 1456]) for k, a in enumerate(starts)]
     write_pcap(tmp_path / "x.pcap", [*packets[:5], *packets[6:], packets[4]])
     r = inspect_pcap(tmp_path / "x.pcap")
     assert r.card is not None

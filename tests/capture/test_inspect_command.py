@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
-from polysight.host.capture import dca1000
 from tests.support.capture.recordings import CARD, OTHER, row, write_pcap
+from tests.support.capture.records import encode_packet
 from tests.support.paths import RIG_FILE
 from tests.support.processes import Bench
 from tests.support.scenes import small_scene
@@ -35,7 +35,7 @@ def test_the_command_reads_the_layout_that_is_given(polysight, tmp_path):
 def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
     data = row(4, False).tobytes()
     starts = range(0, len(data), 1456)
-    packets = [dca1000.encode_packet(1 + k, a, data[a : a + 1456]) for k, a in enumerate(starts)]
+    packets = [encode_packet(1 + k, a, data[a : a + 1456]) for k, a in enumerate(starts)]
     both = [packet for packet in packets for _ in range(2)]
     write_pcap(tmp_path / "both", both, cards=(CARD, OTHER))  # known by its first bytes, not by its name
     done = polysight("both")

@@ -10,11 +10,18 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from polysight.host.capture.dca1000 import Counters, encode_packet
-from polysight.host.capture.earlier_records import Past
+from polysight.host.capture.dca1000 import Counters
 from polysight.host.capture.packet_log import PacketLog
-from polysight.host.capture.placement import Losses, place_record
-from tests.support.capture.records import FULL, Record, is_original_or_masked, log_of, mask_of, next_start, place
+from polysight.host.capture.placement import Losses
+from tests.support.capture.records import (
+    FULL,
+    Record,
+    encode_packet,
+    is_original_or_masked,
+    mask_of,
+    next_start,
+    place,
+)
 
 SLOW = [HealthCheck.too_slow]  # a busy machine is no fault
 COUNT, SEQUENCE = 1 << 48, 1 << 32
@@ -171,17 +178,6 @@ def test_counters_go_on_and_are_not_proportional(frames, frame, records, count, 
         count, sequence, start = count + len(record.data), sequence + len(record.packets), placed.past
 
 
-def test_bytes_the_card_dropped_itself_mask_the_whole_record():
-    """Status bits 7 and 9: the counters have no gap, so no byte's place is certain, even when the count is right."""
-    record = Record.make(5 * 4096, 0, 1)
-    log = log_of(5 * 4096, record.packets)
-    placed, _ = place_record(log, 4096, Past(Counters(0, 1), (0,)), dropped_by_card="DDR_FULL")
-    assert not placed.complete
-    assert placed.missing == [(0, 5 * 4096)]
-    assert "dropped data before numbering it (DDR_FULL)" in placed.reason
-    assert placed.counts.placed == len(record.packets)
-
-
 def test_losses_are_counted_by_kind():
     record = Record.make(30 * FULL, 0, 1)
     kept = [p for k, p in enumerate(record.packets) if k not in (0, 1, 7, 12, 13, 29)]
@@ -296,23 +292,6 @@ def test_corrupted_header_damages_nothing(flip, which, count):
     assert placed.counts.disagreeing == 1
     assert placed.missing == [record.bytes_of(which)]
     assert is_original_or_masked(record, placed, out)
-
-
-def test_fresh_counters_need_no_history():
-    record = Record.make(10 * FULL, 0, 1)
-    placed, _ = place(len(record.data), [record.packets[k] for k in (2, 0, 1, 3, 4, 5, 6, 7, 8, 9)], None, 4096)
-    assert placed.complete
-    assert placed.counts.late == 2
-
-
-def test_second_record_continues_and_the_stale_first_is_outside():
-    first, second = Record.make(5000, 0, 1), Record.make(5000, 5000, 5, seed=1)
-    placed, _ = place(5000, first.packets)
-    assert next_start(placed) == Counters(5000, 5)
-    placed, out = place(5000, [second.packets[0], first.packets[-1], *second.packets[1:]], placed.past, 1000)
-    assert placed.complete
-    assert (placed.counts.leftover, placed.counts.outside) == (1, 0)
-    assert out.tobytes() == second.data
 
 
 def test_more_than_expected_is_not_a_row():

@@ -13,14 +13,13 @@ from pathlib import Path
 import msgpack
 import numpy as np
 
-from polysight.host.capture.dca1000 import encode_packet
 from polysight.host.capture.receiver import ReceiverProcess
-from polysight.host.capture.segment import write_index
 from polysight.host.store.events import EventWriter
 from polysight.host.store.manifest import ManifestWriter
 from polysight.pi_controller.journal import JournalFile
 from polysight.shared.messages import Capture, RunStopped, pack
 from polysight.simulators.scene import load_scene, simulate
+from tests.support.capture.records import encode_packet
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 
@@ -98,16 +97,6 @@ def test_manifest(tmp_path):
         assert fact.pop("count") == count
         assert fact.pop("previous") == (hashlib.sha256(lines[count - 1]).hexdigest()[:16] if count else "")
     assert found == facts
-
-
-def test_index(tmp_path):
-    arrivals = np.array([[5, 100], [7, 250]], dtype=np.int64)
-    crc = write_index(tmp_path / "0000.idx", {"missing": [[250, 300]], "located": True}, arrivals)
-    raw = (tmp_path / "0000.idx").read_bytes()
-    assert zlib.crc32(raw) == crc
-    head, _, tail = raw.partition(b"\n")
-    assert json.loads(head) == {"arrivals": 2, "located": True, "missing": [[250, 300]]}
-    np.testing.assert_array_equal(np.frombuffer(tail, "<i8").reshape(-1, 2), arrivals)
 
 
 def test_whole_scan(tmp_path):

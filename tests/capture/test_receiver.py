@@ -15,14 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host.acquisition.capture_rig import Ending, record_ending
-from polysight.host.capture.dca1000 import Status, encode_packet
+from polysight.host.acquisition.capture_rig import record_ended
+from polysight.host.capture.dca1000 import Status
 from polysight.host.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
 from polysight.host.capture.receiver import Progress, ReceiverProcess
 from polysight.host.capture.segment import read_index
 from polysight.shared.config import Board
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
+from tests.support.capture.records import encode_packet
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
@@ -248,21 +249,21 @@ def test_the_short_last_packet_is_reported_at_once(board, card, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("progress", "status", "now_s", "why"),
+    ("progress", "status", "now_s", "ended"),
     [
-        (Progress(0, 1, 9, True, 1), Status(0), 1.0, Ending.BYTES),
-        (Progress(0, 1, 9, False, 1), Status.RECORD_COMPLETED, 1.1, None),
-        (Progress(0, 1, 9, False, 1), Status.RECORD_COMPLETED, 1.3, Ending.STATUS),
-        (Progress(0, 1, 9, False, 1_200_000_000), Status.RECORD_COMPLETED, 1.3, None),
-        (Progress(0, 1, 9, False, 1, True), Status(0), 1.1, None),
-        (Progress(0, 1, 9, False, 1, True), Status(0), 1.3, Ending.TAIL),
-        (Progress(0, 1, 9, False, 1), Status.NO_LVDS_DATA, 3.9, None),
-        (Progress(0, 1, 9, False, 1), Status(0), 4.1, Ending.SILENCE),
-        (Progress(0, 1, 0, False, 0), Status(0), 4.1, Ending.SILENCE),
+        (Progress(0, 1, 9, True, 1), Status(0), 1.0, True),
+        (Progress(0, 1, 9, False, 1), Status.RECORD_COMPLETED, 1.1, False),
+        (Progress(0, 1, 9, False, 1), Status.RECORD_COMPLETED, 1.3, True),
+        (Progress(0, 1, 9, False, 1_200_000_000), Status.RECORD_COMPLETED, 1.3, False),
+        (Progress(0, 1, 9, False, 1, True), Status(0), 1.1, False),
+        (Progress(0, 1, 9, False, 1, True), Status(0), 1.3, True),
+        (Progress(0, 1, 9, False, 1), Status.NO_LVDS_DATA, 3.9, False),
+        (Progress(0, 1, 9, False, 1), Status(0), 4.1, True),
+        (Progress(0, 1, 0, False, 0), Status(0), 4.1, True),
     ],
 )
-def test_a_record_ends_with_whichever_is_first(progress, status, now_s, why):
-    assert record_ending(progress, status, 10**9, int(now_s * 1e9), 3 * 10**9) is why
+def test_a_record_ends_with_whichever_is_first(progress, status, now_s, ended):
+    assert record_ended(progress, status, 10**9, int(now_s * 1e9), 3 * 10**9) == ended
 
 
 def test_portable_way_receives_the_same(board, card):

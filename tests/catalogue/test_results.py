@@ -10,7 +10,6 @@ import pytest
 from polysight.host.catalogue import MAPS, Pixels, compare, draw_comparison, draw_products, probe, result_of, thumbnail
 from polysight.host.catalogue.compare import SIGNIFICANT, scatter_of
 from polysight.host.polarimetry import permittivity_from_ratio
-from polysight.host.products import read_products
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from tests.support.products import judged_products
@@ -21,11 +20,10 @@ CENTRE = tuple(PET["centre_mm"])
 
 
 def test_a_place_tells_its_own_pixel(processed):
-    saved = read_products(processed / "one")
-    pixels = Pixels(saved)
+    pixels = Pixels(processed / "one" / "products")
     row, column = pixels.nearest(*CENTRE)
     answer = probe(processed / "one", *CENTRE)
-    p = complex(saved.p[row, column])
+    p = complex(pixels.p[row, column])
     assert complex(answer["p"]["real"], answer["p"]["imag"]) == pytest.approx(p, abs=1e-4)
     eps = complex(permittivity_from_ratio(p, pixels.theta_rad))
     assert complex(answer["permittivity"]["real"], answer["permittivity"]["imag"]) == pytest.approx(eps, abs=1e-3)
@@ -36,9 +34,9 @@ def test_a_place_tells_its_own_pixel(processed):
 
 def test_the_error_of_a_pixel_is_that_of_draws(processed):
     """Of P as it is drawn with its standard deviation, in each part."""
-    pixels = Pixels(read_products(processed / "one"))
+    pixels = Pixels(processed / "one" / "products")
     at = pixels.nearest(*CENTRE)
-    p, sigma = complex(pixels.p[at]), float(pixels.p_sigma[at]) / 20  # small: the law is of first order
+    p, sigma = complex(pixels.p[at]), float(pixels.p_std[at]) / 20  # small: the law is of first order
     rng = np.random.default_rng(1)
     drawn = permittivity_from_ratio(
         p + sigma * (rng.standard_normal(4000) + 1j * rng.standard_normal(4000)), pixels.theta_rad
@@ -100,9 +98,8 @@ def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
     from polysight.host.products import write_image
 
     shutil.copytree(processed / "one" / "products", tmp_path / "changed")
-    saved = read_products(processed / "one")
+    saved = pixels = Pixels(processed / "one" / "products")
     v, (x, y) = saved.v.copy(), CENTRE
-    pixels = Pixels(saved)
     inside = np.ix_(abs(pixels.y_mm - y) < 15, abs(pixels.x_mm - x) < 15)
     v[inside] *= 1.3
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -142,7 +139,7 @@ def test_every_map_is_drawn_in_the_size_of_the_image(processed):
 
     from matplotlib.image import imread
 
-    pixels = Pixels(read_products(processed / "one"))
+    pixels = Pixels(processed / "one" / "products")
     for name in MAPS:
         made = draw_products(pixels, name)
         assert imread(io.BytesIO(made.png)).shape[:2] == pixels.valid.shape
@@ -174,7 +171,7 @@ def test_images_whose_arrays_do_not_belong_together_are_refused(tmp_path, change
     for look in (
         lambda: probe(folder, 0.0, 0.0),
         lambda: compare(folder, folder),
-        lambda: thumbnail(Pixels(read_products(folder))),
+        lambda: thumbnail(Pixels(folder)),
     ):
         with pytest.raises(DataError):
             look()
@@ -184,6 +181,6 @@ def test_a_pipe_in_the_image_s_place_keeps_nobody_waiting(tmp_path):
     folder = judged_products(tmp_path / "a", "good")
     (folder / "image.npz").unlink()
     os.mkfifo(folder / "image.npz")
-    for look in (lambda: probe(folder, 0.0, 0.0), lambda: thumbnail(Pixels(read_products(folder)))):
+    for look in (lambda: probe(folder, 0.0, 0.0), lambda: thumbnail(Pixels(folder))):
         with refused(ErrorCode.FILE_FOREIGN):
             look()

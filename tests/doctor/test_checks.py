@@ -28,10 +28,6 @@ from tests.support.doctor.case import QUICK, RIG, context_of
 from tests.support.rigs import programmed_rig
 
 
-def test_a_row_cannot_run_without_pulses():
-    assert main(["doctor", "--config", str(RIG), "--move", "--no-pulse"]) == 2
-
-
 @pytest.mark.parametrize("broken", ["nonsense = 1\n", 'name = "x"\n', "[[[\n", None])
 def test_a_bad_rig_file_is_the_first_and_only_error(tmp_path, broken, capsys):
     path = tmp_path / "rig.toml"

@@ -12,13 +12,14 @@ import pytest
 from polysight.host.acquisition.pi_client import RefusedError
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
-from polysight.host.cli.main import main
+from polysight.host.doctor.checks import run_doctor
+from polysight.host.doctor.context import DoctorOptions
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validation import validate
 from polysight.shared import __version__
 from polysight.shared.config import load_instrument
-from polysight.shared.messages import BeginRun, HelloReply
+from polysight.shared.messages import WIRE_VERSION, BeginRun, HelloReply
 from polysight.shared.raster import plan_raster
 from polysight.simulators.builds import sketch_compiler
 from tests.support.doctor.case import QUICK
@@ -37,7 +38,7 @@ def skipped(findings, cause):
 
 
 def test_all_checks_of_a_healthy_rig_pass(live, capsys):
-    status = main(["doctor", "--config", str(live.config), "--out", str(live.folder), "--move", "--json"])
+    status = run_doctor(DoctorOptions(live.config, live.folder, move=True), as_json=True, system=QUICK)
     document = json.loads(capsys.readouterr().out)
     found = {f["check"]: f for f in document["findings"]}
     assert (status, document["ok"], document["simulated"]) == (0, True, True)
@@ -197,27 +198,22 @@ def test_a_pi_of_this_release_is_ok(unanswered):
     assert [n for n, f in found.items() if f.verdict == "error"] == ["card RH", "card RV"]
 
 
-def test_a_pi_of_another_release(unanswered):
-    with answering(unanswered.instrument, reply(pi_release="0.0.9")):
+@pytest.mark.parametrize(
+    ("changes", "version", "check", "skips"),
+    [
+        ({"pi_release": "0.0.9"}, WIRE_VERSION, "pi", "stage"),
+        ({}, "2.0", "pi", "stage"),
+        ({"firmware": "0.0.7"}, WIRE_VERSION, "stage", "trigger line"),
+        ({"firmware": ""}, WIRE_VERSION, "stage", "trigger line"),
+    ],
+    ids=["release", "wire version", "sketch", "no sketch"],
+)
+def test_a_pi_of_another_release_is_an_error(unanswered, changes, version, check, skips):
+    with answering(unanswered.instrument, reply(**changes), version):
         found = unanswered.doctor()
-    assert found["pi"].verdict == "error"
-    assert "0.0.9" in found["pi"].found
-    assert "stage" in skipped(found, "pi")
-
-
-def test_a_pi_of_another_wire_version(unanswered):
-    with answering(unanswered.instrument, reply(), version="2.0"):
-        found = unanswered.doctor()
-    assert found["pi"].verdict == "error"
-    assert "2.0" in found["pi"].found
-
-
-@pytest.mark.parametrize("firmware", ["0.0.7", ""])
-def test_a_sketch_of_another_release(unanswered, firmware):
-    with answering(unanswered.instrument, reply(firmware=firmware)):
-        found = unanswered.doctor()
-    assert found["stage"].verdict == "error"
-    assert skipped(found, "stage") == ["trigger line"]
+    assert found[check].verdict == "error"
+    assert all(value in found[check].found for value in changes.values())
+    assert skips in skipped(found, check)
 
 
 def test_missing_keys(unanswered, tmp_path):

@@ -7,11 +7,13 @@ import json
 import numpy as np
 import pytest
 
-from polysight.host.cli.main import main
+from polysight.host.cli.main import build_parser, main
 from polysight.host.jobs.label import Edits, label
 from polysight.host.materials import read_labels
 from polysight.host.products import find_labels, find_products, making_products, write_image, write_json
+from polysight.shared.error_codes import ErrorCode
 from tests.support.products import judged_products
+from tests.support.refusals import refused
 
 NAMED = ["--from-patches", "--rename", "1=copper", "--rename", "2=\u6a61\u6728"]
 
@@ -86,34 +88,32 @@ def test_a_box_where_nothing_shines_is_pointed_out(products, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "code", "value"),
     [
-        (["--box", "oak=0,0,100,10"], "outside the image"),
-        (["--box", "oak=0,0,10,10", "--box", "glass=5,5,15,15"], "overlap by 5.0 x 5.0 mm"),
-        (["--box", "oak=nan,0,10,10"], "box of oak, nan"),
-        (["--box", "oak=0,0,10,10", "--box", "oak=20,0,30,10"], "the name oak"),
-        (["--from-patches", "--rename", "1=oak", "--rename", "2=oak"], "the name oak"),
-        (["--box", "oak=0,0,10,10", "--box", "glass=20,0,30,10"], "--metal NAME: oak, glass"),
-        (["--box", "oak=0,0,10,10", "--metal", "copper"], "no box is called copper"),
-        (["--rename", "1=oak"], "no box is called 1"),
-        (["--remove", "oak"], "no box is called oak"),
-        (["--box", "a\nb=0,0,10,10"], "control characters"),
-        (["--from-patches"], "no box is left"),
-        (["--box", "oak=0,0,10,10", "--list"], "--list with other options"),
+        (["--box", "oak=0,0,100,10"], ErrorCode.VALUE_INVALID, "oak"),
+        (["--box", "oak=0,0,10,10", "--box", "glass=5,5,15,15"], ErrorCode.VALUES_CONFLICT, "5.0 x 5.0 mm"),
+        (["--box", "oak=nan,0,10,10"], ErrorCode.VALUE_INVALID, "nan"),
+        (["--box", "oak=0,0,10,10", "--box", "oak=20,0,30,10"], ErrorCode.NAME_TAKEN, "oak"),
+        (["--from-patches", "--rename", "1=oak", "--rename", "2=oak"], ErrorCode.NAME_TAKEN, "oak"),
+        (["--box", "oak=0,0,10,10", "--box", "glass=20,0,30,10"], ErrorCode.KEY_MISSING, "oak, glass"),
+        (["--box", "oak=0,0,10,10", "--metal", "copper"], ErrorCode.KEY_UNKNOWN, "copper"),
+        (["--rename", "1=oak"], ErrorCode.KEY_UNKNOWN, "1"),
+        (["--remove", "oak"], ErrorCode.KEY_UNKNOWN, "oak"),
+        (["--box", "a\nb=0,0,10,10"], ErrorCode.VALUE_INVALID, "a\\nb"),
+        (["--from-patches"], ErrorCode.NO_DATA, "labels.json"),
+        (["--box", "oak=0,0,10,10", "--list"], ErrorCode.VALUES_CONFLICT, "--list"),
     ],
 )
-def test_what_nothing_could_be_learnt_from_is_refused_and_nothing_is_written(products, capsys, words, said):
-    assert main(["label", str(products), *words]) in (2, 3)
-    answer = capsys.readouterr().err
-    assert said in answer
-    assert "\n  why: " in answer
-    assert "\n  do: " in answer
+def test_labels_that_cannot_be_used_are_refused_and_nothing_is_written(products, words, code, value):
+    args = build_parser().parse_args(["label", str(products), *words])
+    with refused(code, value):
+        args.run(args)
     assert not (products / "labels.json").exists()
 
 
-def test_a_folder_without_an_image_is_to_be_processed_first(tmp_path, capsys):
-    assert main(["label", str(tmp_path), "--list"]) == 3
-    assert f"polysight process {tmp_path}" in capsys.readouterr().err
+def test_a_folder_without_an_image_is_to_be_processed_first(tmp_path):
+    with refused(ErrorCode.FILE_MISSING, tmp_path):
+        label(tmp_path, Edits(), list_only=True)
 
 
 def test_a_person_is_asked_for_each_patch(products, capsys):
@@ -124,19 +124,10 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
     assert "named PET 80 %" in questions[1]
     assert "the name pet" in capsys.readouterr().out  # pet beside PET
     before = (products / "labels.json").read_bytes()
-    ask, questions = answering("no")
-    assert main_error(products, ask) == "nothing was changed"
-    ask, questions = answering("yes", "copper")
-    assert "the answers ended" in main_error(products, ask)
+    for answers, code in ((["no"], ErrorCode.VALUE_INVALID), (["yes", "copper"], ErrorCode.KEY_MISSING)):
+        with refused(code):
+            label(products, Edits(), ask=answering(*answers)[0])
     assert (products / "labels.json").read_bytes() == before
-
-
-def main_error(products, ask):
-    from polysight.shared.errors import PolysightError
-
-    with pytest.raises(PolysightError) as e:
-        label(products, Edits(), ask=ask)
-    return e.value.what
 
 
 def test_without_a_terminal_patches_are_listed(products, capsys):

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from polysight.host.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
 from polysight.host.catalogue import Notes, read_notes
 from polysight.host.cli.main import main
 from polysight.simulators.scene import load_scene, simulate
-from tests.support.processes import wait_for
+from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
@@ -63,10 +62,7 @@ def test_names_and_tags_reach_the_terminal_without_control_and_direction_marks(r
 
 
 def test_a_running_scan_is_asked(root, capsys):
-    stop = StopRequest()
-    with ControlFolder(root / "one", stop) as desk:
-        desk.open()
-        wait_for((root / "one" / CONTROL / ALIVE).exists, "the first sign of life")
+    with open_control(root / "one") as stop:
         assert "pause" in answer(capsys, "ask", root / "one", "pause")
         assert stop.paused
     assert main(["ask", str(root / "one"), "pause"]) == 6

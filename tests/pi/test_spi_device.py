@@ -76,14 +76,6 @@ def test_every_position_is_a_burst_by_the_controllers_clock(rig, homed, hub, wir
         assert c.width_max_ns >= 1000 * rate
 
 
-@pytest.mark.parametrize(("core_hz", "fault"), [(400e6, PiFault.PERIOD_TOO_SHORT), (50e6, PiFault.PULSE_TOO_LONG)])
-def test_a_wrong_core_clock_ends_the_row(homed, hub, core_hz, fault):
-    _, host = homed(hub, core_hz=f"250e6,{core_hz}")
-    done = host.row(0)
-    assert (done.status, done.fault) == ("fault", fault)
-    assert host.ask(m.Status()).state == "ready"
-
-
 def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(homed, hub):
     """A run whose bursts exceed spidev's `bufsiz` is refused at once; the next one runs."""
     _, host = homed(hub, bufsiz="512")

@@ -124,15 +124,6 @@ def test_edges_during_a_burst_end_the_row_alone(long_bursts, in_row, wires, edge
     host.until_state("ready")
 
 
-def test_a_pulse_that_may_be_too_long_is_fault_105(rig, in_row, wires):
-    """Without a one-shot, and with a chip that takes 5 ms to change an output."""
-    _, host = in_row(replace(rig, pi=replace(rig.pi, one_shot=False)), "slow:5000")
-    done = host.wait(m.RowFinished)
-    assert (done.fault, done.pulses) == (PiFault.PULSE_TOO_LONG, 1)
-    assert host.of(m.Capture)[0].width_max_ns >= 5_000_000
-    wires.until(lambda: wires.level(SYNC) == 0)
-
-
 def test_a_chip_that_vanishes_is_fault_107(rig, in_row, wires):
     program, host = in_row(rig)
     host.wait(m.Capture)

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.host.plan import Changes, row_motion_s, scan_time, straight_move_s
-from polysight.host.plan.timing import TAIL_S, tail_s, turn_s, whole_packets
+from polysight.host.plan.timing import tail_s, turn_s, whole_packets
 from polysight.pi_controller.stage import row_in_steps
-from polysight.shared.config import Instrument
+from polysight.shared.config import CARD_TAIL_S, Instrument
 from polysight.shared.raster import plan_raster
 from polysight.shared.stage_line import Command, Parameter
 from polysight.shared.wires import WireEdge
@@ -111,4 +111,4 @@ def test_a_row_of_whole_packets_has_no_wait_for_the_last_packet(rig):
     assert not whole_packets(short)
     assert tail_s(whole) == 0.0
     run_out = (row_motion_s(short.grid, short.stage) - 698 / 20) / 2
-    assert tail_s(short) == pytest.approx(TAIL_S + 15 * 1.5e-3 - run_out)
+    assert tail_s(short) == pytest.approx(CARD_TAIL_S + 15 * 1.5e-3 - run_out)

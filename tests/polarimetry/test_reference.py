@@ -63,14 +63,8 @@ def test_weak_parts_and_the_rim_are_masked():
     assert reference.facts()["share_of_plane"] == pytest.approx(reference.valid.mean(), abs=1e-3)
 
 
-def test_the_mean_is_one_number_and_valid_everywhere():
-    light = gains(np.random.default_rng(5), 0.02)
-    reference = plane_reference(*light, X, Y)
-    mean = reference.mean()
-    assert mean.valid.all()
-    assert np.unique(mean.h).size == np.unique(mean.v).size == 1
-    assert mean.h[0, 0] / mean.v[0, 0] == pytest.approx(np.mean(light[0] / light[1]), rel=0.01)
-    assert mean.spread > reference.spread  # includes the variation over the plane
+def test_its_facts_tell_how_the_gains_vary_over_the_plane():
+    reference = plane_reference(*gains(np.random.default_rng(5), 0.02), X, Y)
     assert reference.facts()["ratio_variation_db"] > 0.01
 
 

@@ -18,7 +18,7 @@ from polysight.host.materials.sub_bands import bands_of_row
 from polysight.host.polarimetry import Leakage, PlaneReference
 from polysight.shared.config import Instrument
 from polysight.simulators.scene import decode_scene, simulate
-from tests.support.leakage import remaining
+from tests.support.calibration import remaining
 
 BANDS = 3
 LEAKAGE = {"leakage_h": [0.08, 0.03], "leakage_v": [-0.02, 0.06]}
@@ -153,9 +153,6 @@ def test_incidence_and_reference_are_in_quality_json(products):
 
 def test_the_reference_is_valid_after_a_power_cycle(scan, reference):
     """Samples are referenced to the direct path: gains of the boards drop out of both scans."""
-    mean = reference.mean()
-    assert mean.spread >= reference.spread
-    assert mean.valid.all()
     again = load_reference(scan("plate", hv_gain_db=-2.0))
     at = reference.valid & again.valid
     assert at.sum() > 200

@@ -119,7 +119,7 @@ def test_missing_products_are_named(tmp_path):
     with refused(ErrorCode.FILE_MISSING, tmp_path, MATERIALS):
         read_products(tmp_path, MATERIALS)
     assert SavedProducts(tmp_path).materials == {}
-    assert SavedProducts(tmp_path).chirp is None
+    assert SavedProducts(tmp_path).rig is None
 
 
 def test_a_full_disk_is_reported_with_the_path(tmp_path, monkeypatch):

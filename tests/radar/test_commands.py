@@ -42,12 +42,8 @@ from polysight.host.radar.commands import (
     FrameControl,
     LdoBypass,
     Profile,
-    ReadChirp,
-    ReadProfile,
-    StreamTone,
     slope_code,
     start_code,
-    stream_commands,
 )
 from polysight.host.radar.firmware import file_chunks
 from polysight.host.radar.messages import command, decode, encode
@@ -102,7 +98,6 @@ VECTORS: list[tuple[Command, str]] = [
 
 
 # The same without the request of an acknowledgement.
-_TONE = StreamTone(1435384036 * START_HZ_PER_CODE, 5e6, 40, tx_backoff_db=3, rf_gain_target_db=36)
 _PROFILE = Profile(
     1435384036 * START_HZ_PER_CODE,
     414 * SLOPE_HZ_PER_S_PER_CODE,
@@ -118,8 +113,6 @@ _PROFILE = Profile(
     index=3,
 )
 WITHOUT_ACKNOWLEDGEMENT: list[tuple[Command, str]] = [
-    (ReadProfile(2), "34122143410218000c040000010099f920010800020000001afb47ba"),
-    (ReadChirp(12), "34122143410218000c140000010099e9210108000c000c00851e25d2"),
     (READ_FRAME, "34122143410214000c24000001009dd922010400a14f580e"),
     (InitCalibrations(0x0B10), "34122143010120000c4400000100d1ba89001000100b00000000000000000000d0762e17"),
     (SaveCalibration(0), "34122143410118000c540000010099aaab0008000000000081be78de"),
@@ -134,18 +127,11 @@ WITHOUT_ACKNOWLEDGEMENT: list[tuple[Command, str]] = [
         "656c737a81888f969da4abb2b9c0c7ced5dce3eaf1f8040b121920272e353c434a51585f666d747b828990979ea5acb36df8"
         "cb05",
     ),
-    (_TONE, "34122143010228000cb400000100c94903011800e4388e55030303000000000088130000a80000007ecdceb0"),
-    (stream_commands(True)[1], "34122143010218000cc400000100d939040108000100000060173742"),
-    (stream_commands(True)[0], "34122143858018000cd40000010054ab4640080001000000afaeb0b3"),
     (GET_DIE_ID, "34122143410414000c14000001009de723020400940f23a0"),
     (
         _PROFILE,
         "34122143010240000c2400000100b1d90001300003000000e4388e55e8030000bc0200007017000000000000000000009e01"
         "00004000881300000000a80000007f56dae3",
-    ),
-    (
-        Chirp(0, first=30, last=34, profile=3),
-        "34122143010228000c3400000100c9c9010118001e002200030000000000000000000000000000003dfbe877",
     ),
 ]
 

@@ -13,13 +13,12 @@ from polysight.host.radar.backends import radar_control
 from polysight.host.radar.interface import RadarState
 from polysight.host.radar.native import NativeRadars, radar_board
 from polysight.host.radar.trace import ReplayedWords, read_trace
-from polysight.host.radar.usb import UsbWords
 from polysight.host.store.manifest import decode_line, encode_line
 from polysight.shared.config import Instrument, NativeRadar, Radar
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.radars import RadarBoard, UsbChip, make_image
+from polysight.simulators.radars import RadarBoard, make_image
 from tests.support.radar.boards import BoardWords
 from tests.support.refusals import refused
 
@@ -133,7 +132,7 @@ def test_a_board_in_fault_is_not_done(radars, usb):
 
 def test_two_names_for_one_board_are_refused(rig, usb, clock):
     usb.boards["FTRV"].cores.die = 2
-    with pytest.raises(DeviceError, match="RH and RV"):
+    with refused(ErrorCode.VALUES_CONFLICT, "RH and RV"):
         NativeRadars(rig, usb.open, clock)
 
 
@@ -190,30 +189,11 @@ def test_a_broken_constraint_is_refused_before_anything_is_sent(rig, usb, clock)
         made.arm(65536)
 
 
-def test_ldo_bypass_is_not_sent_without_the_board_s_acknowledgement(rig, usb, clock):
-    native = {n: msgspec.structs.replace(b, ldo_bypass=True) for n, b in rig.radar.native.items()}
-    wrong = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, native=native))
-    with refused(ErrorCode.VALUE_INVALID, "LDO bypass of LS"):
-        NativeRadars(wrong, usb.open, clock)
-    assert not any(b.destroyed for b in usb.boards.values())
-
-
 def test_a_board_that_fails_at_the_start_closes_the_others(rig, usb, clock):
     usb.boards["FTRV"].cores.flash = b""
     with refused(ErrorCode.RADAR_NO_FIRMWARE, "RV"):
         NativeRadars(rig, usb.open, clock)
     assert all(link.closed for links in usb.links.values() for link in links)
-
-
-def test_three_boards_behind_usb(rig, usb, clock):
-    chips = {s: UsbChip(b) for s, b in usb.boards.items()}
-    with NativeRadars(
-        rig, lambda s: UsbWords(*(chips[s].channel(n) for n in "ABCD"), sleep=clock.sleep), clock
-    ) as made:
-        made.arm(FRAMES)
-        usb.pulses(FRAMES)
-        assert {s.state for s in made.states().values()} == {RadarState.DONE}
-    assert [c.errors for c in chips.values()] == [[], [], []]
 
 
 def test_the_rig_file_must_have_every_board_and_each_serial_once(rig):

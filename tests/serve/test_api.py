@@ -156,10 +156,13 @@ def test_exports_stay_in_the_scan(view, scans, tmp_path):
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_two_who_write_the_same_notes_are_both_answered(view, scans):
+@pytest.mark.parametrize(("base", "saved"), [(None, 40), ({"notes": "", "tags": []}, 1)])
+def test_notes_that_somebody_else_has_changed_are_not_overwritten(view, scans, base, saved):
     with ThreadPoolExecutor(2) as both:
-        answers = both.map(lambda k: post(view, "/api/notes?scan=one", {"notes": f"{k}"})[0], range(40))
-        assert set(answers) == {200}
+        texts = ({"notes": f"{k}", "base": base} for k in range(40))
+        answers = list(both.map(lambda body: post(view, "/api/notes?scan=one", body), texts))
+    assert [status for status, _ in answers].count(200) == saved
+    assert {(status, body.get("code")) for status, body in answers} <= {(200, None), (409, ErrorCode.MISMATCH)}
     assert [p.name for p in (scans / "one").glob(".*.part")] == []
 
 

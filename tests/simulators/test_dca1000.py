@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from polysight.simulators.cards.dca1000 import TAIL_S, Card, Code, Message, Network, Output, Packetiser, Packets
+from polysight.simulators.cards.dca1000 import Card, Code, Message, Network, Output, Packets
 
 HOME = Network("192.168.33.30", "192.168.33.180", bytes.fromhex("123456789012"), 4096, 4098)
 CONFIGURE = bytes.fromhex("5aa5 0300 0600 01010102031e aaee")
@@ -44,31 +44,6 @@ def ready_card(sequence: int = 1, byte_count: int = 0, discards: bool = False) -
     return card
 
 
-chunks = st.lists(st.integers(0, 9000), min_size=1, max_size=8)
-
-
-@given(chunks, st.integers(1, 1456), st.integers(0, 2**32 - 1), st.integers(0, 2**48 - 1))
-def test_payloads_joined_are_the_stream_and_the_counters_count_it(
-    sizes: list[int], payload: int, sequence: int, byte_count: int
-) -> None:
-    packetiser = Packetiser(payload, sequence, byte_count)
-    data = stream(sum(sizes))
-    out, at = [], 0
-    for size in sizes:
-        rows = packetiser.feed(data[at : at + size])
-        assert rows.shape[1] == 10 + payload
-        out += [r.tobytes() for r in rows]
-        at += size
-    out += [r.tobytes() for r in packetiser.flush()]
-    assert b"".join(parse(p)[2] for p in out) == data.tobytes()
-    before = 0
-    for i, packet in enumerate(out):
-        got_sequence, got_count, part = parse(packet)
-        assert got_sequence == (sequence + i) % 2**32
-        assert got_count == (byte_count + before) % 2**48
-        before += len(part)
-
-
 def test_the_tail_comes_two_seconds_after_the_last_data_and_the_status_right_behind_it() -> None:
     card = ready_card()
     card.command(START, 10.0)
@@ -84,27 +59,6 @@ def test_the_tail_comes_two_seconds_after_the_last_data_and_the_status_right_beh
     assert card.lvds(stream(4096), 100.0) == []
 
 
-def test_a_record_of_whole_packets_has_no_tail_but_its_status() -> None:
-    card = ready_card()
-    card.command(START, 0.0)
-    assert len(packets(card.lvds(stream(2 * 1456), 0.0))) == 2
-    assert card.tick(TAIL_S) == [Message(COMPLETED)]
-
-
-def test_nothing_is_sent_before_record_start_and_after_record_stop() -> None:
-    card = ready_card()
-    assert card.lvds(stream(5000), 0.0) == []
-    card.command(START, 0.0)
-    card.lvds(stream(2000), 0.1)
-    reply, tail, status = card.command(STOP, 0.2)
-    assert reply == Message(bytes.fromhex("5aa5 0600 0000 aaee"))
-    assert isinstance(tail, Packets)
-    assert tail.rows.shape[1] == 10 + 2000 - 1456
-    assert status == Message(COMPLETED)
-    assert card.lvds(stream(5000), 0.3) == []
-    assert messages(card.command(STOP, 0.4)) == [bytes.fromhex("5aa5 0600 0000 aaee")]
-
-
 def test_a_card_that_discards_at_stop_loses_only_what_fills_no_packet() -> None:
     card = ready_card(discards=True)
     card.command(START, 0.0)
@@ -113,17 +67,6 @@ def test_a_card_that_discards_at_stop_loses_only_what_fills_no_packet() -> None:
     card.command(START, 1.0)
     (packet,) = packets(card.lvds(stream(1456), 1.1))
     assert parse(packet)[:2] == (2, 1456)
-
-
-def test_counters_wrap_and_only_reset_fpga_sets_them_back() -> None:
-    card = ready_card(2**32 - 1, 2**48 - 1456)
-    card.command(START, 0.0)
-    first, second = packets(card.lvds(stream(2 * 1456), 0.0))
-    assert parse(first)[:2] == (2**32 - 1, 2**48 - 1456)
-    assert parse(second)[:2] == (0, 0)
-    assert messages(card.command(bytes.fromhex("5aa5 0100 0000 aaee"), 0.0)) == [bytes.fromhex("5aa5 0100 0000 aaee")]
-    card.command(START, 1.0)
-    assert parse(packets(card.lvds(stream(1456), 1.0))[0])[:2] == (1, 0)
 
 
 @pytest.mark.parametrize(

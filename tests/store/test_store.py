@@ -61,24 +61,23 @@ def test_flipped_bit_is_never_a_fact(some, data):
     assert found.torn or found.faults or found.facts == some
 
 
-def test_every_truncation_gives_the_whole_lines_before_it(tmp_path):
+def test_after_every_truncation_the_lines_before_it_stand_and_the_chain_goes_on(tmp_path):
     some = [{"fact": "scan_started", "n": 1}, {"fact": "row_committed", "row": 0}, {"fact": "scan_ended", "x": "é"}]
-    lines = [encode_line(f) for f in some]
-    raw = b"".join(lines)
-    ends = [0, len(lines[0]), len(lines[0]) + len(lines[1]), len(raw)]
-    path = tmp_path / "manifest.jsonl"
+    path, ends = tmp_path / "manifest.jsonl", [0]
+    with ManifestWriter(path, create=True) as writer:
+        for fact in some:
+            writer.append(fact)
+            ends.append(path.stat().st_size)
+    raw = path.read_bytes()
     for n in range(len(raw) + 1):
         whole = max(k for k, e in enumerate(ends) if e <= n)
         found = parse(raw[:n])
-        assert found.facts == some[:whole]
-        assert found.torn == (n not in ends)
-        assert found.faults == []
+        assert (found.facts, found.torn, found.faults) == (some[:whole], n not in ends, [])
         path.write_bytes(raw[:n])
         with ManifestWriter(path, create=False) as writer:
             writer.append({"fact": "scan_resumed"})
         after = manifest.read(path)
-        assert after.facts == [*some[:whole], {"fact": "scan_resumed"}]
-        assert not after.torn
+        assert (after.facts, after.torn, after.faults) == ([*some[:whole], {"fact": "scan_resumed"}], False, [])
 
 
 def test_two_writers_never_share_a_scan(tmp_path):
@@ -244,6 +243,19 @@ def test_truncated_events_go_on_after_the_last_whole_one(tmp_path_factory, cut):
         writer.append(event)
     writer.close()
     assert path.read_bytes() == raw
+
+
+def test_what_is_cut_off_the_events_is_kept_once(tmp_path):
+    path = tmp_path / "events.msgpack"
+    writer = EventWriter(path)
+    writer.append(Fault(scan_id="s", seq=1, t_mono_ns=1, number=1, what="x"))
+    writer.sync()
+    writer.close()
+    for cut_off in (b"\x84\xa4", b"\xc1\xc1", b""):
+        with path.open("ab") as file:
+            file.write(cut_off)
+        EventWriter(path).close()
+    assert (tmp_path / "events.msgpack.damaged").read_bytes() == b"\x84\xa4\xc1\xc1"
 
 
 def test_scan_ids_fit_the_wire():

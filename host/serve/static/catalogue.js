@@ -100,7 +100,7 @@ async function showTraining() {
   by("train-log").hidden = !program;
   if (!program) return;
   by("train-log").textContent = program.log;
-  by("train-told").textContent = program.running ? "Training…" : program.status === 0 ? "The library is saved." : "Training failed:";
+  by("train-told").textContent = program.running ? `Training: ${program.log.split("\n").pop() || "starting"}` : program.status === 0 ? "The library is saved." : "Training failed:";
   if (program.running) setTimeout(showTraining, 1000);
 }
 
@@ -118,4 +118,8 @@ for (const id of ["find", "state", "tag", "sort"]) by(id).addEventListener("inpu
 
 server = await begin("Scans");
 await look();
+if ((await get("program/train"))?.running) {
+  by("train").hidden = false;
+  showTraining();
+}
 setInterval(() => { if (!document.hidden) look(); }, LOOK_MS);

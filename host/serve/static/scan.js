@@ -139,10 +139,13 @@ async function run(path, body) {
 
 // --- notes ---
 
+let noted; // as they were read: the server refuses to overwrite others
+
 async function saveNotes() {
   try {
     const tags = by("tags").value.split(",").map((t) => t.trim()).filter(Boolean);
-    const told = await post("notes", scan, { notes: by("notes-text").value, tags });
+    const told = await post("notes", scan, { notes: by("notes-text").value, tags, base: noted });
+    noted = { notes: told.notes, tags: told.tags };
     by("tags").value = told.tags.join(", ");
     complain("notes-told");
     by("notes-told").textContent = "Saved.";
@@ -211,6 +214,7 @@ try {
     const { libraries } = await get("scans");
     by("library").append(...libraries.map((name) => make("option", name, null, { value: name })));
   }
+  noted = { notes: summary.notes, tags: summary.tags };
   by("notes-text").value = summary.notes;
   by("tags").value = summary.tags.join(", ");
   by("save-notes").hidden = !server.control;

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import select
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterable
 from itertools import repeat
 from pathlib import Path
 
-from polysight.host.capture import dca1000
 from polysight.shared.config import Board
 from polysight.simulators.cards import MAC, CardEndpoint, Network, Pace
 from polysight.simulators.faults import Faults
@@ -29,8 +29,8 @@ class Cards:
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._serve)
 
-    def add(self, name: str, network: Network, faults: Faults, recording: Path | None, time_scale: float) -> None:
-        endpoint = CardEndpoint(name, network, faults, 0, time_scale, time.monotonic, Pace())
+    def add(self, name: str, network: Network, faults: Faults, recording: Path | None) -> None:
+        endpoint = CardEndpoint(name, network, faults, 0, 1.0, time.monotonic, Pace())
         self.endpoints[name] = endpoint
         if recording is not None:
             plays = (Recording(path) for path in repeat(recording))
@@ -90,10 +90,11 @@ class ScriptedCard:
     def _serve(self) -> None:
         while not self._end.is_set():
             try:
-                code, data = dca1000.decode_request(self._in.recv(2048))
+                raw = self._in.recv(2048)
             except TimeoutError:
                 continue
-            self.seen.append((code, data))
+            code = int.from_bytes(raw[2:4], "little")
+            self.seen.append((code, raw[6:-2]))
             for raw in self._answers(code, sum(c == code for c, _ in self.seen)):
                 self._out.sendto(raw, self.host)
 
@@ -108,4 +109,4 @@ class ScriptedCard:
 
 
 def reply(code: int, status: int = 0) -> bytes:
-    return dca1000.encode_reply(code, status)
+    return struct.pack("<4H", 0xA55A, code, status, 0xEEAA)

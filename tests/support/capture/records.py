@@ -6,12 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polysight.host.capture.dca1000 import Counters, encode_packet
+from polysight.host.capture.dca1000 import Counters
 from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Placed, place_record
 
 FULL = 1456  # bytes of samples in a full packet
+
+
+def encode_packet(sequence: int, byte_count: int, payload: bytes) -> bytes:
+    """A packet as the card sends it; both counters wrap."""
+    count = byte_count % 2**48
+    return (sequence % 2**32).to_bytes(4, "little") + count.to_bytes(6, "little") + payload
 
 
 @dataclass

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from polysight.host.acquisition.control import ALIVE, CONTROL
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
 from polysight.host.catalogue import Scans
 from polysight.host.page.watch import Watch
 from polysight.host.serve.app import make_app
@@ -58,6 +58,16 @@ class GrowingScan:
         """Give a sign of life."""
         (self.path / CONTROL).mkdir(exist_ok=True)
         (self.path / CONTROL / ALIVE).touch()
+
+
+@contextmanager
+def open_control(folder: Path) -> Iterator[StopRequest]:
+    """Serve `folder`/control as a running scan does; yields the stop request that the commands set."""
+    stop = StopRequest()
+    with ControlFolder(folder, stop) as control:
+        control.open()
+        wait_for((folder / CONTROL / ALIVE).exists, "the first sign of life")
+        yield stop
 
 
 class Served:

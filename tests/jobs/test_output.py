@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from polysight.host.cli.main import main
-from polysight.host.jobs import progress
-from polysight.host.jobs.progress import counted, steps
+from polysight.host.jobs import output
+from polysight.host.jobs.output import counted, steps
 
 
 def test_every_step_is_named_before_it_begins(capsys):
@@ -19,7 +19,7 @@ def test_every_step_is_named_before_it_begins(capsys):
 
 def test_without_a_terminal_rows_are_counted_in_lines(capsys, monkeypatch):
     now = iter(range(0, 1000, 2))
-    monkeypatch.setattr(progress, "monotonic", lambda: next(now))
+    monkeypatch.setattr(output, "monotonic", lambda: next(now))
     rows = counted(range(40), 40, "rows")
     assert next(rows) == 0
     assert capsys.readouterr().err == "40 rows ...\n"  # before the first is done
@@ -33,8 +33,8 @@ def test_a_closed_stderr_stops_nothing(monkeypatch):
     def closed(text: str) -> None:
         raise BrokenPipeError(text)
 
-    monkeypatch.setattr(progress.sys.stderr, "write", closed)
-    progress.say("images")
+    monkeypatch.setattr(output.sys.stderr, "write", closed)
+    output.say("images")
 
 
 @pytest.mark.parametrize("words", [["reproduce", "--out", "out", "fig99"]])

@@ -1,20 +1,29 @@
-"""Progress of commands that take seconds or minutes, on stderr: bars on a terminal, a line now and then elsewhere."""
+"""What commands print: results on stdout; progress on stderr, as bars on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from time import monotonic
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from rich.console import Console
-from rich.progress import track
-
-from polysight.host.process import Progress
+if TYPE_CHECKING:
+    from polysight.host.process import Progress
 
 T = TypeVar("T")
 _LINE_S = 5.0  # at least, from one line to the next
+
+
+def print_json(content: Any) -> None:
+    """Print a result for programs."""
+    sys.stdout.write(json.dumps(content, indent=1) + "\n")
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print a result for people."""
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
 
 
 def say(step: str) -> None:
@@ -36,6 +45,9 @@ def steps(things: Sequence[T], names: Sequence[str]) -> Iterator[T]:
 
 def counted(things: Iterable[T], total: int, name: str) -> Iterator[T]:
     """Yield the things with a bar; without a terminal a line at the start, then at tenths, 5 s apart or more."""
+    from rich.console import Console
+    from rich.progress import track
+
     console = Console(stderr=True)
     if console.is_terminal:
         yield from track(things, name, total=total, console=console)
@@ -52,6 +64,8 @@ def counted(things: Iterable[T], total: int, name: str) -> Iterator[T]:
 @contextmanager
 def current_step(first: str) -> Iterator[Progress]:
     """Show the current step, beginning with `first`: on a terminal as a status line, elsewhere as lines."""
+    from rich.console import Console
+
     console = Console(stderr=True)
     if console.is_terminal:
         with console.status(first) as status:

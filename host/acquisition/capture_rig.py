@@ -32,16 +32,8 @@ _COMPLETED_TIMEOUT_S = 0.2  # from a record's stop to its last packet and its st
 def record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int, silence_ns: int) -> bool:
     """Return True if one board's record has ended: all bytes are there, the card reports it, or the card is silent.
 
-    Parameters
-    ----------
-    progress
-        Latest report of its receiver.
-    status
-        Status bits that its card reported since the record started.
-    since_ns, now_ns
-        Time of the last pulse and the present time, monotonic clock.
-    silence_ns
-        Silence that ends a record.
+    `progress` is the receiver's latest report, `status` what the card reported since the record started. `since_ns`
+    (last pulse) and `now_ns` are on the monotonic clock; `silence_ns` is the silence that ends a record.
     """
     silent_ns = now_ns - max(progress.last_arrival_ns, since_ns)
     reported = progress.ended or Status.RECORD_COMPLETED in status  # its short last packet, or its status
@@ -51,10 +43,7 @@ def record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int,
 class CaptureRig:
     """Cards and receivers of the recorded boards; `warnings` lists what differs from the request but suffices to scan.
 
-    Raises
-    ------
-    DeviceError
-        if a port is in use, or the receive buffer is smaller than two bursts.
+    Raises DeviceError if a port is in use, or the receive buffer is smaller than two bursts.
     """
 
     def __init__(self, instrument: Instrument) -> None:

@@ -173,10 +173,7 @@ class ControlFolder:
 def send_command(folder: Path, command: ScanCommand, limit_s: float = _TIMEOUT_S) -> None:
     """Send a command to the scan that runs in `folder`; return when it has been accepted.
 
-    Raises
-    ------
-    ScanError
-        if no scan runs there, or it does not accept the command in time; the command is then withdrawn.
+    Raises ScanError if no scan runs there, or it does not accept the command in time; the command is then withdrawn.
     """
     path = folder / CONTROL / command
     try:

@@ -114,10 +114,7 @@ class RefusedError(ScanError):
 class PiClient:
     """Client of one Pi, for one thread; `instrument` has addresses, keys and limits.
 
-    Raises
-    ------
-    ConfigError
-        if an address needs keys that are missing.
+    Raises ConfigError if an address needs keys that are missing.
     """
 
     def __init__(self, context: zmq.Context[Any], instrument: Instrument) -> None:
@@ -127,7 +124,7 @@ class PiClient:
         self._event_address = instrument.pi.event_address
         self._timeout_s = instrument.limits.command_timeout_s
         self._silence_s = max(10 * instrument.pi.heartbeat_ms / 1e3, instrument.limits.command_timeout_s)
-        self._on_event: Callable[[AnyEvent], None] = _ignore
+        self._on_event: Callable[[AnyEvent], object] = lambda _: None
         keys = Path(instrument.pi.key_dir)
         self._events = subscriber(context, self._event_address, keys)
         self._commands = requester(context, self._address, keys)
@@ -284,10 +281,7 @@ class PiClient:
     def events(self) -> list[AnyEvent]:
         """Return the scan's journalled events that have arrived, in order, without waiting; fetch lost ones.
 
-        Raises
-        ------
-        DeviceError
-            if the Pi is silent on both sockets, or its journal lacks the lost events.
+        Raises DeviceError if the Pi is silent on both sockets, or its journal lacks the lost events.
         """
         while self._events.poll(0):
             parts = self._events.recv_multipart()
@@ -352,10 +346,6 @@ class PiClient:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _ignore(event: AnyEvent) -> None:
-    del event
 
 
 def _is_of(event: AnyEvent, row_index: int, take: int) -> bool:

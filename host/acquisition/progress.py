@@ -112,10 +112,7 @@ OnProgress = Callable[[ScanProgress], None]
 def typical_row_s(row_seconds: Sequence[float]) -> float:
     """Return the typical duration of a row: the median of the last 25, so that a retake or a wait has no effect.
 
-    Parameters
-    ----------
-    row_seconds
-        [n >= 1] from the end of one row to the end of the next, pauses left out.
+    `row_seconds` [n >= 1] are from the end of one row to the end of the next, pauses left out.
     """
     return statistics.median(row_seconds[-_RECENT_ROWS:])
 

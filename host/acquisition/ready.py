@@ -34,22 +34,11 @@ def make_ready(
 ) -> bool:
     """Wait until a row may begin, and home the stage if that is safe; return False if asked to stop now.
 
-    The stage is homed only before the first row, when the operator expects motion, and never after `STAGE_FAULTS`:
-    somebody pressed the emergency stop, or has an arm in the way.
+    The stage is homed only before the first row (`first`), when the operator expects motion, and never after
+    `STAGE_FAULTS`: somebody pressed the emergency stop, or has an arm in the way. The Pi must have begun the run
+    `scan_id`; "" for any. `notify` gets phase and message.
 
-    Parameters
-    ----------
-    pi, stop, notify
-        The Pi, stop requests, and a callback for phase and message.
-    scan_id
-        Run that the Pi must have begun; "" for any.
-    first
-        True if this program has not moved the stage yet.
-
-    Raises
-    ------
-    ScanError
-        if the stage is not ready and must not be homed, or homing fails.
+    Raises ScanError if the stage is not ready and must not be homed, or homing fails.
     """
     status = pi.status()
     if status.state == "ready" and status.homed and status.scan_id == (scan_id or status.scan_id):
@@ -69,11 +58,7 @@ def measure_lost_steps(
     """Home again after the last row; return the lost steps in x and y, millimetres, or None if not possible or wanted.
 
     Lost steps are the distance between the switches and where the count of steps expects them since the last homing.
-
-    Raises
-    ------
-    ScanError
-        if homing fails.
+    Raises ScanError if homing fails.
     """
     if stop.after_row or pi.status().state != "ready":
         return None
@@ -162,15 +147,8 @@ def stage_differences(stage: Stage, hello: HelloReply) -> list[str]:
 def check_same_stage(stage: Stage, hello: HelloReply, source: str) -> list[str]:
     """Check that the Pi places rows where `stage` does; `source` names the origin of `stage`.
 
-    Returns
-    -------
-    list of str
-        A warning if the Pi's release does not report its `[stage]`.
-
-    Raises
-    ------
-    ScanError
-        with both values of each key that differs.
+    Returns a warning if the Pi's release does not report its `[stage]`. Raises ScanError with both values of each key
+    that differs.
     """
     if differing := stage_differences(stage, hello):
         raise ScanError(

@@ -114,10 +114,7 @@ class RowTaker:
     def take(self, row: Row, number: int, transaction: RowTransaction) -> Take:
         """Run and receive a row; leaves `transaction` in `checking`.
 
-        Raises
-        ------
-        PolysightError
-            if the Pi, a card, a receiver or a radar does not respond.
+        Raises PolysightError if the Pi, a card, a receiver or a radar does not respond.
         """
         take = Take(row, number)
         transaction.to(RowState.ARMING)

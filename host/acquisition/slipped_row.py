@@ -98,14 +98,7 @@ def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_byt
     """Rewrite a slipped row with each frame at its pulse and everything else masked; durable on return.
 
     The index keeps its arrivals and gains `pulses_missed` and `frames`: runs of frames as [number of the first frame
-    received, number of its pulse, length].
-
-    Raises
-    ------
-    DeviceError
-        if the disk fails.
-    DataError
-        if the index is not readable.
+    received, number of its pulse, length]. Raises DeviceError if the disk fails, DataError if the index is unreadable.
     """
     facts, arrivals = read_index(path.with_suffix(".idx"))
     received = np.fromfile(path, dtype=np.uint8)

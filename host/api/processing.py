@@ -20,14 +20,7 @@ from polysight.host.store import Source
 class Processing:
     """Processes one source; each step runs once, when its result is first used.
 
-    Parameters
-    ----------
-    source
-        Recorded scan.
-    folder
-        Where it was read; `truth.json` there holds the truth of a simulated scene.
-    options
-        Library, model, metal box, sub-bands, incidence.
+    `folder` is where the source was read; `truth.json` there holds the truth of a simulated scene.
     """
 
     def __init__(self, source: Source, folder: Path, options: Options) -> None:

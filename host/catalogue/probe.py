@@ -23,16 +23,9 @@ _FLOOR_DB = -50.0
 
 
 def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -> dict[str, Any]:
-    """Read all results of a processed scan at one place.
+    """Read all results of a processed scan at one place, in mm from the middle of the image.
 
-    Parameters
-    ----------
-    folder
-        A scan folder, or a folder of products.
-    x_mm, y_mm
-        The place, from the middle of the image.
-    library
-        Reference library; the simulated one if not given.
+    `library` names materials (None: the simulated one).
 
     Returns
     -------

@@ -217,7 +217,6 @@ def _add_train(add: Add) -> None:
 
 _FORMATS = {
     "csv": "materials.csv: a line a patch, permittivity with standard errors",
-    "png": "amplitude (dB) and phase (degrees) of H, V and P, and the materials",
     "hdf5": "image.h5: arrays with axes, units, config, versions (needs h5py)",
     "netcdf": "image.nc: an xarray dataset; complex variables as h_real, h_imag (needs h5netcdf)",
     "zarr": "image.zarr: the same dataset as a Zarr store (needs zarr)",
@@ -242,9 +241,9 @@ def _add_export(add: Add) -> None:
     sub = add(
         "export",
         _export,
-        "export a processed scan to HDF5, NetCDF, Zarr, MATLAB, PNG, CSV or CPHD",
+        "export a processed scan to HDF5, NetCDF, Zarr, MATLAB, CSV or CPHD",
         "polysight export out/one --hdf5 --csv",
-        ("--csv", "--png", "--hdf5"),
+        ("--csv", "--hdf5", "--netcdf"),
     )
     sub.add_argument("products", type=Path, metavar="DIR", help="folder of products, or a scan folder")
     for name, text in _FORMATS.items():

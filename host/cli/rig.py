@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 from polysight.host.cli.options import Add, add_action, add_config_option, add_json_option, count, number, positive
@@ -48,8 +49,8 @@ def _plan(args: argparse.Namespace) -> int:
 
 def _size(text: str) -> tuple[float, float]:
     try:
-        width, height = (float(part) for part in text.split(","))
-    except ValueError:
+        width, height = (positive(part) for part in text.split(","))
+    except (ValueError, argparse.ArgumentTypeError):
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form WIDTH,HEIGHT in mm, e.g. 170,170") from None
     return width, height
 
@@ -68,10 +69,16 @@ def _add_plan(add: Add) -> None:
     sub.add_argument("--like", type=Path, metavar="SCAN", help="take noise and standstill between rows from this scan")
     sub.add_argument("--scene-mm", type=_size, metavar="W,H", help="size of the scene (default: the image's)")
     sub.add_argument(
-        "--snr-db", type=float, metavar="DB", help="direct path over noise per channel, sample and chirp (default: 5.5)"
+        "--snr-db",
+        type=number(float, "a finite number", math.isfinite),
+        metavar="DB",
+        help="direct path over noise per channel, sample and chirp (default: 5.5)",
     )
     sub.add_argument(
-        "--row-overhead-s", type=float, metavar="S", help="standstill between rows (default: 0.3, simulated)"
+        "--row-overhead-s",
+        type=number(float, "a number, 0 or more", lambda s: 0 <= s < math.inf),
+        metavar="S",
+        help="standstill between rows (default: 0.3, simulated)",
     )
     add_json_option(sub)
     group = sub.add_argument_group("numbers of the plan", "instead of the rig file's")

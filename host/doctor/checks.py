@@ -123,18 +123,7 @@ def run_doctor(
     system: System = System(),  # noqa: B008 - immutable
     bundle: Path | None = None,
 ) -> int:
-    """Run and print all checks; return 1 if a check failed, otherwise 0.
-
-    Parameters
-    ----------
-    options
-        Options of the command.
-    as_json
-        Print one JSON document instead of lines.
-    system
-        Queries of this machine.
-    bundle
-        Also write the findings and what explains them into this archive.
+    """Run and print all checks; return 1 if a check failed, otherwise 0. `bundle`: also write an archive for helpers.
 
     Raises
     ------

@@ -33,17 +33,10 @@ from polysight.shared.errors import ConfigError, DataError
 
 
 def classify(data: Sequence[Path], library: Path | None, model: str | None, as_json: bool) -> int:
-    """Name the patches of processed scans together, or judge the models on one library; returns the exit status.
+    """Name the patches of processed scans together, or judge the models on one library; return the exit status.
 
-    Parameters
-    ----------
-    data
-        Folders that `polysight process` wrote, or scan folders, one for each incidence angle; or a library (.npz), or a
-        folder of the published material files.
-    library, model
-        Of the naming; without: the simulated library, and the model that was chosen for it.
-    as_json
-        Print JSON.
+    `data` are processed scans, one for each incidence angle; or one library (.npz), or a folder of the published
+    material files. Names come from `library` (None: the simulated one) and `model` (None: the library's default).
 
     Raises
     ------

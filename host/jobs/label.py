@@ -66,20 +66,8 @@ class FoundPatch:
 class Edits:
     """Changes to labels, applied in this order.
 
-    Attributes
-    ----------
-    from_patches
-        Begin with a box inside each patch that was found, called by its number.
-    removed
-        Names of boxes to leave out.
-    renames
-        `OLD=NEW`.
-    boxes
-        Name and corners, millimetres from the image centre, of new boxes.
-    specimens
-        `NAME=WHICH`.
-    metal
-        Name of the metal reference.
+    `from_patches` begins with a box inside each patch that was found, called by its number; `renames` are `OLD=NEW`,
+    `specimens` `NAME=WHICH`; corners of `boxes` are millimetres from the image centre.
     """
 
     from_patches: bool = False
@@ -97,18 +85,10 @@ class Edits:
 
 
 def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None = None) -> int:
-    """Draw, name and save the boxes of a scan; returns the exit status.
+    """Draw, name and save the boxes of a scan or of its products; return the exit status.
 
-    Parameters
-    ----------
-    folder
-        A scan folder, or a folder of products.
-    edits
-        What the options ask for. Without any, the person is asked.
-    list_only
-        Print what is there, and write nothing.
-    ask
-        Asks a question and returns the answer; None where nobody can be asked.
+    Without `edits` the person is asked for the name of each patch; where nobody can be asked (`ask` is None), and with
+    `list_only`, boxes and patches are printed and nothing is written.
 
     Raises
     ------
@@ -155,12 +135,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
 
 
 def save_labels(place: Path, products: SavedProducts, labels: Labels) -> tuple[Labels, list[str]]:
-    """Check boxes drawn on products, and write them with their picture into `place`.
-
-    Returns
-    -------
-    labels, notes
-        as written, and what the person should know.
+    """Check boxes drawn on products, and write them with their picture into `place`; return them with notes on them.
 
     Raises
     ------

@@ -41,6 +41,7 @@ from polysight.host.products import (
     IMAGE,
     QUALITY,
     RAW_DROPPED,
+    REPORT,
     SavedProducts,
     check_products_folder,
     making_products,
@@ -51,7 +52,6 @@ from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError, advice
 
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
-REPORT = "report.html"
 
 
 def all_rows(
@@ -99,21 +99,10 @@ def truth_of(data: Path) -> tuple[TruthPlate, ...]:
 
 
 def check_options(options: Options, rig: Instrument, axes_m: Axes) -> int | None:
-    """Check inputs that are needed at the end before the work begins; note on stderr if nothing will be named.
+    """Check library, model and drawn boxes before the work begins; note on stderr if nothing will be named.
 
-    Parameters
-    ----------
-    options
-        Whose library, model and drawn boxes are looked at.
-    rig
-        Of the images, as calibrated.
-    axes_m
-        x and y of the images.
-
-    Returns
-    -------
-    int or None
-        Which of the drawn boxes is the metal reference.
+    `rig` is that of the images, as calibrated, `axes_m` are their x and y. Returns the number of the drawn box that is
+    the metal reference, or None.
 
     Raises
     ------
@@ -168,16 +157,9 @@ def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
 
 
 def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> PlaneReference:
-    """Make a reference from a scan of a metal plate that covers the plane.
+    """Make a reference from a scan of a metal plate that covers the plane, and one for each of `bands` sub-bands.
 
-    Parameters
-    ----------
-    folder
-        Scan folder, or the authors' unsynced/<scan>.
-    config
-        Rig file for the latter.
-    bands
-        Sub-bands to image too.
+    `config` is the rig file of scans in the authors' layout.
 
     Raises
     ------

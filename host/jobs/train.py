@@ -61,12 +61,7 @@ EDGE_MM = 9.0
 def training_scan(data: Path, config: Path) -> TrainingScan:
     """Return a scan for the library, its patches named by labels or truth.
 
-    Parameters
-    ----------
-    data
-        A scan folder of any layout, or a folder of products.
-    config
-        Rig file of layouts without one.
+    `data` is a scan folder of any layout, or a folder of products; `config` the rig file of layouts without one.
 
     Raises
     ------

@@ -69,20 +69,8 @@ def range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]
     """Mean power over RX and positions against excess path, relative to the direct path at 0.
 
     An echo of excess path d is `exp(+j 2 pi f d / c)` (host/sync/chain.py), so a Fourier transform along the linear
-    samples, Hann-windowed, has it at bin `d N df / c`.
-
-    Parameters
-    ----------
-    row
-        Synchronised row.
-    chirp
-        The chirp it was taken with.
-    excess_m
-        float64 [n].
-
-    Returns
-    -------
-    float64 [n], dB; all at the floor when no position is valid.
+    samples, Hann-windowed, has it at bin `d N df / c`. Returns dB, float64 [n] as `excess_m`; all at the floor when no
+    position is valid.
     """
     a, b = chirp.linear_samples
     samples = row.samples[:, row.valid, a:b]
@@ -96,15 +84,7 @@ def range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]
 
 
 class RowViewer:
-    """Forms images of committed rows of one scan in a thread.
-
-    Parameters
-    ----------
-    path
-        The scan folder; its manifest is not read here.
-    content
-        Facts so far; grows while the scan runs.
-    """
+    """Forms images of committed rows of one scan in a thread; `content` has the facts, and grows as the scan runs."""
 
     def __init__(self, path: Path, content: Manifest) -> None:
         self._source = ScanFolder(path, content)

@@ -61,15 +61,7 @@ class PiState:
 
 
 class PiListener:
-    """Receives the events of one scan in a thread of its own.
-
-    Parameters
-    ----------
-    instrument
-        Has the address at which the Pi publishes.
-    scan_id
-        The scan whose events are taken.
-    """
+    """Receives the Pi's events of one scan in a thread of its own."""
 
     def __init__(self, instrument: Instrument, scan_id: str) -> None:
         self._instrument, self._scan_id = instrument, scan_id

@@ -137,18 +137,10 @@ def forecast(
     row_overhead_s: float = ROW_OVERHEAD_S,
     scene_mm: tuple[float, float] | None = None,
 ) -> Forecast:
-    """Predict a scan.
+    """Predict a scan of a rig file to which `Changes` were applied.
 
-    Parameters
-    ----------
-    rig
-        Rig file, with `Changes` applied.
-    noise
-        Default: the simulated rig's.
-    row_overhead_s
-        Standstill for each row apart from motion, seconds.
-    scene_mm
-        Width and height of the scene in the object plane; default: the image's.
+    `noise`: default the simulated rig's. `row_overhead_s`: standstill for each row apart from motion. `scene_mm`: width
+    and height of the scene in the object plane; default: the image's.
     """
     noise = noise or Noise()
     aperture, taper = aperture_of(rig)

@@ -154,10 +154,7 @@ def forecast_values(f: Forecast) -> dict[str, Any]:
 def measure_noise(source: RawSource) -> Noise:
     """Measure the direct path over noise of a scan's weaker receiver in a few of its rows.
 
-    Raises
-    ------
-    DataError
-        if the scan has no rows, or bursts of a single chirp.
+    Raises DataError if the scan has no rows, or bursts of a single chirp.
     """
     from polysight.host.report import SyncReport  # here: importing matplotlib takes a second
 
@@ -224,10 +221,7 @@ class PlanOptions:
 def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
     """Print the forecast, or proposals if `minutes` is given; return 1 if the plan would be refused or none fits.
 
-    Raises
-    ------
-    PolysightError
-        if the rig file, a value or the scan of --like is invalid.
+    Raises PolysightError if the rig file, a value or the scan of --like is invalid.
     """
     original = load_instrument(config)
     rig = changes.apply(original)

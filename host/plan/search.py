@@ -110,18 +110,8 @@ def propose(
     """Search for the plans with the least noise in the image within a time and without aliases, best first.
 
     Each plan has the best speed and burst for its pair of steps, and the rig file's aperture. The stage moves at most
-    half a wavelength during a burst.
-
-    Parameters
-    ----------
-    rig
-        Rig file.
-    minutes
-        Maximum duration, without homing.
-    count
-        Maximum number of plans; fewer, or none, are returned if the time is too short.
-    noise, row_overhead_s, scene_mm
-        As for `forecast`.
+    half a wavelength during a burst. At most `count` plans; fewer, or none, if `minutes` (without homing) are too few.
+    Other parameters as :func:`forecast`.
     """
     noise = noise or Noise()
     best: list[tuple[float, Instrument]] = []

@@ -23,6 +23,7 @@ from polysight.host.radar.spi import Clock, SystemClock, WordLink
 from polysight.host.radar.trace import TracedWords, new_trace, traced
 from polysight.host.radar.usb import SCHEME, open_tcp, open_usb
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError
 
 _POLL_S = 0.005
@@ -84,7 +85,10 @@ def firmware_of(rig: Instrument) -> Image | None:
         return read_image(Path(rig.radar.firmware))
     except OSError as e:
         raise ConfigError(
-            f"radar.firmware: {rig.radar.firmware} cannot be read: {e.strerror}", "a typing error", "correct the path"
+            f"radar.firmware: {rig.radar.firmware} cannot be read: {e.strerror}",
+            "a typing error",
+            "correct the path",
+            code=ErrorCode.FILE_UNREADABLE,
         ) from None
 
 
@@ -95,7 +99,7 @@ class _LostLink:
         self._error = error
 
     def _fail(self, *_: object, **__: object) -> Any:
-        raise DeviceError(self._error.what, self._error.why, self._error.remedy)
+        raise DeviceError(self._error.what, self._error.why, self._error.remedy, code=self._error.code)
 
     write = read = interrupt = reset = _fail
 
@@ -111,6 +115,7 @@ def _make_folder(folder: Path) -> None:
             f"radar.trace_dir: {folder} cannot be created: {e.strerror}",
             "a typing error, or a missing permission",
             "correct the path",
+            code=ErrorCode.FILE_UNWRITABLE,
         ) from None
 
 
@@ -181,6 +186,7 @@ class NativeRadars(RadarControl):
                     f"{found[die]} and {name} have the same die id {die}",
                     "both names in radar.native refer to one board",
                     "correct usb_serial or usb_path of one of them",
+                    code=ErrorCode.VALUES_CONFLICT,
                 )
             found[die] = name
 

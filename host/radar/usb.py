@@ -152,7 +152,10 @@ def _read_exactly(port: Port, size: int) -> bytes:
     data = port.read(size)
     if len(data) != size:
         raise DeviceError(
-            f"timeout: received {len(data)} of {size} bytes over USB", "the cable is loose", "check the USB cable"
+            f"timeout: received {len(data)} of {size} bytes over USB",
+            "the cable is loose",
+            "check the USB cable",
+            code=ErrorCode.NO_ANSWER,
         )
     return data
 
@@ -176,15 +179,15 @@ class FtdiPort:
             self._ftdi.set_bitmode(direction, ftdi.BitMode.BITBANG if bit_bang else ftdi.BitMode.MPSSE)
         except self._library.errors as e:
             self.close()
-            what = f"radar USB {place}, channel {'ABCD'[interface - 1]}: cannot be opened: {e}"
-            raise DeviceError(what, _cause(e, "it was unplugged, or libusb is missing"), _CHECK) from None
+            what = f"{place}, channel {'ABCD'[interface - 1]}: cannot be opened: {e}"
+            raise _usb_error(what, e, "it was unplugged, or libusb is missing") from None
 
     def write(self, data: bytes) -> None:
         """Send bytes. Raises DeviceError."""
         try:
             self._ftdi.write_data(data)
         except self._library.errors as e:
-            raise self._lost(e) from None
+            raise _usb_error(f"{self._place}: {e}", e, _PULLED) from None
 
     def read(self, size: int) -> bytes:
         """Receive up to `size` bytes, with a timeout of half a second. Raises DeviceError."""
@@ -193,7 +196,7 @@ class FtdiPort:
             while len(found) < size and time.monotonic() < deadline:
                 found += self._ftdi.read_data_bytes(size - len(found), attempt=4)
         except self._library.errors as e:
-            raise self._lost(e) from None
+            raise _usb_error(f"{self._place}: {e}", e, _PULLED) from None
         return bytes(found)
 
     def close(self) -> None:
@@ -204,10 +207,6 @@ class FtdiPort:
         except (*self._library.errors, TypeError):  # lost, or not opened completely by pyftdi
             self._library.tools.release_device(device)  # otherwise pyftdi counts it as open
 
-    def _lost(self, e: BaseException) -> DeviceError:
-        why = _cause(e, "the cable was pulled, or the board lost power")
-        return DeviceError(f"radar USB {self._place}: {e}", why, _CHECK)
-
 
 _CAUSES = {
     errno.EBUSY: "another program uses this chip: mmWave Studio, or a second polysight; end it",
@@ -217,13 +216,16 @@ _CAUSES = {
 }
 
 
-def _cause(e: BaseException | None, otherwise: str) -> str:
-    """Return the likely cause by errno, also from the errors behind `e`, where pyftdi keeps that of libusb."""
-    while e is not None:
-        if getattr(e, "errno", None) in _CAUSES:
-            return _CAUSES[getattr(e, "errno", 0)]
+_PULLED = "the cable was pulled, or the board lost power"
+
+
+def _usb_error(what: str, e: BaseException | None, otherwise: str) -> DeviceError:
+    """Return an error with the likely cause by errno, also of the errors behind `e`, where pyftdi keeps libusb's."""
+    while e is not None and getattr(e, "errno", None) not in _CAUSES:
         e = e.__cause__ or e.__context__
-    return otherwise
+    number = getattr(e, "errno", 0)
+    code = ErrorCode.BUSY if number == errno.EBUSY else ErrorCode.NO_ANSWER
+    return DeviceError(f"radar USB {what}", _CAUSES.get(number, otherwise), _CHECK, code=code)
 
 
 def open_usb(place: str, slow: bool = False) -> UsbWords:
@@ -278,9 +280,7 @@ class _Library(NamedTuple):
             by_path = place.startswith(PATH)
             matching = [p for p, d in paths.items() if (p if by_path else self._serial(d)) == name]
         except self.errors as e:
-            raise DeviceError(
-                f"radar USB {place}: {e}", _cause(e, "libusb is missing, or the chip was unplugged"), _CHECK
-            ) from None
+            raise _usb_error(f"{place}: {e}", e, "libusb is missing, or the chip was unplugged") from None
         found = f"chips at {', '.join(sorted(paths))}" if paths else "no chip on the bus"
         if not matching:
             what = "at this path" if by_path else "with this serial number"
@@ -288,12 +288,14 @@ class _Library(NamedTuple):
                 f"radar USB {place}: cannot be opened: no chip 0451:fd03 {what}; {found}",
                 "unplugged, another serial number or path, or no permission (a udev rule for 0451:fd03)",
                 _CHECK,
+                code=ErrorCode.NO_ANSWER,
             )
         if len(matching) > 1:
             raise DeviceError(
                 f"radar USB {place}: {len(matching)} chips have this serial number, at {', '.join(sorted(matching))}",
                 "the serial number does not identify the board; none was opened",
                 f'use its path instead of usb_serial: usb_path = "{min(matching)}", or another one',
+                code=ErrorCode.VALUES_CONFLICT,
             )
         return paths[matching[0]]
 
@@ -372,7 +374,10 @@ class _TcpPort:
 
     def _lost(self, what: str) -> DeviceError:
         return DeviceError(
-            f"radar at {self._address}: {what}", "its USB cable was pulled, or its program ended", "check that machine"
+            f"radar at {self._address}: {what}",
+            "its USB cable was pulled, or its program ended",
+            "check that machine",
+            code=ErrorCode.NO_ANSWER,
         )
 
 

@@ -27,8 +27,6 @@ from polysight.host.products import (
     write_netcdf,
     write_zarr,
 )
-from polysight.host.report.context import ReportContext
-from polysight.host.report.figures import figures
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError
 
@@ -218,15 +216,6 @@ def _name(key: str) -> str:
     return (name if name[:1].isalpha() else f"x{name}")[:_LONGEST_NAME]
 
 
-def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:
-    """Write the figures of the images and materials as PNG; return the files."""
-    paths = []
-    for name, data in figures(ReportContext.of_products(products)).items():
-        paths.append(folder / f"{name}.png")
-        write_atomically(paths[-1], data)
-    return paths
-
-
 _FOLDER = "export"
 
 
@@ -255,7 +244,7 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
         raise ConfigError(
             "nothing to export",
             "no format was given",
-            "add one or more of --hdf5, --netcdf, --zarr, --mat, --png, --csv, --cphd",
+            "add one or more of --hdf5, --netcdf, --zarr, --mat, --csv, --cphd",
             code=ErrorCode.KEY_MISSING,
         )
     products = read_products(folder)
@@ -270,9 +259,6 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
     for kind in formats:
         sys.stderr.write(f"writing {kind} ...\n")
         sys.stderr.flush()
-        if kind == "png":
-            _print(write_pngs(out, products))
-            continue
         writer, name = {
             "hdf5": (write_hdf5, "image.h5"),
             "netcdf": (lambda path, saved: write_netcdf(path, full_dataset(ProcessedScan(saved.folder))), "image.nc"),
@@ -281,10 +267,6 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
             "csv": (write_csv, "materials.csv"),
         }[kind]
         writer(out / name, products)
-        _print([out / name])
+        sys.stdout.write(f"{out / name}\n")
+        sys.stdout.flush()
     return 0
-
-
-def _print(paths: list[Path]) -> None:
-    sys.stdout.write("".join(f"{path}\n" for path in paths))
-    sys.stdout.flush()

@@ -26,19 +26,7 @@ KINDS = ("scan", "process", "export", "doctor", "train")
 
 @dataclass(frozen=True)
 class Program:
-    """A program that was started.
-
-    Attributes
-    ----------
-    kind
-        One of `KINDS`.
-    running
-        True while its process exists.
-    status
-        Its exit status; None while it runs, or if it was killed.
-    words
-        Its command line, from `polysight` on.
-    """
+    """A program that was started: its exit status is None while it runs, and if it was killed."""
 
     kind: str
     running: bool

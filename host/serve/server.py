@@ -35,17 +35,7 @@ _END_S = 1  # to close connections
 
 @dataclass(frozen=True)
 class Place:
-    """Address of a server.
-
-    Attributes
-    ----------
-    host, port
-        To bind; port 0: any that is free.
-    hosts
-        Further names that it answers to.
-    certificate, key
-        PEM files of TLS; None: plain HTTP.
-    """
+    """Address of a server: port 0 is any that is free, `hosts` are further names, `certificate` and `key` PEM files."""
 
     host: str = "127.0.0.1"
     port: int = 8080

@@ -36,18 +36,7 @@ T = TypeVar("T")
 class Site:
     """Shared state of the requests to one server.
 
-    Parameters
-    ----------
-    scans
-        The scans that are shown.
-    access
-        Access rules.
-    watches
-        Live views.
-    programs
-        Starts programs; None: nothing can be started.
-    config
-        Rig file of new scans; None: there is none.
+    Without `programs` nothing can be started; `config` is the rig file of new scans.
     """
 
     def __init__(

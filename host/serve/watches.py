@@ -22,12 +22,7 @@ _ALIVE_S = 2.0  # a page that receives nothing for some of these reconnects
 class Watches:
     """Opens a watch when a page asks for a scan, and closes it some time after the last page has disconnected.
 
-    Parameters
-    ----------
-    control
-        True if scans may be controlled.
-    kept
-        Watches that stay open, by name.
+    `control`: scans may be controlled; `kept`: watches that stay open, by name.
     """
 
     def __init__(self, control: bool, kept: dict[str, Watch] | None = None) -> None:

@@ -157,20 +157,10 @@ def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Reason]:
 
 
 def metal_reasons(patch: str, enough: bool, sure: bool, given: bool, against: bool, alone: bool) -> list[Reason]:
-    """Judge the metal reference: confirmed by the scene, given by the user, or neither.
+    """Judge the metal reference `patch` ("patch 3"): confirmed by the scene, given by the user, or neither.
 
-    Parameters
-    ----------
-    patch
-        Its name, e.g. "patch 3".
-    enough, sure
-        The rest of the scene shows that it is metal; and with certainty.
-    given
-        The user chose it.
-    against
-        The scene contradicts it.
-    alone
-        No other patch gives evidence.
+    The rest of the scene shows that it is metal (`enough`), with certainty (`sure`), contradicts it (`against`), or has
+    no other patch that gives evidence (`alone`). `given`: the user chose it.
     """
     give = "lay a metal plate into the scene and name it (--metal X,Y,W,H), or use `polysight calibrate metal`"
     if given and against:

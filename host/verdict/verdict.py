@@ -92,14 +92,17 @@ def verdict_of(reasons: Iterable[Reason]) -> Verdict:
 
 
 def read_verdict(content: Mapping[str, Any]) -> Verdict | None:
-    """Read the verdict in the content of quality.json or materials.json; None if there is none."""
+    """Read the verdict in the content of quality.json or materials.json; None without one of a known level."""
     raw = content.get("verdict")
-    if not isinstance(raw, Mapping) or raw.get("level") not in LEVELS:
+    if not isinstance(raw, Mapping):
         return None
-    level: Level = raw["level"]
+    levels: list[Level] = [level for level in LEVELS if level == raw.get("level")]
+    if not levels:
+        return None
+    listed = raw.get("reasons")
     reasons = [
-        Reason(level, str(r.get("what", "")), str(r.get("why", "")), str(r.get("do", "")))
-        for r in raw.get("reasons") or ()
+        Reason(levels[0], str(r.get("what", "")), str(r.get("why", "")), str(r.get("do", "")))
+        for r in (listed if isinstance(listed, list) else [])
         if isinstance(r, Mapping)
     ]
-    return Verdict(level, tuple(reasons))
+    return Verdict(levels[0], tuple(reasons))

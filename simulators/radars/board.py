@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from enum import Enum
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
 from polysight.simulators.radars.cores import ERASE_S, FRAME_END, RF_FAULT, Cores
 from polysight.simulators.radars.wire import EVENT, NACK, READY, RESPONSE, TO_DEVICE, frame, ones_sum
@@ -232,7 +233,9 @@ class RadarBoard:
 
     def _check(self) -> None:
         if not self.plugged:
-            raise DeviceError("the simulated radar is unplugged", "a test unplugged it", "plug it in")
+            raise DeviceError(
+                "the simulated radar is unplugged", "a test unplugged it", "plug it in", code=ErrorCode.NO_ANSWER
+            )
 
     def _deliver(self) -> None:
         for at, raw in sorted(self._later, key=lambda p: p[0]):

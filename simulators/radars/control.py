@@ -83,7 +83,7 @@ class UsbChip:
 
     def _check(self) -> None:
         if not self._board.plugged:
-            raise DeviceError("no such USB device", "it was unplugged", "plug it in")
+            raise DeviceError("no such USB device", "it was unplugged", "plug it in", code=ErrorCode.NO_ANSWER)
 
     def _spi(self, data: bytearray) -> int:
         code = data[0]

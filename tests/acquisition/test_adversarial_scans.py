@@ -6,6 +6,7 @@ Real receivers over sockets, retakes, rows kept incomplete, resumes. `--long` ta
 from __future__ import annotations
 
 import random
+import time
 from pathlib import Path
 
 import msgspec
@@ -15,10 +16,48 @@ import pytest
 from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.store import ScanFolder, place_again
 from polysight.host.store.validation import validate
+from polysight.shared.config import Board
 from polysight.shared.errors import ScanError
-from tests.support.acquisition.adversarial_card import AdversarialCard
-from tests.support.acquisition.fake_cards import payload_of
+from polysight.simulators.cards import KINDS, Adversary, Arrival
+from tests.support.acquisition.fake_cards import FakeCard, payload_of
 from tests.support.acquisition.fake_rig import FakeRig, small_instrument
+
+NETWORK = tuple(kind for kind in KINDS if kind != "clock")  # the kernel's clock is its own
+
+
+class AdversarialCard(FakeCard):
+    """Sends rows through drawn troubles; what is late comes before, between or behind the packets of later rows."""
+
+    def __init__(self, board: Board, row_bytes: int, frame_bytes: int, chance: random.Random) -> None:
+        self._chance, self._frame = chance, frame_bytes
+        self.rate = 0.5  # of records with troubles
+        self.adversary = Adversary(chance, frame_bytes)
+        self.sent: list[tuple[int, int, tuple[str, ...]]] = []
+        super().__init__(board, row_bytes)
+
+    def send_row(self, row: int, take: int) -> None:
+        if not self.recording:
+            return
+        troubled = self._chance.random() < self.rate
+        troubles = tuple(self._chance.sample(NETWORK, self._chance.randint(1, 3))) if troubled else ()
+        sent = self.adversary.record(
+            self.row_bytes // self._frame, troubles, payload_of(self.board.name, row, self.row_bytes)
+        )
+        self.sent.append((row, take, troubles))
+        self._send(sent.arrivals)
+        self.report_status()
+
+    def _send(self, arrivals: list[Arrival]) -> None:
+        for k, arrival in enumerate(arrivals):
+            if k % 100 == 99:
+                time.sleep(0.002)
+            self.out.sendto(arrival.packet, (self.board.host_address, self.board.data_port))
+
+    def _command(self, code: int, sender: tuple[str, int]) -> None:
+        super()._command(code, sender)
+        if code in (5, 6):  # before the row runs; after its stop
+            self._send(self.adversary.take_late(0.3))
+
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 GRIDS = [(3, 3), (91, 1), (7, 4)]  # points, pulses; 91 ends in a full packet
@@ -51,7 +90,7 @@ def check(folder: Path, rig: FakeRig, incomplete: list[int]) -> None:
             assert again.moved or again.placed.missing == again.missing
 
 
-def test_committed_bytes_are_right_or_masked(request: pytest.FixtureRequest, tmp_path):
+def test_committed_bytes_are_right_or_masked(request, tmp_path):
     for number in range(100 if request.config.getoption("--long") else 3):
         rig, folder = adversarial_rig(number), tmp_path / str(number)
         try:

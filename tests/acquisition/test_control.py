@@ -1,4 +1,4 @@
-"""Wishes from outside the scan's terminal: heard once, never by surprise later, and never at the scan's cost."""
+"""Commands from other programs to a running scan: obeyed once, never by a later scan, and never at the scan's cost."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.host.store.validation import validate
 from polysight.shared.error_codes import ErrorCode
-from tests.support.page.live_view import open_desk
+from tests.support.page.live_view import open_control
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
 from tests.support.store.small_scan import SmallScan
 
 
 @pytest.fixture
-def desk(tmp_path):
-    """A desk that is open for the folder of the test."""
-    with open_desk(tmp_path) as stop:
+def control(tmp_path):
+    """Folder of a scan that takes commands, and its stop request."""
+    with open_control(tmp_path) as stop:
         yield tmp_path, stop
 
 
-def test_commands_are_obeyed_once(desk):
-    folder, stop = desk
+def test_commands_are_obeyed_once(control):
+    folder, stop = control
     send_command(folder, ScanCommand.PAUSE)
     assert stop.paused
     send_command(folder, ScanCommand.CONTINUE)
@@ -49,28 +49,28 @@ def test_commands_are_obeyed_once(desk):
     assert stop.now
 
 
-def test_a_shell_s_touch_is_a_wish(desk):
-    folder, stop = desk
+def test_touch_in_a_shell_is_a_command(control):
+    folder, stop = control
     (folder / CONTROL / "pause").touch()
     wait_for(lambda: stop.paused, "the pause")
 
 
-def test_signs_of_life_go_on_and_the_folder_goes_with_the_desk(tmp_path):
+def test_alive_is_touched_again_and_the_folder_is_removed_at_the_end(tmp_path):
     assert last_alive_s(tmp_path) is None
-    with ControlFolder(tmp_path, StopRequest()) as desk:
-        desk.open()
-        desk.open()
-        wait_for(lambda: last_alive_s(tmp_path), "the first sign")
+    with ControlFolder(tmp_path, StopRequest()) as control:
+        control.open()
+        control.open()
+        wait_for(lambda: last_alive_s(tmp_path), "the first touch")
         first = last_alive_s(tmp_path)
-        wait_for(lambda: last_alive_s(tmp_path) != first, "the next sign")
+        wait_for(lambda: last_alive_s(tmp_path) != first, "the next touch")
     assert not (tmp_path / CONTROL).exists()
 
 
 def test_commands_for_an_earlier_scan_are_deleted(tmp_path):
     (tmp_path / CONTROL).mkdir()
-    for wish in ScanCommand:
-        (tmp_path / CONTROL / wish).touch()
-    with open_desk(tmp_path) as stop:
+    for command in ScanCommand:
+        (tmp_path / CONTROL / command).touch()
+    with open_control(tmp_path) as stop:
         send_command(tmp_path, ScanCommand.CONTINUE)
     assert (stop.after_row, stop.paused) == (False, False)
 
@@ -94,8 +94,8 @@ def test_command_that_is_not_accepted_is_withdrawn(tmp_path):
 
 
 def test_a_folder_that_cannot_be_written_costs_the_scan_nothing(tmp_path):
-    with ControlFolder(tmp_path / "not" / "there", StopRequest()) as desk:
-        desk.open()
+    with ControlFolder(tmp_path / "not" / "there", StopRequest()) as control:
+        control.open()
         with refused(ErrorCode.NO_ANSWER):
             send_command(tmp_path / "not" / "there", ScanCommand.PAUSE)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+
 import msgspec
 import pytest
 
@@ -9,10 +12,53 @@ from polysight.host.acquisition.capture_rig import CaptureRig
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.capture.dca1000 import Code
 from polysight.host.store.validation import validate
-from tests.support.acquisition.fake_cards import FULL, LateCard
+from polysight.shared.config import Board
+from tests.support.acquisition.fake_cards import FULL, FakeCard, payload_of
 from tests.support.acquisition.fake_rig import FakeRig
 
+TAIL_S = 0.6  # from the last data to the short last packet; 2 s of a real card
 CONFIGURE = int(Code.CONFIGURE_FPGA)
+
+
+class LateCard(FakeCard):
+    """A card that keeps a row's last short packet for a while, as the real one does, or until the record's stop.
+
+    Sends full packets at once; the rest and the status `TAIL_S` later, or `lag_s` after the reply to a stop.
+    """
+
+    def __init__(self, board: Board, row_bytes: int, lag_s: float) -> None:
+        self._lag_s, self._record = lag_s, 0  # number of the record
+        self._tail: tuple[int, bytes] | None = None  # of which record, and what
+        self._lock = threading.Lock()
+        self.cut: dict[tuple[int, int], int] = {}  # (row, take): so many bytes are all that come
+        super().__init__(board, row_bytes)
+
+    def send_row(self, row: int, take: int) -> None:
+        if not self.recording:
+            return
+        data = payload_of(self.board.name, row, self.row_bytes)[: self.cut.get((row, take), self.row_bytes)]
+        whole = len(data) // FULL * FULL
+        for a in range(0, whole, FULL):
+            self._rest = data[a : a + FULL]
+            self._send_packet(FULL)
+        self._tail = self._record, data[whole:]
+        threading.Timer(TAIL_S, self._finish, [self._record]).start()
+
+    def _finish(self, record: int) -> None:
+        with self._lock:
+            if self._tail is None or self._tail[0] != record:
+                return
+            self._rest, self._tail = self._tail[1], None
+            self.recording = False
+            self.end_frames()
+
+    def _command(self, code: int, sender: tuple[str, int]) -> None:
+        recorded = self.recording
+        self._record += code == 5
+        super()._command(code, sender)
+        if code == 6 and recorded:
+            time.sleep(self._lag_s)
+            self._finish(self._record)
 
 
 @pytest.mark.parametrize("lag_ms", [0, 5, 30])

@@ -175,6 +175,7 @@ class Native(RadarControl):
 
     def __init__(self, *script: RadarState) -> None:
         self._script, self.armed, self.closed = script, [], False
+        self.waiting: dict[int, list[str]] = {}  # boards that still wait after the pulses of an arming, from 1
 
     def arm(self, frames: int) -> None:
         self.armed.append(frames)
@@ -182,6 +183,10 @@ class Native(RadarControl):
     def states(self) -> dict[str, BoardState]:
         state = self._script[min(len(self.armed), len(self._script)) - 1]
         return {"RH": BoardState(state, "RF core fault 7"), "RV": BoardState(RadarState.ARMED)}
+
+    def wait_done(self, timeout_s: float) -> list[str]:
+        del timeout_s
+        return self.waiting.get(len(self.armed), [])
 
     def close(self) -> None:
         self.closed = True
@@ -226,6 +231,16 @@ def test_radar_that_faults_within_a_row_ends_it_at_once(rig, tmp_path):
     assert (result.exit_status, result.retakes) == ("success", 1)
     assert "aborting" in seen
     assert any("RF core fault 7" in r for r in reasons(result.folder))
+
+
+def test_radar_that_missed_a_pulse_has_its_row_taken_again(rig, tmp_path):
+    """Also the transmitter, of which nothing is recorded."""
+    radars = Native(RadarState.ARMED)
+    radars.waiting = {2: ["LS"]}
+    result = run_scan(rig.instrument, tmp_path / "s", radars=radars)
+    assert (result.exit_status, result.retakes) == ("success", 1)
+    (fact,) = result.folder.facts("row_rejected")
+    assert (fact["row"], fact["faults"]) == (1, [{"kind": "radar_waits", "board": "LS"}])
 
 
 def test_board_that_sends_nothing_ends_the_row_before_its_end(rig, tmp_path):

@@ -172,7 +172,7 @@ def test_held_row_that_is_whole_counts_with_a_note(rig, tmp_path):
 
 
 def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
-    monkeypatch.setattr(row, "row_limit_s", lambda *_: 3.0)  # of every row
+    monkeypatch.setattr(row, "row_limit_s", lambda _, held: 0.5 if held.index == 1 else 60.0)
     rig.pi.hang_at = {1}
     answer = []
 
@@ -181,7 +181,7 @@ def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
             rig.pi.state = "held"
         if p.phase == "held":
             answer.append(time.monotonic())
-            threading.Timer(4.0, end).start()
+            threading.Timer(1.0, end).start()
 
     def end() -> None:
         rig.pi.hang_at = set()

@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 
 from polysight.host.cli.main import main
-from polysight.shared.config import load_instrument
 from polysight.simulators.scene import decode_scene, simulate
 from tests.support.products import unrendered
+from tests.support.rigs import published_rig
+from tests.support.scenes import scene_of
 
 REPO = Path(__file__).resolve().parents[2]
 COPPER = {"name": "copper", "centre_mm": [-45.0, 0.0], "size_mm": [45.0, 45.0], "metal": True}
@@ -22,16 +23,10 @@ PET = {"name": "PET", "centre_mm": [45.0, 0.0], "size_mm": [45.0, 45.0], "permit
 
 def simulated(folder: Path, *plates: dict[str, Any], **more: Any) -> Path:
     """A scan of plates on the grid of examples/own-scene.toml, of nothing on a coarse one; `more` as of `simulate`."""
-    fine, coarse = (31, 27, 10.0, 6.0), (15, 17, 14.0, 8.0)
-    grid = dict(zip(("columns", "rows", "step_x_mm", "step_y_mm"), fine if plates else coarse, strict=True))
-    scene = {
-        "name": "small",
-        "grid": grid,
-        "burst": {"pulses": 2},
-        "image": {"columns": 90, "rows": 60, "pixel_mm": 2.0},
-        "plates": list(plates),
-    }
-    return simulate(load_instrument(REPO / "instrument.toml"), decode_scene(scene, "test"), folder, **more)
+    columns, rows, step_mm = (31, 27, (10.0, 6.0)) if plates else (15, 17, (14.0, 8.0))
+    image = {"columns": 90, "rows": 60, "pixel_mm": 2.0}
+    scene = scene_of(*plates, columns=columns, rows=rows, step_mm=step_mm, image=image)
+    return simulate(published_rig(), decode_scene(scene, "test"), folder, **more)
 
 
 def command(*words: object) -> None:

@@ -12,7 +12,7 @@ from polysight.host.imaging.geometry import Antennas
 from polysight.host.jobs.calibrate import with_places_of
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.geometry import specular_midpoint_m
-from tests.support.commands import told_by
+from tests.support.processes import output_of
 from tests.support.refusals import refused
 
 SHIFTS = {"RH": (1.5, -1.0, 0.8), "RV": (-1.2, 0.7, -1.4)}
@@ -55,7 +55,7 @@ def found(case, tmp_path_factory):
     folder, target, _, _ = case
     out = tmp_path_factory.mktemp("out") / "c"
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    shown = told_by("calibrate", "direct-path", folder, "--target", target, "--out", out)
+    shown = output_of("calibrate", "direct-path", folder, "--target", target, "--out", out)
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before  # the scan is not touched
     return shown, next(out.iterdir())
 

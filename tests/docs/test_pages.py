@@ -9,6 +9,8 @@ import numpy as np
 
 from docs.check.looking import page_faults
 from docs.check.pages import ROOT, all_pages, read_page
+from polysight.host.acquisition import ScanCommand
+from polysight.host.cli.serve import SCAN_COMMANDS
 from polysight.host.materials import check_labels, read_labels
 from polysight.host.radar.usb import PRODUCT, VENDOR
 from polysight.host.verdict import NoResult
@@ -35,6 +37,12 @@ def test_fault_numbers_and_exit_statuses_are_told():
     kinds = {PolysightError, NoResult, *PolysightError.__subclasses__()}
     answer = set(map(int, re.findall(r"^\| (\d+) \|", text.split("## Messages")[0], re.MULTILINE)))
     assert {kind.exit_status for kind in kinds} | {0, 130} == answer
+
+
+def test_every_request_to_a_scan_is_told():
+    page = (ROOT / "docs/how-to/live-view.md").read_text(encoding="utf-8")
+    assert all(f"control/{command}" in page for command in ScanCommand)
+    assert list(ScanCommand) == [*SCAN_COMMANDS]
 
 
 def test_the_drawing_shows_the_rig_file_and_the_sketch():

@@ -14,14 +14,15 @@ import pytest
 from polysight.host.catalogue import PROGRAM
 from polysight.host.serve.programs import program_of
 from polysight.host.store import ScanFolder, validate
-from tests.support.page.chromium import DESK, PHONE, Browser, find_chromium
+from tests.support.page.chromium import DESK, PHONE, Browser
+from tests.support.page.fixtures import browser
 from tests.support.processes import Program
 from tests.support.scenes import small_scene
 from tests.support.simulated_rig import Rig, running
 
 ROWS = 40
 SCENE = small_scene(10, ROWS, step_mm=(10.0, 5.0))
-LIMIT_S = 120.0
+__all__ = ["browser"]
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rig")]
 
 
@@ -45,44 +46,35 @@ class Lab:
 
     def open(self, path: str, size: tuple[int, int, bool] = DESK) -> None:
         """Go to a page with the token."""
-        self.browser.size(*size)
-        self.browser.open("about:blank")
-        self.browser.wait("location.href == 'about:blank'", "an empty page")
-        self.browser.errors.clear()
-        self.browser.open(f"{self.address}{path}#token={self.token}")
+        self.browser.visit(f"{self.address}{path}#token={self.token}", size)
         self.browser.wait("document.querySelector('.bar nav a')", "the page")
 
     def fill(self, **values: Any) -> None:
         """Type into fields, as a person does."""
         for field, value in values.items():
-            self.browser.value(
-                f"(() => {{ const f = document.getElementById('{field}'); f.value = {json.dumps(str(value))};"
-                " f.dispatchEvent(new Event('input', {bubbles: true})); })()"
-            )
+            self.browser.fill(f"#{field}", str(value))
 
     def click(self, element: str) -> None:
         """Press a button that is there."""
-        self.browser.wait(f"document.getElementById('{element}')?.checkVisibility()", f"the button {element}", LIMIT_S)
-        self.browser.wait(f"!document.getElementById('{element}').disabled", f"that {element} can be pressed", LIMIT_S)
-        self.browser.value(f"document.getElementById('{element}').click()")
+        self.browser.click(f"#{element}")
 
     def start(self, name: str, **changes: Any) -> Path:
         """Start a scan from the page; its folder."""
         self.open("/new")
-        self.browser.wait("document.querySelector('.time')", "the plan", LIMIT_S)
+        self.browser.wait("document.querySelector('.time')", "the plan")
         self.fill(name=name, **changes)
         self.click("start")
         there = "location.pathname == '/watch' && document.getElementById('headline')"
-        self.browser.wait(there, "the live view", LIMIT_S)
+        self.browser.wait(there, "the live view")
         return self.scans / name
 
     def wait_headline(self, text: str) -> None:
         """Until the live view says so."""
-        self.browser.wait(f"document.getElementById('headline')?.innerText == {json.dumps(text)}", text, LIMIT_S)
+        self.browser.wait(f"document.getElementById('headline')?.innerText == {json.dumps(text)}", text)
 
     def wait_rows(self, folder: Path, rows: int) -> None:
         """Until so many rows are committed, on the page and on the disk."""
-        self.browser.wait(f"parseInt(document.getElementById('count')?.innerText) >= {rows}", f"{rows} rows", LIMIT_S)
+        self.browser.wait(f"parseInt(document.getElementById('count')?.innerText) >= {rows}", f"{rows} rows")
         assert len(ScanFolder.load(folder).committed()) >= rows
 
     def ended(self, folder: Path) -> None:
@@ -99,25 +91,22 @@ def _program(folder: Path) -> Any:
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
-    if find_chromium() is None:
-        pytest.skip("no chromium here: sudo apt-get install chromium")
-    folder = tmp_path_factory.mktemp("lab")
-    with Browser(tmp_path_factory.mktemp("browser")) as browser, running(folder, time_scale=3.0, scene=SCENE) as rig:
+def lab(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Lab]:
+    with running(tmp_path_factory.mktemp("lab"), time_scale=3.0, scene=SCENE) as rig:
         yield Lab(rig, browser)
 
 
 def test_a_scan_is_planned_started_and_shown(lab):
     lab.open("/new")
-    lab.browser.wait("document.querySelector('.time')", "the plan", LIMIT_S)
+    lab.browser.wait("document.querySelector('.time')", "the plan")
     whole = lab.browser.value("document.querySelector('.time').innerText")
     lab.fill(rows=5)
     lab.browser.wait(f"document.querySelector('.time')?.innerText != {json.dumps(whole)}", "the plan of five rows")
     lab.fill(columns=1999)
-    lab.browser.wait("document.getElementById('start').disabled", "that too long rows are refused", LIMIT_S)
+    lab.browser.wait("document.getElementById('start').disabled", "that too long rows are refused")
     assert "travel" in lab.browser.text("forecast")
     folder = lab.start("first", rows=5, notes="the first one", tags="new, oak")
-    lab.browser.wait("document.getElementById('count')?.innerText == '5 of 5 rows'", "all rows", LIMIT_S)
+    lab.browser.wait("document.getElementById('count')?.innerText == '5 of 5 rows'", "all rows")
     lab.click("to-result")
     lab.browser.wait("location.pathname == '/scan'", "the result")
     lab.ended(folder)
@@ -158,7 +147,7 @@ def test_a_scan_outlives_its_server_and_the_next_one_finds_it(lab):
     lab.wait_rows(folder, 1)
     before = json.loads((folder / PROGRAM / "scan.json").read_text())
     lab.server.kill()
-    lab.browser.wait("document.body.classList.contains('lost')", "that the page says so", LIMIT_S)
+    lab.browser.wait("document.body.classList.contains('lost')", "that the page says so")
     rows = len(ScanFolder.load(folder).committed())
     lab.rig.wait_for(lambda: len(ScanFolder.load(folder).committed()) > rows, "rows without a server")
     lab.serve()
@@ -182,11 +171,12 @@ def test_a_scan_has_the_priority_of_a_terminals_not_of_the_servers(lab):
         Path(f"/proc/{pid}/oom_score_adj").read_text().strip() == Path("/proc/self/oom_score_adj").read_text().strip()
     )
     lab.open("/new")  # one rig, one scan
-    lab.browser.wait("document.querySelector('.time')", "the plan", LIMIT_S)
+    lab.browser.wait("document.querySelector('.time')", "the plan")
     lab.fill(name="fifth")
     lab.click("start")
     lab.browser.wait(
-        "document.getElementById('told').innerText.includes('fourth is being scanned')", "the refusal", LIMIT_S
+        "document.getElementById('told').innerText.includes('fourth is being scanned')",
+        "the refusal",
     )
     assert not (lab.scans / "fifth").exists()
     lab.browser.errors.clear()  # the refused request
@@ -199,15 +189,15 @@ def test_a_scan_has_the_priority_of_a_terminals_not_of_the_servers(lab):
 def test_the_doctor_is_shown_as_it_looks(lab):
     lab.open("/new")
     lab.click("doctor")
-    lab.browser.wait("document.querySelectorAll('#findings li').length > 10", "the first findings", LIMIT_S)
-    lab.browser.wait("/\\d+ ok/.test(document.getElementById('doctor-told').innerText)", "its end", LIMIT_S)
+    lab.browser.wait("document.querySelectorAll('#findings li').length > 10", "the first findings")
+    lab.browser.wait("/\\d+ ok/.test(document.getElementById('doctor-told').innerText)", "its end")
     assert lab.browser.errors == []
 
 
 def test_a_scan_that_cannot_begin_says_why(lab):
     lab.rig.pi.end()
     folder = lab.start("sixth", rows=3)
-    lab.browser.wait("document.getElementById('program-log').innerText.includes('did not answer')", "why", LIMIT_S)
+    lab.browser.wait("document.getElementById('program-log').innerText.includes('did not answer')", "why")
     assert not (folder / "manifest.jsonl").exists()
     lab.rig.wait_for(lambda: not _program(folder).running, "the end of the program")
     assert _program(folder).status not in (0, None)

@@ -155,41 +155,6 @@ def test_folder_that_is_no_scan(bench, command):
     assert not (bench.folder / "out").exists()
 
 
-def test_torn_last_line_is_tolerated(bench, scan):
-    with (scan / "manifest.jsonl").open("ab") as f:
-        f.write(b'{"fact": "row_comm')
-    ended = bench.here("validate", scan)
-    assert (ended.status, ended.err) == (0, "")
-    assert "torn" in ended.out
-    assert bench.here("image", scan, "--out", "out").status == 0
-
-
-@pytest.mark.parametrize("content", [b"", b"junk\n" * 3, None])
-def test_damaged_first_line(bench, scan, content):
-    path = scan / "manifest.jsonl"
-    path.write_bytes(path.read_bytes().replace(b"scan_id", b"scan_ID", 1) if content is None else content)
-    refused(bench.here("process", scan, "--out", "out"), "manifest.jsonl", "scan_started", status=3)
-    refused(bench.here("resume", scan), "manifest.jsonl", "scan_started", status=3)
-    ended = bench.here("validate", scan)
-    assert (ended.status, ended.err) == (1, "")
-    assert "error: manifest.jsonl" in ended.out
-
-
-def test_truncated_and_deleted_rows(bench, scan):
-    row = scan / "raw" / "RH" / "0002.bin"
-    with row.open("r+b") as f:
-        f.truncate(1000)
-    refused(bench.here("process", scan, "--out", "out"), str(row), "1000 bytes", status=3)
-    ended = bench.here("validate", scan)
-    assert (ended.status, ended.err) == (1, "")
-    assert ended.out.count("error:") == 1
-    assert "raw/RH/0002.bin: 1000 bytes" in ended.out
-    shutil.rmtree(scan / "raw")
-    refused(bench.here("image", scan, "--out", "out"), str(scan / "raw"), status=3)
-    ended = bench.here("validate", scan)
-    assert (ended.status, ended.out.count("error:")) == (1, 8)
-
-
 def test_scan_without_a_row(bench, scan):
     path = scan / "manifest.jsonl"
     path.write_bytes(path.read_bytes().splitlines(keepends=True)[0])
@@ -227,25 +192,6 @@ def test_out_is_taken(bench, scan):
     assert list(mine.iterdir()) == [mine / "thesis.tex"]
     assert bench.here("image", scan, "--out", "out").status == 0
     assert bench.here("image", scan, "--out", "out").status == 0, "earlier products may be replaced"
-
-
-@pytest.mark.parametrize("name", ["empty.bin", "empty.pcap", "text.txt", "long-text.bin", "text.pcap", "head.pcap"])
-def test_inspect_what_is_no_recording(bench, name):
-    content = {
-        "empty": b"",
-        "text": b"hello\n",
-        "long-text": b"The quick brown fox jumps over the lazy dog.\n" * 2000,
-        "head": bytes.fromhex("d4c3b2a1020004000000000000000000ffff000001000000") + b"\0" * 7,
-    }
-    (bench.folder / name).write_bytes(content[name.partition(".")[0]])
-    refused(bench.here("inspect", name), name, status=3)
-
-
-def test_inspect_a_truncated_capture(bench):
-    if not CAPTURE.exists():
-        pytest.skip(f"{CAPTURE} is not here: the capture of a real card is not ours to publish")
-    (bench.folder / "cut.pcap").write_bytes(CAPTURE.read_bytes()[:5000])
-    refused(bench.here("inspect", "cut.pcap"), "cut.pcap", "truncated", status=3)
 
 
 # --- the Pi's side ----------------------------------------------------------------------------------------------------

@@ -15,8 +15,10 @@ from polysight.host.process import cores
 from polysight.host.process.request import ProcessRequest
 from polysight.host.products.files import FINISHED
 from polysight.shared.error_codes import ErrorCode
+from polysight.simulators.scene import decode_scene, simulate
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+from tests.support.scenes import scene_of
 
 WORKER = """
 import json, os, sys, time
@@ -112,18 +114,13 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
     assert not finished(job())
     process_many([job()], tmp_path / "out", 1)
     assert finished(job())
-    assert not finished(job(metal_box_mm=(0.0, 0.0, 1.0, 1.0)))
-    assert not finished(job(library=None))
-    assert not finished(job(config=None))
-    library.write_bytes(b"2")
-    assert not finished(job())
-    library.write_bytes(b"1")
-    assert finished(job())
-    rig.write_text("2")
-    assert not finished(job())
-    rig.write_text("1")
-    (folder / "0_0.bin").write_bytes(b"more")
-    assert not finished(job())
+    for change in ({"metal_box_mm": (0.0, 0.0, 1.0, 1.0)}, {"library": None}, {"config": None}):
+        assert not finished(job(**change)), change
+    for path in (library, rig, folder / "0_0.bin"):
+        before = path.read_bytes() if path.exists() else b""
+        path.write_bytes(b"2")
+        assert not finished(job()), path
+        path.write_bytes(before)
     (folder / "0_0.bin").unlink()
     assert finished(job())
     (tmp_path / "out" / "a" / "image.npz").unlink()
@@ -286,17 +283,9 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
 @pytest.mark.timeout(900)
 def test_real_scans_end_to_end(tmp_path, capsys):
     """A simulated scan and a damaged one by the real program; then the mark holds."""
-    from polysight.simulators.scene import decode_scene, simulate
-
-    rig = published_rig()
-    scene = {
-        "name": "plate",
-        "grid": {"columns": 13, "rows": 15, "step_x_mm": 16.0, "step_y_mm": 8.0},
-        "burst": {"pulses": 2},
-        "image": {"columns": 30, "rows": 30, "pixel_mm": 4.0},
-        "plates": [{"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "metal": True}],
-    }
-    simulate(rig, decode_scene(scene, "t"), tmp_path, layout="authors")
+    plate = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "metal": True}
+    scene = scene_of(plate, name="plate", columns=13, rows=15, image={"columns": 30, "rows": 30, "pixel_mm": 4.0})
+    simulate(published_rig(), decode_scene(scene, "t"), tmp_path, layout="authors")
     broken = tmp_path / "unsynced" / "broken"
     broken.mkdir()
     (broken / "data_collection_cfg.json").write_text("{")

@@ -41,6 +41,15 @@ def exported(scan: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out / FILE
 
 
+@pytest.fixture(scope="module")
+def pipeline(scan: Path) -> Pipeline:
+    """A pipeline with all rows of the scan."""
+    made = Pipeline(ScanFolder.load(scan))
+    for row in made.source.rows():
+        made.add_row(row)
+    return made
+
+
 def test_the_file_is_consistent_by_the_standards_own_checks(exported: Path) -> None:
     with exported.open("rb") as file:
         checker = CphdConsistency.from_file(file)
@@ -83,20 +92,14 @@ def image_of(file: Path, channels: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("channels", ["RH", "RV"])
-def test_another_processors_image_of_the_file_is_ours(exported: Path, scan: Path, channels: str) -> None:
-    pipeline = Pipeline(ScanFolder.load(scan))
-    for row in pipeline.source.rows():
-        pipeline.add_row(row)
+def test_another_processors_image_of_the_file_is_ours(exported: Path, pipeline: Pipeline, channels: str) -> None:
     images = pipeline.form_images()
     ours = {"RH": images.h_raw, "RV": images.v_raw}[channels]
     theirs = image_of(exported, channels)
     assert np.abs(theirs - ours).max() < 1e-4 * np.abs(ours).max()
 
 
-def test_positions_without_data_are_said_to_hold_no_signal(exported: Path, scan: Path) -> None:
-    pipeline = Pipeline(ScanFolder.load(scan))
-    for row in pipeline.source.rows():
-        pipeline.add_row(row)
+def test_positions_without_data_are_said_to_hold_no_signal(exported: Path, pipeline: Pipeline) -> None:
     with exported.open("rb") as file, sarkit.cphd.Reader(file) as reader:
         for board in ("RH", "RV"):
             signal, vectors = reader.read_channel(f"{board}-1")

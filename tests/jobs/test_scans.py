@@ -11,7 +11,7 @@ import pytest
 from polysight.host.catalogue import Notes, read_notes
 from polysight.host.cli.main import main
 from polysight.simulators.scene import load_scene, simulate
-from tests.support.page.live_view import open_desk
+from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
@@ -62,7 +62,7 @@ def test_names_and_tags_reach_the_terminal_without_control_and_direction_marks(r
 
 
 def test_a_running_scan_is_asked(root, capsys):
-    with open_desk(root / "one") as stop:
+    with open_control(root / "one") as stop:
         assert "pause" in answer(capsys, "ask", root / "one", "pause")
         assert stop.paused
     assert main(["ask", str(root / "one"), "pause"]) == 6

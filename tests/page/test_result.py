@@ -43,11 +43,8 @@ def test_the_page_shows_it(browser, finished, watching, tmp_path):
     assert watch.wait_for(lambda s: bool(s.get("verdict")), LIMIT_S)
     with served(watch) as view:
         for size in (DESK, PHONE):
-            browser.size(*size)
-            browser.open(view.address + "/")
+            browser.visit(view.address + "/", size)
             browser.wait("document.getElementById('result-level')?.textContent.length > 0", "the verdict")
             assert browser.text("result-level") == "no result"
             assert REASON["do"] in browser.text("reasons")
-            assert browser.value("document.documentElement.scrollWidth <= innerWidth")
-        browser.size(*DESK)
-        browser.screenshot(tmp_path / "page.png")
+            browser.check_whole(view.address)

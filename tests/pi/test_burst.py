@@ -17,7 +17,7 @@ from polysight.pi_controller.trigger import (
 )
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import MIN_PERIOD_NS
-from tests.support.pi.fake_lines import FakeLines, gone
+from tests.support.pi.fakes import FakeLines, gone
 
 PERIOD = 1_500_000
 SPEC = BurstSpec(16, PERIOD, 1000)

@@ -12,7 +12,7 @@ from polysight.pi_controller.cli import main
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 from polysight.simulators.loopback import on_free_subnet
-from tests.support.pi.fake_lines import FakeLines
+from tests.support.pi.fakes import FakeLines
 from tests.support.pi.program import Process
 from tests.support.rigs import at_stage_port
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.paths import REPO
+from tests.support.paths import REPO, RIG_FILE
 from tests.support.rigs import published_rig
 
 PI = REPO / "pi_controller"
@@ -138,7 +138,7 @@ def install(bench, tmp_path):
     copied = tmp_path / "copied"
     shutil.copytree(PI, copied)
     (copied / "a.whl").touch()
-    shutil.copy(REPO / "instrument.toml", copied)
+    shutil.copy(RIG_FILE, copied)
 
     def install(*args):
         return subprocess.run(
@@ -159,7 +159,7 @@ def bench(tmp_path):
     (tmp_path / "installed").touch()
     return {
         **os.environ, "PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}", "LOG": str(tmp_path / "log"),
-        "PIP": str(tmp_path / "bin/pip"), "ROOT": str(tmp_path / "root"), "PI_HOME": str(tmp_path / "home"),
+        "PIP": str(tmp_path / "bin/pip"), "REPO": str(tmp_path / "root"), "PI_HOME": str(tmp_path / "home"),
     }  # fmt: skip
 
 

@@ -21,8 +21,7 @@ from polysight.shared.faults import PiFault, StageError
 from polysight.shared.raster import Row
 from polysight.shared.stage_line import Immediate, Reply
 from tests.support.paths import REPO
-from tests.support.pi.fake_driver import FakeDriver
-from tests.support.pi.fake_lines import FakeLines
+from tests.support.pi.fakes import FakeDriver, FakeLines
 
 SPEC = BurstSpec(2, 1_500_000, 1000)
 ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)

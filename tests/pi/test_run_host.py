@@ -19,8 +19,7 @@ from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import RasterPlan
 from polysight.shared.stage_line import Reply
-from tests.support.pi.fake_driver import FakeDriver
-from tests.support.pi.fake_lines import FakeLines
+from tests.support.pi.fakes import FakeDriver, FakeLines
 
 HEARTBEAT_S = 0.1
 LIMIT_S = 4 * HEARTBEAT_S

@@ -218,14 +218,6 @@ def test_lost_and_damaged_lines_do_not_matter(pi, stage):
     assert stage.rows_run == 1
 
 
-def test_wires_that_break_are_the_trigger_line_lost(host_in_row, pi):
-    host = host_in_row
-    pi.service._loop._lines._client._socket.shutdown(2)
-    done = host.wait(m.RowFinished)
-    assert (done.status, done.fault) == ("fault", PiFault.TRIGGER_LINE_LOST)
-    assert host.refused(m.Home()) == PiFault.TRIGGER_LINE_LOST
-
-
 def test_replay_from_any_sequence(host):
     host.row(0)
     everything = host.journalled

@@ -47,6 +47,13 @@ def test_a_plan_that_is_impossible_fails(options, status):
     assert main(["plan", *RIG, *options]) == status
 
 
+@pytest.mark.parametrize("option", [("--snr-db", "nan"), ("--row-overhead-s", "-1"), ("--scene-mm", "170,inf")])
+def test_a_value_that_is_no_quantity_is_a_usage_error(option):
+    with pytest.raises(SystemExit) as e:
+        main(["plan", *RIG, *option])
+    assert e.value.code == 2
+
+
 def test_the_lines_of_a_plan_make_the_rig_file_that_plan(capsys, tmp_path):
     """Inserted into the rig file as printed, they give the plan's own figures without any option."""
     asked = [*SMALL, "--accel-mm-s2", "345", "--object-distance-mm", "480", "--width-mm", "120"]

@@ -17,7 +17,7 @@ from polysight.host.polarimetry import (
 from polysight.host.polarimetry.leakage import PLATE
 from polysight.shared.error_codes import ErrorCode
 from polysight.simulators.scene import strips
-from tests.support.leakage import remaining
+from tests.support.calibration import remaining
 from tests.support.refusals import refused
 
 THETA = np.radians(55.0)

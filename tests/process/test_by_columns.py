@@ -8,9 +8,10 @@ import tomli_w
 
 from polysight.host.process import Options
 from polysight.host.store.sources.open import open_source
+from polysight.shared.files import read_json
 from polysight.shared.tables import to_builtins
-from tests.support.commands import content, told_by
 from tests.support.pipelines import pipeline_of
+from tests.support.processes import output_of
 from tests.support.rigs import rig_with
 from tests.support.scenes import COPPER, PET, scene_of
 
@@ -40,18 +41,18 @@ def test_sub_bands_have_the_pixels_of_the_whole_band(scan, tmp_path):
     # scan.json contains the rig of the images: rows along x, as in the rig file.
     pipeline.finish(tmp_path, Options(model="none", metal_box_mm=(-55.0, -5.0, -25.0, 25.0)))
     assert grid_written(tmp_path) == (COLUMNS, ROWS)
-    bands = [s["bands"] for s in content(tmp_path / "materials.json")["segments"]]
+    bands = [s["bands"] for s in read_json(tmp_path / "materials.json")["segments"]]
     assert bands
     assert all(len(b) == BANDS for b in bands)
 
 
 def test_the_image_command_writes_the_same_rig(scan, tmp_path):
     (tmp_path / "rig.toml").write_bytes(tomli_w.dumps(to_builtins(RIG)).encode())
-    told_by("image", scan, "--config", tmp_path / "rig.toml", "--out", tmp_path / "out")
+    output_of("image", scan, "--config", tmp_path / "rig.toml", "--out", tmp_path / "out")
     assert grid_written(tmp_path / "out") == (COLUMNS, ROWS)
 
 
 def grid_written(out) -> tuple[int, int]:
-    rig = content(out / "scan.json")["instrument"]
+    rig = read_json(out / "scan.json")["instrument"]
     assert (rig["image"]["columns"], rig["image"]["rows"]) == (IMAGE["columns"], IMAGE["rows"])
     return rig["grid"]["columns"], rig["grid"]["rows"]

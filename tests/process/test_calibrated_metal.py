@@ -11,7 +11,8 @@ from polysight.host.calibration.files import SourceScan, write_metal
 from polysight.host.jobs.calibrate import load_reference
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST
-from tests.support.commands import content, told_by
+from polysight.shared.files import read_json
+from tests.support.processes import output_of
 from tests.support.scenes import EVERYWHERE, scene_of
 
 SCENE = scene_of(EVERYWHERE, columns=10, rows=8) | {"image": {"columns": 24, "rows": 24, "pixel_mm": 4.0}}
@@ -30,7 +31,7 @@ def products(scan_of, tmp_path_factory):
     facts = manifest.read(scan / MANIFEST).facts
     facts[0]["instrument"]["calibration"] = {"metal": str(path)}
     (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
-    told_by("process", scan, "--out", folder / "out", "--model", "none")
+    output_of("process", scan, "--out", folder / "out", "--model", "none")
     return folder / "out", known, gains, path
 
 
@@ -43,6 +44,6 @@ def test_each_pixel_is_divided_by_its_own_gain_where_that_is_known(products):
     assert np.abs(gains[valid] - 1).max() > 0.4
     # What is left: noise, smoothing, and leakage that is not metal's any more.
     np.testing.assert_allclose((p * gains)[valid], 1.0, atol=0.08)
-    quality = content(out / "quality.json")
+    quality = read_json(out / "quality.json")
     assert quality["calibration"]["metal"]["file"] == str(path)
     assert quality["metal_reference"]["share_of_plane"] == pytest.approx(known.mean(), abs=1e-4)

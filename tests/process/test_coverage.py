@@ -12,8 +12,9 @@ from polysight.host.report.context import ReportContext
 from polysight.host.report.tables import masked_positions
 from polysight.host.store import RowData, ScanFolder
 from polysight.host.store.scan_folder import MANIFEST
-from tests.support.commands import content, told_by
+from polysight.shared.files import read_json
 from tests.support.pipelines import pipeline_of
+from tests.support.processes import output_of
 from tests.support.scenes import EVERYWHERE, scene_of
 
 METAL = "-40,10,30,30"  # inside the copper
@@ -32,8 +33,8 @@ def without_rows(scan: Path, to: Path, *rows: int) -> Path:
 
 def test_a_complete_scan_has_all_planned_rows_and_frames(two_plates, tmp_path):
     scan, out = shutil.copytree(two_plates, tmp_path / "scan"), tmp_path / "out"
-    shown = told_by("process", scan, "--out", out, "--metal", METAL)
-    assert content(out / "quality.json")["coverage"] == {
+    shown = output_of("process", scan, "--out", out, "--metal", METAL)
+    assert read_json(out / "quality.json")["coverage"] == {
         "rows_planned": ROWS, "rows_recorded": ROWS, "rows_absent": [], "positions_planned": COLUMNS * ROWS,
         "positions_absent": 0, "frames_planned": FRAMES, "frames_received": FRAMES, "manifest": [],
     }  # fmt: skip
@@ -43,8 +44,8 @@ def test_a_complete_scan_has_all_planned_rows_and_frames(two_plates, tmp_path):
 @pytest.mark.parametrize("command", ["process", "image"])
 def test_missing_rows_are_counted_as_absent(two_plates, tmp_path, command):
     scan, out = without_rows(two_plates, tmp_path / "scan", 1, 15), tmp_path / "out"
-    shown = told_by(command, scan, "--out", out, *(["--metal", METAL] if command == "process" else []))
-    coverage = content(out / "quality.json")["coverage"]
+    shown = output_of(command, scan, "--out", out, *(["--metal", METAL] if command == "process" else []))
+    coverage = read_json(out / "quality.json")["coverage"]
     assert (coverage["rows_planned"], coverage["rows_recorded"], coverage["rows_absent"]) == (ROWS, ROWS - 2, [1, 15])
     assert (coverage["positions_planned"], coverage["positions_absent"]) == (COLUMNS * ROWS, 2 * COLUMNS)
     assert (coverage["frames_planned"], coverage["frames_received"]) == (FRAMES, FRAMES * (ROWS - 2) // ROWS)

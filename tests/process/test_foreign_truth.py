@@ -12,7 +12,7 @@ from polysight.host.cli.main import main
 from polysight.host.jobs.process import truth_of
 from polysight.host.materials import read_truth
 from polysight.shared.errors import DataError
-from tests.support.commands import content
+from polysight.shared.files import read_json
 from tests.support.paths import RIG_FILE
 
 PLATE = {"name": "PET", "centre_mm": [0, 0], "size_mm": [30, 30], "permittivity": [3.0, 0.1]}
@@ -58,7 +58,7 @@ def test_a_scan_with_a_foreign_truth_is_processed_but_not_trained_on(two_plates,
     (scan / "truth.json").write_bytes(FOREIGN["other keys"])
     assert main(["process", str(scan), "--out", str(out), "--metal", "-40,10,30,30"]) == 0
     assert "truth.json" in capsys.readouterr().err
-    assert content(out / "materials.json")["segments"]
+    assert read_json(out / "materials.json")["segments"]
     assert main(["export", str(out), "--csv"]) == 0
     capsys.readouterr()
     status = main(["train", str(scan), "--config", str(RIG_FILE), "--out", str(tmp_path / "library.npz")])

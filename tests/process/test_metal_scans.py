@@ -18,7 +18,7 @@ from polysight.host.materials.sub_bands import bands_of_row
 from polysight.host.polarimetry import Leakage, PlaneReference
 from polysight.shared.config import Instrument
 from polysight.simulators.scene import decode_scene, simulate
-from tests.support.leakage import remaining
+from tests.support.calibration import remaining
 
 BANDS = 3
 LEAKAGE = {"leakage_h": [0.08, 0.03], "leakage_v": [-0.02, 0.06]}

@@ -18,8 +18,9 @@ from polysight.host.products.files import FINISHED
 from polysight.host.store import ScanFolder
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
-from tests.support.commands import content, told_by
+from polysight.shared.files import read_json
 from tests.support.pipelines import pipeline_of
+from tests.support.processes import output_of
 from tests.support.refusals import refused
 
 
@@ -87,7 +88,7 @@ def test_another_plane_and_grid_from_the_command_line(scan: Path, tmp_path: Path
     there = tmp_path / "scan"
     shutil.copytree(scan, there)
     shutil.rmtree(there / "raw")  # the samples are enough
-    told_by("image", there, "--out", tmp_path / "out", "--depth", "4", "--grid", "60x30@2.5")
+    output_of("image", there, "--out", tmp_path / "out", "--depth", "4", "--grid", "60x30@2.5")
     products = read_products(tmp_path / "out")
     assert products.h.shape == (30, 60)
     np.testing.assert_allclose(np.diff(products.x_m), 2.5e-3)
@@ -105,7 +106,7 @@ METAL = "-40,10,30,30"  # inside the copper
 
 
 def rename_pet(scan: Path, name: str) -> None:
-    truth = content(scan / "truth.json")
+    truth = read_json(scan / "truth.json")
     truth["plates"][1]["name"] = name
     (scan / "truth.json").write_text(json.dumps(truth))
 
@@ -113,14 +114,14 @@ def rename_pet(scan: Path, name: str) -> None:
 def test_right_names_are_counted_and_the_mark_of_an_earlier_run_is_removed(two_plates: Path, tmp_path: Path) -> None:
     scan, out = shutil.copytree(two_plates, tmp_path / "scan"), tmp_path / "out"
     rename_pet(scan, "no such material")
-    shown = told_by("process", scan, "--out", out, "--metal", METAL)
-    segments = content(out / "materials.json")["segments"]
+    shown = output_of("process", scan, "--out", out, "--metal", METAL)
+    segments = read_json(out / "materials.json")["segments"]
     for value in (f"{len(segments)} patches", "0 of 1 plates", out / "report.html", f"{out}/"):
         assert str(value) in shown
-    assert content(out / "quality.json")["verdict"]["level"] == "care"
+    assert read_json(out / "quality.json")["verdict"]["level"] == "care"
 
     (out / FINISHED).write_text("{}")
     (pet,) = (s for s in segments if s["truth"] and s["truth"]["name"] == "no such material")
     rename_pet(scan, pet["name"])
-    assert "1 of 1 plates" in told_by("process", scan, "--out", out, "--metal", METAL)
+    assert "1 of 1 plates" in output_of("process", scan, "--out", out, "--metal", METAL)
     assert not (out / FINISHED).exists()

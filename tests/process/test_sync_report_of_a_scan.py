@@ -7,9 +7,10 @@ import pytest
 
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
 from polysight.host.store import manifest
+from polysight.shared.files import read_json
 from polysight.shared.geometry import rx_positions_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from tests.support.commands import content, told_by
+from tests.support.processes import output_of
 from tests.support.rigs import published_rig, rig_with
 from tests.support.scenes import EVERYWHERE, scene_of
 
@@ -41,9 +42,9 @@ def _believe_programmed(scan):
 
 
 def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path):
-    shown = told_by("sync-report", scan, "--out", tmp_path / "report")
-    told_by("image", scan, "--out", tmp_path / "image")
-    report, quality = content(tmp_path / "report" / "sync.json"), content(tmp_path / "image" / "quality.json")
+    shown = output_of("sync-report", scan, "--out", tmp_path / "report")
+    output_of("image", scan, "--out", tmp_path / "image")
+    report, quality = read_json(tmp_path / "report" / "sync.json"), read_json(tmp_path / "image" / "quality.json")
     assert report["simulated"] is True
     slope = published_rig().chirp.slope_hz_per_s
     for name in ("RH", "RV"):
@@ -68,8 +69,8 @@ def test_the_if_of_the_direct_path_follows_from_its_length_and_the_start_frequen
     offset_hz, rig = 500e3, published_rig()
     disturbances = {"ideal": True, "if_offset_hz": offset_hz, "sync_uncertainty_ns": SYNC_NS}
     scene = scene_of(EVERYWHERE, columns=12, rows=2, pulses=1, disturbances=disturbances)
-    told_by("image", scan_of(tmp_path / "scan", scene), "--out", tmp_path / "out")
-    boards, tx = content(tmp_path / "out" / "quality.json")["boards"], np.array(tx_position_m(rig))
+    output_of("image", scan_of(tmp_path / "scan", scene), "--out", tmp_path / "out")
+    boards, tx = read_json(tmp_path / "out" / "quality.json")["boards"], np.array(tx_position_m(rig))
     reach_hz = rig.chirp.slope_hz_per_s * SYNC_NS * 1e-9  # by which the boards' starts differ at most
     for board in rig.receivers:
         path_m = np.linalg.norm(np.array(rx_positions_m(rig, board)) - tx, axis=1).mean()

@@ -9,7 +9,7 @@ import tomli_w
 from polysight.host.cli.main import main
 from polysight.host.materials import Library
 from polysight.shared.tables import to_builtins
-from tests.support.commands import told_by
+from tests.support.processes import output_of
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, PET, scene_of
 
@@ -33,7 +33,7 @@ def test_scans_and_their_scenes_give_the_same_library(scan_of, rig_file, tmp_pat
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes" / "second.toml").write_bytes(tomli_w.dumps(scene("second")).encode())
     scan, out = scan_of(tmp_path / "first", scene("first")), tmp_path / "library.npz"
-    shown = told_by("train", scan, "--simulate", tmp_path / "scenes", "--config", rig_file, "--out", out)
+    shown = output_of("train", scan, "--simulate", tmp_path / "scenes", "--config", rig_file, "--out", out)
     assert "6 patches of 3 materials from 2 scans" in shown
     library = Library.load(out)
     assert (library.names, library.scans) == (NAMES, ("first", "second"))

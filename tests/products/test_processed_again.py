@@ -15,34 +15,19 @@ from polysight.host.materials import Library
 from polysight.host.materials.library import SIMULATED_LIBRARY
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.shared.config import load_instrument
 from polysight.shared.tables import to_builtins
-from polysight.simulators.scene import load_scene, simulate
-from tests.support.paths import RIG_FILE
+from polysight.simulators.scene import decode_scene, simulate
+from tests.support.rigs import published_rig
+from tests.support.scenes import scene_of
 
-SCENE = """name = "two plates"
-[grid]
-columns = 14
-rows = 10
-step_x_mm = 14.0
-step_y_mm = 12.0
-[burst]
-pulses = 2
-[image]
-columns = 40
-rows = 30
-pixel_mm = 4.0
-[[plates]]
-name = "copper"
-centre_mm = [-40.0, 0.0]
-size_mm = [50.0, 60.0]
-metal = true
-[[plates]]
-name = "mine"
-centre_mm = [40.0, 0.0]
-size_mm = [50.0, 60.0]
-permittivity = [4.0, 0.4]
-"""
+SCENE = scene_of(
+    {"name": "copper", "centre_mm": [-40.0, 0.0], "size_mm": [50.0, 60.0], "metal": True},
+    {"name": "mine", "centre_mm": [40.0, 0.0], "size_mm": [50.0, 60.0], "permittivity": [4.0, 0.4]},
+    columns=14,
+    rows=10,
+    step_mm=(14.0, 12.0),
+    image={"columns": 40, "rows": 30, "pixel_mm": 4.0},
+)
 METAL = ["--metal", "-40,0,30,40"]  # the leading minus does not make it an option
 
 
@@ -50,8 +35,7 @@ METAL = ["--metal", "-40,0,30,40"]  # the leading minus does not make it an opti
 def recorded(tmp_path_factory) -> Path:
     """A simulated scan, and its products."""
     folder = tmp_path_factory.mktemp("recorded")
-    (folder / "scene.toml").write_text(SCENE)
-    simulate(load_instrument(RIG_FILE), load_scene(folder / "scene.toml"), folder / "scan")
+    simulate(published_rig(), decode_scene(SCENE, "test"), folder / "scan")
     assert main(["process", str(folder / "scan"), "--out", str(folder / "out"), *METAL]) == 0
     return folder
 
@@ -115,8 +99,7 @@ def test_a_report_is_not_replaced_by_images_without_one(made, capsys):
 def test_products_whose_raw_rows_were_dropped_stay(made, capsys):
     assert main(["drop-raw", str(made / "scan"), "--products", str(made / "out"), "--yes"]) == 0
     before = contents(made / "out")
-    (made / "other.toml").write_text(SCENE.replace("two plates", "another"))
-    other = simulate(load_instrument(RIG_FILE), load_scene(made / "other.toml"), made / "other")
+    other = simulate(published_rig(), decode_scene({**SCENE, "name": "another"}, "test"), made / "other")
     for command in ("process", "image"):
         assert main([command, str(other), "--out", str(made / "out")]) == 2
         assert ScanFolder.load(made / "scan").scan_id in capsys.readouterr().err
@@ -148,7 +131,7 @@ def test_at_another_angle_than_the_librarys_nothing_is_named(made, other_angle, 
 @pytest.fixture
 def no_pi(made) -> Path:
     """A rig file with an address at which no Pi answers."""
-    table = to_builtins(load_instrument(RIG_FILE))
+    table = to_builtins(published_rig())
     table["pi"] |= {"command_address": "tcp://127.0.0.1:1", "event_address": "tcp://127.0.0.1:2"}
     table["limits"] |= {"command_timeout_s": 0.2}
     (made / "rig.toml").write_text(tomli_w.dumps(table))

@@ -113,14 +113,6 @@ def test_the_command_writes_what_is_asked_for(folder, capsys):
     assert sorted(p.name for p in folder.iterdir()) == ["image.npz", "materials.json", "quality.json", "scan.json"]
 
 
-def test_pictures_are_png_and_say_simulated(folder, tmp_path):
-    out = tmp_path / "pictures"
-    assert main(["export", str(folder), "--png", "--out", str(out)]) == 0
-    names = {p.stem for p in out.iterdir()}
-    assert {"amplitude_h", "amplitude_v", "amplitude_p", "phase_p", "materials"} <= names
-    assert all(p.read_bytes().startswith(b"\x89PNG") for p in out.iterdir())
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [(["--hdf5"], "image.npz"), ([], "--hdf5")],

@@ -12,9 +12,8 @@ from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, ProtocolError
 from polysight.shared.faults import EXPLANATIONS, PiFault, StageError, c_header, explain
 from polysight.shared.wires import WireClient, WireEdge, WireMotion, encode, parse
+from tests.support.paths import REPO
 from tests.support.refusals import refused
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_every_number_is_explained_and_unique():
@@ -25,7 +24,7 @@ def test_every_number_is_explained_and_unique():
 
 
 def test_the_firmware_header_is_the_table():
-    assert (ROOT / "arduino_stage" / "stage_errors.h").read_text() == c_header()
+    assert (REPO / "arduino_stage" / "stage_errors.h").read_text() == c_header()
 
 
 big = st.integers(-(2**60), 2**60)

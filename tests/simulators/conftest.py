@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.simulators.loopback import on_free_subnet
-
-ROOT = Path(__file__).parents[2]
+from tests.support.rigs import published_rig
 
 
 @pytest.fixture
@@ -22,4 +20,4 @@ def sockets() -> Iterator[ExitStack]:
 
 @pytest.fixture
 def rig() -> Instrument:
-    return on_free_subnet(load_instrument(ROOT / "instrument.toml"))
+    return on_free_subnet(published_rig())

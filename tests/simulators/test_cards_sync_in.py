@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -11,15 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.raster import plan_raster
 from polysight.shared.wires import WireMotion
 from polysight.simulators.cards.sync_in import Pulse, StageTrack, SyncInput, sync_line
 from polysight.simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
 from tests.support.refusals import refused
+from tests.support.rigs import published_rig
 
-RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+RIG = published_rig()
 DEAD_NS = 278_500  # ramp end 128.5 us + 150 us
 
 

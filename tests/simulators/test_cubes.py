@@ -7,12 +7,11 @@ import pytest
 
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.shared.config import load_instrument
 from polysight.simulators.scene import Scene, decode_scene, reference_cube, simulate, synced_cube
 from polysight.simulators.scene.radar import sample_frequencies_hz
+from tests.support.rigs import published_rig
 
-ROOT = Path(__file__).parents[2]
-RIG = load_instrument(ROOT / "instrument.toml")
+RIG = published_rig()
 SCENE = decode_scene(
     {
         "name": "t",

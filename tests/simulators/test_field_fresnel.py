@@ -1,15 +1,13 @@
 """Reflection of plates in the simulator; interfaces, plates and stacks are compared with tmm in tests/polarimetry."""
 
-from pathlib import Path
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.shared.config import load_instrument
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from polysight.simulators.scene import Plate, Scene
 from polysight.simulators.scene.optics import board_reflectivity, half_space, plate_reflection, slab
+from tests.support.rigs import published_rig
 
 F = 78.5e9
 
@@ -33,7 +31,7 @@ def test_scene_plates_choose_their_model() -> None:
 
 def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None:
     """Samples of a path tau have the phase +2 pi f tau, also inside the sheet."""
-    rig = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+    rig = published_rig()
     theta, thick_m, eps = np.radians(55.0), 0.1, 4.0
     sheet = Plate("sheet", (0.0, 0.0), (45.0, 45.0), permittivity=(eps, 0.02), thickness_mm=1e3 * thick_m)
     f = np.linspace(76.3e9, 79.75e9, 400)

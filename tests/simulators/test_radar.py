@@ -1,13 +1,11 @@
 """Simulated radars: exact without disturbances, and each disturbance has its effect alone."""
 
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
-from polysight.shared.config import load_instrument
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from polysight.simulators.scene import decode_scene
 from polysight.simulators.scene.cubes import reference_cube
@@ -15,9 +13,9 @@ from polysight.simulators.scene.draws import pulse_uniform
 from polysight.simulators.scene.optics import antennas, field_exact
 from polysight.simulators.scene.radar import SimulatedRig, sample_frequencies_hz
 from polysight.simulators.scene.receiver import high_pass, power_on, sync_delay_s
+from tests.support.rigs import published_rig
 
-ROOT = Path(__file__).parents[2]
-RIG = load_instrument(ROOT / "instrument.toml")
+RIG = published_rig()
 GRID = {"columns": 9, "rows": 6, "step_x_mm": 10.0, "step_y_mm": 10.0}
 PLATE = {"name": "m", "centre_mm": [0.0, 0.0], "size_mm": [45.0, 45.0], "metal": True}
 POINT = {"position_mm": [12.0, -9.0], "amplitude": [0.5, 0.0]}

@@ -1,12 +1,11 @@
 """Tilted, raised and rough plates: the fast field equals the exact sum, and both agree with optics."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
 from polysight.shared.raster import mean_burst_travel_mm, plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
@@ -14,14 +13,21 @@ from polysight.simulators.scene import Scene, apply_scene, decode_scene, synced_
 from polysight.simulators.scene.field import build_field, node_matrix
 from polysight.simulators.scene.optics import antennas, field_exact
 from polysight.simulators.scene.radar import sample_frequencies_hz
+from tests.support.rigs import published_rig
 
-RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+RIG = published_rig()
 GRID = {"columns": 21, "rows": 15, "step_x_mm": 10.0, "step_y_mm": 10.0}
 PLATE = {"name": "a", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "permittivity": [4.0, 0.4]}
 SIX = [
     {**PLATE, "centre_mm": [60.0 * a, 60.0 * b], "size_mm": [45.0, 45.0], "height_mm": 2.5 * a + b}
     for a in (-1, 0, 1)
     for b in (-1, 1)
+]
+FLAT = [
+    {**PLATE, "metal": True, "permittivity": None},
+    {**PLATE, "centre_mm": [60.3, 57.1], "size_mm": [45.0, 31.0]},
+    {**PLATE, "centre_mm": [-60.0, 61.0], "size_mm": [45.0, 45.0], "thickness_mm": 3.0},
+    {**PLATE, "centre_mm": [-58.7, -60.0], "size_mm": [20.0, 45.0], "permittivity": [2.61, 0.01]},
 ]
 WAVE = 2 * np.pi * 78.5e9 / SPEED_OF_LIGHT_M_S
 
@@ -50,6 +56,7 @@ def rms_error(fast: np.ndarray, exact: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("tables", "bound"),
     [
+        ({"plates": FLAT, "points": [{"position_mm": [55.0, -60.0], "amplitude": [0.3, 0.2]}]}, 5e-4),
         ({"plates": [{**PLATE, "tilt_deg": [1.0, 0.0]}]}, 0.002),
         ({"plates": [{**PLATE, "tilt_deg": [0.0, 1.0]}]}, 0.002),
         ({"plates": [{**PLATE, "tilt_deg": [2.0, -2.0]}]}, 0.004),
@@ -57,7 +64,7 @@ def rms_error(fast: np.ndarray, exact: np.ndarray) -> float:
         ({"plates": SIX, "points": [{"position_mm": [0.0, 0.0], "height_mm": 3.0}]}, 0.002),
         ({"plates": SIX, "plane_tilt_deg": [0.7, -0.5], "plane_shift_mm": -2.0}, 0.003),
     ],
-    ids=["tilt x", "tilt y", "two degrees", "height", "many heights", "tilted plane"],
+    ids=["flat plates and a point", "tilt x", "tilt y", "two degrees", "height", "many heights", "tilted plane"],
 )
 @pytest.mark.parametrize("role", ["receive_h", "receive_v"])
 def test_the_fast_field_equals_the_exact_sum(tables: dict[str, Any], bound: float, role: str) -> None:

@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.shared.config import load_instrument
 from polysight.simulators import replay
 from polysight.simulators.cards import MAC, CardEndpoint, Network, Pace, bound_udp
 from polysight.simulators.faults import Faults
 from polysight.simulators.loopback import on_free_subnet
 from polysight.simulators.replay import Player, Recording, scan_rows
+from tests.support.rigs import published_rig
 
 OK = {code: bytes.fromhex(f"5aa5{code:02x}000000aaee") for code in range(1, 15)}
 START, STOP = "5aa505000000aaee", "5aa506000000aaee"
@@ -47,7 +47,6 @@ CLIENTS = {
     ],
     "no configuration at all": [],
 }
-REPO = Path(__file__).resolve().parents[2]
 Play = Callable[..., "Client"]
 
 
@@ -81,7 +80,7 @@ class Client:
 
 def free_subnet() -> str:
     """A free loopback subnet 127.x.y.*."""
-    return on_free_subnet(load_instrument(REPO / "instrument.toml")).boards[0].card_address.rpartition(".")[0]
+    return on_free_subnet(published_rig()).boards[0].card_address.rpartition(".")[0]
 
 
 @pytest.fixture

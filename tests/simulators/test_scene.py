@@ -9,8 +9,7 @@ import pytest
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 from polysight.simulators.scene.scene_file import OFF, Disturbances, Scene, apply_scene, decode_scene, load_scene
-
-ROOT = Path(__file__).parents[2]
+from tests.support.paths import REPO
 
 
 def scene(**tables: Any) -> Scene:
@@ -98,7 +97,7 @@ def test_an_invalid_override_is_refused(rig: Instrument, grid: dict[str, Any]) -
     assert next(iter(grid)) in str(caught.value)
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "examples").rglob("*.toml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", sorted((REPO / "examples").rglob("*.toml")), ids=lambda p: p.stem)
 def test_every_example_fits_the_published_rig(rig: Instrument, path: Path) -> None:
     s = load_scene(path)
     assert apply_scene(rig, s).grid.columns > 0
@@ -109,8 +108,8 @@ def test_every_example_fits_the_published_rig(rig: Instrument, path: Path) -> No
 
 
 def test_the_library_does_not_contain_the_demo_scan() -> None:
-    demo = load_scene(ROOT / "examples" / "nine-materials.toml")
-    library = [load_scene(p) for p in sorted((ROOT / "examples" / "library").glob("*.toml"))]
+    demo = load_scene(REPO / "examples" / "nine-materials.toml")
+    library = [load_scene(p) for p in sorted((REPO / "examples" / "library").glob("*.toml"))]
     assert len(library) >= 4
     assert len({s.seed for s in [demo, *library]}) == len(library) + 1
     materials = {p.name: (p.permittivity, p.metal) for p in demo.plates}

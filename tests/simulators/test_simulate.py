@@ -9,17 +9,17 @@ import msgpack
 import numpy as np
 import pytest
 
-from polysight.shared.config import load_instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 from polysight.shared.messages import Capture, RowFinished, RunStarted, RunStopped, unpack_event
 from polysight.shared.raster import FIRST_PULSE_DELAY_S, plan_raster
 from polysight.simulators.__main__ import main
 from polysight.simulators.scene import SimulatedRig, decode_scene, lost_bytes, row_offsets_mm, simulate
+from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
+from tests.support.rigs import published_rig
 
-ROOT = Path(__file__).parents[2]
-RIG = load_instrument(ROOT / "instrument.toml")
+RIG = published_rig()
 RAW: dict[str, Any] = {
     "name": "two small plates",
     "seed": 9,
@@ -173,7 +173,7 @@ def test_the_command_prints_its_folder_and_refuses_invalid_arguments(
 ) -> None:
     scene = tmp_path / "s.toml"
     scene.write_text('name = "s"\n[grid]\ncolumns = 2\nrows = 1\n')
-    common = ["--config", str(ROOT / "instrument.toml"), "--out", str(tmp_path / "o")]
+    common = ["--config", str(RIG_FILE), "--out", str(tmp_path / "o")]
     assert main(["simulate", str(scene), *common, "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["simulated"] is True

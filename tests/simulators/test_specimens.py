@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 from polysight.simulators.scene import Scene, SimulatedRig, apply_scene, decode_scene, draw_specimens, simulate, truth
 from polysight.simulators.scene.specimens import facets
+from tests.support.rigs import published_rig
 
-RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+RIG = published_rig()
 PLATE = {"name": "a", "centre_mm": [30.0, -20.0], "size_mm": [45.0, 30.0], "permittivity": [4.0, 0.4]}
 SMALL = {"columns": 3, "rows": 2, "step_x_mm": 10.0, "step_y_mm": 10.0}
 

@@ -91,17 +91,6 @@ def test_opening_resets(start: Start, speed: float):
     assert stage.rising == []
 
 
-def test_a_silent_host_stops_the_stage(start: Start):
-    """In motion at real time; how soon is tested in lockstep (test_uno_timing.py)."""
-    stage = start(1.0)
-    with closing(PortDriver(str(stage.link))) as driver:
-        driver.replies()
-        for command in (("HELLO",), ("SET", 1, 200), ("ENABLE", 1), ("HOME",)):
-            assert driver.command(*command).kind == "ok"
-        driver.until(lambda: b"alarm:11" in driver.received)
-        driver.until(lambda: stage.motions[-1].vx_um_s == 0)
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signals_end_it_cleanly(start: Start, number: signal.Signals):
     stage = start()

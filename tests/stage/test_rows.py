@@ -63,30 +63,6 @@ def test_random_rows(stage, seed: int):
     assert (motions(wires)[-1].x_um, motions(wires)[-1].y_um) == (0, 0)
 
 
-def test_spacing_is_exact_when_the_rate_divides_the_timer(stage):
-    stage.ready()
-    _, wires = stage.motion("ROW", 20_000, 2 * MM, 50, 0, 20 * MM)
-    rising = [e.t_ns for e in edges(wires) if e.value]
-    assert {b - a for a, b in itertools.pairwise(rising)} == {100_000_000}
-
-
-def test_serpentine(stage):
-    """Rows there and back cover the same points, and begin where the last one ended."""
-    stage.ready()
-    x0, pitch, points, rate = 20_000, 400, 30, 4000
-    last = x0 + pitch * (points - 1)
-    xs = []
-    for k in range(4):
-        start, step = (x0, pitch) if k % 2 == 0 else (last, -pitch)
-        _, wires = stage.motion("ROW", start, step, points, 400 * k, rate)
-        rising = check_row(wires, start, step, points, 400 * k, 20)
-        at = {m.t_ns: m.x_um for m in motions(wires)}
-        xs.append([at[e.t_ns] for e in rising])
-        travelled = {m.x_um for m in motions(wires) if m.t_ns < rising[0].t_ns and m.vx_um_s == 0}
-        assert k == 0 or len(travelled) <= 1  # the turn-round moves y alone
-    assert xs[0] == xs[1][::-1] == xs[2] == xs[3][::-1]
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_hold_resumes_on_the_exact_grid(stage, seed: int):
     rng = random.Random(seed)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -14,16 +12,14 @@ import tomli_w
 
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.tables import to_builtins
-from tests.support.paths import POLYSIGHT, REPO, RIG_FILE
+from polysight.simulators.scene import load_scene, simulate
+from tests.support.paths import RIG_FILE
+from tests.support.processes import Bench
 from tests.support.rigs import published_rig
 
 LIMIT_S = 200
+SIMULATED_RIG = ("python", "-m", "polysight.simulators.rig")
 SCENE = 'name = "a plate"\n[[plates]]\nname = "m"\ncentre_mm = [0, 0]\nsize_mm = [60.0, 60.0]\nmetal = true\n'
-
-
-def run(*command: str) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=REPO)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.usefixtures("uno_programs")
@@ -41,37 +37,13 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
     config, scene = tmp_path / "rig.toml", tmp_path / "scene.toml"
     config.write_text(tomli_w.dumps(to_builtins(rig)))
     scene.write_text(SCENE)
-    command = [
-        sys.executable,
-        "-m",
-        "polysight.simulators.rig",
-        "--config",
-        str(config),
-        "--scene",
-        str(scene),
-        "--with-pi",
-    ]
-    command += ["--dir", str(tmp_path / "rig"), "--uno", "--time-scale", "2"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPO) as process:
-        try:
-            assert process.stdout is not None
-            simulated = process.stdout.readline().removeprefix("ready ").strip()
-            program = str(POLYSIGHT)
-            run(program, "scan", "--config", simulated, "--out", str(tmp_path / "scan"), "--no-process")
-        finally:
-            process.send_signal(signal.SIGTERM)
-    # The same scan without a stage, computed for the plan's positions.
-    run(
-        sys.executable,
-        "-m",
-        "polysight.simulators",
-        "simulate",
-        str(scene),
-        "--config",
-        str(config),
-        "--out",
-        str(tmp_path / "ideal"),
-    )
+    with closing(Bench(tmp_path)) as bench:
+        rig_options = ("--dir", tmp_path / "rig", "--with-pi", "--uno", "--time-scale", "2")
+        simulated = bench.start(*SIMULATED_RIG, "--config", config, "--scene", scene, *rig_options)
+        options = ("--out", tmp_path / "scan", "--no-process")
+        ended = bench.polysight("scan", "--config", simulated.wait_ready(), *options, limit_s=LIMIT_S)
+        assert ended.status == 0, ended.err
+    simulate(rig, load_scene(scene), tmp_path / "ideal")  # the same scan without a stage, at the plan's positions
     scan, ideal = ScanFolder.load(tmp_path / "scan"), ScanFolder.load(tmp_path / "ideal")
     assert sorted(scan.committed()) == [0, 1]
     for board in ("RH", "RV"):
@@ -83,8 +55,9 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
 
 
 def test_a_time_scale_its_heartbeat_cannot_follow_is_refused(tmp_path: Path):
-    command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(RIG_FILE), "--pattern"]
-    command += ["--dir", str(tmp_path / "rig"), "--uno", "--time-scale", "5"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=REPO)
-    assert done.returncode == 2
-    assert "--time-scale 5" in done.stderr
+    with closing(Bench(tmp_path)) as bench:
+        done = bench.run(
+            *SIMULATED_RIG, "--config", RIG_FILE, "--dir", "rig", "--pattern", "--uno", "--time-scale", "5"
+        )
+    assert done.status == 2
+    assert "--time-scale 5" in done.err

@@ -14,6 +14,7 @@ TRIGGER, X_PUL, DRIVERS_OFF = 2, 5, 7
 WATCHDOG_MS = 250 * 1.1  # its oscillator is one of 10 %
 TOP_RATE = 20_000  # steps/s
 CHATTER = {
+    "silence": lambda _: b"",
     "yes": lambda _: b"y\n" * 6,
     "line ends": lambda _: b"\n" * 12,
     "no line ends": lambda _: b"N" * 12,
@@ -49,6 +50,11 @@ def test_chatter_is_no_heartbeat(host, kind: str):
     host.uno.received.clear()
     status = host.status()
     assert (status.integer("alarm"), status.integer("homed")) == (11, 0)
+    host.uno.edges.clear()
+    host.uno.run_ms(500)
+    assert host.uno.edges == []
+    host.obeyed("CLEAR")
+    assert host.command("MOVE", 0, 0, 4000).number == 8  # home first
 
 
 @pytest.mark.parametrize("verb", ["MOVE", "ROW", "HOME"])

@@ -118,30 +118,6 @@ def test_hold_and_stop_begin_within_20_ms(host, byte: Immediate, rate: int):
     assert [r.number for r in host.replies()] == ([15] if byte == Immediate.STOP else [])
 
 
-def test_silence_stops_the_stage(host):
-    """The serial peer dies in the middle of a row: at rest with alarm 11 after the heartbeat's time and the ramp."""
-    host.set(Parameter.HEARTBEAT, 500)
-    host.uno.watch(TRIGGER, X_PUL)
-    host.obeyed("ROW", 2000, 100, 200, 0, 4000)
-    for _ in range(14):
-        host.uno.run_ms(100)
-        host.uno.feed(bytes([Immediate.STATUS]))
-    host.uno.settle()
-    assert host.status().fields["state"] == "row"
-    silent_from = host.uno.cycle
-    host.uno.edges.clear()
-    host.uno.run_ms(500 + 100 + 5)  # heartbeat, 4000 / 40,000 s of ramp
-    *_, last = host.replies()
-    assert (last.kind, last.number) == ("alarm", 11)
-    steps = [e.cycle for e in host.uno.edges if e.pin == X_PUL and e.value]
-    assert silent_from + 480 * MS < steps[-1] <= silent_from + 605 * MS
-    host.uno.edges.clear()
-    host.uno.run_ms(500)
-    assert host.uno.edges == []
-    host.obeyed("CLEAR")
-    assert host.command("MOVE", 0, 0, 4000).number == 8  # home first
-
-
 def test_half_a_second_of_silence_is_the_default(host):
     """A board just reset, told nothing about heartbeats: the first motion is a homing."""
     host.motion("MOVE", 20_000, 0, 8000)

@@ -1,9 +1,9 @@
-"""What several tests need: paths, rigs, scenes, processes, and stand-ins for devices. Import it as `tests.support`.
+"""Shared helpers: paths, rigs, scenes, processes, and stand-ins for devices. Import them as `tests.support`.
 
 paths, rigs, scenes
     Where things are; the published rig and changed ones; scene files small enough for a test.
-commands, processes, simulated_rig, pattern_rig, killed_at
-    Commands in this process; commands as processes; the whole simulated rig as processes.
+processes, simulated_rig, killed_at
+    Commands, in this process or as processes of their own; the whole simulated rig as processes.
 acquisition, capture, doctor, page, pi, radar, stage, store
     Stand-ins and helpers of the test folder of the same name, used by other folders too.
 

@@ -1,4 +1,4 @@
-"""Made-up calibration files: a measured filter, and a metal reference with gains that vary over the plane."""
+"""Made-up calibration files, and a measure of what an estimated leakage leaves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header
 from polysight.host.imaging import ImagedWith, image_grid
-from polysight.host.polarimetry import PlaneReference, plane_reference
+from polysight.host.polarimetry import Leakage, PlaneReference, plane_reference
 from polysight.shared.config import Instrument
 
 SOURCES = [SourceScan("plate", "scans/plate", True, 7)]
@@ -28,3 +28,10 @@ def metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:
     noise = 1 + 0.02 * (rng.standard_normal((2, *x.shape)) + 1j * rng.standard_normal((2, *x.shape)))
     plate = plane_reference(gain * noise[0], 0.7 * noise[1], grid.x_m, grid.y_m, smooth_mm=4.0, name="plate")
     return replace(plate, made_with=ImagedWith.of(rig, {}))
+
+
+def remaining(found: Leakage, truth: Leakage) -> tuple[float, float]:
+    """Larger cross-polar amplitude and deviation of the co-polar ratio from 1, after correction by `found`."""
+    left = np.linalg.solve(found.matrix(), truth.matrix())
+    crosstalk = max(abs(left[0, 1] / left[0, 0]), abs(left[1, 0] / left[1, 1]))
+    return float(crosstalk), float(abs(left[0, 0] / left[1, 1] - 1))

@@ -58,6 +58,14 @@ def processes_naming(text: str) -> dict[int, str]:
     return found
 
 
+def output_of(*arguments: object) -> str:
+    """Run a host command in this process, which must succeed; return its stdout."""
+    out = io.StringIO()
+    with redirect_stdout(out):
+        assert main([str(word) for word in arguments]) == 0
+    return out.getvalue()
+
+
 class Program:
     """A command in a process group of its own, its output in files."""
 

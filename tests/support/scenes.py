@@ -35,11 +35,18 @@ def small_scene(
     return tomli_w.dumps(scene)
 
 
-def scene_of(*plates: dict[str, Any], columns: int, rows: int, pulses: int = 2, **more: Any) -> dict[str, Any]:
-    """A scene of plates on a coarse grid."""
+def scene_of(
+    *plates: dict[str, Any],
+    columns: int,
+    rows: int,
+    step_mm: tuple[float, float] = (14.0, 8.0),
+    pulses: int = 2,
+    **more: Any,
+) -> dict[str, Any]:
+    """A scene of plates on a coarse grid; `more` are its other tables."""
     return {
         "name": "small",
-        "grid": {"columns": columns, "rows": rows, "step_x_mm": 14.0, "step_y_mm": 8.0},
+        "grid": {"columns": columns, "rows": rows, "step_x_mm": step_mm[0], "step_y_mm": step_mm[1]},
         "burst": {"pulses": pulses},
         "image": {"columns": 50, "rows": 40, "pixel_mm": 4.0},
         "plates": list(plates),

@@ -50,8 +50,16 @@ def test_json_gives_back_what_was_written():
     assert again is not None
     assert again.to_dict() == verdict.to_dict()
     assert all(set(r) == {"what", "why", "do"} for r in content["verdict"]["reasons"])
-    assert read_verdict({}) is None
-    assert read_verdict({"verdict": {"level": "perfect"}}) is None
+
+
+@pytest.mark.parametrize("content", [{}, {"verdict": 1}, {"verdict": {"level": "perfect"}}, {"verdict": {"level": []}}])
+def test_content_without_a_known_level_has_no_verdict(content):
+    assert read_verdict(content) is None
+
+
+@pytest.mark.parametrize("reasons", [None, 3, "noise", {"what": "x"}, [1, None]])
+def test_damaged_reasons_are_left_out(reasons):
+    assert read_verdict({"verdict": {"level": "care", "reasons": reasons}}) == Verdict("care")
 
 
 def test_no_result_has_an_exit_status_of_its_own():

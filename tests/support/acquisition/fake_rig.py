@@ -1,14 +1,207 @@
-"""A fake Pi with fake capture cards on a loopback subnet of their own."""
+"""A fake Pi that only speaks the wire protocol, with fake capture cards, on a loopback subnet of their own."""
 
 from __future__ import annotations
 
+import threading
+import time
 from dataclasses import dataclass, field
 
+import zmq
+
+from polysight.shared import messages as m
 from polysight.shared.config import Instrument
+from polysight.shared.raster import Row
 from polysight.simulators.loopback import on_free_subnet
 from tests.support.acquisition.fake_cards import FakeCard
-from tests.support.acquisition.fake_pi import FakePi
 from tests.support.rigs import rig_with
+
+
+class FakePi:
+    """Speaks the wire protocol; a row makes every card send at once."""
+
+    def __init__(self, rig: Instrument, cards: list[FakeCard]) -> None:
+        self.rig, self.cards = rig, cards
+        self.journal: dict[str, list[m.AnyEvent]] = {}
+        self.stage = rig.stage.placement_settings  # in the reply to Hello; {} as of older releases
+        self.homed = False
+        self.run: m.BeginRun | None = None
+        self.state: m.State = "idle"
+        self.homings, self.home_fails, self.lost_mm = 0, set(), (0.0, 0.0)
+        self.lose_events = 0  # number of events that PUB loses
+        self.lose_replies = 0
+        self.fail_rows: dict[tuple[int, int], int] = {}  # (row, take): fault number
+        self.fault, self.latched = 0, ""  # number and reason of the first fault
+        self.hang_at: set[int] = set()  # rows that never end; half of their data is sent
+        self.paced = False  # frames are sent at the times of their pulses
+        self.hang_after_captures = False  # such rows send their bursts before they hang
+        self.notes: dict[tuple[int, int], str] = {}  # reason in RowFinished of a completed row
+        self.wanted_end = False  # the hanging row must end
+        self.commands: list[m.AnyCommand] = []
+        self.rows_run: list[tuple[int, int]] = []
+        self._ran: set[tuple[int, int]] = set()  # since the last BeginRun
+        self.hanging: tuple[Row, int] | None = None
+        self.context = zmq.Context()
+        self.rep = self.context.socket(zmq.ROUTER)  # unlike REP it may leave a request without a reply
+        self.rep.bind(rig.pi.command_address)
+        self.pub = self.context.socket(zmq.PUB)
+        self.pub.bind(rig.pi.event_address)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        last = 0.0
+        while not self._stop.is_set():
+            if self.rep.poll(10):
+                *envelope, raw = self.rep.recv_multipart()
+                command = m.unpack_command(raw)
+                reply = self._answer(command)
+                if not isinstance(command, m.Alive):
+                    self.commands.append(command)
+                if self.lose_replies and not isinstance(command, m.Alive):
+                    self.lose_replies -= 1
+                else:
+                    self.rep.send_multipart([*envelope, m.pack(reply)])
+                self._after()
+            if self.wanted_end and self.hanging is not None:
+                self.wanted_end = False
+                self.finish_hanging()
+            if time.monotonic() - last > 0.05:
+                last = time.monotonic()
+                scan = self.run.scan_id if self.run else ""
+                beat = m.Heartbeat(
+                    scan_id=scan, seq=len(self.journal.get(scan, [])), t_mono_ns=1, state=self.state, period_ms=50
+                )
+                self.pub.send_multipart([b"event", m.pack(beat)])
+        self.rep.close(linger=0)
+        self.pub.close(linger=0)
+        self.context.term()
+
+    def _emit(self, kind: type, **content: object) -> None:
+        assert self.run is not None
+        events = self.journal.setdefault(self.run.scan_id, [])
+        event = kind(scan_id=self.run.scan_id, seq=len(events) + 1, t_mono_ns=time.monotonic_ns(), **content)
+        events.append(event)
+        if self.lose_events:
+            self.lose_events -= 1
+            return
+        self.pub.send_multipart([b"event", m.pack(event)])
+
+    def _answer(self, c: m.AnyCommand) -> m.AnyReply:
+        self._todo = None
+        scan = self.run.scan_id if self.run else ""
+        last = len(self.journal.get(scan, []))
+        if isinstance(c, m.Hello):
+            return m.HelloReply(
+                pi_release="t", firmware="t", backend="fake", state=self.state, scan_id=scan, last_seq=last,
+                stage=self.stage,
+            )  # fmt: skip
+        if isinstance(c, m.Status):
+            return m.StatusReply(
+                state=self.state, homed=self.homed, x_mm=0, y_mm=0, scan_id=scan, row_index=-1, take=0, points=0,
+                pulses=0, last_seq=last, fault=self.fault, reason=self.latched, lost_x_mm=self.lost_mm[0],
+                lost_y_mm=self.lost_mm[1],
+            )  # fmt: skip
+        if isinstance(c, m.EndRun) and (self.hanging is not None or self.run is None):
+            return m.Refused(number=111, what="a row is running" if self.run else "no run is begun")
+        if isinstance(c, m.BeginRun):
+            self.run, self._ran = c, set()
+            self._emit(m.RunStarted, plan=c.plan, resumed=bool(self.journal.get(c.scan_id)))
+        elif isinstance(c, m.EndRun):
+            self._emit(m.RunStopped, exit_status=c.exit_status, reason=c.reason)
+        elif isinstance(c, m.Home):
+            self.homed, self.state, self.fault, self.latched = True, "ready", 0, ""
+            self.homings += 1
+            if self.homings in self.home_fails:
+                self.homed, self.state, self.fault, self.latched = False, "fault", 102, "the switch was not found"
+        elif isinstance(c, m.Replay):
+            events = self.journal.get(c.scan_id, [])
+            few = events[c.from_seq - 1 :][: min(c.limit, 3)]  # never more than a few, as of a Pi whose row runs
+            return m.ReplayReply(events=few, last_seq=len(events))
+        elif isinstance(c, m.RunRow):
+            if (c.row_index, c.take) not in self._ran:  # else a repeated request
+                self._ran.add((c.row_index, c.take))
+                self.rows_run.append((c.row_index, c.take))
+                self._todo = c
+        elif isinstance(c, m.Abort) and self.hanging is not None:
+            row, take = self.hanging
+            self.hanging = None
+            self._emit(
+                m.RowFinished, row_index=row.index, take=take, status="aborted", points=0, edges=0, bursts=0, pulses=0,
+                fault=113, reason=c.reason,
+            )  # fmt: skip
+        return m.Accepted(state=self.state)
+
+    def _after(self) -> None:
+        c = self._todo
+        if c is None or self.run is None:
+            return
+        row = self.run.plan.row(c.row_index)
+        self._emit(m.RowStarted, row=row, take=c.take)
+        if c.row_index in self.hang_at:
+            self.hanging = (row, c.take)
+            for card in self.cards:
+                card.short[row.index, c.take] = card.row_bytes // 2
+                card.send_row(row.index, c.take)
+            if self.hang_after_captures:
+                self._captures(row, c.take)
+            return
+        if self.paced:
+            self._run_at_its_pace(row, c.take)
+        else:
+            self._captures(row, c.take)
+            for card in self.cards:
+                card.send_row(row.index, c.take)
+        fault = self.fail_rows.get((c.row_index, c.take), 0)
+        n = row.points
+        if fault in (101, 102, 107, 109):  # lasting ones
+            self.fault, self.state, self.homed = fault, "fault", fault in (107, 109)
+        self._emit(
+            m.RowFinished, row_index=row.index, take=c.take, status="fault" if fault else "done", points=n, edges=n,
+            bursts=n, pulses=n * self.run.pulses, fault=fault, reason=self.notes.get((c.row_index, c.take), ""),
+        )  # fmt: skip
+
+    def _captures(self, row: Row, take: int) -> None:
+        assert self.run is not None
+        for i in range(row.points):
+            self._emit(
+                m.Capture, row_index=row.index, take=take, point=i, column=row.column(i), edge_ns=i, first_pulse_ns=i,
+                last_pulse_ns=i, pulses=self.run.pulses, width_max_ns=1, jitter_ns=1,
+            )  # fmt: skip
+
+    def _run_at_its_pace(self, row: Row, take: int) -> None:
+        """Bursts 60 ms apart, pulses 1.5 ms apart, on a clock of its own, each frame 0.1 ms after its pulse."""
+        assert self.run is not None
+        n, period, ahead = self.run.pulses, 1_500_000, 77_000_000_000
+        begin = time.monotonic_ns() + 20_000_000
+        for point in range(row.points):
+            first = begin + point * 60_000_000
+            for k in range(n):
+                while (left := first + k * period + 100_000 - time.monotonic_ns()) > 0:
+                    time.sleep(left * 1e-9 if left > 2_000_000 else 0)
+                for card in self.cards:
+                    card.send_frame(row.index, take, point * n + k, self.rig.frame_bytes)
+            self._emit(
+                m.Capture, row_index=row.index, take=take, point=point, column=row.column(point), edge_ns=first + ahead,
+                first_pulse_ns=first + ahead, last_pulse_ns=first + (n - 1) * period + ahead, pulses=n, width_max_ns=1,
+                jitter_ns=1,
+            )  # fmt: skip
+        for card in self.cards:
+            card.end_frames()
+
+    def finish_hanging(self) -> None:
+        """End the hanging row as done."""
+        assert self.hanging is not None
+        (row, take), self.hanging = self.hanging, None
+        n = row.points
+        self._emit(
+            m.RowFinished, row_index=row.index, take=take, status="done", points=n, edges=n, bursts=n,
+            pulses=n * self.rig.burst.pulses,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
 
 
 @dataclass

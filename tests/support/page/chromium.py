@@ -18,7 +18,7 @@ from urllib.request import urlopen
 
 from websockets.sync.client import connect
 
-LIMIT_S = 60.0
+LIMIT_S = 120.0
 DESK, PHONE = (1400, 900, False), (390, 844, True)  # width, height, whether it is a phone
 
 
@@ -128,6 +128,34 @@ class Browser:
     def open(self, url: str) -> None:
         """Go to a page."""
         self.call("Page.navigate", url=url)
+
+    def visit(self, url: str, size: tuple[int, int, bool] = DESK) -> None:
+        """Go to a page, without the errors and requests of the one before."""
+        self.size(*size)
+        self.open("about:blank")  # a page that differs by its fragment only is not loaded anew
+        self.wait("location.href == 'about:blank'", "an empty page")
+        self.errors.clear()
+        self.requests.clear()
+        self.open(url)
+
+    def fill(self, selector: str, text: str) -> None:
+        """Type into a field, as a person does."""
+        self.value(
+            f"(() => {{ const f = document.querySelector({json.dumps(selector)}); f.value = {json.dumps(text)};"
+            " f.dispatchEvent(new Event('input', {bubbles: true})); })()"
+        )
+
+    def click(self, selector: str) -> None:
+        """Press a button that is shown."""
+        found = f"document.querySelector({json.dumps(selector)})"
+        self.wait(f"{found}?.checkVisibility() && !{found}.disabled", f"that {selector} can be pressed")
+        self.value(f"{found}.click()")
+
+    def check_whole(self, address: str) -> None:
+        """Nothing sticks out to the side, nothing is wrong, nothing came from another address."""
+        assert self.value("document.documentElement.scrollWidth <= innerWidth")
+        assert self.errors == []
+        assert all(url.startswith((address, "about:", "blob:")) for url in self.requests), self.requests
 
     def value(self, expression: str) -> Any:
         """What a JavaScript expression is in the page."""

@@ -61,11 +61,11 @@ class GrowingScan:
 
 
 @contextmanager
-def open_desk(folder: Path) -> Iterator[StopRequest]:
-    """Take requests to a scan as its program does; yields what hears of them."""
+def open_control(folder: Path) -> Iterator[StopRequest]:
+    """Serve `folder`/control as a running scan does; yields the stop request that the commands set."""
     stop = StopRequest()
-    with ControlFolder(folder, stop) as desk:
-        desk.open()
+    with ControlFolder(folder, stop) as control:
+        control.open()
         wait_for((folder / CONTROL / ALIVE).exists, "the first sign of life")
         yield stop
 

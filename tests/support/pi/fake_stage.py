@@ -56,17 +56,6 @@ class FakeStage:
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
 
-    def close(self) -> None:
-        self._closed.set()
-        self._stopping.set()
-        self._thread.join()
-        if self._motion:
-            self._motion.join()
-        if self.master >= 0:
-            os.close(self.master)
-        if self.wire:
-            self.wire.close()
-
     def unplug(self) -> None:
         """The cable is pulled: the port reports an error."""
         self._closed.set()
@@ -74,8 +63,14 @@ class FakeStage:
         self._thread.join()
         if self._motion:
             self._motion.join()
-        os.close(self.master)
+        if self.master >= 0:
+            os.close(self.master)
         self.master = -1
+
+    def close(self) -> None:
+        self.unplug()
+        if self.wire:
+            self.wire.close()
 
     def say(self, reply: Reply) -> None:
         raw = reply.encode()

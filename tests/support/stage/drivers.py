@@ -30,31 +30,17 @@ def motions(wires: list[WireMessage]) -> list[WireMotion]:
 
 
 class Driver:
-    """Sends lines, advances the time, and collects the replies."""
+    """Sends lines, advances the time, and collects the replies.
+
+    Each kind has `rx` (bytes to the stage), `run` (ticks), `rest` (until nothing moves), `press` (mask of switches),
+    `slip` (steps lost in x and y) and `reset`.
+    """
 
     def __init__(self) -> None:
         self.wires: list[WireMessage] = []
         self.received = b""
         self.t_ns = 0
         self.sequence = 0
-
-    def rx(self, data: bytes) -> None:
-        raise NotImplementedError
-
-    def run(self, ticks: int) -> None:
-        raise NotImplementedError
-
-    def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
-        raise NotImplementedError
-
-    def press(self, mask: int) -> None:
-        raise NotImplementedError
-
-    def slip(self, dx: int, dy: int) -> None:
-        raise NotImplementedError
-
-    def reset(self) -> None:
-        raise NotImplementedError
 
     def close(self) -> None:
         return

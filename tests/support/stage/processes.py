@@ -31,17 +31,9 @@ class StageProcess:
         self.link = folder / "ttySTAGE"
         self.messages: list[WireMessage] = []
         module, *options = COMMANDS[kind]
-        command = [
-            sys.executable,
-            "-m",
-            f"polysight.simulators.{module}",
-            "--config",
-            config,
-            "--boot-ms",
-            50,
-            *options,
-        ]
-        command += ["--wires", hub or folder / "wires", "--link", self.link, "--time-scale", time_scale]
+        command = [sys.executable, "-m", f"polysight.simulators.{module}", "--config", config, *options]
+        wires = ("--wires", hub or folder / "wires")
+        command += [*wires, "--boot-ms", 50, "--link", self.link, "--time-scale", time_scale]
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
             listener.bind(str(folder / "wires"))
             listener.listen()

@@ -23,7 +23,6 @@ from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import place_record
 from polysight.host.capture.receiver import RowCapture
 from polysight.host.capture.segment import Segment, write_index
-from polysight.host.pipeline import Pipeline
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, PART, ScanFolder
 from polysight.pi_controller.journal import Journal, JournalFullError
@@ -34,6 +33,7 @@ from polysight.shared.raster import plan_raster
 from polysight.shared.tables import decode, to_builtins
 from polysight.simulators.scene import SimulatedRig, load_scene, row_offsets_mm
 from tests.support.capture.records import encode_packet
+from tests.support.pipelines import pipeline_of
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 
@@ -257,10 +257,7 @@ class SmallScan:
 
     def image(self) -> bytes:
         """The final image's bytes, both channels and their mask."""
-        pipeline = Pipeline(ScanFolder.load(self.path))
-        for row in pipeline.source.rows():
-            pipeline.add_row(row)
-        images = pipeline.form_images()
+        images = pipeline_of(ScanFolder.load(self.path)).form_images()
         return b"".join(part.tobytes() for part in (images.h, images.v, images.valid))
 
 

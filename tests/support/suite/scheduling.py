@@ -36,7 +36,7 @@ FIRST = (
     "tests/stage/test_uno_safety.py",
     "tests/benchmarks/test_runs.py",
     "tests/e2e/test_wrong_input.py",
-    "tests/e2e/test_native_radars.py",
+    "tests/e2e/test_radar_backends.py",
     "tests/e2e/test_live_view.py",
     "tests/pi/test_port_reset.py",
     "tests/stage/test_uno.py",

@@ -8,9 +8,11 @@ from polysight.host.store.sources.open import open_source
 from polysight.host.store.sources.published import RowLosses
 from polysight.host.store.sources.published_settings import mirrored
 from polysight.shared.config import Burst, Grid
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
 from polysight.shared.raster import plan_raster
 from polysight.simulators.scene import AuthorsLayout
+from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 COLUMNS, ROWS, PULSES = 9, 4, 3
@@ -92,6 +94,51 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
             assert answer[board]["positions_missing"] == sum(len(skipped[board, r.index]) for r in plan)
             count = sum((b - a) // PACKET for r in plan for a, b in lost[board, r.index])
             assert answer[board]["packets_lost"] == count
+
+
+@pytest.mark.parametrize("zero_filling", [True, False])
+@pytest.mark.parametrize("first_sequence", [0, 1, 5000])
+@pytest.mark.parametrize("lost", [{3}, {0}, {4, 5}, {75}], ids=str)
+def test_lost_packets_are_masked_whatever_the_first_number(tmp_path, zero_filling, first_sequence, lost):
+    assert -(-COLUMNS * BURST // PACKET) == 76
+    folder, sent = record(tmp_path, lost={("RV", 2): packets(*lost)}, zero_filling=zero_filling)
+    log = folder / "RV" / "0_2_log.csv"
+    numbered = [line.partition(",") for line in log.read_text().splitlines()]
+    log.write_text("".join(f"{int(number) - 1 + first_sequence},{rest}\n" for number, _, rest in numbered))
+    data = open_source(folder, BASE).read_row("RV", 2)
+    assert data.frames_expected == COLUMNS * PULSES
+    assert data.missing == [(min(lost) * PACKET, min((max(lost) + 1) * PACKET, COLUMNS * BURST))]
+    check(data, sent["RV", 2])
+
+
+def test_a_header_line_of_a_log_is_skipped(tmp_path):
+    folder, sent = record(tmp_path, {("RH", 0): {3}})
+    log = folder / "RH" / "0_0_log.csv"
+    log.write_text("seq,bytes,time\n" + log.read_text())
+    assert check(open_source(folder, BASE).read_row("RH", 0), sent["RH", 0]).sum() == BURST
+
+
+def test_only_rows_that_both_boards_have_are_read(tmp_path):
+    folder, _ = record(tmp_path)
+    (folder / "RV" / f"{COLUMNS - 1}_3.bin").unlink()
+    scan = open_source(folder, BASE)
+    assert list(scan.rows()) == [0, 1, 2]
+    with refused(ErrorCode.NO_DATA, 3, "RV"):
+        scan.read_row("RV", 3)
+
+
+def test_files_that_contradict_each_other_are_refused(tmp_path):
+    folder, _ = record(tmp_path, zero_filling=False)
+    file = folder / "RH" / "0_0.bin"
+    file.write_bytes(file.read_bytes()[:-100])
+    with refused(ErrorCode.MISMATCH):
+        open_source(folder, BASE).read_row("RH", 0)
+    (folder / "RH" / "0_0_log.csv").write_text("1,1456,1.0\nnonsense\n")
+    with refused(ErrorCode.FILE_DAMAGED, "0_0_log.csv", "nonsense"):
+        open_source(folder, BASE).read_row("RH", 0)
+    file.rename(folder / "RH" / "6_0.bin")
+    with refused(ErrorCode.FILE_FOREIGN, "column 6"):
+        open_source(folder, BASE)
 
 
 @pytest.mark.parametrize("gone", [{0}, {COLUMNS - 1}, {0, 1, 5}])

@@ -1,0 +1,77 @@
+"""Scans of the simulated rig whose radars the host arms: over their simulated USB chips, or by control servers.
+
+The rig plays a counting pattern.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import tomli_w
+
+from polysight.host.acquisition.scan import ScanResult, run_scan
+from polysight.host.store.validation import validate
+from polysight.shared.config import load_instrument
+from tests.support.rigs import rig_table
+
+COLUMNS, ROWS, CHIRPS = 8, 3, 4
+PORTS = {"LS": 5000, "RH": 5001, "RV": 5002}
+
+
+def scanned(bench, radar: dict[str, Any], burst: dict[str, Any]) -> ScanResult:
+    """Scan three rows of eight positions; every row is whole and each radar was armed once for it."""
+    table = rig_table()
+    table["grid"] |= {"columns": COLUMNS, "rows": ROWS}
+    table["burst"] |= burst
+    table["limits"] |= {"end_of_record_s": 1.0, "row_retakes": 2, "command_timeout_s": 5.0}
+    table["radar"] = radar
+    for board in table["boards"]:
+        board["start_offset_hz"] = 0.0 if board["role"] == "transmit" else 790e3
+    (bench.folder / "rig.toml").write_text(tomli_w.dumps(table))
+    rig = bench.start(
+        "python", "-m", "polysight.simulators.rig", "--config", "rig.toml", "--dir", bench.folder / "rig", "--pattern",
+        "--time-scale", "40", "--with-pi",
+    )  # fmt: skip
+    result = run_scan(load_instrument(bench.folder / rig.wait_ready()), bench.folder / "scan")
+    rig.end()
+    assert result.exit_status == "success"
+    assert validate(bench.folder / "scan") == []
+    counts: dict[str, Any] = {}
+    for path in (bench.folder / "rig").glob("cards-*.json"):
+        counts |= json.loads(path.read_text())["boards"]
+    for board in counts.values():
+        assert board["rearmed"] == ROWS + result.retakes
+        if result.retakes == 0:
+            assert board.get("unarmed", 0) == 0
+    return result
+
+
+def test_control_servers_arm_each_row_once(bench):
+    servers = {board: f"127.0.0.1:{port}" for board, port in PORTS.items()}
+    scanned(bench, {"control": "line_server", "servers": servers}, {"pulses": CHIRPS})
+
+
+def test_native_radars_make_a_frame_of_many_chirps_at_each_pulse(bench):
+    """`[burst] pulses = 1, chirps = 4`; the manifest has what the radars were told and what they answered."""
+    burst = {"pulses": 1, "chirps": CHIRPS, "chirp_us": 228.51, "period_us": 1500.0}
+    native = {board: {"usb_serial": board} for board in PORTS}
+    result = scanned(bench, {"control": "native", "native": native}, burst)
+    assert {row.pulses for row in result.folder.committed().values()} == {COLUMNS}
+    data = result.folder.read_row("RH", 0)
+    assert data.frames_expected == COLUMNS * CHIRPS
+    words = data.payload.view("<u4") & 0x0FFFFFFF
+    assert (words == range(words[0], words[0] + words.size)).all()  # the pattern counts on through every chirp
+    first, *rows = result.folder.facts("radars")
+    for answer in first["boards"].values():
+        assert answer["state"] == "configured"
+        assert answer["rf_firmware"] != ""
+        assert answer["calibration"]["passed"]
+        assert answer["boot"] == {"power_up_us": 1856.08, "boot_errors": 0, "tests_failed": 0, "cure": ""}  # from RAM
+        assert any("no image header" in line for line in answer["events"])  # the flash was empty
+    assert len({answer["die_id"] for answer in first["boards"].values()}) == 3
+    assert "direct_if_hz" in first
+    assert [r["row"] for r in rows if all(b["state"] == "done" for b in r["boards"].values())] == [0, 1, 2]
+    for fact in rows:
+        assert all(any("4001080001000000" in sent for sent in b["sent"]) for b in fact["boards"].values())  # the start
+        assert all(b["temperatures_c"]["rx1"] for b in fact["boards"].values())

@@ -59,7 +59,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
         self._scanning: asyncio.Task[ScanResult] | None = None
         self._begun = threading.Event()  # rows are being taken
         self._times: dict[int, float] = {}  # when each row was committed
-        self._told = 0  # rows that `collect` has given
+        self._collected = 0  # rows that `collect` has given
         self._progress = (0, 0)
         super().__init__(name=name)
 
@@ -67,7 +67,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
     async def stage(self) -> None:
         """Reset the state of the previous scan."""
         await self._end()
-        self._place, self._stop, self._told = None, StopRequest(), 0
+        self._place, self._stop, self._collected = None, StopRequest(), 0
         self._begun.clear()
         self._times.clear()
 
@@ -150,21 +150,21 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
         if self._place is None or not (self._place / MANIFEST).exists():
             return
         rows = list(ScanFolder.load(self._place).committed().values())
-        for row in rows[self._told :]:
+        for row in rows[self._collected :]:
             missing = sum(board.missing_bytes for board in row.boards.values())
             values = {"row": row.row, "take": row.take, "pulses": row.pulses, "missing_bytes": missing}
             data = {f"{self.name}-{key}": value for key, value in values.items()}
             at = self._times.get(row.row, time.time())
-            self._told += 1
+            self._collected += 1
             yield {"data": data, "timestamps": dict.fromkeys(data, at), "time": at}
 
     def _scan(self, folder: Path, loop: asyncio.AbstractEventLoop) -> ScanResult:
         """Run the scan; called in its own thread."""
-        with ControlFolder(folder, self._stop) as desk:
+        with ControlFolder(folder, self._stop) as control:
 
             def show(progress: ScanProgress) -> None:
                 if progress.phase != "connect":
-                    desk.open()
+                    control.open()
                 if progress.phase == "row":
                     self._begun.set()
                 if progress.phase == "committed":

@@ -7,12 +7,23 @@ from typing import Any
 
 from polysight.host.catalogue.pictures import MAPS
 from polysight.host.catalogue.pixels import Pixels
-from polysight.host.products import SavedProducts, find_labels, label_folder, read_products
+from polysight.host.materials import PATCHES
+from polysight.host.products import (
+    IMAGE,
+    MATERIALS,
+    QUALITY,
+    REPORT,
+    SCAN,
+    SavedProducts,
+    find_labels,
+    label_folder,
+    read_products,
+)
 from polysight.shared.errors import PolysightError
 
 EXPORT = "export"
 """Folder of a scan that a page has exports written into."""
-FILES = ("report.html", "image.npz", "materials.json", "quality.json", "scan.json", "patches.npz")
+FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES)
 EXPORTS = (".h5", ".mat", ".csv", ".nc", ".cphd")
 _KEYS = (
     "label", "name", "confidence", "probabilities", "why", "metal_reference", "metal_like", "box_mm", "outline_mm",

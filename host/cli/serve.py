@@ -14,7 +14,7 @@ from polysight.shared.errors import ConfigError
 if TYPE_CHECKING:
     from polysight.host.serve import Place
 
-WISHES = ("pause", "continue", "stop", "abort")
+SCAN_COMMANDS = ("pause", "continue", "stop", "abort")
 
 
 def add_commands(add: Add) -> None:
@@ -127,7 +127,7 @@ def _note(args: argparse.Namespace) -> int:
 def _ask(args: argparse.Namespace) -> int:
     from polysight.host.jobs.scans import ask_scan
 
-    return ask_scan(args.scan, args.wish)
+    return ask_scan(args.scan, args.request)
 
 
 def _add_lists(add: Add) -> None:
@@ -149,8 +149,8 @@ def _add_lists(add: Add) -> None:
     sub = add("ask", _ask, "pause, continue, stop or abort a running scan", "polysight ask scans/one pause")
     sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder")
     sub.add_argument(
-        "wish",
-        choices=WISHES,
+        "request",
+        choices=SCAN_COMMANDS,
         help="pause: before the next row; stop: after this row; abort: now, this row is lost; continue: after a pause",
     )
 

@@ -150,9 +150,9 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     alive, promise = os.pipe()  # nothing is written: the child sees its end when this program is gone
     try:
         environment[ALIVE] = str(alive)
-        with log.open("wb") as said:
+        with log.open("wb") as output:
             child = subprocess.Popen(
-                PROGRAM, stdin=subprocess.PIPE, stdout=said, stderr=said, env=environment, pass_fds=(alive,)
+                PROGRAM, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment, pass_fds=(alive,)
             )
             _follow(child, job, stop)
     finally:

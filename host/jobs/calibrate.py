@@ -76,8 +76,8 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     given = None if config is None else load_instrument(config)
     source = open_raw(scan, given)
     rig = source.instrument if given is None else with_places_of(source.instrument, given)
-    in_force = calibration_of_scan(source)
-    filters = {b.name: in_force.high_pass(b.name) for b in rig.receivers}
+    calibration = calibration_of_scan(source)
+    filters = {b.name: calibration.high_pass(b.name) for b in rig.receivers}
     say("places of boards and plane")
     fit = fit_places(load_echoes(source, rig, filters), rig, points, Prior(prior_mm, prior_mm))
     file = places_file(rig, fit, len(points), [source_scan(source, scan)])

@@ -45,10 +45,10 @@ def check_scenes(scenes: Iterable[Path], config: Path) -> None:
         raise _error_of(checked.returncode, checked.stderr)
 
 
-def _error_of(status: int, said: str) -> PolysightError:
+def _error_of(status: int, output: str) -> PolysightError:
     """Return the error of a simulator that failed: its message and exit status."""
     kind = {e.exit_status: e for e in (ConfigError, DataError)}.get(status, DeviceError)
-    return kind(said.strip().removeprefix("error: ") or f"a simulator ended with status {status}, without a word")
+    return kind(output.strip().removeprefix("error: ") or f"a simulator ended with status {status}, without a message")
 
 
 def _check_folder(out: Path) -> None:
@@ -76,7 +76,7 @@ def simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) ->
     Raises
     ------
     PolysightError
-        when it does not start, as it said itself; its logs are in `folder`/logs.
+        when it does not start, with its own message; its logs are in `folder`/logs.
     """
     command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(config), "--scene", str(scene)]
     command += ["--dir", str(folder), "--time-scale", str(time_scale), "--with-pi", "--native"]
@@ -106,8 +106,8 @@ def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
             if line.startswith("ready "):
                 return Path(line.removeprefix("ready ").strip())
             if not line:
-                said = rig.stderr.read()
-                raise _error_of(rig.wait(), said)
+                output = rig.stderr.read()
+                raise _error_of(rig.wait(), output)
     raise DeviceError(
         f"the simulated rig was not ready within {_START_LIMIT_S:.0f} s",
         "an overloaded machine",

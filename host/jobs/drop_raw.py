@@ -45,9 +45,9 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
     for where in sorted({path.parent for boards in what.files.values() for path in boards.values()}):
         names = sorted(path.name for boards in what.files.values() for path in boards.values() if path.parent == where)
         sys.stdout.write(f"to be removed: {where.relative_to(folder)}: {', '.join(names)}\n")
-    said = confirm(text, WORD, yes)
-    if said != WORD:
-        raise ConfigError(f"nothing dropped: answered {said!r}", f"{WORD!r} was asked for", f"type {WORD}, or --yes")
+    answer = confirm(text, WORD, yes)
+    if answer != WORD:
+        raise ConfigError(f"nothing dropped: answered {answer!r}", f"{WORD!r} was asked for", f"type {WORD}, or --yes")
     _keep(products, scan)
     drop(scan, processed, products)
     sys.stdout.write(f"{folder}: dropped; its digests stay in the manifest\n")

@@ -128,11 +128,11 @@ class _Live:
 def _run(folder: Path, options: Options, process: bool, run_rows: RunScan) -> int:
     live = _Live(folder)
     stop = StopRequest()
-    with ScanBar() as bar, ControlFolder(folder, stop) as desk:
+    with ScanBar() as bar, ControlFolder(folder, stop) as control:
 
         def show(progress: ScanProgress) -> None:
             if progress.phase != "connect":
-                desk.open()  # the scan folder is there, and locked by this program
+                control.open()  # the scan folder is there, and locked by this program
             bar.update(progress)
 
         result = run_rows(live.add_row if process else None, show, stop)
@@ -212,7 +212,7 @@ def scan(config: Path, request: ProcessRequest, truth: Path | None, keep_incompl
     def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
         def show(progress: ScanProgress) -> None:
             if truth is not None and progress.phase == "row" and not (folder / TRUTH).exists():
-                with suppress(OSError):  # said below: a row is worth more
+                with suppress(OSError):  # noted below: a row is worth more
                     shutil.copyfile(truth, folder / TRUTH)
             on_progress(progress)
 

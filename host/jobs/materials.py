@@ -30,6 +30,7 @@ from polysight.host.materials import (
 )
 from polysight.host.products import (
     MATERIALS,
+    REPORT,
     SCAN,
     SavedProducts,
     find_products,
@@ -43,7 +44,6 @@ from polysight.shared.errors import ConfigError, DataError
 
 _SAME_FREQUENCY = 1e-6  # relative: far above rounding, far below any other chirp
 _REASONS = 3  # of a verdict, for the terminal
-REPORT = "report.html"
 
 
 def print_verdict(products: SavedProducts, to_terminal: bool = True) -> int:

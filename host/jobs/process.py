@@ -41,6 +41,7 @@ from polysight.host.products import (
     IMAGE,
     QUALITY,
     RAW_DROPPED,
+    REPORT,
     SavedProducts,
     check_products_folder,
     making_products,
@@ -51,7 +52,6 @@ from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError, advice
 
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
-REPORT = "report.html"
 
 
 def all_rows(

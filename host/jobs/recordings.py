@@ -198,8 +198,7 @@ def inspect_placement(file: Path, as_json: bool) -> int:
     again = place_again(row)
     same = again.moved or again.missing == again.placed.missing
     if as_json:
-        said = {**again.placed.facts(), "committed_missing": again.missing, "same": same}
-        print_json(said)
+        print_json({**again.placed.facts(), "committed_missing": again.missing, "same": same})
     else:
         sys.stdout.write("\n".join(_placement_lines(file, again, same)) + "\n")
     return 0 if same else 1

@@ -76,12 +76,12 @@ def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> i
     return 0
 
 
-def ask_scan(folder: Path, wish: str) -> int:
+def ask_scan(folder: Path, command: str) -> int:
     """Send a command to a running scan; return 0 when it has received it. Raises ScanError."""
     if not folder.is_dir():
         raise no_such(folder)
-    send_command(folder, ScanCommand(wish))
-    sys.stdout.write(f"{folder}: heard {wish}\n")
+    send_command(folder, ScanCommand(command))
+    sys.stdout.write(f"{folder}: heard {command}\n")
     return 0
 
 

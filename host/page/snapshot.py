@@ -41,8 +41,8 @@ def make_snapshot(c: Content) -> dict[str, Any]:
     """The whole state of a scan."""
     if c.history is None:
         status = no_scan(c.folder) if not c.problem else unreadable(c.folder, c.problem)
-        wishes = _control(c, running=False)
-        return {"scan": None, "status": asdict(status), "control": wishes, "notices": _notices(c)}
+        control = _control(c, running=False)
+        return {"scan": None, "status": asdict(status), "control": control, "notices": _notices(c)}
     history = c.history
     marks = "".join(_MARKS.get(history.marks.get(row, ""), ".") for row in range(history.plan.rows))
     return {

@@ -10,7 +10,6 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -202,7 +201,7 @@ class Watch:
         self.shown = self._viewer.shown if self._viewer is not None else Shown()
         heard = self._listener.heard if self._listener is not None else PiState()
         content = Content(
-            self.folder, self._history, self._signs(heard), heard, self.shown, self._wish(), self.control,
+            self.folder, self._history, self._signs(heard), heard, self.shown, self._pending(), self.control,
             self._problem, self._result.look(),
         )  # fmt: skip
         self.state = _publish(self.state, make_snapshot(content))
@@ -259,32 +258,23 @@ class Watch:
         silent = now - heard.heard_s if heard.heard_s else None
         return LifeSigns(alive, alive_s, silent, _PI_LIMIT_S, wall)
 
-    def _wish(self) -> ScanCommand | None:
+    def _pending(self) -> ScanCommand | None:
         """The pending request, until the manifest shows that it was carried out."""
         if self._asked is None or self._history is None:
             return None
-        wish, facts = self._asked
+        command, facts = self._asked
         since = {f["fact"] for f in self._content.facts[facts:]}
         if since & {"scan_ended", "scan_resumed", "scan_paused", "scan_continued"}:
             self._asked = None
             return None
-        return wish
+        return command
 
-    def ask(self, wish: ScanCommand) -> None:
+    def ask(self, command: ScanCommand) -> None:
         """Ask the scan to pause, continue, stop or abort; returns when it has taken the request. Raises ScanError."""
         before = len(self._content.facts)
-        send_command(self.folder, wish)
+        send_command(self.folder, command)
         paused = self._history is not None and self._history.paused
-        self._asked = None if wish is ScanCommand.CONTINUE and not paused else (wish, before)
-
-    def wait_for(self, condition: Callable[[dict[str, Any]], bool], limit_s: float) -> bool:
-        """Wait until a snapshot meets a condition; False after the limit."""
-        deadline = time.monotonic() + limit_s
-        while not condition(json.loads(self.state.data)):
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(_TURN_S / 4)
-        return True
+        self._asked = None if command is ScanCommand.CONTINUE and not paused else (command, before)
 
     def _close_parts(self) -> None:
         for part in (self._viewer, self._listener):

@@ -34,6 +34,7 @@ from polysight.shared.tables import decode, to_builtins
 
 SCAN = "scan.json"
 IMAGE, QUALITY, MATERIALS, LABELS = "image.npz", "quality.json", "materials.json", "labels.json"
+REPORT = "report.html"
 FINISHED = ".finished.json"  # settings of the products, written by batch processing
 _OPTIONAL = ("p_sigma",)  # arrays of image.npz that earlier releases did not write
 _PRODUCTS = "products"  # in a scan folder

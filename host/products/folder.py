@@ -26,6 +26,7 @@ from polysight.host.products.files import (
     LABELS,
     MATERIALS,
     QUALITY,
+    REPORT,
     SCAN,
     SavedProducts,
     write_atomically,
@@ -35,7 +36,7 @@ from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, DeviceError
 
 LABELS_PICTURE = "labels.png"
-PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, "report.html", "figures")
+PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, REPORT, "figures")
 RAW_DROPPED = "raw_dropped"
 """Key of quality.json: the scan whose raw data was deleted after these products were made."""
 _BY_HAND = b'"by_hand": true'

@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from markupsafe import Markup, escape
 
 from polysight.host.materials import UNKNOWN
-from polysight.host.products import permittivity_spread, refused_text, write_atomically
+from polysight.host.products import REPORT, permittivity_spread, refused_text, write_atomically
 from polysight.host.report.context import ReportContext
 from polysight.host.report.figures import FIGURES, figures
 from polysight.host.report.style import colours_of, patch_colour, patch_label, plate_label
@@ -41,7 +41,7 @@ def write_report(out_dir: Path, ctx: ReportContext) -> Path:
     pictures = figures(ctx)
     for name, data in pictures.items():
         write_atomically(out_dir / "figures" / f"{name}.png", data)
-    page = out_dir / "report.html"
+    page = out_dir / REPORT
     write_atomically(page, render(ctx, pictures).encode("utf-8"))
     return page
 

@@ -142,7 +142,7 @@ def control_routes(site: Site) -> list[Route]:
 
     return [
         Route("/api/session", _session(site), methods=["POST"]),
-        route("control/{wish}", Body, _control),
+        route("control/{command}", Body, _control),
         route("plan", PlanRequest, _plan),
         route("doctor", Body, _doctor),
         route("start", StartRequest, _start),
@@ -179,7 +179,7 @@ def _session(site: Site) -> Callable[[Request], Awaitable[Response]]:
 
 async def _control(site: Site, request: Request, body: Body) -> dict[str, Any]:
     del body
-    name, given = site.name(request), request.path_params["wish"]
+    name, given = site.name(request), request.path_params["command"]
     if given not in list(ScanCommand):
         raise DataError(
             f"a scan cannot be asked to {given[:40]!r}", "the name is wrong", f"one of {', '.join(ScanCommand)}",

@@ -32,7 +32,7 @@ from polysight.host.catalogue import (
     thumbnail,
 )
 from polysight.host.page import Watch
-from polysight.host.products import read_products
+from polysight.host.products import REPORT, read_products
 from polysight.host.serve.guard import refused
 from polysight.host.serve.programs import program_of, programs_of
 from polysight.host.serve.site import Site
@@ -210,7 +210,7 @@ async def _file(site: Site, request: Request) -> Response:
         return folder, (folder / EXPORT if of == EXPORT else read_products(folder).folder) / name
 
     folder, path = await site.read_scan(request, find)
-    if name == "report.html":
+    if name == REPORT:
         return FileResponse(path, media_type="text/html", headers={"Content-Security-Policy": _REPORT_POLICY})
     return FileResponse(path, media_type="application/octet-stream", filename=f"{folder.name}-{name}")
 

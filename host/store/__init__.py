@@ -11,7 +11,7 @@ from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
 from polysight.host.store.raw import Digests, drop, droppable, require_raw
-from polysight.host.store.replace import PlacedAgain, Replaced, damage_of, place_again, replace_rows
+from polysight.host.store.replace import PlacedAgain, Replaced, place_again, replace_rows
 from polysight.host.store.scan_folder import (
     EVENTS,
     MANIFEST,
@@ -28,7 +28,7 @@ from polysight.host.store.source import CubeRow, RawSource, RowData, Scan, Sourc
 from polysight.host.store.sources.open import is_source, open_source
 from polysight.host.store.sources.published_settings import COLLECTION, mirrored, read_settings, rig_of
 from polysight.host.store.untrusted import MAX_BYTES, check_links, inside, open_npz
-from polysight.host.store.validation import damaged_rows, to_json, validate
+from polysight.host.store.validation import damage_of, damaged_rows, to_json, validate
 
 __all__ = [
     "COLLECTION",

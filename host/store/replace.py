@@ -6,7 +6,7 @@ afterwards. A crash at any moment leaves either the old or the new row.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -26,7 +26,8 @@ from polysight.host.capture import (
 )
 from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.manifest import Fact, ManifestWriter
-from polysight.host.store.scan_folder import BoardRow, ScanFolder, utc_now
+from polysight.host.store.scan_folder import BoardRow, CommittedRow, ScanFolder, utc_now
+from polysight.host.store.validation import board_faults
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
@@ -71,18 +72,6 @@ def place_again(path: Path) -> PlacedAgain:
     return PlacedAgain(evidence, placed, out, missing, moved="frames" in facts)
 
 
-def damage_of(scan: ScanFolder, path: Path) -> str:
-    """Compare a row's files with the manifest; return the difference, "" if there is none."""
-    for row in scan.committed().values():
-        for board in row.boards.values():
-            if (scan.path / board.file).resolve() == path.resolve():
-                try:
-                    return _difference(path, board)
-                except OSError as e:
-                    return f"{e.filename}: {e.strerror}"
-    return "the manifest has no such committed row"
-
-
 def replace_rows(scan: ScanFolder) -> list[Replaced]:
     """Place every committed row again, and commit those with a different result.
 
@@ -95,7 +84,7 @@ def replace_rows(scan: ScanFolder) -> list[Replaced]:
     with scan.writer() as writer:
         scan.reload()
         for row in scan.committed().values():
-            boards = {name: _place(scan, row.row, board) for name, board in row.boards.items()}
+            boards = {name: _place(scan, row, board) for name, board in row.boards.items()}
             found += [report for report, _ in boards.values()]
             changed = {name: again for name, (report, again) in boards.items() if report.changed and again is not None}
             if changed:
@@ -104,31 +93,22 @@ def replace_rows(scan: ScanFolder) -> list[Replaced]:
     return found
 
 
-def _place(scan: ScanFolder, row: int, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
+def _place(scan: ScanFolder, row: CommittedRow, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
     name, path = Path(board.file).parent.name, scan.path / board.file
-    before = board.missing_bytes
+    unchanged = Replaced(row.row, name, board.missing_bytes, board.missing_bytes)
     if not board.packets_crc32:
-        return Replaced(row, name, before, before, "its packets were not kept"), None
+        return replace(unchanged, left="its packets were not kept"), None
     try:
-        if difference := _difference(path, board):
-            return Replaced(row, name, before, before, difference, damaged=True), None
+        if faults := board_faults(scan, board, row.pulses):
+            return replace(unchanged, left="; ".join(map(str, faults)), damaged=True), None
         again = place_again(path)
-    except (DataError, OSError) as e:
-        return Replaced(row, name, before, before, str(e), damaged=True), None
+    except DataError as e:
+        return replace(unchanged, left=str(e), damaged=True), None
     if again.moved:
-        return Replaced(row, name, before, before, "its frames were placed by their pulses"), None
+        return replace(unchanged, left="its frames were placed by their pulses"), None
     after = sum(b - a for a, b in again.placed.missing)
     same = again.missing == again.placed.missing and f"{crc32(again.out.tobytes()):08x}" == board.crc32
-    return Replaced(row, name, before, after, changed=not same), again
-
-
-def _difference(path: Path, board: BoardRow) -> str:
-    """Return which of a row's files differs from the committed one; "" if none does. Raises OSError."""
-    digests = {".bin": board.crc32, ".idx": board.index_crc32, PACKETS: board.packets_crc32}
-    for suffix, digest in digests.items():
-        if digest and f"{crc32(path.with_suffix(suffix).read_bytes()):08x}" != digest:
-            return f"its {suffix} file differs from the committed one"
-    return ""
+    return replace(unchanged, after=after, changed=not same), again
 
 
 def _commit(scan: ScanFolder, writer: ManifestWriter, row: int, changed: dict[str, PlacedAgain]) -> None:

@@ -85,6 +85,15 @@ def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
     return {row: [str(f) for f in faults] for row, faults in found.items() if faults}
 
 
+def damage_of(scan: ScanFolder, path: Path) -> str:
+    """Compare a row's files with the manifest; return the faults, "" if there are none. `path` is its payload."""
+    for row in scan.committed().values():
+        for board in row.boards.values():
+            if (scan.path / board.file).resolve() == path.resolve():
+                return "; ".join(map(str, board_faults(scan, board, row.pulses)))
+    return "the manifest has no such committed row"
+
+
 def _lost_lines(fault: ManifestFault, lost: str) -> Finding:
     """Return a fault of the manifest as a finding; a note if no row is `lost`."""
     return Finding("error" if lost else "note", f"{MANIFEST} line {fault.line}", fault.what, lost or _ALL_THERE)
@@ -114,11 +123,12 @@ def _row(scan: ScanFolder, row: CommittedRow) -> list[Finding]:
     if set(row.boards) != boards:
         found.append(Finding("error", where, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
     for board in row.boards.values():
-        found += _board(scan, board, pulses)
+        found += board_faults(scan, board, pulses)
     return found
 
 
-def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
+def board_faults(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
+    """Compare the files of one board's committed row of `frames` frames with the manifest."""
     where, path = board.file, scan.path / board.file
     found = []
     expected = frames * scan.instrument.frame_bytes

@@ -32,7 +32,7 @@ from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, PolysightError, ScanError, os_error
 from polysight.shared.faults import explain
 from polysight.shared.tables import to_builtins
-from tests.support.acquisition.fake_rig import receiver_of
+from tests.support.acquisition.receivers import receiver_of
 from tests.support.refusals import refused
 
 

@@ -23,7 +23,7 @@ from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validation import validate
 from polysight.shared import messages as m
 from polysight.shared.error_codes import ErrorCode
-from tests.support.acquisition.fake_rig import receivers
+from tests.support.acquisition.receivers import receivers
 from tests.support.refusals import refused
 
 

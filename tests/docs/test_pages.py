@@ -10,6 +10,7 @@ import numpy as np
 from docs.check.looking import page_faults
 from docs.check.pages import ROOT, all_pages, read_page
 from polysight.host.acquisition import ScanCommand
+from polysight.host.cli.serve import SCAN_COMMANDS
 from polysight.host.materials import check_labels, read_labels
 from polysight.host.radar.usb import PRODUCT, VENDOR
 from polysight.host.verdict import NoResult
@@ -40,7 +41,8 @@ def test_fault_numbers_and_exit_statuses_are_told():
 
 def test_every_request_to_a_scan_is_told():
     page = (ROOT / "docs/how-to/live-view.md").read_text(encoding="utf-8")
-    assert all(f"control/{wish}" in page for wish in ScanCommand)
+    assert all(f"control/{command}" in page for command in ScanCommand)
+    assert list(ScanCommand) == [*SCAN_COMMANDS]
 
 
 def test_the_drawing_shows_the_rig_file_and_the_sketch():

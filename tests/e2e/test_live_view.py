@@ -43,10 +43,10 @@ class View:
             return json.load(reply)
         return {"status": {"headline": "not there yet"}}
 
-    def ask(self, wish: str) -> None:
+    def ask(self, command: str) -> None:
         """What a button does."""
         headers = {"X-Polysight-Token": self._token}
-        with urlopen(Request(f"{self._address}/api/control/{wish}", b"", headers), timeout=LIMIT_S) as reply:
+        with urlopen(Request(f"{self._address}/api/control/{command}", b"", headers), timeout=LIMIT_S) as reply:
             assert reply.status == 200
 
     def wait(self, condition: Callable[[dict[str, Any]], object], what: str) -> dict[str, Any]:

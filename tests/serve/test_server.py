@@ -47,7 +47,7 @@ class Page:
 
 @pytest.fixture
 def desk(growing):
-    """A running scan of which nothing has come yet: its folder and what hears of wishes."""
+    """A running scan of which nothing has come yet: its folder and what hears of commands."""
     growing.grow_to("scan_started")
     with open_control(growing.path) as stop:
         yield growing.path, stop
@@ -57,8 +57,8 @@ def desk(growing):
 def test_without_the_token_nothing_is_asked(desk, watching, given):
     folder, stop = desk
     with served(watching(folder, control=True), TOKEN) as view:
-        for wish in ScanCommand:
-            status, body, _ = ask(view, f"/api/control/{wish}?token={TOKEN}", "POST", **given)
+        for command in ScanCommand:
+            status, body, _ = ask(view, f"/api/control/{command}?token={TOKEN}", "POST", **given)
             assert status == 403
             assert "token" in json.loads(body)["what"]
     assert not stop.after_row
@@ -68,8 +68,8 @@ def test_without_the_token_nothing_is_asked(desk, watching, given):
 def test_with_the_token_the_scan_hears(desk, watching):
     folder, stop = desk
     with served(watching(folder, control=True), TOKEN) as view:
-        for wish, holds in ((ScanCommand.PAUSE, True), (ScanCommand.CONTINUE, False)):
-            assert ask(view, f"/api/control/{wish}", "POST", **{TOKEN_HEADER: TOKEN})[0] == 200
+        for command, holds in ((ScanCommand.PAUSE, True), (ScanCommand.CONTINUE, False)):
+            assert ask(view, f"/api/control/{command}", "POST", **{TOKEN_HEADER: TOKEN})[0] == 200
             assert stop.paused is holds
         assert ask(view, "/api/control/abort", "POST", **{TOKEN_HEADER: TOKEN})[0] == 200
         assert stop.now

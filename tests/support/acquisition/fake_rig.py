@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import zmq
 
@@ -233,18 +232,3 @@ def small_instrument(**limits: float) -> Instrument:
     limits = {"end_of_record_s": 0.25, "command_timeout_s": 1.5, "free_disk_bytes": 0, **limits}
     card = {"receive_buffer_bytes": 1 << 20}
     return on_free_subnet(rig_with(grid={"columns": 3, "rows": 4}, burst={"pulses": 3}, limits=limits, card=card))
-
-
-def receivers() -> list[int]:
-    """Process ids of the receivers of this test's scan, in the order of the recorded boards."""
-    children = Path(f"/proc/self/task/{threading.main_thread().native_id}/children").read_text().split()
-    return sorted(
-        int(pid)
-        for pid in children
-        if b"polysight.host.capture.receiver_process" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    )
-
-
-def receiver_of(board: str) -> int:
-    """Process id of the receiver of RH or RV."""
-    return receivers()[["RH", "RV"].index(board)]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,9 +16,11 @@ from polysight.host.process import ProcessRequest
 from polysight.simulators.scene import decode_scene, simulate
 from tests.support.page.chromium import Browser, find_chromium
 from tests.support.page.live_view import GrowingScan
+from tests.support.products import unrendered
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, PET, scene_of
 from tests.support.store.small_scan import Samples, SmallScan
+from tests.support.suite.once import made_once
 
 
 @pytest.fixture(scope="session")
@@ -37,13 +42,26 @@ def growing(finished: Path, tmp_path: Path) -> GrowingScan:
     return GrowingScan(finished, tmp_path / "scan")
 
 
-@pytest.fixture
-def watching() -> Iterator[Callable[..., Watch]]:
-    """Makes `Watch`es that run until the test ends."""
-    made: list[Watch] = []
+class Watched(Watch):
+    """A watch whose snapshots are waited for."""
 
-    def watch(*arguments: object, **options: object) -> Watch:
-        made.append(Watch(*arguments, **options))  # pyright: ignore[reportArgumentType]
+    def wait_for(self, condition: Callable[[dict[str, Any]], bool], limit_s: float) -> bool:
+        """Wait until a snapshot meets a condition; False after the limit."""
+        deadline = time.monotonic() + limit_s
+        while not condition(json.loads(self.state.data)):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.05)
+        return True
+
+
+@pytest.fixture
+def watching() -> Iterator[Callable[..., Watched]]:
+    """Makes watches, as `Watch`, that run until the test ends."""
+    made: list[Watched] = []
+
+    def watch(*arguments: Any, **options: Any) -> Watched:
+        made.append(Watched(*arguments, **options))
         made[-1].start()
         return made[-1]
 
@@ -63,9 +81,12 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.fixture(scope="session")
 def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with two processed scans, `one` and `two`, of copper and PET with other noise."""
-    root = tmp_path_factory.mktemp("processed")
     scene = decode_scene(scene_of(COPPER, PET, columns=15, rows=17), "test")
-    for name, seed in (("one", 3), ("two", 7)):
-        folder = simulate(published_rig(), scene, root / name, seed=seed)
-        assert process(ProcessRequest(data=str(folder), out=str(folder / "products")), threads=1) == 0
-    return root
+
+    def make(root: Path) -> None:
+        for name, seed in (("one", 3), ("two", 7)):
+            folder = simulate(published_rig(), scene, root / name, seed=seed)
+            with unrendered():
+                assert process(ProcessRequest(data=str(folder), out=str(folder / "products")), threads=1) == 0
+
+    return made_once(tmp_path_factory, "processed", make)

@@ -59,3 +59,4 @@ class ErrorCode(StrEnum):
     # Radar
     RADAR_RESTARTED = "radar-restarted"
     RADAR_NO_FIRMWARE = "radar-no-firmware"
+    RADAR_FAULT = "radar-fault"  # a fatal event, or a failed self-test

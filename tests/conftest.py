@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -12,6 +13,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from polysight.shared.config import Instrument
+
+gc.disable()  # until all is imported and collected; what that makes lives to the end
 
 # The tests start some hundred programs: our modules are compiled once for all of them, whatever the shell says; and one
 # thread each for linear algebra, for two that spin against each other on few cores are ten times slower than one.
@@ -59,6 +62,11 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if hasattr(config, "workerinput"):  # with one worker alone, as they are
         longest_first(items)
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)

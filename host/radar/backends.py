@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
 from polysight.host.radar.native import NativeRadars
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
 
 LINE = b"Retrigger\n"
@@ -66,6 +67,7 @@ class LineServers(RadarControl):
                     f"{board}: its control server at {self._servers[board]} does not read its lines",
                     "the program there hangs: the lines of many rows fill its connection",
                     "restart it, then `polysight resume SCAN`",
+                    code=ErrorCode.NO_ANSWER,
                 ) from None
             except ConnectionError:
                 self._reset.add(board)
@@ -130,22 +132,30 @@ class LineServers(RadarControl):
                     f" {self._timeout_s:g} s",
                     "the connection is half-open: that machine was switched off, or the network is cut",
                     "check that machine and the cable, then `polysight resume SCAN`",
+                    code=ErrorCode.NO_ANSWER,
                 )
 
     def _unreachable(self, board: str, e: OSError) -> DeviceError:
         what = f"{board}: cannot reach its control server at {self._servers[board]}"
         if isinstance(e, ConnectionRefusedError):
             return DeviceError(
-                f"{what}: connection refused", "that machine is running, but no server listens", _START_SERVER
+                f"{what}: connection refused",
+                "that machine is running, but no server listens",
+                _START_SERVER,
+                code=ErrorCode.NO_ANSWER,
             )
         if isinstance(e, TimeoutError):
             return DeviceError(
                 f"{what} within {self._timeout_s:g} s",
                 "that machine is off, or a firewall drops the connection",
                 _START_SERVER,
+                code=ErrorCode.NO_ANSWER,
             )
         return DeviceError(
-            f"{what}: {e.strerror or e}", "the address is wrong, or there is no route to it", _START_SERVER
+            f"{what}: {e.strerror or e}",
+            "the address is wrong, or there is no route to it",
+            _START_SERVER,
+            code=ErrorCode.NO_ANSWER,
         )
 
 

@@ -142,6 +142,7 @@ class BringUp:
                 f"{self._name}: starts, but not from its flash: {'; '.join(self._ignored)}",
                 "the flash does not contain the image: a power failure during the download, or a worn flash",
                 "download it again; until then radar.firmware starts the board from RAM",
+                code=ErrorCode.RADAR_NO_FIRMWARE,
             )
         after = self._main_patch()
         self._verify(after, before, image)
@@ -180,7 +181,10 @@ class BringUp:
         """Raise DeviceError if the board reported a hardware fault at any start of this bring-up."""
         if self._damage:
             raise DeviceError(
-                f"{self._name}: {self._damage}", "the start-up self-test of the device failed", "replace the board"
+                f"{self._name}: {self._damage}",
+                "the start-up self-test of the device failed",
+                "replace the board",
+                code=ErrorCode.RADAR_FAULT,
             )
 
     def _load_firmware(self) -> str:
@@ -213,6 +217,7 @@ class BringUp:
                 f"{self._name}: refuses {image.name}: {booted}",
                 "an image for another device",
                 "use TI's image for AWR2243",
+                code=ErrorCode.REFUSED_BY_PEER,
             )
 
     def _booted(self) -> e.Event:
@@ -246,7 +251,10 @@ class BringUp:
             return
         if patch in (before, _NO_PATCH):
             raise DeviceError(
-                what, "it did not start from the download", "power-cycle the board, then `polysight radar check`"
+                what,
+                "it did not start from the download",
+                "power-cycle the board, then `polysight radar check`",
+                code=ErrorCode.MISMATCH,
             )
         self._link.warnings.append(what)
 
@@ -317,6 +325,7 @@ class BringUp:
                 f"{self._name}: RF init failed: {', '.join(failed)} ({event})",
                 "no reference clock, an RF supply out of range, or a damaged RF part",
                 "measure the RF supplies; power-cycle the board; replace it if the fault remains",
+                code=ErrorCode.RADAR_FAULT,
             )
         if self._calibration is not None and saved is None and die != NO_DIE:
             self._calibration.save(die, read_calibration(self._link, self._name))
@@ -361,7 +370,10 @@ class BringUp:
                 self._ignored.append(str(event))
         elif event.fatal:
             raise DeviceError(
-                f"{self._name}: {event}", "the radar stopped with a fault", "the retake of the row resets it"
+                f"{self._name}: {event}",
+                "the radar stopped with a fault",
+                "the retake of the row resets it",
+                code=ErrorCode.RADAR_FAULT,
             )
 
 
@@ -381,4 +393,5 @@ def data_of(name: str, answer: Message, question: c.Command, min_bytes: int) -> 
         f"{name}: the answer to 0x{question.ID:04X} has no such data",
         "unknown device or firmware",
         "check the firmware",
+        code=ErrorCode.MESSAGE_INVALID,
     )

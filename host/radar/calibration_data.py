@@ -101,14 +101,22 @@ class CalibrationFiles:
         return data
 
     def save(self, die_id: str, data: bytes) -> None:
-        """Write a die's file atomically. Raises OSError."""
+        """Write a die's file atomically. Raises ConfigError if it cannot be written."""
         path = self.path(die_id)
-        self._folder.mkdir(parents=True, exist_ok=True)
         temperature = struct.unpack_from("<h", data, 16)[0]
         content = {"die_id": die_id, "temperature_c": temperature, "crc32": zlib.crc32(data), "data": data.hex()}
         part = path.with_suffix(".part")
-        part.write_text(json.dumps(content), encoding="utf-8")
-        part.replace(path)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            part.write_text(json.dumps(content), encoding="utf-8")
+            part.replace(path)
+        except OSError as error:
+            raise ConfigError(
+                f"radar.calibration_dir: {path} cannot be written: {error.strerror}",
+                "the path is wrong, a permission is missing, or the disk is full",
+                "correct calibration_dir, or remove it",
+                code=ErrorCode.FILE_UNWRITABLE,
+            ) from None
 
 
 def read_calibration(link: Link, name: str) -> bytes:
@@ -118,10 +126,18 @@ def read_calibration(link: Link, name: str) -> bytes:
         blocks = link.call(SaveCalibration(part)).blocks
         if not blocks or len(blocks[0].data) != PART_BYTES + 4:
             raise DeviceError(
-                f"{name}: the answer has no calibration data", "unknown firmware", "remove calibration_dir"
+                f"{name}: the answer has no calibration data",
+                "unknown firmware",
+                "remove calibration_dir",
+                code=ErrorCode.MESSAGE_INVALID,
             )
         if struct.unpack_from("<2H", blocks[0].data) != (PARTS, part):
-            raise DeviceError(f"{name}: the answer has not part {part} of the calibration", "unknown firmware", _REMEDY)
+            raise DeviceError(
+                f"{name}: the answer has not part {part} of the calibration",
+                "unknown firmware",
+                _REMEDY,
+                code=ErrorCode.MESSAGE_INVALID,
+            )
         data += blocks[0].data[4:]
     return data
 
@@ -138,7 +154,10 @@ def restore_calibration(link: Link, name: str, data: bytes, timeout_s: float, no
     passed = event.values.get("passed")
     if not isinstance(passed, int) or passed & RESTORED != RESTORED:
         raise DeviceError(
-            f"{name}: does not accept its calibration data: {event}", "the firmware has changed since", _REMEDY
+            f"{name}: does not accept its calibration data: {event}",
+            "the firmware has changed since",
+            _REMEDY,
+            code=ErrorCode.REFUSED_BY_PEER,
         )
     link.call(InitCalibrations(ALL & ~RESTORED))
     return f"calibration restored, made at {struct.unpack_from('<h', data, 16)[0]} C"

@@ -85,7 +85,10 @@ def firmware_of(rig: Instrument) -> Image | None:
         return read_image(Path(rig.radar.firmware))
     except OSError as e:
         raise ConfigError(
-            f"radar.firmware: {rig.radar.firmware} cannot be read: {e.strerror}", "a typing error", "correct the path"
+            f"radar.firmware: {rig.radar.firmware} cannot be read: {e.strerror}",
+            "a typing error",
+            "correct the path",
+            code=ErrorCode.FILE_UNREADABLE,
         ) from None
 
 
@@ -112,6 +115,7 @@ def _make_folder(folder: Path) -> None:
             f"radar.trace_dir: {folder} cannot be created: {e.strerror}",
             "a typing error, or a missing permission",
             "correct the path",
+            code=ErrorCode.FILE_UNWRITABLE,
         ) from None
 
 

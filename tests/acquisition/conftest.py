@@ -6,9 +6,15 @@ import pytest
 
 from tests.support.acquisition.fake_cards import payload_of
 from tests.support.acquisition.fake_rig import FakeRig, small_instrument
+from tests.support.acquisition.receivers import fork_receivers
 from tests.support.page.fixtures import finished, samples
 
 __all__ = ["finished", "samples"]
+
+
+@pytest.fixture(autouse=True)
+def _forked_receivers(monkeypatch: pytest.MonkeyPatch) -> None:
+    fork_receivers(monkeypatch)
 
 
 @pytest.fixture

@@ -12,7 +12,8 @@ import pytest
 from polysight.host.acquisition.pi_client import RefusedError
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
-from polysight.host.cli.main import main
+from polysight.host.doctor.checks import run_doctor
+from polysight.host.doctor.context import DoctorOptions
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validation import validate
@@ -37,7 +38,7 @@ def skipped(findings, cause):
 
 
 def test_all_checks_of_a_healthy_rig_pass(live, capsys):
-    status = main(["doctor", "--config", str(live.config), "--out", str(live.folder), "--move", "--json"])
+    status = run_doctor(DoctorOptions(live.config, live.folder, move=True), as_json=True, system=QUICK)
     document = json.loads(capsys.readouterr().out)
     found = {f["check"]: f for f in document["findings"]}
     assert (status, document["ok"], document["simulated"]) == (0, True, True)

@@ -17,7 +17,6 @@ from polysight.host.radar.calibration_data import (
 )
 from polysight.host.radar.program import program
 from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DeviceError
 from tests.support.refusals import refused
 
 FRAMES = 4
@@ -73,10 +72,16 @@ def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp
     if name == "RH" and bit in OF_TX:
         radar.configure()
         return
-    with pytest.raises(DeviceError, match=text):
+    with refused(ErrorCode.RADAR_FAULT, text):
         radar.configure()
     assert not (tmp_path / "kept").exists()
     assert 0x0100 not in board.executed
+
+
+def test_a_calibration_folder_that_cannot_be_written_is_named(made, tmp_path):
+    (tmp_path / "kept").write_text("a file in place of the folder")
+    with refused(ErrorCode.FILE_UNWRITABLE, tmp_path / "kept", "calibration_dir"):
+        made(CalibrationFiles(tmp_path / "kept", b"settings")).configure()
 
 
 def test_other_settings_and_other_dies_have_their_own_calibration(made, board, tmp_path):

@@ -22,7 +22,7 @@ from polysight.host.report.maps import draw_materials, permittivity_map
 from polysight.host.report.style import shorten_labels
 from polysight.host.report.tables import budget_table
 from polysight.host.verdict import LEVELS
-from tests.support.products import BUDGET, NAMES, PERMITTIVITY, REASON, judged_products, segments
+from tests.support.products import BUDGET, NAMES, PERMITTIVITY, REASON, judged_products, segments, unrendered
 
 RESULTS = (*NAMES, "2.90", "± 0.20", "ε′ ±")
 
@@ -62,7 +62,8 @@ def drawn_text(make) -> str:
 @pytest.mark.parametrize("level", LEVELS)
 def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
     folder = judged_products(tmp_path, level)
-    page = unescape(write_report(folder, context(folder)).read_text(encoding="utf-8"))
+    with unrendered():
+        page = unescape(write_report(folder, context(folder)).read_text(encoding="utf-8"))
     head = page[page.index("<main>") : page.index("<h2>Images")]
     assert f'<span class="badge">{LEVELS[level]}</span>' in head
     for part in REASON.values():
@@ -75,7 +76,8 @@ def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
 @pytest.mark.parametrize("careless", [False, True])
 def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_path, careless):
     folder = judged_products(tmp_path, "none", careless)
-    text = drawn_text(lambda: write_report(folder, context(folder)))
+    with unrendered():
+        text = drawn_text(lambda: write_report(folder, context(folder)))
     text += drawn_text(lambda: plot_scan(ProcessedScan(folder)))
     page = unescape((folder / "report.html").read_text(encoding="utf-8"))
     for part in (text, page[page.index("<main>") :]):
@@ -98,7 +100,8 @@ def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path)
 
 def test_products_of_earlier_releases_have_no_verdict_and_no_budget(tmp_path):
     folder = judged_products(tmp_path, None)
-    page = unescape(write_report(folder, context(folder, materials=segments(None))).read_text(encoding="utf-8"))
+    with unrendered():
+        page = unescape(write_report(folder, context(folder, materials=segments(None))).read_text(encoding="utf-8"))
     assert 'class="verdict' not in page
     assert "Error budget" not in page
     assert "2.90 ± 0.20" in page

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import zmq
 
@@ -18,7 +17,7 @@ from tests.support.rigs import rig_with
 
 
 class FakePi:
-    """Speaks the wire protocol; a row makes every card send at once."""
+    """A Pi that speaks only the wire protocol; a row makes every card send its data."""
 
     def __init__(self, rig: Instrument, cards: list[FakeCard]) -> None:
         self.rig, self.cards = rig, cards
@@ -171,7 +170,7 @@ class FakePi:
             )  # fmt: skip
 
     def _run_at_its_pace(self, row: Row, take: int) -> None:
-        """Bursts 60 ms apart, pulses 1.5 ms apart, on a clock of its own, each frame 0.1 ms after its pulse."""
+        """Send bursts 60 ms apart with pulses 1.5 ms apart, on its own clock, and each frame 0.1 ms after its pulse."""
         assert self.run is not None
         n, period, ahead = self.run.pulses, 1_500_000, 77_000_000_000
         begin = time.monotonic_ns() + 20_000_000
@@ -233,18 +232,3 @@ def small_instrument(**limits: float) -> Instrument:
     limits = {"end_of_record_s": 0.25, "command_timeout_s": 1.5, "free_disk_bytes": 0, **limits}
     card = {"receive_buffer_bytes": 1 << 20}
     return on_free_subnet(rig_with(grid={"columns": 3, "rows": 4}, burst={"pulses": 3}, limits=limits, card=card))
-
-
-def receivers() -> list[int]:
-    """Their process ids, in the order of the recorded boards."""
-    children = Path(f"/proc/self/task/{threading.main_thread().native_id}/children").read_text().split()
-    return sorted(
-        int(pid)
-        for pid in children
-        if b"polysight.host.capture.receiver_process" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    )
-
-
-def receiver_of(board: str) -> int:
-    """Process id of a board's receiver, of the boards RH and RV."""
-    return receivers()[["RH", "RV"].index(board)]

@@ -16,9 +16,11 @@ from polysight.host.process import ProcessRequest
 from polysight.simulators.scene import decode_scene, simulate
 from tests.support.page.chromium import Browser, find_chromium
 from tests.support.page.live_view import GrowingScan
+from tests.support.products import unrendered
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, PET, scene_of
 from tests.support.store.small_scan import Samples, SmallScan
+from tests.support.suite.once import made_once
 
 
 @pytest.fixture(scope="session")
@@ -55,7 +57,7 @@ class Watched(Watch):
 
 @pytest.fixture
 def watching() -> Iterator[Callable[..., Watched]]:
-    """Makes watches, as `Watch`, that look on until the test ends."""
+    """Makes watches, as `Watch`, that run until the test ends."""
     made: list[Watched] = []
 
     def watch(*arguments: Any, **options: Any) -> Watched:
@@ -79,9 +81,12 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 @pytest.fixture(scope="session")
 def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with two processed scans, `one` and `two`, of copper and PET with other noise."""
-    root = tmp_path_factory.mktemp("processed")
     scene = decode_scene(scene_of(COPPER, PET, columns=15, rows=17), "test")
-    for name, seed in (("one", 3), ("two", 7)):
-        folder = simulate(published_rig(), scene, root / name, seed=seed)
-        assert process(ProcessRequest(data=str(folder), out=str(folder / "products")), threads=1) == 0
-    return root
+
+    def make(root: Path) -> None:
+        for name, seed in (("one", 3), ("two", 7)):
+            folder = simulate(published_rig(), scene, root / name, seed=seed)
+            with unrendered():
+                assert process(ProcessRequest(data=str(folder), out=str(folder / "products")), threads=1) == 0
+
+    return made_once(tmp_path_factory, "processed", make)

@@ -57,11 +57,18 @@ class Rig(Bench):
         return self.start("polysight", "scan", "--config", self.config, "--out", self.folder / "scan", *more)
 
     def wait_mid_row(self, scan: Program, rows: int) -> None:
-        """Until so many rows are committed and something of the next one has come."""
+        """Until so many rows are committed, and the Pi has journalled an event since the next one was begun."""
+        begun = 0  # bytes of the journal
 
         def there() -> bool:
+            nonlocal begun
             assert scan.process.poll() is None, f"the scan ended too early: {scan.err}"
-            return self.committed() >= rows and self._receiving()
+            journal = sum(path.stat().st_size for path in self.folder.glob("rig/journal/*.journal"))
+            if self.committed() < rows or not any(self.folder.glob("scan/raw/*/*.part")):
+                begun = 0
+            elif not begun:
+                begun = journal
+            return 0 < begun < journal
 
         wait_for(there, f"row {rows} being received")
 
@@ -70,12 +77,6 @@ class Rig(Bench):
         with suppress(PolysightError):  # not begun yet
             return len(ScanFolder.load(self.folder / "scan").committed())
         return 0
-
-    def _receiving(self) -> bool:
-        """Whether any byte of a row that is not committed has come; the file is made at its full size, as zeros."""
-        with suppress(FileNotFoundError):  # committed this moment
-            return any(any(p.read_bytes()[:4096]) for p in self.folder.glob("scan/raw/*/*.part"))
-        return False
 
     def close(self) -> None:
         """End everything; nothing of this rig may live on."""

@@ -57,7 +57,7 @@ class Rig(Bench):
         return self.start("polysight", "scan", "--config", self.config, "--out", self.folder / "scan", *more)
 
     def wait_mid_row(self, scan: Program, rows: int) -> None:
-        """Until so many rows are committed, and the Pi has journalled an event since the next one was begun."""
+        """Wait until this number of rows is committed, and the Pi has journalled an event of the next row."""
         begun = 0  # bytes of the journal
 
         def there() -> bool:
@@ -79,7 +79,7 @@ class Rig(Bench):
         return 0
 
     def close(self) -> None:
-        """End everything; nothing of this rig may live on."""
+        """End all processes of this rig; fail if one is left."""
         super().close()
         left = self.processes()
         assert not left, left
@@ -89,7 +89,7 @@ class Rig(Bench):
 def running(
     folder: Path, time_scale: float = 40.0, env: dict[str, str] | None = None, scene: str = SCENE
 ) -> Iterator[Rig]:
-    """A simulated rig in `folder` that runs; nothing of it is left afterwards, whatever happened."""
+    """Run a simulated rig in `folder`; all its processes are ended afterwards."""
     made = Rig(folder, time_scale, env, scene)
     try:
         made.begin()

@@ -185,7 +185,7 @@ class PiClient:
         self._stop_heartbeat()
 
     def home(self) -> None:
-        """Start homing the stage; retry if there was no reply and it does not home. Raises RefusedError, DeviceError."""
+        """Start homing; retry without a reply if the stage does not home. Raises RefusedError, DeviceError."""
         if self._once(Home(), self._timeout_s) is None and self.status().state != "homing":
             self._ask(Home(), Accepted)
 

@@ -57,11 +57,18 @@ class Rig(Bench):
         return self.start("polysight", "scan", "--config", self.config, "--out", self.folder / "scan", *more)
 
     def wait_mid_row(self, scan: Program, rows: int) -> None:
-        """Wait until this number of rows is committed and data of the next row has arrived."""
+        """Wait until this number of rows is committed, and the Pi has journalled an event of the next row."""
+        begun = 0  # bytes of the journal
 
         def there() -> bool:
+            nonlocal begun
             assert scan.process.poll() is None, f"the scan ended too early: {scan.err}"
-            return self.committed() >= rows and self._receiving()
+            journal = sum(path.stat().st_size for path in self.folder.glob("rig/journal/*.journal"))
+            if self.committed() < rows or not any(self.folder.glob("scan/raw/*/*.part")):
+                begun = 0
+            elif not begun:
+                begun = journal
+            return 0 < begun < journal
 
         wait_for(there, f"row {rows} being received")
 
@@ -70,12 +77,6 @@ class Rig(Bench):
         with suppress(PolysightError):  # not begun yet
             return len(ScanFolder.load(self.folder / "scan").committed())
         return 0
-
-    def _receiving(self) -> bool:
-        """True if any byte of an uncommitted row has arrived; its file is created at full size with zeros."""
-        with suppress(FileNotFoundError):  # committed this moment
-            return any(any(p.read_bytes()[:4096]) for p in self.folder.glob("scan/raw/*/*.part"))
-        return False
 
     def close(self) -> None:
         """End all processes of this rig; fail if one is left."""

@@ -147,12 +147,7 @@ def _imaged(scan: Path, changed_ns: int) -> Pipeline | None:
     del changed_ns
     pipeline = Pipeline(ScanFolder.load(scan), samples="read")
     rows = list(pipeline.source.rows())
-    if not rows or not pipeline.samples.holds(rows):
-        return None
-    for row in rows:
-        if not pipeline.samples.restore(row):
-            return None
-    return pipeline
+    return pipeline if rows and all(map(pipeline.samples.restore, rows)) else None
 
 
 def _db(value: complex) -> float | None:

@@ -45,7 +45,9 @@ class Summary:
     verdict
         Level of its products' verdict, "" where it was not processed or not judged.
     processed
-        Whether there is an image.
+        True if there are materials.
+    images_only
+        True if there are images without materials: by `polysight image`, or before processing has ended.
     seconds
         When it began, since 1970; 0 where nothing says.
     """
@@ -61,6 +63,7 @@ class Summary:
     reason: str = ""
     verdict: str = ""
     processed: bool = False
+    images_only: bool = False
     materials: tuple[str, ...] = ()
     notes: str = ""
     tags: tuple[str, ...] = ()
@@ -92,8 +95,9 @@ def summary_of(folder: Path, name: str) -> Summary:
     except OSError:
         raw = None
     if raw is None:
-        reason = "" if facts["processed"] else _start_failure(folder)
-        state = "products" if facts["processed"] else "failed" if reason else "begun"
+        products = facts["processed"] or facts.get("images_only", False)
+        reason = "" if products else _start_failure(folder)
+        state = "products" if products else "failed" if reason else "begun"
         return Summary(state=state, reason=reason, **{"seconds": _age(folder), **facts})
     first, rows, last = _read(raw)
     if first is None:
@@ -191,12 +195,13 @@ def _processed(folder: Path) -> dict[str, Any]:
     where = next((f for f in (folder / "products", folder) if (f / IMAGE).exists()), None)
     if where is None:
         return {"processed": False}
-    found: dict[str, Any] = {"processed": True}
+    complete = (where / MATERIALS).exists()
+    found: dict[str, Any] = {"processed": complete, "images_only": not complete}
     try:
         products = SavedProducts(where)
-        verdict = products.verdict
-        found["verdict"] = "" if verdict is None else verdict.level
-        if (where / MATERIALS).exists():
+        if complete:
+            verdict = products.verdict
+            found["verdict"] = "" if verdict is None else verdict.level
             names = [str(s["name"]) for s in products.segments if s.get("name")]
             found["materials"] = tuple(dict.fromkeys(names))[:12]
         if where == folder:

@@ -159,11 +159,11 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
         os.close(alive)
         os.close(promise)
     seconds = time.monotonic() - began
-    if stop is not None and stop.is_set() and child.returncode:
+    if child.returncode == 0 or finished(job):  # it may be killed after the mark
+        return _done(job, seconds)
+    if stop is not None and stop.is_set():
         return Outcome(job.name, "stopped", seconds)
-    if child.returncode:
-        return Outcome(job.name, "failed", seconds, message=_failure(log, child.returncode))
-    return _done(job, seconds)
+    return Outcome(job.name, "failed", seconds, message=_failure(log, child.returncode, on_dask=stop is None))
 
 
 def _follow(child: subprocess.Popen[bytes], job: Job, stop: Event | None) -> None:
@@ -185,10 +185,11 @@ def _done(job: Job, seconds: float = 0.0) -> Outcome:
     return Outcome(job.name, "done", seconds or float(mark.get("seconds", 0.0)), float(mark["memory_gb"]))
 
 
-def _failure(log: Path, status: int) -> str:
+def _failure(log: Path, status: int, on_dask: bool) -> str:
     """The last message in a program's log, or the signal that killed it."""
     if status < 0:
-        return f"killed by signal {-status}; signal 9 is usually the system running out of memory: give --jobs 1"
+        fewer = "start fewer workers on one machine" if on_dask else "give --jobs 1"
+        return f"killed by signal {-status}; signal 9 is usually the system running out of memory: {fewer}"
     lines = [x.strip() for x in log.read_text(encoding="utf-8", errors="replace").splitlines() if x.strip()]
     messages = [x for x in lines if not x.startswith(("why:", "do:"))]
     return messages[-1] if messages else f"exit status {status}"

@@ -6,8 +6,18 @@ import sys
 from pathlib import Path
 
 from polysight.host.jobs.cards import confirm
-from polysight.host.products import QUALITY, RAW_DROPPED, read_products, write_json
-from polysight.host.store import Digests, ScanFolder, drop, droppable, utc_now
+from polysight.host.products import QUALITY, RAW_DROPPED, REPORT, products_locked, read_products, write_json
+from polysight.host.store import (
+    Digests,
+    ScanFolder,
+    damaged_samples,
+    drop,
+    droppable,
+    dropped_rows,
+    locked_samples,
+    utc_now,
+)
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError
 
 WORD = "drop"  # confirms the removal of raw rows
@@ -16,15 +26,28 @@ WORD = "drop"  # confirms the removal of raw rows
 def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
     """Delete the raw data of processed rows after confirmation; return the exit status.
 
+    Products with a report and whole samples of every row must remain; no other program may be writing them.
+
     Raises
     ------
     DataError
-        when there are no products, or they were made from nothing of this scan.
+        when products or samples are not complete, or were made from nothing of this scan.
     ConfigError
-        when it is not confirmed; nothing was removed.
+        when it is not confirmed, or products are being written; nothing was removed.
+    DeviceError
+        when the scan is being processed or recorded.
     """
     scan = ScanFolder.load(folder)
-    products = read_products(products or folder).folder
+    payloads = [scan.path / board.file for row in scan.committed().values() for board in row.boards.values()]
+    if dropped_rows(scan) and not any(path.exists() for path in payloads):
+        sys.stdout.write(f"{folder}: every processed row is dropped already\n")
+        return 0
+    products = read_products(products or folder, REPORT).folder
+    with products_locked(products), locked_samples(scan):
+        return _drop(scan, folder, products, yes)
+
+
+def _drop(scan: ScanFolder, folder: Path, products: Path, yes: bool) -> int:
     processed = processed_digests(products)
     what = droppable(scan, processed)
     for line in what.kept:
@@ -38,9 +61,10 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
             )
         sys.stdout.write(f"{folder}: every processed row is dropped already\n")
         return 0
+    _check_samples(scan, set(what.files))
     text = (
-        f"{folder}: the raw data of {len(what.files)} rows, {what.bytes / 1e6:.1f} MB, is removed. {products} stays;"
-        " it cannot be processed again."
+        f"{folder}: the raw data of {len(what.files)} rows, {what.bytes / 1e6:.1f} MB, is removed. {products} and"
+        " the kept samples stay: images and materials can be made again, but not synchronised again."
     )
     for where in sorted({path.parent for boards in what.files.values() for path in boards.values()}):
         names = sorted(path.name for boards in what.files.values() for path in boards.values() if path.parent == where)
@@ -52,6 +76,24 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
     drop(scan, processed, products)
     sys.stdout.write(f"{folder}: dropped; its digests stay in the manifest\n")
     return 0
+
+
+def _check_samples(scan: ScanFolder, rows: set[int]) -> None:
+    """Check that images can be made without the raw data of these rows. Raises DataError."""
+    damaged = {row: names for row, names in damaged_samples(scan).items() if row in rows}
+    if not damaged:
+        from polysight.host.pipeline import Pipeline
+
+        samples = Pipeline(scan, samples="read").samples
+        damaged = {row: ["samples/samples.json: other settings"] for row in rows if not samples.is_kept(row)}
+    if damaged:
+        names = sorted({name for files in damaged.values() for name in files})
+        raise DataError(
+            f"{scan.path}: samples of rows {', '.join(map(str, damaged))} are damaged or missing: {', '.join(names)}",
+            "without them the raw data is all there is to make images from",
+            f"`polysight process {scan.path} --out DIR` makes them again",
+            code=ErrorCode.FILE_DAMAGED,
+        )
 
 
 def _keep(products: Path, scan: ScanFolder) -> None:

@@ -38,6 +38,7 @@ from polysight.host.products import (
     read_products,
     refused_text,
 )
+from polysight.host.store import is_source
 from polysight.host.verdict import NoResult
 from polysight.shared.config import Chirp, load_instrument
 from polysight.shared.errors import ConfigError, DataError
@@ -259,6 +260,8 @@ def report(folder: Path) -> int:
     """
     found = find_products(folder, REPORT)
     if found is None:
+        if not is_source(folder):
+            read_products(folder, REPORT)  # raises with the reason
         from polysight.host.jobs.process import process
         from polysight.host.process import ProcessRequest
 

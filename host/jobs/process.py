@@ -42,13 +42,14 @@ from polysight.host.products import (
     QUALITY,
     RAW_DROPPED,
     REPORT,
-    SavedProducts,
     check_products_folder,
     making_products,
+    raw_dropped,
     write_json,
 )
-from polysight.host.store import ScanFolder, Source, open_source, raw_source, require_raw
+from polysight.host.store import ScanFolder, Source, dropped_rows, open_source, raw_source, require_raw
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, advice
 
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -194,21 +195,37 @@ def process(request: ProcessRequest, threads: int | None = None) -> int:
     Raises PolysightError.
     """
     options, data, out = load_options(request), Path(request.data), Path(request.out)
-    source = open_source(data, None if request.config is None else Path(request.config))
+    source = open_source(data, None if request.config is None else Path(request.config), dropped=True)
     plates = truth_of(data)
     check_products_folder(out, source.scan_id)
     pipeline = all_rows(source, data, bands=options.bands, options=options, threads=threads)
+    _check_dropped(pipeline, out)
     publish_images(pipeline, out)
     products = make_products(pipeline, out, options, plates)
     sys.stdout.write(products.summary())
     return products.exit_status
 
 
+def _check_dropped(pipeline: Pipeline, out: Path) -> None:
+    """Keep the mark of products whose raw data was dropped. Raises DataError if the new ones have fewer rows."""
+    if not (isinstance(pipeline.source, ScanFolder) and dropped_rows(pipeline.source) and (mark := raw_dropped(out))):
+        return
+    pipeline.quality.note(**{RAW_DROPPED: mark})
+    coverage = pipeline.quality.coverage()
+    if coverage["rows_absent"]:
+        raise DataError(
+            f"{out} holds products of more rows: {len(coverage['rows_absent'])} rows have no data any more",
+            "their raw data was dropped, and their samples are damaged or missing",
+            "give another --out",
+            code=ErrorCode.NOT_ENOUGH_DATA,
+        )
+
+
 def image(data: Path, out: Path, config: Path | None, view: View = AS_IN_RIG_FILE) -> int:
     """Make image.npz and quality.json only; return the exit status. Raises PolysightError."""
     source = open_source(data, config, dropped=True)
     check_products_folder(out, source.scan_id)
-    if isinstance(source, ScanFolder) and SavedProducts(out).quality.get(RAW_DROPPED):
+    if isinstance(source, ScanFolder) and raw_dropped(out):
         require_raw(source)  # products in `out` may be all that is left of it
     pipeline = all_rows(source, data, depth_m=PLANE_REACH_M if view == AS_IN_RIG_FILE else 0.0, view=view)
     images = pipeline.form_images()

@@ -53,7 +53,8 @@ def _bytes_of(root: Path, s: Summary) -> int:
 
 def _line(s: Summary) -> str:
     """State, rows, verdict, materials and tags of a scan."""
-    parts = [s.state, f"{s.committed}/{s.rows} rows" if s.rows else "", s.verdict, ", ".join(map(_called, s.materials))]
+    parts = [s.state, f"{s.committed}/{s.rows} rows" if s.rows else "", s.verdict]
+    parts += ["images only" if s.images_only else "", ", ".join(map(_called, s.materials))]
     parts += ["simulated" if s.simulated else "", " ".join(f"#{tag}" for tag in s.tags)]
     parts.append(s.reason if s.state == "failed" and not s.rows else "")
     return "  ".join(part for part in parts if part)

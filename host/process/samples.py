@@ -14,9 +14,9 @@ import math
 import os
 import threading
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Annotated, Any, Literal, TypedDict, Unpack
 
 import msgspec
 import numpy as np
@@ -31,22 +31,38 @@ from polysight.host.imaging import (
     SubBandImages,
     View,
     needed_gate_m,
+    reduction,
 )
 from polysight.host.process.quality import Quality
-from polysight.host.store import ScanFolder, Source, crc32, inside, manifest, require_raw
+from polysight.host.products import plain
+from polysight.host.store import (
+    SAMPLE_ROWS,
+    SAMPLES,
+    ScanFolder,
+    Source,
+    dropped_rows,
+    inside,
+    manifest,
+    open_records,
+    raw_digest,
+    read_sample_rows,
+    record_digest,
+    require_raw,
+)
 from polysight.host.sync import HighPass
 from polysight.shared.config import Instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.files import read_json
 
-FOLDER, HEAD, ROWS = "samples", "samples.json", "rows.jsonl"
+HEAD = "samples.json"
 FORMAT = 1
 MAKING = 1
 """Version of the method that makes samples from raw data."""
 Use = Literal["none", "read", "keep"]
 Filters = Mapping[str, HighPass | None]
 Gate = tuple[float, float]
+Count = Annotated[int, msgspec.Meta(ge=0)]
 _FIGURES = ("direct_hz", "direct_snr")  # of a row's quality figures: one number a position
 _log = logging.getLogger(__name__)
 
@@ -83,6 +99,30 @@ def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
     return json.loads(json.dumps({"making": MAKING, **imaged, **parts, "speed_mm_s": rig.stage.speed_mm_s}))
 
 
+class _RowFigures(msgspec.Struct):
+    """Quality figures of a row and board as rows.jsonl has them, see `Quality`."""
+
+    frames_expected: Count
+    frames_received: Count
+    bytes_missing: Count
+    crc32: str
+    positions: Count
+    positions_masked: Count
+    masked_columns: list[tuple[Count, Count]]
+    stages: list[tuple[str, float | None, float | None, float | None]]
+
+
+def _read_figures(entry: object) -> dict[str, Any] | None:
+    """Return the figures of a row from its line; None if they have another form."""
+    try:
+        figures = msgspec.convert(entry, _RowFigures)
+    except msgspec.ValidationError:
+        return None
+    stages = {name: tuple(np.nan if s is None else s for s in spread) for name, *spread in figures.stages}
+    columns = [list(run) for run in figures.masked_columns]
+    return {**msgspec.structs.asdict(figures), "masked_columns": columns, "stages": stages}
+
+
 class KeptSamples:
     """Kept samples of a scan folder; nothing is kept for other sources.
 
@@ -109,7 +149,7 @@ class KeptSamples:
     ) -> None:
         use, depth_m = choices.get("samples", "none"), choices.get("depth_m", PLANE_REACH_M)
         self._scan = source if isinstance(source, ScanFolder) and use != "none" else None
-        self._folder = Path() if self._scan is None else self._scan.path / FOLDER
+        self._folder = Path() if self._scan is None else self._scan.path / SAMPLES
         self._plan, self._made, self._quality = source.plan, made_with(rig, filters), quality
         self._bands, self._keep = choices.get("bands", 1), use == "keep"
         self._lines: dict[int, dict[str, Any]] = {}
@@ -119,36 +159,42 @@ class KeptSamples:
         self._lock = threading.Lock()
         self._head = self._read_head()
         viewed = choices.get("view", AS_IN_RIG_FILE).of(rig, source.mirrored)
-        gate = self._gate_m(needed_gate_m(viewed, depth_m), needed_gate_m(rig, PLANE_REACH_M))
+        gate = self._gate_m(rig, needed_gate_m(viewed, depth_m), needed_gate_m(rig, PLANE_REACH_M))
         self.images = ImageBuilder(viewed, live=choices.get("live", False), gate_m=gate)
         self.sub_bands = SubBandImages(viewed, self._bands, gate)
         self._builders = {"samples": self.images}
         self._builders |= {f"band_{k}": builder for k, builder in enumerate(self.sub_bands.builders)}
         self._keep &= not self._head or set(self._builders) == set(self._head["frequencies_hz"])
 
-    def _gate_m(self, needed: Gate, usual: Gate) -> Gate:
+    def _gate_m(self, rig: Instrument, needed: Gate, usual: Gate) -> Gate:
         """Return the gate on disk (without samples: the usual one) if it covers the needed one, else the latter."""
         kept = tuple(self._head.get("gate_m", usual))
+        if self._head and not _has_frequencies(self._head, rig, kept, usual):
+            self._head, kept = {}, usual
         if kept[0] <= needed[0] and needed[1] <= kept[1]:
             return kept
         self._head, self._keep = {}, False
         return needed
 
-    def holds(self, rows: Sequence[int]) -> bool:
-        """True if all these rows can be restored from disk."""
-        return all(self._line(row) is not None for row in rows)
-
     def processable(self, source: Source, folder: Path) -> list[int]:
-        """Rows of a source with data; `folder` is for messages.
+        """Rows of a source with raw data or whole samples; `folder` is for messages. Logs which rows have neither.
 
         Raises
         ------
         DataError
-            if there are none, or raw data that is needed was dropped.
+            if there are none.
         """
         rows = list(source.rows())
-        if isinstance(source, ScanFolder) and not self.holds(rows):
+        gone = dropped_rows(source) if isinstance(source, ScanFolder) else set()
+        lost = [row for row in rows if row in gone and not self.is_kept(row)]
+        if lost and len(lost) == len(rows) and isinstance(source, ScanFolder):
             require_raw(source)
+        if lost:
+            _log.warning(
+                "%s: rows %s are left out: their samples are damaged or missing, and their raw data was dropped;"
+                " `polysight validate %s` names the files; restore them from a copy",
+                self._folder, ", ".join(map(str, lost)), folder,
+            )  # fmt: skip
         if not rows:
             raise DataError(
                 f"{folder}: no row is recorded whole",
@@ -156,21 +202,28 @@ class KeptSamples:
                 f"`polysight resume {folder}` takes the missing rows of a scan folder",
                 code=ErrorCode.NO_DATA,
             )
-        return rows
+        return [row for row in rows if row not in lost]
+
+    def is_kept(self, row: int) -> bool:
+        """True if a row can be restored."""
+        return self._records(row) is not None
 
     def restore(self, row: int) -> bool:
         """Restore a row into the images; return False if it must be synchronised instead."""
-        line = self._line(row)
-        if line is None:
-            return False
-        arrays = {board: self._array(board) for board in line["boards"]}
-        records = {board: array[row] for board, array in arrays.items() if array is not None}
-        for board, entry in line["boards"].items():
-            if board not in records or _digest(records[board]) != entry["crc32"]:
-                return False
-        for board, record in records.items():
-            self._put(board, row, record, line["boards"][board]["figures"])
-        return True
+        records = self._records(row)
+        for board, (record, figures) in (records or {}).items():
+            self._put(board, row, record, figures)
+        return records is not None
+
+    def _records(self, row: int) -> dict[str, tuple[Any, dict[str, Any]]] | None:
+        """Return a row's record and figures by board; None if one of them is missing, damaged or outdated."""
+        line, found = self._line(row), {}
+        for board, entry in ({} if line is None else line["boards"]).items():
+            array, figures = self._array(board), _read_figures(entry["figures"])
+            if array is None or figures is None or record_digest(array[row]) != entry["crc32"]:
+                return None
+            found[board] = (array[row], figures)
+        return found or None
 
     def save(self, row: int) -> None:
         """Save a row that was just added to the images; log a warning if it cannot be written."""
@@ -192,7 +245,7 @@ class KeptSamples:
                 with (self._folder / f"{board}.npy").open("r+b") as file:
                     file.seek(-(self._plan.rows - row) * record.nbytes, 2)
                     file.write(record.tobytes())
-                boards[board] = {"crc32": _digest(record), "raw": digest, "figures": figures}
+                boards[board] = {"crc32": record_digest(record), "raw": digest, "figures": figures}
             os.write(rows, manifest.encode_line({"fact": "row", "row": row, "boards": boards}))
         except (OSError, ValueError, DataError) as e:
             self._keep = False
@@ -203,8 +256,7 @@ class KeptSamples:
         committed = self._scan.committed().get(row) if self._scan is not None else None
         if committed is None or any(name not in committed.boards for name in self._quality.boards):
             return None
-        boards = {name: committed.boards[name] for name in self._quality.boards}
-        return {name: f"{b.crc32} {b.index_crc32} {b.missing_bytes}" for name, b in boards.items()}
+        return {name: raw_digest(committed.boards[name]) for name in self._quality.boards}
 
     def _line(self, row: int) -> dict[str, Any] | None:
         """Return the line of rows.jsonl for a row, if it was made from the committed raw data."""
@@ -237,25 +289,14 @@ class KeptSamples:
 
     def _read_lines(self) -> None:
         """Read new lines of rows.jsonl; skip a truncated or damaged one."""
-        try:
-            raw = (self._folder / ROWS).read_bytes()
-        except OSError:
-            return
-        end = raw.rfind(b"\n") + 1
-        for text in raw[self._read_bytes : end].splitlines():
-            line = manifest.decode_line(text)
-            if line is not None and _is_row(line):
-                self._lines[line["row"]] = line
-        self._read_bytes = end
+        lines, self._read_bytes = read_sample_rows(self._folder, self._read_bytes)
+        self._lines |= lines
 
     def _array(self, board: str) -> NDArray[Any] | None:
         """Return a board's records, memory-mapped; None if the file does not fit samples.json."""
         if board not in self._arrays:
-            try:
-                found = np.load(self._folder / f"{board}.npy", mmap_mode="r", allow_pickle=False)
-            except (OSError, ValueError, EOFError):
-                return None
-            if found.dtype != self._type(board) or found.shape != (self._plan.rows,):
+            found = open_records(self._folder / f"{board}.npy")
+            if found is None or found.dtype != self._type(board) or found.shape != (self._plan.rows,):
                 return None
             self._arrays[board] = found
         return self._arrays[board]
@@ -279,7 +320,7 @@ class KeptSamples:
         for name in _FIGURES:
             out[name] = quality.rows[row][name][forward]
         figures = {name: value for name, value in quality.rows[row].items() if name not in _FIGURES}
-        return out, {**figures, "stages": [[name, *spread] for name, spread in figures["stages"].items()]}
+        return out, plain({**figures, "stages": [[name, *spread] for name, spread in figures["stages"].items()]})
 
     def _put(self, board: str, row: int, record: Any, figures: dict[str, Any]) -> None:
         """Add a record to the images and its figures to the quality; the inverse of `_record`."""
@@ -287,16 +328,15 @@ class KeptSamples:
         for name, builder in self._builders.items():
             builder.boards[board].put(row, ReducedRow(record[name], record[f"{name}_direct"], record["valid"]))
         values: dict[str, Any] = {name: np.array(record[name][forward]) for name in _FIGURES}
-        values["stages"] = {name: tuple(spread) for name, *spread in figures["stages"]}
         self._quality.boards[board].put(row, {**figures, **values}, np.array(record["echo"][:, forward]))
 
     def _open(self) -> int | None:
         """Open and lock rows.jsonl; start new files if those on disk do not fit. None if another program locked it."""
         self._folder.mkdir(exist_ok=True)
         if self._scan is not None:
-            for name in (HEAD, ROWS, f"{HEAD}.part", *(f"{board}.npy" for board in self._quality.boards)):
-                inside(self._scan.path, f"{FOLDER}/{name}", FOLDER)  # a link could overwrite another file
-        rows = os.open(self._folder / ROWS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+            for name in (HEAD, SAMPLE_ROWS, f"{HEAD}.part", *(f"{board}.npy" for board in self._quality.boards)):
+                inside(self._scan.path, f"{SAMPLES}/{name}", SAMPLES)  # a link could overwrite another file
+        rows = os.open(self._folder / SAMPLE_ROWS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
         weakref.finalize(self, os.close, rows)
         try:
             fcntl.flock(rows, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -333,10 +373,6 @@ class KeptSamples:
         part.replace(self._folder / HEAD)
 
 
-def _digest(record: Any) -> str:
-    return f"{crc32(record.tobytes()):08x}"
-
-
 def _is_valid_head(head: Mapping[str, Any]) -> bool:
     """True if samples.json has a gate of two finite numbers, and lists of frequencies."""
     gate, frequencies = head.get("gate_m"), head.get("frequencies_hz")
@@ -347,15 +383,13 @@ def _is_valid_head(head: Mapping[str, Any]) -> bool:
     return good and len(gate) == 2
 
 
+def _has_frequencies(head: Mapping[str, Any], rig: Instrument, gate: Gate, usual: Gate) -> bool:
+    """True if the frequencies in samples.json are those of its gate; a gate twice as wide as usual is damage."""
+    if not 0 < gate[1] - gate[0] < 2 * (usual[1] - usual[0]):
+        return False
+    kept, expected = head["frequencies_hz"]["samples"], reduction(rig.chirp, gate).frequencies_hz
+    return len(kept) == expected.size and np.allclose(kept, expected, rtol=1e-9, atol=0)
+
+
 def _is_finite(value: object) -> bool:
     return isinstance(value, int | float) and math.isfinite(value)
-
-
-def _is_row(line: Mapping[str, Any]) -> bool:
-    """True if a line of rows.jsonl has a row number and the entries of its boards."""
-    boards = line.get("boards")
-    return (
-        isinstance(line.get("row"), int)
-        and isinstance(boards, dict)
-        and all(isinstance(b, dict) and {"crc32", "raw", "figures"} <= b.keys() for b in boards.values())
-    )

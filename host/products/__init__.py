@@ -44,6 +44,8 @@ from polysight.host.products.folder import (
     find_labels,
     label_folder,
     making_products,
+    products_locked,
+    raw_dropped,
     scan_folder_of,
 )
 from polysight.host.products.material_table import (
@@ -78,7 +80,9 @@ __all__ = [
     "patch_dataset",
     "permittivity_spread",
     "plain",
+    "products_locked",
     "ranges_text",
+    "raw_dropped",
     "read_image",
     "read_netcdf",
     "read_products",

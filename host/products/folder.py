@@ -73,7 +73,7 @@ def check_products_folder(out: Path, scan_id: str) -> None:
             "give a folder inside it as --out",
             code=ErrorCode.VALUE_INVALID,
         )
-    dropped = _raw_dropped(out)
+    dropped = raw_dropped(out)
     if dropped and dropped.get("scan_id") != scan_id:
         raise ConfigError(
             f"{out} holds the only products of scan {dropped.get('scan_id')}",
@@ -102,19 +102,7 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
         old.rename(place)  # a program was killed between the two renames of _replace
     shutil.rmtree(old, ignore_errors=True)  # or after them
     check_products_folder(out, scan_id)
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        lock = _create_locked(new)
-    except BlockingIOError:
-        raise ConfigError(
-            f"{out}: another program is writing products there",
-            "it was started twice",
-            "give another --out, or wait",
-            code=ErrorCode.BUSY,
-        ) from None
-    except OSError as e:
-        raise _no_folder(out, e) from None
-    keep = False
+    lock, keep = _lock(out, new), False
     try:
         yield new
         for name, content in _hand_labels(place, scan_id).items():
@@ -132,6 +120,35 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
         os.close(lock)
         if not keep:
             shutil.rmtree(new, ignore_errors=True)
+
+
+@contextmanager
+def products_locked(out: Path) -> Iterator[None]:
+    """Keep other programs from replacing the products in `out`. Raises ConfigError as :func:`making_products`."""
+    place = out.resolve()
+    new = place.with_name(f".{place.name}.new")
+    lock = _lock(out, new)
+    try:
+        yield
+    finally:
+        os.close(lock)
+        shutil.rmtree(new, ignore_errors=True)
+
+
+def _lock(out: Path, new: Path) -> int:
+    """Create and lock the new folder beside `out`; return the file descriptor of the lock. Raises ConfigError."""
+    try:
+        new.parent.mkdir(parents=True, exist_ok=True)
+        return _create_locked(new)
+    except BlockingIOError:
+        raise ConfigError(
+            f"{out}: another program is writing products there",
+            "it was started twice",
+            "give another --out, or wait",
+            code=ErrorCode.BUSY,
+        ) from None
+    except OSError as e:
+        raise _no_folder(out, e) from None
 
 
 def _no_folder(out: Path, e: OSError) -> ConfigError:
@@ -202,8 +219,8 @@ def _is_product(name: str) -> bool:
     return name in PRODUCTS or name == FINISHED
 
 
-def _raw_dropped(out: Path) -> dict[str, Any]:
-    """Return the entry of quality.json on deleted raw data; empty without it."""
+def raw_dropped(out: Path) -> dict[str, Any]:
+    """Return the entry `raw_dropped` of quality.json; empty without it."""
     try:
         dropped = SavedProducts(out).quality.get(RAW_DROPPED)
     except DataError:

@@ -1,7 +1,8 @@
 """Scan folders (append-only, self-validating, resumable), and a common `Source` protocol for all recorded layouts.
 
 `ScanFolder` reads and writes our own scans: `manifest` is the log of facts, `events` the Pi's event log, `raw` deletes
-raw data of processed rows, `replace` places rows again from their packets, `validation` checks a folder.
+raw data of processed rows, `sample_rows` checks kept samples, `replace` places rows again from their packets,
+`validation` checks a folder.
 `open_source` opens any known layout (our own, and the published data in `sources`) as a `Source`: rig, plan, rows with
 data, `read_row`, and facts about the recording. `raw_source` requires a source that contains the chirps.
 """
@@ -10,8 +11,18 @@ from polysight.host.store import manifest
 from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
-from polysight.host.store.raw import Digests, drop, droppable, require_raw
+from polysight.host.store.raw import Digests, drop, droppable, dropped_rows, require_raw
 from polysight.host.store.replace import PlacedAgain, Replaced, place_again, replace_rows
+from polysight.host.store.sample_rows import (
+    SAMPLE_ROWS,
+    SAMPLES,
+    damaged_samples,
+    locked_samples,
+    open_records,
+    raw_digest,
+    read_sample_rows,
+    record_digest,
+)
 from polysight.host.store.scan_folder import (
     EVENTS,
     MANIFEST,
@@ -36,6 +47,8 @@ __all__ = [
     "MANIFEST",
     "MAX_BYTES",
     "PART",
+    "SAMPLES",
+    "SAMPLE_ROWS",
     "CubeRow",
     "Digests",
     "EventWriter",
@@ -56,19 +69,26 @@ __all__ = [
     "crc32",
     "damage_of",
     "damaged_rows",
+    "damaged_samples",
     "drop",
     "droppable",
+    "dropped_rows",
     "inside",
     "is_source",
+    "locked_samples",
     "manifest",
     "mirrored",
     "new_scan_id",
     "open_npz",
+    "open_records",
     "open_source",
     "place_again",
+    "raw_digest",
     "raw_source",
     "read_events",
+    "read_sample_rows",
     "read_settings",
+    "record_digest",
     "replace_rows",
     "require_raw",
     "rig_of",

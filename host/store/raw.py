@@ -39,6 +39,11 @@ def dropped_files(scan: ScanFolder) -> dict[str, Fact]:
     return {file: fact for file, (_, fact) in files.items()}
 
 
+def dropped_rows(scan: ScanFolder) -> set[int]:
+    """Return the rows of which a dropped file is gone."""
+    return {fact["row"] for file, fact in dropped_files(scan).items() if not (scan.path / file).exists()}
+
+
 def require_raw(scan: ScanFolder) -> None:
     """Check that no raw data of the scan was dropped. Raises DataError."""
     facts = list(dropped_files(scan).values())
@@ -46,7 +51,7 @@ def require_raw(scan: ScanFolder) -> None:
         raise DataError(
             f"{scan.path}: the raw data of {len({f['row'] for f in facts})} rows was dropped",
             f"it was dropped on {facts[-1]['dropped_utc'][:10]}, after it was processed into {facts[-1]['products']}",
-            "use those products; a new scan is needed to process again, or the raw folder of a copy",
+            "use those products; to synchronise again, restore the raw folder from a copy, or scan again",
             code=ErrorCode.NO_DATA,
         )
 

@@ -13,7 +13,8 @@ from polysight.host.store import manifest
 from polysight.host.store.append_only import crc32
 from polysight.host.store.events import read_events
 from polysight.host.store.manifest import ManifestFault
-from polysight.host.store.raw import dropped_files
+from polysight.host.store.raw import dropped_files, dropped_rows
+from polysight.host.store.sample_rows import SAMPLES, damaged_samples
 from polysight.host.store.scan_folder import EVENTS, MANIFEST, PART, BoardRow, CommittedRow, ScanFolder
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, PolysightError
@@ -206,6 +207,16 @@ def _dropped(scan: ScanFolder) -> list[Finding]:
     last = list(files.values())[-1]
     what = f"the raw data of {len({f['row'] for f in files.values()})} rows was dropped after processing"
     found = [Finding("note", "raw", f"{what} into {last['products']} ({last['dropped_utc']}); digests are kept")]
+    if (scan.path / SAMPLES).exists():
+        gone, lost = (
+            dropped_rows(scan),
+            "its raw data was dropped: restore the file from a copy, or images leave it out",
+        )
+        for row, names in damaged_samples(scan).items():
+            what = f"row {row} is damaged or missing (CRC)"
+            found += [Finding("error", name, what, lost) for name in names if row in gone]
+    else:
+        found.append(Finding("note", SAMPLES, "absent: no image can be made again"))
     left = [file for file in files if (scan.path / file).exists()]
     if left:
         remedy = f"`polysight drop-raw {scan.path}` removes them"

@@ -39,6 +39,13 @@ def test_every_scan_is_listed_with_its_state(root):
     assert (found["done"].simulated, found["done"].processed, found["out/one"].verdict) == (True, True, "none")
 
 
+def test_images_without_materials_are_no_result(root):
+    """As after a kill of `process`, or by `polysight image`."""
+    (root / "done" / "products" / "materials.json").unlink()
+    found = Scans(root).summary("done")
+    assert (found.processed, found.images_only, found.verdict, found.materials) == (False, True, "", ())
+
+
 def test_rows_are_counted_as_the_scan_folder_counts_them(root):
     """Taken again, withdrawn, torn and damaged lines included."""
     path = root / "done" / MANIFEST

@@ -38,6 +38,8 @@ if out.name == "slow":
 for name in ("image.npz", "quality.json"):
     (out / name).write_text("{}")
 (out / ".finished.json").write_text(json.dumps({"made_with": job["made_with"], "memory_gb": 0.5}))
+if out.name == "late":
+    os.kill(os.getpid(), 9)
 """
 
 KILLS_ITS_WORKER = """
@@ -98,6 +100,13 @@ def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not
     assert [o.status for o in again] == ["skipped", "failed", "skipped", "failed"]
     assert runs(tmp_path) == sorted([*names, "bad", "killed"])
     assert "2 finished before, 2 to process" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("worker")
+def test_a_program_killed_after_its_mark_has_finished_its_scan(tmp_path):
+    scans(tmp_path / "in", "late")
+    (job,) = jobs(tmp_path / "in", "late")
+    assert many.run_scan(job).status == "done"
 
 
 @pytest.mark.usefixtures("worker")

@@ -91,7 +91,7 @@ async function compare() {
 await begin("Compare");
 try {
   const { scans } = await get("scans");
-  const good = scans.filter((s) => s.processed).map((s) => s.name);
+  const good = scans.filter((s) => s.processed || s.images_only).map((s) => s.name);
   for (const id of ["a", "b"]) {
     by(id).append(make("option", "–", null, { value: "" }), ...good.map((name) => make("option", name, null, { value: name })));
     by(id).value = good.includes(query.get(id)) ? query.get(id) : "";

@@ -155,7 +155,7 @@ async function saveNotes() {
 // --- begin ---
 
 async function load() {
-  try { result = summary.processed ? await get("result", scan) : null; } catch (error) { complain("told", error); result = null; }
+  try { result = summary.processed || summary.images_only ? await get("result", scan) : null; } catch (error) { complain("told", error); result = null; }
   showHead();
   showReasons();
   showFiles();

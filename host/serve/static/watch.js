@@ -280,10 +280,10 @@ async function ask(wish) {
 /** The program that a page started for this scan: what it says when it has not come as far as the manifest. */
 async function showProgram() {
   try { summary = await get("scan", { scan: name }); } catch { return; } // not there yet, or gone for a moment
-  by("to-result").hidden = !summary.processed;
+  by("to-result").hidden = !(summary.processed || summary.images_only);
   by("to-result").href = pageOf("scan", name);
   const program = summary.programs.find((p) => p.kind === "scan");
-  const ill = program && !program.running && ![0, 7].includes(program.status) && !summary.processed;
+  const ill = program && !program.running && ![0, 7].includes(program.status) && by("to-result").hidden;
   by("program").hidden = !program || !(program.running || ill) || (program.running && Boolean(state?.scan) && !ill);
   if (by("program").hidden) return;
   by("program-title").textContent = program.running ? "The program is starting" : `polysight scan ${ending(program)}`;

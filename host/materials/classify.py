@@ -210,35 +210,6 @@ class Classifier:
         name = nearest if far <= 1 else UNKNOWN
         return PatchName(name, confidence, {}, far, 0, probabilities, nearest=nearest)
 
-    def pixels(
-        self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike
-    ) -> tuple[npt.NDArray[np.str_], npt.NDArray[np.float64]]:
-        """Classify each pixel independently (libraries with one incidence angle).
-
-        Parameters
-        ----------
-        h, v
-            |H|, |V| relative to metal, [n]; of complex values the modulus.
-        p
-            complex [n], metal-referenced ratio.
-
-        Returns
-        -------
-        names
-            str [n]; "unknown" beyond the threshold, or if the pixel is not finite.
-        distance
-            float64 [n], distance over the threshold; infinite if the pixel is not finite.
-        """
-        x = features_of(h, v, p)
-        good = usable(x)
-        nothing = PatchName(UNKNOWN, 0.0, {}, np.inf, 0)
-        found = self._named(good, self._model.by_pixel(x[good]) if good.any() else None, nothing)
-        return found.names, found.distance
-
-    def patch(self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> PatchName:
-        """Name one patch alone; parameters as :meth:`pixels`."""
-        return self.scan([features_of(h, v, p)])[0].verdict
-
     def _named(
         self, good: npt.NDArray[np.bool_], pixels: tuple[npt.NDArray, Real] | None, name: PatchName
     ) -> NamedPatch:

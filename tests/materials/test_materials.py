@@ -23,6 +23,7 @@ from polysight.host.materials import (
     read_truth,
 )
 from polysight.host.materials.analyse import Optics
+from polysight.host.materials.classify import features_of
 from polysight.host.materials.knn import ratio_distance
 from polysight.host.materials.library import FORMAT
 from polysight.host.materials.samples import majority
@@ -165,12 +166,12 @@ def test_distances_are_distances():
 
 
 def test_pixels_that_are_not_finite_are_unknown(library):
-    c = Classifier(library, Weights())
-    names, distance = c.pixels([0.5, np.nan, 0.5], [0.1, 0.1, 0.1], [4 + 1j, 4 + 1j, 0])
-    assert names[1] == names[2] == UNKNOWN
-    assert names[0] != UNKNOWN
-    assert np.isinf(distance[1:]).all()
-    assert c.patch([], [], []).name == UNKNOWN
+    some = features_of([0.5, np.nan, 0.5], [0.1, 0.1, 0.1], [4 + 1j, 4 + 1j, 0])
+    found, empty = Classifier(library, Weights()).scan([some, features_of([], [], [])])
+    assert found.names[1] == found.names[2] == UNKNOWN
+    assert found.names[0] != UNKNOWN
+    assert np.isinf(found.distance[1:]).all()
+    assert empty.verdict.name == UNKNOWN
 
 
 def test_a_majority_names_the_patch():

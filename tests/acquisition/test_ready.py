@@ -11,6 +11,7 @@ import pytest
 
 from polysight.host.acquisition import ready
 from polysight.host.acquisition.control import StopRequest
+from polysight.host.acquisition.pi_client import PiClient
 from polysight.host.acquisition.ready import STAGE_NOT_REPORTED, check_disk, make_ready
 from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.doctor.check_host import check_time
@@ -58,6 +59,18 @@ def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeyp
     monkeypatch.setattr(ready, "time", pi)
     with refused(ErrorCode.STAGE_NOT_READY, reason):
         make_ready(pi, StopRequest(), lambda *_: None)
+
+
+@pytest.mark.parametrize(("state", "asked"), [("idle", 2), ("ready", 2), ("homing", 1)])
+def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, asked):
+    """A stage that is still `ready` has not begun: its lost steps would be those of the homing before."""
+    sent = []
+    pi: Any = SimpleNamespace(
+        _timeout_s=1.0, _once=lambda *given: sent.append(given), _ask=lambda *given: sent.append(given),
+        status=lambda: SimpleNamespace(state=state),
+    )  # fmt: skip
+    PiClient.home(pi)
+    assert len(sent) == asked
 
 
 def test_pi_and_host_have_the_same_homing_timeout():

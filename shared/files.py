@@ -74,13 +74,8 @@ def read_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
     DataError, OSError
         as `read_bounded`.
     """
-    return parse_json(read_bounded(path, max_bytes))
-
-
-def parse_json(raw: bytes) -> Any:
-    """Parse JSON in UTF-8. Raises ValueError, also if it is nested too deeply."""
     try:
-        return json.loads(raw.decode("utf-8"))
+        return json.loads(read_bounded(path, max_bytes).decode("utf-8"))
     except RecursionError:
         raise ValueError("nested too deeply") from None
 

@@ -185,8 +185,8 @@ class PiClient:
         self._stop_heartbeat()
 
     def home(self) -> None:
-        """Start homing the stage. Raises RefusedError, DeviceError."""
-        if self._once(Home(), self._timeout_s) is None and self.status().state not in ("homing", "ready"):
+        """Start homing; retry without a reply if the stage does not home. Raises RefusedError, DeviceError."""
+        if self._once(Home(), self._timeout_s) is None and self.status().state != "homing":
             self._ask(Home(), Accepted)
 
     def run_row(self, scan_id: str, row_index: int, take: int) -> None:

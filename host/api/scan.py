@@ -27,9 +27,9 @@ from polysight.host.products import (
 )
 from polysight.host.store import MANIFEST, ScanFolder, Source, open_source
 from polysight.host.verdict import Verdict
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, DataError, no_such
+from polysight.shared.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     import xarray
@@ -135,15 +135,10 @@ def _products_only(path: Path, options: Options, anew: bool) -> Scan:
 
 
 def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:
-    """Open recorded data of any layout. Raises DataError or ConfigError."""
-    if not path.is_dir():
-        raise no_such(path)
-    if (path / MANIFEST).exists():
-        return ScanFolder.load(path)
-    if isinstance(rig, Instrument):
-        return open_source(path, rig)
-    file = Path(rig) if rig is not None else path / RIG if (path / RIG).exists() else packaged(RIG)
-    return open_source(path, load_instrument(file))
+    """Open recorded data of any layout; without `rig`, with the rig file beside it or the packaged one."""
+    if rig is None:
+        rig = path / RIG if (path / RIG).exists() else packaged(RIG)
+    return open_source(path, rig if isinstance(rig, Instrument) else Path(rig), dropped=True)
 
 
 def _is_current(saved: SavedProducts, scan: ScanFolder) -> bool:

@@ -90,7 +90,7 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
         if the file is missing or damaged, or does not belong to the row.
     """
     try:
-        line, _, tail = read_bounded(path, PacketLog.most_kept(row.size) + _MAX_RUN_BYTES).partition(b"\n")
+        line, _, tail = read_bounded(path, PacketLog.max_kept_bytes(row.size) + _MAX_RUN_BYTES).partition(b"\n")
         head: dict[str, Any] = json.loads(line)
         evidence = msgspec.convert(head["evidence"], Evidence)
         size = 2 * BATCH.itemsize * head["batches"]
@@ -123,7 +123,7 @@ def _restored(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row
     """Restore the packet log. Raises ValueError if payload is missing."""
     many, sizes = runs["packets"].astype(np.int64), runs["size"].astype(np.int64)
     payload_bytes = sum((many * sizes).tolist())  # each product fits 48 bits; their sum need not fit 64
-    if expected != row.size or payload_bytes > PacketLog.most_kept(expected) or (sizes == 0).any():
+    if expected != row.size or payload_bytes > PacketLog.max_kept_bytes(expected) or (sizes == 0).any():
         raise ValueError("it is of another row, or has more payload than a receiver keeps")
     nth = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
     each = np.repeat(sizes, many)

@@ -16,7 +16,7 @@ from polysight.host.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, P
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 _SPARE_BYTES = 1 << 20  # of payload beyond the row, for left-over packets
-_MOST = 4  # largest kept payload, in rows; two network paths double it
+_MAX_ROWS = 4  # of payload that is kept; two network paths double it
 
 
 class PacketLog:
@@ -91,10 +91,10 @@ class PacketLog:
             self._filled += to.size
 
     def _room_for(self, more: int) -> bool:
-        """True if `more` bytes of payload can be kept; memory grows up to `_MOST` rows."""
+        """True if `more` bytes of payload can be kept; memory grows up to `_MAX_ROWS` rows."""
         if self._filled + more <= self.payload.size:
             return True
-        size = min(2 * self.payload.size + more, self.most_kept(self.expected))
+        size = min(2 * self.payload.size + more, self.max_kept_bytes(self.expected))
         if self._filled + more > size:
             return False
         grown = np.empty(size, dtype=np.uint8)
@@ -103,9 +103,9 @@ class PacketLog:
         return True
 
     @staticmethod
-    def most_kept(expected: int) -> int:
+    def max_kept_bytes(expected: int) -> int:
         """Return the largest payload that is kept of a row of `expected` bytes."""
-        return _MOST * (expected + _SPARE_BYTES)
+        return _MAX_ROWS * (expected + _SPARE_BYTES)
 
     def _note(self, t_ns: int) -> None:
         if self._noted + 2 > len(self._batches):

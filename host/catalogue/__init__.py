@@ -21,7 +21,7 @@ from polysight.host.catalogue.pixels import Pixels
 from polysight.host.catalogue.probe import probe
 from polysight.host.catalogue.result import EXPORT, files_of, result_of
 from polysight.host.catalogue.scans import Scans, folder_bytes
-from polysight.host.catalogue.summary import PROGRAM, Summary, log_tail, summary_of
+from polysight.host.catalogue.summary import PROGRAM, Summary, log_tail
 
 __all__ = [
     "AMPLITUDE",
@@ -50,7 +50,6 @@ __all__ = [
     "probe",
     "read_notes",
     "result_of",
-    "summary_of",
     "thumbnail",
     "write_notes",
 ]

@@ -162,7 +162,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     if stop is not None and stop.is_set() and child.returncode:
         return Outcome(job.name, "stopped", seconds)
     if child.returncode:
-        return Outcome(job.name, "failed", seconds, message=_why(log, child.returncode))
+        return Outcome(job.name, "failed", seconds, message=_failure(log, child.returncode))
     return _done(job, seconds)
 
 
@@ -185,7 +185,8 @@ def _done(job: Job, seconds: float = 0.0) -> Outcome:
     return Outcome(job.name, "done", seconds or float(mark.get("seconds", 0.0)), float(mark["memory_gb"]))
 
 
-def _why(log: Path, status: int) -> str:
+def _failure(log: Path, status: int) -> str:
+    """The last message in a program's log, or the signal that killed it."""
     if status < 0:
         return f"killed by signal {-status}; signal 9 is usually the system running out of memory: give --jobs 1"
     lines = [x.strip() for x in log.read_text(encoding="utf-8", errors="replace").splitlines() if x.strip()]
@@ -330,10 +331,10 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
     """Table of the results of all scans, and their counts."""
     rows = [("scan", "result", "seconds", "memory", "masked", "patches", "")]
     for o in outcomes:
-        masked, patches = _found(out / o.name) if o.status in ("done", "skipped") else ("", "")
+        masked, patches, verdict = _results(out / o.name) if o.status in ("done", "skipped") else ("", "", "")
         seconds = f"{o.seconds:.0f}" if o.seconds else ""
         memory = f"{o.memory_gb:.1f} GB" if o.memory_gb else ""
-        rows.append((o.name, o.status, seconds, memory, masked, patches, o.message or _verdict(out / o.name)))
+        rows.append((o.name, o.status, seconds, memory, masked, patches, o.message or verdict))
     widths = [max(len(row[k]) for row in rows) for k in range(6)]
     lines = []
     for row in rows:
@@ -346,25 +347,17 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
     return "\n".join([*lines, end, ""])
 
 
-def _verdict(products: Path) -> str:
-    """The verdict of products with its first reason; empty if `good`."""
-    try:
-        verdict = SavedProducts(products).verdict
-    except (PolysightError, AttributeError, KeyError, TypeError):
-        return ""
-    if verdict is None or verdict.level == "good":
-        return ""
-    return f"{verdict.text}: {verdict.reasons[0].what}" if verdict.reasons else verdict.text
-
-
-def _found(products: Path) -> tuple[str, str]:
-    """Share of masked or missing positions and number of patches, from the products."""
+def _results(products: Path) -> tuple[str, str, str]:
+    """Share of masked or missing positions, number of patches, and the verdict unless it is `good`; "" if unknown."""
     saved = SavedProducts(products)
     try:
         boards = saved.quality["boards"].values()
         absent = saved.quality.get("coverage", {}).get("positions_absent", 0)  # of each board
         lost = sum(b["positions_masked"] + absent for b in boards)
         share = lost / max(1, sum(b["positions"] + absent for b in boards))
-        return f"{100 * share:.2g} %", str(len(saved.materials["segments"]))
+        masked, patches, verdict = f"{100 * share:.2g} %", str(len(saved.materials["segments"])), saved.verdict
     except (PolysightError, AttributeError, KeyError, TypeError):
-        return "", ""
+        return "", "", ""
+    if verdict is None or verdict.level == "good":
+        return masked, patches, ""
+    return masked, patches, f"{verdict.text}: {verdict.reasons[0].what}" if verdict.reasons else verdict.text

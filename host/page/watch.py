@@ -68,7 +68,7 @@ class GrowingFile:
                 if status.st_size < self._position or f.read(len(self._head)) != self._head:
                     self.replaced, self._position = True, 0
                 f.seek(0)
-                self._head = f.read(min(self._position, _HEAD))
+                self._head = f.read(_HEAD)
                 f.seek(self._position)
                 return f.read()
         except OSError:

@@ -7,7 +7,7 @@ of its frames. A fatal event leads to `FAULT`, which only a reset leaves. Not ru
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import Enum
 from typing import Any
@@ -38,18 +38,6 @@ class State(Enum):
     RUNNING = "pulses have begun"
     DONE = "frames ended"
     FAULT = "has failed, needs a reset"
-
-
-TRANSITIONS: Mapping[State, frozenset[State]] = {
-    State.OFF: frozenset({State.POWERED, State.FAULT}),
-    State.POWERED: frozenset({State.RF_READY, State.FAULT, State.OFF}),
-    State.RF_READY: frozenset({State.CONFIGURED, State.FAULT, State.OFF}),
-    State.CONFIGURED: frozenset({State.ARMED, State.FAULT, State.OFF}),
-    State.ARMED: frozenset({State.RUNNING, State.DONE, State.CONFIGURED, State.FAULT, State.OFF}),
-    State.RUNNING: frozenset({State.DONE, State.CONFIGURED, State.FAULT, State.OFF}),
-    State.DONE: frozenset({State.ARMED, State.FAULT, State.OFF}),
-    State.FAULT: frozenset({State.OFF}),
-}
 
 
 class RadarBoard:
@@ -126,7 +114,7 @@ class RadarBoard:
                         raise up.with_ignored(error) from None
                     if on_step is not None:
                         on_step(step, outcome)
-                self._to(state)
+                self._state = state
 
     def write_flash(self, image: Image, progress: Callable[[int, int], None]) -> str:
         """Write firmware to the board's flash, start from it and verify; return a description of the flash.
@@ -142,9 +130,7 @@ class RadarBoard:
                 raise up.with_ignored(error) from None
 
     def _begin(self) -> BringUp:
-        if self._state is not State.OFF:
-            self._to(State.OFF)
-        self.reason, self._frames = "", 0
+        self._state, self.reason, self._frames = State.OFF, "", 0
         self.facts.clear()
         return BringUp(
             self.name, self._link, self._words, self._clock, self._program, self._firmware, self._die_id,
@@ -225,7 +211,7 @@ class RadarBoard:
     def pulses_begin(self) -> None:
         """Note that pulses may come from now on, which the radar does not report."""
         if self._state is State.ARMED:
-            self._to(State.RUNNING)
+            self._state = State.RUNNING
 
     def poll(self) -> State:
         """Read the board's events and return its state; a lost link is a fault."""
@@ -275,7 +261,7 @@ class RadarBoard:
         """Enter `FAULT`; the first reason is kept."""
         if self._state is not State.FAULT:
             self.reason = reason
-            self._to(State.FAULT)
+            self._state = State.FAULT
 
     def _stop(self) -> None:
         """Stop frames that wait for triggers, after one frame period, because a stop is forbidden during a frame."""
@@ -284,7 +270,7 @@ class RadarBoard:
         if self._state in (State.ARMED, State.RUNNING):
             self._link.call(c.FrameControl(c.STOP_WHILE_WAITING))
             self._link.wait_for((e.FRAME_END,), _READY_TIMEOUT_S, self._note)
-            self._to(State.CONFIGURED)
+            self._state = State.CONFIGURED
 
     def _wait(self, event_id: int, timeout_s: float) -> e.Event:
         return self._link.wait_for((event_id,), timeout_s, self._on_event)
@@ -311,18 +297,9 @@ class RadarBoard:
         if event.fatal:
             self.fail(str(event))
         elif event.id == e.FRAME_END and self._state in (State.ARMED, State.RUNNING):
-            self._to(State.DONE)
+            self._state = State.DONE
         elif event.id == e.TRIGGER_READY and self._state in (State.CONFIGURED, State.DONE):
-            self._to(State.ARMED)
-
-    def _to(self, state: State) -> None:
-        if state not in TRANSITIONS[self._state]:
-            raise DeviceError(
-                f"{self.name}: no transition from {self._state.name} to {state.name}",
-                "events in an unexpected order",
-                "resume the scan",
-            )
-        self._state = state
+            self._state = State.ARMED
 
     @contextmanager
     def _fault_on_error(self) -> Iterator[None]:

@@ -41,7 +41,7 @@ from polysight.host.report.style import (
     write_label,
 )
 
-_ROOM = 0.09  # of a map's height, for a label of two lines
+_ROOM = 0.05  # of a map's height, for a label
 _POSITION_COLOURS = ("#dfe5ec", "#882255")  # with data light, masked dark: readable without colour
 
 
@@ -63,17 +63,18 @@ def draw_materials(ax: Axes, ctx: ReportContext, size: float = 7.5) -> list[MapL
     _crop(ax, ctx)
     labels = []
     for row in ctx.materials:
-        x0, _, x1, y1 = row["box_mm"]
+        x0, y0, x1, y1 = row["box_mm"]
         if row.get("refused"):
             ax.add_patch(outline_of(row, fill=False, edgecolor=REFUSED_COLOUR, hatch=HATCH, linewidth=0.0))
         if row.get("outline_mm") or row.get("refused"):
             ax.add_patch(outline_of(row, fill=False, edgecolor=INK, linewidth=0.9))
         name = patch_label(row)
-        below = "" if row.get("confidence") is None else f"{100 * row['confidence']:.0f} %"
-        below = "not judged" if row.get("refused") else below
-        text = write_label(ax, (x0 + x1) / 2, y1 + 0.5, f"{name}\n{below}" if below else name, size, above=True)
+        within = "" if row.get("confidence") is None else f"{100 * row['confidence']:.0f} %"
+        within = "not judged" if row.get("refused") else within
+        text = write_label(ax, (x0 + x1) / 2, y1 + 0.5, name, size, above=True)
         _keep_inside(ax, text, y1)
-        labels.append(MapLabel(text, str(row["label"]), name, patch_colour(row, colours), below))
+        write_label(ax, (x0 + x1) / 2, y0 + 1.0, within, size, above=True)  # two lines above would reach the next patch
+        labels.append(MapLabel(text, str(row["label"]), name, patch_colour(row, colours)))
     return labels
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zlib
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, Literal
 
 from polysight.host.capture import PACKETS, read_index
 from polysight.host.store import manifest
+from polysight.host.store.append_only import crc32
 from polysight.host.store.events import read_events
 from polysight.host.store.manifest import ManifestFault
 from polysight.host.store.raw import dropped_files
@@ -153,7 +153,7 @@ def board_faults(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding
         needed = board.missing_bytes > 0 or board.index_crc32 != ""
         return [*found, Finding("error", where, "absent", _COPY)] if needed else found
     try:
-        index_crc = zlib.crc32(index.read_bytes())
+        index_crc = crc32(index.read_bytes())
     except OSError as e:
         return [*found, _not_read(where, e)]
     if board.index_crc32 and f"{index_crc:08x}" != board.index_crc32:
@@ -195,7 +195,7 @@ def _digest(path: Path) -> tuple[int, int]:
     with path.open("rb") as f:
         while chunk := f.read(_CHUNK):
             size += len(chunk)
-            crc = zlib.crc32(chunk, crc)
+            crc = crc32(chunk, crc)
     return size, crc
 
 
@@ -248,7 +248,7 @@ def _committed_events(path: Path, length: int, fact: dict[str, Any]) -> list[Fin
     if length < size:
         return [Finding("error", EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
     with path.open("rb") as f:
-        whole = f"{zlib.crc32(f.read(size)):08x}" == crc
+        whole = f"{crc32(f.read(size)):08x}" == crc
     what = f"not the events that were there when {when} (CRC)"
     return [] if whole else [Finding("error", EVENTS, what, "restore it from a copy")]
 

@@ -235,7 +235,7 @@ def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
 def _against_one(
     words: NDArray[np.int16], valid: NDArray[np.bool_], linear: tuple[int, int], full_scale: int
 ) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32]]:
-    """Estimate offsets relative to one chirp per position; try another one if it matches few of the others.
+    """Estimate offsets relative to one chirp per position; try another one if it is unusable or matches few others.
 
     Returns the offsets, the middle of the signal's band [position], and [position, chirp]: coherence with the reference
     chirp, usable chirps (received whole, not clipped, not silent), and the largest count.
@@ -244,27 +244,31 @@ def _against_one(
     # Threshold for two records of noise: four times the RMS of a sum of random phases.
     noise = 4.0 / np.sqrt(words.shape[-1] * (linear[1] - linear[0]))
     order = np.argsort(~valid, axis=1, kind="stable")  # the valid ones, first to last
-    reference, todo = order[:, 0], np.arange(positions)
+    reference, todo, every = order[:, 0], np.arange(positions), np.arange(positions)
     frequency, amplitude, centre = np.zeros(valid.shape), np.zeros(valid.shape, complex), np.zeros(positions)
     coherence, usable, peak = np.zeros(valid.shape), valid, np.zeros(valid.shape, np.int32)
+    best_sum = np.full(positions, -1.0)
     for attempt in range(min(_REFERENCES, chirps)):
         tried = order[todo, attempt]
         offset, product, middle, energy, highest = passes.match(words if attempt == 0 else words[todo], tried, linear)
         if attempt == 0:
             usable, peak = valid & (highest < full_scale) & (energy > 0), highest
+            rank = np.where(usable, 1, 2)
+            rank[every, tried] = 0
+            order = np.argsort(rank, axis=1, kind="stable")  # the one tried, then the usable ones
         at = np.arange(todo.size), tried
         c = np.abs(product) / np.sqrt(np.maximum(energy * energy[at][:, None], 1e-30)) * usable[todo]
         c[at] = 0  # a chirp always matches itself
-        better = c.sum(axis=1) >= coherence[todo].sum(axis=1)
+        total = np.where(usable[todo, tried], c.sum(axis=1), -1.0)
+        better = total >= best_sum[todo]
         won = todo[better]
-        reference[won], coherence[won] = tried[better], c[better]
+        reference[won], coherence[won], best_sum[won] = tried[better], c[better], total[better]
         frequency[won], amplitude[won], centre[won] = offset[better], product[better], middle[better]
-        matching = (c > noise).sum(axis=1)
-        todo = todo[2 * matching < usable[todo].sum(axis=1) - 1]
+        count, matching = usable[todo].sum(axis=1), (c > noise).sum(axis=1)
+        todo = todo[(count > 0) & (~usable[todo, tried] | (2 * matching < count - 1))]
         if todo.size == 0:
             break
     best = coherence.max(axis=1)
-    every = np.arange(positions)
     coherence[every, reference] = np.where(usable[every, reference], best, 0)  # as good as its best match
     return Tone(frequency, amplitude), centre, coherence, usable, peak
 

@@ -42,7 +42,7 @@ class BuildError(Exception):
 
 
 def source_digest() -> str:
-    """Return the digest of the C sources; the library contains it, to detect a library of other sources."""
+    """Return the digest of the C sources. A library ends with it: another, truncated or foreign file is not loaded."""
     digest = hashlib.sha256()
     for path in sorted([*HERE.glob("*.c"), *HERE.glob("*.h")]):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
@@ -85,7 +85,7 @@ def build(folder: Path = HERE, target: str = "") -> Path:
             for bits, flags in widths.items()
             for source in SOURCES
         ]
-        jobs.append((["width.c", f'-DSOURCES="{source_digest()}"'], "width.o"))
+        jobs.append((["width.c"], "width.o"))
         with ThreadPoolExecutor(os.cpu_count()) as workers:
             commands = [[*compiler, *_FLAGS.split(), "-c", *words, "-o", f"{made}/{name}"] for words, name in jobs]
             list(workers.map(_run, commands))
@@ -93,7 +93,7 @@ def build(folder: Path = HERE, target: str = "") -> Path:
         objects = [f"{made}/{name}" for _, name in jobs]
         _run([*compiler, "-O3", "-fno-sanitize=undefined", "-s", "-shared", "-o", library, *objects, "-lm"])
         new = folder / f".{LIBRARY}-{os.getpid()}"
-        shutil.copyfile(library, new)
+        new.write_bytes(Path(library).read_bytes() + source_digest().encode())
         new.replace(folder / LIBRARY)  # atomic: programs that use the old library keep it
     return folder / LIBRARY
 

@@ -10,7 +10,7 @@
 /* `high_pass_filter.Equaliser`; without corners there is one tap, 1. */
 typedef struct {
     int taps, is_signed, corners;
-    double sample_rate_hz, reach;
+    double sample_rate_hz, reach, even, odd; /* even, odd: factors of `find_taps` */
     const double *corners_hz;
 } Equaliser;
 
@@ -36,9 +36,8 @@ static void find_taps(const Equaliser *e, double frequency, Complex *taps)
         return;
     }
     Complex low = inverse(e, frequency - e->reach), middle = inverse(e, frequency), high = inverse(e, frequency + e->reach);
-    double w = TURN * e->reach * FOLD, even = 1 / (cos(w) - 1), odd = 1 / (2 * sin(w));
-    Complex both = {((low.re + high.re) / 2 - middle.re) * even, ((low.im + high.im) / 2 - middle.im) * even};
-    Complex apart = {(high.im - low.im) * odd, -(high.re - low.re) * odd}; /* divided by j */
+    Complex both = {((low.re + high.re) / 2 - middle.re) * e->even, ((low.im + high.im) / 2 - middle.im) * e->even};
+    Complex apart = {(high.im - low.im) * e->odd, -(high.re - low.re) * e->odd}; /* divided by j */
     taps[0] = (Complex){(both.re - apart.re) / 2, (both.im - apart.im) / 2};
     taps[1] = (Complex){middle.re - both.re, middle.im - both.im};
     taps[2] = (Complex){(both.re + apart.re) / 2, (both.im + apart.im) / 2};
@@ -77,21 +76,30 @@ static void choose_coherent(const double *coherence, const uint8_t *usable, int 
         good[k] = usable[k] && coherence[k] >= GOOD * sorted[(count - 1) / 2];
 }
 
-/* `align._against_one`: offsets relative to one chirp; try another one if it matches few of the others. Returns the
-   middle of the signal's band. */
+/* Chirps of a kind first, then the others, each in order of recording; the first `fixed` stay. */
+static void put_first(int *order, const uint8_t *kind, int chirps, int fixed)
+{
+    int at = fixed;
+    for (int wanted = 1; wanted >= 0; wanted--)
+        for (int k = 0; k < chirps; k++)
+            if ((kind[k] != 0) == wanted && !(fixed && k == order[0]))
+                order[at++] = k;
+}
+
+/* `align._against_one`: offsets relative to one chirp; try another one if it is not usable or matches few of the others.
+   Returns the middle of the signal's band. */
 static double against_one(Work *w, Chirps *c, const uint8_t *valid, int full_scale, const int32_t *peak)
 {
-    int chirps = w->chirps, reference = 0, usable = 0, at = 0;
-    double best_sum = 0, best = 0, centre = 0, noise = 4 / sqrt((double)RX * w->n);
-    for (int wanted = 1; wanted >= 0; wanted--) /* valid chirps first, in order */
-        for (int k = 0; k < chirps; k++)
-            if ((valid[k] != 0) == wanted)
-                c->order[at++] = k;
+    int chirps = w->chirps, reference = 0, usable = 0;
+    double best_sum = -1, best = 0, centre = 0, noise = 4 / sqrt((double)RX * w->n);
+    put_first(c->order, valid, chirps, 0);
     for (int attempt = 0; attempt < REFERENCES && attempt < chirps; attempt++) {
         int tried = c->order[attempt], matching = 0;
         double sum = 0, middle = match(w, tried, c->found, c->found_product, c->energy);
         for (int k = 0; attempt == 0 && k < chirps; k++)
             usable += c->usable[k] = valid[k] && peak[k] < full_scale && c->energy[k] > 0;
+        if (attempt == 0)
+            put_first(c->order, c->usable, chirps, 1);
         for (int k = 0; k < chirps; k++) {
             double energy = (double)c->energy[k] * c->energy[tried];
             double match = magnitude(c->found_product[k]) / sqrt(energy > 1e-30 ? energy : 1e-30);
@@ -99,6 +107,7 @@ static double against_one(Work *w, Chirps *c, const uint8_t *valid, int full_sca
             sum += c->sorted[k];
             matching += c->sorted[k] > noise;
         }
+        sum = c->usable[tried] ? sum : -1;
         if (sum >= best_sum) {
             best_sum = sum;
             reference = tried;
@@ -107,7 +116,7 @@ static double against_one(Work *w, Chirps *c, const uint8_t *valid, int full_sca
             memcpy(c->frequency, c->found, sizeof *c->frequency * chirps);
             memcpy(c->product, c->found_product, sizeof *c->product * chirps);
         }
-        if (2 * matching >= usable - 1)
+        if (!usable || (c->usable[tried] && 2 * matching >= usable - 1))
             break;
     }
     for (int k = 0; k < chirps; k++)
@@ -130,7 +139,7 @@ static void align_position(Work *w, Chirps *c, const Equaliser *e, const int16_t
                            int full_scale, Aligned out)
 {
     int chirps = w->chirps, count = 0, half = 0;
-    for (int k = 0; k < chirps; k++)
+    for (int k = 0; k < chirps; k++) /* reads all words in order, into the first caches */
         out.peak[k] = largest(words + 2 * RX * k * w->samples, 2 * RX * w->samples);
     part_iq(words, chirps * w->samples, w->i, w->q);
     *out.centre = against_one(w, c, valid, full_scale, out.peak);
@@ -207,19 +216,21 @@ static size_t lay_out(Work *w, Chirps *c, int taps, float *memory)
         *columns[i] = room(memory, &used, LANES * size, sizeof(float));
     for (int i = 0; i < 4; i++)
         *chirp[i] = room(memory, &used, padded, sizeof(float));
-    w->i = room(memory, &used, chirps * RX * w->samples + LANES, sizeof *w->i);
-    w->q = room(memory, &used, chirps * RX * w->samples + LANES, sizeof *w->q);
-    w->folded_re = room(memory, &used, chirps * values, sizeof(float));
-    w->folded_im = room(memory, &used, chirps * values, sizeof(float));
+    w->i = room(memory, &used, chirps * RX * w->samples + LANES, sizeof(float));
+    w->q = room(memory, &used, chirps * RX * w->samples + LANES, sizeof(float));
+    w->folded_re = room(memory, &used, whole_lanes(w->chirps) * values, sizeof(float));
+    w->folded_im = room(memory, &used, whole_lanes(w->chirps) * values, sizeof(float));
     w->all_re = room(memory, &used, values, sizeof(float));
     w->all_im = room(memory, &used, values, sizeof(float));
     w->total = room(memory, &used, 4 * (size_t)RX * w->samples, sizeof(float));
     w->root_c = room(memory, &used, size, sizeof(float));
     w->root_s = room(memory, &used, size, sizeof(float));
-    w->power = room(memory, &used, size, sizeof(double));
-    w->smooth = room(memory, &used, size, sizeof(double));
+    w->turn_c = room(memory, &used, RX * size, sizeof(float));
+    w->turn_s = room(memory, &used, RX * size, sizeof(float));
+    w->power = room(memory, &used, 3 * size, sizeof(double));
+    w->smooth = room(memory, &used, 3 * size, sizeof(double));
     w->sums = room(memory, &used, 6 * PARTS * chirps, sizeof(double));
-    w->newton = room(memory, &used, 11 * chirps, sizeof(double));
+    w->tones = room(memory, &used, 5 * chirps, sizeof(double));
     w->bin = room(memory, &used, size, sizeof *w->bin);
     w->place = room(memory, &used, size, sizeof *w->place);
     c->order = room(memory, &used, chirps, sizeof *c->order);
@@ -244,6 +255,11 @@ static void prepare(Work *w)
         w->bin[i] = bin_at(i, w->size);
         w->place[w->bin[i]] = i;
     }
+    for (int i = 0; i < RX * w->size; i++) {
+        int root = i % LANES / RX * (w->bin[i / LANES] / FOLD);
+        w->turn_c[i] = w->root_c[root];
+        w->turn_s[i] = w->root_s[root];
+    }
     for (int p = 0; p <= w->parts; p++)
         w->edges[p] = p * w->blocks / w->parts;
     for (int p = 0; p < w->parts; p++)
@@ -258,7 +274,9 @@ int NAME(align)(const int16_t *words, const uint8_t *valid, int positions, int c
                 uint8_t *good, double *frequency, double *phase, double *amplitude, double *gain, double *error,
                 double *coherence, int32_t *peak)
 {
-    const Equaliser e = {equalise ? 3 : 1, filter[2] != 0, corners, filter[0], filter[1], filter + 3};
+    const double reach = TURN * filter[1] * FOLD; /* angle of a tap at this distance */
+    const Equaliser e = {equalise ? 3 : 1, filter[2] != 0, corners, filter[0], filter[1], 1 / (cos(reach) - 1), 1 / (2 * sin(reach)),
+                         filter + 3};
     const int blocks = (b - a) / FOLD;
     Work w = {.chirps = chirps, .samples = samples, .a = a, .b = b, .n = b - a, .blocks = blocks, .size = size};
     Chirps c;

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import threading
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -22,6 +23,7 @@ RX = 4
 """Number of RX that the loops support."""
 
 _log = logging.getLogger(__name__)
+_lock = threading.Lock()
 
 
 class LoadError(Exception):
@@ -48,13 +50,14 @@ class Library:
         from polysight.host.sync import build  # not at import, so that `python -m polysight.host.sync.build` is clean
 
         path = path or build.HERE / build.LIBRARY
+        if not path.is_file():
+            raise LoadError(f"{path} is missing")
         try:
+            if not path.read_bytes().endswith(build.source_digest().encode()):  # loading it could end the program
+                raise LoadError(f"{path} was compiled from other sources, or is damaged")
             loaded = ctypes.CDLL(str(path))
         except OSError as e:
             raise LoadError(str(e)) from None
-        loaded.sources.restype = ctypes.c_char_p
-        if loaded.sources().decode() != build.source_digest():
-            raise LoadError(f"{path} was compiled from other sources")
         self.bits = bits or int(loaded.vector_bits())
         self._loaded = loaded
 
@@ -138,9 +141,14 @@ class Library:
             raise MemoryError(f"no memory for {name}")
 
 
-@lru_cache(maxsize=1)
 def library() -> Library | None:
-    """Return the compiled loops; None, and a warning, if they cannot be used."""
+    """Return the compiled loops; None, and one warning, if they cannot be used."""
+    with _lock:
+        return _load()
+
+
+@lru_cache(maxsize=1)
+def _load() -> Library | None:
     try:
         return Library()
     except LoadError as e:

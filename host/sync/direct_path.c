@@ -94,7 +94,7 @@ int NAME(search)(const float *halves, const float *weights, int positions, int b
                 im[LANES * m + k] = (y[m] + y[blocks + m]) + (y[2 * blocks + m] + y[3 * blocks + m]);
             }
         }
-        transform(re, im, size, c, s);
+        transform(re, im, size, c, s, size);
         for (int i = 0; i < LANES * size; i++)
             re[i] = re[i] * re[i] + im[i] * im[i];
         double middle[LANES];

@@ -14,17 +14,21 @@ typedef struct {
     int n, blocks, size;       /* number of linear samples, of blocks; size of the transform */
     int parts, edges[PARTS + 1];
     double part_times[PARTS];
-    int16_t *i, *q; /* I and Q of the burst: [chirp][sample][RX] each */
+    float *i, *q; /* I and Q of the burst: [chirp][sample][RX] each */
     float *root_c, *root_s, *phase_c, *phase_s;
+    float *turn_c, *turn_s; /* twiddle factors of `spectrum` */
     float *one_re, *one_im, *row_re, *row_im, *re, *im; /* one chirp; sixteen records in sequence; sixteen interleaved */
     float *spare, *folded_re, *folded_im, *all_re, *all_im, *total;
-    double *power, *smooth, *sums, *newton;
+    double *power, *smooth, *sums, *tones;
     int *bin, *place;
 } Work;
 
+/* A number of chirps, rounded up to whole groups of LANES. */
+static inline size_t whole_lanes(int chirps) { return (size_t)(chirps + LANES - 1) / LANES * LANES; }
+
 /* Multiply a chirp i + j q by the conjugate of k + j l for every RX; return the energy of the chirp. */
-static inline float correlate(const int16_t *restrict i, const int16_t *restrict q, const int16_t *restrict k,
-                              const int16_t *restrict l, float *restrict re, float *restrict im, int count)
+static inline float correlate(const float *restrict i, const float *restrict q, const float *restrict k,
+                              const float *restrict l, float *restrict re, float *restrict im, int count)
 {
     float energy = 0;
     for (int j = 0; j < count; j++) {
@@ -34,33 +38,6 @@ static inline float correlate(const int16_t *restrict i, const int16_t *restrict
         energy += x * x + y * y;
     }
     return energy;
-}
-
-/* Sum over the RX. */
-static inline void over_rx(const float *restrict values, float *restrict sums, int samples)
-{
-    for (int n = 0; n < samples; n++)
-        sums[n] = (values[4 * n] + values[4 * n + 1]) + (values[4 * n + 2] + values[4 * n + 3]);
-}
-
-/* Interleave four records that are stored one after the other. */
-static inline void in_turn(const float *restrict values, float *restrict out, int quarter)
-{
-    for (int i = 0; i < quarter; i++) {
-        out[4 * i] = values[i];
-        out[4 * i + 1] = values[quarter + i];
-        out[4 * i + 2] = values[2 * quarter + i];
-        out[4 * i + 3] = values[3 * quarter + i];
-    }
-}
-
-/* Transpose records [LANES][n] to [n][LANES], padded with zeros to [size][LANES]. */
-static inline void interleave(const float *restrict records, float *restrict spare, float *restrict out, int n,
-                              int size)
-{
-    in_turn(records, spare, LANES / 4 * n);
-    in_turn(spare, out, LANES / 4 * n);
-    memset(out + LANES * n, 0, sizeof *out * LANES * (size - n));
 }
 
 /* Index of the strongest bin of each of sixteen spectra. */
@@ -96,100 +73,84 @@ static inline Complex interpolated(const Work *w, const float *re, const float *
     return times(peak, cis(whole * (w->n - 1) / 2));
 }
 
-/* Middle of the signal's band in linear samples x + j y, cycles per sample 0..1. */
-static double centre_of_band(Work *w, const int16_t *restrict x, const int16_t *restrict y)
+/* Power of a chirp x + j y, summed over the RX, in every bin. Sixteen records, every fourth sample of each RX, are
+   transformed; a butterfly joins the four records of an RX. */
+static void spectrum(Work *w, const float *restrict x, const float *restrict y)
 {
-    int n = w->n, size = w->size, width = BAND_BINS * size / n / 2, top = 0;
-    memset(w->re, 0, sizeof *w->re * LANES * size);
-    memset(w->im, 0, sizeof *w->im * LANES * size);
-    for (int i = 0; i < n; i++)
-        for (int r = 0; r < RX; r++) {
-            w->re[LANES * i + r] = x[RX * i + r];
-            w->im[LANES * i + r] = y[RX * i + r];
-        }
-    transform(w->re, w->im, size, w->root_c, w->root_s);
-    for (int i = 0; i < size; i++) {
-        float power = 0;
-        for (int r = 0; r < RX; r++) {
-            int j = LANES * i + r;
-            power += w->re[j] * w->re[j] + w->im[j] * w->im[j];
-        }
-        w->power[w->bin[i]] = power;
+    int quarter = w->size / FOLD, blocks = w->n / FOLD;
+    for (int i = 0; i < LANES * blocks; i++) {
+        w->re[i] = x[i];
+        w->im[i] = y[i];
     }
-    for (int box = 0; box < 3; box++) { /* three box filters are nearly Gaussian */
-        double sum = 0, *other = w->smooth;
-        for (int i = 0; i < width; i++)
-            sum += w->power[i % size];
-        for (int i = 0; i < size; i++) {
-            w->smooth[i] = sum; /* sum of the box that starts here */
-            sum += w->power[(i + width) & (size - 1)] - w->power[i];
+    memset(w->re + LANES * blocks, 0, sizeof *w->re * LANES * (quarter - blocks));
+    memset(w->im + LANES * blocks, 0, sizeof *w->im * LANES * (quarter - blocks));
+    transform(w->re, w->im, quarter, w->root_c, w->root_s, w->size);
+    for (int i = 0; i < quarter; i++) {
+        int bin = w->bin[i] / FOLD;
+        const float *re = w->re + LANES * i, *im = w->im + LANES * i;
+        const float *c = w->turn_c + LANES * i, *s = w->turn_s + LANES * i;
+        float a[LANES], b[LANES], power[FOLD][RX];
+        for (int k = 0; k < LANES; k++) {
+            a[k] = re[k] * c[k] - im[k] * s[k];
+            b[k] = re[k] * s[k] + im[k] * c[k];
         }
+        for (int r = 0; r < RX; r++) {
+            const float *u = a + r, *v = b + r;
+            float c = u[0] + u[8], d = v[0] + v[8], e = u[0] - u[8], f = v[0] - v[8];
+            float g = u[4] + u[12], h = v[4] + v[12], k = u[4] - u[12], l = v[4] - v[12];
+            power[0][r] = (c + g) * (c + g) + (d + h) * (d + h);
+            power[1][r] = (e + l) * (e + l) + (f - k) * (f - k);
+            power[2][r] = (c - g) * (c - g) + (d - h) * (d - h);
+            power[3][r] = (e - l) * (e - l) + (f + k) * (f + k);
+        }
+        for (int q = 0; q < FOLD; q++)
+            w->power[bin + q * quarter] = (power[q][0] + power[q][1]) + (power[q][2] + power[q][3]);
+    }
+}
+
+/* Middle of the signal's band in linear samples x + j y, cycles per sample 0..1. */
+static double centre_of_band(Work *w, const float *restrict x, const float *restrict y)
+{
+    int size = w->size, width = BAND_BINS * size / w->n / 2;
+    spectrum(w, x, y);
+    for (int box = 0; box < 3; box++) { /* three box filters are nearly Gaussian */
+        double *other = w->smooth;
+        for (int i = 0; i < width; i++)
+            w->power[size + i] = w->power[i];
+        memset(other, 0, sizeof *other * size);
+        for (int j = 0; j < width; j++)
+            for (int i = 0; i < size; i++)
+                other[i] += w->power[i + j]; /* sum of the box that starts here */
         w->smooth = w->power;
         w->power = other;
     }
-    for (int i = 1; i < size; i++)
-        top = w->power[i] > w->power[top] ? i : top;
-    return (double)((top + 3 * (width / 2)) % size) / size;
+    return (double)((maximum(w->power, size) + 3 * (width / 2)) % size) / size;
 }
 
 /* First pass: the tone between each chirp and a reference chirp; see `numpy_passes.match`. Returns the centre. */
 static double match(Work *w, int reference, double *frequency, Complex *product, float *energy)
 {
     int n = w->n, chirp = RX * w->samples, start = RX * w->a;
-    const int16_t *u = w->i + reference * chirp + start, *v = w->q + reference * chirp + start;
+    const float *u = w->i + reference * chirp + start, *v = w->q + reference * chirp + start;
     for (int first = 0; first < w->chirps; first += LANES) {
         int count = w->chirps - first < LANES ? w->chirps - first : LANES;
         int32_t at[LANES];
         memset(w->row_re + count * n, 0, sizeof(float) * (LANES - count) * n);
         memset(w->row_im + count * n, 0, sizeof(float) * (LANES - count) * n);
         for (int k = 0; k < count; k++) {
-            const int16_t *x = w->i + (first + k) * chirp + start, *y = w->q + (first + k) * chirp + start;
+            const float *x = w->i + (first + k) * chirp + start, *y = w->q + (first + k) * chirp + start;
             energy[first + k] = correlate(x, y, u, v, w->one_re, w->one_im, RX * n);
             over_rx(w->one_re, w->row_re + k * n, n);
             over_rx(w->one_im, w->row_im + k * n, n);
         }
         interleave(w->row_re, w->spare, w->re, n, w->size);
         interleave(w->row_im, w->spare, w->im, n, w->size);
-        transform(w->re, w->im, w->size, w->root_c, w->root_s);
+        transform(w->re, w->im, w->size, w->root_c, w->root_s, w->size);
         strongest(w->re, w->im, w->size, at);
         for (int k = 0; k < count; k++)
             product[first + k] = interpolated(w, w->re + k, w->im + k, at[k], frequency + first + k);
     }
     return centre_of_band(w, u, v);
-}
-
-/* Newton's method on the periodograms of records [part][record], `tone.refine`; frequency in cycles per sample. */
-static void newton(const double *restrict re, const double *restrict im, const double *restrict t, int parts,
-                   int count, int steps, double *restrict f, Complex *restrict tone, double *restrict s)
-{
-    double limit = TURN / (t[parts - 1] - t[0]);
-    double *restrict r0 = s, *restrict i0 = s + count, *restrict r1 = s + 2 * count, *restrict i1 = s + 3 * count;
-    double *restrict r2 = s + 4 * count, *restrict i2 = s + 5 * count;
-    memset(f, 0, sizeof *f * count);
-    for (int step = 0; step < steps; step++) {
-        memset(s, 0, sizeof *s * 6 * count);
-        for (int p = 0; p < parts; p++)
-            for (int k = 0; k < count; k++) {
-                Complex turn = step ? cis(-f[k] * t[p]) : (Complex){1, 0}; /* f is zero at first */
-                double a = re[p * count + k] * turn.re - im[p * count + k] * turn.im;
-                double b = re[p * count + k] * turn.im + im[p * count + k] * turn.re;
-                r0[k] += a;
-                i0[k] += b;
-                r1[k] += t[p] * a;
-                i1[k] += t[p] * b;
-                r2[k] += t[p] * t[p] * a;
-                i2[k] += t[p] * t[p] * b;
-            }
-        for (int k = 0; k < count; k++) {
-            double slope = r0[k] * i1[k] - i0[k] * r1[k];
-            double curvature = r1[k] * r1[k] + i1[k] * i1[k] - (r0[k] * r2[k] + i0[k] * i2[k]);
-            double d = curvature < 0 ? -slope / curvature : 0;
-            d = d < -limit ? -limit : d > limit ? limit : d;
-            f[k] += d / TURN;
-            tone[k].re = r0[k] + d * i1[k] - d * d / 2 * r2[k];
-            tone[k].im = i0[k] - d * r1[k] - d * d / 2 * i2[k];
-        }
-    }
 }
 
 /* Extrapolate the `count` values that start at signal + s by s values to either side with the parabola through three
@@ -225,7 +186,7 @@ static inline void add_filtered(const float *restrict re, const float *restrict 
 
 /* Mix a chirp's linear samples x + j y by exp(-j 2 pi frequency (n - middle)) and average every FOLD samples, to
    [block][RX] with one spare block at either end. */
-static inline void mix_and_fold(Work *w, const int16_t *restrict x, const int16_t *restrict y, double frequency,
+static inline void mix_and_fold(Work *w, const float *restrict x, const float *restrict y, double frequency,
                                 float *restrict re, float *restrict im)
 {
     float c[LANES], s[LANES], *restrict f = w->one_re, *restrict g = w->one_im;
@@ -258,16 +219,22 @@ static inline void add(const float *restrict re, const float *restrict im, float
     }
 }
 
-/* Multiply x + j y by the conjugate of u + j v; also the energy of x + j y. */
-static inline void multiply(const float *restrict x, const float *restrict y, const float *restrict u,
-                            const float *restrict v, float *restrict re, float *restrict im, float *restrict energy,
-                            int values)
+/* Correlate sixteen records re + j im [value][LANES] with another: sums over the values [from, to), of even and odd RX
+   apart, and the energy of the records. */
+static inline void correlate_part(const float *restrict re, const float *restrict im, const float *restrict all_re,
+                                  const float *restrict all_im, int from, int to, float sums[5][LANES])
 {
-    for (int j = 0; j < values; j++) {
-        re[j] = x[j] * u[j] + y[j] * v[j];
-        im[j] = y[j] * u[j] - x[j] * v[j];
-        energy[j] = x[j] * x[j] + y[j] * y[j];
-    }
+    memset(sums, 0, sizeof *sums * 5);
+    for (int j = from; j < to; j += 2)
+        for (int k = 0; k < LANES; k++) {
+            float x = re[LANES * j + k], y = im[LANES * j + k];
+            float u = re[LANES * (j + 1) + k], v = im[LANES * (j + 1) + k];
+            sums[0][k] += x * all_re[j] + y * all_im[j];
+            sums[1][k] += y * all_re[j] - x * all_im[j];
+            sums[2][k] += u * all_re[j + 1] + v * all_im[j + 1];
+            sums[3][k] += v * all_re[j + 1] - u * all_im[j + 1];
+            sums[4][k] += (x * x + y * y) + (u * u + v * v);
+        }
 }
 
 /* Second pass: the tone between each chirp, mixed down, folded and filtered, and the sum of the good others; see
@@ -278,11 +245,11 @@ static float against_others(Work *w, const double *frequency, const Complex *tap
 {
     int values = RX * w->blocks, chirps = w->chirps, all = w->parts * chirps;
     double *even_re = w->sums, *even_im = even_re + all, *odd_re = even_im + all, *odd_im = odd_re + all;
-    double *rest_re = odd_im + all, *rest_im = rest_re + all, *odd_f = w->newton + 6 * chirps;
+    double *rest_re = odd_im + all, *rest_im = rest_re + all, *odd_f = w->tones;
     Complex *odd_tone = (Complex *)(odd_f + chirps);
     float level = 0, *all_re = w->all_re, *all_im = w->all_im;
-    memset(w->folded_re, 0, sizeof(float) * chirps * values);
-    memset(w->folded_im, 0, sizeof(float) * chirps * values);
+    memset(w->folded_re, 0, sizeof(float) * whole_lanes(chirps) * values);
+    memset(w->folded_im, 0, sizeof(float) * whole_lanes(chirps) * values);
     memset(w->all_re, 0, sizeof(float) * values);
     memset(w->all_im, 0, sizeof(float) * values);
     for (int k = 0; k < chirps; k++) {
@@ -297,42 +264,34 @@ static float against_others(Work *w, const double *frequency, const Complex *tap
     }
     for (int j = 0; j < values; j++)
         level += all_re[j] * all_re[j] + all_im[j] * all_im[j];
-    for (int k = 0; k < chirps; k++) {
-        multiply(w->folded_re + k * values, w->folded_im + k * values, all_re, all_im, w->one_re, w->one_im, w->spare,
-                 values);
-        energy[k] = 0;
+    memset(energy, 0, sizeof *energy * chirps);
+    for (int first = 0; first < chirps; first += LANES) {
+        int here = chirps - first < LANES ? chirps - first : LANES;
+        float sums[5][LANES];
+        interleave(w->folded_re + first * values, w->spare, w->re, values, values);
+        interleave(w->folded_im + first * values, w->spare, w->im, values, values);
         for (int p = 0; p < w->parts; p++) {
-            float f[RX] = {0}, g[RX] = {0}, own[RX] = {0};
-            for (int m = w->edges[p]; m < w->edges[p + 1]; m++)
-                for (int r = 0; r < RX; r++) {
-                    f[r] += w->one_re[RX * m + r];
-                    g[r] += w->one_im[RX * m + r];
-                    own[r] += w->spare[RX * m + r];
-                }
-            float part = (own[0] + own[1]) + (own[2] + own[3]);
-            int j = p * chirps + k;
-            even_re[j] = f[0] + f[2];
-            even_im[j] = g[0] + g[2];
-            odd_re[j] = f[1] + f[3];
-            odd_im[j] = g[1] + g[3];
-            rest_re[j] = even_re[j] + odd_re[j] - (good[k] ? part : 0);
-            rest_im[j] = even_im[j] + odd_im[j];
-            energy[k] += part;
+            correlate_part(w->re, w->im, all_re, all_im, RX * w->edges[p], RX * w->edges[p + 1], sums);
+            for (int i = 0; i < here; i++) {
+                int k = first + i, j = p * chirps + k;
+                even_re[j] = sums[0][i];
+                even_im[j] = sums[1][i];
+                odd_re[j] = sums[2][i];
+                odd_im[j] = sums[3][i];
+                rest_re[j] = even_re[j] + odd_re[j] - (good[k] ? sums[4][i] : 0);
+                rest_im[j] = even_im[j] + odd_im[j];
+                energy[k] += sums[4][i];
+            }
         }
     }
-    newton(rest_re, rest_im, w->part_times, w->parts, chirps, 2, found, tone, w->newton);
+    newton_step(rest_re, rest_im, w->part_times, w->parts, chirps, 1, found, tone);
+    newton_step(rest_re, rest_im, w->part_times, w->parts, chirps, 0, found, tone);
     for (int p = 0; p < w->parts; p++)
-        for (int k = 0; k < chirps; k++) {
-            int j = p * chirps + k;
-            Complex turn = cis(-found[k] * w->part_times[p]);
-            Complex even = times((Complex){even_re[j], even_im[j]}, turn);
-            Complex odd = times((Complex){odd_re[j], odd_im[j]}, turn);
-            even_re[j] = even.re, even_im[j] = even.im;
-            odd_re[j] = odd.re, odd_im[j] = odd.im;
-        }
+        turn_back(found, w->part_times[p], chirps, even_re + p * chirps, even_im + p * chirps, odd_re + p * chirps,
+                  odd_im + p * chirps);
     Complex *even_tone = odd_tone + chirps;
-    newton(even_re, even_im, w->part_times, w->parts, chirps, 1, apart_f, even_tone, w->newton);
-    newton(odd_re, odd_im, w->part_times, w->parts, chirps, 1, odd_f, odd_tone, w->newton);
+    newton_step(even_re, even_im, w->part_times, w->parts, chirps, 1, apart_f, even_tone);
+    newton_step(odd_re, odd_im, w->part_times, w->parts, chirps, 1, odd_f, odd_tone);
     for (int k = 0; k < chirps; k++) {
         apart_f[k] -= odd_f[k];
         apart_phase[k] = angle(times(even_tone[k], conjugate(odd_tone[k])));
@@ -341,7 +300,7 @@ static float against_others(Work *w, const double *frequency, const Complex *tap
 }
 
 /* Mix a whole chirp x + j y by exp(-j 2 pi frequency (n - middle of the linear samples)). */
-static inline void mix(Work *w, const int16_t *restrict x, const int16_t *restrict y, double frequency, int blocks,
+static inline void mix(Work *w, const float *restrict x, const float *restrict y, double frequency, int blocks,
                        float *restrict re, float *restrict im)
 {
     float c[LANES], s[LANES];
@@ -374,13 +333,11 @@ static void average(Work *w, const double *frequency, const Complex *weights, in
         extend(w->row_im, values, LANES);
         add_filtered(w->row_re, w->row_im, weights + k * count, count, LANES, to, to + values, values);
     }
-    const float *first = w->total, *second = w->total + 2 * values;
-    for (int r = 0; r < RX; r++)
-        for (int n = 0; n < w->samples; n++)
-            for (int part = 0; part < 2; part++) {
-                int j = part * values + RX * n + r;
-                mean[2 * (r * w->samples + n) + part] = first[j] + second[j];
-            }
+    for (int j = 0; j < values; j++) {
+        w->row_re[j] = w->total[j] + w->total[2 * values + j];
+        w->row_im[j] = w->total[values + j] + w->total[3 * values + j];
+    }
+    by_rx(w->row_re, w->row_im, w->samples, mean, mean + 2 * w->samples, mean + 4 * w->samples, mean + 6 * w->samples);
     for (int h = 0; h < 2; h++)
         for (int r = 0; r < RX; r++)
             for (int m = 0; m < w->blocks; m++)

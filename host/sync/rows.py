@@ -16,7 +16,7 @@ from polysight.host.sync.high_pass_filter import HighPass
 from polysight.shared.config import Instrument
 
 _CUBE_ROWS = 7  # rows used to detect the form of a cube
-_POSITIONS = 16  # read at a time: 1 MB, which stays in the processor's cache
+_POSITIONS = 32  # read at a time: 2 MB, which stay in the processor's cache
 
 
 class RowSynchroniser:

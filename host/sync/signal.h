@@ -69,13 +69,14 @@ static inline void release(float *memory)
     free(block);
 }
 
-/* Separate the words of some samples (I of four RX, then Q of four RX) into I and Q: x + j y. */
-static inline void part_iq(const int16_t *restrict words, int samples, int16_t *restrict x, int16_t *restrict y)
+/* Convert the words of some samples (I of four RX, then Q of four RX) to x + j y. */
+static inline void part_iq(const int16_t *restrict words, int samples, float *restrict x, float *restrict y)
 {
-    for (int n = 0; n < samples; n++) {
-        memcpy(x + RX * n, words + 2 * RX * n, RX * sizeof *x);
-        memcpy(y + RX * n, words + 2 * RX * n + RX, RX * sizeof *y);
-    }
+    for (int n = 0; n < samples; n++)
+        for (int r = 0; r < RX; r++) {
+            x[RX * n + r] = words[2 * RX * n + r];
+            y[RX * n + r] = words[2 * RX * n + RX + r];
+        }
 }
 
 /* Largest magnitude of words. */
@@ -87,6 +88,18 @@ static inline int32_t largest(const int16_t *restrict words, int count)
         high = words[i] > high ? words[i] : high;
     }
     return high > -(int32_t)low ? high : -(int32_t)low;
+}
+
+/* Index of the first maximum. */
+static inline int maximum(const double *values, int count)
+{
+    double highest = values[0];
+    int i = 0;
+    for (int j = 1; j < count; j++)
+        highest = values[j] > highest ? values[j] : highest;
+    while (i < count - 1 && values[i] != highest)
+        i++;
+    return i;
 }
 
 /* exp(-j 2 pi (frequency (step m - origin) + turns)) for m < count, as an outer product of coarse and fine steps like
@@ -121,10 +134,13 @@ static inline void ramp(double frequency, double turns, int step, double origin,
 /* scale exp(-j 2 pi frequency q) for the samples q of a block, for all RX. */
 static inline void phases_within(double frequency, double scale, float *restrict c, float *restrict s)
 {
+    Complex turns[FOLD];
+    VECTOR
+    for (int q = 0; q < FOLD; q++)
+        turns[q] = cis(-frequency * q);
     for (int i = 0; i < LANES; i++) {
-        Complex z = cis(-frequency * (i / RX));
-        c[i] = (float)(z.re * scale);
-        s[i] = (float)(z.im * scale);
+        c[i] = (float)(turns[i / RX].re * scale);
+        s[i] = (float)(turns[i / RX].im * scale);
     }
 }
 
@@ -169,12 +185,13 @@ static inline void butterfly(float *restrict re, float *restrict im, int row, co
     }
 }
 
-/* Fourier transforms of sixteen records [size][LANES] in place, decimation in frequency; bin order as in `bin_at`. */
-static inline void transform(float *restrict re, float *restrict im, int size, const float *c, const float *s)
+/* Fourier transforms of sixteen records [size][LANES] in place, decimation in frequency; bin order as in `bin_at`. c, s
+   are the roots of unity of a multiple of the size, `roots`. */
+static inline void transform(float *restrict re, float *restrict im, int size, const float *c, const float *s, int roots)
 {
     int n = size;
     for (; n >= 4; n /= 4) {
-        int q = n / 4, turn = size / n;
+        int q = n / 4, turn = roots / n;
         for (int first = 0; first < size; first += n)
             for (int j = 0; j < q; j++) {
                 int i = (first + j) * LANES, k = j * turn;
@@ -191,6 +208,88 @@ static inline void transform(float *restrict re, float *restrict im, int size, c
                 re[i + LANES + k] = a - d;
                 im[i + LANES + k] = b - e;
             }
+}
+
+/* Sum over the RX. */
+static inline void over_rx(const float *restrict values, float *restrict sums, int samples)
+{
+    for (int n = 0; n < samples; n++)
+        sums[n] = (values[4 * n] + values[4 * n + 1]) + (values[4 * n + 2] + values[4 * n + 3]);
+}
+
+/* Interleave four records that are stored one after the other. */
+static inline void in_turn(const float *restrict values, float *restrict out, int quarter)
+{
+    for (int i = 0; i < quarter; i++) {
+        out[4 * i] = values[i];
+        out[4 * i + 1] = values[quarter + i];
+        out[4 * i + 2] = values[2 * quarter + i];
+        out[4 * i + 3] = values[3 * quarter + i];
+    }
+}
+
+/* Transpose records [LANES][n] to [n][LANES], padded with zeros to [size][LANES]. */
+static inline void interleave(const float *restrict records, float *restrict spare, float *restrict out, int n,
+                              int size)
+{
+    in_turn(records, spare, LANES / 4 * n);
+    in_turn(spare, out, LANES / 4 * n);
+    memset(out + LANES * n, 0, sizeof *out * LANES * (size - n));
+}
+
+/* A step of Newton's method on the periodograms of records [part][record], `tone.refine`: changes the frequency, cycles
+   per sample. `first`: the frequency is still zero. */
+static inline void newton_step(const double *restrict re, const double *restrict im, const double *restrict t, int parts,
+                               int count, int first, double *restrict f, Complex *restrict tone)
+{
+    double limit = TURN / (t[parts - 1] - t[0]);
+    VECTOR
+    for (int k = 0; k < count; k++) {
+        double r0 = 0, i0 = 0, r1 = 0, i1 = 0, r2 = 0, i2 = 0, start = first ? 0 : f[k];
+        for (int p = 0; p < parts; p++) {
+            Complex turn = first ? (Complex){1, 0} : cis(-start * t[p]);
+            double a = re[(size_t)p * count + k] * turn.re - im[(size_t)p * count + k] * turn.im;
+            double b = re[(size_t)p * count + k] * turn.im + im[(size_t)p * count + k] * turn.re;
+            r0 += a;
+            i0 += b;
+            r1 += t[p] * a;
+            i1 += t[p] * b;
+            r2 += t[p] * t[p] * a;
+            i2 += t[p] * t[p] * b;
+        }
+        double slope = r0 * i1 - i0 * r1, curvature = r1 * r1 + i1 * i1 - (r0 * r2 + i0 * i2);
+        double d = curvature < 0 ? -slope / curvature : 0;
+        d = d < -limit ? -limit : d > limit ? limit : d;
+        f[k] = start + d / TURN;
+        tone[k].re = r0 + d * i1 - d * d / 2 * r2;
+        tone[k].im = i0 - d * r1 - d * d / 2 * i2;
+    }
+}
+
+/* Multiply values a + j b and c + j d by exp(-j 2 pi frequency time). */
+static inline void turn_back(const double *restrict frequency, double time, int count, double *restrict a,
+                             double *restrict b, double *restrict c, double *restrict d)
+{
+    VECTOR
+    for (int k = 0; k < count; k++) {
+        Complex turn = cis(-frequency[k] * time), one = {a[k], b[k]}, other = {c[k], d[k]};
+        a[k] = one.re * turn.re - one.im * turn.im;
+        b[k] = one.re * turn.im + one.im * turn.re;
+        c[k] = other.re * turn.re - other.im * turn.im;
+        d[k] = other.re * turn.im + other.im * turn.re;
+    }
+}
+
+/* Separate samples of four RX into records of complex values. */
+static inline void by_rx(const float *restrict re, const float *restrict im, int samples, float *restrict a,
+                         float *restrict b, float *restrict c, float *restrict d)
+{
+    for (int n = 0; n < samples; n++) {
+        a[2 * n] = re[RX * n], a[2 * n + 1] = im[RX * n];
+        b[2 * n] = re[RX * n + 1], b[2 * n + 1] = im[RX * n + 1];
+        c[2 * n] = re[RX * n + 2], c[2 * n + 1] = im[RX * n + 2];
+        d[2 * n] = re[RX * n + 3], d[2 * n + 1] = im[RX * n + 3];
+    }
 }
 
 #endif

@@ -17,6 +17,3 @@ int vector_bits(void)
 #else
 int vector_bits(void) { return 128; }
 #endif
-
-/* Digest of the sources of this library, `build.source_digest`. */
-const char *sources(void) { return SOURCES; }

@@ -26,7 +26,7 @@ NETWORK = tuple(kind for kind in KINDS if kind != "clock")  # the kernel's clock
 
 
 class AdversarialCard(FakeCard):
-    """Sends rows through drawn troubles; what is late comes before, between or behind the packets of later rows."""
+    """Sends each row with randomly drawn faults; delayed packets arrive among the packets of later rows."""
 
     def __init__(self, board: Board, row_bytes: int, frame_bytes: int, chance: random.Random) -> None:
         self._chance, self._frame = chance, frame_bytes
@@ -76,7 +76,7 @@ def adversarial_rig(number: int) -> FakeRig:
 
 
 def check(folder: Path, rig: FakeRig, incomplete: list[int]) -> None:
-    """Every committed byte is right or masked, and a row with a mask was said to be incomplete."""
+    """Check that every committed byte is right or masked, and that a row with a mask is listed as incomplete."""
     scan = ScanFolder.load(folder)
     assert [f for f in validate(folder) if f.severity == "error"] == []
     for row, committed in scan.committed().items():

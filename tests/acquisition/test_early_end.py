@@ -63,7 +63,7 @@ class LateCard(FakeCard):
 
 @pytest.mark.parametrize("lag_ms", [0, 5, 30])
 def test_take_after_a_row_that_ended_early_is_whole(make_instrument, payload, tmp_path, lag_ms):
-    """One fault of the Pi in row 1. Its stopped records end some ms after the stop's reply: packet, then status."""
+    """The Pi reports a fault in row 1. The last packet and the status arrive some ms after the reply to the stop."""
     made = make_instrument(end_of_record_s=10.0)
     rig = FakeRig(msgspec.structs.replace(made, grid=msgspec.structs.replace(made.grid, rows=2)))
     for board in rig.instrument.recorded:
@@ -83,7 +83,7 @@ def test_take_after_a_row_that_ended_early_is_whole(make_instrument, payload, tm
 
 
 def test_card_that_sent_nothing_is_set_up_again_before_the_retake(rig, tmp_path):
-    """It was without power for a moment, and answers again, but has forgotten what it was told at the start."""
+    """It lost power for a moment: it replies again, but its configuration is lost."""
     card = rig.cards["RH"]
 
     def answer(p) -> None:

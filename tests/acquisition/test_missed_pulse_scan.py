@@ -54,7 +54,7 @@ def test_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(paced, payload, 
 
 
 def _kept(paced, payload, folder: Path, missed: dict[str, set[int]]) -> set[str]:
-    """Scans, and checks row 0 of every board; those whose frames were told apart."""
+    """Run a scan and check row 0 of every board; return the boards whose frames could be placed."""
     paced.pi.rows_run.clear()  # the rows of the scan before
     result, answer = run_scan(paced.instrument, folder, keep_incomplete=True), set()
     assert (result.exit_status, result.incomplete_rows) == ("success", [0])
@@ -75,7 +75,7 @@ def _kept(paced, payload, folder: Path, missed: dict[str, set[int]]) -> set[str]
 
 
 def test_row_with_a_spurious_edge_is_not_complete(paced, payload, tmp_path):
-    """A radar that counts its frames sees one edge too many: as many frames as pulses, all behind it one place off."""
+    """A radar that counts frames sees a spurious edge: as many frames as pulses, but all behind the edge off by one."""
     for take in (1, 2):
         paced.cards["RV"].extra[0, take] = 20
     want = np.frombuffer(payload("RV", 0, paced.instrument.row_bytes), dtype=np.uint8)

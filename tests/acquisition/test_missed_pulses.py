@@ -65,7 +65,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_on_a_quiet_machine_only_the_missed_pulses_are_masked(case):
-    """Beside it at most one frame in two rows, where its packet came while the receiver gathered others."""
+    """Besides these at most one frame in two rows, whose packet came while the receiver read others."""
     results = [placed(CASES[case], QUIET, seed) for seed in range(20)]
     for result, truth in results:
         check(result, truth, CASES[case])
@@ -115,7 +115,7 @@ def test_undetermined_frames_are_masked_each_for_its_own_reason():
     st.lists(st.integers(0, 30 * 64), min_size=0, max_size=6, unique=True),
 )
 def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_factory, missed, unsure, cuts):
-    """By an independent account of every byte: received, not in a hole, of a frame that was placed."""
+    """Expected bytes are computed independently: received, not in a hole, of a frame that was placed."""
     frame, path = 64, tmp_path_factory.mktemp("r") / "0000.part"
     slots = np.delete(np.arange(30), sorted(missed))
     pairs = sorted(cuts)[: len(cuts) // 2 * 2]

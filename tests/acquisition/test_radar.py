@@ -17,7 +17,7 @@ from polysight.host.radar.interface import BoardState, RadarControl, RadarState
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import Instrument, Radar
 from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.errors import DeviceError
 from polysight.shared.tables import decode, to_builtins
 from polysight.simulators.faults import Faults
 from polysight.simulators.radars import LineServer
@@ -130,7 +130,7 @@ except DeviceError as e:
 
 
 def test_half_open_connection_is_noticed():
-    """The machine vanishes without a word: here its network does, in a namespace of its own."""
+    """The peer's machine disappears: here the network of a separate namespace is switched off."""
     if shutil.which("ip") is None or subprocess.run(["unshare", "-rn", "true"], check=False).returncode:
         pytest.skip("needs iproute2 and user namespaces")
     done = subprocess.run(
@@ -158,7 +158,7 @@ def with_radar(instrument: Instrument, **radar) -> dict:
     ],
 )
 def test_wrong_radar_tables_are_refused(make_instrument, radar, rule):
-    with pytest.raises(ConfigError, match=rule):
+    with refused(ErrorCode.VALUE_INVALID, rule):
         decode(with_radar(make_instrument(), **radar), Instrument, "test")
 
 
@@ -171,7 +171,7 @@ def test_backend_is_that_of_the_rig_file(make_instrument):
 
 
 class Native(RadarControl):
-    """What a backend that talks to the radar itself would say, by the script of a test: a state for each arming."""
+    """A backend with native control that reports a scripted state after each arming."""
 
     def __init__(self, *script: RadarState) -> None:
         self._script, self.armed, self.closed = script, [], False
@@ -244,7 +244,7 @@ def test_radar_that_missed_a_pulse_has_its_row_taken_again(rig, tmp_path):
 
 
 def test_board_that_sends_nothing_ends_the_row_before_its_end(rig, tmp_path):
-    """Bursts are sent and a board stays silent: the row, which here would never end, is aborted and taken again."""
+    """Bursts are sent and a board sends nothing: the row, which would never end here, is aborted and retaken."""
     rig.cards["RH"].silent_data = True
     rig.pi.hang_at, rig.pi.hang_after_captures = {0}, True
     limits = msgspec.structs.replace(rig.instrument.limits, row_retakes=1)

@@ -11,6 +11,7 @@ import pytest
 
 from polysight.host.acquisition import ready
 from polysight.host.acquisition.control import StopRequest
+from polysight.host.acquisition.pi_client import PiClient
 from polysight.host.acquisition.ready import STAGE_NOT_REPORTED, check_disk, make_ready
 from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.doctor.check_host import check_time
@@ -60,6 +61,18 @@ def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeyp
         make_ready(pi, StopRequest(), lambda *_: None)
 
 
+@pytest.mark.parametrize(("state", "asked"), [("idle", 2), ("ready", 2), ("homing", 1)])
+def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, asked):
+    """A stage that is still `ready` has not begun: its lost steps would be those of the homing before."""
+    sent = []
+    pi: Any = SimpleNamespace(
+        _timeout_s=1.0, _once=lambda *given: sent.append(given), _ask=lambda *given: sent.append(given),
+        status=lambda: SimpleNamespace(state=state),
+    )  # fmt: skip
+    PiClient.home(pi)
+    assert len(sent) == asked
+
+
 def test_pi_and_host_have_the_same_homing_timeout():
     from polysight.pi_controller import machine, stage
 
@@ -68,7 +81,7 @@ def test_pi_and_host_have_the_same_homing_timeout():
 
 @pytest.mark.parametrize("rows", [1, 3, 4])
 def test_disk_space_checked_is_that_of_the_rows(make_instrument, tmp_path, monkeypatch, rows):
-    """The law of sizes: rows x boards that are recorded x what one board sends; the same in plan, doctor and scan."""
+    """Rows x recorded boards x bytes of a board's row; plan, doctor and scan use the same size."""
     rig = make_instrument(free_disk_bytes=1000)
     assert len(rig.recorded) == 2
     need = rows * 2 * rig.grid.columns * rig.burst.pulses * rig.frame_bytes
@@ -129,7 +142,7 @@ def test_settings_that_do_not_place_rows_may_differ(rig):
 
 
 def test_a_scan_begun_without_comparison_resumes_with_a_warning(rig, tmp_path):
-    """Its rows lie where that Pi had them; refusing it would have them put elsewhere."""
+    """The earlier rows were placed with that Pi's settings; only the same settings continue them."""
     stop, right = StopRequest(), rig.pi.stage
     rig.pi.stage = {}
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
@@ -142,7 +155,7 @@ def test_a_scan_begun_without_comparison_resumes_with_a_warning(rig, tmp_path):
 
 
 def scanned(rig, folder, **stage):
-    """The result, and the last `scan_ended`."""
+    """Run a scan with these settings of [stage]; return its result and its `scan_ended`."""
     replace = msgspec.structs.replace
     result = run_scan(replace(rig.instrument, stage=replace(rig.instrument.stage, **stage)), folder)
     return result, ScanFolder.load(folder).facts("scan_ended")[-1]
@@ -171,7 +184,7 @@ def test_homing_that_fails_after_the_last_row_ends_no_scan(rig, tmp_path):
 
 
 def test_only_a_scan_that_has_all_its_rows_is_homed_after(rig, tmp_path):
-    """Who stopped it expects no more motion; and a scan that is whole already moves nothing."""
+    """An operator who stopped the scan expects no motion, and a complete scan needs none."""
     stop = StopRequest()
 
     def after_the_first(progress):

@@ -49,7 +49,7 @@ def request(folder: Path) -> ProcessRequest:
 
 @pytest.mark.parametrize("fault", [102, 109])
 def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig, tmp_path, fault):
-    """The Pi ends row 1 with it and is in `fault` then, as after an emergency stop."""
+    """The Pi ends row 1 with this fault and stays in state `fault`, as after an emergency stop."""
     rig.pi.fail_rows[1, 1], rig.pi.latched = fault, "stage alarm 14: the emergency stop is pressed"
     phases = []
     with refused(ErrorCode.STAGE_NOT_READY, explain(fault).what) as e:
@@ -137,7 +137,7 @@ def test_homing_that_another_program_started_is_waited_for():
 
 @pytest.mark.parametrize("board", ["RH", "RV"])
 def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, tmp_path, board):
-    """Whichever board it is of; the Pi is told, and rows that wait for processing come after the message."""
+    """For each board: the Pi gets Abort, and the error is reported before the queued rows are processed."""
     rig.pi.hang_at = {1}
     answer, said_at_end = [], []
     release = threading.Event()
@@ -222,7 +222,7 @@ class ClosedPipe(io.TextIOWrapper):
 
 @pytest.mark.parametrize("kind", [FullDisk, ClosedPipe])
 def test_scan_without_a_terminal_is_recorded_and_processed(rig, tmp_path, monkeypatch, kind):
-    """In row 1 the terminal goes, and with it stdout and stderr."""
+    """In row 1 the terminal closes (SIGHUP), and stdout and stderr fail."""
     config = tmp_path / "rig.toml"
     config.write_text(tomli_w.dumps(to_builtins(rig.instrument)))
     made, streams = [], [kind(), kind()]
@@ -286,7 +286,7 @@ def test_processing_that_fails_does_not_hide_that_every_row_is_there(rig, tmp_pa
 
 
 def test_a_complete_scan_succeeds_if_the_pi_run_cannot_be_ended(rig, tmp_path, monkeypatch):
-    """Its disk is full, say: every row is committed, and what follows has all it needs."""
+    """As with a full disk on the Pi: every row is committed, so nothing is missing."""
 
     def refused(*_):
         raise DeviceError("the Pi did not write it down", "its disk is full", "remove old journals")

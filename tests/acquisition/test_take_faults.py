@@ -97,14 +97,8 @@ def test_stopped_now_is_on_request_whatever_else_is_missing(rig, tmp_path):
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
     (fact,) = result.folder.facts("row_rejected")
     assert (fact["reasons"], fact["faults"]) == ([str(ON_REQUEST)], [{"kind": "on_request"}])
-
-
-def test_a_row_kept_incomplete_has_the_kind_and_board_of_its_fault(rig, tmp_path):
-    for take in (1, 2, 3):
-        rig.cards["RV"].drop[1, take] = {3}
-    result = run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
-    answer = {f["row"]: f.get("faults") for f in result.folder.facts("row_committed")}
-    assert answer == {0: None, 1: [{"kind": "lost_on_the_way", "board": "RV"}], 2: None, 3: None}
+    assert (result.exit_status, list(result.folder.committed())) == ("abort", [])
+    assert not list((tmp_path / "s" / "raw").rglob("*.part"))
 
 
 def test_every_kind_has_its_words_and_its_line_in_the_specification():
@@ -119,7 +113,7 @@ def test_every_kind_has_its_words_and_its_line_in_the_specification():
 
 
 def test_words_follow_the_kind_alone():
-    """Reasons are for people: whatever they say, the cause is that of the kind."""
+    """The cause shown depends on the kind of the fault, not on the text of the reason."""
     answer = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
     for kind, (why, do) in CAUSES.items():
         notice = notice_of_rejection(0, 1, [answer], [TakeFault(kind, answer, "RV").fact()], "")

@@ -32,7 +32,7 @@ def test_one_long_row_does_not_change_the_typical_row_time():
 
 
 class Clock:
-    """Stands for `time`: it goes only when it is told to; whoever sleeps through a pause sleeps long."""
+    """Replaces `time`: it advances only on demand; a sleep during a pause takes PAUSE_S."""
 
     def __init__(self, stop: StopRequest) -> None:
         self.now, self._stop = 1000.0, stop
@@ -70,7 +70,7 @@ def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
 
 
 def test_the_page_has_the_same_time_left(rig, tmp_path):
-    """The facts of a scan with times of our own: rows a minute apart, a pause of a day before the last."""
+    """Facts of a scan with changed times: rows a minute apart, a pause of a day before the last."""
     run_scan(rig.instrument, tmp_path / "s")
     utc = "2026-05-{:02d}T02:{:02d}:00.000+00:00"
     history: ScanHistory | None = None

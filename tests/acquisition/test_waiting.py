@@ -32,7 +32,7 @@ def limited(instrument, **limits):
 
 
 def test_next_row_waits_for_processing_with_a_notice(rig, tmp_path):
-    """Processing hangs on row 0: with one row allowed to wait, row 2 is committed last; released, all are."""
+    """Processing hangs on row 0 and one row may wait: row 1 is the last one recorded until processing continues."""
     release, started, at_wait = threading.Event(), [], []
 
     def on_row(_: int) -> None:
@@ -84,7 +84,7 @@ def test_rows_of_an_earlier_run_hold_nothing_up(rig, tmp_path):
 
 
 def test_slow_disk_holds_the_scan_up_and_loses_nothing(rig, payload, tmp_path, monkeypatch):
-    """The receivers stop dead while they should write row 1, until the notice comes."""
+    """The receivers are stopped (SIGSTOP) while they write row 1, until the notice appears."""
     monkeypatch.setattr(row, "_DISK_NOTICE_S", 0.05)
     stopped: list[int] = []
     notices: list[tuple[int, str]] = []
@@ -125,7 +125,7 @@ def test_full_disk_between_rows_ends_the_scan_before_the_next_row(rig, tmp_path,
 
 
 def test_disk_that_cannot_hold_the_row_is_an_error_before_its_first_pulse(rig, tmp_path):
-    """The reservation itself fails: a limit on the size of files stands for a disk that filled up meanwhile."""
+    """Reserving the file fails: a limit on the size of files (RLIMIT_FSIZE) replaces a full disk."""
 
     def progress(p) -> None:
         if p.state == "waiting" and len(rig.pi.rows_run) == 2:
@@ -142,7 +142,7 @@ def test_disk_that_cannot_hold_the_row_is_an_error_before_its_first_pulse(rig, t
 
 
 def test_capture_has_priority_over_processing(rig, tmp_path):
-    """Whatever the system permits: a receiver is real-time, or has the lower nice value by NICE at least."""
+    """A receiver has real-time priority or, if that is not permitted, a nice value lower by at least NICE."""
     processing, capture = [], []
 
     def on_row(_: int) -> None:
@@ -194,7 +194,7 @@ def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
 
 
 def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
-    """Asked for while the loop sleeps: it does not sleep again before Abort, and no other command goes out."""
+    """A stop requested while the loop waits: Abort is the next command, sent before the loop waits again."""
     rig.pi.hang_at, rig.pi.hang_after_captures = {0}, True
     stop, points, asked, aborted = StopRequest(), [], [], []
     sleeps: list[float] = []  # of the loop, in ms; None would be for ever
@@ -238,7 +238,7 @@ def test_stop_now_before_the_row_begins_moves_nothing(rig, tmp_path, state):
 
 
 def test_every_end_is_written_down(rig, tmp_path, monkeypatch):
-    """An error that is no fault of the rig is an end with a reason, too."""
+    """An unexpected exception is recorded with its reason, too."""
 
     class BugError(Exception):
         pass

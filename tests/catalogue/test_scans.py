@@ -12,6 +12,7 @@ import pytest
 from polysight.host.catalogue import NOTES, Notes, Scans, read_notes, scans, write_notes
 from polysight.host.store import MANIFEST, ScanFolder, manifest
 from polysight.shared.errors import ConfigError, DataError
+from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
 
 
@@ -30,14 +31,6 @@ def root(processed: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_scans_that_are_not_listed_are_named(root):
-    (root / "linked").symlink_to(root / "done")
-    shutil.copytree(root / "done", root / "a\u202eb")
-    scans = Scans(root)
-    assert scans.left_out() == ["a\\u202eb", "linked"]
-    assert not {"linked", "a\u202eb"} & {s.name for s in scans.list()}
-
-
 def test_every_scan_is_listed_with_its_state(root):
     found = {s.name: s for s in Scans(root).list()}
     assert {n: (s.state, s.committed, s.rows) for n, s in found.items()} == {
@@ -45,6 +38,17 @@ def test_every_scan_is_listed_with_its_state(root):
         "out/one": ("products", 0, 0),
     }  # fmt: skip
     assert (found["done"].simulated, found["done"].processed, found["out/one"].verdict) == (True, True, "none")
+
+
+def test_a_scan_that_has_not_ended_runs_or_pauses_while_its_program_lives(root):
+    scan, listed = root / "week/lost", Scans(root)
+    with open_control(scan):
+        assert listed.summary("week/lost").state == "running"
+        with (scan / MANIFEST).open("ab") as f:
+            f.write(manifest.encode_line({"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"}))
+        assert listed.summary("week/lost").state == "paused"
+    os.utime(scan / MANIFEST, (1e9, 1e9))
+    assert listed.summary("week/lost").state == "lost"
 
 
 def test_rows_are_counted_as_the_scan_folder_counts_them(root):
@@ -89,14 +93,16 @@ def test_damaged_scans_are_listed_and_break_nothing(root):
     assert (found["done"].state, found["done"].verdict) == ("finished", "damaged")
 
 
-def test_links_and_hidden_folders_are_not_followed(root, tmp_path_factory):
+def test_links_hidden_folders_and_unprintable_names_are_not_followed(root, tmp_path_factory):
     other = tmp_path_factory.mktemp("elsewhere")
     shutil.copytree(root / "done", other / "secret")
     (root / "link").symlink_to(other / "secret")
     (root / ".hidden").mkdir()
     shutil.copytree(root / "done", root / ".hidden" / "one")
+    shutil.copytree(root / "done", root / "a\u202eb")
     names = {s.name for s in Scans(root).list()}
-    assert not names & {"link", ".hidden/one"}
+    assert not names & {"link", ".hidden/one", "a\u202eb"}
+    assert Scans(root).left_out() == ["a\\u202eb", "link"]
     for name in ("link", ".hidden/one", "../elsewhere", "", "done/", "done/products/..", "week"):
         with pytest.raises(DataError):
             Scans(root).folder(name)

@@ -90,15 +90,6 @@ def test_a_card_that_is_mute(live):
     assert found["direct path RH"].verdict == "ok"  # the other board is checked to its end
 
 
-def test_a_card_at_another_address(live):
-    def move_card(table):
-        table["boards"][1]["card_address"] = table["boards"][1]["card_address"].rpartition(".")[0] + ".77"
-
-    found = live.doctor(live.variant(move_card))
-    assert_failed(found, "card RH")
-    assert ".77:" in found["card RH"].found
-
-
 def test_a_receive_buffer_that_is_too_small(live):
     found = live.doctor(live.variant(lambda table: table["card"].update(receive_buffer_bytes=4096)))
     assert_failed(found, "buffer RH", "buffer RV")
@@ -122,14 +113,6 @@ def test_a_scan_in_progress_is_not_disturbed(live):
         pi.end_run("another", "abort", "test")
     assert_failed(found, "rig is free")
     assert {"card RH", "card RV", "pulses", "trigger line"} <= set(skipped(found, "rig is free"))
-
-
-def test_the_pi_refuses_pulses_that_the_radars_cannot_take(live):
-    with live.pi() as pi:
-        for period_us, width_us in ((100, 1), (1500, 5)):
-            with pytest.raises(RefusedError):
-                pi.pulse(16, period_us, width_us)
-        assert pi.pulse(3, 1500, 1).pulses == 3
 
 
 def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
@@ -214,15 +197,3 @@ def test_a_pi_of_another_release_is_an_error(unanswered, changes, version, check
     assert found[check].verdict == "error"
     assert all(value in found[check].found for value in changes.values())
     assert skips in skipped(found, check)
-
-
-def test_missing_keys(unanswered, tmp_path):
-    def change(table):
-        table["pi"] |= {"command_address": "tcp://192.0.2.1:5601", "event_address": "tcp://192.0.2.1:5602"}
-        table["pi"]["key_dir"] = str(tmp_path / "nothing")
-
-    unanswered.folder.joinpath("rig").mkdir()
-    found = unanswered.doctor(unanswered.variant(change))
-    assert found["keys"].verdict == "error"
-    assert "host.key_secret" in found["keys"].found
-    assert "pi" in skipped(found, "keys")

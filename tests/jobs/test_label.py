@@ -123,6 +123,8 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
     assert boxes(products).metal == "metal"
     assert "named PET 80 %" in questions[1]
     assert "the name pet" in capsys.readouterr().out  # pet beside PET
+    assert label(products, Edits(), ask=answering("yes", "oak", "glass", "", "nothing", "glass")[0]) == 0
+    assert boxes(products).metal == "glass"
     before = (products / "labels.json").read_bytes()
     for answers, code in ((["no"], ErrorCode.VALUE_INVALID), (["yes", "copper"], ErrorCode.KEY_MISSING)):
         with refused(code):

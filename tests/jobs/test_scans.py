@@ -9,10 +9,12 @@ from pathlib import Path
 import pytest
 
 from polysight.host.catalogue import Notes, read_notes
-from polysight.host.cli.main import main
+from polysight.host.cli.main import build_parser, main
+from polysight.shared.error_codes import ErrorCode
 from polysight.simulators.scene import load_scene, simulate
 from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
+from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 
@@ -79,15 +81,19 @@ def test_a_place_and_two_scans_are_told(root, capsys, tmp_path):
     assert json.loads(answer(capsys, "compare", root / "two", root / "three", "--json"))["significant_share"] == 0
 
 
-@pytest.mark.parametrize("words", [["probe", "one", "0,0"], ["compare", "one", "two"], ["probe", "two", "900,0"]])
-def test_what_cannot_be_told_is_an_error(root, capsys, words):
-    words = [words[0], *(str(root / w) if "," not in w else w for w in words[1:])]
-    assert main(words) == 3
-    assert "why" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("words", [["scans", "nowhere"], ["note", "nowhere"], ["ask", "nowhere", "stop"]])
-def test_folders_that_are_not_there_are_said_to_be_missing(tmp_path, capsys, words):
-    words[1] = str(tmp_path / words[1])
-    assert main(words) == 3
-    assert "does not exist" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [
+        ("probe one 0,0", ErrorCode.FILE_MISSING),
+        ("compare one two", ErrorCode.FILE_MISSING),
+        ("probe two 900,0", ErrorCode.VALUE_INVALID),
+        ("scans nowhere", ErrorCode.FILE_MISSING),
+        ("note nowhere", ErrorCode.FILE_MISSING),
+        ("ask nowhere stop", ErrorCode.FILE_MISSING),
+    ],
+)
+def test_folders_and_places_that_are_not_there_are_refused(root, monkeypatch, command, code):
+    monkeypatch.chdir(root)
+    args = build_parser().parse_args(command.split())
+    with refused(code):
+        args.run(args)

@@ -55,6 +55,20 @@ def test_another_file_in_its_place_is_read_from_the_beginning(finished, tmp_path
     assert tail.file.replaced
 
 
+def test_another_and_longer_file_is_found_after_a_single_look(finished, tmp_path):
+    """Before anything else was appended to the one that was read."""
+    path = tmp_path / MANIFEST
+    raw = (finished / MANIFEST).read_bytes()
+    others = [fact | {"of": "another scan" * 50} for fact in manifest.parse(raw).facts]
+    path.write_bytes(raw)
+    tail = ManifestTail(path)
+    assert len(tail.look()) == len(others)
+    (tmp_path / "new").write_bytes(b"".join(map(manifest.encode_line, others)))
+    (tmp_path / "new").rename(path)
+    assert tail.look() == others
+    assert tail.file.replaced
+
+
 def test_a_line_that_is_torn_waits_for_its_rest(tmp_path):
     path = tmp_path / MANIFEST
     line = manifest.encode_line({"fact": "scan_ended", "reason": "x" * 50})

@@ -51,7 +51,7 @@ def test_a_start_that_has_passed_moves_the_whole_burst():
 
 @given(st.integers(0, 15), st.integers(0, 10_000), st.integers(0, 10_000))
 def test_width_is_an_upper_bound_of_every_pulse(k, set_ns, clear_ns):
-    """The line goes high or low at an unknown moment within its call: the bound covers both calls whole."""
+    """The line changes at an unknown time within each call, so the bound covers both calls completely."""
     lines = FakeLines(long=lambda n: set_ns if n == 2 * k else clear_ns if n == 2 * k + 1 else 0)
     sent = send_burst(lines, SPEC, 1_000)
     worst = max(1000, set_ns) + clear_ns

@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 
 import pytest
 
@@ -40,29 +39,6 @@ def test_sigterm_ends_the_row_and_the_program(instrument, start, hub, stage):
     last = host.wait(m.RowFinished)
     assert (last.row_index, last.status) == (1, "aborted")
     assert not host.of(m.RunStopped)
-
-
-def test_kill_9_and_the_journal_goes_on(instrument, start, hub, stage):
-    program, host = start(instrument, "--wires", hub)
-    host.accepted(host.begin())
-    host.home()
-    host.row(0)
-    stage.pace_s = 0.05
-    host.start_row(1)
-    host.wait(m.Capture, lambda e: e.row_index == 1)
-    program.end(signal.SIGKILL)
-    seen = host.journalled
-    stage.pace_s = 0.0
-    _, host = start(instrument, "--wires", hub)
-    kept = host.replay()
-    assert kept[: len(seen)] == seen, "every published event is in the journal"
-    host.accepted(host.begin())
-    host.home()
-    assert host.row(1, take=2).status == "done"
-    after = host.journalled
-    assert after[0].resumed
-    assert [e.seq for e in after] == list(range(len(kept) + 1, len(kept) + 1 + len(after)))
-    assert host.replay() == kept + after
 
 
 def test_simulated_wires_need_neither_gpiod_nor_numpy(config, hub, stage, tmp_path):
@@ -112,7 +88,7 @@ def test_commands_without_the_service(command, instrument, write_config, hub, st
 
 
 def test_commands_beside_the_service(command, instrument, write_config, start, hub):
-    """Those that need its lines, stage or ports are refused with its address, and not because a line is in use."""
+    """Commands that need lines, stage or ports are refused because the service runs; the error has its address."""
     rig = on_free_subnet(instrument)  # ports that stay the same from one program to the next
     start(rig, "--wires", hub)
     config = write_config(rig)

@@ -36,7 +36,7 @@ RUN, END = m.RunRow(scan_id="scan", row_index=0, take=1), m.EndRun(scan_id="scan
 
 
 def draw(rng: random.Random, valid: list[Any]) -> bytes:
-    """A message that is wrong in one way or several; now and then a correct one, of a client that owns nothing."""
+    """Draw a message with one or more errors; sometimes a correct one of a client that does not own the run."""
     kind = rng.randrange(6)
     if kind == 0:
         return rng.randbytes(rng.choice([0, 1, 5, 40, 400]))

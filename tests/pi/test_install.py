@@ -38,7 +38,7 @@ def unit():
 
 
 def test_the_unit_is_what_systemd_accepts(tmp_path):
-    """With a program in the place of ours: it is not installed here."""
+    """The program in the unit is replaced, because it is not installed here."""
     if shutil.which("systemd-analyze") is None:
         pytest.skip("no systemd-analyze: `apt-get install systemd` runs this test too")
     text = (PI / "polysight-pi.service").read_text()
@@ -91,7 +91,7 @@ def test_the_unit_gives_what_the_program_asks_for(unit):
 
 
 def test_a_program_that_hangs_is_started_anew(unit):
-    """Told by the executor itself, more often than the watchdog asks and later than a lost stage takes."""
+    """The executor feeds the watchdog; its timeout is longer than a lost stage blocks the executor."""
     service = unit["Service"]
     assert service["Type"] == "notify"
     assert service["Restart"] == "on-failure"
@@ -159,7 +159,7 @@ def bench(tmp_path):
     (tmp_path / "installed").touch()
     return {
         **os.environ, "PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}", "LOG": str(tmp_path / "log"),
-        "PIP": str(tmp_path / "bin/pip"), "REPO": str(tmp_path / "root"), "PI_HOME": str(tmp_path / "home"),
+        "PIP": str(tmp_path / "bin/pip"), "ROOT": str(tmp_path / "root"), "PI_HOME": str(tmp_path / "home"),
     }  # fmt: skip
 
 
@@ -212,7 +212,7 @@ def test_a_release_that_cannot_be_installed_changes_nothing(install, tmp_path):
 
 
 def test_an_unfinished_release_is_never_used(install, tmp_path):
-    """The power is cut while pip installs: the release's folder exists, and was never in use."""
+    """Power is lost while pip installs: the release's folder exists but must not become active."""
     opt = tmp_path / "root/opt/polysight"
     assert install().returncode == 0
     python = opt / "venv/bin/python"

@@ -2,7 +2,6 @@
 
 import errno
 import os
-from types import SimpleNamespace
 
 import msgspec
 
@@ -56,12 +55,6 @@ def test_a_full_disk_refuses_the_beginning_and_the_end_of_a_run(pi, monkeypatch)
     assert host.ask(m.Hello()).in_run
     host.accepted(stop)
     assert [type(e) for e in host.replay()] == [m.RunStarted, m.RunStopped] * 2
-
-
-def test_no_run_begins_on_a_full_disk(pi, monkeypatch):
-    monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=1 << 20))
-    assert pi.host.refused(pi.host.begin()) == PiFault.JOURNAL_FULL
-    assert pi.host.replay() == []
 
 
 def test_the_pis_client_prints_each_event_once_also_behind_a_lost_journal(pi, instrument):

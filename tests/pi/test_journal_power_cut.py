@@ -1,4 +1,4 @@
-"""Power is cut at each thing that is done to the disk: what was synced is there, and what is there is a prefix."""
+"""Power is lost at each disk operation: everything synced is on the disk, and the disk has a prefix of the events."""
 
 from __future__ import annotations
 

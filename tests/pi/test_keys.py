@@ -32,7 +32,7 @@ ELSEWHERE = "tcp://192.0.2.1:5601"
 
 
 class Door:
-    """An executor that only answers Hello: these tests are about connections."""
+    """A minimal executor that only answers Hello, for tests of connections."""
 
     crash = None
     unresponsive_s = 0.0

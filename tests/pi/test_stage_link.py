@@ -23,7 +23,7 @@ def dry_stage():
 
 @pytest.fixture
 def connect(dry_stage):
-    """Opens the link; gives it, and the queue of its news."""
+    """Opens the link; gives it and the queue of its unsolicited replies."""
     opened = []
 
     def connect(**options):

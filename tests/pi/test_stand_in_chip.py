@@ -40,7 +40,7 @@ def rig(gpio_rig):
 
 @pytest.fixture
 def long_bursts(rig):
-    """0.8 s long: time for the test to act during a burst, on a busy machine too."""
+    """Bursts of 0.8 s, so that the test can act during a burst on a busy machine."""
     burst = replace(rig.burst, pulses=9, period_us=100_000.0)
     return replace(rig, burst=burst, stage=replace(rig.stage, speed_mm_s=2.0))
 
@@ -54,7 +54,7 @@ def wires(hub):
 
 @pytest.fixture
 def in_row(start, stage, hub, wires):
-    """Starts the program on a chip with these faults, and a row whose edges come from the test: the first comes now."""
+    """Starts the program on a chip with these faults and a row whose edges the test sends; sends the first one."""
 
     def in_row(rig, *faults):
         program, host = start(rig, **gpio.environment(rig.pi.gpio_chip, hub, faults=faults))

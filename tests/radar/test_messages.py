@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from polysight.host.radar.messages import (
     DEVICE_SYNC,
-    HEADER_BYTES,
     Direction,
     Kind,
     Message,
@@ -80,29 +79,9 @@ def test_checksum_of_the_control_document():
     assert checksum(words) == 0xF171
 
 
-@given(st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=8), st.randoms())
-def test_checksum_does_not_depend_on_the_order_of_words(words: list[int], random):
-    mixed = list(words)
-    random.shuffle(mixed)
-    assert checksum(struct.pack(f"<{len(words)}H", *words)) == checksum(struct.pack(f"<{len(words)}H", *mixed))
-
-
-def test_an_event_with_a_16_bit_crc_is_decoded():
-    """The first event after power-up; its CRC-16 is CCITT-FALSE, whose check value is 0x29B1."""
+def test_the_16_bit_crc_is_ccitt_false():
+    """Its check value; messages with it are in test_received.py."""
     assert crc(b"123456789", 2) == bytes.fromhex("b129")
-    block = struct.pack("<HHIQQ", 0x5000, 24, 7, 0, 0)
-    head = struct.pack("<5H", Direction.MAIN_TO_HOST | Kind.EVENT << 4 | 0x280 << 6, 12 + len(block) + 2, 0, 0, 1)
-    head += checksum(head).to_bytes(2, "little")
-    raw = DEVICE_SYNC + head + block + crc(head + block, 2)
-    assert len(head) == HEADER_BYTES
-    assert decode(raw).blocks[0].id == 0x5000
-    assert decode_header(raw).crc_bytes == 2
-
-
-def test_error_of_a_response():
-    refused = Message(Direction.RF_TO_HOST, Kind.RESPONSE, 8, (SubBlock(0, struct.pack("<HH", 80, 0x0102)),))
-    assert decode(encode(refused)).error == (80, 0x0102)
-    assert command((SubBlock(0x0102),)).error is None
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import msgspec
 import pytest
 
 from polysight.host.radar import board as boards
-from polysight.host.radar.backends import radar_control
 from polysight.host.radar.interface import RadarState
 from polysight.host.radar.native import NativeRadars, radar_board
 from polysight.host.radar.trace import ReplayedWords, read_trace
@@ -205,14 +204,6 @@ def test_the_rig_file_must_have_every_board_and_each_serial_once(rig):
     with pytest.raises(ValueError, match="usb_serial"):
         Radar(control="native", native=twice)
     assert decode(to_builtins(rig), Instrument, "rig.toml") == rig
-
-
-def test_the_backend_is_chosen_by_the_rig_file(rig, monkeypatch):
-    monkeypatch.setattr(
-        "polysight.host.radar.native.NativeRadars.__init__", lambda self, rig: setattr(self, "rig", rig)
-    )
-    made = radar_control(rig)
-    assert isinstance(made, NativeRadars)
 
 
 # --- lost links, traces ---

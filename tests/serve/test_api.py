@@ -18,12 +18,10 @@ import pytest
 
 from polysight.host.serve import control, site
 from polysight.host.serve.guard import TOKEN_HEADER
-from polysight.host.serve.programs import program_of
 from polysight.shared.error_codes import ErrorCode
 from tests.support.page.asking import TOKEN, ask, get, post
 from tests.support.page.live_view import Served, served_folder
 from tests.support.paths import RIG_FILE
-from tests.support.processes import wait_for
 from tests.support.products import judged_products
 
 
@@ -135,17 +133,6 @@ def test_of_two_starts_at_once_one_is_refused(view, scans, monkeypatch):
         thread.join()
     assert sorted(found) == [200, 409]
     assert sum((scans / name).exists() for name in ("first", "second")) == 1
-
-
-def test_a_scan_that_did_not_begin_says_why(view, scans):
-    """Here no Pi answers; so it is when another program holds the port of a card."""
-    assert post(view, "/api/start", {"name": "three"})[0] == 200
-    wait_for(lambda: not program_of(scans / "three", "scan").running, "the program's end")
-    wait_for(lambda: get(view, "/api/scan?scan=three")["state"] == "failed", "the state")
-    listed = {s["name"]: s for s in get(view, "/api/scans")["scans"]}
-    assert "polysight" not in listed["three"]["reason"]
-    assert len(listed["three"]["reason"]) > 10
-    assert listed["three"]["reason"] in program_of(scans / "three", "scan").log
 
 
 def test_exports_stay_in_the_scan(view, scans, tmp_path):

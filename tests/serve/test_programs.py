@@ -50,29 +50,29 @@ def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
     assert "--version" not in found.log  # the log of the earlier one stays in the file
 
 
-def test_a_program_is_known_by_its_number_and_its_begin(tmp_path):
+@pytest.fixture
+def sleeping(tmp_path: Path) -> Iterator[Path]:
+    """A folder for which a program runs, which is killed in the end."""
     child = launcher.launch(["/bin/sleep", "60"], str(tmp_path), str(tmp_path / PROGRAM / "scan"))
     try:
-        found = program_of(tmp_path, "scan")
-        assert found is not None
-        assert found.running
-        answer = json.loads((tmp_path / PROGRAM / "scan.json").read_text())
-        (tmp_path / PROGRAM / "scan.json").write_text(json.dumps(answer | {"ticks": answer["ticks"] - 1}))
-        assert not program_of(tmp_path, "scan").running  # another process has the number now
-    finally:
-        os.killpg(child.pid, 9)
-        child.wait()
-
-
-def test_one_program_of_a_kind_runs_in_a_folder(programs, tmp_path):
-    child = launcher.launch(["/bin/sleep", "60"], str(tmp_path), str(tmp_path / PROGRAM / "scan"))
-    try:
-        with refused(ErrorCode.BUSY):
-            programs.start(tmp_path, "scan", ["--version"])
+        yield tmp_path
     finally:
         os.killpg(child.pid, 9)
         child.wait()
     assert program_of(tmp_path, "scan").status is None  # killed: it could not say
+
+
+def test_a_program_is_known_by_its_number_and_its_begin(sleeping):
+    assert program_of(sleeping, "scan").running
+    file = sleeping / PROGRAM / "scan.json"
+    answer = json.loads(file.read_text())
+    file.write_text(json.dumps(answer | {"ticks": answer["ticks"] - 1}))
+    assert not program_of(sleeping, "scan").running  # another process has the number now
+
+
+def test_one_program_of_a_kind_runs_in_a_folder(programs, sleeping):
+    with refused(ErrorCode.BUSY):
+        programs.start(sleeping, "scan", ["--version"])
 
 
 @pytest.mark.parametrize(
@@ -121,6 +121,11 @@ def test_a_scan_starts_with_its_plan_and_without_a_pi_says_why(tmp_path):
         ended(folder, "scan")
         wait_for(lambda: program_of(folder, "scan").status is not None, "its status")
         assert program_of(folder, "scan").status != 0
+        wait_for(lambda: get(view, "/api/scan?scan=week/one")["state"] == "failed", "the state")
+        reason = get(view, "/api/scan?scan=week/one")["reason"]
+        assert len(reason) > 10
+        assert "polysight" not in reason
+        assert reason in program_of(folder, "scan").log
         assert get(view, "/api/scans")["scans"][0]["tags"] == ["t"]
         assert post(view, "/api/start", {"name": "week/one"})[0] == 200  # once more, by the same name
         assert get(view, "/api/scan?scan=week/one")["notes"] == "n"

@@ -80,15 +80,6 @@ def test_buttons_reach_the_scan(browser, growing, watching):
         assert browser.errors == []
 
 
-def test_a_wrong_token_is_said(browser, growing, watching):
-    growing.grow_to("row_committed")
-    with open_control(growing.path) as stop, served(watching(growing.path, control=True), TOKEN) as view:
-        opened(browser, view, token="guessed")
-        browser.click("#stop")
-        browser.wait("document.getElementById('answer').innerText.includes('token is wrong')", "the refusal")
-        assert not stop.after_row
-
-
 def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, watching):
     """At an address of its own: a port of 127.0.0.1 that was free for a while may be somebody else's by then."""
     rig = on_free_subnet(published_rig())

@@ -41,7 +41,7 @@ class Bench:
         self.pulse = 0
 
     def request(self, code: int, body: bytes = b"") -> list[bytes]:
-        """Send a request, and everything that the card has to say then."""
+        """Send a request; return all replies."""
         datagram = struct.pack("<HHH", 0xA55A, code, len(body)) + body + b"\xaa\xee"
         network = self.card.card.network
         self.commands.sendto(datagram, (network.card_address, network.command_port))

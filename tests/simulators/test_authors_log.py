@@ -1,4 +1,4 @@
-"""The simulated packet logs of the published layout are told apart as those of the real cards are.
+"""The authors' rule finds the positions in simulated packet logs of the published layout.
 
 A card sends its last, short packet some 2 s after its data ended (seen on a DCA1000). The authors' decoder lives on it:
 it gathers packets until a pause of 45 ms, fills frames from what it has gathered, and a pause of n x 90 ms counts as n
@@ -76,7 +76,7 @@ def test_a_row_that_fills_its_last_packet_ends_without_a_late_one(tmp_path: Path
 def test_the_host_reads_rows_whose_last_packet_comes_late(
     tmp_path: Path, skipped: dict[tuple[str, int], tuple[int, ...]]
 ) -> None:
-    """It is no position of its own, also where positions are missing and have to be told by time."""
+    """The late packet is no extra position, also if positions are missing and found by time."""
     source = open_source(scan_in(tmp_path, skipped=skipped), RIG)
     for row in (0, 1):
         for board in ("RH", "RV"):

@@ -1,4 +1,4 @@
-"""Where programs are compiled to, and what happens where the repository is not there."""
+"""Folders of compiled programs, with and without the repository."""
 
 from __future__ import annotations
 

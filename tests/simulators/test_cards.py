@@ -1,4 +1,4 @@
-"""The process of the simulated cards: a test client is host and Pi, over real sockets and the real hub."""
+"""The process of the simulated cards; the test is host and Pi, over real sockets and the real hub."""
 
 from __future__ import annotations
 
@@ -109,7 +109,6 @@ def start(rig: Instrument, tmp_path: Path) -> Iterator[Start]:
             launch("polysight.simulators.cards", *common, "--time-scale", str(TIME_SCALE), *arguments)
             return {name: HostSide(rig, name, sockets) for name in boards.split(",")}
 
-        begin.processes = running  # type: ignore[attr-defined]
         yield begin
         for process in reversed(running):
             process.send_signal(signal.SIGTERM)

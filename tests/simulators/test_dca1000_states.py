@@ -20,7 +20,7 @@ def request(code: int, body: bytes = b"") -> bytes:
 
 
 class AnyUse(RuleBasedStateMachine):
-    """The card beside a model that knows only: bytes given, bytes received, recording or not."""
+    """The card compared with a model of bytes given, bytes received, and recording or not."""
 
     @initialize(
         sequence=st.sampled_from([1, 77, 2**32 - 2]),

@@ -66,7 +66,7 @@ class Client:
         return self.commands.recv(4096)
 
     def packets(self, payload_bytes: int) -> bytes:
-        """Payload in order of arrival, until there is so much of it."""
+        """Return this number of payload bytes, in order of arrival."""
         got = b""
         while len(got) < payload_bytes:
             packet, source = self.data.recvfrom(4096)

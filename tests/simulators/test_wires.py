@@ -58,7 +58,7 @@ def serve(tmp_path: Path, reports: list[str]) -> Iterator[Serve]:
 
 
 def take(client: WireClient, n: int) -> list[WireMessage]:
-    """The next n messages, as they come; fewer when 5 s pass without one."""
+    """Return the next n messages; fewer if 5 s pass without one."""
     got: list[WireMessage] = []
     while len(got) < n and (message := client.receive(5.0)) is not None:
         got.append(message)

@@ -31,7 +31,7 @@ def firmware_program() -> Path:
 
 @pytest.fixture(scope="session")
 def sanitized_program() -> Path:
-    """The same with address and undefined-behaviour sanitizers; whatever they find ends the program."""
+    """The same with address and undefined-behaviour sanitizers, whose findings end the program."""
     gxx = sketch_compiler()
     if gxx is None:
         pytest.skip("no C++ compiler: `apt-get install g++` runs these tests too")
@@ -47,7 +47,7 @@ def sanitized_program() -> Path:
 
 @pytest.fixture(scope="session")
 def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """`make firmware` in a folder, and what it said."""
+    """Output folder and stdout of `make firmware`."""
     if lacking := [p for p in missing() if p not in ("libsimavr-dev", "libelf-dev")]:
         pytest.skip(f"no firmware without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
     folder = tmp_path_factory.mktemp("firmware")

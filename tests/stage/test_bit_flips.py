@@ -1,4 +1,4 @@
-"""No single flipped bit and no lost byte turns a command into another one."""
+"""No flipped bit and no lost byte turns a command into another one."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ Start = Callable[..., StageProcess]
 
 @pytest.fixture(params=COMMANDS)
 def kind(request: pytest.FixtureRequest) -> str:
-    """Which stage; it is compiled before a time limit runs."""
+    """Kind of stage, compiled before a timeout starts."""
     if request.param == "pc":
         request.getfixturevalue("firmware_program")
     elif request.param == "uno":
@@ -36,7 +36,7 @@ def kind(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def speed(kind: str) -> float:
-    """Times real time, as fast as a busy machine emulates it."""
+    """Speed relative to real time that a busy machine can emulate."""
     return 4.0 if kind == "uno" else 20.0
 
 
@@ -115,7 +115,7 @@ def test_dies_with_its_parent(kind: str, tmp_path: Path):
 
 
 def test_an_emulator_in_lockstep_dies_with_its_parent(uno_programs: tuple[Path, Path]):
-    """A killed test run leaves no emulator behind that uses a core, even if its parent was gone before it asked."""
+    """A killed test run leaves no emulator running, even if the parent ended before the emulator checked."""
     program, image = uno_programs
     assert not outlives_its_parent(uno_programs, "rest 1000000000000000\nrun 1000000000000000\n")
     with subprocess.Popen([program, "--parent", str(os.getppid()), image], stdin=subprocess.PIPE) as uno:

@@ -29,7 +29,7 @@ def test_random_bytes(talker, request: pytest.FixtureRequest):
 
 @pytest.mark.timeout(600)
 def test_almost_lines(talker, request: pytest.FixtureRequest):
-    """Random lines of the alphabet of commands: a parser's favourite food."""
+    """Random lines of the characters of commands."""
     amount = 10_000 if request.config.getoption("--long") else 300
     rng = random.Random(amount)
     talker.ready()

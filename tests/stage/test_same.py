@@ -1,4 +1,4 @@
-"""The firmware's code and the Python stand-in say and do the same, to the byte and the tick."""
+"""Firmware and Python stand-in send the same bytes and edges at the same ticks."""
 
 from __future__ import annotations
 

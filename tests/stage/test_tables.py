@@ -1,4 +1,4 @@
-"""What is written down twice agrees: firmware, Python and the interface page."""
+"""Constants in firmware, Python and the interface page agree."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def pins(text: str) -> dict[str, int]:
 
 
 def test_pinout():
-    """The published rig's pins, what it did not have beside them, and the same at the emulated board."""
+    """Pins are the published rig's and further ones; the emulated board has the same."""
     published = {"TRIGGER": 2, "LEFT_PUL": 3, "LEFT_DIR": 8, "RIGHT_PUL": 4, "RIGHT_DIR": 9, "X_PUL": 5, "X_DIR": 10}
     board = pins("\n".join(re.findall(r"PIN_.*", (SKETCH / "board.h").read_text(encoding="ascii"))))
     assert published.items() <= board.items()
@@ -45,7 +45,7 @@ def test_pinout():
 
 
 def test_pins_ratios_and_limits_are_in_board_h_alone():
-    """Nothing but board.h names a pin or an interface number that another rig would change."""
+    """Only board.h has pins and numbers that another rig would change."""
     for source in [
         *SKETCH.glob("*.cpp"),
         *SKETCH.glob("*.ino"),
@@ -96,10 +96,11 @@ def test_longest_status_fits_a_line():
 
 
 def test_page_lists_every_error():
-    rows = dict(re.findall(r"^\| (\d+) \| (.+?) \|", PAGE.partition("## Errors and alarms")[2], re.MULTILINE))
+    page = " ".join(PAGE.partition("## Errors and alarms")[2].split())
     for error in StageError:
-        assert rows.get(str(int(error))) == EXPLANATIONS[error].what
-    assert set(rows) == {str(int(e)) for e in StageError}
+        e = EXPLANATIONS[error]
+        assert f"* **{int(error)}**: {e.what} ({e.why}): {e.remedy}" in page
+    assert set(re.findall(r"\* \*\*(\d+)\*\*", page)) == {str(int(e)) for e in StageError}
 
 
 def test_page_lists_parameters_bytes_and_verbs():
@@ -133,7 +134,7 @@ def test_sketch_fits_an_uno(built: tuple[Path, str]):
 
 
 def test_no_floating_point_anywhere(built: tuple[Path, str]):
-    """Not in the interrupt, and nowhere else: no routine of the compiler's soft floating point is linked."""
+    """No routine of the compiler's soft floating point is linked."""
     elf = str(built[0] / "arduino_stage.elf")
     symbols = subprocess.run(["avr-nm", elf], capture_output=True, text=True, check=True).stdout
     assert " __vector_11" in symbols  # the step interrupt: these are the right symbols
@@ -155,7 +156,7 @@ def test_the_arduino_ide_makes_the_same_image(built: tuple[Path, str], tmp_path:
 
 
 def test_sketch_folder_is_what_the_arduino_ide_wants():
-    """The .ino is named like its folder, and what it needs stands beside it: of the folders only src/ is compiled."""
+    """The .ino has its folder's name and its sources beside it: of subfolders the IDE compiles only src/."""
     assert [p.name for p in SKETCH.glob("*.ino")] == [f"{SKETCH.name}.ino"]
     assert not (SKETCH / "src").exists()
     for source in [*SKETCH.glob("*.cpp"), *SKETCH.glob("*.h"), *SKETCH.glob("*.ino")]:

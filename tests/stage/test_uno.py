@@ -80,7 +80,7 @@ def test_random_rows(host, batch: int):
 
 @pytest.mark.parametrize("accel", [400, 40_000, 400_000])
 def test_homing_finds_the_same_zero(host, accel: int):
-    """From anywhere, and where the simulated rig expects it."""
+    """From any position, and at the zero of the simulated rig."""
     host.set(Parameter.ACCEL, accel)
     for x, y in ((900, 700), (377, 1111)):
         host.motion("MOVE", x, y, 2000)
@@ -104,7 +104,7 @@ def test_backlash_comes_from_below_and_runs_up(host):
 
 
 def test_a_short_hold_is_told_and_costs_no_step(host):
-    """HOLD and RESUME at once: whether or not the main program saw the hold, the row does not pass for undisturbed."""
+    """HOLD and RESUME at once: the row is reported as held even if the main program did not see the hold."""
     host.uno.edges.clear()
     host.obeyed("ROW", 3000, 100, 60, 0, 4000)
     while not host.uno.edges:
@@ -120,7 +120,7 @@ def test_a_short_hold_is_told_and_costs_no_step(host):
 
 @pytest.mark.parametrize("chatty", [False, True])
 def test_no_command_is_lost_silently(host, chatty: bool):
-    """A host that does not wait for answers: every line is answered, or the host hears that something was lost."""
+    """A host that does not wait for answers: every line is answered, or a loss is reported."""
     lines = [host.line("MOVE", 10 + i, 0, 4000) if i % 7 == 0 else host.line("CLEAR") for i in range(100)]
     gap = b"?\n" * 12 if chatty else b""  # six times as many bytes of answer: the board is kept busy writing
     host.uno.feed(b"".join(gap + line for line in lines))
@@ -151,7 +151,7 @@ def test_a_second_command_on_its_way_is_answered(host):
 
 @pytest.mark.parametrize(("mask", "number"), [(1, 12), (2, 12), (4, 14)])
 def test_a_switch_at_any_moment_is_an_alarm(host, request: pytest.FixtureRequest, mask: int, number: int):
-    """The main program looks at the interrupt's findings in a loop; whenever the switch comes, it is never `done`."""
+    """A switch that closes at any time during a motion is an alarm, never `done`."""
     rng = random.Random(mask)
     host.obeyed("MOVE", 200, 200, 4000)
     host.uno.rest()

@@ -24,7 +24,7 @@ SCENE = 'name = "a plate"\n[[plates]]\nname = "m"\ncentre_mm = [0, 0]\nsize_mm =
 
 @pytest.mark.usefixtures("uno_programs")
 def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
-    """Every row is committed, and the radars saw the plate from where the plan has the stage, between triggers too."""
+    """Every row is committed, and the radars measured the plate from the planned positions, also between triggers."""
     rig = published_rig()
     replace = msgspec.structs.replace
     rig = replace(

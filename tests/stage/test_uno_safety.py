@@ -1,4 +1,4 @@
-"""Chatter, glitches and stray bytes on an emulated UNO with the compiled sketch, in lockstep: nothing moves by them."""
+"""Noise on line and switches of an emulated UNO with the compiled sketch, in lockstep: nothing moves."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CHATTER = {
 
 @pytest.mark.parametrize("kind", CHATTER)
 def test_chatter_is_no_heartbeat(host, kind: str):
-    """The stage rests within its heartbeat's time and its ramp after the last sign of life, whatever comes then."""
+    """The stage stops within its heartbeat and ramp after the last STATUS byte, whatever else it receives."""
     rng = random.Random(kind)
     host.set(Parameter.HEARTBEAT, 500)
     host.uno.watch(X_PUL)
@@ -59,7 +59,7 @@ def test_chatter_is_no_heartbeat(host, kind: str):
 
 @pytest.mark.parametrize("verb", ["MOVE", "ROW", "HOME"])
 def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
-    """It hangs in motion while the step interrupt goes on: the motors rest, and the board knows no position."""
+    """The main program hangs during motion: the motors stop, and the position is unknown."""
     arguments = {"MOVE": (100_000, 0, TOP_RATE), "ROW": (9000, 400, 100, 0, 4000), "HOME": ()}[verb]
     if verb == "HOME":
         host.motion("MOVE", 20_000, 20_000, TOP_RATE)
@@ -144,7 +144,7 @@ def test_a_real_switch_stops_at_once(host, rate: int, mask: int, number: int):
 
 
 def test_no_stray_byte_ends_a_hold(host):
-    """Every single byte but STOP, once, in a hold: the stage stays where it is, and goes on when it is told to."""
+    """Every byte but STOP during a hold: the stage does not move, and RESUME continues the row."""
     host.uno.watch(X_PUL)
     host.obeyed("ROW", 4000, 200, 60, 500, 4000)
     host.uno.run_ms(1200)
@@ -164,7 +164,7 @@ def test_no_stray_byte_ends_a_hold(host):
 
 @pytest.mark.parametrize("accel", [400, 2_000, 40_000])
 def test_homing_overruns_the_switch_by_little(host, accel: int):
-    """Whatever the rows' acceleration is: a millimetre, within which a switch has to take it."""
+    """At any acceleration of rows at most about a millimetre, which a switch must tolerate."""
     host.motion("MOVE", 12_000, 300, TOP_RATE)
     host.set(Parameter.ACCEL, accel)
     host.uno.watch(X_PUL)

@@ -1,4 +1,4 @@
-"""How fast and how soon the compiled sketch is, on an emulated UNO, in lockstep: exact on any machine."""
+"""Speed and reaction time of the compiled sketch on an emulated UNO, in lockstep: exact on any machine."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def busiest_step(host: Host) -> int:
 
 
 def test_interrupt_cost(host):
-    """The step interrupt fits between two steps at the highest rate, and the comment above it tells the truth."""
+    """The step interrupt fits between two steps at the highest rate and takes as long as its comment says."""
     most = busiest_step(host)
     assert documented_cycles() - 60 <= most <= documented_cycles() <= HZ // TOP_RATE - MARGIN
 
@@ -119,7 +119,7 @@ def test_hold_and_stop_begin_within_20_ms(host, byte: Immediate, rate: int):
 
 
 def test_half_a_second_of_silence_is_the_default(host):
-    """A board just reset, told nothing about heartbeats: the first motion is a homing."""
+    """A board after reset, without SET HEARTBEAT, that is homed."""
     host.motion("MOVE", 20_000, 0, 8000)
     host.uno.reset()
     host.uno.run_ms(5)

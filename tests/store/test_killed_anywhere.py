@@ -90,14 +90,3 @@ def test_resume_is_killed_at_every_operation_too(samples, undisturbed, tmp_path,
         goes_on(scan, undisturbed, f"{fault} at {at} of the resume")
         shutil.rmtree(folder)
     assert killed > 4
-
-
-def test_image_of_a_killed_scan_is_that_of_the_undisturbed_one(samples, undisturbed, tmp_path):
-    done = operations(samples, tmp_path / "count")
-    for at in [i for i, what in enumerate(done, 1) if what.startswith("rename")]:
-        folder = tmp_path / str(at)
-        folder.mkdir()
-        scan = SmallScan(samples, folder)
-        broken_off(scan, FaultyDisk(folder, "killed within", at))
-        goes_on(scan, undisturbed, f"killed at {at}")
-        assert scan.image() == undisturbed.final_image

@@ -1,4 +1,4 @@
-"""Made-up calibration files, and a measure of what an estimated leakage leaves."""
+"""Made-up calibration files, and the leakage that remains after a correction."""
 
 from __future__ import annotations
 

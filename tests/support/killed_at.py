@@ -1,4 +1,4 @@
-"""Runs a program of the instrument that kills itself, as by SIGKILL, at one exact operation on a file.
+"""Run a program of the instrument that kills itself (SIGKILL) at one exact file operation.
 
     python killed_at.py HITS OPERATION:SUFFIX:NTH,... polysight scan --out DIR
 

@@ -30,7 +30,7 @@ class Ended:
 
     @property
     def message(self) -> str:
-        """The one error message, from its `program:` on. Fails when there is a traceback, none, or more than one."""
+        """The error message. Fails if there is a traceback, no message, or more than one."""
         assert "Traceback" not in self.err, self.err
         starts = ("polysight ", "error: ", "usage: ")
         begun = [i for i, line in enumerate(self.err.splitlines()) if line.startswith(starts)]
@@ -97,7 +97,7 @@ class Program:
         os.killpg(self.process.pid, signal.SIGINT)
 
     def wait(self, limit_s: float = LIMIT_S) -> Ended:
-        """Its end; fails when it does not come within the limit."""
+        """Wait for the end; fail after the limit."""
         try:
             status = self.process.wait(limit_s)
         except subprocess.TimeoutExpired:
@@ -116,13 +116,13 @@ class Program:
         return self.out.partition("\n")[0].removeprefix("ready ")
 
     def kill(self) -> None:
-        """SIGKILL to it alone, as the kernel kills a process."""
+        """Send SIGKILL to this process only."""
         if self.process.poll() is None:
             self.process.kill()
             self.process.wait()
 
     def end(self) -> None:
-        """SIGTERM, and SIGKILL when that does not help."""
+        """Send SIGTERM, then SIGKILL if it does not end; fails in that case."""
         if self.process.poll() is None:
             self.process.terminate()
             try:
@@ -154,7 +154,7 @@ class Bench:
         return self.run("polysight", *arguments, limit_s=limit_s)
 
     def here(self, *arguments: str | Path) -> Ended:
-        """Run a command of the host in this process: the same without the start of a program, a second each."""
+        """Run a host command in this process, which saves a second for starting a program."""
         out, err, before = io.StringIO(), io.StringIO(), signal.getsignal(signal.SIGTERM)
         try:
             with chdir(self.folder), redirect_stdout(out), redirect_stderr(err):

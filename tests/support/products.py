@@ -58,7 +58,7 @@ def segments(level: str | None) -> list[dict[str, Any]]:
 
 
 def judged_products(folder: Path, level: str | None, careless: bool = False) -> Path:
-    """Write them; `careless` leaves names and permittivities where the verdict allows none."""
+    """Write the files; with `careless`, names and permittivities are kept although the verdict allows none."""
     rng = np.random.default_rng(2)
     h, v = (rng.standard_normal((2, 20, 30)) + 1j * rng.standard_normal((2, 20, 30))).astype(np.complex64)
     axes = (np.linspace(-0.06, 0.06, 30), np.linspace(-0.04, 0.04, 20))
@@ -90,7 +90,7 @@ PIXEL = (
 
 @contextmanager
 def unrendered() -> Iterator[None]:
-    """Figures are composed, and saved as one pixel: rendering takes seconds a report, and tests/report looks at it."""
+    """Save every figure as one pixel: rendering takes seconds per report, and tests/report covers it."""
 
     def save(_: Figure, file: BinaryIO, **_options: Any) -> None:
         file.write(PIXEL)

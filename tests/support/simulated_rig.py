@@ -57,11 +57,18 @@ class Rig(Bench):
         return self.start("polysight", "scan", "--config", self.config, "--out", self.folder / "scan", *more)
 
     def wait_mid_row(self, scan: Program, rows: int) -> None:
-        """Until so many rows are committed and something of the next one has come."""
+        """Wait until this number of rows is committed, and the Pi has journalled an event of the next row."""
+        begun = 0  # bytes of the journal
 
         def there() -> bool:
+            nonlocal begun
             assert scan.process.poll() is None, f"the scan ended too early: {scan.err}"
-            return self.committed() >= rows and self._receiving()
+            journal = sum(path.stat().st_size for path in self.folder.glob("rig/journal/*.journal"))
+            if self.committed() < rows or not any(self.folder.glob("scan/raw/*/*.part")):
+                begun = 0
+            elif not begun:
+                begun = journal
+            return 0 < begun < journal
 
         wait_for(there, f"row {rows} being received")
 
@@ -71,14 +78,8 @@ class Rig(Bench):
             return len(ScanFolder.load(self.folder / "scan").committed())
         return 0
 
-    def _receiving(self) -> bool:
-        """Whether any byte of a row that is not committed has come; the file is made at its full size, as zeros."""
-        with suppress(FileNotFoundError):  # committed this moment
-            return any(any(p.read_bytes()[:4096]) for p in self.folder.glob("scan/raw/*/*.part"))
-        return False
-
     def close(self) -> None:
-        """End everything; nothing of this rig may live on."""
+        """End all processes of this rig; fail if one is left."""
         super().close()
         left = self.processes()
         assert not left, left
@@ -88,7 +89,7 @@ class Rig(Bench):
 def running(
     folder: Path, time_scale: float = 40.0, env: dict[str, str] | None = None, scene: str = SCENE
 ) -> Iterator[Rig]:
-    """A simulated rig in `folder` that runs; nothing of it is left afterwards, whatever happened."""
+    """Run a simulated rig in `folder`; all its processes are ended afterwards."""
     made = Rig(folder, time_scale, env, scene)
     try:
         made.begin()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import _ctypes
 import logging
+import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import numpy as np
@@ -65,11 +68,25 @@ def same(one: AlignedRow, other: AlignedRow):
         np.testing.assert_allclose(getattr(one, name)[usable], getattr(other, name)[usable], rtol=0, atol=1e-5)
     turn = np.exp(1j * one.phase) - np.exp(1j * other.phase.astype(np.float64))
     np.testing.assert_allclose(turn[usable], 0, atol=1e-5)
-    np.testing.assert_allclose(one.error, other.error, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(one.error, other.error, rtol=0, atol=2e-5)
 
 
 def equaliser_of(rig):
     return Equaliser.of(high_pass(rig.chirp), rig.chirp, 4)
+
+
+@pytest.mark.parametrize("other", ["silent", "clipped"])
+def test_one_usable_chirp_is_the_average_wherever_it_is_in_the_burst(loops, other):
+    one = bursts(positions=3, chirps=1)
+    for by in (loops.align, align_in_numpy):
+        expected = align(by, one, np.ones((3, 1), bool), (0, 192))
+        for k in range(6):
+            words = np.full((3, 6, *one.shape[2:]), 32767 if other == "clipped" else 0, np.int16)
+            words[:, k] = one[:, 0]
+            got = align(by, words, np.ones((3, 6), bool), (0, 192))
+            np.testing.assert_array_equal(got.good, np.arange(6) == np.full((3, 1), k))
+            np.testing.assert_array_equal(got.centre, expected.centre)
+            np.testing.assert_allclose(got.mean, expected.mean, rtol=0, atol=1e-2)
 
 
 def test_a_row_in_pieces_is_the_same_row(loops):
@@ -210,13 +227,13 @@ def test_the_compiled_loops_are_used_if_available(library_file, monkeypatch):
 
 @pytest.fixture
 def fresh_library():
-    compiled.library.cache_clear()
+    compiled._load.cache_clear()
     yield
-    compiled.library.cache_clear()
+    compiled._load.cache_clear()
 
 
 @pytest.mark.usefixtures("fresh_library")
-@pytest.mark.parametrize("broken", ["absent", "of other sources", "no library"])
+@pytest.mark.parametrize("broken", ["absent", "of other sources", "no library", "truncated", "foreign", "a pipe"])
 def test_without_compiled_loops_there_is_one_warning(library_file, tmp_path, monkeypatch, caplog, broken):
     file = tmp_path / build.LIBRARY
     if broken == "of other sources":
@@ -224,11 +241,17 @@ def test_without_compiled_loops_there_is_one_warning(library_file, tmp_path, mon
         monkeypatch.setattr(build, "source_digest", lambda: "another")
     elif broken == "no library":
         file.write_text("text", encoding="utf-8")
+    elif broken == "truncated":
+        file.write_bytes(library_file.read_bytes()[:30000])
+    elif broken == "foreign":
+        shutil.copyfile(_ctypes.__file__, file)
+    elif broken == "a pipe":
+        os.mkfifo(file)
     real = compiled.Library
     monkeypatch.setattr(compiled, "Library", lambda: real(file))
-    with caplog.at_level(logging.WARNING):
-        for _ in range(3):
-            assert align_row(bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
+    with caplog.at_level(logging.WARNING), ThreadPoolExecutor(3) as pool:
+        for row in pool.map(lambda _: align_row(bursts(), np.ones((5, 6), bool), (0, 192)), range(3)):
+            assert row.good.all()
     (record,) = caplog.records
     assert "python -m polysight.host.sync.build" in record.getMessage()
 

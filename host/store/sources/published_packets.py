@@ -99,7 +99,7 @@ def read_log(path: Path) -> PacketLog | None:
     return PacketLog(sequence, size, at_s)
 
 
-_MOST = 16  # rows' worth that a stream may span: what is not there is filled with zeros
+_MAX_ROWS = 16  # that a stream may span: what is missing is filled with zeros
 
 
 def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled: bool) -> Stream:
@@ -121,7 +121,7 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
     first = _first_sequence(log, shape, full, raw if zero_filled else None)
     start = (log.sequence - first) * full
     end = int(start[-1] + log.size[-1])
-    if end > _MOST * (shape.bytes + raw.size):
+    if end > _MAX_ROWS * (shape.bytes + raw.size):
         raise DataError(
             f"{file}: its packet log spans {end} bytes, a row has {shape.bytes}",
             "the numbers of its packets jump: a damaged log, or one of several rows",

@@ -1,1 +1,1 @@
-"""A fake Pi, fake capture cards and late frames."""
+"""A fake Pi with fake capture cards, and a model of late frames."""

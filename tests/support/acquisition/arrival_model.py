@@ -12,7 +12,7 @@ PAYLOAD = 1456
 
 @dataclass(frozen=True)
 class Load:
-    """How busy the machine is: stalls a second and their mean length, of the sender and of the receiver."""
+    """Load of the machine: stalls per second and their mean length, for sender and receiver."""
 
     stalls_per_s: float = 0.0
     stall_ms: float = 0.0
@@ -32,7 +32,7 @@ def _stalls(rng: np.random.Generator, load: Load, begin: int, end: int) -> np.nd
 
 
 def _awake(t: float, stalls: np.ndarray) -> float:
-    """When what is due at t happens, after the stall that covers it."""
+    """Time at which something due at `t` happens: after the stall that covers it."""
     covering = stalls[(stalls[:, 0] <= t) & (t < stalls[:, 1])] if len(stalls) else stalls
     return float(covering[:, 1].max()) if len(covering) else t
 
@@ -46,7 +46,7 @@ def receive(
     drift: float = 0.0,
     lost: frozenset[int] = frozenset(),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The arrivals a receiver writes down, int64 [n, 2], and when the host reads each burst's event, int64 [burst].
+    """Return the arrivals that a receiver logs, int64 [n, 2], and when the host reads each event, int64 [burst].
 
     `lost` packets never come. The clocks' offset is drawn.
     """

@@ -66,7 +66,7 @@ class FakeCard:
         self.out.sendto(status, (self.board.host_address, self.board.command_port))
 
     def send_frame(self, row: int, take: int, slot: int, frame_bytes: int) -> None:
-        """The frame of one pulse, unless the radar missed it; packets leave as they fill."""
+        """Send the frame of one pulse, unless the radar missed it; packets are sent when they are full."""
         extra, last = self.extra.get((row, take)), slot == self.row_bytes // frame_bytes - 1
         if slot == extra:
             self._rest += bytes(frame_bytes)
@@ -77,7 +77,7 @@ class FakeCard:
             self._send_packet(FULL)
 
     def end_frames(self) -> None:
-        """The short last packet, and its status."""
+        """Send the short last packet and the status."""
         self._send_packet(len(self._rest))
         self.report_status()
 

@@ -17,7 +17,7 @@ from tests.support.rigs import rig_with
 
 
 class FakePi:
-    """Speaks the wire protocol; a row makes every card send at once."""
+    """A Pi that speaks only the wire protocol; a row makes every card send its data."""
 
     def __init__(self, rig: Instrument, cards: list[FakeCard]) -> None:
         self.rig, self.cards = rig, cards
@@ -170,7 +170,7 @@ class FakePi:
             )  # fmt: skip
 
     def _run_at_its_pace(self, row: Row, take: int) -> None:
-        """Bursts 60 ms apart, pulses 1.5 ms apart, on a clock of its own, each frame 0.1 ms after its pulse."""
+        """Send bursts 60 ms apart with pulses 1.5 ms apart, on its own clock, and each frame 0.1 ms after its pulse."""
         assert self.run is not None
         n, period, ahead = self.run.pulses, 1_500_000, 77_000_000_000
         begin = time.monotonic_ns() + 20_000_000

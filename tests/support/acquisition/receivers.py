@@ -59,10 +59,10 @@ def fork_receivers(patch: pytest.MonkeyPatch) -> None:
 
 
 def receivers() -> list[int]:
-    """Their process ids, in the order of the recorded boards."""
+    """Process ids of the receivers of this test's scan, in the order of the recorded boards."""
     return sorted(one.pid for one in _started if one.pid is not None and one.poll() is None)
 
 
 def receiver_of(board: str) -> int:
-    """Process id of a board's receiver, of the boards RH and RV."""
+    """Process id of the receiver of RH or RV."""
     return receivers()[["RH", "RV"].index(board)]

@@ -38,7 +38,7 @@ class Cards:
 
     @staticmethod
     def network_of(board: Board) -> Network:
-        """What a board's card has in its EEPROM."""
+        """Network settings in the EEPROM of a board's card."""
         return Network(board.host_address, board.card_address, MAC, board.command_port, board.data_port)
 
     def start(self) -> None:
@@ -72,7 +72,7 @@ class Cards:
 
 
 class ScriptedCard:
-    """A card that sends `answers(code, count)` to each request, `count` being how often the code was received."""
+    """A card that replies `answers(code, count)` to each request; `count`: how often the code was received."""
 
     def __init__(self, board: Board, answers: Callable[[int, int], Iterable[bytes]], source_port: int = 1024) -> None:
         self.seen: list[tuple[int, bytes]] = []

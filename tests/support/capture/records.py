@@ -37,7 +37,7 @@ class Record:
 
 
 class Card:
-    """Records one behind the other; `reset` begins its counters anew."""
+    """Makes consecutive records; `reset` restarts the counters."""
 
     def __init__(self, size: int, count: int = 0, sequence: int = 1) -> None:
         self._size, self._count, self._sequence, self._seed = size, count, sequence, 0
@@ -46,7 +46,7 @@ class Card:
         self._count, self._sequence = 0, 1
 
     def record(self, resets: tuple[int, ...] = ()) -> Record:
-        """The next record; the counters begin anew before each of the packets `resets`."""
+        """Return the next record; the counters restart before each of the packets `resets`."""
         self._seed += 1
         whole = Record.make(self._size, 0, 1, self._seed)
         packets = []
@@ -74,7 +74,7 @@ def log_of(size: int, packets: list[bytes], batch: int = 7, t_ns: int = 1) -> Pa
 def place(
     size: int, packets: list[bytes], start: Counters | Past | None = None, frame: int = 1, batch: int = 7
 ) -> tuple[Placed, np.ndarray]:
-    """Place a row that starts at these counters, or behind what is known of the records before."""
+    """Place a row that starts at these counters, or after the known earlier records."""
     past = Past(start, (0,)) if isinstance(start, Counters) else start
     return place_record(log_of(size, packets, batch), frame, past)
 

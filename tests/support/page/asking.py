@@ -30,20 +30,20 @@ def ask(
 
 
 def get(view: Any, path: str, **headers: str) -> Any:
-    """JSON of a request that is answered."""
+    """Return the JSON of a request that must succeed."""
     status, body, _ = ask(view, path, **headers)
     assert status == 200, (path, status, body)
     return json.loads(body)
 
 
 def post(view: Any, path: str, body: Any = None, token: str = TOKEN, **headers: str) -> tuple[int, Any]:
-    """Status and JSON of what is asked for with the token."""
+    """Send a POST with the token; return status and JSON."""
     status, raw, _ = ask(view, path, "POST", {} if body is None else body, **{TOKEN_HEADER: token, **headers})
     return status, json.loads(raw)
 
 
 def raw(view: Any, data: bytes, limit_s: float = LIMIT_S) -> bytes:
-    """What comes back for some bytes, until the server closes."""
+    """Send bytes; return everything received until the server closes the connection."""
     with socket.create_connection(("127.0.0.1", view.port), limit_s) as s:
         s.sendall(data)
         out = b""
@@ -60,7 +60,7 @@ def _received(s: socket.socket) -> bytes:
 
 
 def digest_of(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file below a folder, and where links lead."""
+    """SHA-256 of every file below a folder, and the targets of links."""
     return {
         str(p.relative_to(folder)): f"-> {p.readlink()}"
         if p.is_symlink()

@@ -28,7 +28,7 @@ def find_chromium() -> str | None:
 
 
 class NavigatedError(Exception):
-    """The page went elsewhere while it was asked: ask again."""
+    """The page navigated during the request: repeat it."""
 
 
 class Browser:
@@ -95,7 +95,7 @@ class Browser:
         raise AssertionError("Chromium has no page")
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Call a method of the protocol; events that come meanwhile are kept where they matter."""
+        """Call a method of the protocol; events received meanwhile are processed."""
         self._count += 1
         self._socket.send(json.dumps({"id": self._count, "method": method, "params": parameters}))
         while True:
@@ -152,23 +152,23 @@ class Browser:
         self.value(f"{found}.click()")
 
     def check_whole(self, address: str) -> None:
-        """Nothing sticks out to the side, nothing is wrong, nothing came from another address."""
+        """Check that nothing overflows sideways, there are no errors, and nothing was loaded from another address."""
         assert self.value("document.documentElement.scrollWidth <= innerWidth")
         assert self.errors == []
         assert all(url.startswith((address, "about:", "blob:")) for url in self.requests), self.requests
 
     def value(self, expression: str) -> Any:
-        """What a JavaScript expression is in the page."""
+        """Return the value of a JavaScript expression in the page."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
     def text(self, element: str) -> str:
-        """What an element, by its id, says."""
+        """Return the text of the element with this id."""
         return self.value(f"document.getElementById('{element}')?.innerText ?? ''")
 
     def wait(self, expression: str, what: str, limit_s: float = LIMIT_S) -> None:
-        """Until an expression is true in the page."""
+        """Wait until an expression is true in the page."""
         deadline = time.monotonic() + limit_s
         while not self._true(expression):
             assert time.monotonic() < deadline, f"not within {limit_s:g} s: {what}; it says {self.text('status')!r}"

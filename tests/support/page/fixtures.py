@@ -57,7 +57,7 @@ class Watched(Watch):
 
 @pytest.fixture
 def watching() -> Iterator[Callable[..., Watched]]:
-    """Makes watches, as `Watch`, that look on until the test ends."""
+    """Makes watches, as `Watch`, that run until the test ends."""
     made: list[Watched] = []
 
     def watch(*arguments: Any, **options: Any) -> Watched:

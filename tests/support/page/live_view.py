@@ -1,4 +1,4 @@
-"""What the tests of the live view have in common: scans that grow on demand, and servers on free ports."""
+"""Helpers for tests of the live view: scans that grow on demand, and servers on free ports."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.processes import LIMIT_S, wait_for
 
 
 class GrowingScan:
-    """A copy of a finished scan whose manifest and events come line by line; a sign of life is given on demand."""
+    """A copy of a finished scan whose manifest and events are written line by line; `live` touches its `alive` file."""
 
     def __init__(self, finished: Path, folder: Path) -> None:
         self._facts = manifest.read(finished / MANIFEST).facts
@@ -33,7 +33,7 @@ class GrowingScan:
         shutil.copytree(finished / "raw", folder / "raw")
 
     def grow(self) -> str:
-        """Write the next fact, and the events it knows of; returns its name, empty when there is none left."""
+        """Write the next fact and its events; return its name, "" if none is left."""
         if not self._facts:
             return ""
         fact = self._facts.pop(0)
@@ -45,7 +45,7 @@ class GrowingScan:
         return str(fact["fact"])
 
     def write(self, fact: manifest.Fact) -> None:
-        """Write a fact of one's own."""
+        """Write another fact."""
         with (self.path / MANIFEST).open("ab") as f:
             f.write(manifest.encode_line(fact))
 
@@ -55,7 +55,7 @@ class GrowingScan:
             assert self._facts, f"no {fact} left"
 
     def live(self) -> None:
-        """Give a sign of life."""
+        """Touch the scan's `alive` file."""
         (self.path / CONTROL).mkdir(exist_ok=True)
         (self.path / CONTROL / ALIVE).touch()
 
@@ -71,7 +71,7 @@ def open_control(folder: Path) -> Iterator[StopRequest]:
 
 
 class Served:
-    """A site on a port that is free, or where it is told to be."""
+    """A site on a free port, or at the given address."""
 
     def __init__(self, site: Site, host: str = "127.0.0.1", port: int = 0, place: Place | None = None) -> None:
         self.site = site

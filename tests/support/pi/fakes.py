@@ -13,7 +13,7 @@ from polysight.shared.stage_line import Immediate, Reply
 
 
 class FakeDriver:
-    """Takes everything; what was sent is kept."""
+    """Accepts every command and keeps the bytes sent."""
 
     def __init__(self) -> None:
         self.config = Stage("none")

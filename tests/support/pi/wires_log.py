@@ -1,4 +1,4 @@
-"""Everything that happens on chosen wires, read all the time: an unread socket would stall who writes to it."""
+"""Records everything on the given wires, in a thread: an unread socket would block the senders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One fault at a random moment of a board's bring-up or row: what happens, and the cause that its error must name."""
+"""One fault at a random time of a board's bring-up or row, and the cause that the error must name."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SILENT = r"no power|does not report|did not report"
 
 
 class FaultyWords(BoardWords):
-    """A word link on which `act` is called when transfer `at` begins (words, line looks and resets counted)."""
+    """A word link that calls `act` when transfer number `at` begins (words, reads of the line, and resets count)."""
 
     def __init__(self, board: Simulated, clock: VirtualClock, at: int, act: Callable[[FaultyWords], None]) -> None:
         super().__init__(board, clock)

@@ -184,5 +184,5 @@ BUS = Bus()
 
 
 def get_backend() -> Bus:
-    """What pyftdi asks its backends' modules for."""
+    """Return the backend; pyftdi calls this function of a backend module."""
     return BUS

@@ -69,7 +69,7 @@ class Conversation:
 
 
 def play(stage, path: Path) -> None:
-    """Every line of the file in turn; fails at the first that does not hold."""
+    """Play every line of the file; fail at the first one that does not match."""
     talk = Conversation(stage)
     for number, sign, texts in _steps(path):
         try:
@@ -86,7 +86,7 @@ def play(stage, path: Path) -> None:
 
 
 def _steps(path: Path) -> list[tuple[int, str, list[str]]]:
-    """Line number, sign and text of every step; what is sent in one go is one step."""
+    """Line number, sign and texts of every step; consecutive lines to send are one step."""
     steps: list[tuple[int, str, list[str]]] = []
     for number, line in enumerate(path.read_text(encoding="ascii").splitlines(), 1):
         line = line.partition(" //")[0].strip()

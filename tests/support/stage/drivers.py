@@ -290,7 +290,7 @@ class PortDriver(Driver):
                 return
 
     def _listen_for_banner(self) -> None:
-        """Opening resets the board; what it was saying meanwhile is dropped."""
+        """Wait for the banner: opening the port resets the board. Bytes before it are dropped."""
         self.until(lambda: b"polysight-stage" in self.received)
         self.received = self.received[self.received.index(b"polysight-stage") :]
 
@@ -305,7 +305,7 @@ class PortDriver(Driver):
         self._listen(0.2)
 
     def rx(self, data: bytes) -> None:
-        """Every line has an answer, and so has a STATUS byte by itself; what else comes, comes later."""
+        """Send bytes and wait for the answers: one for each line and one for a single STATUS byte."""
         *lines, self._sent = (self._sent + data).split(b"\n")
         answers = sum(bool(line.translate(None, bytes(Immediate))) for line in lines)
         answers += data == bytes([Immediate.STATUS])
@@ -317,7 +317,7 @@ class PortDriver(Driver):
         self._listen(ticks / TICK_HZ / self._speed)
 
     def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
-        """Ask for the status until it is not one of motion; those answers are not part of the conversation."""
+        """Request the status until the stage rests; these answers are not kept."""
         limit = time.monotonic() + max(limit_ticks / TICK_HZ / self._speed, LIMIT_S)
         while time.monotonic() < limit:
             if self.status().fields["state"] in ("idle", "alarm", "hold"):

@@ -87,7 +87,7 @@ time.sleep(600)
 
 
 def outlives_its_parent(command: Sequence[str | Path], standard_input: str = "") -> bool:
-    """Start a command by another process, kill that one, and see if the command goes on."""
+    """Start a command in another process, kill that process, and return True if the command goes on."""
     arguments = [sys.executable, "-c", PARENT, standard_input, *map(str, command)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, cwd=REPO) as parent:
         assert parent.stdout is not None

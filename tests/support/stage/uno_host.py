@@ -62,6 +62,6 @@ class Host:
         return last
 
     def at(self, edge: PinEdge) -> tuple[int, int]:
-        """Where the motors stood at an edge, in the firmware's coordinates."""
+        """Return the position of the motors at an edge, in the firmware's coordinates."""
         assert edge.left == edge.right
         return edge.x - self.zero[0], edge.left - self.zero[1]

@@ -27,7 +27,7 @@ GROWS = ("write", "pwrite", "posix_fallocate", "create", "mkdir", "rename", "fsy
 
 
 class Killed(BaseException):
-    """The program ends here: nothing catches this, and whatever runs on its way out reaches the disk no more."""
+    """The program ends here: nothing catches this, and later operations do not reach the disk."""
 
 
 class FaultyDisk:
@@ -88,7 +88,7 @@ class FaultyDisk:
             del self._durable[path]
 
     def lose_power(self) -> None:
-        """Draw what of the unsynced is left. Names are lost from the newest on: file systems keep their order."""
+        """Draw which unsynced changes are left. Names are lost from the newest on: file systems keep their order."""
         for path, durable in self._durable.items():
             if path.exists():
                 now = path.read_bytes()
@@ -101,7 +101,7 @@ class FaultyDisk:
 
     @contextmanager
     def __call__(self) -> Iterator[FaultyDisk]:
-        """Within the block everything goes through here."""
+        """Redirect all disk operations of the block to this object."""
         calls = {"open": self._os_open, "pwrite": self._pwrite, "fsync": self._fsync, "mkdir": self._mkdir}
         calls |= {"rename": self._rename, "unlink": self._unlink}
         calls |= {name: partial(self._on_file, name) for name in ("ftruncate", "posix_fallocate")}

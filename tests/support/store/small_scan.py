@@ -42,7 +42,7 @@ SCENE = small_scene(3, 3, step_mm=(20.0, 20.0), pixels=12)
 
 
 class Samples:
-    """The simulated samples of every row: the same for every take of it."""
+    """Simulated samples of every row, the same for every take."""
 
     def __init__(self, folder: Path) -> None:
         (folder / "scene.toml").write_text(SCENE)
@@ -62,7 +62,7 @@ class Samples:
 
 
 class SmallPi:
-    """The Pi's journal, and rows that are over at once. Stands for PiClient."""
+    """Replaces PiClient: writes the Pi's journal; rows end at once."""
 
     def __init__(self, instrument: Instrument, folder: Path) -> None:
         self._instrument = instrument
@@ -141,7 +141,7 @@ class SmallPi:
         self.state, self.fault, self._journal.broken = "ready", "", False
 
     def come_to_rest(self, reason: str) -> None:
-        """Nothing moves."""
+        """Do nothing: nothing moves."""
 
     def abort(self, reason: str) -> None:
         raise AssertionError(f"nothing asks for an abort here: {reason}")
@@ -153,7 +153,7 @@ class SmallPi:
 
 
 class SmallRig:
-    """Every byte comes. Stands for CaptureRig; rows are written as its receivers write them."""
+    """Replaces CaptureRig: every byte arrives; rows are written as by its receivers."""
 
     def __init__(self, samples: Samples) -> None:
         self._samples = samples
@@ -209,7 +209,7 @@ class SmallRig:
 
 
 class SmallScan:
-    """One scan in `folder`/scan with its journal in `folder`/journal, run and resumed as often as one likes."""
+    """A scan in `folder`/scan with its journal in `folder`/journal; `run` starts or resumes it."""
 
     def __init__(self, samples: Samples, folder: Path) -> None:
         self._samples = samples

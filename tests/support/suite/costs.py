@@ -24,7 +24,7 @@ def _now_s() -> tuple[float, float]:
 
 
 class Costs:
-    """Workers measure each test's phases; whoever started them adds up."""
+    """Workers measure the phases of each test; the main process adds them up."""
 
     def __init__(self) -> None:
         self._last_s = _now_s()

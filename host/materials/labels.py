@@ -240,4 +240,4 @@ def patches_from_labels(
         patches.append(make_patch(n, mask, x_m, y_m, margin_mm))
         labels[mask] = n
         names[n] = name
-    return Segmentation(labels, tuple(patches), float("nan")), names
+    return Segmentation(labels, tuple(patches)), names

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER, SLOW
+from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER
 from polysight.host.materials.knn import fit_weights
 from polysight.host.materials.library import Entry, Library
 from polysight.host.materials.result import MaterialsResult
@@ -198,11 +198,11 @@ def _confusion(true: npt.NDArray, found: npt.NDArray, names: npt.NDArray) -> Rea
 
 
 def best_model(samples: Samples) -> tuple[str, tuple[Score, ...]]:
-    """Return the name of the best model with whole groups left out, and the scores of all but the slowest.
+    """Return the name of the best model with whole groups left out, and the scores of all models.
 
     The criterion is the mean of the pixels' and of the patches' share.
     """
-    scores = tuple(score(samples, model) for model in MODELS if model != SLOW)
+    scores = tuple(score(samples, model) for model in MODELS)
     return max(scores, key=lambda s: s.pixels + s.patches).model, scores
 
 
@@ -247,7 +247,7 @@ def fit_samples(samples: Samples) -> dict[str, Any]:
 
     The scores are of materials in two or more scans; `not_judged` lists the others.
     """
-    scores = {model: score(samples, model) for model in MODELS if model != SLOW}
+    scores = {model: score(samples, model) for model in MODELS}
     weighted, own = fit_weights(samples), scores[DISCRIMINANT]
     judged = {s.model: {"pixels": s.pixels, "patches": s.patches} for s in scores.values()}
     for name in (DISCRIMINANT, PAPER):

@@ -197,15 +197,3 @@ def test_a_pi_of_another_release_is_an_error(unanswered, changes, version, check
     assert found[check].verdict == "error"
     assert all(value in found[check].found for value in changes.values())
     assert skips in skipped(found, check)
-
-
-def test_missing_keys(unanswered, tmp_path):
-    def change(table):
-        table["pi"] |= {"command_address": "tcp://192.0.2.1:5601", "event_address": "tcp://192.0.2.1:5602"}
-        table["pi"]["key_dir"] = str(tmp_path / "nothing")
-
-    unanswered.folder.joinpath("rig").mkdir()
-    found = unanswered.doctor(unanswered.variant(change))
-    assert found["keys"].verdict == "error"
-    assert "host.key_secret" in found["keys"].found
-    assert "pi" in skipped(found, "keys")

@@ -101,12 +101,19 @@ def combine(channels: Distances, w: Weights) -> Real:
     return w.h * channels[0] + w.v * channels[1] + w.p * channels[2]
 
 
-def voters(names: npt.NDArray, neighbours: int) -> Any:
-    """Return scikit-learn's KNN of labelled pixels, to be called with distances [queries, pixels]."""
-    from sklearn.neighbors import KNeighborsClassifier  # slow import, which most commands do not need
+class Voters:
+    """The k nearest of labelled pixels have a vote each; of names with equally many the first wins."""
 
-    knn = KNeighborsClassifier(n_neighbors=min(neighbours, names.size), metric="precomputed")
-    return knn.fit(np.zeros((names.size, names.size)), names)  # only the shape is used
+    def __init__(self, names: npt.NDArray, neighbours: int) -> None:
+        self.neighbours = min(neighbours, names.size)
+        self._names, self._of = np.unique(names, return_inverse=True)
+
+    def predict(self, distance: Real) -> npt.NDArray:
+        """Return the name of each query from its distances to the labelled pixels, [queries, pixels]."""
+        near = np.argpartition(distance, self.neighbours - 1, axis=1)[:, : self.neighbours]
+        queries, kinds = len(near), self._names.size
+        votes = np.bincount((self._of[near] + kinds * np.arange(queries)[:, None]).ravel(), minlength=queries * kinds)
+        return self._names[votes.reshape(queries, kinds).argmax(axis=1)]
 
 
 class PaperKnn(Model):
@@ -126,6 +133,7 @@ class PaperKnn(Model):
         self, channels: str = "H+V+P", weights: Weights | None = None, thresholds: Mapping[str, float] | None = None
     ) -> None:
         self.channels, self.given, self.thresholds = channels, weights, dict(thresholds or {})
+        self._distributions: ErrorDiscriminant | None = None
 
     def fit(self, samples: Samples) -> PaperKnn:
         """Store the pixels, and fit the weights unless they are given or no two scans share a material."""
@@ -137,9 +145,16 @@ class PaperKnn(Model):
             self.weights = Weights()
         else:
             self.weights = fit_weights(samples, channels=self.channels).weights
-        self.x, self.voters = samples.x, voters(samples.names, self.weights.neighbours)
-        self.distributions = ErrorDiscriminant().fit(samples)
+        self.x, self.voters = samples.x, Voters(samples.names, self.weights.neighbours)
+        self._samples, self._distributions = samples, None
         return self
+
+    @property
+    def distributions(self) -> ErrorDiscriminant:  # type: ignore[override]
+        """The materials' distributions, fitted when they are asked for: pixels are named without them."""
+        if self._distributions is None:
+            self._distributions = ErrorDiscriminant().fit(self._samples)
+        return self._distributions
 
     def by_scan(
         self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
@@ -155,7 +170,7 @@ class PaperKnn(Model):
         names, relative = [], []
         for start in range(0, len(x), _CHUNK):
             distance = combine(self._distances(x[start : start + _CHUNK]), self.weights)
-            k = self.voters.n_neighbors
+            k = self.voters.neighbours
             near = np.partition(distance, k - 1, axis=1)[:, :k].mean(axis=1)
             names.append(self.voters.predict(distance))
             relative.append(near / np.array([self.thresholds.get(str(n), np.inf) for n in names[-1]]))
@@ -219,7 +234,7 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
         )
     few, neighbours = _few(samples), Weights.neighbours
     same_scan = few.groups[:, None] == few.groups[None, :]
-    knn = voters(few.names, min(neighbours, int((~same_scan).sum(axis=1).min())))
+    knn = Voters(few.names, min(neighbours, int((~same_scan).sum(axis=1).min())))
     grid = [(0.0, 0.0)] if channels == "P" else [(0.0, 0.0), *product(GRID, GRID)]
     tried: list[tuple[float, float, Weights]] = []
     alone: dict[str, float] = {}
@@ -247,7 +262,7 @@ def _few(samples: Samples) -> Samples:
     return samples.take(np.sort(np.concatenate(at)))
 
 
-def _left_out(distance: Real, knn: Any, few: Samples, same_scan: npt.NDArray[np.bool_]) -> float:
+def _left_out(distance: Real, knn: Voters, few: Samples, same_scan: npt.NDArray[np.bool_]) -> float:
     """Return the pixel accuracy, mean over the materials of two or more scans, without votes of the same scan."""
     found = knn.predict(np.where(same_scan, _FAR, distance))
     return float(np.mean([(found[few.names == n] == n).mean() for n in np.unique(few.names[few.shared])]))

@@ -35,6 +35,8 @@ GRID = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Values of lambda_H and lambda_V to try, relative to lambda_P = 1, with each channel scaled by its spread."""
 MARGIN = 2.0
 """Largest distance of a known pixel, relative to the distances between the library's own patches."""
+FIT_PIXELS = 3
+"""Pixels of each patch to fit weights: pixels of a patch are similar, and the cost grows with the square."""
 _CHUNK = 512
 _FAR = 1e9
 Distances = tuple[Real, Real, Real]
@@ -205,9 +207,7 @@ class Fit:
     thresholds: dict[str, float]
 
 
-def fit_weights(
-    samples: Samples, neighbours: int = 15, pixels_per_patch: int = 3, seed: int = 0, channels: str = "H+V+P"
-) -> Fit:
+def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     """Fit the paper's three weights and the measure of P.
 
     Every combination of the grid is judged on scans left out; among the combinations within half a percent of the best
@@ -217,12 +217,6 @@ def fit_weights(
     ----------
     samples
         Pixels of at least two scans.
-    neighbours
-        k of the KNN.
-    pixels_per_patch
-        Random pixels of each patch: pixels of a patch are similar, and the cost grows with the square.
-    seed
-        Seed of that choice.
     channels
         "P": only the measure is fitted.
 
@@ -238,7 +232,7 @@ def fit_weights(
             "process more scans with other placements",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
-    few = _few(samples, pixels_per_patch, np.random.default_rng(seed))
+    few, neighbours = _few(samples), Weights.neighbours
     same_scan = few.groups[:, None] == few.groups[None, :]
     knn = Voters(few.names, min(neighbours, int((~same_scan).sum(axis=1).min())))
     grid = [(0.0, 0.0)] if channels == "P" else [(0.0, 0.0), *product(GRID, GRID)]
@@ -248,7 +242,7 @@ def fit_weights(
         distances = channel_distances(few.x, few.x, measure)
         scale = [1 / max(float(np.median(c)), 1e-12) for c in distances]
         for wh, wv in grid:
-            w = Weights(wh * scale[0], wv * scale[1], scale[2], measure, neighbours)
+            w = Weights(wh * scale[0], wv * scale[1], scale[2], measure)
             accuracy = _left_out(combine(distances, w), knn, few, same_scan)
             tried.append((accuracy, -abs(np.log(max(wh, 0.1))) - abs(np.log(max(wv, 0.1))), w))
             if wh == wv == 0:
@@ -261,9 +255,10 @@ def fit_weights(
     return Fit(weights, accuracy, by_channel, _thresholds(combine(distances, weights), neighbours, few))
 
 
-def _few(samples: Samples, per_patch: int, rng: np.random.Generator) -> Samples:
-    """Return at most so many random pixels of every patch."""
-    at = [rng.permutation(np.flatnonzero(samples.patches == i))[:per_patch] for i in np.unique(samples.patches)]
+def _few(samples: Samples) -> Samples:
+    """Return at most `FIT_PIXELS` random pixels of every patch."""
+    rng = np.random.default_rng(0)
+    at = [rng.permutation(np.flatnonzero(samples.patches == i))[:FIT_PIXELS] for i in np.unique(samples.patches)]
     return samples.take(np.sort(np.concatenate(at)))
 
 

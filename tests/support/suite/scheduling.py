@@ -35,7 +35,7 @@ FIRST = (
     "tests/papers/test_patches.py",
     "tests/e2e/test_kill_and_resume.py",
     "tests/e2e/test_demo.py",
-    "tests/e2e/test_native_radars.py",
+    "tests/e2e/test_radar_backends.py",
     "tests/e2e/test_wrong_input.py",
     "tests/imaging/test_focus.py",
     "tests/stage/test_uno.py",

@@ -43,7 +43,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
 
     Signals: `folder`, `scan_id`, `rows_committed`, `rows_planned`, `state` (what `polysight scan` is doing).
 
-    `name` begins the names of signals and data keys. `keep_incomplete`: keep rows with gaps after all retakes.
+    Names of signals and data keys begin with the given one. `keep_incomplete`: keep rows with gaps after all retakes.
     """
 
     def __init__(self, config: Path | str, name: str = "radar_scan", keep_incomplete: bool = False) -> None:

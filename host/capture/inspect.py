@@ -221,7 +221,7 @@ def _remarks(r: Report, mirrored: bool) -> list[str]:
     if max(r.rx_rms) == 0:
         return ["every sample is zero: nothing was recorded"]
     if mirrored:
-        found.append("most power is at negative frequencies: I and Q seem to be swapped")
+        found.append("most power is at negative frequencies: I and Q seem to be swapped (--q-first)")
     if silent := [k for k, v in enumerate(r.rx_rms) if v < 0.01 * max(r.rx_rms)]:
         found.append(f"RX {', '.join(map(str, silent))} have no signal: antennas off, or another lane layout")
     if r.clipped:

@@ -12,7 +12,6 @@ one does not.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +22,6 @@ from numpy.typing import NDArray
 from polysight.host.imaging.images import ImageBuilder
 from polysight.host.imaging.resolution import limit_m
 
-Progress = Callable[[int, int], None]
 _MAX_TILT_DEG = 3.0
 
 
@@ -73,9 +71,7 @@ class Focus:
         }
 
 
-def focus_sweep(
-    builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17, progress: Progress | None = None
-) -> Focus:
+def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) -> Focus:
     """Find the plane on which the sum of both channels is sharpest.
 
     Parameters
@@ -86,8 +82,6 @@ def focus_sweep(
         Search range to either side of the rig file's plane.
     planes
         Number of planes.
-    progress
-        Called with the number of planes done and the total.
     """
     grid = builder.grid
     depths = np.linspace(-depth_m, depth_m, planes)
@@ -96,8 +90,6 @@ def focus_sweep(
         for board in builder.boards.values():
             image = board.image(replace(grid, z_m=float(np.mean(grid.z_m)) + depth))[0]
             stack[i] += np.abs(image) ** 2
-        if progress is not None:
-            progress(i + 1, planes)
     cells = _cells(builder, depths)
     x, y = grid.x_m - grid.x_m.mean(), grid.y_m - grid.y_m.mean()
 

@@ -124,8 +124,6 @@ class ImageBuilder:
     ----------
     rig
         Rig of the scan.
-    window
-        Fast-time window, see :func:`polysight.host.imaging.reduce.reduction`.
     taper
         Window over the aperture in x and y, as for scipy; "boxcar" for none; None: the rig file's. Without a taper,
         sidelobes make the inside of a plate depend on its surroundings, differently in H and V
@@ -142,7 +140,6 @@ class ImageBuilder:
     def __init__(
         self,
         rig: Instrument,
-        window: Window = "hann",
         taper: Window | None = None,
         live: bool = False,
         depth_m: float = 0.0,
@@ -156,7 +153,7 @@ class ImageBuilder:
         self.gate_m = needed_gate_m(rig, depth_m) if gate_m is None else gate_m
         taper = TAPERS[rig.image.apodisation] if taper is None else taper
         weights = np.outer(window_weights(taper, plan.rows), window_weights(taper, plan.columns)).astype(np.float32)
-        gated = reduction(rig.chirp, self.gate_m, window)
+        gated = reduction(rig.chirp, self.gate_m)
         self._antennas, self._middle_hz = antennas, float(np.mean(gated.frequencies_hz))
         self.boards = {b.name: BoardSamples(rig, b, self.grid, gated, weights, live) for b in rig.receivers}
 

@@ -39,12 +39,7 @@ class Reconstruction:
     residual: NDArray[np.float64]
 
 
-def reconstruct(
-    board: BoardSamples,
-    iterations: int = 60,
-    strength: float = STRENGTH,
-    progress: Callable[[int, int], None] | None = None,
-) -> Reconstruction:
+def reconstruct(board: BoardSamples, iterations: int = 60, strength: float = STRENGTH) -> Reconstruction:
     """Reconstruct the image of a board from its valid positions.
 
     Parameters
@@ -56,8 +51,6 @@ def reconstruct(
     strength
         Weight of sparsity relative to the strongest pixel of the matched filter: pixels below about this level become
         0, and the others weaker by as much. For a few points with many random omissions 0.01 converges faster.
-    progress
-        Called with the number of steps done and the total.
     """
     imager, _ = choose_imager(board.aperture)
     weights, gate = np.sqrt(board.weights), board.model.astype(np.complex64)
@@ -77,15 +70,13 @@ def reconstruct(
     x = np.zeros_like(matched)
     ahead, t = x, 1.0
     residuals = []
-    for i in range(iterations):
+    for _ in range(iterations):
         misfit = forward(ahead) - data
         residuals.append(float(np.linalg.norm(misfit)) / norm)
         new = _shrunk(ahead - adjoint(misfit) / np.float32(lipschitz), threshold)
         grown = (1 + np.sqrt(1 + 4 * t * t)) / 2
         ahead = (new + (t - 1) / grown * (new - x)).astype(np.complex64)
         x, t = new, grown
-        if progress is not None:
-            progress(i + 1, iterations)
     return Reconstruction(x, np.array(residuals))
 
 

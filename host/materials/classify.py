@@ -1,14 +1,13 @@
 """Name the pixels and patches of a scan by a reference library; the available models.
 
-`MODELS` lists the models: the paper's KNN, the discriminant of error sources, and others of scikit-learn for
-comparison. `Classifier` uses the library's model, or the requested one. `add_explanation` gives the reason of a name.
+`MODELS` lists the models: the paper's KNN and the discriminant of error sources. `Classifier` uses the library's model,
+or the requested one. `add_explanation` gives the reason of a name.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,13 +17,11 @@ from polysight.host.materials.knn import PaperKnn, Weights
 from polysight.host.materials.library import Library
 from polysight.host.materials.permittivity import format_permittivity
 from polysight.host.materials.samples import (
-    WIDTH,
     Model,
     NamedScan,
     Real,
     Samples,
     SceneErrors,
-    by_angle,
     feature_matrix,
     usable,
 )
@@ -33,12 +30,16 @@ from polysight.shared.errors import DataError
 
 PAPER = "weighted KNN (paper)"
 DISCRIMINANT = "discriminant of error sources"
-SLOW = "metric learning (NCA) + KNN"
-"""Takes seconds to fit, too long for every start of a program; never the default."""
 SHORT = {"knn": PAPER, "discriminant": DISCRIMINANT}
 """Names of models in commands."""
-EARLIER = {"own-spread": DISCRIMINANT, "discriminant of error sources, own spread": DISCRIMINANT}
-"""Names of models in earlier releases and their libraries."""
+EARLIER = (
+    "own-spread",
+    "discriminant of error sources, own spread",
+    "linear discriminant",
+    "linear discriminant of logarithms",
+    "quadratic discriminant",
+)
+"""Names of models in earlier releases and their libraries: the discriminant replaces them."""
 UNKNOWN = "unknown"
 INCLUSIONS = 0.05
 """Share of a patch's pixels that may be of another material; a pixel's prior is its patch's name otherwise."""
@@ -46,63 +47,9 @@ LIKELY = 0.005
 """Materials of less probability are not listed."""
 
 
-class SklearnModel(Model):
-    """A scikit-learn estimator on some channels; unknown pixels are those far from the discriminant's materials."""
-
-    def __init__(self, estimator: Any, channels: str) -> None:
-        self.estimator, self.channels = estimator, channels
-        self.distributions = ErrorDiscriminant()
-
-    def fit(self, samples: Samples) -> SklearnModel:
-        """Fit the estimator to labelled pixels."""
-        self.estimator.fit(self._columns(samples.x), samples.names)
-        self.distributions.fit(samples)
-        return self
-
-    def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
-        """Name each pixel; return the names and the distances to those materials over the threshold."""
-        names = self.estimator.predict(self._columns(x))
-        return names, self.distributions.distance(x, names)
-
-    def _columns(self, x: Real) -> Real:
-        chosen = {"H": (0,), "V": (1,), "P": (2, 3), "H+V+P": (0, 1, 2, 3)}[self.channels]
-        return x[:, [WIDTH * a + c for a in range(x.shape[1] // WIDTH) for c in chosen]]
-
-
-def log_features(x: Real) -> Real:
-    """Return ln|H|, ln|V| and the direction of V / H for each angle; features of fewer channels unchanged."""
-    if x.shape[1] % WIDTH:
-        return x
-    h, v, q = by_angle(x)
-    length = np.maximum(np.abs(q), 1e-9)
-    logs = (np.log(np.maximum(h, 1e-9)), np.log(np.maximum(v, 1e-9)), q.real / length, q.imag / length)
-    return np.concatenate(logs, axis=1)
-
-
-def _sklearn(channels: str, *names: str) -> SklearnModel:
-    from sklearn.discriminant_analysis import LinearDiscriminantAnalysis, QuadraticDiscriminantAnalysis
-    from sklearn.neighbors import KNeighborsClassifier, NeighborhoodComponentsAnalysis
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import FunctionTransformer, StandardScaler
-
-    parts: dict[str, Callable[[], Any]] = {
-        "log": lambda: FunctionTransformer(log_features),
-        "scale": StandardScaler,
-        "lda": LinearDiscriminantAnalysis,
-        "qda": lambda: QuadraticDiscriminantAnalysis(reg_param=0.02),
-        "nca": lambda: NeighborhoodComponentsAnalysis(random_state=0, max_iter=60),
-        "knn": lambda: KNeighborsClassifier(15),
-    }
-    return SklearnModel(make_pipeline(*(parts[n]() for n in names)), channels)
-
-
 MODELS: dict[str, Callable[[str], Model]] = {
     PAPER: PaperKnn,
     DISCRIMINANT: ErrorDiscriminant,
-    SLOW: lambda channels: _sklearn(channels, "scale", "nca", "knn"),
-    "linear discriminant": lambda channels: _sklearn(channels, "scale", "lda"),
-    "linear discriminant of logarithms": lambda channels: _sklearn(channels, "log", "scale", "lda"),
-    "quadratic discriminant": lambda channels: _sklearn(channels, "scale", "qda"),
 }
 
 
@@ -263,35 +210,6 @@ class Classifier:
         name = nearest if far <= 1 else UNKNOWN
         return PatchName(name, confidence, {}, far, 0, probabilities, nearest=nearest)
 
-    def pixels(
-        self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike
-    ) -> tuple[npt.NDArray[np.str_], npt.NDArray[np.float64]]:
-        """Classify each pixel independently (libraries with one incidence angle).
-
-        Parameters
-        ----------
-        h, v
-            |H|, |V| relative to metal, [n]; of complex values the modulus.
-        p
-            complex [n], metal-referenced ratio.
-
-        Returns
-        -------
-        names
-            str [n]; "unknown" beyond the threshold, or if the pixel is not finite.
-        distance
-            float64 [n], distance over the threshold; infinite if the pixel is not finite.
-        """
-        x = features_of(h, v, p)
-        good = usable(x)
-        nothing = PatchName(UNKNOWN, 0.0, {}, np.inf, 0)
-        found = self._named(good, self._model.by_pixel(x[good]) if good.any() else None, nothing)
-        return found.names, found.distance
-
-    def patch(self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> PatchName:
-        """Name one patch alone; parameters as :meth:`pixels`."""
-        return self.scan([features_of(h, v, p)])[0].verdict
-
     def _named(
         self, good: npt.NDArray[np.bool_], pixels: tuple[npt.NDArray, Real] | None, name: PatchName
     ) -> NamedPatch:
@@ -314,7 +232,7 @@ def features_of(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
 
 
 def _model_name(given: str) -> str:
-    name = EARLIER.get(given) or SHORT.get(given, given)
+    name = DISCRIMINANT if given in EARLIER else SHORT.get(given, given)
     if name not in MODELS:
         raise DataError(
             f"no classifier is called {given!r}", "the library was made by another version, or the name is wrong",

@@ -184,6 +184,3 @@ def _moments(d: Real, covariances: Real, weight: Real) -> tuple[Real, Real]:
     off = d - middle[:, None]
     spread = np.einsum("pk,pkde->pde", share, covariances + off[..., :, None] * off[..., None, :])
     return middle, np.asarray(known[:, None, None] * np.linalg.inv(spread), np.float64)
-
-
-__all__ = ["CommonError", "Patches", "costs", "explanations", "probabilities"]

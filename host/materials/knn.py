@@ -35,6 +35,8 @@ GRID = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Values of lambda_H and lambda_V to try, relative to lambda_P = 1, with each channel scaled by its spread."""
 MARGIN = 2.0
 """Largest distance of a known pixel, relative to the distances between the library's own patches."""
+FIT_PIXELS = 3
+"""Pixels of each patch to fit weights: pixels of a patch are similar, and the cost grows with the square."""
 _CHUNK = 512
 _FAR = 1e9
 Distances = tuple[Real, Real, Real]
@@ -99,12 +101,19 @@ def combine(channels: Distances, w: Weights) -> Real:
     return w.h * channels[0] + w.v * channels[1] + w.p * channels[2]
 
 
-def voters(names: npt.NDArray, neighbours: int) -> Any:
-    """Return scikit-learn's KNN of labelled pixels, to be called with distances [queries, pixels]."""
-    from sklearn.neighbors import KNeighborsClassifier  # slow import, which most commands do not need
+class Voters:
+    """The k nearest of labelled pixels have a vote each; of names with equally many the first wins."""
 
-    knn = KNeighborsClassifier(n_neighbors=min(neighbours, names.size), metric="precomputed")
-    return knn.fit(np.zeros((names.size, names.size)), names)  # only the shape is used
+    def __init__(self, names: npt.NDArray, neighbours: int) -> None:
+        self.neighbours = min(neighbours, names.size)
+        self._names, self._of = np.unique(names, return_inverse=True)
+
+    def predict(self, distance: Real) -> npt.NDArray:
+        """Return the name of each query from its distances to the labelled pixels, [queries, pixels]."""
+        near = np.argpartition(distance, self.neighbours - 1, axis=1)[:, : self.neighbours]
+        queries, kinds = len(near), self._names.size
+        votes = np.bincount((self._of[near] + kinds * np.arange(queries)[:, None]).ravel(), minlength=queries * kinds)
+        return self._names[votes.reshape(queries, kinds).argmax(axis=1)]
 
 
 class PaperKnn(Model):
@@ -124,6 +133,7 @@ class PaperKnn(Model):
         self, channels: str = "H+V+P", weights: Weights | None = None, thresholds: Mapping[str, float] | None = None
     ) -> None:
         self.channels, self.given, self.thresholds = channels, weights, dict(thresholds or {})
+        self._distributions: ErrorDiscriminant | None = None
 
     def fit(self, samples: Samples) -> PaperKnn:
         """Store the pixels, and fit the weights unless they are given or no two scans share a material."""
@@ -135,9 +145,16 @@ class PaperKnn(Model):
             self.weights = Weights()
         else:
             self.weights = fit_weights(samples, channels=self.channels).weights
-        self.x, self.voters = samples.x, voters(samples.names, self.weights.neighbours)
-        self.distributions = ErrorDiscriminant().fit(samples)
+        self.x, self.voters = samples.x, Voters(samples.names, self.weights.neighbours)
+        self._samples, self._distributions = samples, None
         return self
+
+    @property
+    def distributions(self) -> ErrorDiscriminant:  # type: ignore[override]
+        """The materials' distributions, fitted when they are asked for: pixels are named without them."""
+        if self._distributions is None:
+            self._distributions = ErrorDiscriminant().fit(self._samples)
+        return self._distributions
 
     def by_scan(
         self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
@@ -153,7 +170,7 @@ class PaperKnn(Model):
         names, relative = [], []
         for start in range(0, len(x), _CHUNK):
             distance = combine(self._distances(x[start : start + _CHUNK]), self.weights)
-            k = self.voters.n_neighbors
+            k = self.voters.neighbours
             near = np.partition(distance, k - 1, axis=1)[:, :k].mean(axis=1)
             names.append(self.voters.predict(distance))
             relative.append(near / np.array([self.thresholds.get(str(n), np.inf) for n in names[-1]]))
@@ -190,9 +207,7 @@ class Fit:
     thresholds: dict[str, float]
 
 
-def fit_weights(
-    samples: Samples, neighbours: int = 15, pixels_per_patch: int = 3, seed: int = 0, channels: str = "H+V+P"
-) -> Fit:
+def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     """Fit the paper's three weights and the measure of P.
 
     Every combination of the grid is judged on scans left out; among the combinations within half a percent of the best
@@ -202,12 +217,6 @@ def fit_weights(
     ----------
     samples
         Pixels of at least two scans.
-    neighbours
-        k of the KNN.
-    pixels_per_patch
-        Random pixels of each patch: pixels of a patch are similar, and the cost grows with the square.
-    seed
-        Seed of that choice.
     channels
         "P": only the measure is fitted.
 
@@ -223,9 +232,9 @@ def fit_weights(
             "process more scans with other placements",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
-    few = _few(samples, pixels_per_patch, np.random.default_rng(seed))
+    few, neighbours = _few(samples), Weights.neighbours
     same_scan = few.groups[:, None] == few.groups[None, :]
-    knn = voters(few.names, min(neighbours, int((~same_scan).sum(axis=1).min())))
+    knn = Voters(few.names, min(neighbours, int((~same_scan).sum(axis=1).min())))
     grid = [(0.0, 0.0)] if channels == "P" else [(0.0, 0.0), *product(GRID, GRID)]
     tried: list[tuple[float, float, Weights]] = []
     alone: dict[str, float] = {}
@@ -233,7 +242,7 @@ def fit_weights(
         distances = channel_distances(few.x, few.x, measure)
         scale = [1 / max(float(np.median(c)), 1e-12) for c in distances]
         for wh, wv in grid:
-            w = Weights(wh * scale[0], wv * scale[1], scale[2], measure, neighbours)
+            w = Weights(wh * scale[0], wv * scale[1], scale[2], measure)
             accuracy = _left_out(combine(distances, w), knn, few, same_scan)
             tried.append((accuracy, -abs(np.log(max(wh, 0.1))) - abs(np.log(max(wv, 0.1))), w))
             if wh == wv == 0:
@@ -246,13 +255,14 @@ def fit_weights(
     return Fit(weights, accuracy, by_channel, _thresholds(combine(distances, weights), neighbours, few))
 
 
-def _few(samples: Samples, per_patch: int, rng: np.random.Generator) -> Samples:
-    """Return at most so many random pixels of every patch."""
-    at = [rng.permutation(np.flatnonzero(samples.patches == i))[:per_patch] for i in np.unique(samples.patches)]
+def _few(samples: Samples) -> Samples:
+    """Return at most `FIT_PIXELS` random pixels of every patch."""
+    rng = np.random.default_rng(0)
+    at = [rng.permutation(np.flatnonzero(samples.patches == i))[:FIT_PIXELS] for i in np.unique(samples.patches)]
     return samples.take(np.sort(np.concatenate(at)))
 
 
-def _left_out(distance: Real, knn: Any, few: Samples, same_scan: npt.NDArray[np.bool_]) -> float:
+def _left_out(distance: Real, knn: Voters, few: Samples, same_scan: npt.NDArray[np.bool_]) -> float:
     """Return the pixel accuracy, mean over the materials of two or more scans, without votes of the same scan."""
     found = knn.predict(np.where(same_scan, _FAR, distance))
     return float(np.mean([(found[few.names == n] == n).mean() for n in np.unique(few.names[few.shared])]))

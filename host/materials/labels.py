@@ -190,7 +190,6 @@ def patches_from_labels(
     x_m: npt.ArrayLike,
     y_m: npt.ArrayLike,
     unit: Literal["pixel", "mm"] = "pixel",
-    flip_y: bool = False,
     margin_mm: float = 0.0,
 ) -> tuple[Segmentation, dict[int, str]]:
     """Make patches of boxes drawn by hand.
@@ -203,8 +202,6 @@ def patches_from_labels(
         Pixel centres in metres.
     unit
         Unit of the boxes.
-    flip_y
-        True if pixel rows count from the top (largest y).
     margin_mm
         Margin inside the box; hand-drawn boxes usually lie inside the material already.
 
@@ -227,8 +224,6 @@ def patches_from_labels(
             mask = box_mask(box, x_m, y_m)
         else:
             x0, y0, x1, y1 = (round(b) for b in box)
-            if flip_y:
-                y0, y1 = y.size - y1, y.size - y0
             mask = np.zeros(labels.shape, bool)
             mask[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = True
         if not mask.any():
@@ -240,4 +235,4 @@ def patches_from_labels(
         patches.append(make_patch(n, mask, x_m, y_m, margin_mm))
         labels[mask] = n
         names[n] = name
-    return Segmentation(labels, tuple(patches), float("nan")), names
+    return Segmentation(labels, tuple(patches)), names

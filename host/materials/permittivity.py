@@ -68,11 +68,6 @@ class Permittivity:
         """True if P is known and too close to 1 for a permittivity."""
         return bool(np.isfinite(self.ratio)) and not self.metal_distance >= METAL_LIKE
 
-    @property
-    def determinable(self) -> bool:
-        """True if there is an estimate."""
-        return self.value is not None
-
 
 def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
     """Format a permittivity: `2.89 - j0.43` for a lossy medium, `2.89 + j27.30` for one with gain.

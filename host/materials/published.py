@@ -31,7 +31,7 @@ from polysight.shared.files import read_bounded, read_json
 
 Image = npt.NDArray[np.complexfloating]
 PIXELS = 120
-"""Number of pixels of a box, at even intervals: the paper's "about 80 to 120" for each material."""
+"""Largest number of pixels of a box, at even intervals: the paper's "about 80 to 120" for each material."""
 ORIENTATIONS = {
     "x to the right, y along the rows": lambda a: a,
     "y from the last row": lambda a: a[::-1],
@@ -167,7 +167,7 @@ def image_orientation(scans: Sequence[LabelledScan]) -> str:
     return best if shares[best] > shares[first] + _CLEARLY else first
 
 
-def entries_of_boxes(scan: LabelledScan, angle_deg: float, pixels: int = PIXELS) -> list[Entry]:
+def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
     """Return library entries of a labelled scan, each box relative to the scan's metal; leakage is not removed.
 
     Parameters
@@ -176,8 +176,6 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float, pixels: int = PIXELS)
         In the right orientation.
     angle_deg
         Incidence angle.
-    pixels
-        Largest number of pixels of a box.
 
     Raises
     ------
@@ -199,7 +197,7 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float, pixels: int = PIXELS)
         good = np.flatnonzero(np.isfinite(hs) & np.isfinite(vs) & (hs != 0) & (vs != 0))
         if good.size == 0:
             continue
-        at = good[np.unique(np.linspace(0, good.size - 1, min(pixels, good.size)).round().astype(int))]
+        at = good[np.unique(np.linspace(0, good.size - 1, min(PIXELS, good.size)).round().astype(int))]
         out.append(
             Entry(
                 name=name,

@@ -104,12 +104,12 @@ class Samples:
         return self.groups_of_material > 1
 
     @classmethod
-    def of(cls, library: Library, pixels_per_patch: int | None = None, seed: int = 0) -> Samples:
+    def of(cls, library: Library, pixels_per_patch: int | None = None) -> Samples:
         """Return the pixels of a library of one angle, grouped by scan; of each patch at most so many, at random.
 
         Raises DataError if no pixel is usable.
         """
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         x, names, groups, patches, specimens = [], [], [], [], []
         for i, e in enumerate(library.entries):
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -133,7 +133,7 @@ class Samples:
         which = None if self.specimens is None else self.specimens[at]
         return Samples(self.x[at], self.names[at], self.groups[at], self.patches[at], which, self.angles_deg)
 
-    def joined(self, other: Samples, seed: int = 0) -> Samples:
+    def joined(self, other: Samples) -> Samples:
         """Join with samples of a second angle, patch by patch.
 
         Scans of the same name are paired; without common names, scans are paired in their order. In a pair of scans
@@ -142,7 +142,7 @@ class Samples:
 
         Raises DataError if no material was seen under both angles.
         """
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         ours, theirs = np.unique(self.groups), np.unique(other.groups)
         common = np.intersect1d(ours, theirs)
         pairs = zip(common, common, strict=True) if common.size else zip(ours, theirs, strict=False)

@@ -94,11 +94,10 @@ class Patch:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """Label image int32 [ny, nx] (0: no patch), its patches, and the threshold between bright and dark, dB."""
+    """Label image int32 [ny, nx] (0: no patch), and its patches."""
 
     labels: npt.NDArray[np.int32]
     patches: tuple[Patch, ...]
-    threshold_db: float
 
 
 def axis_mm(axis_m: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -204,13 +203,13 @@ def segment(
         )
     pixel_mm = abs(float(axis_mm(x_m)[1] - axis_mm(x_m)[0]))
     level = np.maximum(level_db(h, v, usable, cfg.smooth_px), cfg.floor_db)
-    masks, threshold = _regions(_without_speckle(level, usable, cfg, pixel_mm), usable, cfg, pixel_mm)
+    masks = _regions(_without_speckle(level, usable, cfg, pixel_mm), usable, cfg, pixel_mm)
     labels = np.zeros(h.shape, np.int32)
     patches = []
     for mask in sorted(masks, key=lambda mask: _reading_order(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
         labels[mask] = len(patches) + 1
         patches.append(make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable))
-    return Segmentation(labels, tuple(patches), threshold)
+    return Segmentation(labels, tuple(patches))
 
 
 def _reading_order(mask: Mask, y_mm: npt.NDArray[np.float64], row_pitch_mm: float) -> tuple[float, float]:
@@ -229,7 +228,7 @@ def insides(images: ChannelImages) -> list[Mask]:
 def whole_plane(usable: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float) -> Segmentation:
     """Return all usable pixels as one patch, for a material that fills the image."""
     patch = make_patch(1, usable, x_m, y_m, margin_mm, usable)
-    return Segmentation(usable.astype(np.int32), (patch,), float("-inf"))
+    return Segmentation(usable.astype(np.int32), (patch,))
 
 
 def _without_speckle(
@@ -258,19 +257,18 @@ def _without_speckle(
 
 def _regions(
     levels: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]], usable: Mask, cfg: SegmentSettings, pixel_mm: float
-) -> tuple[list[Mask], float]:
-    """Return the masks of all patches, bright ones first, and the first threshold, dB."""
+) -> list[Mask]:
+    """Return the masks of all patches, bright ones first."""
     radius = max(1, round((cfg.smallest_mm / pixel_mm - 1) / 2))
     around = np.asarray(skimage.morphology.disk(max(1, round(cfg.margin_mm / pixel_mm))), bool)
     found: list[Mask] = []
-    rest, first = usable.copy(), 0.0
+    rest = usable.copy()
     for turn in range(_TURNS):
         level = levels[0] if turn == 0 else np.maximum(levels[1], cfg.dimmest_db)
         inside = level[rest]
         if inside.size == 0 or np.ptp(inside) == 0:
             break
         threshold = float(skimage.filters.threshold_otsu(inside))
-        first = threshold if turn == 0 else first
         bright = inside > threshold
         if not bright.any() or bright.all() or not _separate(inside, bright, cfg.least_contrast_db):
             break
@@ -279,7 +277,7 @@ def _regions(
             break
         found += new
         rest &= ~np.asarray(scipy.ndimage.binary_dilation(np.logical_or.reduce(new), around), bool)
-    return found, first
+    return found
 
 
 def _separate(level: npt.NDArray[np.float64], bright: Mask, least_contrast_db: float) -> bool:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER, SLOW
+from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER
 from polysight.host.materials.knn import fit_weights
 from polysight.host.materials.library import Entry, Library
 from polysight.host.materials.result import MaterialsResult
@@ -32,7 +32,7 @@ from polysight.shared.errors import DataError
 FOLDS = 8
 OPTIMISTIC = "by pixel (optimistic)"
 PIXELS = 16
-"""Pixels per patch for judging models."""
+"""Pixels of each patch, in a library and to judge models."""
 
 
 @dataclass(frozen=True)
@@ -198,15 +198,15 @@ def _confusion(true: npt.NDArray, found: npt.NDArray, names: npt.NDArray) -> Rea
 
 
 def best_model(samples: Samples) -> tuple[str, tuple[Score, ...]]:
-    """Return the name of the best model with whole groups left out, and the scores of all but the slowest.
+    """Return the name of the best model with whole groups left out, and the scores of all models.
 
     The criterion is the mean of the pixels' and of the patches' share.
     """
-    scores = tuple(score(samples, model) for model in MODELS if model != SLOW)
+    scores = tuple(score(samples, model) for model in MODELS)
     return max(scores, key=lambda s: s.pixels + s.patches).model, scores
 
 
-def score_unseen_materials(samples: Samples, model: str, channels: str = "H+V+P") -> dict[str, float]:
+def score_unseen_materials(samples: Samples, model: str) -> dict[str, float]:
     """Return the share of each material's patches that are called unknown if it is left out of the training data.
 
     The other materials are learnt from other scans than the judged one, as always.
@@ -216,7 +216,7 @@ def score_unseen_materials(samples: Samples, model: str, channels: str = "H+V+P"
         missed = []
         for train, test in splits(samples):
             others = train[samples.names[train] != name]
-            fitted = MODELS[model](channels)
+            fitted = MODELS[model]("H+V+P")
             fitted.fit(samples.take(others))
             for group in np.unique(samples.groups[test]):
                 at = test[samples.groups[test] == group]
@@ -247,7 +247,7 @@ def fit_samples(samples: Samples) -> dict[str, Any]:
 
     The scores are of materials in two or more scans; `not_judged` lists the others.
     """
-    scores = {model: score(samples, model) for model in MODELS if model != SLOW}
+    scores = {model: score(samples, model) for model in MODELS}
     weighted, own = fit_weights(samples), scores[DISCRIMINANT]
     judged = {s.model: {"pixels": s.pixels, "patches": s.patches} for s in scores.values()}
     for name in (DISCRIMINANT, PAPER):
@@ -300,8 +300,8 @@ class TrainingScan:
     specimens: Mapping[int, str] | None = None
 
 
-def entries_of(scan: TrainingScan, pixels_per_patch: int = 16) -> list[Entry]:
-    """Return the library entries of one scan: each patch of known material, with up to so many interior pixels.
+def entries_of(scan: TrainingScan) -> list[Entry]:
+    """Return the library entries of one scan: each patch of known material, with up to `PIXELS` interior pixels.
 
     Pixels are taken at even intervals, so that the same scan always gives the same entries.
     """
@@ -312,7 +312,7 @@ def entries_of(scan: TrainingScan, pixels_per_patch: int = 16) -> list[Entry]:
         rows, cols = np.nonzero(patch.patch.interior & np.isfinite(r.p) & (r.p != 0))
         if name is None or rows.size == 0:
             continue
-        pick = np.unique(np.linspace(0, rows.size - 1, min(pixels_per_patch, rows.size)).round().astype(int))
+        pick = np.unique(np.linspace(0, rows.size - 1, min(PIXELS, rows.size)).round().astype(int))
         at = (rows[pick], cols[pick])
         eps = patch.truth.permittivity if patch.truth else None
         theta = r.theta_rad[at] if r.theta_rad.ndim else r.theta_rad
@@ -335,7 +335,7 @@ def entries_of(scan: TrainingScan, pixels_per_patch: int = 16) -> list[Entry]:
     return out
 
 
-def make_library(scans: Iterable[TrainingScan], note: str = "", pixels_per_patch: int = 16) -> Library:
+def make_library(scans: Iterable[TrainingScan], note: str = "") -> Library:
     """Make a library of several scans, with its fit.
 
     Raises
@@ -343,7 +343,7 @@ def make_library(scans: Iterable[TrainingScan], note: str = "", pixels_per_patch
     DataError
         with no patch of known material, or fewer than two scans with one.
     """
-    entries = [e for scan in scans for e in entries_of(scan, pixels_per_patch)]
+    entries = [e for scan in scans for e in entries_of(scan)]
     if not entries:
         raise DataError(
             "no patch of known material in these scans",

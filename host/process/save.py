@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -183,7 +183,7 @@ def _report_context(
     from polysight.host.report import context_of, manifest_sentence
 
     images = findings.images
-    context = context_of(
+    return context_of(
         findings.found,
         images.x_m,
         images.y_m,
@@ -191,7 +191,7 @@ def _report_context(
         simulated=scan.simulated,
         valid=images.valid,
         plates=findings.plates,
-        named_by=named_by,
+        library_note=named_by,
         quality=quality,
         config=_config_summary(rig),
         provenance={
@@ -200,8 +200,10 @@ def _report_context(
             **versions(),
         },
         notes=[note for note in (manifest_sentence(quality["coverage"]), NOT_ON_HARDWARE, unnamed) if note],
+        plan=scan.plan,
+        rx_gains=rx_gains(images),
+        rig_file=tomli_w.dumps(to_builtins(rig)),
     )
-    return replace(context, plan=scan.plan, rx_gains=rx_gains(images), rig_file=tomli_w.dumps(to_builtins(rig)))
 
 
 def _config_summary(rig: Instrument) -> dict[str, Any]:

@@ -166,27 +166,19 @@ def context_of(
     result: MaterialsResult,
     x_m: npt.NDArray[np.float64],
     y_m: npt.NDArray[np.float64],
-    *,
-    title: str,
-    simulated: bool,
-    valid: npt.NDArray[np.bool_] | None = None,
     plates: Sequence[TruthPlate] = (),
-    named_by: str = "",
-    quality: dict[str, Any] | None = None,
-    config: dict[str, Any] | None = None,
-    provenance: dict[str, Any] | None = None,
-    notes: Sequence[str] = (),
+    **fields: Any,
 ) -> ReportContext:
-    """Return the context of a :class:`polysight.host.materials.MaterialsResult`; other arguments are passed on."""
+    """Return the context of a :class:`polysight.host.materials.MaterialsResult`.
+
+    `plates` are the true ones, if known; `fields` are the remaining attributes of :class:`ReportContext`.
+    """
     return ReportContext(
-        title=title,
-        simulated=simulated,
         x_m=x_m,
         y_m=y_m,
         h=result.calibrated.h,
         v=result.calibrated.v,
         p=result.calibrated.p,
-        valid=valid,
         materials=result.rows(),
         segments=result.segmentation.labels,
         pixel_names={r.patch.label: (r.names, r.patch.interior) for r in result.patches if r.names is not None},
@@ -194,11 +186,7 @@ def context_of(
         metal_how=result.metal.how,
         pixel_accuracy=pixel_accuracy(result),
         expected_accuracy=expected_pixel_accuracy(result),
-        library_note=named_by,
-        quality=quality or {},
-        config=config or {},
-        provenance=provenance or {},
-        notes=list(notes),
+        **fields,
     )
 
 

@@ -30,10 +30,12 @@ def inside(folder: Path, name: str, within: str = "") -> Path:
     DataError
         if the path, with links followed, is elsewhere.
     """
-    path, root = folder / name, (folder / within).resolve()
+    path, home = folder / name, folder.resolve()
+    root = (folder / within).resolve() if within else home
     try:
-        there = ".." not in path.parts and path.resolve().is_relative_to(folder.resolve() / within)
-        there = there and path.resolve() != root and root.is_relative_to(folder.resolve())
+        found = path.resolve()
+        there = ".." not in path.parts and found.is_relative_to(home / within)
+        there = there and found != root and root.is_relative_to(home)
     except (OSError, ValueError):  # a name that no file can have
         there = False
     if not there:

@@ -156,39 +156,32 @@ def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Reason]:
     ]
 
 
-def metal_reasons(patch: str, enough: bool, sure: bool, given: bool, against: bool, alone: bool) -> list[Reason]:
-    """Judge the metal reference `patch` ("patch 3"): confirmed by the scene, given by the user, or neither.
+def metal_reasons(
+    patch: str, likely: bool, certain: bool, given: bool, contradicted: bool, only_patch: bool
+) -> list[Reason]:
+    """Judge the metal reference `patch` ("patch 3").
 
-    The rest of the scene shows that it is metal (`enough`), with certainty (`sure`), contradicts it (`against`), or has
-    no other patch that gives evidence (`alone`). `given`: the user chose it.
+    By the other patches it is `likely` or `certain` to be metal, or `contradicted`; `only_patch`: there are no others.
+    `given`: the user chose it.
     """
-    give = "lay a metal plate into the scene and name it (--metal X,Y,W,H), or use `polysight calibrate metal`"
-    if given and against:
-        return [
-            Reason(
-                "none" if not enough and not alone else "care",
-                f"the given metal reference ({patch}) does not look like metal",
-                "it reflects H and V differently, or relative to it the other patches are impossible materials",
-                give,
-                8.0,
-            )
-        ]
-    if given or sure:
+    do = "lay a metal plate into the scene and name it (--metal X,Y,W,H), or use `polysight calibrate metal`"
+    if given and contradicted:
+        return [Reason(
+            "care" if likely or only_patch else "none",
+            f"the given metal reference ({patch}) does not look like metal",
+            "it reflects H and V differently, or relative to it the other patches are impossible materials", do, 8.0,
+        )]  # fmt: skip
+    if given or certain:
         return []
-    if enough:
-        return [
-            Reason(
-                "care",
-                f"the metal reference ({patch}) is likely metal, not certainly",
-                "a wet or conducting plate could look like it; all permittivities depend on it",
-                give,
-                2.8,
-            )
-        ]
+    if likely:
+        return [Reason(
+            "care", f"the metal reference ({patch}) is likely metal, not certainly",
+            "a wet or conducting plate could look like it; all permittivities depend on it", do, 2.8,
+        )]  # fmt: skip
     why = "relative to it the other patches are impossible materials, or too few of them give evidence"
-    if alone:
+    if only_patch:
         why = "nothing else in the scene can show that it is metal"
-    return [Reason("none", f"no metal reference: {patch} is not shown to be metal", why, give, 8.0)]
+    return [Reason("none", f"no metal reference: {patch} is not shown to be metal", why, do, 8.0)]
 
 
 def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> list[Reason]:

@@ -249,7 +249,7 @@ def _sweep(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
         disturbances = {"if_offset_hz": offset}
         with scanned("direct path", (), run.config, 900, grid=GRID, disturbances=disturbances) as (source, _):
             data = source.read_row(source.instrument.receivers[0].name, 0)
-        chirps, valid = decode_row(data.payload, data.missing, data.frames_expected, chirp.samples)
+            chirps, valid = decode_row(data.payload, data.missing, data.frames_expected, chirp.samples)
         swept.append(tones(chirps[:, valid], chirp))
         if offset == USUAL_HZ:
             shown = chirps[:, valid]

@@ -12,6 +12,7 @@ import pytest
 from polysight.host.catalogue import NOTES, Notes, Scans, read_notes, scans, write_notes
 from polysight.host.store import MANIFEST, ScanFolder, manifest
 from polysight.shared.errors import ConfigError, DataError
+from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
 
 
@@ -44,6 +45,17 @@ def test_images_without_materials_are_no_result(root):
     (root / "done" / "products" / "materials.json").unlink()
     found = Scans(root).summary("done")
     assert (found.processed, found.images_only, found.verdict, found.materials) == (False, True, "", ())
+
+
+def test_a_scan_that_has_not_ended_runs_or_pauses_while_its_program_lives(root):
+    scan, listed = root / "week/lost", Scans(root)
+    with open_control(scan):
+        assert listed.summary("week/lost").state == "running"
+        with (scan / MANIFEST).open("ab") as f:
+            f.write(manifest.encode_line({"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"}))
+        assert listed.summary("week/lost").state == "paused"
+    os.utime(scan / MANIFEST, (1e9, 1e9))
+    assert listed.summary("week/lost").state == "lost"
 
 
 def test_rows_are_counted_as_the_scan_folder_counts_them(root):

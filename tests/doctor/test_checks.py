@@ -19,10 +19,12 @@ from polysight.host.doctor.check_host import (
     check_receivers,
     check_time,
 )
+from polysight.host.doctor.check_pi import check_keys
 from polysight.host.doctor.checks import CHECKS, run_checks
 from polysight.host.doctor.context import CheckContext, DoctorOptions, System, error, ok
 from polysight.host.doctor.receiver_load import LoadResult, measure_receivers
 from polysight.shared.messages import GPIOD, WIRES, HelloReply
+from polysight.shared.sockets import HOST_KEYS
 from polysight.shared.tables import to_builtins
 from tests.support.doctor.case import QUICK, RIG, context_of
 from tests.support.rigs import programmed_rig
@@ -75,6 +77,15 @@ def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
 )
 def test_a_lost_clock_is_an_error_and_an_unsynchronised_one_a_warning(system, verdict):
     assert check_host_clock(context_of(system=system)).verdict == verdict
+
+
+@pytest.mark.parametrize(("mode", "verdict"), [(0o600, "ok"), (0o640, "warning"), (None, "error")])
+def test_the_secret_key_must_be_there_and_for_its_user_alone(tmp_path, mode, verdict):
+    for name in HOST_KEYS if mode else ():
+        (tmp_path / name).touch(mode)
+        (tmp_path / name).chmod(mode)
+    addresses = {"command_address": "tcp://192.0.2.1:5601", "event_address": "tcp://192.0.2.1:5602"}
+    assert check_keys(context_of(programmed_rig(pi=addresses | {"key_dir": str(tmp_path)}))).verdict == verdict
 
 
 def test_the_kernel_reports_if_its_clock_is_synchronised():

@@ -9,7 +9,6 @@ import time
 
 import pytest
 
-from polysight.host.acquisition.pi_client import RefusedError
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
 from polysight.host.doctor.checks import run_doctor
@@ -19,12 +18,14 @@ from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validation import validate
 from polysight.shared import __version__
 from polysight.shared.config import load_instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.messages import WIRE_VERSION, BeginRun, HelloReply
 from polysight.shared.raster import plan_raster
 from polysight.simulators.builds import sketch_compiler
 from tests.support.doctor.case import QUICK
 from tests.support.doctor.live_rig import answering
 from tests.support.processes import wait_for
+from tests.support.refusals import refused
 
 
 def assert_failed(findings, *names):
@@ -108,7 +109,7 @@ def test_a_scan_in_progress_is_not_disturbed(live):
     with live.pi() as pi:
         pi.begin_run(run)
         found = live.doctor(pulse=True, move=True)
-        with pytest.raises(RefusedError, match="another"):
+        with refused(ErrorCode.REFUSED_BY_PEER, "another"):
             pi.pulse(16, 1500, 1)
         pi.end_run("another", "abort", "test")
     assert_failed(found, "rig is free")
@@ -197,15 +198,3 @@ def test_a_pi_of_another_release_is_an_error(unanswered, changes, version, check
     assert found[check].verdict == "error"
     assert all(value in found[check].found for value in changes.values())
     assert skips in skipped(found, check)
-
-
-def test_missing_keys(unanswered, tmp_path):
-    def change(table):
-        table["pi"] |= {"command_address": "tcp://192.0.2.1:5601", "event_address": "tcp://192.0.2.1:5602"}
-        table["pi"]["key_dir"] = str(tmp_path / "nothing")
-
-    unanswered.folder.joinpath("rig").mkdir()
-    found = unanswered.doctor(unanswered.variant(change))
-    assert found["keys"].verdict == "error"
-    assert "host.key_secret" in found["keys"].found
-    assert "pi" in skipped(found, "keys")

@@ -17,7 +17,7 @@ def _full(rig, **options):
 
 @pytest.mark.parametrize(("columns", "rows", "step"), [(41, 41, 4.0), (350, 200, 2.0)])
 def test_without_a_taper_the_measured_response_is_the_geometrys_limit(make_rig, columns, rows, step):
-    board = _full(make_rig(columns, rows, step, step, pixels=(31, 31)), taper="boxcar", window="boxcar")
+    board = _full(make_rig(columns, rows, step, step, pixels=(31, 31)), taper="boxcar")
     response = point_response(board.aperture, board.weights)
     np.testing.assert_allclose(response.width_mm, response.limit_mm, rtol=0.08)
     assert max(response.sidelobe_db) < -11  # a sinc's first sidelobe is -13.3 dB

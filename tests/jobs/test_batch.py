@@ -212,7 +212,7 @@ def test_a_dask_cluster_does_the_same(tmp_path):
     todo = jobs(tmp_path / "in", "a", "bad", "c")
     # Threads of this process stand for the workers: the programs they start are their own all the same.
     with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, protocol="tcp"
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0", protocol="tcp"
     ) as cluster:
         outcomes = process_many(todo, tmp_path / "out", 1, dask=cluster.scheduler_address)
     assert [o.status for o in outcomes] == ["done", "failed", "done"]
@@ -281,7 +281,7 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
     with (
         dask.config.set({"distributed.worker.preload": [str(preload)]}),
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp"
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", protocol="tcp"
         ) as cluster,
     ):
         outcomes = process_many(todo, tmp_path / "out", 1, dask=cluster.scheduler_address)

@@ -98,6 +98,12 @@ def test_names_of_any_script_are_kept_in_one_form(text, name):
     assert clean_name(name.partition("#")[0]) == name.partition("#")[0]
 
 
+@pytest.mark.parametrize("mark", ["\u200b", "\u00ad", "\u2060", "\ufeff"])
+def test_marks_that_show_nothing_are_no_part_of_a_name(mark):
+    with refused(ErrorCode.VALUE_INVALID):
+        clean_name(f"rubber{mark}")
+
+
 def test_label_files_are_read_back_and_pixels_become_millimetres(tmp_path):
     path = tmp_path / "labels.json"
     given = checked({"copper": COPPER, "\u6a61\u6728": OAK}, specimens={"\u6a61\u6728": "board 7"})

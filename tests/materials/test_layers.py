@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.host.materials.layer_fit import LayerFit, fit_layer
-from polysight.host.materials.layers import Bands, Layer, Spectrum, predict
+from polysight.host.materials.layer_fit import LayerFit, check_range, fit_layer
+from polysight.host.materials.layers import Bands, Layer, Spectrum, check_stack, predict
 from polysight.host.polarimetry import permittivity_from_ratio, ratio_from_permittivity
 from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
@@ -70,15 +70,6 @@ def test_water_behind_glass_where_eq3_is_off_by_a_factor():
     q, _ = predict(stack, BANDS, THETA)
     single = permittivity_from_ratio(1 / q.mean(), THETA)
     assert single.real < 9.37 / 1.5 or single.real > 9.37 * 1.5 or abs(single.imag) < 18 / 1.5
-
-
-def test_thickness_is_fitted_when_asked():
-    eps, d = 3.56 - 0.18j, 1e-3
-    bands = measured([Layer("acrylic", eps, d)], 1e-3, 5e-3)
-    fit = fit_layer(bands, [Layer("acrylic", None, d)], THETA, thickness_range_m=(0.5e-3, 2e-3))
-    truth = [s for s in (fit, *fit.rivals) if abs(s.permittivity - eps) < 0.1]
-    assert truth
-    assert truth[0].thickness_m == pytest.approx(d, rel=0.02)
 
 
 def test_error_bars_are_those_of_repeated_measurements():
@@ -158,3 +149,15 @@ def test_what_one_scan_in_a_thousand_would_miss_is_said_and_its_rivals_are_kept(
     assert loose.stretch > 2
     assert loose.rivals[0].chi2 - loose.chi2 > 9  # kept all the same
     assert loose.rivals[0].permittivity == pytest.approx(stiff.rivals[0].permittivity, rel=1e-3)
+
+
+@pytest.mark.parametrize("eps", [0.5 + 0j, 4 + 0.5j, 1e9 + 0j, 4 - 1e9j])
+def test_a_known_layer_that_no_passive_material_is(eps):
+    with refused(ErrorCode.VALUE_INVALID):
+        check_stack([Layer("a", eps, 1e-3), Layer("b")])
+
+
+def test_a_range_of_thickness_that_nothing_can_tell_apart():
+    check_range((0.5e-3, 20e-3))
+    with refused(ErrorCode.VALUE_INVALID, "1000 mm"):
+        check_range((0.5e-3, 1.0))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polysight.host.cli.main import main
-from polysight.host.materials import Entry, Library, parse_layer
+from polysight.host.materials import Entry, Library
 from polysight.host.materials.layers import Layer, Spectrum, predict
 from tests.support.paths import RIG_FILE
 from tests.support.published_files import write_materials
@@ -40,26 +40,6 @@ def test_water_behind_glass_as_typed(tmp_path, capsys):
     assert "in the stack   9.37 - j18.00" in capsys.readouterr().out
     assert main(["permittivity", str(folder), "--segment", "9"]) != 0
     assert "no segment 9" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("text", "layer"),
-    [
-        ("glass,5.5,0.05,3", GLASS),
-        ("water, 9.37, 18", Layer("water", 9.37 - 18j)),
-        ("sheet,?,0.5", Layer("sheet", None, 0.5e-3)),
-        ("liquid,?", Layer("liquid")),
-    ],
-)
-def test_layers_as_typed(text, layer):
-    assert parse_layer(text) == layer
-
-
-@pytest.mark.parametrize("text", ["glass", "glass,5.5", "glass,a,b", "x,?,-1", "x,1,2,3,4"])
-def test_other_layers_are_refused(text, capsys):
-    with pytest.raises(SystemExit):
-        main(["permittivity", "out", "--layer", text])
-    assert "NAME,REAL,LOSS,MM" in capsys.readouterr().err
 
 
 def sugar() -> list[Entry]:

@@ -23,6 +23,7 @@ from polysight.host.materials import (
     read_truth,
 )
 from polysight.host.materials.analyse import Optics
+from polysight.host.materials.classify import features_of
 from polysight.host.materials.knn import ratio_distance
 from polysight.host.materials.library import FORMAT
 from polysight.host.materials.samples import majority
@@ -165,12 +166,12 @@ def test_distances_are_distances():
 
 
 def test_pixels_that_are_not_finite_are_unknown(library):
-    c = Classifier(library, Weights())
-    names, distance = c.pixels([0.5, np.nan, 0.5], [0.1, 0.1, 0.1], [4 + 1j, 4 + 1j, 0])
-    assert names[1] == names[2] == UNKNOWN
-    assert names[0] != UNKNOWN
-    assert np.isinf(distance[1:]).all()
-    assert c.patch([], [], []).name == UNKNOWN
+    some = features_of([0.5, np.nan, 0.5], [0.1, 0.1, 0.1], [4 + 1j, 4 + 1j, 0])
+    found, empty = Classifier(library, Weights()).scan([some, features_of([], [], [])])
+    assert found.names[1] == found.names[2] == UNKNOWN
+    assert found.names[0] != UNKNOWN
+    assert np.isinf(found.distance[1:]).all()
+    assert empty.verdict.name == UNKNOWN
 
 
 def test_a_majority_names_the_patch():
@@ -198,9 +199,9 @@ def test_metal_has_no_permittivity():
     rng = np.random.default_rng(0)
     n = rng.standard_normal((4, 150)) * 0.01
     e = estimate_permittivity(1 + n[0] + 1j * n[1], 1 + n[2] + 1j * n[3], THETA)
-    assert not e.determinable
+    assert e.value is None
     assert e.metal_distance < 0.05
-    assert not estimate_permittivity(np.zeros(0, complex), np.zeros(0, complex), THETA).determinable
+    assert estimate_permittivity(np.zeros(0, complex), np.zeros(0, complex), THETA).value is None
 
 
 def test_median_ratio_is_unbiased_where_v_nearly_vanishes():
@@ -217,7 +218,7 @@ def test_permittivity_of_the_plates_within_ten_percent(synthetic):
     result = synthetic(21).analyse()
     for r in result.patches:
         if r.truth.metal:
-            assert not r.permittivity.determinable
+            assert r.permittivity.value is None
         else:
             assert r.permittivity.value.real == pytest.approx(r.truth.permittivity.real, rel=0.10)
 

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
-from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER, SLOW
+from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER
 from polysight.host.materials.knn import PaperKnn, Weights, fit_weights
 from polysight.host.materials.samples import CHANNELS, Model, Samples, feature_matrix
 from polysight.host.materials.train import best_model, score, splits
 from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
-
-QUICK = [m for m in MODELS if m != SLOW]
 
 
 def samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=0, angle=0.0):
@@ -41,7 +39,7 @@ def test_every_model_learns_what_is_there_to_learn(model):
     assert score(samples(groups=4, noise=0.003), model).pixels > 0.97
 
 
-@pytest.mark.parametrize("model", QUICK)
+@pytest.mark.parametrize("model", MODELS)
 def test_no_model_finds_what_is_not_there(model):
     data = samples(materials=4)
     rng = np.random.default_rng(1)
@@ -148,7 +146,6 @@ def test_channels_alone_know_less():
 def test_the_best_is_chosen_and_one_scan_is_refused():
     name, scores = best_model(samples(groups=3, pixels=8))
     assert max(scores, key=lambda s: s.pixels + s.patches).model == name
-    assert SLOW not in [s.model for s in scores]
     with refused(ErrorCode.NOT_ENOUGH_DATA):
         score(samples(groups=1), name)
 

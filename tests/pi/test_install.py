@@ -159,7 +159,7 @@ def bench(tmp_path):
     (tmp_path / "installed").touch()
     return {
         **os.environ, "PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}", "LOG": str(tmp_path / "log"),
-        "PIP": str(tmp_path / "bin/pip"), "REPO": str(tmp_path / "root"), "PI_HOME": str(tmp_path / "home"),
+        "PIP": str(tmp_path / "bin/pip"), "ROOT": str(tmp_path / "root"), "PI_HOME": str(tmp_path / "home"),
     }  # fmt: skip
 
 

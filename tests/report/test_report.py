@@ -1,7 +1,6 @@
-"""The report is one file, loads nothing, says what is simulated, and its products are whole or absent."""
+"""The report is one file, loads nothing, and says what is simulated."""
 
 import base64
-import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -11,13 +10,11 @@ import pytest
 from matplotlib import colormaps
 
 from polysight.host.process import masked_runs
-from polysight.host.products import plain, read_image, write_atomically, write_image, write_json
 from polysight.host.report import ReportContext, write_report
 from polysight.host.report.maps import coverage_figure
 from polysight.host.report.report import render
 from polysight.host.report.style import colours_of, png
 from polysight.host.report.tables import imaging_table, masked_positions, pretty, quality_tables, text
-from polysight.shared.errors import DataError
 from polysight.shared.raster import RasterPlan
 from tests.support.products import unrendered
 
@@ -227,50 +224,6 @@ def test_one_material_has_one_colour(ctx):
     table = colours_of(ctx)
     assert {"copper", "acrylic", "cork", "PET <b>", "unknown"} == set(table)
     assert len(set(table.values())) == len(table)
-
-
-def test_image_product_round_trips(ctx, tmp_path):
-    path = tmp_path / "products" / "image.npz"
-    write_image(path, ctx.h, ctx.v, ctx.p, ctx.x_m, ctx.y_m, ctx.valid)
-    z = read_image(path)
-    assert {k: a.dtype for k, a in z.items()} == {
-        **dict.fromkeys(("h", "v", "p"), np.dtype(np.complex64)),
-        **dict.fromkeys(("x_m", "y_m"), np.dtype(np.float64)),
-        "valid": np.dtype(np.bool_),
-    }
-    np.testing.assert_array_equal(z["h"], ctx.h)
-    np.testing.assert_array_equal(z["y_m"], ctx.y_m)
-    assert [p.name for p in path.parent.iterdir()] == ["image.npz"]
-    with pytest.raises(DataError):
-        write_image(path, ctx.h[1:], ctx.v, ctx.p, ctx.x_m, ctx.y_m, ctx.valid)
-    path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(DataError):
-        read_image(path)
-
-
-def test_json_products_are_strict(tmp_path):
-    content = {"a": np.float32(1.5), "b": [np.inf, float("nan"), 2 - 1j], "c": np.array([1, 2]), "d": (True, None, "ε")}
-    write_json(tmp_path / "q.json", content)
-    assert json.loads((tmp_path / "q.json").read_text(encoding="utf-8")) == {
-        "a": 1.5,
-        "b": [None, None, {"real": 2.0, "imag": -1.0}],
-        "c": [1, 2],
-        "d": [True, None, "ε"],
-    }
-    assert plain(plain(content)) == plain(content)
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "x.json"
-    write_atomically(path, b"old")
-
-    def full(_fd):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError):  # noqa: PT011
-        write_atomically(path, b"new")
-    assert path.read_bytes() == b"old"
 
 
 def test_numbers_read_well():

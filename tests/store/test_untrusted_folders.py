@@ -117,30 +117,39 @@ def test_an_archive_that_claims_too_much_is_refused_by_its_size(read, tmp_path):
         read(bomb(tmp_path / "big.npz"))
 
 
-@pytest.mark.parametrize("change", [{"packets": 0xFFFFFFFF, "size": 0}, {"packets": 0xFFFFFFFF}])
-def test_a_packet_log_that_claims_too_much_is_refused_by_its_size(scan, change):
-
-    board = next(iter(scan.committed()[0].boards.values()))
-    path = (scan.path / board.file).with_suffix(PACKETS)
-    line, _, tail = path.read_bytes().partition(b"\n")
-    head = json.loads(line)
-    at = 16 * head["batches"]
-    runs = np.frombuffer(tail[at : at + RUN.itemsize * head["runs"]], dtype=RUN).copy()
-    for key, value in change.items():
-        runs[key] = value
-    path.write_bytes(line + b"\n" + tail[:at] + runs.tobytes() + tail[at + runs.nbytes :])
-    with pytest.raises(DataError):
-        read_packets(path, np.fromfile(scan.path / board.file, dtype=np.uint8))
-
-
-def test_a_row_that_claims_to_be_larger_than_its_file_is_refused(scan):
-    board = next(iter(scan.committed()[0].boards.values()))
-    path = (scan.path / board.file).with_suffix(PACKETS)
-    line, _, tail = path.read_bytes().partition(b"\n")
-    head = json.loads(line)
+def larger_row(head, runs):
     head["evidence"]["expected"] = 1 << 45
-    path.write_bytes(json.dumps(head).encode() + b"\n" + tail)
-    with pytest.raises(PolysightError):
+    return runs
+
+
+def overflow(head, _runs):
+    head["runs"] = 1 << 16
+    return claims(1 << 16, 0xFFFFFFFF, 0x8000)  # 2**63 bytes in all: 64 bits call that negative
+
+
+def claims(runs: int, packets: int, size: int) -> np.ndarray:
+    return np.array([(0, 0, packets, size, 0)] * runs, RUN)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        larger_row,
+        overflow,
+        lambda _, runs: claims(len(runs), 0xFFFFFFFF, 0),
+        lambda _, runs: claims(len(runs), 0xFFFFFFFF, 1456),
+    ],
+    ids=["row", "overflow", "empty packets", "many packets"],
+)
+def test_a_packet_log_that_claims_too_much_is_refused(scan, change):
+    board = next(iter(scan.committed()[0].boards.values()))
+    path = (scan.path / board.file).with_suffix(PACKETS)
+    line, _, tail = path.read_bytes().partition(b"\n")
+    head = json.loads(line)
+    at, end = 16 * head["batches"], 16 * head["batches"] + RUN.itemsize * head["runs"]
+    runs = change(head, np.frombuffer(tail[at:end], RUN))
+    path.write_bytes(json.dumps(head).encode() + b"\n" + tail[:at] + runs.tobytes() + tail[end:])
+    with refused(ErrorCode.FILE_DAMAGED):
         read_packets(path, np.fromfile(scan.path / board.file, dtype=np.uint8))
 
 
@@ -243,20 +252,6 @@ def test_files_of_any_size_are_refused_before_they_are_read(scan, file):
     for use in (manifest.read, read_index, lambda path: read_packets(path, np.zeros(8, np.uint8))):
         with pytest.raises(DataError):
             use(path)
-
-
-def test_a_packet_log_whose_numbers_overflow_is_refused(scan):
-    board = next(iter(scan.committed()[0].boards.values()))
-    path = (scan.path / board.file).with_suffix(PACKETS)
-    line, _, tail = path.read_bytes().partition(b"\n")
-    head = json.loads(line)
-    at = 16 * head["batches"]
-    runs = np.zeros(1 << 16, RUN)
-    runs["packets"], runs["size"] = 0xFFFFFFFF, 0x8000  # 2**63 bytes in all: 64 bits call that negative
-    head["runs"] = runs.size
-    path.write_bytes(json.dumps(head).encode() + b"\n" + tail[:at] + runs.tobytes())
-    with refused(ErrorCode.FILE_DAMAGED):
-        read_packets(path, np.fromfile(scan.path / board.file, dtype=np.uint8))
 
 
 DEEP = "[" * 100_000

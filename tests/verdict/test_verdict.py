@@ -118,7 +118,7 @@ def test_a_weak_direct_path_shows_in_the_metals_level():
 
 
 @pytest.mark.parametrize(
-    ("enough", "sure", "given", "against", "alone", "want"),
+    ("likely", "certain", "given", "contradicted", "only_patch", "want"),
     [
         (True, True, False, False, False, "good"),
         (True, False, False, False, False, "care"),
@@ -129,8 +129,8 @@ def test_a_weak_direct_path_shows_in_the_metals_level():
         (False, False, True, True, False, "none"),
     ],
 )
-def test_metal_is_never_judged_by_itself(enough, sure, given, against, alone, want):
-    assert level(metal_reasons("patch 3", enough, sure, given, against, alone)) == want
+def test_metal_is_never_judged_by_itself(likely, certain, given, contradicted, only_patch, want):
+    assert level(metal_reasons("patch 3", likely, certain, given, contradicted, only_patch)) == want
 
 
 def test_other_rules():

@@ -1,0 +1,56 @@
+"""Files of products are written whole or not at all, and read back as they were."""
+
+import json
+
+import numpy as np
+import pytest
+
+from polysight.host.products import plain, read_image, write_atomically, write_image, write_json
+from polysight.shared.errors import DataError
+
+
+def test_image_product_round_trips(tmp_path):
+    rng = np.random.default_rng(0)
+    h, v, p = (rng.standard_normal((3, 5, 7)) + 1j * rng.standard_normal((3, 5, 7))).astype(np.complex64)
+    x, y, valid = np.linspace(-0.1, 0.1, 7), np.linspace(0.0, 0.1, 5), rng.uniform(size=h.shape) < 0.8
+    path = tmp_path / "products" / "image.npz"
+    write_image(path, h, v, p, x, y, valid)
+    z = read_image(path)
+    assert {k: a.dtype for k, a in z.items()} == {
+        **dict.fromkeys(("h", "v", "p"), np.dtype(np.complex64)),
+        **dict.fromkeys(("x_m", "y_m"), np.dtype(np.float64)),
+        "valid": np.dtype(np.bool_),
+    }
+    np.testing.assert_array_equal(z["h"], h)
+    np.testing.assert_array_equal(z["y_m"], y)
+    assert [p.name for p in path.parent.iterdir()] == ["image.npz"]
+    with pytest.raises(DataError):
+        write_image(path, h[1:], v, p, x, y, valid)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(DataError):
+        read_image(path)
+
+
+def test_json_products_are_strict(tmp_path):
+    content = {"a": np.float32(1.5), "b": [np.inf, float("nan"), 2 - 1j], "c": np.array([1, 2]), "d": (True, None, "ε")}
+    write_json(tmp_path / "q.json", content)
+    assert json.loads((tmp_path / "q.json").read_text(encoding="utf-8")) == {
+        "a": 1.5,
+        "b": [None, None, {"real": 2.0, "imag": -1.0}],
+        "c": [1, 2],
+        "d": [True, None, "ε"],
+    }
+    assert plain(plain(content)) == plain(content)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "x.json"
+    write_atomically(path, b"old")
+
+    def full(_fd):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError):  # noqa: PT011
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"old"

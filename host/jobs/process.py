@@ -142,11 +142,18 @@ def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple
         except DataError as e:
             if not (new / IMAGE).exists():
                 raise
+            why = _why_no_pixel(pipeline) or e.why
             if (out / REPORT).exists():
                 where = f"{out} holds the earlier products; `polysight image` with another --out writes the images"
-                raise DataError(e.what, e.why, advice(e.remedy, where), code=e.code) from None
-            failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
+                raise DataError(e.what, why, advice(e.remedy, where), code=e.code) from None
+            failed = DataError(e.what, why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
     raise failed
+
+
+def _why_no_pixel(pipeline: Pipeline) -> str:
+    """Name the boards without any valid position, which leave no pixel valid; "" if there are none."""
+    boards = " and ".join(pipeline.quality.boards_masked)
+    return f"no position of {boards} has a direct path: TX or RX is off, or its data are constant" if boards else ""
 
 
 def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
@@ -236,6 +243,13 @@ def image(data: Path, out: Path, config: Path | None, view: View = AS_IN_RIG_FIL
     sys.stdout.flush()
     pipeline.quality.note_imaging(pipeline.images, images)
     write_json(out / QUALITY, quality_content(pipeline.quality))
+    if not images.valid.any():
+        raise DataError(
+            "the image has no valid pixel",
+            _why_no_pixel(pipeline) or "nothing was recorded, or all of it was masked",
+            f"`polysight sync-report {data} --out DIR` shows the direct path of each row",
+            code=ErrorCode.NO_DATA,
+        )
     return 0
 
 

@@ -44,7 +44,7 @@ class BoardQuality:
             "positions_masked": int(synced.valid.size - synced.valid.sum()),
             "masked_columns": masked_runs(~synced.valid[:: plan_raster(self.rig.grid).row(row).direction]),
             "direct_hz": np.where(synced.valid, synced.direct_hz, np.nan),
-            "stages": synced.stages,
+            "stages": {name: spread for name, spread in synced.stages.items() if np.isfinite(spread).all()},
             "direct_snr": _direct_snr(synced),
         }
         self.put(row, figures, echo_of_row(synced, self._filter))
@@ -155,6 +155,11 @@ class Quality:
         self.seconds: dict[str, float] = {}
         self.notes: dict[str, Any] = {}
         self._lock = threading.Lock()  # rows are processed in several threads
+
+    @property
+    def boards_masked(self) -> list[str]:
+        """Boards with rows of which no position has a direct path."""
+        return [name for name, b in self.boards.items() if b.positions and b.positions_masked == b.positions]
 
     def coverage(self) -> dict[str, Any]:
         """Compare rows, positions and frames with the plan; missing rows count as not received."""

@@ -34,7 +34,6 @@ from polysight.host.imaging import (
     reduction,
 )
 from polysight.host.process.quality import Quality
-from polysight.host.products import plain
 from polysight.host.store import (
     SAMPLE_ROWS,
     SAMPLES,
@@ -109,7 +108,7 @@ class _RowFigures(msgspec.Struct):
     positions: Count
     positions_masked: Count
     masked_columns: list[tuple[Count, Count]]
-    stages: list[tuple[str, float | None, float | None, float | None]]
+    stages: list[tuple[str, float, float, float]]
 
 
 def _read_figures(entry: object) -> dict[str, Any] | None:
@@ -118,7 +117,7 @@ def _read_figures(entry: object) -> dict[str, Any] | None:
         figures = msgspec.convert(entry, _RowFigures)
     except msgspec.ValidationError:
         return None
-    stages = {name: tuple(np.nan if s is None else s for s in spread) for name, *spread in figures.stages}
+    stages = {name: tuple(spread) for name, *spread in figures.stages}
     columns = [list(run) for run in figures.masked_columns]
     return {**msgspec.structs.asdict(figures), "masked_columns": columns, "stages": stages}
 
@@ -320,7 +319,7 @@ class KeptSamples:
         for name in _FIGURES:
             out[name] = quality.rows[row][name][forward]
         figures = {name: value for name, value in quality.rows[row].items() if name not in _FIGURES}
-        return out, plain({**figures, "stages": [[name, *spread] for name, spread in figures["stages"].items()]})
+        return out, {**figures, "stages": [[name, *spread] for name, spread in figures["stages"].items()]}
 
     def _put(self, board: str, row: int, record: Any, figures: dict[str, Any]) -> None:
         """Add a record to the images and its figures to the quality; the inverse of `_record`."""

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from polysight.host.cli.main import main
+from polysight.host.jobs.materials import report
 from polysight.host.materials import Entry, Library
 from polysight.host.materials.layers import Layer, Spectrum, predict
+from polysight.shared.error_codes import ErrorCode
 from tests.support.paths import RIG_FILE
 from tests.support.published_files import write_materials
+from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 GLASS = Layer("glass", 5.5 - 0.05j, 3e-3)
@@ -67,6 +70,12 @@ def test_concentration_of_a_library_and_of_published_files(tmp_path, capsys, for
     assert "watr" in capsys.readouterr().err
     assert main(["concentration", str(path), "--value", "water=0"]) == 0
     assert "median error" in capsys.readouterr().out
+
+
+def test_a_report_of_images_alone_says_what_is_missing(tmp_path):
+    (tmp_path / "image.npz").touch()
+    with refused(ErrorCode.FILE_MISSING, "report.html"):
+        report(tmp_path)
 
 
 def test_classifiers_are_judged_under_both_splits_as_typed(tmp_path, capsys):

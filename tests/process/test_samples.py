@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -11,9 +12,12 @@ import numpy as np
 import pytest
 
 from polysight.host.imaging import PLANE_REACH_M, ChannelImages, View
+from polysight.host.jobs.process import image, process
 from polysight.host.pipeline import Pipeline
-from polysight.host.process import map_rows
-from polysight.host.store import ScanFolder
+from polysight.host.process import ProcessRequest, map_rows
+from polysight.host.store import RowData, ScanFolder
+from polysight.host.store.manifest import encode_line
+from polysight.host.store.source import pieces_of
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from tests.support.pipelines import pipeline_of
@@ -190,6 +194,9 @@ def test_samples_can_be_read_as_the_specification_says(kept: Path) -> None:
         lambda h: {**h, "frequencies_hz": {"samples": "many"}},
         lambda h: {**h, "gate_m": [0.1]},
         lambda h: {**h, "gate_m": [None, 1.0]},
+        lambda h: {**h, "gate_m": [0.0, 10.0]},
+        lambda h: {**h, "gate_m": [0.0, 1e12]},
+        lambda h: {**h, "frequencies_hz": {"samples": [f + 1e6 for f in h["frequencies_hz"]["samples"]]}},
         lambda h: [h],
     ],
 )
@@ -198,6 +205,72 @@ def test_an_invalid_head_is_ignored(two_plates: Path, kept: Path, head) -> None:
     path.write_text(json.dumps(head(json.loads(path.read_text()))))
     expected, found = processed(two_plates, "none"), processed(kept, "read")
     assert same(found.form_images(), expected.form_images())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        None,
+        {"positions": None},
+        {"masked_columns": "abc"},
+        {"stages": [["x", None, "y", {}]]},
+        {"positions_masked": -5},
+    ],
+)
+def test_a_row_with_invalid_figures_is_made_again(two_plates: Path, kept: Path, change: dict | None) -> None:
+    path = kept / "samples" / "rows.jsonl"
+    facts = [json.loads(line) for line in path.read_text().splitlines()]
+    entry = facts[4]["boards"]["RH"]
+    entry["figures"] = change if change is None else {**entry["figures"], **change}
+    path.write_bytes(b"".join(encode_line({k: v for k, v in f.items() if k != "crc"}) for f in facts))
+    expected = processed(two_plates, "none").form_images()
+    assert same(processed(kept).form_images(), expected)
+    assert same(processed(without_raw(kept)).form_images(), expected)
+
+
+def damaged_raw(monkeypatch: pytest.MonkeyPatch, change: Callable[[str, np.ndarray], None]) -> None:
+    """Change the words int16 [chirp and sample, 2 x RX] of every row that is read."""
+    read_row = ScanFolder.read_row
+
+    def changed(self: ScanFolder, board: str, row: int) -> RowData:
+        found = read_row(self, board, row)
+        words = found.payload.view("<i2").reshape(-1, 8).copy()
+        change(board, words)
+        return RowData(pieces_of(words.view(np.uint8).ravel()), [], found.frames_expected, found.crc32)
+
+    monkeypatch.setattr(ScanFolder, "read_row", changed)
+
+
+@pytest.mark.parametrize("dead", [("RH", "RV"), ("RV",)])
+@pytest.mark.parametrize("command", ["image", "process"])
+def test_an_image_without_a_valid_pixel_is_an_error_that_names_the_board(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dead: tuple[str, ...], command: str
+) -> None:
+    def silent(board: str, words: np.ndarray) -> None:
+        words *= board not in dead
+
+    damaged_raw(monkeypatch, silent)
+    with refused(ErrorCode.NO_DATA, " and ".join(dead)):
+        if command == "image":
+            image(scan, tmp_path / "out", None)
+        else:
+            process(ProcessRequest(data=str(scan), out=str(tmp_path / "out")))
+    assert (tmp_path / "out" / "image.npz").exists()
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered in divide:RuntimeWarning")
+def test_rows_of_dead_receivers_are_kept(
+    scan: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def one_rx(_: str, words: np.ndarray) -> None:
+        words[:, [1, 2, 3, 5, 6, 7]] = 0
+
+    damaged_raw(monkeypatch, one_rx)
+    first = processed(scan)
+    assert not caplog.text
+    again = processed(without_raw(scan))
+    assert same(again.form_images(), first.form_images())
+    assert again.quality.to_dict()["boards"] == first.quality.to_dict()["boards"]
 
 
 @pytest.mark.parametrize("name", ["rows.jsonl", "RH.npy", "samples.json", ""])

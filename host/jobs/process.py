@@ -137,6 +137,7 @@ def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple
     are. Raises PolysightError.
     """
     with making_products(out, pipeline.source.scan_id) as new, current_step("image") as progress:
+        _check_dropped(pipeline, out)  # `out` is locked; `drop-raw` may have run since the rows were added
         try:
             return replace(pipeline.finish(new, options, plates, progress), folder=out)
         except DataError as e:
@@ -215,7 +216,10 @@ def process(request: ProcessRequest, threads: int | None = None) -> int:
 
 def _check_dropped(pipeline: Pipeline, out: Path) -> None:
     """Keep the mark of products whose raw data was dropped. Raises DataError if the new ones have fewer rows."""
-    if not (isinstance(pipeline.source, ScanFolder) and dropped_rows(pipeline.source) and (mark := raw_dropped(out))):
+    if not isinstance(pipeline.source, ScanFolder) or not (mark := raw_dropped(out)):
+        return
+    pipeline.source.reload()
+    if not dropped_rows(pipeline.source):
         return
     pipeline.quality.note(**{RAW_DROPPED: mark})
     coverage = pipeline.quality.coverage()

@@ -16,7 +16,7 @@ import pytest
 from polysight.host.cli.main import main
 from polysight.host.jobs.drop_raw import drop_raw, processed_digests
 from polysight.host.jobs.live_scan import resume
-from polysight.host.jobs.process import process
+from polysight.host.jobs.process import all_rows, load_options, make_products, process
 from polysight.host.process.request import ProcessRequest
 from polysight.host.products import REPORT, making_products
 from polysight.host.store import locked_samples
@@ -97,6 +97,14 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     again = json.loads((scan / "products" / "quality.json").read_text())
     assert again["raw_dropped"] == json.loads(products["quality.json"])["raw_dropped"]
     assert again["boards"] == dropped["boards"]
+
+
+def test_products_replaced_after_a_drop_in_between_keep_its_mark(scan):
+    request = ProcessRequest(data=str(scan), out=str(scan / "products"))
+    pipeline = all_rows(ScanFolder.load(scan), scan)
+    assert drop_raw(scan, None, yes=True) == 0
+    make_products(pipeline, scan / "products", load_options(request), ())
+    assert "raw_dropped" in json.loads((scan / "products" / "quality.json").read_text())
 
 
 @pytest.mark.parametrize("what", ["image only", "being made", "being processed", "sample", "no samples", "settings"])

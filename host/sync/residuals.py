@@ -60,12 +60,13 @@ def errors(
     two = found & (aligned.good.sum(axis=1) > 1)
     n = aligned.good[two].sum(axis=1)
     whole = (n[:, None] / np.stack([(n + 1) // 2, n // 2], axis=1)).astype(np.float32)
-    out = {
-        "received": received,
-        "aligned": one,
-        "averaged": _direct_path(done.halves[found].sum(axis=1), path),
-        "referenced": _object(done.halves[two] * whole[..., None, None], path) if two.any() else np.zeros((3, 0)),
-    }
+    with np.errstate(divide="ignore", invalid="ignore"):  # dead RX have no direct path: their figures are not finite
+        out = {
+            "received": received,
+            "aligned": one,
+            "averaged": _direct_path(done.halves[found].sum(axis=1), path),
+            "referenced": _object(done.halves[two] * whole[..., None, None], path) if two.any() else np.zeros((3, 0)),
+        }
     for values in out.values():
         values[0] *= sample_rate_hz
     return out

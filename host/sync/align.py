@@ -123,18 +123,20 @@ def align_pieces(
     Raises
     ------
     ValueError
-        if there is no piece.
+        if there is no piece, or the pieces are not the positions of `valid`.
     """
     linear, row, done = whole_blocks(linear), None, 0
     for words in pieces:
         if row is None:
             row = _empty_row(valid.shape, words.shape, (linear[1] - linear[0]) // FOLD)
         here = slice(done, done + len(words))
+        if words.shape[:2] != valid[here].shape:
+            raise ValueError(f"bursts {words.shape[:2]} at position {done} of {valid.shape}")
         align = by or _loops(words.shape[-1])
         align(words, valid[here], linear, equaliser, full_scale, row.part(here))
         done = here.stop
-    if row is None:
-        raise ValueError("a row without pieces")
+    if row is None or done != len(valid):
+        raise ValueError(f"{done} of {len(valid)} positions")
     return row
 
 

@@ -150,7 +150,12 @@ def _bursts(pieces: Iterable[NDArray[np.int16]], frames: int, setup: BoardSetup)
             raise _mismatch(found, (rx, samples), setup)
         yield words.reshape(-1, setup.pulses, samples, 2, rx)
     if frames:
-        raise _mismatch(frames, setup.path.steering.shape, setup)  # missing
+        raise DataError(
+            f"the recording ends {frames} frames before the end of its row",
+            "it is truncated, or was recorded with another rig file",
+            "use the rig file of this scan",
+            code=ErrorCode.NOT_ENOUGH_DATA,
+        )
 
 
 def _mismatch(frames: int, shape: tuple[int, ...], setup: BoardSetup) -> DataError:

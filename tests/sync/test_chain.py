@@ -169,3 +169,8 @@ def test_a_row_without_frames_is_invalid(setup):
 def test_frames_of_another_rig_are_refused(setup, shape):
     with refused(ErrorCode.MISMATCH, shape[1]):
         synchronise_row(np.zeros(shape, np.complex64), np.ones(shape[1], bool), setup)
+
+
+def test_a_truncated_recording_is_refused(setup):
+    with refused(ErrorCode.NOT_ENOUGH_DATA, PULSES):
+        synchronise_row(np.zeros((4, PULSES, 256), np.complex64), np.ones(2 * PULSES, bool), setup)

@@ -106,6 +106,13 @@ def test_a_row_in_pieces_is_the_same_row(loops):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize("positions", [0, 4, 6])
+def test_pieces_that_are_not_the_row_are_refused(loops, positions):
+    for by in (loops.align, align_in_numpy):
+        with pytest.raises(ValueError, match="position"):
+            align_pieces([bursts(1)] * positions, np.ones((5, 6), bool), (0, 192), by=by)
+
+
 @pytest.mark.parametrize("linear", [(0, 192), (8, 204), (3, 243), (10, 90), (4, 44)])
 @pytest.mark.parametrize("filtered", [True, False])
 def test_any_linear_part(loops, rig, linear, filtered):

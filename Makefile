@@ -13,9 +13,10 @@ unexport PYTHONDONTWRITEBYTECODE  # modules are compiled once, not for each of a
 help:  ## this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-KERNELS := $(wildcard host/sync/*.c host/sync/*.h) host/sync/build.py setup.py
+PROJECTS := shared pi_controller simulators host papers
+KERNELS := $(wildcard host/polysight/sync/*.c host/polysight/sync/*.h) host/polysight/sync/build.py host/setup.py
 
-$(VENV)/installed: pyproject.toml $(KERNELS)
+$(VENV)/installed: pyproject.toml $(PROJECTS:%=%/pyproject.toml) $(KERNELS)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 2; }
 	@./tests/install-python.sh $(PYTHON) $(VENV)
 	@touch $@
@@ -63,11 +64,12 @@ reproduce: $(VENV)/installed  ## the paper's tables and figures from simulation,
 	$(BIN)/polysight reproduce --out $(OUT)/reproduce
 
 library: $(VENV)/installed  ## make the simulated reference library of the classifier again
-	$(BIN)/polysight train --simulate examples/library --times 2 --out host/materials/simulated-library.npz
+	$(BIN)/polysight train --simulate examples/library --times 2 --out host/polysight/materials/simulated-library.npz
 
 wheels: $(VENV)/installed  ## wheels for users, x86-64 and ARM64, any Python, for machines without a compiler (OUT=out)
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/wheels $(patsubst %,./%,$(filter-out host,$(PROJECTS)))
 	for platform in manylinux_2_17_x86_64 manylinux_2_17_aarch64; do \
-	  POLYSIGHT_WHEEL=$$platform $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/wheels . || exit 1; done
+	  POLYSIGHT_WHEEL=$$platform $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/wheels ./host || exit 1; done
 	@ls $(OUT)/wheels
 
 docs: $(VENV)/installed  ## make the API reference (OUT=out), check all links, run every command that README and docs show
@@ -85,7 +87,7 @@ pi-install: $(VENV)/installed  ## install or update the Pi half on a Pi: make pi
 	@test -n "$(HOST)" || { echo "make pi-install HOST=user@address"; exit 2; }
 	rm -rf $(OUT)/pi && mkdir -p $(OUT)/pi/sources
 	tar -c --exclude=__pycache__ --exclude='*.egg-info' --exclude=build shared pi_controller | tar -x -C $(OUT)/pi/sources
-	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/pi/copied $(OUT)/pi/sources/pi_controller
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/pi/copied $(OUT)/pi/sources/shared $(OUT)/pi/sources/pi_controller
 	cp pi_controller/install.sh pi_controller/requirements.txt pi_controller/polysight-pi.service pi_controller/60-polysight.rules instrument.toml $(OUT)/pi/copied/
 	tar -c -C $(OUT)/pi/copied . | ssh $(HOST) 'rm -rf $(ON_PI) && mkdir -p $(ON_PI) && tar -x -C $(ON_PI)'
 	ssh -t $(HOST) sudo $(ON_PI)/install.sh

@@ -5,7 +5,7 @@
 #include "motion.h"
 #include "stage_errors.h"
 
-// Second word of SET; shared/stage_line.py has the same list.
+// Second word of SET; shared/polysight_shared/stage_line.py has the same list.
 enum Parameter : uint8_t {
   PARAMETER_ACCEL = 0,
   PARAMETER_HEARTBEAT = 1,
@@ -16,7 +16,7 @@ enum Parameter : uint8_t {
   PARAMETER_BACKLASH = 6,
 };
 
-// Bytes that act at once; shared/stage_line.py has the same list.
+// Bytes that act at once; shared/polysight_shared/stage_line.py has the same list.
 enum Immediate : uint8_t {
   IMMEDIATE_HOLD = 0x81,
   IMMEDIATE_RESUME = 0x9D,  // twice; three bits away from every other byte of the line

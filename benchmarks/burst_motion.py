@@ -18,12 +18,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.data import ROOT
-from polysight.host.imaging import ImageBuilder
-from polysight.host.imaging.geometry import row_offsets_m
-from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.raster import mean_burst_travel_mm, plan_raster
-from polysight.simulators.scene import Point, Scene, SimulatedRig, apply_scene, row_offsets_mm
+from polysight.imaging import ImageBuilder
+from polysight.imaging.geometry import row_offsets_m
+from polysight.sync import BoardSetup, synchronise_row
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.raster import mean_burst_travel_mm, plan_raster
+from polysight_simulators.scene import Point, Scene, SimulatedRig, apply_scene, row_offsets_mm
 
 Images = dict[str, NDArray[np.complex64]]
 TREATMENTS = {

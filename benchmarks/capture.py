@@ -13,7 +13,7 @@ from pathlib import Path
 from benchmarks.cards import Cards
 from benchmarks.child import Child, ask
 from benchmarks.trial import HEAD, PlainLoops, Receivers
-from polysight.shared.config import load_instrument
+from polysight_shared.config import load_instrument
 
 RIG = Path(__file__).parents[1] / "instrument.toml"
 

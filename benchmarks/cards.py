@@ -10,7 +10,7 @@ import msgspec
 
 from benchmarks.child import Child
 from benchmarks.signal_block import make_block
-from polysight.shared.config import Board, Instrument
+from polysight_shared.config import Board, Instrument
 
 
 class Cards:

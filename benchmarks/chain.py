@@ -28,8 +28,8 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
     seconds by stage (`stages`).
     """
     from benchmarks.data import RepeatedRows, published  # after the thread limits
-    from polysight.host.pipeline import Pipeline
-    from polysight.host.store.scan_folder import ScanFolder
+    from polysight.pipeline import Pipeline
+    from polysight.store.scan_folder import ScanFolder
 
     if "scan" in source:
         scan = ScanFolder.load(Path(source["scan"]))

@@ -22,8 +22,8 @@ import msgspec
 import numpy as np
 
 from polysight.data import packaged
-from polysight.host.imaging import PlaneEstimate
-from polysight.host.materials import (
+from polysight.imaging import PlaneEstimate
+from polysight.materials import (
     UNKNOWN,
     PatchEstimate,
     PatchMeasurement,
@@ -32,15 +32,15 @@ from polysight.host.materials import (
     measured_ratio,
     truth_plates,
 )
-from polysight.host.pipeline import Pipeline
-from polysight.host.polarimetry import PlaneReference, plane_reference
-from polysight.host.process import Findings, Options
-from polysight.host.store import CubeRow, open_source
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.raster import RasterPlan, plan_raster
-from polysight.simulators.scene import decode_scene, synced_cube
-from polysight.simulators.scene.scene_file import Scene, apply_scene
-from polysight.simulators.scene.simulated_scan import simulate, truth
+from polysight.pipeline import Pipeline
+from polysight.polarimetry import PlaneReference, plane_reference
+from polysight.process import Findings, Options
+from polysight.store import CubeRow, open_source
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.raster import RasterPlan, plan_raster
+from polysight_simulators.scene import decode_scene, synced_cube
+from polysight_simulators.scene.scene_file import Scene, apply_scene
+from polysight_simulators.scene.simulated_scan import simulate, truth
 
 MATERIALS: dict[str, tuple[float, float]] = {
     "wood": (2.61, 0.01), "PTFE": (2.05, 0.005), "PET": (3.78, 0.7), "acrylic": (4.0, 0.4), "cardboard": (4.54, 0.56),

@@ -17,15 +17,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.imaging.geometry import Antennas, image_grid, row_offsets_m
-from polysight.host.imaging.reduce import scene_gate_m
-from polysight.host.store import ManifestFault
-from polysight.host.store.source import RowData
-from polysight.host.sync.chain import SyncedRow
-from polysight.shared.config import Board, Instrument, load_instrument
-from polysight.shared.raster import RasterPlan, Row, plan_raster
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.scene import OwnLayout, Scene, SimulatedRig, apply_scene, load_scene, row_offsets_mm
+from polysight.imaging.geometry import Antennas, image_grid, row_offsets_m
+from polysight.imaging.reduce import scene_gate_m
+from polysight.store import ManifestFault
+from polysight.store.source import RowData
+from polysight.sync.chain import SyncedRow
+from polysight_shared.config import Board, Instrument, load_instrument
+from polysight_shared.raster import RasterPlan, Row, plan_raster
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_simulators.scene import OwnLayout, Scene, SimulatedRig, apply_scene, load_scene, row_offsets_mm
 
 ROOT = Path(__file__).parents[1]
 RIG = ROOT / "instrument.toml"

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.published.synchronise import Synchroniser
-from polysight.host.capture.decode import raw_words
-from polysight.host.sync.align import align_row
-from polysight.host.sync.direct_path import prepare, reference
-from polysight.host.sync.tone import estimate_tone
-from polysight.shared.config import Board, Instrument
-from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.capture.decode import raw_words
+from polysight.sync.align import align_row
+from polysight.sync.direct_path import prepare, reference
+from polysight.sync.tone import estimate_tone
+from polysight_shared.config import Board, Instrument
+from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = NDArray[np.complex128]
 SEED = 20260

@@ -16,15 +16,15 @@ from benchmarks.data import as_synced, published, temporary, write_point_cube
 from benchmarks.measure import Seconds, one_core
 from benchmarks.published.image import SETTINGS, form_image
 from benchmarks.table import Line, add_arguments, show, write
-from polysight.host.imaging import ImageBuilder
-from polysight.host.imaging import lattice as kernels
-from polysight.host.imaging.aperture import Aperture, row_starts_m
-from polysight.host.imaging.geometry import Antennas, image_grid, scan_offsets_m
-from polysight.host.imaging.reduce import reduction, scene_gate_m
-from polysight.host.imaging.samples import choose_imager
-from polysight.host.imaging.spectral import IncrementalImager
-from polysight.shared.config import Board, Instrument
-from polysight.shared.raster import plan_raster
+from polysight.imaging import ImageBuilder
+from polysight.imaging import lattice as kernels
+from polysight.imaging.aperture import Aperture, row_starts_m
+from polysight.imaging.geometry import Antennas, image_grid, scan_offsets_m
+from polysight.imaging.reduce import reduction, scene_gate_m
+from polysight.imaging.samples import choose_imager
+from polysight.imaging.spectral import IncrementalImager
+from polysight_shared.config import Board, Instrument
+from polysight_shared.raster import plan_raster
 
 __all__ = ["add_arguments", "run"]
 REPEATS = 5

@@ -25,15 +25,15 @@ import numpy as np
 
 from benchmarks.coverage import CHI2_68, CHI2_95, GRID, PLACES, Cubes
 from polysight.data import packaged
-from polysight.host.jobs.process import plane_of
-from polysight.host.materials import METAL, Layer, LayerFit, fit_row, match_truth, truth_plates
-from polysight.host.pipeline import Pipeline
-from polysight.host.polarimetry import PlaneReference
-from polysight.host.process import Options
-from polysight.shared.config import Instrument, load_instrument
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.scene.scene_file import Plate, Scene, apply_scene
-from polysight.simulators.scene.simulated_scan import truth
+from polysight.jobs.process import plane_of
+from polysight.materials import METAL, Layer, LayerFit, fit_row, match_truth, truth_plates
+from polysight.pipeline import Pipeline
+from polysight.polarimetry import PlaneReference
+from polysight.process import Options
+from polysight_shared.config import Instrument, load_instrument
+from polysight_simulators.scene import decode_scene
+from polysight_simulators.scene.scene_file import Plate, Scene, apply_scene
+from polysight_simulators.scene.simulated_scan import truth
 
 RANGE_M = (0.3e-3, 6e-3)
 """Where the thickness of a sheet is looked for."""

@@ -7,11 +7,11 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from benchmarks.data import as_synced, point_row
-from polysight.host.imaging import ImageBuilder, backproject
-from polysight.host.imaging.geometry import Antennas, row_offsets_m
-from polysight.host.imaging.reduce import reduction, scene_gate_m
-from polysight.shared.config import Board, Instrument
-from polysight.shared.raster import plan_raster
+from polysight.imaging import ImageBuilder, backproject
+from polysight.imaging.geometry import Antennas, row_offsets_m
+from polysight.imaging.reduce import reduction, scene_gate_m
+from polysight_shared.config import Board, Instrument
+from polysight_shared.raster import plan_raster
 
 SEED = 7
 POINTS, POSITIONS, PIXELS = 9, 2000, 60

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measure import Seconds
-from polysight.host.imaging.aperture import Aperture
+from polysight.imaging.aperture import Aperture
 
 MISSING = "is not here, so there is no line for it: `pip install --group bench` adds it (FastSAR also needs g++)"
 

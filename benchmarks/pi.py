@@ -20,13 +20,13 @@ from benchmarks.data import temporary
 from benchmarks.measure import machine
 from benchmarks.table import add_arguments as add_common
 from benchmarks.table import write
-from polysight.host.acquisition.pi_client import PiClient
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.messages import BeginRun, Capture, RowFinished
-from polysight.shared.raster import plan_raster
-from polysight.shared.tables import to_builtins
-from polysight.shared.wires import WireClient, WireEdge
-from polysight.simulators import gpio
+from polysight.acquisition.pi_client import PiClient
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.messages import BeginRun, Capture, RowFinished
+from polysight_shared.raster import plan_raster
+from polysight_shared.tables import to_builtins
+from polysight_shared.wires import WireClient, WireEdge
+from polysight_simulators import gpio
 
 RIG = Path(__file__).parents[1] / "instrument.toml"
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
@@ -81,10 +81,10 @@ def _start(stack: ExitStack, module: str, *args: object, **environment: str) -> 
 def _measure(rig: Instrument, points: int, folder: Path, stack: ExitStack) -> dict[str, Any]:
     config, hub = folder / "rig.toml", folder / "wires"
     config.write_text(tomli_w.dumps(to_builtins(rig)), encoding="utf-8")
-    _start(stack, "polysight.simulators.wires", "--socket", hub)
-    _start(stack, "polysight.simulators.stage", "--config", config, "--wires", hub, "--link", rig.stage.port)
+    _start(stack, "polysight_simulators.wires", "--socket", hub)
+    _start(stack, "polysight_simulators.stage", "--config", config, "--wires", hub, "--link", rig.stage.port)
     environment = gpio.environment(Path(rig.pi.gpio_chip), hub)
-    process, command_address = _start(stack, "polysight.pi_controller", "run", "--config", config, **environment)
+    process, command_address = _start(stack, "polysight_pi", "run", "--config", config, **environment)
     event_address = process.stdout.readline().split()[1] if process.stdout else ""
     wires = WireClient(hub, listen=rig.pi.sync_out)
     stack.callback(wires.close)

@@ -10,7 +10,7 @@ import json
 import sys
 import time
 
-from polysight.host.capture.network import bind_udp, enlarge_receive_buffer, kernel_drops
+from polysight.capture.network import bind_udp, enlarge_receive_buffer, kernel_drops
 
 
 def main(argv: list[str]) -> int:

@@ -25,10 +25,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from benchmarks.sparse_scans import predicted
-from polysight.host.capture.decode import row_words
-from polysight.host.imaging import ChannelImages, ImageBuilder
-from polysight.host.imaging.sparse import reconstruct
-from polysight.host.materials import (
+from polysight.capture.decode import row_words
+from polysight.imaging import ChannelImages, ImageBuilder
+from polysight.imaging.sparse import reconstruct
+from polysight.materials import (
     Classifier,
     Library,
     MaterialsResult,
@@ -37,14 +37,14 @@ from polysight.host.materials import (
     pixel_accuracy,
     truth_plates,
 )
-from polysight.host.materials.analyse import ImagePair, KnownScene, Optics
-from polysight.host.materials.library import SIMULATED_LIBRARY
-from polysight.host.plan import Changes, scan_time
-from polysight.host.polarimetry import incidence_choice
-from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.raster import plan_raster
-from polysight.simulators.scene import Scene, SimulatedRig, load_scene, row_offsets_mm, truth
+from polysight.materials.analyse import ImagePair, KnownScene, Optics
+from polysight.materials.library import SIMULATED_LIBRARY
+from polysight.plan import Changes, scan_time
+from polysight.polarimetry import incidence_choice
+from polysight.sync import BoardSetup, synchronise_row
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.raster import plan_raster
+from polysight_simulators.scene import Scene, SimulatedRig, load_scene, row_offsets_mm, truth
 
 ROOT = Path(__file__).parents[1]
 ITERATIONS = 40

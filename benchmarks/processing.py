@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from polysight.host.capture.decode import decode_row
-from polysight.host.sync.chain import BoardSetup, synchronise_row
-from polysight.shared.config import load_instrument
+from polysight.capture.decode import decode_row
+from polysight.sync.chain import BoardSetup, synchronise_row
+from polysight_shared.config import load_instrument
 
 
 def main(argv: list[str]) -> int:

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.signal_block import PACKETS, make_block, make_packets, number
-from polysight.host.capture.network import _Header, _IoVec, _Message
-from polysight.host.capture.scheduling import take_priority
-from polysight.shared.config import load_instrument
+from polysight.capture.network import _Header, _IoVec, _Message
+from polysight.capture.scheduling import take_priority
+from polysight_shared.config import load_instrument
 
 BEHIND_S = 0.005  # a card catches up on its own buffer at most; packets later than this are delayed
 TURN_S = 0.0005  # packets due within this time go together, as the card's own pace is finer than this process can wait

@@ -7,8 +7,8 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.capture.dca1000 import MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES
-from polysight.shared.config import Instrument
+from polysight.capture.dca1000 import MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES
+from polysight_shared.config import Instrument
 
 PACKETS = 4096
 """4096 packets of 1456 bytes are 1456 frames of 4096 bytes, 91 bursts of 16: blocks join without a seam."""

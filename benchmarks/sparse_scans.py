@@ -2,7 +2,7 @@
 
 Every example scene is simulated once with all positions, without noise or disturbances, so that only the
 missing positions matter. Then rows or columns are masked, and the image is made by matched filter and by reconstruction
-(host/imaging/sparse.py). The error is that of the whole image against the matched filter of all positions, both
+(host/polysight/imaging/sparse.py). The error is that of the whole image against the matched filter of all positions, both
 channels' mean; a reconstruction is compared through the samples it predicts.
 """
 
@@ -17,12 +17,12 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from polysight.host.imaging.samples import BoardSamples, choose_imager
-from polysight.host.imaging.sparse import reconstruct
-from polysight.host.pipeline import Pipeline
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.shared.config import Instrument, load_instrument
-from polysight.simulators.scene import load_scene, simulate
+from polysight.imaging.samples import BoardSamples, choose_imager
+from polysight.imaging.sparse import reconstruct
+from polysight.pipeline import Pipeline
+from polysight.store.scan_folder import ScanFolder
+from polysight_shared.config import Instrument, load_instrument
+from polysight_simulators.scene import load_scene, simulate
 
 ROOT = Path(__file__).parents[1]
 SCENES = ("point-targets", "nine-materials")

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from polysight.host.report.sync_report import SyncReport, write_sync_report
-from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.shared.config import load_instrument
-from polysight.simulators.scene import SimulatedRig, decode_scene
+from polysight.report.sync_report import SyncReport, write_sync_report
+from polysight.sync import BoardSetup, synchronise_row
+from polysight_shared.config import load_instrument
+from polysight_simulators.scene import SimulatedRig, decode_scene
 
 SNR_DB = 7.2
 SCENE = {

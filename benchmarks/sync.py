@@ -14,10 +14,10 @@ from benchmarks.data import RepeatedRows, published, recorded_rows, temporary
 from benchmarks.measure import Seconds, one_core
 from benchmarks.published.synchronise import Synchroniser
 from benchmarks.table import Line, add_arguments, show, write
-from polysight.host.imaging import ImageBuilder
-from polysight.host.pipeline import Pipeline
-from polysight.host.sync import direct_path
-from polysight.shared.config import Instrument
+from polysight.imaging import ImageBuilder
+from polysight.pipeline import Pipeline
+from polysight.sync import direct_path
+from polysight_shared.config import Instrument
 
 __all__ = ["add_arguments", "run"]
 REPEATS = 5

@@ -14,8 +14,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from polysight.host.imaging.geometry import Antennas, ImageGrid
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.imaging.geometry import Antennas, ImageGrid
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 OVERSAMPLING = 32
 BLOCK = 128  # positions at a time: their profiles stay in the second-level cache

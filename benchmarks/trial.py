@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from benchmarks.cards import Cards
 from benchmarks.child import Child, ask, cpu_s
 from benchmarks.signal_block import PACKETS
-from polysight.host.capture.dca1000 import MAX_PAYLOAD_BYTES
-from polysight.host.capture.receiver import ReceiverProcess
-from polysight.host.capture.scheduling import receiver_cores
+from polysight.capture.dca1000 import MAX_PAYLOAD_BYTES
+from polysight.capture.receiver import ReceiverProcess
+from polysight.capture.scheduling import receiver_cores
 
 ROW_BLOCKS = 48  # of one board: 286 MB, twelve published rows
 KEEPS_PACE = 0.98

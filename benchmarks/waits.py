@@ -15,12 +15,12 @@ from benchmarks.data import ROOT, SCENE, published, recorded_rows, temporary, wr
 from benchmarks.measure import Seconds
 from benchmarks.table import Line, add_arguments, show, write
 from benchmarks.whole import rows_that_fit
-from polysight.host.catalogue import Scans
-from polysight.host.imaging import View
-from polysight.host.jobs.process import make_products, publish_images
-from polysight.host.pipeline import Pipeline
-from polysight.host.process import Options
-from polysight.host.store import MANIFEST, ScanFolder
+from polysight.catalogue import Scans
+from polysight.imaging import View
+from polysight.jobs.process import make_products, publish_images
+from polysight.pipeline import Pipeline
+from polysight.process import Options
+from polysight.store import MANIFEST, ScanFolder
 
 __all__ = ["add_arguments", "run"]
 REPEATS = 3
@@ -84,7 +84,7 @@ def listed(scan: Path, made: Path, root: Path, count: int) -> tuple[Seconds, Sec
 def command(words: list[str]) -> tuple[float, float]:
     """CPU and wall seconds of a command in a process of its own. Raises RuntimeError when it fails."""
     before, began = os.times(), time.perf_counter()
-    done = subprocess.run([sys.executable, "-m", "polysight.host", *words], cwd=ROOT, capture_output=True, check=False)
+    done = subprocess.run([sys.executable, "-m", "polysight", *words], cwd=ROOT, capture_output=True, check=False)
     wall, after = time.perf_counter() - began, os.times()
     if done.returncode:
         raise RuntimeError(f"polysight {' '.join(words)}: {done.stderr.decode()}")
@@ -129,7 +129,7 @@ def small_products(folder: Path) -> Path:
     rig = ["--config", str(ROOT / "instrument.toml")]
     small = (SCENE.parent / "own-scene.toml") if (SCENE.parent / "own-scene.toml").exists() else SCENE
     subprocess.run(
-        [sys.executable, "-m", "polysight.simulators", "simulate", str(small), *rig, "--out", str(scan)],
+        [sys.executable, "-m", "polysight_simulators", "simulate", str(small), *rig, "--out", str(scan)],
         cwd=ROOT,
         check=True,
         capture_output=True,

@@ -16,8 +16,8 @@ from benchmarks.measure import Seconds, one_core
 from benchmarks.published.image import form_image
 from benchmarks.table import Line, show, write
 from benchmarks.table import add_arguments as add_common
-from polysight.host.imaging import image_grid
-from polysight.shared.config import Instrument
+from polysight.imaging import image_grid
+from polysight_shared.config import Instrument
 
 REPEATS = 3
 SPARE_BYTES = 3 << 30

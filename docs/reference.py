@@ -20,7 +20,7 @@ from urllib.parse import unquote
 import pdoc.doc
 import pdoc.render
 
-PACKAGES = ("polysight", "polysight.host", "polysight.shared", "polysight.simulators", "polysight.pi_controller")
+PACKAGES = ("polysight", "polysight_shared", "polysight_simulators", "polysight_pi")
 
 _TO_PRIVATE = re.compile(r'<a href="[^"#]*#_[^"]*">(.*?)</a>')  # base classes that have no place of their own
 

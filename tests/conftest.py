@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-from polysight.shared.config import Instrument
+from polysight_shared.config import Instrument
 
 gc.disable()  # until all is imported and collected; what that makes lives to the end
 

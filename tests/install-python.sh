@@ -3,6 +3,7 @@
 # Says what it does, and each minute that it still does it; warnings of packages that are none of the user's business stay away.
 set -u
 python=$1 venv=$2
+projects="-e ./shared -e ./pi_controller -e ./simulators -e ./host -e ./papers"
 export PYTHONWARNINGS=ignore PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_QUIET=2 PIP_NO_INPUT=1 PIP_ROOT_USER_ACTION=ignore UV_NO_PROGRESS=1
 
 patiently() {  # COMMAND...: its exit status, and a line for every minute that it takes
@@ -19,7 +20,7 @@ patiently() {  # COMMAND...: its exit status, and a line for every minute that i
 if command -v uv >/dev/null; then
   echo "installing the instrument and its tools into $venv, with uv"
   if uv venv --quiet --seed --allow-existing --python "$python" "$venv" &&
-    patiently uv pip install --quiet --compile-bytecode --python "$venv/bin/python" --editable . --group dev; then
+    patiently uv pip install --quiet --compile-bytecode --python "$venv/bin/python" $projects --group dev; then
     exit 0
   fi
   echo "uv could not; trying pip"
@@ -27,4 +28,4 @@ fi
 "$python" -m venv "$venv" || exit 2
 echo "installing the instrument and its tools into $venv, with pip: some minutes (uv, where installed, takes seconds)"
 patiently "$venv/bin/python" -m pip install --upgrade "pip>=25.1" &&
-  patiently "$venv/bin/python" -m pip install --editable . --group dev
+  patiently "$venv/bin/python" -m pip install $projects --group dev

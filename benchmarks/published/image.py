@@ -11,9 +11,9 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from polysight.host.imaging.geometry import Antennas, ImageGrid
-from polysight.shared.config import Board, Instrument
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.imaging.geometry import Antennas, ImageGrid
+from polysight_shared.config import Board, Instrument
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 SETTINGS = (1024, 2048, 4096)  # points of the range FFT, from the cheapest
 

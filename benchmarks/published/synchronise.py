@@ -7,9 +7,9 @@ import scipy.fft
 import scipy.signal
 from numpy.typing import NDArray
 
-from polysight.shared.config import Board, Instrument
-from polysight.shared.geometry import rx_positions_m, tx_position_m
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight_shared.config import Board, Instrument
+from polysight_shared.geometry import rx_positions_m, tx_position_m
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = NDArray[np.complexfloating]
 UPSCALE = 64  # alignment transforms are so many times longer than a chirp

@@ -16,8 +16,16 @@ from unittest import mock
 
 from docs.check.pages import ROOT
 
-PROGRAMS = {"polysight": "polysight.host.cli.main", "polysight-pi": "polysight.pi_controller.cli"}
-OWN = ("benchmarks", "docs", "polysight", "papers")
+PROGRAMS = {"polysight": "polysight.cli.main", "polysight-pi": "polysight_pi.cli"}
+OWN = (
+    "benchmarks",
+    "docs",
+    "polysight",
+    "polysight_papers",
+    "polysight_pi",
+    "polysight_shared",
+    "polysight_simulators",
+)
 _BEFORE = ("sudo", "env", "exec", "time", "nohup", "ssh", "timeout", "nice")
 _ENDS = re.compile(r"[|&;()\n]+")
 _REDIRECTS = re.compile(r"[<>&]+")

@@ -92,7 +92,7 @@ def run_page(page: Page, copy: Path, limit_s: float = LIMIT_S) -> PageRun:
 
 def _start_rig(copy: Path, work: Path, environment: dict[str, str]) -> subprocess.Popen[str]:
     """A simulated rig; `instrument.toml` of the copy becomes the one that reaches it."""
-    command = [sys.executable, "-m", "polysight.simulators.rig", "--config", "instrument.toml", "--scene", RIG_SCENE]
+    command = [sys.executable, "-m", "polysight_simulators.rig", "--config", "instrument.toml", "--scene", RIG_SCENE]
     command += ["--dir", str(work / "rig"), "--time-scale", str(RIG_TIME_SCALE), "--with-pi", "--native"]
     rig = subprocess.Popen(
         command, cwd=copy, env=environment, stdout=subprocess.PIPE, text=True, start_new_session=True

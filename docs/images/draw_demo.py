@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 
-from polysight.host.report import INK, MUTED, PALETTE, STAMP
+from polysight.report import INK, MUTED, PALETTE, STAMP
 
 SHOWN_DB = {"H, s-polarised": (-35, 0), "V, p-polarised": (-35, 0), "P = H / V": (-3, 24)}
 REACH_MM = 98.0

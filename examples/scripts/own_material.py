@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from polysight.host.jobs.train import train
-from polysight.host.materials import Library
-from polysight.host.polarimetry import fresnel
-from polysight.host.products.files import read_products
-from polysight.host.report.exports import material_columns
-from polysight.shared.config import load_instrument
-from polysight.shared.geometry import incidence_deg
-from polysight.simulators.scene import load_scene, simulate
+from polysight.jobs.train import train
+from polysight.materials import Library
+from polysight.polarimetry import fresnel
+from polysight.products.files import read_products
+from polysight.report.exports import material_columns
+from polysight_shared.config import load_instrument
+from polysight_shared.geometry import incidence_deg
+from polysight_simulators.scene import load_scene, simulate
 
 ROOT = Path(__file__).parents[2]
 

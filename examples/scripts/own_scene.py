@@ -7,12 +7,12 @@
 # %%
 from pathlib import Path
 
-from polysight.host.materials import read_truth
-from polysight.host.pipeline import Pipeline
-from polysight.host.process.request import Options
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.shared.config import load_instrument
-from polysight.simulators.scene import load_scene, simulate
+from polysight.materials import read_truth
+from polysight.pipeline import Pipeline
+from polysight.process.request import Options
+from polysight.store.scan_folder import ScanFolder
+from polysight_shared.config import load_instrument
+from polysight_simulators.scene import load_scene, simulate
 
 ROOT = Path(__file__).parents[2]
 

@@ -2,7 +2,7 @@
 # # From raw data to the image
 #
 # Takes a scan folder (here: `polysight simulate examples/point-targets.toml --out out/points`) and makes both images
-# step by step, as `host/pipeline.py` does. Run it from the folder that holds `out/`.
+# step by step, as `host/polysight/pipeline.py` does. Run it from the folder that holds `out/`.
 
 # %%
 from pathlib import Path
@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from polysight.host.capture.decode import row_words
-from polysight.host.imaging import ImageBuilder
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.sync import BoardSetup, synchronise_row
+from polysight.capture.decode import row_words
+from polysight.imaging import ImageBuilder
+from polysight.store.scan_folder import ScanFolder
+from polysight.sync import BoardSetup, synchronise_row
 
 # %%
 scan = ScanFolder.load(Path("out/points"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-
 from tests.support.acquisition.fake_cards import payload_of
 from tests.support.acquisition.fake_rig import FakeRig, small_instrument
 from tests.support.acquisition.receivers import fork_receivers

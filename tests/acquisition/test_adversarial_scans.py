@@ -12,15 +12,15 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-
-from polysight.host.acquisition.scan import resume_scan, run_scan
-from polysight.host.store import ScanFolder, place_again
-from polysight.host.store.validation import validate
-from polysight.shared.config import Board
-from polysight.shared.errors import ScanError
-from polysight.simulators.cards import KINDS, Adversary, Arrival
 from tests.support.acquisition.fake_cards import FakeCard, payload_of
 from tests.support.acquisition.fake_rig import FakeRig, small_instrument
+
+from polysight.acquisition.scan import resume_scan, run_scan
+from polysight.store import ScanFolder, place_again
+from polysight.store.validation import validate
+from polysight_shared.config import Board
+from polysight_shared.errors import ScanError
+from polysight_simulators.cards import KINDS, Adversary, Arrival
 
 NETWORK = tuple(kind for kind in KINDS if kind != "clock")  # the kernel's clock is its own
 

@@ -7,9 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tests.support.page.live_view import open_control
+from tests.support.processes import wait_for
+from tests.support.refusals import refused
+from tests.support.store.small_scan import SmallScan
 
-from polysight.host.acquisition import scan as host_run
-from polysight.host.acquisition.control import (
+from polysight.acquisition import scan as host_run
+from polysight.acquisition.control import (
     CONTROL,
     ControlFolder,
     ScanCommand,
@@ -17,14 +21,10 @@ from polysight.host.acquisition.control import (
     last_alive_s,
     send_command,
 )
-from polysight.host.store import manifest
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.host.store.validation import validate
-from polysight.shared.error_codes import ErrorCode
-from tests.support.page.live_view import open_control
-from tests.support.processes import wait_for
-from tests.support.refusals import refused
-from tests.support.store.small_scan import SmallScan
+from polysight.store import manifest
+from polysight.store.scan_folder import MANIFEST, ScanFolder
+from polysight.store.validation import validate
+from polysight_shared.error_codes import ErrorCode
 
 
 @pytest.fixture

@@ -7,14 +7,14 @@ import time
 
 import msgspec
 import pytest
-
-from polysight.host.acquisition.capture_rig import CaptureRig
-from polysight.host.acquisition.scan import run_scan
-from polysight.host.capture.dca1000 import Code
-from polysight.host.store.validation import validate
-from polysight.shared.config import Board
 from tests.support.acquisition.fake_cards import FULL, FakeCard, payload_of
 from tests.support.acquisition.fake_rig import FakeRig
+
+from polysight.acquisition.capture_rig import CaptureRig
+from polysight.acquisition.scan import run_scan
+from polysight.capture.dca1000 import Code
+from polysight.store.validation import validate
+from polysight_shared.config import Board
 
 TAIL_S = 0.6  # from the last data to the short last packet; 2 s of a real card
 CONFIGURE = int(Code.CONFIGURE_FPGA)

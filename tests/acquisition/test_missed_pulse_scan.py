@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.acquisition.scan import run_scan
-from polysight.host.store.validation import validate
+from polysight.acquisition.scan import run_scan
+from polysight.store.validation import validate
 
 POINTS, PULSES = 8, 6
 

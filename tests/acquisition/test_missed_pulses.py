@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from polysight.host.acquisition.missed_pulses import PlacedFrames, place_frames, slipped_frames
-from polysight.host.acquisition.slipped_row import describe, rewrite_row
-from polysight.host.capture.segment import read_index, write_index
 from tests.support.acquisition.arrival_model import MS, PAYLOAD, US, Load, pulse_times, receive
+
+from polysight.acquisition.missed_pulses import PlacedFrames, place_frames, slipped_frames
+from polysight.acquisition.slipped_row import describe, rewrite_row
+from polysight.capture.segment import read_index, write_index
 
 FRAME = 4096
 BURSTS, PULSES = 12, 16
@@ -148,7 +148,7 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
 
 
 def _capture(expected, holes):
-    from polysight.host.capture.receiver import RowCapture
+    from polysight.capture.receiver import RowCapture
 
     zeros = dict.fromkeys(RowCapture.__struct_fields__, 0)
     return RowCapture(

@@ -7,8 +7,8 @@ import re
 
 from rich.console import Console
 
-from polysight.host.acquisition.scan import ScanProgress
-from polysight.host.jobs.live_scan import ScanBar
+from polysight.acquisition.scan import ScanProgress
+from polysight.jobs.live_scan import ScanBar
 
 ROWS = 20
 

@@ -10,19 +10,19 @@ import sys
 
 import msgspec
 import pytest
-
-from polysight.host.acquisition.scan import run_scan
-from polysight.host.radar.backends import LINE, Endless, LineServers, radar_control
-from polysight.host.radar.interface import BoardState, RadarControl, RadarState
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.shared.config import Instrument, Radar
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DeviceError
-from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.faults import Faults
-from polysight.simulators.radars import LineServer
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
+
+from polysight.acquisition.scan import run_scan
+from polysight.radar.backends import LINE, Endless, LineServers, radar_control
+from polysight.radar.interface import BoardState, RadarControl, RadarState
+from polysight.store.scan_folder import ScanFolder
+from polysight_shared.config import Instrument, Radar
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError
+from polysight_shared.tables import decode, to_builtins
+from polysight_simulators.faults import Faults
+from polysight_simulators.radars import LineServer
 
 
 class Server:
@@ -115,8 +115,8 @@ def test_unknown_host_is_named():
 
 HALF_OPEN = """
 import socket, subprocess
-from polysight.host.radar.backends import LineServers
-from polysight.shared.errors import DeviceError
+from polysight.radar.backends import LineServers
+from polysight_shared.errors import DeviceError
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
 listener = socket.create_server(("127.0.0.1", 5000))
 radars = LineServers({"RH": "127.0.0.1:5000"}, 0.5)

@@ -8,19 +8,19 @@ from typing import Any
 
 import msgspec
 import pytest
-
-from polysight.host.acquisition import ready
-from polysight.host.acquisition.control import StopRequest
-from polysight.host.acquisition.pi_client import PiClient
-from polysight.host.acquisition.ready import STAGE_NOT_REPORTED, check_disk, make_ready
-from polysight.host.acquisition.scan import resume_scan, run_scan
-from polysight.host.doctor.check_host import check_time
-from polysight.host.plan.forecast import forecast
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.faults import PiFault
-from polysight.shared.stage_line import HOMING_TIMEOUT_S
 from tests.support.refusals import refused
+
+from polysight.acquisition import ready
+from polysight.acquisition.control import StopRequest
+from polysight.acquisition.pi_client import PiClient
+from polysight.acquisition.ready import STAGE_NOT_REPORTED, check_disk, make_ready
+from polysight.acquisition.scan import resume_scan, run_scan
+from polysight.doctor.check_host import check_time
+from polysight.plan.forecast import forecast
+from polysight.store.scan_folder import ScanFolder
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.faults import PiFault
+from polysight_shared.stage_line import HOMING_TIMEOUT_S
 
 
 class HomingPi:
@@ -74,7 +74,7 @@ def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, asked):
 
 
 def test_pi_and_host_have_the_same_homing_timeout():
-    from polysight.pi_controller import machine, stage
+    from polysight_pi import machine, stage
 
     assert machine.TIMEOUTS_S["homing"] == stage.MOTION_TIMEOUT_S == HOMING_TIMEOUT_S < ready._HOMING_TIMEOUT_S
 

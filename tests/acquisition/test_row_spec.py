@@ -5,16 +5,16 @@ from __future__ import annotations
 import re
 
 import pytest
-
-from polysight.host.acquisition.row import TRANSITIONS, RowState, RowTransaction
-from polysight.host.capture import receiver as receiver_words
-from polysight.host.capture.dca1000 import Code
-from polysight.host.radar.interface import RadarControl, RadarState
-from polysight.shared import messages
-from polysight.shared.config import Radar
-from polysight.shared.error_codes import ErrorCode
 from tests.support.paths import REPO
 from tests.support.refusals import refused
+
+from polysight.acquisition.row import TRANSITIONS, RowState, RowTransaction
+from polysight.capture import receiver as receiver_words
+from polysight.capture.dca1000 import Code
+from polysight.radar.interface import RadarControl, RadarState
+from polysight_shared import messages
+from polysight_shared.config import Radar
+from polysight_shared.error_codes import ErrorCode
 
 SPEC = (REPO / "docs/spec/row.md").read_text(encoding="utf-8")
 

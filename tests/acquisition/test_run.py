@@ -15,17 +15,17 @@ import msgspec
 import numpy as np
 import pytest
 import tomli_w
-
-from polysight.host.acquisition.control import StopRequest
-from polysight.host.acquisition.scan import resume_scan, run_scan
-from polysight.host.acquisition.scan_loop import takes_so_far
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validation import validate
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ScanError
-from polysight.shared.tables import to_builtins
 from tests.support.refusals import refused
 from tests.support.store.plain_scan import errors
+
+from polysight.acquisition.control import StopRequest
+from polysight.acquisition.scan import resume_scan, run_scan
+from polysight.acquisition.scan_loop import takes_so_far
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.validation import validate
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ScanError
+from polysight_shared.tables import to_builtins
 
 
 def digests(scan: ScanFolder) -> dict[str, str]:
@@ -172,8 +172,8 @@ def test_killed_host_resumes_and_committed_rows_stay(rig, payload, tmp_path):
     """SIGKILL in the middle of row 2. The Pi finishes that row; the new take must not use its end."""
     (tmp_path / "rig.toml").write_text(tomli_w.dumps(to_builtins(rig.instrument)))
     code = (
-        "import sys\nfrom pathlib import Path\nfrom polysight.shared.config import load_instrument\n"
-        "from polysight.host.acquisition.scan import run_scan\n"
+        "import sys\nfrom pathlib import Path\nfrom polysight_shared.config import load_instrument\n"
+        "from polysight.acquisition.scan import run_scan\n"
         "run_scan(load_instrument(Path(sys.argv[1])), Path(sys.argv[2]))"
     )
     rig.pi.hang_at = {2}

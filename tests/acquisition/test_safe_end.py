@@ -16,24 +16,24 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 import tomli_w
-
-from polysight.host.acquisition import scan_loop as running
-from polysight.host.acquisition.control import StopRequest, ignore_hangup
-from polysight.host.acquisition.pi_client import PiClient
-from polysight.host.acquisition.ready import make_ready
-from polysight.host.acquisition.scan import resume_scan, run_scan
-from polysight.host.jobs import live_scan as live
-from polysight.host.jobs import live_scan as progress
-from polysight.host.process.request import ProcessRequest
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validation import validate
-from polysight.shared import messages as m
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DeviceError, PolysightError, ScanError, os_error
-from polysight.shared.faults import explain
-from polysight.shared.tables import to_builtins
 from tests.support.acquisition.receivers import receiver_of
 from tests.support.refusals import refused
+
+from polysight.acquisition import scan_loop as running
+from polysight.acquisition.control import StopRequest, ignore_hangup
+from polysight.acquisition.pi_client import PiClient
+from polysight.acquisition.ready import make_ready
+from polysight.acquisition.scan import resume_scan, run_scan
+from polysight.jobs import live_scan as live
+from polysight.jobs import live_scan as progress
+from polysight.process.request import ProcessRequest
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.validation import validate
+from polysight_shared import messages as m
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError, PolysightError, ScanError, os_error
+from polysight_shared.faults import explain
+from polysight_shared.tables import to_builtins
 
 
 def commands(pi) -> list[type]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 
 import pytest
-
-from polysight.host.acquisition.control import StopRequest
-from polysight.host.acquisition.scan import run_scan
-from polysight.host.acquisition.take import ON_REQUEST, FaultKind, TakeFault
-from polysight.host.capture.dca1000 import Status
-from polysight.host.page.history import CAUSES, notice_of_rejection
-from polysight.shared.faults import PiFault, explain
 from tests.support.paths import REPO
+
+from polysight.acquisition.control import StopRequest
+from polysight.acquisition.scan import run_scan
+from polysight.acquisition.take import ON_REQUEST, FaultKind, TakeFault
+from polysight.capture.dca1000 import Status
+from polysight.page.history import CAUSES, notice_of_rejection
+from polysight_shared.faults import PiFault, explain
 
 SPEC = REPO / "docs/spec/scan-folder.md"
 HELD = "held on the way: some positions were passed below full speed"

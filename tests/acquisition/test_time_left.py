@@ -6,12 +6,12 @@ import statistics
 
 import pytest
 
-from polysight.host.acquisition import scan_loop as running
-from polysight.host.acquisition.control import StopRequest
-from polysight.host.acquisition.progress import time_left, typical_row_s
-from polysight.host.acquisition.scan import run_scan
-from polysight.host.page.history import ScanHistory, seconds
-from polysight.host.page.snapshot import remaining
+from polysight.acquisition import scan_loop as running
+from polysight.acquisition.control import StopRequest
+from polysight.acquisition.progress import time_left, typical_row_s
+from polysight.acquisition.scan import run_scan
+from polysight.page.history import ScanHistory, seconds
+from polysight.page.snapshot import remaining
 
 ROW_S, PAUSE_S, HOMING_S = 12.0, 7200.0, 240.0
 

@@ -13,18 +13,18 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 import zmq
-
-from polysight.host.acquisition import ready, row
-from polysight.host.acquisition import scan_loop as running
-from polysight.host.acquisition.control import StopRequest
-from polysight.host.acquisition.progress import NICE
-from polysight.host.acquisition.scan import resume_scan, run_scan
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validation import validate
-from polysight.shared import messages as m
-from polysight.shared.error_codes import ErrorCode
 from tests.support.acquisition.receivers import receivers
 from tests.support.refusals import refused
+
+from polysight.acquisition import ready, row
+from polysight.acquisition import scan_loop as running
+from polysight.acquisition.control import StopRequest
+from polysight.acquisition.progress import NICE
+from polysight.acquisition.scan import resume_scan, run_scan
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.validation import validate
+from polysight_shared import messages as m
+from polysight_shared.error_codes import ErrorCode
 
 
 def limited(instrument, **limits):

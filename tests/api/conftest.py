@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-from polysight.host.cli.main import main
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.products import unrendered
 from tests.support.rigs import published_rig
 from tests.support.scenes import scene_of
+
+from polysight.cli.main import main
+from polysight_simulators.scene import decode_scene, simulate
 
 REPO = Path(__file__).resolve().parents[2]
 COPPER = {"name": "copper", "centre_mm": [-45.0, 0.0], "size_mm": [45.0, 45.0], "metal": True}

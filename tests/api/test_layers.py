@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-
-from polysight.host.api.layers import layer_dataset
-from polysight.host.materials.layers import Layer, Spectrum, predict
-from polysight.host.products import ProcessedScan, write_json
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight.api.layers import layer_dataset
+from polysight.materials.layers import Layer, Spectrum, predict
+from polysight.products import ProcessedScan, write_json
+from polysight_shared.error_codes import ErrorCode
 
 CHIRP = published_rig().chirp
 SHEET = Layer("sheet", 3.4 - 0.1j, 1.7e-3)

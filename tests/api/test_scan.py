@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from tests.support.refusals import refused
 
 import polysight
 from polysight import open_scan, read_netcdf
-from polysight.host.products.files import read_image
-from polysight.host.store import manifest
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.shared.config import load_instrument
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, DataError, PolysightError
-from tests.support.refusals import refused
+from polysight.products.files import read_image
+from polysight.store import manifest
+from polysight.store.scan_folder import MANIFEST, ScanFolder
+from polysight_shared.config import load_instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DataError, PolysightError
 
 from .conftest import COPPER, PET, REPO, command, simulated
 
@@ -360,7 +360,7 @@ def test_importing_polysight_imports_nothing_else():
         "import sys\nfor name in ('numpy', 'xarray', 'msgspec', 'scipy', 'matplotlib'): sys.modules[name] = None\n"
         "import polysight\nassert polysight.__version__\n"
         "assert {'open_scan', 'fresnel', 'backproject'} <= set(dir(polysight))\n"
-        "assert not [m for m in sys.modules if m.startswith('polysight.host')]\n"
+        "assert not [m for m in sys.modules if m.startswith('polysight')]\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

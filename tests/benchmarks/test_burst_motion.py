@@ -1,7 +1,6 @@
 """Images of a simulated scan in motion, beside one that stands still during each burst."""
 
 import pytest
-
 from benchmarks.burst_motion import GRID, errors
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-
 from benchmarks import peers
 from benchmarks.data import published
-from polysight.host.imaging import backproject, image_grid
-from polysight.host.imaging.aperture import Aperture
-from polysight.host.imaging.geometry import Antennas
+from numpy.typing import NDArray
+
+from polysight.imaging import backproject, image_grid
+from polysight.imaging.aperture import Aperture
+from polysight.imaging.geometry import Antennas
 
 ROWS, COLUMNS, EVERY = 6, 7, 2
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-
 from benchmarks.data import RIG
 from benchmarks.published.image import SETTINGS, form_image
 from benchmarks.published.synchronise import SYNC_RX, Synchroniser
-from polysight.host.imaging import ImageGrid, backproject, image_grid
-from polysight.host.imaging.geometry import Antennas
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.raster import mean_burst_travel_mm, plan_raster
-from polysight.simulators.scene import Scene, SimulatedRig, apply_scene, decode_scene, reference_cube, row_offsets_mm
+from numpy.typing import NDArray
+
+from polysight.imaging import ImageGrid, backproject, image_grid
+from polysight.imaging.geometry import Antennas
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.raster import mean_burst_travel_mm, plan_raster
+from polysight_simulators.scene import Scene, SimulatedRig, apply_scene, decode_scene, reference_cube, row_offsets_mm
 
 STEP_MM = 5.0
 SMALL = {

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from benchmarks import accuracy, image, sync, table, waits, whole
 from benchmarks.__main__ import main
 from benchmarks.measure import THREADS

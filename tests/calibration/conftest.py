@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-from polysight.host.store import MANIFEST, manifest
-from polysight.shared.config import Instrument
-from polysight.shared.tables import to_builtins
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.rigs import Change, rig_with
+
+from polysight.store import MANIFEST, manifest
+from polysight_shared.config import Instrument
+from polysight_shared.tables import to_builtins
+from polysight_simulators.scene import decode_scene, simulate
 
 
 @pytest.fixture(scope="session")

@@ -4,14 +4,16 @@ import msgspec
 import numpy as np
 import pytest
 import tomli_w
+from tests.support.calibration import SOURCES, filter_file, metal_reference
+from tests.support.refusals import refused
 
-from polysight.host.calibration.active import (
+from polysight.calibration.active import (
     calibration_of_rig,
     calibration_of_scan,
     copy_into_scan,
     load_calibration,
 )
-from polysight.host.calibration.files import (
+from polysight.calibration.files import (
     FilterFile,
     MetalFile,
     PlacesFile,
@@ -20,15 +22,13 @@ from polysight.host.calibration.files import (
     write_calibration,
     write_metal,
 )
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validation import validate
-from polysight.shared.config import load_instrument
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError
-from polysight.shared.raster import plan_raster
-from polysight.shared.tables import to_builtins
-from tests.support.calibration import SOURCES, filter_file, metal_reference
-from tests.support.refusals import refused
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.validation import validate
+from polysight_shared.config import load_instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+from polysight_shared.raster import plan_raster
+from polysight_shared.tables import to_builtins
 
 
 @pytest.fixture

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from polysight.host.calibration.active import load_calibration
-from polysight.host.calibration.files import FilterFile, read_calibration
-from polysight.host.calibration.filters import BIN_HZ, MIN_CHIRPS, binned
-from polysight.host.cli.main import main
-from polysight.host.pipeline import Pipeline
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.sync.high_pass_filter import HighPass, high_pass
+from polysight.calibration.active import load_calibration
+from polysight.calibration.files import FilterFile, read_calibration
+from polysight.calibration.filters import BIN_HZ, MIN_CHIRPS, binned
+from polysight.cli.main import main
+from polysight.pipeline import Pipeline
+from polysight.store.scan_folder import ScanFolder
+from polysight.sync.high_pass_filter import HighPass, high_pass
 
 OFFSETS_HZ = (60e3, 250e3, 500e3, 850e3, 1250e3)
 TRUE_KHZ = (235.0, 700.0)

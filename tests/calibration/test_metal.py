@@ -5,19 +5,19 @@ import shutil
 import msgspec
 import numpy as np
 import pytest
-
-from polysight.host.calibration.active import checked_calibration, load_calibration
-from polysight.host.calibration.files import write_calibration, write_metal
-from polysight.host.cli.main import main
-from polysight.host.imaging import ImagedWith
-from polysight.host.jobs.calibrate import load_reference
-from polysight.host.materials import MetalChoice
-from polysight.host.pipeline import Pipeline
-from polysight.host.process import Options
-from polysight.host.store import ScanFolder
-from polysight.shared.error_codes import ErrorCode
 from tests.support.calibration import SOURCES, filter_file, metal_reference
 from tests.support.refusals import refused
+
+from polysight.calibration.active import checked_calibration, load_calibration
+from polysight.calibration.files import write_calibration, write_metal
+from polysight.cli.main import main
+from polysight.imaging import ImagedWith
+from polysight.jobs.calibrate import load_reference
+from polysight.materials import MetalChoice
+from polysight.pipeline import Pipeline
+from polysight.process import Options
+from polysight.store import ScanFolder
+from polysight_shared.error_codes import ErrorCode
 
 
 def board(name, **more):

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 import tomli_w
-
-from polysight.host.calibration.active import Calibration, load_calibration
-from polysight.host.calibration.files import PlacesFile, read_calibration
-from polysight.host.calibration.places import Prior, TargetPoint, fit_places, load_echoes, places_file, read_target
-from polysight.host.calibration.scans import open_raw
-from polysight.host.imaging.geometry import Antennas
-from polysight.host.jobs.calibrate import with_places_of
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.geometry import specular_midpoint_m
 from tests.support.processes import output_of
 from tests.support.refusals import refused
+
+from polysight.calibration.active import Calibration, load_calibration
+from polysight.calibration.files import PlacesFile, read_calibration
+from polysight.calibration.places import Prior, TargetPoint, fit_places, load_echoes, places_file, read_target
+from polysight.calibration.scans import open_raw
+from polysight.imaging.geometry import Antennas
+from polysight.jobs.calibrate import with_places_of
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.geometry import specular_midpoint_m
 
 SHIFTS = {"RH": (1.5, -1.0, 0.8), "RV": (-1.2, 0.7, -1.4)}
 DEEPER_MM = 1.7
@@ -113,7 +113,7 @@ def few_echoes(case):
     """Samples at few positions."""
     folder, _, believed, _ = case
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("polysight.host.calibration.places.POSITIONS", 60)
+        patch.setattr("polysight.calibration.places.POSITIONS", 60)
         return load_echoes(open_raw(folder), believed)
 
 

@@ -3,15 +3,15 @@
 import msgspec
 import numpy as np
 import pytest
-
-from polysight.host.calibration.direct_signal import by_geometry, fit_start, start_of, unwrapped
-from polysight.host.calibration.files import StartFile, read_calibration
-from polysight.host.calibration.scans import open_raw
-from polysight.host.cli.main import main
-from polysight.host.radar.constraints import direct_if_hz
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.tables import to_builtins
 from tests.support.refusals import refused
+
+from polysight.calibration.direct_signal import by_geometry, fit_start, start_of, unwrapped
+from polysight.calibration.files import StartFile, read_calibration
+from polysight.calibration.scans import open_raw
+from polysight.cli.main import main
+from polysight.radar.constraints import direct_if_hz
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.tables import to_builtins
 
 TABLES = {"grid": {"columns": 6, "rows": 2}, "burst": {"pulses": 16}, "image": {"columns": 20, "rows": 20}}
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-
-from polysight.host.capture.card import CardClient
-from polysight.shared.config import Board, Instrument
-from polysight.shared.tables import to_builtins
-from polysight.simulators.faults import Faults
-from polysight.simulators.loopback import on_free_subnet
 from tests.support.capture.cards import Cards, ScriptedCard
 from tests.support.rigs import rig_with
+
+from polysight.capture.card import CardClient
+from polysight_shared.config import Board, Instrument
+from polysight_shared.tables import to_builtins
+from polysight_simulators.faults import Faults
+from polysight_simulators.loopback import on_free_subnet
 
 
 def small_rig() -> Instrument:

@@ -13,12 +13,12 @@ import pytest
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
-
-from polysight.host.capture.earlier_records import Past
-from polysight.host.capture.packet_log import PacketLog
-from polysight.host.capture.placement import Placed, place_record
-from polysight.simulators.cards import KINDS, Adversary, Sent
 from tests.support.capture.records import FULL, mask_of
+
+from polysight.capture.earlier_records import Past
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import Placed, place_record
+from polysight_simulators.cards import KINDS, Adversary, Sent
 
 STEPS = 20
 GRIDS = [  # bytes of a frame, frames of a row

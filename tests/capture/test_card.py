@@ -6,13 +6,13 @@ import select
 import time
 
 import pytest
-
-from polysight.host.capture.card import CardClient
-from polysight.host.capture.dca1000 import Code, Status
-from polysight.shared.config import Card
-from polysight.shared.error_codes import ErrorCode
 from tests.support.capture.cards import reply
 from tests.support.refusals import refused
+
+from polysight.capture.card import CardClient
+from polysight.capture.dca1000 import Code, Status
+from polysight_shared.config import Card
+from polysight_shared.error_codes import ErrorCode
 
 
 def test_configures_as_seen_on_a_real_card(scripted):

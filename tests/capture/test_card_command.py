@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomli_w
-
-from polysight.shared.tables import to_builtins
-from polysight.simulators.cards import bound_udp
-from polysight.simulators.faults import Faults
 from tests.support.paths import POLYSIGHT
 from tests.support.processes import Bench, Ended
+
+from polysight_shared.tables import to_builtins
+from polysight_simulators.cards import bound_udp
+from polysight_simulators.faults import Faults
 
 LIMIT_S = 60.0
 NEW_MAC = "12:34:56:78:90:13"

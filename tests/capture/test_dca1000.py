@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from polysight.host.capture import dca1000 as d
-from polysight.shared.errors import ProtocolError
+from polysight.capture import dca1000 as d
+from polysight_shared.errors import ProtocolError
 
 
 def test_vectors_seen():

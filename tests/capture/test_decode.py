@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-
-from polysight.host.capture.decode import decode_row, decode_two_lane
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight.capture.decode import decode_row, decode_two_lane
+from polysight_shared.error_codes import ErrorCode
 
 
 def cube(frames: int, samples: int, rx: int, seed: int = 0) -> np.ndarray:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from polysight.host.capture.card import CardClient, EepromSettings, program_eeprom
-from polysight.host.capture.dca1000 import Code, Status
-from polysight.shared.error_codes import ErrorCode
-from polysight.simulators.cards import Network
 from tests.support.capture.cards import reply
 from tests.support.refusals import refused
+
+from polysight.capture.card import CardClient, EepromSettings, program_eeprom
+from polysight.capture.dca1000 import Code, Status
+from polysight_shared.error_codes import ErrorCode
+from polysight_simulators.cards import Network
 
 
 def test_the_bytes_are_reversed():

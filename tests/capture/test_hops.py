@@ -10,9 +10,10 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from tests.support.paths import REPO
 
-from polysight.host.capture.dca1000 import Status
-from polysight.host.capture.network import (
+from polysight.capture.dca1000 import Status
+from polysight.capture.network import (
     Hop,
     neighbour_answers,
     route_interface,
@@ -20,9 +21,8 @@ from polysight.host.capture.network import (
     silent_hop,
     silent_radar,
 )
-from polysight.host.capture.receiver import RowCapture
-from polysight.shared.config import Board
-from tests.support.paths import REPO
+from polysight.capture.receiver import RowCapture
+from polysight_shared.config import Board
 
 CARD = "192.168.33.180"
 BOARD = Board("RH", "receive_h", CARD, "192.168.33.30", 4096, 4098, ())
@@ -101,8 +101,8 @@ try() { "$PYTHON" - "$1" <<'END'
 import sys
 from pathlib import Path
 import msgspec
-from polysight.host.capture.survey import survey_cards
-from polysight.shared.config import load_instrument
+from polysight.capture.survey import survey_cards
+from polysight_shared.config import load_instrument
 rig = load_instrument(Path("instrument.toml"))
 limits = msgspec.structs.replace(rig.limits, command_timeout_s=0.15)
 survey = survey_cards(msgspec.structs.replace(rig, limits=limits))[0]

@@ -6,18 +6,18 @@ import io
 
 import numpy as np
 import pytest
-
-from polysight.host.capture import kind_of
-from polysight.host.capture.dca1000 import Status
-from polysight.host.capture.inspect import Layout, inspect_bin
-from polysight.host.capture.pcap import inspect_pcap, read_pcap
-from polysight.host.jobs.recordings import inspect_file, main_text
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DataError
 from tests.support.capture.recordings import row, write_pcap
 from tests.support.capture.records import encode_packet
 from tests.support.paths import REAL_CAPTURES
 from tests.support.refusals import refused
+
+from polysight.capture import kind_of
+from polysight.capture.dca1000 import Status
+from polysight.capture.inspect import Layout, inspect_bin
+from polysight.capture.pcap import inspect_pcap, read_pcap
+from polysight.jobs.recordings import inspect_file, main_text
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
 
 needs_real = pytest.mark.skipif(
     not REAL_CAPTURES.is_dir(),
@@ -88,7 +88,7 @@ def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):
 
 
 def test_of_a_huge_file_only_the_beginning_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("polysight.host.capture.inspect.MAX_BYTES", 1 << 20)
+    monkeypatch.setattr("polysight.capture.inspect.MAX_BYTES", 1 << 20)
     path = tmp_path / "x.bin"
     row(4, False).tofile(path)
     with path.open("r+b") as f:

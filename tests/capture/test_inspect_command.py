@@ -8,7 +8,6 @@ import subprocess
 import sys
 
 import pytest
-
 from tests.support.capture.recordings import CARD, OTHER, row, write_pcap
 from tests.support.capture.records import encode_packet
 from tests.support.paths import RIG_FILE
@@ -50,7 +49,7 @@ def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
 
 def test_a_row_of_a_scan_is_read_with_the_scans_rig_file(polysight, tmp_path):
     (tmp_path / "scene.toml").write_text(small_scene(8, 2, metal=False))
-    simulate = [sys.executable, "-m", "polysight.simulators", "simulate", tmp_path / "scene.toml", "--config", RIG_FILE]
+    simulate = [sys.executable, "-m", "polysight_simulators", "simulate", tmp_path / "scene.toml", "--config", RIG_FILE]
     subprocess.run([*simulate, "--out", tmp_path / "scan"], check=True, capture_output=True)
     done = polysight("scan/raw/RV/0001.bin")
     assert done.status == 0, done.err

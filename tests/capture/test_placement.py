@@ -9,10 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-
-from polysight.host.capture.dca1000 import Counters
-from polysight.host.capture.packet_log import PacketLog
-from polysight.host.capture.placement import Losses
 from tests.support.capture.records import (
     FULL,
     Record,
@@ -22,6 +18,10 @@ from tests.support.capture.records import (
     next_start,
     place,
 )
+
+from polysight.capture.dca1000 import Counters
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import Losses
 
 SLOW = [HealthCheck.too_slow]  # a busy machine is no fault
 COUNT, SEQUENCE = 1 << 48, 1 << 32

@@ -12,16 +12,16 @@ from pathlib import Path
 
 import msgpack
 import numpy as np
-
-from polysight.host.capture.receiver import ReceiverProcess
-from polysight.host.store.events import EventWriter
-from polysight.host.store.manifest import ManifestWriter
-from polysight.pi_controller.journal import JournalFile
-from polysight.shared.messages import Capture, RunStopped, pack
-from polysight.simulators.scene import load_scene, simulate
 from tests.support.capture.records import encode_packet
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
+
+from polysight.capture.receiver import ReceiverProcess
+from polysight.store.events import EventWriter
+from polysight.store.manifest import ManifestWriter
+from polysight_pi.journal import JournalFile
+from polysight_shared.messages import Capture, RunStopped, pack
+from polysight_simulators.scene import load_scene, simulate
 
 FRAMES, SAMPLES = 96, 256
 

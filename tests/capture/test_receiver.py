@@ -14,18 +14,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.host.acquisition.capture_rig import record_ended
-from polysight.host.capture.dca1000 import Status
-from polysight.host.capture.network import BatchReceiver, bind_udp
-from polysight.host.capture.receiver import Progress, ReceiverProcess
-from polysight.host.capture.segment import read_index
-from polysight.shared.config import Board
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DeviceError
 from tests.support.capture.records import encode_packet
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
+
+from polysight.acquisition.capture_rig import record_ended
+from polysight.capture.dca1000 import Status
+from polysight.capture.network import BatchReceiver, bind_udp
+from polysight.capture.receiver import Progress, ReceiverProcess
+from polysight.capture.segment import read_index
+from polysight_shared.config import Board
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError
 
 FULL = 1456
 
@@ -170,8 +170,8 @@ def test_survives_ctrl_c_and_ends_with_its_host(board):
 
 def test_ends_when_its_host_is_killed(board, tmp_path):
     code = (
-        "import time\nfrom polysight.shared.config import Board\n"
-        "from polysight.host.capture.receiver import ReceiverProcess\n"
+        "import time\nfrom polysight_shared.config import Board\n"
+        "from polysight.capture.receiver import ReceiverProcess\n"
         f"r = ReceiverProcess(Board('RH', 'receive_h', '{board.card_address}', '{board.host_address}', 1, "
         f"{board.data_port}, ()), 1 << 20)\n"
         f"from pathlib import Path\nr.begin_row(0, 1, 4096, 4096, Path({str(tmp_path / 'a.part')!r}))\n"

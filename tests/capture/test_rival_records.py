@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-
-from polysight.host.capture.earlier_records import Past
 from tests.support.capture.records import FULL, Card, Record, is_original_or_masked, place
+
+from polysight.capture.earlier_records import Past
 
 FRAME = 4096
 FULL_ENDS = 91 * FRAME

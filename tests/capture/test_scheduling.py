@@ -6,14 +6,14 @@ import os
 import subprocess
 
 import pytest
-
-from polysight.host.capture.network import check_receive_buffer, usable_packets
-from polysight.host.capture.receiver import ReceiverProcess
-from polysight.host.capture.scheduling import Core, receiver_cores, take_core, take_priority
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DeviceError
 from tests.support.paths import REPO
 from tests.support.refusals import refused
+
+from polysight.capture.network import check_receive_buffer, usable_packets
+from polysight.capture.receiver import ReceiverProcess
+from polysight.capture.scheduling import Core, receiver_cores, take_core, take_priority
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError
 
 FULL = 1456
 RIGHTS = REPO / "host/rights.sh"

@@ -6,12 +6,12 @@ import zlib
 
 import numpy as np
 import pytest
-
-from polysight.host.capture.packet_log import PacketLog
-from polysight.host.capture.segment import Segment, read_index
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DataError, DeviceError
 from tests.support.refusals import refused
+
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.segment import Segment, read_index
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError, DeviceError
 
 
 def test_memory_is_taken_again_and_clean():

@@ -6,15 +6,15 @@ import os
 
 import numpy as np
 import pytest
-
-from polysight.host.catalogue import MAPS, Pixels, compare, draw_comparison, draw_products, probe, result_of, thumbnail
-from polysight.host.catalogue.compare import SIGNIFICANT, scatter_of
-from polysight.host.polarimetry import permittivity_from_ratio
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DataError
 from tests.support.products import judged_products
 from tests.support.refusals import refused
 from tests.support.scenes import COPPER, PET
+
+from polysight.catalogue import MAPS, Pixels, compare, draw_comparison, draw_products, probe, result_of, thumbnail
+from polysight.catalogue.compare import SIGNIFICANT, scatter_of
+from polysight.polarimetry import permittivity_from_ratio
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
 
 CENTRE = tuple(PET["centre_mm"])
 
@@ -95,7 +95,7 @@ def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
     """The V channel of the PET's pixels is made 30 % stronger in a copy."""
     import shutil
 
-    from polysight.host.products import write_image
+    from polysight.products import write_image
 
     shutil.copytree(processed / "one" / "products", tmp_path / "changed")
     saved = pixels = Pixels(processed / "one" / "products")

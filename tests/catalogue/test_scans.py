@@ -8,12 +8,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-
-from polysight.host.catalogue import NOTES, Notes, Scans, read_notes, scans, write_notes
-from polysight.host.store import MANIFEST, ScanFolder, manifest
-from polysight.shared.errors import ConfigError, DataError
 from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
+
+from polysight.catalogue import NOTES, Notes, Scans, read_notes, scans, write_notes
+from polysight.store import MANIFEST, ScanFolder, manifest
+from polysight_shared.errors import ConfigError, DataError
 
 
 @pytest.fixture

@@ -8,13 +8,13 @@ import json
 from pathlib import Path
 
 import pytest
-
-from polysight.host.cli.main import build_parser, main
-from polysight.host.cli.options import joined
-from polysight.host.materials.library import SIMULATED_LIBRARY
-from polysight.host.products import write_json
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight.cli.main import build_parser, main
+from polysight.cli.options import joined
+from polysight.materials.library import SIMULATED_LIBRARY
+from polysight.products import write_json
+from polysight_shared.error_codes import ErrorCode
 
 E = {"real": 4.5, "imag": -0.4, "real_std": 0.07, "imag_std": 0.08}
 SEGMENTS = [

@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 import scipy.signal
 from numpy.testing import assert_allclose
-
-from polysight.host.cli.main import FAMILIES
-from polysight.host.imaging import TAPERS, window_weights
-from polysight.simulators.scene import load_scene, simulate
 from tests.support.paths import RIG_FILE
 from tests.support.products import judged_products
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
+
+from polysight.cli.main import FAMILIES
+from polysight.imaging import TAPERS, window_weights
+from polysight_simulators.scene import load_scene, simulate
 
 NUMBERS = {"numpy"}
 SCIPY = {"scipy"}
@@ -29,7 +29,7 @@ HEAVY = {
 
 RUN = """
 import contextlib, io, json, sys
-from polysight.host.cli.main import main
+from polysight.cli.main import main
 with contextlib.redirect_stdout(io.StringIO()):
     try:
         status = main(sys.argv[1:])
@@ -78,9 +78,9 @@ def test_a_plan_is_made_without_scipys_parts():
 
 def test_jobs_load_what_they_compute_with_when_they_compute():
     drawing = {"classify", "label"}
-    jobs = {f.stem for f in (RIG_FILE.parent / "host" / "jobs").glob("[a-z]*.py")} - drawing
+    jobs = {f.stem for f in (RIG_FILE.parent / "host" / "polysight" / "jobs").glob("[a-z]*.py")} - drawing
     modules = [*(f"jobs.{job}" for job in sorted(jobs)), "pipeline", "acquisition", "doctor", "api", "plan"]
-    code = "import sys\n" + "".join(f"import polysight.host.{m}\n" for m in modules) + "print(*sys.modules)"
+    code = "import sys\n" + "".join(f"import polysight.{m}\n" for m in modules) + "print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=RIG_FILE.parent)
     assert set(done.stdout.split()) & (HEAVY - {"zmq"}) == set()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-
 from docs.check.looking import page_faults
 from docs.check.pages import read_page
 from docs.check.running import run_page, script_of
@@ -43,10 +42,10 @@ ssh -t pi@host sudo -u polysight /opt/polysight/venv/bin/polysight-pi check --co
 make -C arduino_stage firmware; make flash PORT=/dev/ttyACM0
 systemctl status polysight-pi
 .venv/bin/python -m pytest tests/stage --stage-port /dev/ttyACM0 -v
-python -m polysight.simulators.rig --config instrument.toml --dir rig --pattern
+python -m polysight_simulators.rig --config instrument.toml --dir rig --pattern
 ```
 ```python
-from polysight.host.imaging import ImageBuilder
+from polysight.imaging import ImageBuilder
 ```
 ```toml
 [pi]
@@ -76,14 +75,14 @@ def test_a_sound_page_has_no_faults(tmp_path):
         ("```sh hardware\npolysight scan\n```", "--out"),
         ("```sh minutes\ncd x && sudo -u y polysight-pi jog --dz 1\n```", "--dz"),
         ("```console\n$ polysight validate\n```", "SCAN"),
-        ("```sh\npython -m polysight.simulators.gone\n```", "no module"),
-        ("```sh\npython -m polysight.simulators.stage --config a --link b --gone\n```", "--gone"),
+        ("```sh\npython -m polysight_simulators.gone\n```", "no module"),
+        ("```sh\npython -m polysight_simulators.stage --config a --link b --gone\n```", "--gone"),
         ("```sh\nmake reproduce WAY=1\n```", "no variable WAY"),
         ("```sh\npython -m pytest tests/gone\n```", "no path tests/gone"),
         ("```sh\npython -m pytest tests/stage --stage-portt x\n```", "no option --stage-portt"),
         ("```sh sometimes\nls\n```", "unknown mark 'sometimes'"),
-        ("```python\nfrom polysight.host.imaging import Gone\n```", "has no Gone"),
-        ("```python\nfrom polysight.host.gone import a\n```", "No module named"),
+        ("```python\nfrom polysight.imaging import Gone\n```", "has no Gone"),
+        ("```python\nfrom polysight.gone import a\n```", "No module named"),
         ("```python\nx = (\n```", "python block"),
         ("```toml\nx =\n```", "toml block"),
     ],

@@ -7,15 +7,14 @@ import re
 from collections.abc import Iterator
 
 import pytest
-
 from docs.check.commands import command_faults, parser_of
 from docs.check.pages import ROOT
 
 MODULES = (
-    "polysight.host.cli.main", "polysight.pi_controller.cli", "docs.check",
-    "polysight.simulators", "polysight.simulators.rig", "polysight.simulators.cards", "polysight.simulators.stage",
-    "polysight.simulators.wires", "polysight.simulators.uno", "polysight.simulators.replay",
-    "polysight.simulators.radars",
+    "polysight.cli.main", "polysight_pi.cli", "docs.check",
+    "polysight_simulators", "polysight_simulators.rig", "polysight_simulators.cards", "polysight_simulators.stage",
+    "polysight_simulators.wires", "polysight_simulators.uno", "polysight_simulators.replay",
+    "polysight_simulators.radars",
 )  # fmt: skip
 
 
@@ -45,7 +44,7 @@ def test_help_has_an_example_that_works(parser):
 
 
 def test_help_begins_with_a_sentence_an_example_and_the_options_used_most():
-    root = parser_of("polysight.host.cli.main")
+    root = parser_of("polysight.cli.main")
     assert root is not None
     for parser in [p for p in leaves(root) if p is not root]:
         text = parser.format_help()
@@ -69,7 +68,7 @@ def test_every_option_is_explained(parser):
 
 def test_readme_names_every_command():
     block = (ROOT / "README.md").read_text(encoding="utf-8").split("## Commands")[1]
-    for module, program in (("polysight.host.cli.main", "polysight"), ("polysight.pi_controller.cli", "polysight-pi")):
+    for module, program in (("polysight.cli.main", "polysight"), ("polysight_pi.cli", "polysight-pi")):
         parser = parser_of(module)
         assert parser is not None
         for action in parser._actions:

@@ -6,16 +6,16 @@ import re
 import tomllib
 
 import numpy as np
-
 from docs.check.looking import page_faults
 from docs.check.pages import ROOT, all_pages, read_page
-from polysight.host.acquisition import ScanCommand
-from polysight.host.cli.serve import SCAN_COMMANDS
-from polysight.host.materials import check_labels, read_labels
-from polysight.host.radar.usb import PRODUCT, VENDOR
-from polysight.host.verdict import NoResult
-from polysight.shared.errors import PolysightError
-from polysight.shared.faults import EXPLANATIONS, PiFault
+
+from polysight.acquisition import ScanCommand
+from polysight.cli.serve import SCAN_COMMANDS
+from polysight.materials import check_labels, read_labels
+from polysight.radar.usb import PRODUCT, VENDOR
+from polysight.verdict import NoResult
+from polysight_shared.errors import PolysightError
+from polysight_shared.faults import EXPLANATIONS, PiFault
 
 
 def test_links_and_commands():

@@ -10,16 +10,16 @@ from pathlib import Path
 
 import msgspec
 import pytest
-
 from docs.check.pages import ROOT, read_page
-from polysight.host.capture import dca1000
-from polysight.host.capture.card import EepromSettings
-from polysight.host.radar import commands, events
-from polysight.host.radar.commands import DEVICE_CONFIGURATION, Command
-from polysight.host.radar.messages import Direction, Kind, SubBlock, decode
-from polysight.host.radar.program import program
-from polysight.shared import messages, stage_line
-from polysight.shared.config import NativeRadar, Radar, load_instrument
+
+from polysight.capture import dca1000
+from polysight.capture.card import EepromSettings
+from polysight.radar import commands, events
+from polysight.radar.commands import DEVICE_CONFIGURATION, Command
+from polysight.radar.messages import Direction, Kind, SubBlock, decode
+from polysight.radar.program import program
+from polysight_shared import messages, stage_line
+from polysight_shared.config import NativeRadar, Radar, load_instrument
 
 SPEC = ROOT / "docs/spec"
 

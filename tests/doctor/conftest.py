@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-
-from polysight.shared.tables import to_builtins
-from polysight.simulators.loopback import on_free_subnet
 from tests.support.doctor.live_rig import SCENE, LiveRig, impatient_rig
 from tests.support.processes import LIMIT_S, wait_for
+
+from polysight_shared.tables import to_builtins
+from polysight_simulators.loopback import on_free_subnet
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRig]:
     folder = tmp_path_factory.mktemp("d")
     (folder / "base.toml").write_text(tomli_w.dumps(to_builtins(impatient_rig())))
     (folder / "scene.toml").write_text(SCENE)
-    command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(folder / "base.toml"), "--with-pi"]
+    command = [sys.executable, "-m", "polysight_simulators.rig", "--config", str(folder / "base.toml"), "--with-pi"]
     command += ["--scene", str(folder / "scene.toml"), "--dir", str(folder / "rig"), "--time-scale", "40"]
     log = folder / "rig.log"
     with log.open("wb") as out:

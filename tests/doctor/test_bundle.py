@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 import tomli_w
 import zmq
+from tests.support.rigs import rig_table
 from zmq.auth import create_certificates
 
-from polysight.host.cli.main import main
-from polysight.host.doctor.bundle import HIDDEN, Redactor, write_bundle
-from polysight.host.doctor.context import DoctorOptions, ok
-from polysight.shared.config import load_instrument
-from tests.support.rigs import rig_table
+from polysight.cli.main import main
+from polysight.doctor.bundle import HIDDEN, Redactor, write_bundle
+from polysight.doctor.context import DoctorOptions, ok
+from polysight_shared.config import load_instrument
 
 TOKEN = "f00dfacef00dfacef00dfacef00dface"
 

@@ -6,28 +6,28 @@ from pathlib import Path
 import msgspec
 import pytest
 import tomli_w
+from tests.support.doctor.case import QUICK, RIG, context_of
+from tests.support.rigs import programmed_rig
 
-from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
-from polysight.host.capture.network import route_interface
-from polysight.host.cli.main import main
-from polysight.host.doctor import checks, kernel
-from polysight.host.doctor.check_capture import check_network
-from polysight.host.doctor.check_host import (
+from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
+from polysight.capture.network import route_interface
+from polysight.cli.main import main
+from polysight.doctor import checks, kernel
+from polysight.doctor.check_capture import check_network
+from polysight.doctor.check_host import (
     check_calibration,
     check_disk,
     check_host_clock,
     check_receivers,
     check_time,
 )
-from polysight.host.doctor.check_pi import check_keys
-from polysight.host.doctor.checks import CHECKS, run_checks
-from polysight.host.doctor.context import CheckContext, DoctorOptions, System, error, ok
-from polysight.host.doctor.receiver_load import LoadResult, measure_receivers
-from polysight.shared.messages import GPIOD, WIRES, HelloReply
-from polysight.shared.sockets import HOST_KEYS
-from polysight.shared.tables import to_builtins
-from tests.support.doctor.case import QUICK, RIG, context_of
-from tests.support.rigs import programmed_rig
+from polysight.doctor.check_pi import check_keys
+from polysight.doctor.checks import CHECKS, run_checks
+from polysight.doctor.context import CheckContext, DoctorOptions, System, error, ok
+from polysight.doctor.receiver_load import LoadResult, measure_receivers
+from polysight_shared.messages import GPIOD, WIRES, HelloReply
+from polysight_shared.sockets import HOST_KEYS
+from polysight_shared.tables import to_builtins
 
 
 @pytest.mark.parametrize("broken", ["nonsense = 1\n", 'name = "x"\n', "[[[\n", None])

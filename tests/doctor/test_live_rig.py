@@ -8,24 +8,24 @@ import json
 import time
 
 import pytest
-
-from polysight.host.acquisition.scan import run_scan
-from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
-from polysight.host.doctor.checks import run_doctor
-from polysight.host.doctor.context import DoctorOptions
-from polysight.host.pipeline import Pipeline
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validation import validate
-from polysight.shared import __version__
-from polysight.shared.config import load_instrument
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.messages import WIRE_VERSION, BeginRun, HelloReply
-from polysight.shared.raster import plan_raster
-from polysight.simulators.builds import sketch_compiler
 from tests.support.doctor.case import QUICK
 from tests.support.doctor.live_rig import answering
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
+
+from polysight.acquisition.scan import run_scan
+from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
+from polysight.doctor.checks import run_doctor
+from polysight.doctor.context import DoctorOptions
+from polysight.pipeline import Pipeline
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.validation import validate
+from polysight_shared import __version__
+from polysight_shared.config import load_instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.messages import WIRE_VERSION, BeginRun, HelloReply
+from polysight_shared.raster import plan_raster
+from polysight_simulators.builds import sketch_compiler
 
 
 def assert_failed(findings, *names):
@@ -154,7 +154,7 @@ def test_a_trigger_wire_that_is_cut(live):
 
 def test_a_stage_that_is_silent(live):
     try:
-        with live.stopped("--trigger-line" if sketch_compiler() else "polysight.simulators.stage"):
+        with live.stopped("--trigger-line" if sketch_compiler() else "polysight_simulators.stage"):
             with live.pi() as pi:
                 wait_for(lambda: pi.status().state == "fault", "the fault")
             found = live.doctor(move=True)

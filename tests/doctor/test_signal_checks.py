@@ -2,19 +2,19 @@
 
 import numpy as np
 import pytest
+from tests.support.doctor.case import FRAMES, RIG, context_of, frames_of, signal_of
+from tests.support.rigs import programmed_rig
 
-from polysight.host.capture.receiver import RowCapture
-from polysight.host.doctor.check_capture import (
+from polysight.capture.receiver import RowCapture
+from polysight.doctor.check_capture import (
     check_direct_path,
     check_level,
     check_radar,
     judge_direct_path,
     judge_skew,
 )
-from polysight.host.doctor.context import CapturedFrames
-from polysight.host.radar.constraints import direct_if_hz
-from tests.support.doctor.case import FRAMES, RIG, context_of, frames_of, signal_of
-from tests.support.rigs import programmed_rig
+from polysight.doctor.context import CapturedFrames
+from polysight.radar.constraints import direct_if_hz
 
 
 def judged(board="RH", rig=RIG, **disturbances):

@@ -7,12 +7,12 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
-
-from polysight.shared.config import Instrument
-from polysight.simulators.loopback import on_free_subnet
 from tests.support.processes import Bench
 from tests.support.rigs import rig_with
 from tests.support.simulated_rig import SCENE, Rig, running
+
+from polysight_shared.config import Instrument
+from polysight_simulators.loopback import on_free_subnet
 
 
 @pytest.fixture(scope="session")

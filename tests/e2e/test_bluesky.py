@@ -11,13 +11,13 @@ import pytest
 import tomli_w
 from bluesky import RunEngine
 from bluesky.utils import FailedStatus, RunEngineInterrupted
-
-from polysight import RadarScan, radar_scan
-from polysight.host.cli.main import main
-from polysight.host.store import ScanFolder
-from polysight.shared.tables import to_builtins
 from tests.support.processes import wait_for
 from tests.support.simulated_rig import Rig
+
+from polysight import RadarScan, radar_scan
+from polysight.cli.main import main
+from polysight.store import ScanFolder
+from polysight_shared.tables import to_builtins
 
 pytestmark = pytest.mark.slow
 Documents = list[tuple[str, dict[str, Any]]]

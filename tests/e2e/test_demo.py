@@ -5,9 +5,9 @@ from __future__ import annotations
 import signal
 
 import pytest
-
-from polysight.host.store.manifest import decode_line
 from tests.support.paths import RIG_FILE
+
+from polysight.store.manifest import decode_line
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -10,9 +10,9 @@ import resource
 
 import pytest
 
-from polysight.host.store.events import read_events
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.shared.messages import RowStarted
+from polysight.store.events import read_events
+from polysight.store.scan_folder import ScanFolder
+from polysight_shared.messages import RowStarted
 
 
 @pytest.fixture

@@ -20,16 +20,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from polysight.host.pipeline import Pipeline
-from polysight.host.store import manifest
-from polysight.host.store.events import read_events
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validation import validate
-from polysight.shared.messages import RowStarted
 from tests.support.paths import REPO
 from tests.support.products import unrendered
 from tests.support.scenes import small_scene
+
+from polysight.pipeline import Pipeline
+from polysight.store import manifest
+from polysight.store.events import read_events
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.validation import validate
+from polysight_shared.messages import RowStarted
 
 pytestmark = pytest.mark.slow
 KILLED_AT = REPO / "tests/support/killed_at.py"

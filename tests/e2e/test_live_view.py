@@ -13,9 +13,9 @@ from urllib.error import URLError
 from urllib.request import Request, urlopen
 
 import pytest
-
-from polysight.host.store.validation import validate
 from tests.support.scenes import small_scene
+
+from polysight.store.validation import validate
 
 LIMIT_S = 120.0
 ROWS = 40

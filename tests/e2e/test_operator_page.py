@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-from polysight.host.catalogue import PROGRAM
-from polysight.host.serve.programs import program_of
-from polysight.host.store import ScanFolder, validate
 from tests.support.page.chromium import DESK, PHONE, Browser
 from tests.support.page.fixtures import browser
 from tests.support.processes import Program
 from tests.support.scenes import small_scene
 from tests.support.simulated_rig import Rig, running
+
+from polysight.catalogue import PROGRAM
+from polysight.serve.programs import program_of
+from polysight.store import ScanFolder, validate
 
 ROWS = 40
 SCENE = small_scene(10, ROWS, step_mm=(10.0, 5.0))

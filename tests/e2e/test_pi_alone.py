@@ -24,18 +24,18 @@ HOST_ONLY = (
     "jinja2",
     "rich",
     "gpiod",
-    "polysight.host",
-    "polysight.simulators",
+    "polysight",
+    "polysight_simulators",
 )
 EVERYTHING = """
 import importlib, pkgutil
-from polysight import pi_controller, shared
-for package in (pi_controller, shared):
+import polysight_pi, polysight_shared
+for package in (polysight_pi, polysight_shared):
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
 """
-HELP = "from polysight.pi_controller.cli import main\nmain({arguments})\n"
+HELP = "from polysight_pi.cli import main\nmain({arguments})\n"
 
 
 def alone(code: str, *absent: str) -> subprocess.CompletedProcess[str]:
@@ -62,8 +62,8 @@ def test_help(arguments):
 
 def test_gpio_without_gpiod_is_one_message():
     code = (
-        "from polysight.pi_controller.lines import load_gpiod\n"
-        "from polysight.shared.errors import PolysightError\n"
+        "from polysight_pi.lines import load_gpiod\n"
+        "from polysight_shared.errors import PolysightError\n"
         "try:\n    load_gpiod()\nexcept PolysightError as e:\n    print(e)\n"
     )
     ended = alone(code, *HOST_ONLY)

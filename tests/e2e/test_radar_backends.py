@@ -9,11 +9,11 @@ import json
 from typing import Any
 
 import tomli_w
-
-from polysight.host.acquisition.scan import ScanResult, run_scan
-from polysight.host.store.validation import validate
-from polysight.shared.config import load_instrument
 from tests.support.rigs import rig_table
+
+from polysight.acquisition.scan import ScanResult, run_scan
+from polysight.store.validation import validate
+from polysight_shared.config import load_instrument
 
 COLUMNS, ROWS, CHIRPS = 8, 3, 4
 PORTS = {"LS": 5000, "RH": 5001, "RV": 5002}
@@ -30,7 +30,7 @@ def scanned(bench, radar: dict[str, Any], burst: dict[str, Any]) -> ScanResult:
         board["start_offset_hz"] = 0.0 if board["role"] == "transmit" else 790e3
     (bench.folder / "rig.toml").write_text(tomli_w.dumps(table))
     rig = bench.start(
-        "python", "-m", "polysight.simulators.rig", "--config", "rig.toml", "--dir", bench.folder / "rig", "--pattern",
+        "python", "-m", "polysight_simulators.rig", "--config", "rig.toml", "--dir", bench.folder / "rig", "--pattern",
         "--time-scale", "40", "--with-pi",
     )  # fmt: skip
     result = run_scan(load_instrument(bench.folder / rig.wait_ready()), bench.folder / "scan")

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-
-from polysight.shared.tables import to_builtins
 from tests.support.paths import REAL_CAPTURES, RIG_FILE
 from tests.support.scenes import small_scene
+
+from polysight_shared.tables import to_builtins
 
 CAPTURE = REAL_CAPTURES / "test_one_frame.pcap"
 SCENE = small_scene(12, 4, pixels=30, pixel_mm=5.0, metal=False, seed=1)
@@ -109,7 +109,7 @@ def test_scene_file(bench, old, new, words):
 
 def test_simulated_rig(bench):
     """What its processes would refuse, the rig refuses before it starts them."""
-    rig = ("python", "-m", "polysight.simulators.rig", "--config", RIG_FILE, "--pattern", "--dir", "rig")
+    rig = ("python", "-m", "polysight_simulators.rig", "--config", RIG_FILE, "--pattern", "--dir", "rig")
     refused(bench.run(*rig, "--faults", "no.toml"), "no.toml: no such file", status=2)
     refused(bench.run(*rig, "--fault", "RH.los=0.1"), "faults of RH", "los", status=2)
     refused(bench.run(*rig, "--time-scale", "0"), "--time-scale", status=2)
@@ -132,7 +132,7 @@ def recorded(tmp_path_factory):
     """A simulated scan of nothing: no metal, no plates."""
     folder = tmp_path_factory.mktemp("recorded")
     (folder / "scene.toml").write_text(SCENE)
-    command = [sys.executable, "-m", "polysight.simulators", "simulate", folder / "scene.toml", "--config", RIG_FILE]
+    command = [sys.executable, "-m", "polysight_simulators", "simulate", folder / "scene.toml", "--config", RIG_FILE]
     subprocess.run([*command, "--out", folder / "scan"], check=True, capture_output=True)
     return folder / "scan"
 
@@ -209,7 +209,7 @@ def lonely(bench, lonely_instrument):
 def wires(bench):
     """Simulated wires."""
     path = bench.folder / "wires.sock"
-    bench.start("python", "-m", "polysight.simulators.wires", "--socket", path).wait_ready()
+    bench.start("python", "-m", "polysight_simulators.wires", "--socket", path).wait_ready()
     return path
 
 

@@ -7,11 +7,11 @@ import runpy
 
 import numpy as np
 import pytest
-
-from polysight.host.materials import Library
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.paths import REPO
 from tests.support.rigs import published_rig
+
+from polysight.materials import Library
+from polysight_simulators.scene import decode_scene, simulate
 
 SCRIPTS = REPO / "examples" / "scripts"
 LIMIT = 20  # lines from raw data to the image, imports included

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.host.materials import format_permittivity
+from polysight.materials import format_permittivity
 
 ROOT = Path(__file__).parents[2]
 TOPS = ("host", "papers", "simulators", "benchmarks", "examples", "shared", "pi_controller")
 BY_HAND = re.compile(r"[-+−–] ?j\(?$")
 OTHERS = re.compile(r"[-+−–] ?j\(?(\$?\{|%)")
-WRITER = "host/materials/permittivity.py"
+WRITER = "host/polysight/materials/permittivity.py"
 
 
 def built_by_hand(text: str) -> list[int]:
@@ -42,7 +42,7 @@ def test_no_text_is_built_by_hand():
                 past += [f"{name}:{line}" for line in built_by_hand(file.read_text(encoding="utf-8"))]
         for file in (f for suffix in ("js", "html", "ipynb") for f in (ROOT / top).rglob(f"*.{suffix}")):
             past += [str(file.relative_to(ROOT))] if OTHERS.search(file.read_text(encoding="utf-8")) else []
-    assert past == [], "use format_permittivity of polysight.host.materials"
+    assert past == [], "use format_permittivity of polysight.materials"
 
 
 @pytest.mark.parametrize(

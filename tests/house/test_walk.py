@@ -41,9 +41,9 @@ def test_every_stop_is_a_file_and_a_function(file, name):
 
 
 def test_a_scan_passes_the_stops_in_their_order(tmp_path):
-    from polysight.host.jobs.process import process
-    from polysight.host.process.request import ProcessRequest
-    from polysight.simulators.__main__ import main
+    from polysight.jobs.process import process
+    from polysight.process.request import ProcessRequest
+    from polysight_simulators.__main__ import main
 
     scan = tmp_path / "scan"
     command = ["simulate", str(ROOT / "examples" / "own-scene.toml"), "--config", str(ROOT / "instrument.toml")]

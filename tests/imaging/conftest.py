@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.imaging.geometry import Antennas, row_offsets_m
-from polysight.host.sync.chain import SyncedRow
-from polysight.shared.config import Board, Instrument
-from polysight.shared.raster import plan_raster
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.imaging.geometry import Antennas, row_offsets_m
+from polysight.sync.chain import SyncedRow
+from polysight_shared.config import Board, Instrument
+from polysight_shared.raster import plan_raster
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 
 @pytest.fixture(scope="session")

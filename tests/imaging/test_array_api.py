@@ -4,14 +4,14 @@ import importlib
 
 import numpy as np
 import pytest
-
-from polysight.host.imaging import backproject, project
-from polysight.host.imaging.aperture import Aperture
-from polysight.host.imaging.direct import DirectImager
-from polysight.host.imaging.geometry import Antennas, image_grid, scan_offsets_m
-from polysight.host.imaging.spectral import IncrementalImager, SpectralImager
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight.imaging import backproject, project
+from polysight.imaging.aperture import Aperture
+from polysight.imaging.direct import DirectImager
+from polysight.imaging.geometry import Antennas, image_grid, scan_offsets_m
+from polysight.imaging.spectral import IncrementalImager, SpectralImager
+from polysight_shared.error_codes import ErrorCode
 
 
 def _strict():

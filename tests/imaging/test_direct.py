@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from polysight.host.imaging import backproject, project
-from polysight.shared.units import SPEED_OF_LIGHT_M_S as C
+from polysight.imaging import backproject, project
+from polysight_shared.units import SPEED_OF_LIGHT_M_S as C
 
 
 def _phase_history(f, tx, rx, reference, points, amplitudes):

@@ -4,8 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.imaging import ImageBuilder, image_grid
-from polysight.host.imaging.focus import _at, focus_sweep
+from polysight.imaging import ImageBuilder, image_grid
+from polysight.imaging.focus import _at, focus_sweep
 
 PLACES_MM = [(-60, -55), (-10, -60), (58, -50), (-62, 5), (3, -4), (60, 8), (-55, 60), (8, 55), (61, 58)]
 

@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
-
-from polysight.host import report
-from polysight.host.cli.main import main
-from polysight.host.imaging.focus import Focus
-from polysight.host.jobs import process as offline
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.rigs import published_rig
+
+from polysight import report
+from polysight.cli.main import main
+from polysight.imaging.focus import Focus
+from polysight.jobs import process as offline
+from polysight_simulators.scene import decode_scene, simulate
 
 SCENE = {
     "name": "one point",

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polysight.host.imaging import image_grid
-from polysight.host.imaging.aperture import Aperture, irregular
-from polysight.host.imaging.direct import DirectImager
-from polysight.host.imaging.geometry import Antennas, scan_offsets_m
-from polysight.host.imaging.lattice import forget
-from polysight.host.imaging.reduce import reduction, scene_gate_m
-from polysight.host.imaging.samples import choose_imager
-from polysight.host.imaging.spectral import IncrementalImager, SpectralImager
-from polysight.shared.raster import plan_raster
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.imaging import image_grid
+from polysight.imaging.aperture import Aperture, irregular
+from polysight.imaging.direct import DirectImager
+from polysight.imaging.geometry import Antennas, scan_offsets_m
+from polysight.imaging.lattice import forget
+from polysight.imaging.reduce import reduction, scene_gate_m
+from polysight.imaging.samples import choose_imager
+from polysight.imaging.spectral import IncrementalImager, SpectralImager
+from polysight_shared.raster import plan_raster
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 IMAGERS = [SpectralImager, IncrementalImager, DirectImager]
 # columns, rows, steps (mm), pixels, pixel (mm): common lattices, none in x, coarser and finer pixels, full width.

@@ -6,19 +6,19 @@ import msgspec
 import numpy as np
 import pytest
 import scipy.signal
-
-from polysight.host.imaging import ImageBuilder, backproject, image_grid
-from polysight.host.imaging.geometry import Antennas, row_offsets_m
-from polysight.host.imaging.reduce import reduction, scene_gate_m
-from polysight.host.imaging.samples import mirror_samples
-from polysight.host.materials.layers import Spectrum
-from polysight.host.polarimetry import multilayer
-from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.geometry import specular_midpoint_m
-from polysight.shared.raster import plan_raster
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from tests.support.refusals import refused
+
+from polysight.imaging import ImageBuilder, backproject, image_grid
+from polysight.imaging.geometry import Antennas, row_offsets_m
+from polysight.imaging.reduce import reduction, scene_gate_m
+from polysight.imaging.samples import mirror_samples
+from polysight.materials.layers import Spectrum
+from polysight.polarimetry import multilayer
+from polysight.sync import BoardSetup, synchronise_row
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.geometry import specular_midpoint_m
+from polysight_shared.raster import plan_raster
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 
 def _build(rig, rows, **options):

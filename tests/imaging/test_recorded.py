@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import scipy.io
 
-from polysight.host.imaging import backproject
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.imaging import backproject
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 BRIGHT_M = np.array([-15.6, 21.6, 0.0])  # the strongest reflector of this degree, on the ground
 

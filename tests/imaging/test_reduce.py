@@ -6,10 +6,10 @@ import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.host.imaging.geometry import Antennas, image_grid
-from polysight.host.imaging.reduce import reduction, scene_gate_m
-from polysight.shared.raster import plan_raster
-from polysight.shared.units import SPEED_OF_LIGHT_M_S as C
+from polysight.imaging.geometry import Antennas, image_grid
+from polysight.imaging.reduce import reduction, scene_gate_m
+from polysight_shared.raster import plan_raster
+from polysight_shared.units import SPEED_OF_LIGHT_M_S as C
 
 GATE = (0.30, 0.47)
 

@@ -4,9 +4,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.imaging import ImageBuilder
-from polysight.host.imaging.resolution import board_facts, point_response
-from polysight.shared.geometry import specular_midpoint_m
+from polysight.imaging import ImageBuilder
+from polysight.imaging.resolution import board_facts, point_response
+from polysight_shared.geometry import specular_midpoint_m
 
 
 def _full(rig, **options):

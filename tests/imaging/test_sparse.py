@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from polysight.host.imaging import ImageBuilder, image_grid
-from polysight.host.imaging.sparse import reconstruct
+from polysight.imaging import ImageBuilder, image_grid
+from polysight.imaging.sparse import reconstruct
 
 AT = [(6, 8), (20, 30), (33, 12)]
 AMPLITUDES = np.array([1.0, 0.6j, -0.8])

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from polysight.host.imaging.images import MIN_SAMPLES, sub_bands
-from polysight.host.materials.layers import Spectrum
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight.imaging.images import MIN_SAMPLES, sub_bands
+from polysight.materials.layers import Spectrum
+from polysight_shared.error_codes import ErrorCode
 
 CHIRP = published_rig().chirp
 

@@ -7,18 +7,18 @@ import time
 from pathlib import Path
 
 import pytest
-
-from polysight.host.cli.main import main
-from polysight.host.jobs import batch as many
-from polysight.host.jobs.batch import Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of, table
-from polysight.host.process import cores
-from polysight.host.process.request import ProcessRequest
-from polysight.host.products.files import FINISHED
-from polysight.shared.error_codes import ErrorCode
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 from tests.support.scenes import scene_of
+
+from polysight.cli.main import main
+from polysight.jobs import batch as many
+from polysight.jobs.batch import Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of, table
+from polysight.process import cores
+from polysight.process.request import ProcessRequest
+from polysight.products.files import FINISHED
+from polysight_shared.error_codes import ErrorCode
+from polysight_simulators.scene import decode_scene, simulate
 
 WORKER = """
 import json, os, sys, time
@@ -236,8 +236,8 @@ def test_a_scan_that_carries_its_mark_is_done_and_not_processed_again(tmp_path):
 STARTER = """
 import sys
 from pathlib import Path
-from polysight.host.jobs import batch
-child = "from polysight.host.jobs import batch_worker as w, batch; import os, sys, time;" \
+from polysight.jobs import batch
+child = "from polysight.jobs import batch_worker as w, batch; import os, sys, time;" \
     "w.end_with(os.environ[batch.ALIVE]); open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
 batch.PROGRAM = (sys.executable, "-c", child, sys.argv[2])
 batch.run_scan(batch.jobs_of([batch.ProcessRequest(data=sys.argv[1], out=sys.argv[1] + "-out")])[0])
@@ -272,8 +272,7 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
     (tmp_path / "worker.py").write_text(WORKER.replace("time.sleep(600)", KILLS_ITS_WORKER))
     preload = tmp_path / "preload.py"
     preload.write_text(
-        "from polysight.host.jobs import batch\n"
-        f"batch.PROGRAM = ({sys.executable!r}, {str(tmp_path / 'worker.py')!r})\n"
+        f"from polysight.jobs import batch\nbatch.PROGRAM = ({sys.executable!r}, {str(tmp_path / 'worker.py')!r})\n"
     )
     names = ("a", "b", "slow", "c")
     scans(tmp_path / "in", *names)

@@ -6,14 +6,14 @@ import json
 
 import numpy as np
 import pytest
-
-from polysight.host.cli.main import build_parser, main
-from polysight.host.jobs.label import Edits, label
-from polysight.host.materials import read_labels
-from polysight.host.products import find_labels, find_products, making_products, write_image, write_json
-from polysight.shared.error_codes import ErrorCode
 from tests.support.products import judged_products
 from tests.support.refusals import refused
+
+from polysight.cli.main import build_parser, main
+from polysight.jobs.label import Edits, label
+from polysight.materials import read_labels
+from polysight.products import find_labels, find_products, making_products, write_image, write_json
+from polysight_shared.error_codes import ErrorCode
 
 NAMED = ["--from-patches", "--rename", "1=copper", "--rename", "2=\u6a61\u6728"]
 

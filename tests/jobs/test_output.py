@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from polysight.host.cli.main import main
-from polysight.host.jobs import output
-from polysight.host.jobs.output import counted, steps
+from polysight.cli.main import main
+from polysight.jobs import output
+from polysight.jobs.output import counted, steps
 
 
 def test_every_step_is_named_before_it_begins(capsys):

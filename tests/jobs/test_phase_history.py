@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import sarkit.cphd
 from sarkit.verification import CphdConsistency
-
-from polysight.host.cli.main import main
-from polysight.host.jobs.phase_history import FILE
-from polysight.host.pipeline import Pipeline
-from polysight.host.store import ScanFolder
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.rigs import rig_with
+
+from polysight.cli.main import main
+from polysight.jobs.phase_history import FILE
+from polysight.pipeline import Pipeline
+from polysight.store import ScanFolder
+from polysight_simulators.scene import decode_scene, simulate
 
 C_M_S = 299_792_458.0
 SCENE = {

@@ -7,16 +7,16 @@ import shutil
 from pathlib import Path
 
 import pytest
-
-from polysight.host.catalogue import Notes, read_notes
-from polysight.host.cli.main import build_parser, main
-from polysight.shared.error_codes import ErrorCode
-from polysight.simulators.scene import load_scene, simulate
 from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
+
+from polysight.catalogue import Notes, read_notes
+from polysight.cli.main import build_parser, main
+from polysight_shared.error_codes import ErrorCode
+from polysight_simulators.scene import load_scene, simulate
 
 
 @pytest.fixture

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from polysight.host.cli.main import main
-from polysight.host.jobs.train import training_scan
-from polysight.host.materials import Library, entries_of
-from polysight.shared.errors import DataError
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.paths import RIG_FILE
 from tests.support.rigs import published_rig
 from tests.support.scenes import scene_of
+
+from polysight.cli.main import main
+from polysight.jobs.train import training_scan
+from polysight.materials import Library, entries_of
+from polysight_shared.errors import DataError
+from polysight_simulators.scene import decode_scene, simulate
 
 pytestmark = pytest.mark.slow
 MINE = "h\u00e4rtes \u6a61\u6728"

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from polysight.host.materials import Library, TrainingScan, TruthPlate, make_library
-from polysight.host.materials.analyse import FOUND, ImagePair, KnownScene, Optics, analyse
+from polysight.materials import Library, TrainingScan, TruthPlate, make_library
+from polysight.materials.analyse import FOUND, ImagePair, KnownScene, Optics, analyse
 
 THETA = np.radians(55.0)
 NINE = {

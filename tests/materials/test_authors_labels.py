@@ -4,8 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from tests.support.drawn_files import Errors, Material, write_labels
+from tests.support.refusals import refused
 
-from polysight.host.materials.published import (
+from polysight.materials.published import (
     ORIENTATIONS,
     PIXELS,
     angle_in_text,
@@ -14,10 +16,8 @@ from polysight.host.materials.published import (
     label_folders,
     read_labelled_scan,
 )
-from polysight.host.polarimetry import ratio_from_permittivity
-from polysight.shared.error_codes import ErrorCode
-from tests.support.drawn_files import Errors, Material, write_labels
-from tests.support.refusals import refused
+from polysight.polarimetry import ratio_from_permittivity
+from polysight_shared.error_codes import ErrorCode
 
 MATERIALS = {
     "Copper plate": Material("copper", None),

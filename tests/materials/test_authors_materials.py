@@ -5,13 +5,13 @@ import pickle
 
 import numpy as np
 import pytest
-
-from polysight.host.materials import Entry
-from polysight.host.materials.published import read_material, read_materials, read_pickle
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DataError
 from tests.support.published_files import write_materials
 from tests.support.refusals import refused
+
+from polysight.materials import Entry
+from polysight.materials.published import read_material, read_materials, read_pickle
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
 
 RNG = np.random.default_rng(1)
 

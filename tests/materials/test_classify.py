@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from polysight.host.cli.main import main
-from polysight.host.materials import UNKNOWN, Classifier, Library, TrainingScan, entries_of, fit_library
-from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER
-from polysight.host.materials.patch_files import PATCHES, match_patches, pack_patches, read_patches
-from polysight.host.report.context import classifier_sentence
-from polysight.papers.sensys2026.patches import Errors, draw, groups
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight.cli.main import main
+from polysight.materials import UNKNOWN, Classifier, Library, TrainingScan, entries_of, fit_library
+from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER
+from polysight.materials.patch_files import PATCHES, match_patches, pack_patches, read_patches
+from polysight.report.context import classifier_sentence
+from polysight_papers.sensys2026.patches import Errors, draw, groups
+from polysight_shared.error_codes import ErrorCode
 
 ANGLES = (55.0, 60.0)
 
@@ -198,7 +198,7 @@ def test_the_discriminant_starts_without_scikit_learn(powders, tmp_path):
     """It loads for a second or two, which nobody waits for who does not use it."""
     powders.save(tmp_path / "l.npz")
     code = (
-        "import sys; from pathlib import Path; from polysight.host.materials import Classifier, Library;"
+        "import sys; from pathlib import Path; from polysight.materials import Classifier, Library;"
         f"Classifier(Library.load(Path({str(tmp_path / 'l.npz')!r})), model='discriminant', angles_deg=[55.0]);"
         "sys.exit('sklearn' in sys.modules)"
     )

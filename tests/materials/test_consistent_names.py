@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from polysight.host.materials import SIMULATED_LIBRARY, UNKNOWN, Classifier, Library
-from polysight.host.materials.classify import features_of
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight.materials import SIMULATED_LIBRARY, UNKNOWN, Classifier, Library
+from polysight.materials.classify import features_of
+from polysight_shared.error_codes import ErrorCode
 
 ANGLE_DEG = 54.9
 

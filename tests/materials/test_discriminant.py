@@ -2,17 +2,17 @@
 
 import numpy as np
 import pytest
-
-from polysight.host.cli.main import main
-from polysight.host.materials import Classifier, Entry, Library
-from polysight.host.materials.classify import DISCRIMINANT, PAPER
-from polysight.host.materials.discriminant import REJECTED, ErrorDiscriminant
-from polysight.host.materials.knn import fit_weights
-from polysight.host.materials.samples import Samples, feature_matrix
-from polysight.host.materials.train import fit_samples, score, score_unseen_materials
-from polysight.host.report.context import classifier_sentence
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight.cli.main import main
+from polysight.materials import Classifier, Entry, Library
+from polysight.materials.classify import DISCRIMINANT, PAPER
+from polysight.materials.discriminant import REJECTED, ErrorDiscriminant
+from polysight.materials.knn import fit_weights
+from polysight.materials.samples import Samples, feature_matrix
+from polysight.materials.train import fit_samples, score, score_unseen_materials
+from polysight.report.context import classifier_sentence
+from polysight_shared.error_codes import ErrorCode
 
 MEANS = np.array([[-0.6, -2.0, 0.1], [-0.55, -1.9, 0.2], [-0.5, -2.2, 3.1], [-0.4, -1.5, -3.1], [-0.3, -1.2, 0.5]])
 """ln|H|, ln|V| and arg P of five materials; two of them lie on either side of 180 degrees."""

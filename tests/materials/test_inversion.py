@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.host.materials.inversion import (
+from polysight.materials.inversion import (
     SOURCES,
     PatchMeasurement,
     RigPrior,
@@ -15,7 +15,7 @@ from polysight.host.materials.inversion import (
     slope,
     true_ratio,
 )
-from polysight.host.polarimetry import fresnel, permittivity_from_ratio
+from polysight.polarimetry import fresnel, permittivity_from_ratio
 
 THETA = np.radians(55.0)
 EPS = np.array([2.6 - 0.01j, 3.5 - 0.8j, 4.0 - 0.4j, 4.7 - 0.7j, 5.1 - 1.1j, 4.75 - 2.4j, 6.3 - 0.2j, 7.5 - 0.3j])

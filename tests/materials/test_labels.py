@@ -6,8 +6,9 @@ import json
 
 import numpy as np
 import pytest
+from tests.support.refusals import refused
 
-from polysight.host.materials import (
+from polysight.materials import (
     Entry,
     Labels,
     Library,
@@ -17,9 +18,8 @@ from polysight.host.materials import (
     pack_labels,
     read_labels,
 )
-from polysight.host.process import Options
-from polysight.shared.error_codes import ErrorCode
-from tests.support.refusals import refused
+from polysight.process import Options
+from polysight_shared.error_codes import ErrorCode
 
 X_M = Y_M = np.linspace(-0.049, 0.049, 50)  # 50 pixels of 2 mm: -50 to 50 mm
 COPPER, OAK = (-40.0, -10.0, -10.0, 10.0), (10.0, -10.0, 40.0, 10.0)

@@ -4,14 +4,14 @@ import json
 
 import numpy as np
 import pytest
-
-from polysight import multilayer
-from polysight.host.cli.main import main
-from polysight.host.imaging import sub_bands
-from polysight.host.materials import METAL, Layer, LayerFit, bands_of_row, fit_layer, parse_layer
-from polysight.host.materials.layers import Bands, Spectrum, predict
 from tests.support.paths import RIG_FILE
 from tests.support.rigs import published_rig
+
+from polysight import multilayer
+from polysight.cli.main import main
+from polysight.imaging import sub_bands
+from polysight.materials import METAL, Layer, LayerFit, bands_of_row, fit_layer, parse_layer
+from polysight.materials.layers import Bands, Spectrum, predict
 
 THETA = np.radians(55.0)
 CHIRP = published_rig().chirp

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from polysight.host.materials.layer_fit import LayerFit, check_range, fit_layer
-from polysight.host.materials.layers import Bands, Layer, Spectrum, check_stack, predict
-from polysight.host.polarimetry import permittivity_from_ratio, ratio_from_permittivity
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight.materials.layer_fit import LayerFit, check_range, fit_layer
+from polysight.materials.layers import Bands, Layer, Spectrum, check_stack, predict
+from polysight.polarimetry import permittivity_from_ratio, ratio_from_permittivity
+from polysight_shared.error_codes import ErrorCode
 
 THETA = np.radians(55.0)
 WATER = 9.37 - 18.0j

@@ -5,16 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.host.cli.main import main
-from polysight.host.jobs.materials import report
-from polysight.host.materials import Entry, Library
-from polysight.host.materials.layers import Layer, Spectrum, predict
-from polysight.shared.error_codes import ErrorCode
 from tests.support.paths import RIG_FILE
 from tests.support.published_files import write_materials
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight.cli.main import main
+from polysight.jobs.materials import report
+from polysight.materials import Entry, Library
+from polysight.materials.layers import Layer, Spectrum, predict
+from polysight_shared.error_codes import ErrorCode
 
 GLASS = Layer("glass", 5.5 - 0.05j, 3e-3)
 

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.support.refusals import refused
 
-from polysight.host.materials import (
+from polysight.materials import (
     PAPER,
     UNKNOWN,
     Classifier,
@@ -22,16 +23,15 @@ from polysight.host.materials import (
     pixel_accuracy,
     read_truth,
 )
-from polysight.host.materials.analyse import Optics
-from polysight.host.materials.classify import features_of
-from polysight.host.materials.knn import ratio_distance
-from polysight.host.materials.library import FORMAT
-from polysight.host.materials.samples import majority
-from polysight.host.polarimetry import fresnel
-from polysight.papers.sensys2026.table2 import table2
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DataError
-from tests.support.refusals import refused
+from polysight.materials.analyse import Optics
+from polysight.materials.classify import features_of
+from polysight.materials.knn import ratio_distance
+from polysight.materials.library import FORMAT
+from polysight.materials.samples import majority
+from polysight.polarimetry import fresnel
+from polysight_papers.sensys2026.table2 import table2
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
 
 THETA = np.radians(55.0)
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-
-from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER
-from polysight.host.materials.knn import PaperKnn, Weights, fit_weights
-from polysight.host.materials.samples import CHANNELS, Model, Samples, feature_matrix
-from polysight.host.materials.train import best_model, score, splits
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER
+from polysight.materials.knn import PaperKnn, Weights, fit_weights
+from polysight.materials.samples import CHANNELS, Model, Samples, feature_matrix
+from polysight.materials.train import best_model, score, splits
+from polysight_shared.error_codes import ErrorCode
 
 
 def samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=0, angle=0.0):

@@ -7,10 +7,10 @@ import json
 
 import numpy as np
 import pytest
-
-from polysight.host.materials import UNKNOWN, Classifier, ImagePair, match_patches, pack_patches, read_patches
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight.materials import UNKNOWN, Classifier, ImagePair, match_patches, pack_patches, read_patches
+from polysight_shared.error_codes import ErrorCode
 
 
 def named_again(found, scene, classifier, path):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from polysight.host.materials.permittivity import estimate_permittivity
-from polysight.host.polarimetry import permittivity_from_ratio, ratio_from_permittivity
+from polysight.materials.permittivity import estimate_permittivity
+from polysight.polarimetry import permittivity_from_ratio, ratio_from_permittivity
 
 THETA = np.radians(55.0)
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from tests.support.refusals import refused
 
-from polysight.host.materials import (
+from polysight.materials import (
     Labels,
     SegmentSettings,
     find_metal,
@@ -14,10 +15,9 @@ from polysight.host.materials import (
     read_labels,
     segment,
 )
-from polysight.host.materials.segment import box_mask
-from polysight.host.materials.truth import match_truth
-from polysight.shared.error_codes import ErrorCode
-from tests.support.refusals import refused
+from polysight.materials.segment import box_mask
+from polysight.materials.truth import match_truth
+from polysight_shared.error_codes import ErrorCode
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from polysight.host.materials import MODELS, UNKNOWN, Classifier, Entry, Library, specimens
-from polysight.host.materials.classify import DISCRIMINANT, add_explanation
-from polysight.host.materials.samples import Samples, SceneErrors, feature_matrix
-from polysight.host.materials.specimens import (
+from polysight.materials import MODELS, UNKNOWN, Classifier, Entry, Library, specimens
+from polysight.materials.classify import DISCRIMINANT, add_explanation
+from polysight.materials.samples import Samples, SceneErrors, feature_matrix
+from polysight.materials.specimens import (
     PUBLISHED_SPREAD,
     cost_of_none,
     effect,
@@ -15,8 +15,8 @@ from polysight.host.materials.specimens import (
     relative,
     without,
 )
-from polysight.host.polarimetry import fresnel
-from polysight.papers.sensys2026.patches import Errors, draw, groups
+from polysight.polarimetry import fresnel
+from polysight_papers.sensys2026.patches import Errors, draw, groups
 
 ANGLE = np.radians(60.0)
 KINDS = {"a": 2.2 - 0.02j, "b": 3.0 - 0.6j, "c": 4.0 - 0.3j, "d": 5.0 - 1.2j, "e": 6.5 - 0.2j, "f": 4.7 - 2.4j}

@@ -4,15 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from polysight.host.imaging import ChannelImages
-from polysight.host.imaging.images import SubBand
-from polysight.host.materials.analyse import MetalChoice
-from polysight.host.materials.layer_fit import fit_layer
-from polysight.host.materials.layers import Bands, Layer
-from polysight.host.materials.sub_bands import band_rows, bands_of_row
-from polysight.host.polarimetry import fresnel, ratio_from_permittivity
 from tests.support.rigs import published_rig
+
+from polysight.imaging import ChannelImages
+from polysight.imaging.images import SubBand
+from polysight.materials.analyse import MetalChoice
+from polysight.materials.layer_fit import fit_layer
+from polysight.materials.layers import Bands, Layer
+from polysight.materials.sub_bands import band_rows, bands_of_row
+from polysight.polarimetry import fresnel, ratio_from_permittivity
 
 THETA = np.radians(55.0)
 BAND = SubBand((0, 96), 76.3e9, 78.0e9)

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from polysight.host.materials.analyse import ImagePair, KnownScene, MetalChoice, Optics, analyse, smooth_inside
-from polysight.host.materials.labels import patches_from_labels, patches_from_plates
-from polysight.host.materials.truth import TruthPlate
-from polysight.host.polarimetry import fresnel
+from polysight.materials.analyse import ImagePair, KnownScene, MetalChoice, Optics, analyse, smooth_inside
+from polysight.materials.labels import patches_from_labels, patches_from_plates
+from polysight.materials.truth import TruthPlate
+from polysight.polarimetry import fresnel
 
 X_M, Y_M = np.arange(60) * 2e-3, np.arange(40) * 2e-3
 THETA = np.radians(55.0)

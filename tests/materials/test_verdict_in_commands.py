@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.host.cli.main import main
-from polysight.host.materials import PATCHES
-from polysight.host.materials.patch_files import FORMAT
-from polysight.host.verdict import LEVELS, NoResult
 from tests.support.products import NAMES, PERMITTIVITY, REASON, judged_products
+
+from polysight.cli.main import main
+from polysight.materials import PATCHES
+from polysight.materials.patch_files import FORMAT
+from polysight.verdict import LEVELS, NoResult
 
 NUMBERS = ("2.9", "0.2", "3.0")
 

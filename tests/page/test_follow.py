@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.host.page.watch import EventTail, ManifestTail
-from polysight.host.store import manifest
-from polysight.host.store.events import read_events
-from polysight.host.store.scan_folder import EVENTS, MANIFEST
+from polysight.page.watch import EventTail, ManifestTail
+from polysight.store import manifest
+from polysight.store.events import read_events
+from polysight.store.scan_folder import EVENTS, MANIFEST
 
 CUTS = st.lists(st.floats(0, 1), max_size=12)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from polysight.host.page.history import ScanHistory, seconds
-from polysight.host.page.snapshot import remaining
-from polysight.host.store import manifest
-from polysight.host.store.events import read_events
-from polysight.host.store.scan_folder import EVENTS, MANIFEST, ScanFolder
-from polysight.shared.messages import Capture, Fault
+from polysight.page.history import ScanHistory, seconds
+from polysight.page.snapshot import remaining
+from polysight.store import manifest
+from polysight.store.events import read_events
+from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
+from polysight_shared.messages import Capture, Fault
 
 UTC = "2026-05-01T02:{:02d}:{:02d}.000+00:00"
 

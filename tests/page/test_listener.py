@@ -12,15 +12,15 @@ from contextlib import suppress
 import msgspec
 import pytest
 import zmq
-from zmq.utils.monitor import recv_monitor_message
-
-from polysight.host.page.listener import PiListener
-from polysight.shared import messages as m
-from polysight.shared.raster import plan_raster
-from polysight.shared.sockets import EVENT_TOPIC, publisher
 from tests.support.paths import REPO
 from tests.support.processes import wait_for
 from tests.support.rigs import published_rig
+from zmq.utils.monitor import recv_monitor_message
+
+from polysight.page.listener import PiListener
+from polysight_shared import messages as m
+from polysight_shared.raster import plan_raster
+from polysight_shared.sockets import EVENT_TOPIC, publisher
 
 RIG = published_rig()
 OF = {"scan_id": "mine", "t_mono_ns": 1}
@@ -114,7 +114,7 @@ def test_without_keys_the_view_is_deaf_and_says_so(tmp_path):
 LOOKER = """
 import sys, zmq
 from pathlib import Path
-from polysight.shared.sockets import observer
+from polysight_shared.sockets import observer
 socket = observer(zmq.Context(), sys.argv[1], Path())
 while True:
     socket.recv_multipart()

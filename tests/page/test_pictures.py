@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.image import imread
-
-from polysight.host.catalogue import PHASE, colour_bar, draw
-from polysight.host.imaging import ChannelImages
-from polysight.host.page.images import range_profile_db
-from polysight.host.sync.chain import SyncedRow
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from tests.support.rigs import published_rig
+
+from polysight.catalogue import PHASE, colour_bar, draw
+from polysight.imaging import ChannelImages
+from polysight.page.images import range_profile_db
+from polysight.sync.chain import SyncedRow
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 NY, NX = 8, 11
 

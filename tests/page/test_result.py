@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 
-from polysight.host.page.watch import ProductsTail
 from tests.support.page.chromium import DESK, PHONE
 from tests.support.page.live_view import GrowingScan, served
 from tests.support.processes import LIMIT_S
 from tests.support.products import REASON, judged_products
+
+from polysight.page.watch import ProductsTail
 
 
 def test_the_verdict_follows_the_products(tmp_path):

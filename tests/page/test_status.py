@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from polysight.host.acquisition.control import ScanCommand
-from polysight.host.page.history import ScanHistory, notice_of_fault
-from polysight.host.page.images import Shown
-from polysight.host.page.listener import PiState
-from polysight.host.page.status import LifeSigns, judge, no_scan
-from polysight.host.store import manifest
-from polysight.host.store.scan_folder import MANIFEST
-from polysight.shared.faults import EXPLANATIONS, PiFault
-from polysight.shared.messages import Fault
+from polysight.acquisition.control import ScanCommand
+from polysight.page.history import ScanHistory, notice_of_fault
+from polysight.page.images import Shown
+from polysight.page.listener import PiState
+from polysight.page.status import LifeSigns, judge, no_scan
+from polysight.store import manifest
+from polysight.store.scan_folder import MANIFEST
+from polysight_shared.faults import EXPLANATIONS, PiFault
+from polysight_shared.messages import Fault
 
 FOLDER = Path("scans/one")
 LIVELY = LifeSigns(alive=True, alive_s=0, pi_silent_s=0.3, pi_limit_s=6.0, now_s=1.8e9)

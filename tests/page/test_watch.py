@@ -6,13 +6,13 @@ import json
 import shutil
 
 import pytest
-
-from polysight.host.page.images import draw
-from polysight.host.page.watch import Watch
-from polysight.host.pipeline import Pipeline
-from polysight.host.store.scan_folder import ScanFolder
 from tests.support.page.live_view import GrowingScan
 from tests.support.processes import LIMIT_S, wait_for
+
+from polysight.page.images import draw
+from polysight.page.watch import Watch
+from polysight.pipeline import Pipeline
+from polysight.store.scan_folder import ScanFolder
 
 
 def answer(watch: Watch) -> dict:

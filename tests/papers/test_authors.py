@@ -8,20 +8,20 @@ import shutil
 
 import numpy as np
 import pytest
-
-from polysight.host.cli.main import main
-from polysight.host.materials import Library, knn
-from polysight.host.polarimetry import ratio_from_permittivity
-from polysight.papers.sensys2026 import dataset_figures as authors_items
-from polysight.papers.sensys2026.dataset import IMAGES, LABELS, MATERIALS, read_authors, read_names, row_of
-from polysight.papers.sensys2026.dataset_figures import Judgements, authors_fig20, paired, repeated, task_samples
-from polysight.papers.sensys2026.dataset_run import authors_recipe, text_of, without_leakage
-from polysight.papers.sensys2026.item import Table
-from polysight.papers.sensys2026.table2 import table2
-from polysight.shared.error_codes import ErrorCode
 from tests.support.drawn_files import Errors, Material, write_labels, write_material
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
+
+from polysight.cli.main import main
+from polysight.materials import Library, knn
+from polysight.polarimetry import ratio_from_permittivity
+from polysight_papers.sensys2026 import dataset_figures as authors_items
+from polysight_papers.sensys2026.dataset import IMAGES, LABELS, MATERIALS, read_authors, read_names, row_of
+from polysight_papers.sensys2026.dataset_figures import Judgements, authors_fig20, paired, repeated, task_samples
+from polysight_papers.sensys2026.dataset_run import authors_recipe, text_of, without_leakage
+from polysight_papers.sensys2026.item import Table
+from polysight_papers.sensys2026.table2 import table2
+from polysight_shared.error_codes import ErrorCode
 
 CHOSEN = (1, 3, 12, 15, 27, 28, 30, 32, 34, 36)
 ERRORS = Errors(0.004, 0.01, leakage=0.05)

@@ -5,13 +5,13 @@ import inspect
 import numpy as np
 import pytest
 
-from polysight.host.materials.classify import DISCRIMINANT, PAPER
-from polysight.host.materials.train import score
-from polysight.host.polarimetry import fresnel, permittivity_from_ratio
-from polysight.papers.sensys2026 import patches
-from polysight.papers.sensys2026.classification import pixel_bound
-from polysight.papers.sensys2026.patches import Errors, calibrated_errors, draw, groups, h_accuracy
-from polysight.papers.sensys2026.table2 import published
+from polysight.materials.classify import DISCRIMINANT, PAPER
+from polysight.materials.train import score
+from polysight.polarimetry import fresnel, permittivity_from_ratio
+from polysight_papers.sensys2026 import patches
+from polysight_papers.sensys2026.classification import pixel_bound
+from polysight_papers.sensys2026.patches import Errors, calibrated_errors, draw, groups, h_accuracy
+from polysight_papers.sensys2026.table2 import published
 
 QUIET = Errors(0.0, 0.0)
 
@@ -104,7 +104,7 @@ def test_the_bound_is_one_without_errors_and_falls_to_chance():
 
 
 def test_confusions_stand_in_the_order_of_table_2():
-    from polysight.papers.sensys2026.classification import confusion_figure
+    from polysight_papers.sensys2026.classification import confusion_figure
 
     group = groups()["powders"]
     found = score(draw(group.materials, 60.0, Errors(0.03, 0.06), 0).samples(), DISCRIMINANT)

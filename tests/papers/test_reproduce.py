@@ -7,12 +7,12 @@ import re
 import matplotlib.figure
 import pytest
 
-from polysight.host.cli.main import main
-from polysight.papers.sensys2026 import run as catalogue
-from polysight.papers.sensys2026 import run as report
-from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure
-from polysight.papers.sensys2026.table2 import published
-from polysight.shared.errors import DataError
+from polysight.cli.main import main
+from polysight_papers.sensys2026 import run as catalogue
+from polysight_papers.sensys2026 import run as report
+from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure
+from polysight_papers.sensys2026.table2 import published
+from polysight_shared.errors import DataError
 
 
 def item(key="fig3", value=1.0):
@@ -42,7 +42,7 @@ def test_the_page_is_one_file_that_calls_everything_simulated_and_names_what_is_
         raise DataError("no such image", "it was not made")
 
     makers = {"fig3": lambda _: item(), "fig20": broken, "fig21": lambda _: item("fig21")}
-    for module in (catalogue, report, __import__("polysight.papers.sensys2026.run", fromlist=["run"])):
+    for module in (catalogue, report, __import__("polysight_papers.sensys2026.run", fromlist=["run"])):
         monkeypatch.setattr(module, "MAKERS", makers)
     assert main(["reproduce", "--out", str(tmp_path), "fig3", "fig20"]) == 1
     page = (tmp_path / "reproduce.html").read_text(encoding="utf-8")

@@ -2,19 +2,19 @@
 
 import numpy as np
 import pytest
-
-from polysight.host.polarimetry import specular_incidence_rad
-from polysight.papers.sensys2026 import run as catalogue
-from polysight.papers.sensys2026.images import FIG13_DISTANCE_MM, PLACES_MM, front_on
-from polysight.papers.sensys2026.item import Run
-from polysight.papers.sensys2026.permittivities import APART_MM, REACH_MM, places
-from polysight.papers.sensys2026.scenes import plate, scanned
-from polysight.papers.sensys2026.synchronisation import tones
-from polysight.shared.config import load_instrument
-from polysight.shared.error_codes import ErrorCode
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight.polarimetry import specular_incidence_rad
+from polysight_papers.sensys2026 import run as catalogue
+from polysight_papers.sensys2026.images import FIG13_DISTANCE_MM, PLACES_MM, front_on
+from polysight_papers.sensys2026.item import Run
+from polysight_papers.sensys2026.permittivities import APART_MM, REACH_MM, places
+from polysight_papers.sensys2026.scenes import plate, scanned
+from polysight_papers.sensys2026.synchronisation import tones
+from polysight_shared.config import load_instrument
+from polysight_shared.error_codes import ErrorCode
 
 
 @pytest.mark.parametrize("seed", range(20))

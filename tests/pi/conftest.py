@@ -11,16 +11,16 @@ from typing import Any
 import msgspec
 import pytest
 import tomli_w
-
-from polysight.pi_controller.service import Service
-from polysight.shared import messages as m
-from polysight.shared.config import Instrument
-from polysight.shared.tables import to_builtins
-from polysight.simulators.wires import WireHub
 from tests.support.pi.fake_stage import FakeStage
 from tests.support.pi.host_side import HostSide
 from tests.support.pi.program import Process
 from tests.support.rigs import at_stage_port, published_rig, timed_by_the_program
+
+from polysight_pi.service import Service
+from polysight_shared import messages as m
+from polysight_shared.config import Instrument
+from polysight_shared.tables import to_builtins
+from polysight_simulators.wires import WireHub
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def instrument(tmp_path: Path) -> Instrument:
 
 @pytest.fixture
 def gpio_rig(instrument: Instrument, tmp_path: Path) -> Instrument:
-    """With SYNC_IN on a GPIO line of the stand-in chip (simulators/gpio) at `tmp_path / "chip"`."""
+    """With SYNC_IN on a GPIO line of the stand-in chip (simulators/polysight_simulators/gpio) at `tmp_path / "chip"`."""
     rig = timed_by_the_program(instrument)
     return msgspec.structs.replace(rig, pi=msgspec.structs.replace(rig.pi, gpio_chip=str(tmp_path / "chip")))
 

@@ -5,9 +5,9 @@ from itertools import pairwise
 
 import pytest
 
-from polysight.shared import messages as m
-from polysight.shared.faults import PiFault
-from polysight.shared.wires import WireClient, WireEdge
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
+from polysight_shared.wires import WireClient, WireEdge
 
 
 @pytest.fixture

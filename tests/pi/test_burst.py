@@ -6,18 +6,18 @@ import threading
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.support.pi.fakes import FakeLines, gone
 
-from polysight.pi_controller.bursts import BurstSpec, Edge, send_burst
-from polysight.pi_controller.trigger import (
+from polysight_pi.bursts import BurstSpec, Edge, send_burst
+from polysight_pi.trigger import (
     FIRST_PULSE_DELAY_NS,
     BurstSent,
     Counts,
     LoopFault,
     TriggerLoop,
 )
-from polysight.shared.faults import PiFault
-from polysight.shared.raster import MIN_PERIOD_NS
-from tests.support.pi.fakes import FakeLines, gone
+from polysight_shared.faults import PiFault
+from polysight_shared.raster import MIN_PERIOD_NS
 
 PERIOD = 1_500_000
 SPEC = BurstSpec(16, PERIOD, 1000)

@@ -12,11 +12,11 @@ from itertools import pairwise
 
 import msgspec
 import pytest
-
-from polysight.shared import messages as m
-from polysight.simulators import gpio, uno
 from tests.support.pi.wires_log import WiresLog
 from tests.support.stage.processes import StageProcess
+
+from polysight_shared import messages as m
+from polysight_simulators import gpio, uno
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 if lacking := gpio.missing() + uno.missing():

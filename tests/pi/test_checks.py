@@ -10,14 +10,14 @@ from collections import namedtuple
 
 import msgspec
 import pytest
-
-from polysight.pi_controller import checks
-from polysight.pi_controller import lines as pi_lines
-from polysight.pi_controller.checks import attempt, check_lines, judge_widths, measure_clock
-from polysight.pi_controller.keys import make_keys
-from polysight.shared.sockets import publisher, replier
-from polysight.simulators import gpio
 from tests.support.pi.program import run
+
+from polysight_pi import checks
+from polysight_pi import lines as pi_lines
+from polysight_pi.checks import attempt, check_lines, judge_widths, measure_clock
+from polysight_pi.keys import make_keys
+from polysight_shared.sockets import publisher, replier
+from polysight_simulators import gpio
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 replace = msgspec.structs.replace

@@ -4,16 +4,16 @@ import json
 import os
 
 import pytest
-
-from polysight.pi_controller import cli
-from polysight.pi_controller.bursts import BurstRecord
-from polysight.pi_controller.cli import main
-from polysight.shared import messages as m
-from polysight.shared.faults import PiFault
-from polysight.simulators.loopback import on_free_subnet
 from tests.support.pi.fakes import FakeLines
 from tests.support.pi.program import Process
 from tests.support.rigs import at_stage_port
+
+from polysight_pi import cli
+from polysight_pi.bursts import BurstRecord
+from polysight_pi.cli import main
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
+from polysight_simulators.loopback import on_free_subnet
 
 
 @pytest.fixture
@@ -112,10 +112,10 @@ def test_an_impossible_speed_is_a_usage_error(config, speed):
 def test_pulse_reports_faults(command, config, monkeypatch):
     late = BurstRecord(2, 0, 1, 2, 1000, 900, PiFault.PERIOD_TOO_SHORT)
     records = iter([late, late._replace(fault=0), late])
-    monkeypatch.setattr("polysight.pi_controller.lines.open_lines", lambda *_: FakeLines())
-    monkeypatch.setattr("polysight.pi_controller.bursts.send_burst", lambda *_: next(records))
-    monkeypatch.setattr("polysight.pi_controller.system.prepare_process", list)
-    monkeypatch.setattr("polysight.pi_controller.system.prepare_thread", list)
+    monkeypatch.setattr("polysight_pi.lines.open_lines", lambda *_: FakeLines())
+    monkeypatch.setattr("polysight_pi.bursts.send_burst", lambda *_: next(records))
+    monkeypatch.setattr("polysight_pi.system.prepare_process", list)
+    monkeypatch.setattr("polysight_pi.system.prepare_thread", list)
     status, _, err = command("pulse", "--config", config, "--count", 3)
     assert (status, "fault 106 in 2 of 3 bursts" in err, "do:" in err) == (1, True, True)
 
@@ -124,7 +124,7 @@ def test_an_error_of_the_system_is_a_message(command, config, monkeypatch):
     def refuse(_):
         raise PermissionError(13, "Permission denied", "/dev/gpiochip0")
 
-    monkeypatch.setattr("polysight.pi_controller.client.refuse_beside_service", refuse)
+    monkeypatch.setattr("polysight_pi.client.refuse_beside_service", refuse)
     status, _, err = command("jog", "--config", config)
     assert (status, "/dev/gpiochip0: Permission denied" in err, "do: " in err) == (5, True, True)
 

@@ -13,13 +13,13 @@ import msgpack
 import msgspec
 import pytest
 import zmq
-
-from polysight.shared import messages as m
-from polysight.shared.errors import ProtocolError
-from polysight.shared.raster import RasterPlan
 from tests.support.pi.host_side import HostSide
 from tests.support.pi.program import resident_bytes
 from tests.support.pi.wires_log import WiresLog
+
+from polysight_shared import messages as m
+from polysight_shared.errors import ProtocolError
+from polysight_shared.raster import RasterPlan
 
 NAN, INF = float("nan"), float("inf")
 VALUES: tuple[Any, ...] = (

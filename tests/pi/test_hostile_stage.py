@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 
 import pytest
-
-from polysight.shared import messages as m
-from polysight.shared.stage_line import Reply
 from tests.support.pi.program import resident_bytes
+
+from polysight_shared import messages as m
+from polysight_shared.stage_line import Reply
 
 BOUND_BYTES = 24 << 20
 FLOOD = 100_000  # lines

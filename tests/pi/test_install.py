@@ -11,7 +11,6 @@ import sys
 from pathlib import Path
 
 import pytest
-
 from tests.support.paths import REPO, RIG_FILE
 from tests.support.rigs import published_rig
 
@@ -113,9 +112,10 @@ def test_the_unit_exposes_little(tmp_path):
     assert float(found[1]) <= 3.0, done.stdout
 
 
-def test_pinned_versions_are_what_the_wheel_asks_for():
+def test_pinned_versions_are_what_the_wheels_ask_for():
     pins = dict(x.split("==") for x in (PI / "requirements.txt").read_text().split() if "==" in x)
-    asked = re.findall(r'"(\w+)>=([\d.]+)', (PI / "pyproject.toml").read_text().partition("dependencies = [")[2])
+    projects = [(REPO / name / "pyproject.toml").read_text() for name in ("shared", "pi_controller")]
+    asked = [pin for text in projects for pin in re.findall(r'"(\w+)>=([\d.]+)', text.partition("dependencies = [")[2])]
     assert set(pins) == {name for name, _ in asked}
 
     def key(version):

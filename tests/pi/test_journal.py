@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.support.refusals import refused
 
-from polysight.pi_controller import journal as journal_module
-from polysight.pi_controller.journal import (
+from polysight_pi import journal as journal_module
+from polysight_pi.journal import (
     CAPTURE_BYTES,
     DAMAGED,
     MAGIC,
@@ -17,10 +18,9 @@ from polysight.pi_controller.journal import (
     Journal,
     JournalFile,
 )
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.messages import RunStopped, unpack_event
-from polysight.shared.raster import RasterPlan
-from tests.support.refusals import refused
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.messages import RunStopped, unpack_event
+from polysight_shared.raster import RasterPlan
 
 payloads = st.lists(st.binary(max_size=40), max_size=12)
 

@@ -5,10 +5,10 @@ import os
 
 import msgspec
 
-from polysight.pi_controller import journal as journal_module
-from polysight.pi_controller.client import replay_events
-from polysight.shared import messages as m
-from polysight.shared.faults import PiFault
+from polysight_pi import journal as journal_module
+from polysight_pi.client import replay_events
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
 
 
 def full(*_):

@@ -6,11 +6,11 @@ import os
 from typing import Any
 
 import pytest
-
-from polysight.pi_controller.journal import Journal
-from polysight.shared import messages as m
-from polysight.shared.raster import RasterPlan
 from tests.support.store.faulty_disk import FaultyDisk, Killed
+
+from polysight_pi.journal import Journal
+from polysight_shared import messages as m
+from polysight_shared.raster import RasterPlan
 
 PLAN = RasterPlan(3, 2, 1.0, 1.0)
 

@@ -10,23 +10,23 @@ from pathlib import Path
 import msgspec
 import pytest
 import zmq
-from zmq.auth import load_certificate
-
-from polysight.host.acquisition.pi_client import PiClient
-from polysight.pi_controller import checks
-from polysight.pi_controller.checks import attempt
-from polysight.pi_controller.cli import main
-from polysight.pi_controller.keys import allow, make_keys, read_allowed, revoke
-from polysight.pi_controller.server import Server
-from polysight.shared import messages as m
-from polysight.shared.config import load_instrument
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.faults import PiFault
-from polysight.shared.sockets import HOST_KEYS, HandshakeMonitor, requester
-from polysight.shared.tables import decode, to_builtins
 from tests.support.paths import REPO, RIG_FILE
 from tests.support.refusals import refused as expect_refused
 from tests.support.rigs import published_rig
+from zmq.auth import load_certificate
+
+from polysight.acquisition.pi_client import PiClient
+from polysight_pi import checks
+from polysight_pi.checks import attempt
+from polysight_pi.cli import main
+from polysight_pi.keys import allow, make_keys, read_allowed, revoke
+from polysight_pi.server import Server
+from polysight_shared import messages as m
+from polysight_shared.config import load_instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.faults import PiFault
+from polysight_shared.sockets import HOST_KEYS, HandshakeMonitor, requester
+from polysight_shared.tables import decode, to_builtins
 
 ELSEWHERE = "tcp://192.0.2.1:5601"
 

@@ -7,13 +7,13 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
-
-from polysight.pi_controller import lines as pi_lines
-from polysight.pi_controller.bursts import BurstSpec, send_burst
-from polysight.pi_controller.lines import GpiodLines, find_chip, open_lines
-from polysight.shared.config import Pi
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight_pi import lines as pi_lines
+from polysight_pi.bursts import BurstSpec, send_burst
+from polysight_pi.lines import GpiodLines, find_chip, open_lines
+from polysight_shared.config import Pi
+from polysight_shared.error_codes import ErrorCode
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 SET_VALUES = 3 << 30 | 16 << 16 | 0xB4 << 8 | 0x0F  # <linux/gpio.h>: _IOWR(0xB4, 0x0F, two 64-bit words)

@@ -10,18 +10,18 @@ from typing import Any, get_args
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from polysight.pi_controller.bursts import BurstSpec, Edge
-from polysight.pi_controller.machine import RULES, TIMEOUTS_S, WIRE_STATE, RefusedError, State
-from polysight.pi_controller.row_machine import RowMachine
-from polysight.pi_controller.stage_link import STATUS_PER_HEARTBEAT, StatusWatch
-from polysight.pi_controller.trigger import LOOK_UP_S, BurstSent, LoopFault, TriggerLoop, TriggerWatch
-from polysight.shared import messages as m
-from polysight.shared.faults import PiFault, StageError
-from polysight.shared.raster import Row
-from polysight.shared.stage_line import Immediate, Reply
 from tests.support.paths import REPO
 from tests.support.pi.fakes import FakeDriver, FakeLines
+
+from polysight_pi.bursts import BurstSpec, Edge
+from polysight_pi.machine import RULES, TIMEOUTS_S, WIRE_STATE, RefusedError, State
+from polysight_pi.row_machine import RowMachine
+from polysight_pi.stage_link import STATUS_PER_HEARTBEAT, StatusWatch
+from polysight_pi.trigger import LOOK_UP_S, BurstSent, LoopFault, TriggerLoop, TriggerWatch
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault, StageError
+from polysight_shared.raster import Row
+from polysight_shared.stage_line import Immediate, Reply
 
 SPEC = BurstSpec(2, 1_500_000, 1000)
 ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)

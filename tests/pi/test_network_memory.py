@@ -13,12 +13,12 @@ import time
 from contextlib import suppress
 
 import pytest
-
-from polysight.pi_controller import executor as executors
-from polysight.pi_controller.executor import REPLAYS_WAITING
-from polysight.pi_controller.system import MAX_BYTES
-from polysight.shared import messages as m
 from tests.support.pi.program import resident_bytes
+
+from polysight_pi import executor as executors
+from polysight_pi.executor import REPLAYS_WAITING
+from polysight_pi.system import MAX_BYTES
+from polysight_shared import messages as m
 
 MORE, LONG, COMMAND = 1, 2, 4
 ENOUGH_BYTES = 2 << 30  # a client that could send so much was not stopped

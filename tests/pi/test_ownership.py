@@ -12,12 +12,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from polysight.pi_controller import executor as executors
-from polysight.pi_controller import system
-from polysight.pi_controller.client import take_over
-from polysight.pi_controller.service import TAKE_OVER_KEY
-from polysight.shared import messages as m
-from polysight.shared.faults import PiFault
+from polysight_pi import executor as executors
+from polysight_pi import system
+from polysight_pi.client import take_over
+from polysight_pi.service import TAKE_OVER_KEY
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def test_a_run_without_a_heartbeat_can_be_replaced(pi):
 def test_a_hanging_executor_does_not_look_alive(pi, hang, monkeypatch):
     """Commands are refused and no heartbeat is sent, until it runs again."""
     host = pi.host
-    monkeypatch.setattr("polysight.pi_controller.server.HUNG_S", 0.5)
+    monkeypatch.setattr("polysight_pi.server.HUNG_S", 0.5)
     monkeypatch.setattr(executors, "TURN_S", 0.05)
 
     def until(kind):

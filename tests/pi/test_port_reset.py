@@ -8,11 +8,11 @@ from contextlib import closing
 
 import msgspec
 import pytest
-
-from polysight.pi_controller.cli import main
-from polysight.simulators.builds import sketch_compiler
 from tests.support.processes import wait_for
 from tests.support.stage.processes import StageProcess
+
+from polysight_pi.cli import main
+from polysight_simulators.builds import sketch_compiler
 
 
 @pytest.mark.slow

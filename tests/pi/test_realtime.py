@@ -11,10 +11,10 @@ import time
 from pathlib import Path
 
 import pytest
-
-from polysight.pi_controller.system import OTHERS_PRIORITY, PRIORITY
-from polysight.simulators import gpio
 from tests.support.pi.program import require_stand_in_chip
+
+from polysight_pi.system import OTHERS_PRIORITY, PRIORITY
+from polysight_simulators import gpio
 
 require_stand_in_chip()
 

@@ -8,15 +8,15 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from polysight.host.plan.timing import row_motion_s
-from polysight.pi_controller.executor import burst_of, check_run
-from polysight.pi_controller.machine import RefusedError
-from polysight.shared import messages as m
-from polysight.shared.config import Burst
-from polysight.shared.faults import PiFault
-from polysight.shared.raster import MIN_PERIOD_US, WIDTH_US, plan_raster
 from tests.support.rigs import published_rig
+
+from polysight.plan.timing import row_motion_s
+from polysight_pi.executor import burst_of, check_run
+from polysight_pi.machine import RefusedError
+from polysight_shared import messages as m
+from polysight_shared.config import Burst
+from polysight_shared.faults import PiFault
+from polysight_shared.raster import MIN_PERIOD_US, WIDTH_US, plan_raster
 
 RIG = published_rig()
 replace = msgspec.structs.replace

@@ -11,15 +11,15 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from polysight.pi_controller.executor import REPLAYED_IN_A_ROW, Executor
-from polysight.pi_controller.journal import Journal
-from polysight.pi_controller.trigger import TriggerLoop
-from polysight.shared import messages as m
-from polysight.shared.faults import PiFault
-from polysight.shared.raster import RasterPlan
-from polysight.shared.stage_line import Reply
 from tests.support.pi.fakes import FakeDriver, FakeLines
+
+from polysight_pi.executor import REPLAYED_IN_A_ROW, Executor
+from polysight_pi.journal import Journal
+from polysight_pi.trigger import TriggerLoop
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
+from polysight_shared.raster import RasterPlan
+from polysight_shared.stage_line import Reply
 
 HEARTBEAT_S = 0.1
 LIMIT_S = 4 * HEARTBEAT_S

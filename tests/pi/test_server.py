@@ -3,15 +3,15 @@
 import msgspec
 import pytest
 
-from polysight.host.acquisition.pi_client import HostHeartbeat
-from polysight.pi_controller.lines import GpiodLines, SpiLines
-from polysight.pi_controller.sim_lines import WireLines
-from polysight.shared import messages as m
-from polysight.shared.errors import DeviceError
-from polysight.shared.faults import PiFault, StageError
-from polysight.shared.messages import is_simulated
-from polysight.shared.stage_line import Immediate
-from polysight.shared.wires import WireClient, WireEdge
+from polysight.acquisition.pi_client import HostHeartbeat
+from polysight_pi.lines import GpiodLines, SpiLines
+from polysight_pi.sim_lines import WireLines
+from polysight_shared import messages as m
+from polysight_shared.errors import DeviceError
+from polysight_shared.faults import PiFault, StageError
+from polysight_shared.messages import is_simulated
+from polysight_shared.stage_line import Immediate
+from polysight_shared.wires import WireClient, WireEdge
 
 RUN_0 = m.RunRow(scan_id="scan", row_index=0, take=1)
 
@@ -235,7 +235,7 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(pi, 
 
     raised = []
     monkeypatch.setattr("threading.excepthook", lambda args: raised.append(args.exc_type))
-    monkeypatch.setattr("polysight.pi_controller.row_machine.RowMachine.on_burst", fail)
+    monkeypatch.setattr("polysight_pi.row_machine.RowMachine.on_burst", fail)
     stage.pace_s = 0.2  # the reply to the row goes out before its first edge comes
     host.start_row()
     pi.thread.join(60)

@@ -10,13 +10,13 @@ from itertools import pairwise
 
 import msgspec
 import pytest
-
-from polysight.shared import messages as m
-from polysight.shared.faults import PiFault
-from polysight.shared.wires import WireEdge
-from polysight.simulators import gpio
 from tests.support.pi.program import require_stand_in_chip, run
 from tests.support.pi.wires_log import WiresLog
+
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
+from polysight_shared.wires import WireEdge
+from polysight_simulators import gpio
 
 require_stand_in_chip()
 

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.support.refusals import refused
+from tests.support.rigs import published_rig
 
-from polysight.pi_controller.bursts import (
+from polysight_pi.bursts import (
     DEFAULT_BUFSIZ,
     MAX_HZ,
     MIN_BYTES,
@@ -20,12 +22,10 @@ from polysight.pi_controller.bursts import (
     send_burst,
     spi_burst,
 )
-from polysight.pi_controller.sim_lines import SpiWireLines
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.faults import PiFault
-from polysight.shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_WIDTH_NS
-from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from polysight_pi.sim_lines import SpiWireLines
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.faults import PiFault
+from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_WIDTH_NS
 
 bursts = st.tuples(st.integers(1, 256), st.integers(MIN_PERIOD_NS, 20_000_000), st.integers(MIN_WIDTH_NS, MAX_WIDTH_NS))
 ROOMY = 1 << 22

@@ -3,15 +3,15 @@
 import queue
 
 import pytest
-
-from polysight.pi_controller.stage import BenchStage
-from polysight.pi_controller.stage_link import StageLink, StageLost, StageLostError, StageRefusedError
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.faults import StageError, explain
-from polysight.shared.stage_line import Command, Immediate, Reply
 from tests.support.pi.fake_stage import FakeStage
 from tests.support.refusals import refused
 from tests.support.rigs import at_stage_port
+
+from polysight_pi.stage import BenchStage
+from polysight_pi.stage_link import StageLink, StageLost, StageLostError, StageRefusedError
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.faults import StageError, explain
+from polysight_shared.stage_line import Command, Immediate, Reply
 
 
 @pytest.fixture
@@ -107,7 +107,7 @@ def test_a_pulled_cable_is_a_lost_stage(dry_stage, connect):
 def test_no_port_and_another_protocol(tmp_path, monkeypatch, connect):
     with refused(ErrorCode.FILE_UNREADABLE, tmp_path / "none"):
         StageLink(str(tmp_path / "none"), 115200, lambda _: None)
-    monkeypatch.setattr("polysight.pi_controller.stage_link.PROTOCOL_VERSION", 9)
+    monkeypatch.setattr("polysight_pi.stage_link.PROTOCOL_VERSION", 9)
     with refused(ErrorCode.VERSION_UNSUPPORTED, "protocol 2", 9):
         connect()
 

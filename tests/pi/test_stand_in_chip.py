@@ -14,14 +14,14 @@ from pathlib import Path
 
 import msgspec
 import pytest
-
-from polysight.shared import messages as m
-from polysight.shared.faults import PiFault
-from polysight.shared.wires import WireEdge
-from polysight.simulators import gpio
 from tests.support.paths import REPO
 from tests.support.pi.program import require_stand_in_chip, run
 from tests.support.pi.wires_log import WiresLog
+
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
+from polysight_shared.wires import WireEdge
+from polysight_simulators import gpio
 
 require_stand_in_chip()
 
@@ -161,8 +161,8 @@ import os, sys
 from datetime import timedelta
 from pathlib import Path
 import gpiod, msgspec
-from polysight.pi_controller.lines import GpiodLines, find_chip
-from polysight.shared.config import load_instrument
+from polysight_pi.lines import GpiodLines, find_chip
+from polysight_shared.config import load_instrument
 chip = Path(os.environ["GPIOSHIM_CHIP"])
 assert find_chip("pinctrl-bcm2835", chip.parent) == str(chip)
 rig = load_instrument(Path("instrument.toml"))

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-
-from polysight.shared.tables import to_builtins
-from polysight.simulators.uno import ENABLING_COMMAND, missing
 from tests.pi_box.box import Box
 from tests.pi_box.installed import InstalledPi, print_figure, rig_of_the_box
 from tests.pi_box.uno import Uno
 from tests.support.pi.host_side import HostSide
+
+from polysight_shared.tables import to_builtins
+from polysight_simulators.uno import ENABLING_COMMAND, missing
 
 HERE = Path(__file__).parent
 

@@ -10,14 +10,14 @@ from typing import Any
 
 import msgspec
 import tomli_w
-
-from polysight.shared.config import Instrument
-from polysight.shared.tables import to_builtins
 from tests.pi_box.box import Box
 from tests.pi_box.uno import Uno
 from tests.support.paths import BIN, REPO
 from tests.support.pi.host_side import HostSide
 from tests.support.rigs import published_rig, timed_by_the_program
+
+from polysight_shared.config import Instrument
+from polysight_shared.tables import to_builtins
 
 PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
 INSTALL_LIMIT_S = 7200

@@ -15,13 +15,13 @@ from pathlib import Path
 import msgspec
 import pytest
 import zmq
-
-from polysight.shared import messages as m
-from polysight.shared.faults import PiFault
-from polysight.shared.sockets import HandshakeMonitor, requester
 from tests.pi_box.installed import PROGRAM, READY_LIMIT_S, InstalledPi, print_figure
 from tests.support.pi.host_side import HostSide
 from tests.support.rigs import published_rig
+
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
+from polysight_shared.sockets import HandshakeMonitor, requester
 
 SYNC_OUT = 22
 INPUT, OUTPUT = 0, 1

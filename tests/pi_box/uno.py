@@ -9,8 +9,9 @@ import threading
 import time
 from pathlib import Path
 
-from polysight.shared.wires import WireMotion, parse
 from tests.support.paths import REPO
+
+from polysight_shared.wires import WireMotion, parse
 
 REST_S = 1.0
 
@@ -35,7 +36,7 @@ class Uno:
         self._listener.listen()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        command = [sys.executable, "-m", "polysight.simulators.uno", "--config", str(config)]
+        command = [sys.executable, "-m", "polysight_simulators.uno", "--config", str(config)]
         command += ["--wires", str(wires), "--link", str(self.port)]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPO)
         assert self._process.stdout is not None

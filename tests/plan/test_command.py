@@ -7,20 +7,20 @@ import tomllib
 
 import pytest
 import tomli_w
-
-from polysight.host.cli.main import main
-from polysight.host.plan import Changes, row_motion_s
-from polysight.host.plan.plan_command import measure_noise
-from polysight.host.plan.timing import tail_s, turn_s
-from polysight.host.store import manifest
-from polysight.host.store.events import EventWriter
-from polysight.host.store.scan_folder import EVENTS, MANIFEST, ScanFolder
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.messages import Capture
-from polysight.shared.raster import plan_raster
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
+
+from polysight.cli.main import main
+from polysight.plan import Changes, row_motion_s
+from polysight.plan.plan_command import measure_noise
+from polysight.plan.timing import tail_s, turn_s
+from polysight.store import manifest
+from polysight.store.events import EventWriter
+from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.messages import Capture
+from polysight_shared.raster import plan_raster
+from polysight_simulators.scene import decode_scene, simulate
 
 RIG = ["--config", str(RIG_FILE)]
 SMALL = ["--columns", "40", "--rows", "30"]

@@ -5,16 +5,16 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-
-from polysight.host.imaging import ImageBuilder, backproject
-from polysight.host.imaging.geometry import Antennas
-from polysight.host.imaging.resolution import board_facts
-from polysight.host.plan import Changes, Noise, field_limits, forecast, propose
-from polysight.host.plan.field import PhaseSlope
-from polysight.host.plan.forecast import aperture_of, find_warnings, predict_burst, predict_noise
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.geometry import specular_midpoint_m
 from tests.support.refusals import refused
+
+from polysight.imaging import ImageBuilder, backproject
+from polysight.imaging.geometry import Antennas
+from polysight.imaging.resolution import board_facts
+from polysight.plan import Changes, Noise, field_limits, forecast, propose
+from polysight.plan.field import PhaseSlope
+from polysight.plan.forecast import aperture_of, find_warnings, predict_burst, predict_noise
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.geometry import specular_midpoint_m
 
 
 def test_without_changes_the_rig_file_stays(rig):

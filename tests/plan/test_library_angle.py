@@ -2,11 +2,11 @@
 
 import msgspec
 import pytest
-
-from polysight.host.doctor.check_host import check_library
-from polysight.host.plan import forecast
-from polysight.shared.geometry import incidence_deg
 from tests.support.doctor.case import context_of
+
+from polysight.doctor.check_host import check_library
+from polysight.plan import forecast
+from polysight_shared.geometry import incidence_deg
 
 
 @pytest.mark.parametrize(("distance_mm", "known"), [(499.0, True), (505.0, True), (560.0, False), (450.0, False)])

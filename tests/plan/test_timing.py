@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.host.plan import Changes, row_motion_s, scan_time, straight_move_s
-from polysight.host.plan.timing import tail_s, turn_s, whole_packets
-from polysight.pi_controller.stage import row_in_steps
-from polysight.shared.config import CARD_TAIL_S, Instrument
-from polysight.shared.raster import plan_raster
-from polysight.shared.stage_line import Command, Parameter
-from polysight.shared.wires import WireEdge
-from polysight.simulators.stage import TICK_HZ, PythonStage, Rig
+from polysight.plan import Changes, row_motion_s, scan_time, straight_move_s
+from polysight.plan.timing import tail_s, turn_s, whole_packets
+from polysight_pi.stage import row_in_steps
+from polysight_shared.config import CARD_TAIL_S, Instrument
+from polysight_shared.raster import plan_raster
+from polysight_shared.stage_line import Command, Parameter
+from polysight_shared.wires import WireEdge
+from polysight_simulators.stage import TICK_HZ, PythonStage, Rig
 
 
 class Stage:

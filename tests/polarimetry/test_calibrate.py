@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.support.refusals import refused
+from tests.support.rigs import published_rig
 
-from polysight.host.polarimetry import (
+from polysight.polarimetry import (
     calibrate,
     calibrate_by_reference,
     correct_leakage,
@@ -14,10 +16,8 @@ from polysight.host.polarimetry import (
     smooth,
     specular_incidence_rad,
 )
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.geometry import incidence_deg, specular_midpoint_m
-from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.geometry import incidence_deg, specular_midpoint_m
 
 THETA = np.radians(55.0)
 SHAPE = (40, 60)

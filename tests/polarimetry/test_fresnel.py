@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.host.polarimetry import (
+from polysight.polarimetry import (
     brewster_angle_rad,
     fresnel,
     permittivity_from_ratio,

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.support.calibration import remaining
+from tests.support.refusals import refused
 
-from polysight.host.polarimetry import (
+from polysight.polarimetry import (
     Leakage,
     Standard,
     common_direction,
@@ -14,11 +16,9 @@ from polysight.host.polarimetry import (
     leakage_from_images,
     strips_wave,
 )
-from polysight.host.polarimetry.leakage import PLATE
-from polysight.shared.error_codes import ErrorCode
-from polysight.simulators.scene import strips
-from tests.support.calibration import remaining
-from tests.support.refusals import refused
+from polysight.polarimetry.leakage import PLATE
+from polysight_shared.error_codes import ErrorCode
+from polysight_simulators.scene import strips
 
 THETA = np.radians(55.0)
 UPRIGHT, LYING = 0.0, np.pi / 2

@@ -10,11 +10,11 @@ import tmm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.host.polarimetry import fresnel, multilayer
-from polysight.shared.errors import PolysightError
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.scene import Layer, layered
-from polysight.simulators.scene.optics import half_space, slab
+from polysight.polarimetry import fresnel, multilayer
+from polysight_shared.errors import PolysightError
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_simulators.scene import Layer, layered
+from polysight_simulators.scene.optics import half_space, slab
 
 media = st.tuples(st.floats(1.0, 12.0), st.floats(0.0, 20.0)).map(lambda e: complex(e[0], -e[1]))
 lossless = st.floats(1.0, 12.0).map(complex)

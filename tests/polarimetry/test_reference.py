@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from polysight.host.polarimetry import fresnel, plane_reference
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight.polarimetry import fresnel, plane_reference
+from polysight_shared.error_codes import ErrorCode
 
 THETA = np.radians(55.0)
 X, Y = np.arange(60) * 2e-3, np.arange(50) * 2e-3

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-from polysight.host.imaging import ChannelImages
-from polysight.host.materials import TruthPlate, read_truth
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.shared.config import Instrument
-from polysight.simulators.scene import Scene, decode_scene, load_scene, simulate
 from tests.support.paths import EXAMPLES
 from tests.support.pipelines import pipeline_of
 from tests.support.rigs import published_rig, rig_with
 from tests.support.scenes import COPPER, PET, scene_of
+
+from polysight.imaging import ChannelImages
+from polysight.materials import TruthPlate, read_truth
+from polysight.store.scan_folder import ScanFolder
+from polysight_shared.config import Instrument
+from polysight_simulators.scene import Scene, decode_scene, load_scene, simulate
 
 
 class Imaged:

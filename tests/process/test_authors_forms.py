@@ -6,18 +6,18 @@ import msgspec
 import numpy as np
 import pytest
 import tomli_w
-
-from polysight.host.cli.main import main
-from polysight.host.store.sources.open import open_source
-from polysight.host.store.sources.published import PublishedCubes
-from polysight.host.sync.cubes import detect_form
-from polysight.shared.config import Image
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.tables import to_builtins
-from polysight.simulators.scene import decode_scene, simulate, write_cube
 from tests.support.pipelines import pipeline_of
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight.cli.main import main
+from polysight.store.sources.open import open_source
+from polysight.store.sources.published import PublishedCubes
+from polysight.sync.cubes import detect_form
+from polysight_shared.config import Image
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.tables import to_builtins
+from polysight_simulators.scene import decode_scene, simulate, write_cube
 
 RIG = published_rig()
 SMALL = msgspec.structs.replace(RIG, image=Image(columns=60, rows=50, pixel_mm=4.0))

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tomli_w
-
-from polysight.host.process import Options
-from polysight.host.store.sources.open import open_source
-from polysight.shared.files import read_json
-from polysight.shared.tables import to_builtins
 from tests.support.pipelines import pipeline_of
 from tests.support.processes import output_of
 from tests.support.rigs import rig_with
 from tests.support.scenes import COPPER, PET, scene_of
+
+from polysight.process import Options
+from polysight.store.sources.open import open_source
+from polysight_shared.files import read_json
+from polysight_shared.tables import to_builtins
 
 BANDS, COLUMNS, ROWS = 2, 13, 17
 IMAGE = {"columns": 50, "rows": 40, "pixel_mm": 4.0}

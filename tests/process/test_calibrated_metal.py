@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from polysight.host.calibration.files import SourceScan, write_metal
-from polysight.host.jobs.calibrate import load_reference
-from polysight.host.store import manifest
-from polysight.host.store.scan_folder import MANIFEST
-from polysight.shared.files import read_json
 from tests.support.processes import output_of
 from tests.support.scenes import EVERYWHERE, scene_of
+
+from polysight.calibration.files import SourceScan, write_metal
+from polysight.jobs.calibrate import load_reference
+from polysight.store import manifest
+from polysight.store.scan_folder import MANIFEST
+from polysight_shared.files import read_json
 
 SCENE = scene_of(EVERYWHERE, columns=10, rows=8) | {"image": {"columns": 24, "rows": 24, "pixel_mm": 4.0}}
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.host.report.context import ReportContext
-from polysight.host.report.tables import masked_positions
-from polysight.host.store import RowData, ScanFolder
-from polysight.host.store.scan_folder import MANIFEST
-from polysight.shared.files import read_json
 from tests.support.pipelines import pipeline_of
 from tests.support.processes import output_of
 from tests.support.scenes import EVERYWHERE, scene_of
+
+from polysight.report.context import ReportContext
+from polysight.report.tables import masked_positions
+from polysight.store import RowData, ScanFolder
+from polysight.store.scan_folder import MANIFEST
+from polysight_shared.files import read_json
 
 METAL = "-40,10,30,30"  # inside the copper
 COLUMNS, ROWS, PULSES = 15, 17, 2

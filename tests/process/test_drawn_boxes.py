@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from polysight.host.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library, MetalChoice
-from polysight.host.materials.labels import labels_of, pack_labels, read_labels
-from polysight.host.process import Options
+from polysight.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library, MetalChoice
+from polysight.materials.labels import labels_of, pack_labels, read_labels
+from polysight.process import Options
 
 
 @pytest.fixture

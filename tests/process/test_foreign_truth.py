@@ -6,14 +6,14 @@ import json
 import shutil
 
 import pytest
+from tests.support.paths import RIG_FILE
 
 from polysight import open_scan
-from polysight.host.cli.main import main
-from polysight.host.jobs.process import truth_of
-from polysight.host.materials import read_truth
-from polysight.shared.errors import DataError
-from polysight.shared.files import read_json
-from tests.support.paths import RIG_FILE
+from polysight.cli.main import main
+from polysight.jobs.process import truth_of
+from polysight.materials import read_truth
+from polysight_shared.errors import DataError
+from polysight_shared.files import read_json
 
 PLATE = {"name": "PET", "centre_mm": [0, 0], "size_mm": [30, 30], "permittivity": [3.0, 0.1]}
 FOREIGN = {

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from polysight.host.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library, pixel_accuracy
-from polysight.host.materials.segment import axis_mm, box_mask
-from polysight.host.polarimetry import calibrate, correct_leakage, ratio_from_permittivity
+from polysight.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library, pixel_accuracy
+from polysight.materials.segment import axis_mm, box_mask
+from polysight.polarimetry import calibrate, correct_leakage, ratio_from_permittivity
 
 
 def inside(scan, name, rim_mm=11.0):

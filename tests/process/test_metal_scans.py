@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.host.cli.main import main
-from polysight.host.jobs.calibrate import load_reference
-from polysight.host.jobs.process import imaged
-from polysight.host.materials import fit_layer, parse_layer, read_truth
-from polysight.host.materials.analyse import KnownScene, MetalChoice
-from polysight.host.materials.sub_bands import bands_of_row
-from polysight.host.polarimetry import Leakage, PlaneReference
-from polysight.shared.config import Instrument
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.calibration import remaining
+
+from polysight.cli.main import main
+from polysight.jobs.calibrate import load_reference
+from polysight.jobs.process import imaged
+from polysight.materials import fit_layer, parse_layer, read_truth
+from polysight.materials.analyse import KnownScene, MetalChoice
+from polysight.materials.sub_bands import bands_of_row
+from polysight.polarimetry import Leakage, PlaneReference
+from polysight_shared.config import Instrument
+from polysight_simulators.scene import decode_scene, simulate
 
 BANDS = 3
 LEAKAGE = {"leakage_h": [0.08, 0.03], "leakage_v": [-0.02, 0.06]}

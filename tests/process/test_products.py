@@ -8,20 +8,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.host.cli.main import main
-from polysight.host.jobs.process import all_rows, make_products, publish_images
-from polysight.host.pipeline import Pipeline
-from polysight.host.process import Options
-from polysight.host.products import read_products
-from polysight.host.products.files import FINISHED
-from polysight.host.store import ScanFolder
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DataError
-from polysight.shared.files import read_json
 from tests.support.pipelines import pipeline_of
 from tests.support.processes import output_of
 from tests.support.refusals import refused
+
+from polysight.cli.main import main
+from polysight.jobs.process import all_rows, make_products, publish_images
+from polysight.pipeline import Pipeline
+from polysight.process import Options
+from polysight.products import read_products
+from polysight.products.files import FINISHED
+from polysight.store import ScanFolder
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+from polysight_shared.files import read_json
 
 
 @pytest.fixture(scope="module")

@@ -10,18 +10,18 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-
-from polysight.host.imaging import PLANE_REACH_M, ChannelImages, View
-from polysight.host.jobs.process import image, process
-from polysight.host.pipeline import Pipeline
-from polysight.host.process import ProcessRequest, map_rows
-from polysight.host.store import RowData, ScanFolder
-from polysight.host.store.manifest import encode_line
-from polysight.host.store.source import pieces_of
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DataError
 from tests.support.pipelines import pipeline_of
 from tests.support.refusals import refused
+
+from polysight.imaging import PLANE_REACH_M, ChannelImages, View
+from polysight.jobs.process import image, process
+from polysight.pipeline import Pipeline
+from polysight.process import ProcessRequest, map_rows
+from polysight.store import RowData, ScanFolder
+from polysight.store.manifest import encode_line
+from polysight.store.source import pieces_of
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
 
 PIXELS = ("h", "v", "h_raw", "v_raw", "h_footprint", "v_footprint", "valid")
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
-from polysight.host.store import manifest
-from polysight.shared.files import read_json
-from polysight.shared.geometry import rx_positions_m, tx_position_m
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from tests.support.processes import output_of
 from tests.support.rigs import published_rig, rig_with
 from tests.support.scenes import EVERYWHERE, scene_of
+
+from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
+from polysight.store import manifest
+from polysight_shared.files import read_json
+from polysight_shared.geometry import rx_positions_m, tx_position_m
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 COLUMNS, ROWS, PULSES = 10, 3, 8
 SYNC_NS = 5.0  # each board samples SYNC_IN up to this much late, uniformly distributed

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-
 from benchmarks.coverage import Cubes
-from polysight.host.imaging import Illumination, correct_tilt
-from polysight.host.materials.segment import box_mask
-from polysight.simulators.scene import decode_scene
 from tests.support.pipelines import pipeline_of
+
+from polysight.imaging import Illumination, correct_tilt
+from polysight.materials.segment import box_mask
+from polysight_simulators.scene import decode_scene
 
 PLACES = [(-60.0, 40.0), (0.0, 40.0), (60.0, 40.0), (-60.0, -40.0), (0.0, -40.0), (60.0, -40.0)]
 TILTS_DEG = [(0.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-0.7, 0.7), (0.5, -1.0)]

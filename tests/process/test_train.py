@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tomli_w
-
-from polysight.host.cli.main import main
-from polysight.host.materials import Library
-from polysight.shared.tables import to_builtins
 from tests.support.processes import output_of
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, PET, scene_of
+
+from polysight.cli.main import main
+from polysight.materials import Library
+from polysight_shared.tables import to_builtins
 
 MORE = {"name": "rubber", "centre_mm": [-40.0, -50.0], "size_mm": [50.0, 50.0], "permittivity": [5.06, 1.11]}
 NAMES = ("PET", "copper", "rubber")

@@ -5,14 +5,14 @@ import json
 import msgspec
 import numpy as np
 import pytest
-
 from benchmarks.coverage import Cubes
-from polysight.host.materials import match_truth, truth_plates
-from polysight.host.process import Options
-from polysight.host.store import open_source
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.scene.simulated_scan import simulate, truth
 from tests.support.pipelines import pipeline_of
+
+from polysight.materials import match_truth, truth_plates
+from polysight.process import Options
+from polysight.store import open_source
+from polysight_simulators.scene import decode_scene
+from polysight_simulators.scene.simulated_scan import simulate, truth
 
 PLATES = {
     "ceramic": ([-62.0, 32.0], [4.75, 2.43]), "acrylic": ([0.0, 34.0], [4.0, 0.4]), "PET": ([62.0, 32.0], [3.78, 0.7]),

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-
-from polysight.host.cli.main import main
-from polysight.host.materials import Library
-from polysight.host.materials.library import SIMULATED_LIBRARY
-from polysight.host.store import manifest
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.shared.tables import to_builtins
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.rigs import published_rig
 from tests.support.scenes import scene_of
+
+from polysight.cli.main import main
+from polysight.materials import Library
+from polysight.materials.library import SIMULATED_LIBRARY
+from polysight.store import manifest
+from polysight.store.scan_folder import MANIFEST, ScanFolder
+from polysight_shared.tables import to_builtins
+from polysight_simulators.scene import decode_scene, simulate
 
 SCENE = scene_of(
     {"name": "copper", "centre_mm": [-40.0, 0.0], "size_mm": [50.0, 60.0], "metal": True},

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from polysight.host.products import plain, read_image, write_atomically, write_image, write_json
-from polysight.shared.errors import DataError
+from polysight.products import plain, read_image, write_atomically, write_image, write_json
+from polysight_shared.errors import DataError
 
 
 def test_image_product_round_trips(tmp_path):

@@ -9,13 +9,13 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-
-from polysight.host.products import folder as products_folder
-from polysight.host.products import write_json
-from polysight.host.products.folder import check_products_folder, making_products
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DataError, DeviceError
 from tests.support.refusals import refused
+
+from polysight.products import folder as products_folder
+from polysight.products import write_json
+from polysight.products.folder import check_products_folder, making_products
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError, DeviceError
 
 OLD = {"image.npz": b"old", "report.html": b"old page", "figures/h.png": b"old h", "figures/p.png": b"old p"}
 NEW = {"image.npz": b"new", "quality.json": b"{}", "figures/h.png": b"new h"}

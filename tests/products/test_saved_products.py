@@ -13,13 +13,16 @@ import msgspec
 import numpy as np
 import pytest
 import tomli_w
+from tests.support.paths import RIG_FILE
+from tests.support.refusals import refused
+from tests.support.rigs import published_rig, rig_with
 
-from polysight.host.cli.main import main
-from polysight.host.imaging import ChannelImages, sub_bands
-from polysight.host.materials import parse_layer
-from polysight.host.materials.layers import Layer, Spectrum, predict
-from polysight.host.products import write_json
-from polysight.host.products.files import (
+from polysight.cli.main import main
+from polysight.imaging import ChannelImages, sub_bands
+from polysight.materials import parse_layer
+from polysight.materials.layers import Layer, Spectrum, predict
+from polysight.products import write_json
+from polysight.products.files import (
     MATERIALS,
     SCAN,
     SavedProducts,
@@ -27,12 +30,9 @@ from polysight.host.products.files import (
     write_atomically,
     write_scan_facts,
 )
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DataError, os_error
-from polysight.shared.tables import to_builtins
-from tests.support.paths import RIG_FILE
-from tests.support.refusals import refused
-from tests.support.rigs import published_rig, rig_with
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError, os_error
+from polysight_shared.tables import to_builtins
 
 HERE = published_rig()  # rig file in the current folder
 USED = msgspec.structs.replace(  # rig of the scan: another slope, another window

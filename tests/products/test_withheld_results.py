@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import scipy.io
 import xarray
-
-from polysight import open_scan
-from polysight.host.cli.main import main
-from polysight.host.products import permittivity_spread, read_image, read_products, withhold, write_image, write_json
-from polysight.shared.error_codes import ErrorCode
 from tests.support.products import NAMES, judged_products
 from tests.support.refusals import refused
+
+from polysight import open_scan
+from polysight.cli.main import main
+from polysight.products import permittivity_spread, read_image, read_products, withhold, write_image, write_json
+from polysight_shared.error_codes import ErrorCode
 
 
 @pytest.mark.parametrize("level", ["good", "care", "none"])

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-
-from polysight.shared.config import Instrument
-from polysight.simulators.radars import RadarBoard, make_image
 from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
+
+from polysight_shared.config import Instrument
+from polysight_simulators.radars import RadarBoard, make_image
 
 
 @pytest.fixture

@@ -6,18 +6,18 @@ import json
 import struct
 
 import pytest
+from tests.support.refusals import refused
 
-from polysight.host.radar.board import RadarBoard, State
-from polysight.host.radar.calibration_data import (
+from polysight.radar.board import RadarBoard, State
+from polysight.radar.calibration_data import (
     ALL,
     RESTORED,
     CalibrationFiles,
     InitCalibrations,
     RestoreCalibration,
 )
-from polysight.host.radar.program import program
-from polysight.shared.error_codes import ErrorCode
-from tests.support.refusals import refused
+from polysight.radar.program import program
+from polysight_shared.error_codes import ErrorCode
 
 FRAMES = 4
 

@@ -12,14 +12,14 @@ import msgspec
 import pytest
 import tomli_w
 
-from polysight.host.cli.main import main
-from polysight.host.radar.messages import decode
-from polysight.host.radar.program import program
-from polysight.shared.tables import to_builtins
-from polysight.simulators.radars import RadarBoard, make_image
-from polysight.simulators.radars.__main__ import replay
-from polysight.simulators.radars.cores import BOOT_S
-from polysight.simulators.radars.wire import FAULT_DATA
+from polysight.cli.main import main
+from polysight.radar.messages import decode
+from polysight.radar.program import program
+from polysight_shared.tables import to_builtins
+from polysight_simulators.radars import RadarBoard, make_image
+from polysight_simulators.radars.__main__ import replay
+from polysight_simulators.radars.cores import BOOT_S
+from polysight_simulators.radars.wire import FAULT_DATA
 
 STEPS = ["USB", "reset", "power rails", "firmware", "RF power-up", "versions", "settings", "RF init", "chirp", "die id"]
 STEPS += ["one frame", "read back"]
@@ -44,8 +44,8 @@ def opened(words, clock, monkeypatch):
         places.append((place, slow))
         return words
 
-    monkeypatch.setattr("polysight.host.jobs.radar.open_board", open_board)
-    monkeypatch.setattr("polysight.host.jobs.radar.SystemClock", lambda: clock)
+    monkeypatch.setattr("polysight.jobs.radar.open_board", open_board)
+    monkeypatch.setattr("polysight.jobs.radar.SystemClock", lambda: clock)
     return places
 
 

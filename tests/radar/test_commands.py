@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.host.radar.calibration_data import InitCalibrations, RestoreCalibration, SaveCalibration
-from polysight.host.radar.commands import (
+from polysight.radar.calibration_data import InitCalibrations, RestoreCalibration, SaveCalibration
+from polysight.radar.commands import (
     APLL_BANDWIDTH,
     DATA_PATH,
     DATA_PATH_CLOCK,
@@ -45,8 +45,8 @@ from polysight.host.radar.commands import (
     slope_code,
     start_code,
 )
-from polysight.host.radar.firmware import file_chunks
-from polysight.host.radar.messages import command, decode, encode
+from polysight.radar.firmware import file_chunks
+from polysight.radar.messages import command, decode, encode
 
 PUBLISHED = Profile(76.01e9, 38.816929e12, 100.0, 7.0, 128.5, 256, 2.15e6, 175.0, 350.0, 30, 30)
 OTHER = Profile(76.01087e9, 38.816929e12, 100.0, 6.5, 128.5, 512, 5e6, 350.0, 2800.0, 40, 36, 3)

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-
-from polysight.host.radar.board import RadarBoard, State
-from polysight.host.radar.commands import LOW_POWER_OFF, Chirp, LdoBypass
-from polysight.host.radar.program import program
-from polysight.host.radar.spi import Link
-from polysight.shared.errors import DeviceError
-from polysight.simulators.radars import Fault, make_image
-from polysight.simulators.radars import RadarBoard as Simulated
 from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
+
+from polysight.radar.board import RadarBoard, State
+from polysight.radar.commands import LOW_POWER_OFF, Chirp, LdoBypass
+from polysight.radar.program import program
+from polysight.radar.spi import Link
+from polysight_shared.errors import DeviceError
+from polysight_simulators.radars import Fault, make_image
+from polysight_simulators.radars import RadarBoard as Simulated
 
 RIG = native_rig()
 LOST = st.sampled_from([Fault.NACK, Fault.BAD_CRC, Fault.BAD_CHECKSUM, Fault.LOST_INTERRUPT, Fault.NO_ANSWER])

@@ -7,16 +7,16 @@ import zlib
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from polysight.host.radar.board import RadarBoard, State
-from polysight.host.radar.firmware import CHUNK_TIMEOUT_S, TO_RAM, check_image, file_chunks, read_image
-from polysight.host.radar.program import program
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, DeviceError
-from polysight.simulators.radars import Fault, make_image
-from polysight.simulators.radars import RadarBoard as Simulated
 from tests.support.radar.boards import BoardWords, Restarts, VirtualClock, native_rig
 from tests.support.refusals import refused
+
+from polysight.radar.board import RadarBoard, State
+from polysight.radar.firmware import CHUNK_TIMEOUT_S, TO_RAM, check_image, file_chunks, read_image
+from polysight.radar.program import program
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DeviceError
+from polysight_simulators.radars import Fault, make_image
+from polysight_simulators.radars import RadarBoard as Simulated
 
 RIG = native_rig()
 DATA = make_image()

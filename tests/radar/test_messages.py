@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.host.radar.messages import (
+from polysight.radar.messages import (
     DEVICE_SYNC,
     Direction,
     Kind,
@@ -21,7 +21,7 @@ from polysight.host.radar.messages import (
     decode_header,
     encode,
 )
-from polysight.shared.errors import ProtocolError
+from polysight_shared.errors import ProtocolError
 
 START = "341221438102180000340000010065c94001080001000000a9cad469"
 STOP = "341221438102180000440000010065b94001080004000000e223f5a8"

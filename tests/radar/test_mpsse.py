@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from polysight.host.radar.board import RadarBoard, State
-from polysight.host.radar.program import program
-from polysight.host.radar.usb import UsbWords, read_words, set_up_spi, write_words
-from polysight.shared.error_codes import ErrorCode
-from polysight.simulators.radars import UsbChip
-from polysight.simulators.radars import board as simulated
 from tests.support.refusals import refused
+
+from polysight.radar.board import RadarBoard, State
+from polysight.radar.program import program
+from polysight.radar.usb import UsbWords, read_words, set_up_spi, write_words
+from polysight_shared.error_codes import ErrorCode
+from polysight_simulators.radars import UsbChip
+from polysight_simulators.radars import board as simulated
 
 
 @pytest.fixture

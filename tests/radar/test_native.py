@@ -7,19 +7,19 @@ from pathlib import Path
 
 import msgspec
 import pytest
-
-from polysight.host.radar import board as boards
-from polysight.host.radar.interface import RadarState
-from polysight.host.radar.native import NativeRadars, radar_board
-from polysight.host.radar.trace import ReplayedWords, read_trace
-from polysight.host.store.manifest import decode_line, encode_line
-from polysight.shared.config import Instrument, NativeRadar, Radar
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DeviceError
-from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.radars import RadarBoard, make_image
 from tests.support.radar.boards import BoardWords
 from tests.support.refusals import refused
+
+from polysight.radar import board as boards
+from polysight.radar.interface import RadarState
+from polysight.radar.native import NativeRadars, radar_board
+from polysight.radar.trace import ReplayedWords, read_trace
+from polysight.store.manifest import decode_line, encode_line
+from polysight_shared.config import Instrument, NativeRadar, Radar
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError
+from polysight_shared.tables import decode, to_builtins
+from polysight_simulators.radars import RadarBoard, make_image
 
 PERIOD_S = 1.5e-3
 FRAMES = 24
@@ -263,7 +263,7 @@ def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
 
 
 def test_a_full_disk_ends_a_trace_but_no_row(rig, usb, clock, tmp_path, monkeypatch):
-    monkeypatch.setattr("polysight.host.radar.native.new_trace", lambda *_: Path("/dev/full"))
+    monkeypatch.setattr("polysight.radar.native.new_trace", lambda *_: Path("/dev/full"))
     kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, trace_dir=str(tmp_path)))
     with NativeRadars(kept, usb.open, clock) as radars:
         assert run_row(radars, usb) == ALL_DONE

@@ -7,10 +7,10 @@ import re
 from collections import Counter
 
 import pytest
-
-from polysight.host.radar.board import State
-from polysight.simulators.radars import RadarBoard as Simulated
 from tests.support.radar.faults import FRAMES, Case, Outcome, draw, run
+
+from polysight.radar.board import State
+from polysight_simulators.radars import RadarBoard as Simulated
 
 LONGEST_S = 45.0  # of virtual time: a bring-up whose every command is sent three times would be given up long before
 NAMED = 0.95

@@ -7,16 +7,16 @@ import zlib
 from collections.abc import Sequence
 
 import pytest
-
-from polysight.host.radar.commands import DEVICE_CONFIGURATION, GET_MAIN_VERSION, LOW_POWER_OFF, RF_POWER_UP
-from polysight.host.radar.events import BOOT_STATUS, MAIN_CPU_FAULT, MAIN_POWER_UP, decode_event
-from polysight.host.radar.messages import Direction, Kind, SubBlock, decode, decode_header
-from polysight.host.radar.spi import Link
-from polysight.shared.error_codes import ErrorCode
-from polysight.simulators.radars.wire import frame, ones_sum
 from tests.support.radar import received
 from tests.support.radar.boards import VirtualClock
 from tests.support.refusals import refused
+
+from polysight.radar.commands import DEVICE_CONFIGURATION, GET_MAIN_VERSION, LOW_POWER_OFF, RF_POWER_UP
+from polysight.radar.events import BOOT_STATUS, MAIN_CPU_FAULT, MAIN_POWER_UP, decode_event
+from polysight.radar.messages import Direction, Kind, SubBlock, decode, decode_header
+from polysight.radar.spi import Link
+from polysight_shared.error_codes import ErrorCode
+from polysight_simulators.radars.wire import frame, ones_sum
 
 
 class Sent:

@@ -11,19 +11,19 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-
-from polysight.host.radar.board import RadarBoard, State
-from polysight.host.radar.constraints import constraints
-from polysight.host.radar.native import open_board
-from polysight.host.radar.program import program
-from polysight.host.radar.spi import SystemClock
-from polysight.shared.error_codes import ErrorCode
-from polysight.simulators.radars import RadarBoard as Simulated
-from polysight.simulators.radars import RadarSocket, make_image
-from polysight.simulators.rig import derive
-from polysight.simulators.scene import SimulatedRig, decode_scene, without_offset
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight.radar.board import RadarBoard, State
+from polysight.radar.constraints import constraints
+from polysight.radar.native import open_board
+from polysight.radar.program import program
+from polysight.radar.spi import SystemClock
+from polysight_shared.error_codes import ErrorCode
+from polysight_simulators.radars import RadarBoard as Simulated
+from polysight_simulators.radars import RadarSocket, make_image
+from polysight_simulators.rig import derive
+from polysight_simulators.scene import SimulatedRig, decode_scene, without_offset
 
 EMPTY = decode_scene({"name": "the direct path alone"}, "test")
 

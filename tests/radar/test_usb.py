@@ -8,15 +8,15 @@ import sys
 import pytest
 from pyftdi.ftdi import Ftdi
 from pyftdi.usbtools import UsbTools
-
-from polysight.host.radar.interface import RadarState
-from polysight.host.radar.native import NativeRadars
-from polysight.host.radar.usb import open_usb
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DeviceError
-from polysight.simulators.radars import RadarBoard, UsbChip, make_image
 from tests.support.radar import usb_bus
 from tests.support.refusals import refused
+
+from polysight.radar.interface import RadarState
+from polysight.radar.native import NativeRadars
+from polysight.radar.usb import open_usb
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError
+from polysight_simulators.radars import RadarBoard, UsbChip, make_image
 
 FRAMES = 4
 

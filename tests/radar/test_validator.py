@@ -9,15 +9,15 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from polysight.host.radar.constraints import constraints, direct_if_hz, require
-from polysight.host.radar.program import program
-from polysight.shared.config import Instrument, NativeRadar
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError
-from polysight.shared.geometry import direct_path_m
 from tests.support.radar.boards import native_rig
 from tests.support.refusals import refused
+
+from polysight.radar.constraints import constraints, direct_if_hz, require
+from polysight.radar.program import program
+from polysight_shared.config import Instrument, NativeRadar
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+from polysight_shared.geometry import direct_path_m
 
 FRAMES = 5600
 
@@ -144,7 +144,7 @@ def test_frame_counts(rig, frames, holds):
 
 
 def test_pulse_gap(rig, monkeypatch):
-    monkeypatch.setattr("polysight.host.radar.program.TRIGGER_MARGIN_US", 149.0)
+    monkeypatch.setattr("polysight.radar.program.TRIGGER_MARGIN_US", 149.0)
     assert broken(rig) == {"pulse gap"}
 
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import xarray
 
-from polysight.host.cli.main import main
-from polysight.host.products import dataset_files, write_image, write_json
-from polysight.host.products.dataset_files import join_complex, read_netcdf, split_complex
-from polysight.shared.config import load_instrument
-from polysight.shared.errors import DataError
-from polysight.shared.tables import to_builtins
+from polysight.cli.main import main
+from polysight.products import dataset_files, write_image, write_json
+from polysight.products.dataset_files import join_complex, read_netcdf, split_complex
+from polysight_shared.config import load_instrument
+from polysight_shared.errors import DataError
+from polysight_shared.tables import to_builtins
 
 REPO = Path(__file__).resolve().parents[2]
 PATCH = {

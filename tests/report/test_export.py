@@ -9,14 +9,14 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-
-from polysight.host.cli.main import main
-from polysight.host.products import write_image, write_json
-from polysight.host.products.files import read_products
-from polysight.host.report import exports as hdf5
-from polysight.host.report.exports import write_hdf5, write_mat
 from tests.support.products import segments
 from tests.support.rigs import rig_table
+
+from polysight.cli.main import main
+from polysight.products import write_image, write_json
+from polysight.products.files import read_products
+from polysight.report import exports as hdf5
+from polysight.report.exports import write_hdf5, write_mat
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import scipy.io
 
-from polysight.host.cli.main import main
-from polysight.host.products import write_image, write_json
+from polysight.cli.main import main
+from polysight.products import write_image, write_json
 
 PATCH = {
     "label": 4, "name": 'PET, "0.5 mm"', "confidence": 0.75, "metal_reference": False, "metal_like": True,

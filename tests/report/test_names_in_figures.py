@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from matplotlib.font_manager import findfont, get_font
 
-from polysight.host.report import style
-from polysight.host.report.context import ReportContext
-from polysight.host.report.figures import figures
-from polysight.host.report.report import render, write_report
-from polysight.host.report.style import figure_label, font_families, is_drawable
+from polysight.report import style
+from polysight.report.context import ReportContext
+from polysight.report.figures import figures
+from polysight.report.report import render, write_report
+from polysight.report.style import figure_label, font_families, is_drawable
 
 NAMES = ["木板", "ガラス", "유리 3", "стекло", "Plexiglas®", "\U0001f9f1 brick", "tab\there", "a $b$ c_{", "زجاج"]
 PERMITTIVITY = {"real": 3.9, "imag": -0.6, "real_p30_p70": [3.8, 4.0], "imag_p30_p70": [-0.7, -0.5]}

@@ -8,15 +8,15 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from matplotlib import colormaps
-
-from polysight.host.process import masked_runs
-from polysight.host.report import ReportContext, write_report
-from polysight.host.report.maps import coverage_figure
-from polysight.host.report.report import render
-from polysight.host.report.style import colours_of, png
-from polysight.host.report.tables import imaging_table, masked_positions, pretty, quality_tables, text
-from polysight.shared.raster import RasterPlan
 from tests.support.products import unrendered
+
+from polysight.process import masked_runs
+from polysight.report import ReportContext, write_report
+from polysight.report.maps import coverage_figure
+from polysight.report.report import render
+from polysight.report.style import colours_of, png
+from polysight.report.tables import imaging_table, masked_positions, pretty, quality_tables, text
+from polysight_shared.raster import RasterPlan
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

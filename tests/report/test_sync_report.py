@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from polysight.host.report.sync_report import PAPER, SyncReport, write_sync_report
-from polysight.host.sync.chain import SyncedRow
-from polysight.host.sync.residuals import STAGES
+from polysight.report.sync_report import PAPER, SyncReport, write_sync_report
+from polysight.sync.chain import SyncedRow
+from polysight.sync.residuals import STAGES
 
 SCALES = {"received": (8e4, 1.8, 0.1), "aligned": (80.0, 0.013, 0.01), "averaged": (20.0, 0.003, 0.003)}
 

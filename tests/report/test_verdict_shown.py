@@ -12,17 +12,17 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
-
-from polysight.host.api.plot import plot_scan
-from polysight.host.products import ProcessedScan, permittivity_spread, read_products
-from polysight.host.report import ReportContext, write_report
-from polysight.host.report.ellipses import SHARES, ellipse_of, place_numbers
-from polysight.host.report.figures import channel_figure, phase_limits_deg
-from polysight.host.report.maps import draw_materials, permittivity_map
-from polysight.host.report.style import shorten_labels
-from polysight.host.report.tables import budget_table
-from polysight.host.verdict import LEVELS
 from tests.support.products import BUDGET, NAMES, PERMITTIVITY, REASON, judged_products, segments, unrendered
+
+from polysight.api.plot import plot_scan
+from polysight.products import ProcessedScan, permittivity_spread, read_products
+from polysight.report import ReportContext, write_report
+from polysight.report.ellipses import SHARES, ellipse_of, place_numbers
+from polysight.report.figures import channel_figure, phase_limits_deg
+from polysight.report.maps import draw_materials, permittivity_map
+from polysight.report.style import shorten_labels
+from polysight.report.tables import budget_table
+from polysight.verdict import LEVELS
 
 RESULTS = (*NAMES, "2.90", "± 0.20", "ε′ ±")
 

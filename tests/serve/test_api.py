@@ -15,14 +15,14 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-
-from polysight.host.serve import control, site
-from polysight.host.serve.guard import TOKEN_HEADER
-from polysight.shared.error_codes import ErrorCode
 from tests.support.page.asking import TOKEN, ask, get, post
 from tests.support.page.live_view import Served, served_folder
 from tests.support.paths import RIG_FILE
 from tests.support.products import judged_products
+
+from polysight.serve import control, site
+from polysight.serve.guard import TOKEN_HEADER
+from polysight_shared.error_codes import ErrorCode
 
 
 @pytest.fixture

@@ -15,15 +15,15 @@ from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
-
-from polysight.host.serve import connections, guard
-from polysight.host.serve.guard import TOKEN_HEADER, TRIES, Access, cookie_name
-from polysight.shared.error_codes import ErrorCode
 from tests.support.page.asking import TOKEN, ask, digest_of, get, post, raw
 from tests.support.page.live_view import Served, served_folder
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.products import judged_products
 from tests.support.refusals import refused
+
+from polysight.serve import connections, guard
+from polysight.serve.guard import TOKEN_HEADER, TRIES, Access, cookie_name
+from polysight_shared.error_codes import ErrorCode
 
 SECRET = "nobody may read this"
 FOREIGN_HOSTS = ("evil.example", "127.0.0.1.evil.example", "localhost.evil.example:80", "192.168.1.7", "", "[", "a:b:c")
@@ -314,8 +314,9 @@ def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
     subject = ["-subj", "/CN=127.0.0.1", "-addext", "subjectAltName=IP:127.0.0.1"]
     command = [program, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", *files, *subject]
     subprocess.run([str(w) for w in command], check=True, capture_output=True)
-    from polysight.host.serve import Place
     from tests.support.page.live_view import served_place
+
+    from polysight.serve import Place
 
     for wrong in ("key.pem", "certificate.pem"):  # twice the same, and so neither belongs to the other
         with refused(ErrorCode.FILE_FOREIGN, tmp_path / wrong):

@@ -9,11 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-from polysight.host.catalogue import Notes, read_notes, write_notes
-from polysight.host.materials import Library, read_labels
-from polysight.host.products import SavedProducts
-from polysight.host.serve.programs import program_of
 from tests.support.page.asking import TOKEN
 from tests.support.page.chromium import DESK, PHONE, Browser
 from tests.support.page.live_view import Served, served_folder
@@ -21,6 +16,11 @@ from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
 from tests.support.products import judged_products
 from tests.support.scenes import COPPER, PET
+
+from polysight.catalogue import Notes, read_notes, write_notes
+from polysight.materials import Library, read_labels
+from polysight.products import SavedProducts
+from polysight.serve.programs import program_of
 
 pytestmark = pytest.mark.xdist_group("browser")
 SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])

@@ -10,19 +10,19 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-from polysight.host.catalogue import PROGRAM
-from polysight.host.jobs.live_scan import _check_new
-from polysight.host.serve import launcher
-from polysight.host.serve.programs import Programs, program_of
-from polysight.host.store import validate
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, DeviceError
 from tests.support.page.asking import TOKEN, get, post
 from tests.support.page.live_view import served_folder
 from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
+
+from polysight.catalogue import PROGRAM
+from polysight.jobs.live_scan import _check_new
+from polysight.serve import launcher
+from polysight.serve.programs import Programs, program_of
+from polysight.store import validate
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DeviceError
 
 
 @pytest.fixture

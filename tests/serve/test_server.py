@@ -10,16 +10,16 @@ import socket
 
 import msgspec
 import pytest
-
-from polysight.host.acquisition.control import ScanCommand
-from polysight.host.cli.main import build_parser
-from polysight.host.serve.app import STATIC
-from polysight.host.serve.control import FORMATS, ExportRequest
-from polysight.host.serve.guard import TOKEN_HEADER
-from polysight.host.serve.server import Place
 from tests.support.page.asking import TOKEN, ask
 from tests.support.page.live_view import open_control, served
 from tests.support.processes import LIMIT_S
+
+from polysight.acquisition.control import ScanCommand
+from polysight.cli.main import build_parser
+from polysight.serve.app import STATIC
+from polysight.serve.control import FORMATS, ExportRequest
+from polysight.serve.guard import TOKEN_HEADER
+from polysight.serve.server import Place
 
 
 class Page:

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-from polysight.host.catalogue import Scans, scans
-from polysight.host.serve import reading, site, watches
-from polysight.shared.error_codes import ErrorCode
 from tests.support.page.asking import TOKEN, ask, get, post
 from tests.support.page.live_view import Served, served_folder
 from tests.support.processes import wait_for
 from tests.support.products import judged_products
+
+from polysight.catalogue import Scans, scans
+from polysight.serve import reading, site, watches
+from polysight_shared.error_codes import ErrorCode
 
 LIMIT_S = 0.4
 

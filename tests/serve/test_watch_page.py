@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 
 import pytest
-
-from polysight.simulators.loopback import on_free_subnet
 from tests.support.page.chromium import DESK, PHONE, Browser
 from tests.support.page.live_view import GrowingScan, open_control, served
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.rigs import published_rig
+
+from polysight_simulators.loopback import on_free_subnet
 
 TOKEN = "0123456789"
 PICTURES = "[...document.querySelectorAll('.view img')]"

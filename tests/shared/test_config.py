@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import no_such
-from polysight.shared.geometry import direct_path_m, incidence_deg, rx_positions_m, specular_midpoint_m, tx_position_m
-from polysight.shared.tables import decode, read_toml, to_builtins
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
+
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import no_such
+from polysight_shared.geometry import direct_path_m, incidence_deg, rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.tables import decode, read_toml, to_builtins
 
 
 def test_the_published_rig_survives_toml(rig: Instrument, tmp_path: Path):

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DeviceError, ProtocolError
-from polysight.shared.faults import EXPLANATIONS, PiFault, StageError, c_header, explain
-from polysight.shared.wires import WireClient, WireEdge, WireMotion, encode, parse
 from tests.support.paths import REPO
 from tests.support.refusals import refused
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError, ProtocolError
+from polysight_shared.faults import EXPLANATIONS, PiFault, StageError, c_header, explain
+from polysight_shared.wires import WireClient, WireEdge, WireMotion, encode, parse
 
 
 def test_every_number_is_explained_and_unique():

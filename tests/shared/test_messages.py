@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import inspect
-
-from polysight.shared import messages as m
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ProtocolError
-from polysight.shared.raster import RasterPlan
 from tests.support.refusals import refused
+
+from polysight_shared import messages as m
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ProtocolError
+from polysight_shared.raster import RasterPlan
 
 
 def values_of(declared: Any) -> st.SearchStrategy:

@@ -3,11 +3,11 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from polysight.shared.config import Burst, Grid, Stage
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.raster import check_burst_fits, mean_burst_travel_mm, plan_raster
 from tests.support.refusals import refused
+
+from polysight_shared.config import Burst, Grid, Stage
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.raster import check_burst_fits, mean_burst_travel_mm, plan_raster
 
 grids = st.builds(
     Grid,

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.shared.errors import ProtocolError
-from polysight.shared.stage_line import Command, Immediate, Reply, crc16, seal, unseal
+from polysight_shared.errors import ProtocolError
+from polysight_shared.stage_line import Command, Immediate, Reply, crc16, seal, unseal
 
 commands = st.builds(
     Command,

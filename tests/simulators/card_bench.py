@@ -7,10 +7,10 @@ import struct
 from contextlib import ExitStack
 from typing import Any
 
-from polysight.shared.config import Instrument
-from polysight.simulators.cards import Pace, SimulatedCard, StageTrack, bound_udp
-from polysight.simulators.faults import read_faults
-from polysight.simulators.scene import PatternSource, pattern_frames
+from polysight_shared.config import Instrument
+from polysight_simulators.cards import Pace, SimulatedCard, StageTrack, bound_udp
+from polysight_simulators.faults import read_faults
+from polysight_simulators.scene import PatternSource, pattern_frames
 
 FRAME, PERIOD_NS = 4096, 1_500_000
 ALIVE, CONFIGURE, EEPROM, START = (

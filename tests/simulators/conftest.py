@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
-
-from polysight.shared.config import Instrument
-from polysight.simulators.loopback import on_free_subnet
 from tests.support.rigs import published_rig
+
+from polysight_shared.config import Instrument
+from polysight_simulators.loopback import on_free_subnet
 
 
 @pytest.fixture

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.host.store.sources.open import open_source
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.rigs import published_rig
+
+from polysight.store.sources.open import open_source
+from polysight_simulators.scene import decode_scene, simulate
 
 RIG = published_rig()
 PULSES, FRAME = 16, 4096

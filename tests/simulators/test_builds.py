@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from polysight.shared.errors import DeviceError
-from polysight.simulators import builds
-from polysight.simulators.uno import board
+from polysight_shared.errors import DeviceError
+from polysight_simulators import builds
+from polysight_simulators.uno import board
 
 
 def _compile(source: Path) -> Path:

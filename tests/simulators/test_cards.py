@@ -16,12 +16,12 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from polysight.shared.config import Instrument
-from polysight.shared.tables import to_builtins
-from polysight.shared.wires import WireClient, WireEdge, WireMotion
-from polysight.simulators.cards.sender import ReceiveQueue, bound_udp
-from polysight.simulators.loopback import is_free, on_subnet
-from polysight.simulators.scene import pattern_frames
+from polysight_shared.config import Instrument
+from polysight_shared.tables import to_builtins
+from polysight_shared.wires import WireClient, WireEdge, WireMotion
+from polysight_simulators.cards.sender import ReceiveQueue, bound_udp
+from polysight_simulators.loopback import is_free, on_subnet
+from polysight_simulators.scene import pattern_frames
 
 TIME_SCALE = 20.0
 FRAME = 4096
@@ -104,9 +104,9 @@ def start(rig: Instrument, tmp_path: Path) -> Iterator[Start]:
         def begin(*arguments: str, boards: str = "RH,RV") -> dict[str, HostSide]:
             config = tmp_path / "rig.toml"
             config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
-            launch("polysight.simulators.wires", "--socket", str(tmp_path / "w.sock"))
+            launch("polysight_simulators.wires", "--socket", str(tmp_path / "w.sock"))
             common = ("--config", str(config), "--wires", str(tmp_path / "w.sock"), "--boards", boards, "--pattern")
-            launch("polysight.simulators.cards", *common, "--time-scale", str(TIME_SCALE), *arguments)
+            launch("polysight_simulators.cards", *common, "--time-scale", str(TIME_SCALE), *arguments)
             return {name: HostSide(rig, name, sockets) for name in boards.split(",")}
 
         yield begin
@@ -185,7 +185,7 @@ def test_a_record_goes_on_while_the_stage_moves_or_owes_a_burst(
 def test_wrong_arguments_are_one_message(rig: Instrument, tmp_path: Path, arguments: list[str], words: str) -> None:
     config = tmp_path / "rig.toml"
     config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
-    command = [sys.executable, "-m", "polysight.simulators.cards", "--config", config, "--wires", tmp_path / "w.sock"]
+    command = [sys.executable, "-m", "polysight_simulators.cards", "--config", config, "--wires", tmp_path / "w.sock"]
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=20, check=False)
     assert done.returncode == 2
     assert words in done.stderr

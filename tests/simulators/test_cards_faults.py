@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from polysight.shared.config import Instrument
-from polysight.simulators.faults import Faults, read_faults
 from tests.simulators.card_bench import ALIVE, CONFIGURE, FRAME, START, Bench, payload, reply
+
+from polysight_shared.config import Instrument
+from polysight_simulators.faults import Faults, read_faults
 
 
 @pytest.mark.parametrize("bit", range(12))

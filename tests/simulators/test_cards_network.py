@@ -6,13 +6,13 @@ import struct
 from contextlib import ExitStack
 
 import numpy as np
-
-from polysight.shared.config import Instrument
-from polysight.shared.error_codes import ErrorCode
-from polysight.simulators.cards import CardEndpoint, CardSender, Network, Pace, bound_udp
-from polysight.simulators.faults import Faults
 from tests.simulators.card_bench import ALIVE, EEPROM, START, Bench, reply
 from tests.support.refusals import refused
+
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_simulators.cards import CardEndpoint, CardSender, Network, Pace, bound_udp
+from polysight_simulators.faults import Faults
 
 
 def test_the_eeproms_addresses_are_taken_over_the_network_after_a_power_cycle(

@@ -10,15 +10,15 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-
-from polysight.shared.config import load_instrument
-from polysight.simulators.cards import bound_udp
-from polysight.simulators.rig import card_groups
 from tests.support.paths import RIG_FILE
 from tests.support.processes import Bench, Program
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 from tests.support.stage.processes import runs
+
+from polysight_shared.config import load_instrument
+from polysight_simulators.cards import bound_udp
+from polysight_simulators.rig import card_groups
 
 SCENE = small_scene(10, 4)
 
@@ -27,7 +27,7 @@ SCENE = small_scene(10, 4)
 def launch(tmp_path):
     """Starts the simulated rig in `tmp_path`/rig."""
     with closing(Bench(tmp_path)) as bench:
-        rig = ("python", "-m", "polysight.simulators.rig", "--config", RIG_FILE, "--dir", tmp_path / "rig")
+        rig = ("python", "-m", "polysight_simulators.rig", "--config", RIG_FILE, "--dir", tmp_path / "rig")
         yield lambda *arguments: bench.start(*rig, *arguments)
 
 
@@ -36,7 +36,7 @@ def children(program: Program) -> dict[str, int]:
     found, pid = {}, program.process.pid
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         words = Path(f"/proc/{child}/cmdline").read_bytes().decode().split("\0")
-        found[next((w for w in words if w.startswith("polysight.simulators.")), words[0])] = int(child)
+        found[next((w for w in words if w.startswith("polysight_simulators.")), words[0])] = int(child)
     return found
 
 
@@ -88,7 +88,7 @@ def test_a_process_that_dies_ends_the_rig_and_is_named(launch, tmp_path):
     process = launch("--pattern")
     process.wait_ready()
     pids = children(process)
-    os.kill(pids["polysight.simulators.wires"], signal.SIGKILL)
+    os.kill(pids["polysight_simulators.wires"], signal.SIGKILL)
     ended = process.wait()
     assert ended.status == 5
     assert "process ended with status" in ended.err

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from polysight.shared.config import Instrument
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.raster import plan_raster
-from polysight.shared.wires import WireMotion
-from polysight.simulators.cards.sync_in import Pulse, StageTrack, SyncInput, sync_line
-from polysight.simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.raster import plan_raster
+from polysight_shared.wires import WireMotion
+from polysight_simulators.cards.sync_in import Pulse, StageTrack, SyncInput, sync_line
+from polysight_simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
 
 RIG = published_rig()
 DEAD_NS = 278_500  # ramp end 128.5 us + 150 us

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.host.pipeline import Pipeline
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.simulators.scene import Scene, decode_scene, reference_cube, simulate, synced_cube
-from polysight.simulators.scene.radar import sample_frequencies_hz
 from tests.support.rigs import published_rig
+
+from polysight.pipeline import Pipeline
+from polysight.store.scan_folder import ScanFolder
+from polysight_simulators.scene import Scene, decode_scene, reference_cube, simulate, synced_cube
+from polysight_simulators.scene.radar import sample_frequencies_hz
 
 RIG = published_rig()
 SCENE = decode_scene(

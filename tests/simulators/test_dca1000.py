@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from polysight.simulators.cards.dca1000 import Card, Code, Message, Network, Output, Packets
+from polysight_simulators.cards.dca1000 import Card, Code, Message, Network, Output, Packets
 
 HOME = Network("192.168.33.30", "192.168.33.180", bytes.fromhex("123456789012"), 4096, 4098)
 CONFIGURE = bytes.fromhex("5aa5 0300 0600 01010102031e aaee")

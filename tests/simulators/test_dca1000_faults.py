@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError
-from polysight.simulators.cards.dca1000 import Status
-from polysight.simulators.cards.fault_draws import NetworkFaults, OverflowFaults, PulseFaults
-from polysight.simulators.cards.sync_in import Pulse
-from polysight.simulators.faults import Faults, read_faults
 from tests.support.refusals import refused
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+from polysight_simulators.cards.dca1000 import Status
+from polysight_simulators.cards.fault_draws import NetworkFaults, OverflowFaults, PulseFaults
+from polysight_simulators.cards.sync_in import Pulse
+from polysight_simulators.faults import Faults, read_faults
 
 SIZE = 20  # bytes of a packet, 10 of them its header
 EVERYTHING = Faults(

@@ -9,7 +9,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from polysight.simulators.cards.dca1000 import TAIL_S, Card, Message, Network, Output, Packets, Status, message
+from polysight_simulators.cards.dca1000 import TAIL_S, Card, Message, Network, Output, Packets, Status, message
 
 HOME = Network("192.168.33.30", "192.168.33.180", bytes.fromhex("123456789012"), 4096, 4098)
 ENDS = {Status.RECORD_COMPLETED, Status.NO_LVDS_DATA}

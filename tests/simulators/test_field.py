@@ -5,16 +5,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from polysight.shared.config import Instrument
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.scene import Scene, apply_scene, decode_scene
-from polysight.simulators.scene.field import ObjectField, build_field, node_matrix
-from polysight.simulators.scene.optics import antennas, direct_factor, field_exact
-from polysight.simulators.scene.radar import sample_frequencies_hz
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_simulators.scene import Scene, apply_scene, decode_scene
+from polysight_simulators.scene.field import ObjectField, build_field, node_matrix
+from polysight_simulators.scene.optics import antennas, direct_factor, field_exact
+from polysight_simulators.scene.radar import sample_frequencies_hz
 
 GRID = {"columns": 29, "rows": 21, "step_x_mm": 10.0, "step_y_mm": 10.0}
 PLATES = [

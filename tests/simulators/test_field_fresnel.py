@@ -3,11 +3,11 @@
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.scene import Plate, Scene
-from polysight.simulators.scene.optics import board_reflectivity, half_space, plate_reflection, slab
 from tests.support.rigs import published_rig
+
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_simulators.scene import Plate, Scene
+from polysight_simulators.scene.optics import board_reflectivity, half_space, plate_reflection, slab
 
 F = 78.5e9
 

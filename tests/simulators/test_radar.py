@@ -5,15 +5,15 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.scene.cubes import reference_cube
-from polysight.simulators.scene.draws import pulse_uniform
-from polysight.simulators.scene.optics import antennas, field_exact
-from polysight.simulators.scene.radar import SimulatedRig, sample_frequencies_hz
-from polysight.simulators.scene.receiver import high_pass, power_on, sync_delay_s
 from tests.support.rigs import published_rig
+
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_simulators.scene import decode_scene
+from polysight_simulators.scene.cubes import reference_cube
+from polysight_simulators.scene.draws import pulse_uniform
+from polysight_simulators.scene.optics import antennas, field_exact
+from polysight_simulators.scene.radar import SimulatedRig, sample_frequencies_hz
+from polysight_simulators.scene.receiver import high_pass, power_on, sync_delay_s
 
 RIG = published_rig()
 GRID = {"columns": 9, "rows": 6, "step_x_mm": 10.0, "step_y_mm": 10.0}

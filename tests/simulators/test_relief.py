@@ -4,16 +4,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from polysight.shared.config import Instrument
-from polysight.shared.geometry import incidence_deg
-from polysight.shared.raster import mean_burst_travel_mm, plan_raster
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.scene import Scene, apply_scene, decode_scene, synced_cube
-from polysight.simulators.scene.field import build_field, node_matrix
-from polysight.simulators.scene.optics import antennas, field_exact
-from polysight.simulators.scene.radar import sample_frequencies_hz
 from tests.support.rigs import published_rig
+
+from polysight_shared.config import Instrument
+from polysight_shared.geometry import incidence_deg
+from polysight_shared.raster import mean_burst_travel_mm, plan_raster
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_simulators.scene import Scene, apply_scene, decode_scene, synced_cube
+from polysight_simulators.scene.field import build_field, node_matrix
+from polysight_simulators.scene.optics import antennas, field_exact
+from polysight_simulators.scene.radar import sample_frequencies_hz
 
 RIG = published_rig()
 GRID = {"columns": 21, "rows": 15, "step_x_mm": 10.0, "step_y_mm": 10.0}

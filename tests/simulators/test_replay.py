@@ -19,13 +19,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.simulators import replay
-from polysight.simulators.cards import MAC, CardEndpoint, Network, Pace, bound_udp
-from polysight.simulators.faults import Faults
-from polysight.simulators.loopback import on_free_subnet
-from polysight.simulators.replay import Player, Recording, scan_rows
 from tests.support.rigs import published_rig
+
+from polysight_simulators import replay
+from polysight_simulators.cards import MAC, CardEndpoint, Network, Pace, bound_udp
+from polysight_simulators.faults import Faults
+from polysight_simulators.loopback import on_free_subnet
+from polysight_simulators.replay import Player, Recording, scan_rows
 
 OK = {code: bytes.fromhex(f"5aa5{code:02x}000000aaee") for code in range(1, 15)}
 START, STOP = "5aa505000000aaee", "5aa506000000aaee"
@@ -98,7 +98,7 @@ def play() -> Iterator[Play]:
         def begin(source: Path, *arguments: str) -> Client:
             subnet = free_subnet()
             addresses = ("--card-address", f"{subnet}.180", "--host-address", f"{subnet}.30")
-            command = [sys.executable, "-m", "polysight.simulators.replay", str(source), *addresses, *arguments]
+            command = [sys.executable, "-m", "polysight_simulators.replay", str(source), *addresses, *arguments]
             player = sockets.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
             sockets.callback(player.kill)
             players.append(player)

@@ -5,11 +5,11 @@ from typing import Any
 
 import msgspec
 import pytest
-
-from polysight.shared.config import Instrument
-from polysight.shared.errors import ConfigError
-from polysight.simulators.scene.scene_file import OFF, Disturbances, Scene, apply_scene, decode_scene, load_scene
 from tests.support.paths import REPO
+
+from polysight_shared.config import Instrument
+from polysight_shared.errors import ConfigError
+from polysight_simulators.scene.scene_file import OFF, Disturbances, Scene, apply_scene, decode_scene, load_scene
 
 
 def scene(**tables: Any) -> Scene:

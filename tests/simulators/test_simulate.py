@@ -8,16 +8,16 @@ from zlib import crc32
 import msgpack
 import numpy as np
 import pytest
-
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError
-from polysight.shared.messages import Capture, RowFinished, RunStarted, RunStopped, unpack_event
-from polysight.shared.raster import FIRST_PULSE_DELAY_S, plan_raster
-from polysight.simulators.__main__ import main
-from polysight.simulators.scene import SimulatedRig, decode_scene, lost_bytes, row_offsets_mm, simulate
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+from polysight_shared.messages import Capture, RowFinished, RunStarted, RunStopped, unpack_event
+from polysight_shared.raster import FIRST_PULSE_DELAY_S, plan_raster
+from polysight_simulators.__main__ import main
+from polysight_simulators.scene import SimulatedRig, decode_scene, lost_bytes, row_offsets_mm, simulate
 
 RIG = published_rig()
 RAW: dict[str, Any] = {

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from polysight.shared.config import Instrument
-from polysight.shared.errors import ConfigError
-from polysight.simulators.scene import Scene, SimulatedRig, apply_scene, decode_scene, draw_specimens, simulate, truth
-from polysight.simulators.scene.specimens import facets
 from tests.support.rigs import published_rig
+
+from polysight_shared.config import Instrument
+from polysight_shared.errors import ConfigError
+from polysight_simulators.scene import Scene, SimulatedRig, apply_scene, decode_scene, draw_specimens, simulate, truth
+from polysight_simulators.scene.specimens import facets
 
 RIG = published_rig()
 PLATE = {"name": "a", "centre_mm": [30.0, -20.0], "size_mm": [45.0, 30.0], "permittivity": [4.0, 0.4]}

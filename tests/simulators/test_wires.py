@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import DeviceError
-from polysight.shared.wires import WireClient, WireEdge, WireMessage, WireMotion, encode
-from polysight.simulators.wires import WireHub
 from tests.support.refusals import refused
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError
+from polysight_shared.wires import WireClient, WireEdge, WireMessage, WireMotion, encode
+from polysight_simulators.wires import WireHub
 
 Serve = Callable[..., Path]
 Join = Callable[..., WireClient]

@@ -9,13 +9,13 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
-
-from polysight.shared.errors import DeviceError
-from polysight.simulators.builds import SKETCH_DIR, build_sketch, sketch_compiler
-from polysight.simulators.uno import ENABLING_COMMAND, EmulatedUno, emulator, firmware, missing
 from tests.support.stage.drivers import Driver, FirmwareDriver, PortDriver, PythonDriver, UnoDriver
 from tests.support.stage.processes import StageProcess
 from tests.support.stage.uno_host import Host
+
+from polysight_shared.errors import DeviceError
+from polysight_simulators.builds import SKETCH_DIR, build_sketch, sketch_compiler
+from polysight_simulators.uno import ENABLING_COMMAND, EmulatedUno, emulator, firmware, missing
 
 _SANITIZE = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-O1")
 

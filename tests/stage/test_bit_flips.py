@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from polysight.shared.stage_line import Command
+from polysight_shared.stage_line import Command
 
 # In an order in which each is obeyed after the one before.
 COMMANDS = (

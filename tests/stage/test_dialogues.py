@@ -19,7 +19,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
 from tests.support.stage.conversation import play
 
 DIALOGUES = sorted((Path(__file__).parent / "dialogues").glob("*.txt"))

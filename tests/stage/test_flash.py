@@ -10,7 +10,6 @@ import tty
 from pathlib import Path
 
 import pytest
-
 from tests.support.paths import REPO
 
 SKETCH = REPO / "arduino_stage"

@@ -12,12 +12,12 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-
-from polysight.shared.wires import WireMotion
 from tests.support.paths import RIG_FILE
 from tests.support.stage.conversation import play
 from tests.support.stage.drivers import PortDriver
 from tests.support.stage.processes import COMMANDS, LIMIT_S, StageProcess, outlives_its_parent
+
+from polysight_shared.wires import WireMotion
 
 # x, y in um at the triggers of dialogues/row.txt
 ROW_POINTS = [(5 * x, 5000) for x in range(20_000, 22_000, 400)] + [(5 * x, 7000) for x in range(21_600, 19_600, -400)]
@@ -110,7 +110,7 @@ def test_ends_when_the_wires_are_gone(start: Start, speed: float):
 
 def test_dies_with_its_parent(kind: str, tmp_path: Path):
     module, *options = COMMANDS[kind]
-    command = [sys.executable, "-m", f"polysight.simulators.{module}", "--config", RIG_FILE, *options]
+    command = [sys.executable, "-m", f"polysight_simulators.{module}", "--config", RIG_FILE, *options]
     assert not outlives_its_parent([*command, "--link", tmp_path / "tty"])
 
 

@@ -6,9 +6,9 @@ import itertools
 import random
 
 import pytest
-
-from polysight.shared.stage_line import Immediate
 from tests.support.stage.drivers import edges, motions
+
+from polysight_shared.stage_line import Immediate
 
 MM = 200  # steps
 UM = 5  # per step

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from polysight.shared.stage_line import Command, Immediate
+from polysight_shared.stage_line import Command, Immediate
 
 
 def _act(rng: random.Random, sequence: int) -> tuple[str, object]:

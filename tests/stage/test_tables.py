@@ -8,15 +8,15 @@ import subprocess
 from pathlib import Path
 
 import pytest
-
-from polysight.shared import stage_line
-from polysight.shared.config import Stage
-from polysight.shared.faults import EXPLANATIONS, StageError, c_header
-from polysight.shared.stage_line import Immediate, Parameter, Reply
-from polysight.simulators.stage import logic as stage_logic
-from polysight.simulators.stage import motion as stage_motion
-from polysight.simulators.stage import python_stage as stage_python
 from tests.support.paths import REPO
+
+from polysight_shared import stage_line
+from polysight_shared.config import Stage
+from polysight_shared.faults import EXPLANATIONS, StageError, c_header
+from polysight_shared.stage_line import Immediate, Parameter, Reply
+from polysight_simulators.stage import logic as stage_logic
+from polysight_simulators.stage import motion as stage_motion
+from polysight_simulators.stage import python_stage as stage_python
 
 SKETCH = REPO / "arduino_stage"
 PAGE = (REPO / "docs" / "spec" / "stage-line.md").read_text(encoding="utf-8")
@@ -39,7 +39,11 @@ def test_pinout():
     board = pins("\n".join(re.findall(r"PIN_.*", (SKETCH / "board.h").read_text(encoding="ascii"))))
     assert published.items() <= board.items()
     assert len(set(board.values())) == len(board)
-    emulated = pins(re.findall(r"enum (\{ TRIGGER.*?\});", (REPO / "simulators/uno/rig.c").read_text(), re.DOTALL)[0])
+    emulated = pins(
+        re.findall(
+            r"enum (\{ TRIGGER.*?\});", (REPO / "simulators/polysight_simulators/uno/rig.c").read_text(), re.DOTALL
+        )[0]
+    )
     names = {"DRIVERS_OFF": "ENABLE", "EMERGENCY_STOP": "EMERGENCY"}
     assert {names.get(k, k): v for k, v in emulated.items()} == board
 

@@ -7,9 +7,9 @@ import random
 
 import pytest
 
-from polysight.shared.stage_line import Command, Immediate, Parameter
-from polysight.simulators.stage import homing_zero
-from polysight.simulators.uno import HZ
+from polysight_shared.stage_line import Command, Immediate, Parameter
+from polysight_simulators.stage import homing_zero
+from polysight_simulators.uno import HZ
 
 US, MS = HZ // 1_000_000, HZ // 1000
 TRIGGER, X_PUL, RIGHT_PUL = 2, 5, 4  # the left motor steps just before the right one

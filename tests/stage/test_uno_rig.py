@@ -9,16 +9,16 @@ import msgspec
 import numpy as np
 import pytest
 import tomli_w
-
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.shared.tables import to_builtins
-from polysight.simulators.scene import load_scene, simulate
 from tests.support.paths import RIG_FILE
 from tests.support.processes import Bench
 from tests.support.rigs import published_rig
 
+from polysight.store.scan_folder import ScanFolder
+from polysight_shared.tables import to_builtins
+from polysight_simulators.scene import load_scene, simulate
+
 LIMIT_S = 200
-SIMULATED_RIG = ("python", "-m", "polysight.simulators.rig")
+SIMULATED_RIG = ("python", "-m", "polysight_simulators.rig")
 SCENE = 'name = "a plate"\n[[plates]]\nname = "m"\ncentre_mm = [0, 0]\nsize_mm = [60.0, 60.0]\nmetal = true\n'
 
 

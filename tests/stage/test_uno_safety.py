@@ -6,8 +6,8 @@ import random
 
 import pytest
 
-from polysight.shared.stage_line import Immediate, Parameter
-from polysight.simulators.uno import HZ
+from polysight_shared.stage_line import Immediate, Parameter
+from polysight_simulators.uno import HZ
 
 US, MS = HZ // 1_000_000, HZ // 1000
 TRIGGER, X_PUL, DRIVERS_OFF = 2, 5, 7

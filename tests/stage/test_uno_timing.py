@@ -7,11 +7,11 @@ import re
 from pathlib import Path
 
 import pytest
-
-from polysight.shared.stage_line import Immediate, Parameter
-from polysight.simulators.uno import HZ, firmware
 from tests.support.paths import REPO
 from tests.support.stage.uno_host import Host
+
+from polysight_shared.stage_line import Immediate, Parameter
+from polysight_simulators.uno import HZ, firmware
 
 SKETCH = REPO / "arduino_stage"
 US, MS = HZ // 1_000_000, HZ // 1000

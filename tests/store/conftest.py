@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TypeVar
 
 import pytest
-
 from tests.support.store.small_scan import Samples, SmallScan
 
 T = TypeVar("T")

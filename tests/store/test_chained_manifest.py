@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from polysight.host.store import manifest
-from polysight.host.store.manifest import ManifestWriter, encode_line, parse
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.host.store.validation import validate
-from polysight.simulators.scene import decode_scene, simulate
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, PET, scene_of
 from tests.support.store.plain_scan import errors, write_scan
+
+from polysight.store import manifest
+from polysight.store.manifest import ManifestWriter, encode_line, parse
+from polysight.store.scan_folder import MANIFEST, ScanFolder
+from polysight.store.validation import validate
+from polysight_simulators.scene import decode_scene, simulate
 
 SOME = [{"fact": "scan_started"}, *({"fact": "row_committed", "row": k} for k in range(5)), {"fact": "scan_ended"}]
 

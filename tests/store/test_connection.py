@@ -8,15 +8,15 @@ from typing import Any
 
 import pytest
 import tomli_w
-
-from polysight.host.acquisition.scan import resume_scan
-from polysight.host.cli.main import main
-from polysight.host.page.history import ScanHistory
-from polysight.host.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, with_connection
-from polysight.shared.config import Instrument
-from polysight.shared.errors import ConfigError
-from polysight.shared.tables import decode, to_builtins
 from tests.support.rigs import rig_table
+
+from polysight.acquisition.scan import resume_scan
+from polysight.cli.main import main
+from polysight.page.history import ScanHistory
+from polysight.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, with_connection
+from polysight_shared.config import Instrument
+from polysight_shared.errors import ConfigError
+from polysight_shared.tables import decode, to_builtins
 
 
 @pytest.fixture(scope="module")

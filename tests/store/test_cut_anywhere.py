@@ -10,15 +10,15 @@ from pathlib import Path
 
 import msgpack
 import pytest
-
-from polysight.host.store.events import read_events
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validation import validate
-from polysight.pi_controller.journal import records
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.messages import RowStarted
 from tests.support.refusals import refused
 from tests.support.store.small_scan import SmallScan
+
+from polysight.store.events import read_events
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.validation import validate
+from polysight_pi.journal import records
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.messages import RowStarted
 
 pytestmark = pytest.mark.timeout(3600)  # with --long
 PAGE = bytes(4096)

@@ -8,14 +8,14 @@ import shutil
 from pathlib import Path
 
 import pytest
-
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validation import validate
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import PolysightError
 from tests.support.refusals import refused
 from tests.support.store.faulty_disk import GROWS, FaultyDisk
 from tests.support.store.small_scan import Samples, SmallScan
+
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.validation import validate
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import PolysightError
 
 
 def needs_space(samples: Samples, folder: Path, whose: str) -> list[int]:

@@ -9,12 +9,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validation import validate
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 from tests.support.store.plain_scan import errors
 from tests.support.store.small_scan import Samples, SmallScan
+
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.validation import validate
 
 POWER_CUTS = 4  # draws of what is left, for each place
 pytestmark = [

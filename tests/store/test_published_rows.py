@@ -3,17 +3,17 @@
 import msgspec
 import numpy as np
 import pytest
-
-from polysight.host.store.sources.open import open_source
-from polysight.host.store.sources.published import RowLosses
-from polysight.host.store.sources.published_settings import mirrored
-from polysight.shared.config import Burst, Grid
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
-from polysight.shared.raster import plan_raster
-from polysight.simulators.scene import AuthorsLayout
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight.store.sources.open import open_source
+from polysight.store.sources.published import RowLosses
+from polysight.store.sources.published_settings import mirrored
+from polysight_shared.config import Burst, Grid
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
+from polysight_shared.raster import plan_raster
+from polysight_simulators.scene import AuthorsLayout
 
 COLUMNS, ROWS, PULSES = 9, 4, 3
 BASE = published_rig()

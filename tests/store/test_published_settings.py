@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
-
-from polysight.host.store.sources.open import open_source
-from polysight.host.store.sources.published import PublishedCubes
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.geometry import rx_positions_m, tx_position_m
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
+
+from polysight.store.sources.open import open_source
+from polysight.store.sources.published import PublishedCubes
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.geometry import rx_positions_m, tx_position_m
 
 COLUMNS, ROWS, PULSES, SAMPLES = 7, 4, 4, 256
 

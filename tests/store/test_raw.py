@@ -12,25 +12,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.host.cli.main import main
-from polysight.host.jobs.drop_raw import drop_raw, processed_digests
-from polysight.host.jobs.live_scan import resume
-from polysight.host.jobs.process import all_rows, load_options, make_products, process
-from polysight.host.process.request import ProcessRequest
-from polysight.host.products import REPORT, making_products
-from polysight.host.store import locked_samples
-from polysight.host.store.append_only import AppendFile
-from polysight.host.store.raw import drop, droppable, dropped_files, require_raw
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.host.store.validation import damaged_rows
-from polysight.host.verdict import NoResult
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, DataError, ScanError
 from tests.support.paths import POLYSIGHT, RIG_FILE
 from tests.support.refusals import refused
 from tests.support.scenes import small_scene
 from tests.support.store.plain_scan import errors
+
+from polysight.cli.main import main
+from polysight.jobs.drop_raw import drop_raw, processed_digests
+from polysight.jobs.live_scan import resume
+from polysight.jobs.process import all_rows, load_options, make_products, process
+from polysight.process.request import ProcessRequest
+from polysight.products import REPORT, making_products
+from polysight.store import locked_samples
+from polysight.store.append_only import AppendFile
+from polysight.store.raw import drop, droppable, dropped_files, require_raw
+from polysight.store.scan_folder import MANIFEST, ScanFolder
+from polysight.store.validation import damaged_rows
+from polysight.verdict import NoResult
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DataError, ScanError
 
 ROWS, BOARDS = 4, 2
 SCENE = small_scene(8, ROWS, metal=False)
@@ -46,7 +46,7 @@ def processed(tmp_path_factory) -> Path:
     """A simulated scan with its images."""
     folder = tmp_path_factory.mktemp("processed")
     (folder / "scene.toml").write_text(SCENE)
-    simulate = [sys.executable, "-m", "polysight.simulators", "simulate", folder / "scene.toml"]
+    simulate = [sys.executable, "-m", "polysight_simulators", "simulate", folder / "scene.toml"]
     config = ["--config", RIG_FILE, "--out", folder / "scan"]
     subprocess.run([*simulate, *config], check=True, capture_output=True)
     assert polysight("image", folder / "scan", "--out", folder / "scan" / "products").returncode == 0

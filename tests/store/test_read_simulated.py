@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.sources.open import open_source
-from polysight.host.store.validation import validate
-from polysight.simulators.scene import SimulatedRig, decode_scene, lost_bytes, simulate
 from tests.support.rigs import published_rig
+
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.sources.open import open_source
+from polysight.store.validation import validate
+from polysight_simulators.scene import SimulatedRig, decode_scene, lost_bytes, simulate
 
 RIG = published_rig()
 RAW = {

@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from polysight.host.capture import PACKETS, Evidence, place_record, read_packets, write_index, write_packets
-from polysight.host.capture.earlier_records import Past
-from polysight.host.jobs.recordings import inspect_placement, replace_folder
-from polysight.host.store import ManifestWriter, ScanFolder, replace_rows
-from polysight.host.store.append_only import crc32
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.raster import plan_raster
 from tests.support.capture.records import Record, log_of, mask_of
 from tests.support.refusals import refused
 from tests.support.rigs import rig_with
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 from tests.support.store.plain_scan import errors
+
+from polysight.capture import PACKETS, Evidence, place_record, read_packets, write_index, write_packets
+from polysight.capture.earlier_records import Past
+from polysight.jobs.recordings import inspect_placement, replace_folder
+from polysight.store import ManifestWriter, ScanFolder, replace_rows
+from polysight.store.append_only import crc32
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.raster import plan_raster
 
 
 def scan_with(folder: Path, lost: int, wrong: bool = False) -> tuple[ScanFolder, bytes]:

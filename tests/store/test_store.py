@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from polysight.host.store import manifest
-from polysight.host.store.append_only import crc32
-from polysight.host.store.events import EventWriter, read_events
-from polysight.host.store.manifest import ManifestWriter, encode_line, parse
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.source import RawSource, pieces_of
-from polysight.host.store.validation import to_json, validate
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, PolysightError
-from polysight.shared.messages import Fault
-from polysight.shared.raster import plan_raster
 from tests.support.acquisition.fake_rig import small_instrument
 from tests.support.refusals import refused
 from tests.support.store.plain_scan import write_scan
+
+from polysight.store import manifest
+from polysight.store.append_only import crc32
+from polysight.store.events import EventWriter, read_events
+from polysight.store.manifest import ManifestWriter, encode_line, parse
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.source import RawSource, pieces_of
+from polysight.store.validation import to_json, validate
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, PolysightError
+from polysight_shared.messages import Fault
+from polysight_shared.raster import plan_raster
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),

@@ -7,13 +7,13 @@ import os
 from pathlib import Path
 
 import pytest
-
-from polysight.host.store import append_only as appending
-from polysight.host.store import validation as validate
-from polysight.host.store.manifest import ManifestWriter
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight.store import append_only as appending
+from polysight.store import validation as validate
+from polysight.store.manifest import ManifestWriter
+from polysight.store.scan_folder import ScanFolder
+from polysight_shared.error_codes import ErrorCode
 
 
 def test_a_disk_without_locks_is_not_a_scan_in_use(tmp_path, monkeypatch):

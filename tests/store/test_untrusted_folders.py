@@ -13,30 +13,30 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-
-from polysight.host.calibration import calibration_of_scan
-from polysight.host.capture import read_index, read_packets
-from polysight.host.capture.packet_file import PACKETS, RUN
-from polysight.host.capture.segment import write_durably
-from polysight.host.cli.main import main
-from polysight.host.materials.labels import read_labels
-from polysight.host.materials.library import Library
-from polysight.host.materials.patch_files import read_patches
-from polysight.host.materials.published import read_material
-from polysight.host.materials.truth import read_truth
-from polysight.host.products.dataset_files import read_netcdf
-from polysight.host.products.files import SavedProducts, read_image, write_atomically
-from polysight.host.products.folder import making_products
-from polysight.host.store import manifest
-from polysight.host.store.raw import drop, droppable
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.sources.published_settings import read_json as read_settings_json
-from polysight.host.store.validation import validate
-from polysight.shared.config import load_instrument
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
+
+from polysight.calibration import calibration_of_scan
+from polysight.capture import read_index, read_packets
+from polysight.capture.packet_file import PACKETS, RUN
+from polysight.capture.segment import write_durably
+from polysight.cli.main import main
+from polysight.materials.labels import read_labels
+from polysight.materials.library import Library
+from polysight.materials.patch_files import read_patches
+from polysight.materials.published import read_material
+from polysight.materials.truth import read_truth
+from polysight.products.dataset_files import read_netcdf
+from polysight.products.files import SavedProducts, read_image, write_atomically
+from polysight.products.folder import making_products
+from polysight.store import manifest
+from polysight.store.raw import drop, droppable
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.sources.published_settings import read_json as read_settings_json
+from polysight.store.validation import validate
+from polysight_shared.config import load_instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError
 
 OUTSIDE = ["../victim.bin", "/etc/passwd", "raw/../../victim.bin", "raw/a\0b.bin", "", ".", "manifest.jsonl"]
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header
-from polysight.host.imaging import ImagedWith, image_grid
-from polysight.host.polarimetry import Leakage, PlaneReference, plane_reference
-from polysight.shared.config import Instrument
+from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header
+from polysight.imaging import ImagedWith, image_grid
+from polysight.polarimetry import Leakage, PlaneReference, plane_reference
+from polysight_shared.config import Instrument
 
 SOURCES = [SourceScan("plate", "scans/plate", True, 7)]
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.simulators.scene.optics import half_space
+from polysight_simulators.scene.optics import half_space
 
 Complex = NDArray[np.complexfloating]
 PIXELS = 150  # per side of an image

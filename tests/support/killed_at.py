@@ -44,9 +44,9 @@ def main(words: list[str]) -> int:
         kill_at(Path(hits), operation, suffix, int(nth))
     sys.argv = [str(Path(sys.executable).with_name(program)), *arguments]
     if program == "polysight":
-        from polysight.host.cli.main import main as run
+        from polysight.cli.main import main as run
     else:
-        from polysight.pi_controller.cli import main as run
+        from polysight_pi.cli import main as run
     return run()
 
 

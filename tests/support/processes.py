@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from polysight.host.cli.main import main
+from polysight.cli.main import main
 from tests.support.paths import BIN
 
 LIMIT_S = 60.0

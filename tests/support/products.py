@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from polysight.host.products import write_image, write_json
+from polysight.products import write_image, write_json
 
 NAMES = ("PET", "acrylic", "copper")
 REASON = {"what": "no metal reference", "why": "it is the only patch", "do": "lay a metal plate into the scene"}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from polysight.host.materials import Entry
+from polysight.materials import Entry
 
 
 def write_materials(folder: Path, entries: Iterable[Entry]) -> None:

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import PolysightError
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import PolysightError
 
 
 @contextmanager

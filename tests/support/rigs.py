@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.tables import decode, to_builtins
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.tables import decode, to_builtins
 from tests.support.paths import RIG_FILE
 
 MID_BAND_OFFSET_HZ = 790e3  # start offset of a receiver that puts the direct path mid-band

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import tomli_w
 
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.errors import PolysightError
-from polysight.shared.tables import decode, to_builtins
+from polysight.store.scan_folder import ScanFolder
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.errors import PolysightError
+from polysight_shared.tables import decode, to_builtins
 from tests.support.paths import RIG_FILE
 from tests.support.processes import Bench, Program, wait_for
 from tests.support.scenes import small_scene
@@ -34,7 +34,7 @@ class Rig(Bench):
         folder = self.folder
         (folder / "scene.toml").write_text(self._scene)
         self.simulators = self.start(
-            "python", "-m", "polysight.simulators.rig", "--config", RIG_FILE, "--scene", folder / "scene.toml",
+            "python", "-m", "polysight_simulators.rig", "--config", RIG_FILE, "--scene", folder / "scene.toml",
             "--dir", folder / "rig", "--time-scale", str(self._time_scale), env=self._env,
         )  # fmt: skip
         base = Path(self.simulators.wait_ready())

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from polysight.host.capture.decode import raw_words
-from polysight.host.sync.align import AlignedRow, align_row
-from polysight.shared.config import Board, Instrument
-from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.capture.decode import raw_words
+from polysight.sync.align import AlignedRow, align_row
+from polysight_shared.config import Board, Instrument
+from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 
 def sweep_hz(rig: Instrument) -> np.ndarray:

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.host.sync.backlash import echo_of_row, estimate_backlash, object_filter
-from polysight.shared.raster import plan_raster
-from polysight.simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
+from polysight.sync import BoardSetup, synchronise_row
+from polysight.sync.backlash import echo_of_row, estimate_backlash, object_filter
+from polysight_shared.raster import plan_raster
+from polysight_simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
 
 POINTS = [{"position_mm": p, "amplitude": [0.8, 0.0]} for p in ([0.0, 0.0], [25.0, 10.0], [-30.0, -8.0])]
 

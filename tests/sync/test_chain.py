@@ -5,13 +5,13 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-
-from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.host.sync.high_pass_filter import high_pass
-from polysight.host.sync.tone import estimate_tone
-from polysight.shared.error_codes import ErrorCode
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from tests.support.refusals import refused
+
+from polysight.sync import BoardSetup, synchronise_row
+from polysight.sync.high_pass_filter import high_pass
+from polysight.sync.tone import estimate_tone
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 POSITIONS, PULSES = 9, 6
 

@@ -14,9 +14,9 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from polysight.host.sync import build, compiled, direct_path, numpy_direct_path
-from polysight.host.sync.align import AlignedRow, align_in_numpy, align_pieces, align_row
-from polysight.host.sync.high_pass_filter import Equaliser, HighPass, high_pass
+from polysight.sync import build, compiled, direct_path, numpy_direct_path
+from polysight.sync.align import AlignedRow, align_in_numpy, align_pieces, align_row
+from polysight.sync.high_pass_filter import Equaliser, HighPass, high_pass
 
 WIDTHS = (128, 256, 512)
 
@@ -228,7 +228,7 @@ def test_three_receivers_are_aligned_in_numpy():
 def test_the_compiled_loops_are_used_if_available(library_file, monkeypatch):
     found = compiled.Library(library_file)
     monkeypatch.setattr(compiled, "library", lambda: found)
-    monkeypatch.setattr("polysight.host.sync.align.align_in_numpy", None)
+    monkeypatch.setattr("polysight.sync.align.align_in_numpy", None)
     assert align_row(bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
 
 
@@ -260,12 +260,12 @@ def test_without_compiled_loops_there_is_one_warning(library_file, tmp_path, mon
         for row in pool.map(lambda _: align_row(bursts(), np.ones((5, 6), bool), (0, 192)), range(3)):
             assert row.good.all()
     (record,) = caplog.records
-    assert "python -m polysight.host.sync.build" in record.getMessage()
+    assert "python -m polysight.sync.build" in record.getMessage()
 
 
 def test_the_build_command_does_not_import_itself_twice():
-    """`python -m polysight.host.sync.build` would warn if importing the package imported this module."""
-    code = "import sys, polysight.host.sync; sys.exit('polysight.host.sync.build' in sys.modules)"
+    """`python -m polysight.sync.build` would warn if importing the package imported this module."""
+    code = "import sys, polysight.sync; sys.exit('polysight.sync.build' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -4,9 +4,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.sync.direct_path import prepare, reference
-from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.sync.direct_path import prepare, reference
+from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 CENTRE = 95.5
 

@@ -3,10 +3,10 @@
 import msgspec
 import numpy as np
 import pytest
-
-from polysight.host.sync.high_pass_filter import Equaliser, HighPass, filtered, fit_high_pass, high_pass
-from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
+
+from polysight.sync.high_pass_filter import Equaliser, HighPass, filtered, fit_high_pass, high_pass
+from polysight_shared.error_codes import ErrorCode
 
 
 def test_each_section_is_3_db_down_and_45_degrees_ahead_at_its_corner():

@@ -5,13 +5,13 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-
-from polysight.host.capture import row_words
-from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.shared.raster import Burst, plan_raster
-from polysight.simulators.scene import SimulatedRig, decode_scene
-from polysight.simulators.scene.simulated_scan import row_offsets_mm
 from tests.support.rigs import published_rig
+
+from polysight.capture import row_words
+from polysight.sync import BoardSetup, synchronise_row
+from polysight_shared.raster import Burst, plan_raster
+from polysight_simulators.scene import SimulatedRig, decode_scene
+from polysight_simulators.scene.simulated_scan import row_offsets_mm
 
 COLUMNS = 24
 MANY = Burst(pulses=16, period_us=1500.0)

@@ -18,11 +18,12 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from polysight.shared import messages as m
-from polysight.shared.config import load_instrument
-from polysight.shared.wires import WireEdge, parse
 from tests.support.pi.host_side import HostSide
 from tests.uml.gpio_sim import Change, SimChip
+
+from polysight_shared import messages as m
+from polysight_shared.config import load_instrument
+from polysight_shared.wires import WireEdge, parse
 
 LINES = 28
 LIMIT_S = 600.0
@@ -60,9 +61,9 @@ def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     rig = load_instrument(config)
     python = [sys.executable, "-m"]
     uno = start(
-        *python, "polysight.simulators.uno", "--config", str(config), "--wires", str(WIRES), "--link", str(PORT)
+        *python, "polysight_simulators.uno", "--config", str(config), "--wires", str(WIRES), "--link", str(PORT)
     )
-    pi = start(*python, "polysight.pi_controller", "run", "--config", str(config), "--stage-port", str(PORT))
+    pi = start(*python, "polysight_pi", "run", "--config", str(config), "--stage-port", str(PORT))
     host = HostSide(rig.pi.command_address, rig.pi.event_address, rig)
     host.accepted(host.begin())
     host.accepted(m.Home())

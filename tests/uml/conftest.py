@@ -14,12 +14,12 @@ from typing import Any
 import msgspec
 import pytest
 import tomli_w
-
-from polysight.shared.config import Instrument
-from polysight.shared.tables import to_builtins
-from polysight.simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 from tests.support.paths import REPO
 from tests.support.rigs import published_rig, timed_by_the_program
+
+from polysight_shared.config import Instrument
+from polysight_shared.tables import to_builtins
+from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
 HERE = Path(__file__).parent
 LIMIT_S = 900

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from polysight.host.verdict import (
+from polysight.verdict import (
     Coverage,
     NoResult,
     Reason,

@@ -9,7 +9,7 @@ import threading
 
 import numpy as np
 
-from polysight.shared.config import Board
+from polysight_shared.config import Board
 
 FULL = 1456  # bytes of samples in a full packet
 

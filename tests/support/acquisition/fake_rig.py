@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 import zmq
 
-from polysight.shared import messages as m
-from polysight.shared.config import Instrument
-from polysight.shared.raster import Row
-from polysight.simulators.loopback import on_free_subnet
+from polysight_shared import messages as m
+from polysight_shared.config import Instrument
+from polysight_shared.raster import Row
+from polysight_simulators.loopback import on_free_subnet
 from tests.support.acquisition.fake_cards import FakeCard
 from tests.support.rigs import rig_with
 

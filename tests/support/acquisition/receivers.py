@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from polysight.host.capture import receiver, receiver_process
+from polysight.capture import receiver, receiver_process
 
 _FORKS = multiprocessing.get_context("forkserver")
 _FORKS.set_forkserver_preload([__name__])

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterable
 from itertools import repeat
 from pathlib import Path
 
-from polysight.shared.config import Board
-from polysight.simulators.cards import MAC, CardEndpoint, Network, Pace
-from polysight.simulators.faults import Faults
-from polysight.simulators.replay import Player, Recording
+from polysight_shared.config import Board
+from polysight_simulators.cards import MAC, CardEndpoint, Network, Pace
+from polysight_simulators.faults import Faults
+from polysight_simulators.replay import Player, Recording
 
 LIMIT_S = 60.0
 

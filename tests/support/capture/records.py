@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polysight.host.capture.dca1000 import Counters
-from polysight.host.capture.earlier_records import Past
-from polysight.host.capture.packet_log import PacketLog
-from polysight.host.capture.placement import Placed, place_record
+from polysight.capture.dca1000 import Counters
+from polysight.capture.earlier_records import Past
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import Placed, place_record
 
 FULL = 1456  # bytes of samples in a full packet
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from polysight.host.calibration.direct_signal import find_direct
-from polysight.host.doctor.context import CheckContext, DoctorOptions, System
-from polysight.host.doctor.receiver_load import LoadResult
-from polysight.host.sync import BoardSetup
-from polysight.simulators.scene import SimulatedRig, decode_scene
+from polysight.calibration.direct_signal import find_direct
+from polysight.doctor.context import CheckContext, DoctorOptions, System
+from polysight.doctor.receiver_load import LoadResult
+from polysight.sync import BoardSetup
+from polysight_simulators.scene import SimulatedRig, decode_scene
 from tests.support.rigs import programmed_rig
 
 QUICK = System(

@@ -16,12 +16,12 @@ import msgspec
 import tomli_w
 import zmq
 
-from polysight.host.acquisition.pi_client import PiClient
-from polysight.host.doctor.checks import run_checks
-from polysight.host.doctor.context import CheckContext, DoctorOptions, Finding, System
-from polysight.shared import messages as m
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.tables import to_builtins
+from polysight.acquisition.pi_client import PiClient
+from polysight.doctor.checks import run_checks
+from polysight.doctor.context import CheckContext, DoctorOptions, Finding, System
+from polysight_shared import messages as m
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.tables import to_builtins
 from tests.support.doctor.case import QUICK
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.rigs import programmed_rig
@@ -122,7 +122,7 @@ class LiveRig:
             if entry.name.isdigit():
                 with suppress(OSError):
                     line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-                    if str(self.folder) in line and word in line and "polysight.simulators.rig" not in line:
+                    if str(self.folder) in line and word in line and "polysight_simulators.rig" not in line:
                         found.append(int(entry.name))
         assert len(found) == 1, (word, found)
         return found[0]

@@ -9,7 +9,7 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from polysight.host.serve.guard import TOKEN_HEADER
+from polysight.serve.guard import TOKEN_HEADER
 from tests.support.processes import LIMIT_S
 
 TOKEN = "the-right-token"

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from polysight.host.jobs.process import process
-from polysight.host.page.watch import Watch
-from polysight.host.process import ProcessRequest
-from polysight.simulators.scene import decode_scene, simulate
+from polysight.jobs.process import process
+from polysight.page.watch import Watch
+from polysight.process import ProcessRequest
+from polysight_simulators.scene import decode_scene, simulate
 from tests.support.page.chromium import Browser, find_chromium
 from tests.support.page.live_view import GrowingScan
 from tests.support.products import unrendered

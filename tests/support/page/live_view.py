@@ -8,17 +8,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from polysight.host.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
-from polysight.host.catalogue import Scans
-from polysight.host.page.watch import Watch
-from polysight.host.serve.app import make_app
-from polysight.host.serve.guard import Access
-from polysight.host.serve.programs import Programs
-from polysight.host.serve.server import Place, server
-from polysight.host.serve.site import Site
-from polysight.host.serve.watches import Watches
-from polysight.host.store import manifest
-from polysight.host.store.scan_folder import EVENTS, MANIFEST, utc_now
+from polysight.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
+from polysight.catalogue import Scans
+from polysight.page.watch import Watch
+from polysight.serve.app import make_app
+from polysight.serve.guard import Access
+from polysight.serve.programs import Programs
+from polysight.serve.server import Place, server
+from polysight.serve.site import Site
+from polysight.serve.watches import Watches
+from polysight.store import manifest
+from polysight.store.scan_folder import EVENTS, MANIFEST, utc_now
 from tests.support.processes import LIMIT_S, wait_for
 
 

@@ -16,10 +16,10 @@ import time
 import tty
 from pathlib import Path
 
-from polysight.shared.errors import PolysightError, ProtocolError
-from polysight.shared.faults import StageError
-from polysight.shared.stage_line import Command, Immediate, Reply
-from polysight.shared.wires import WireClient, WireEdge
+from polysight_shared.errors import PolysightError, ProtocolError
+from polysight_shared.faults import StageError
+from polysight_shared.stage_line import Command, Immediate, Reply
+from polysight_shared.wires import WireClient, WireEdge
 
 STEPS_PER_MM = 200
 

@@ -6,10 +6,10 @@ import queue
 from collections.abc import Callable
 from typing import Any
 
-from polysight.pi_controller.bursts import Edge
-from polysight.shared.config import Stage
-from polysight.shared.errors import DeviceError
-from polysight.shared.stage_line import Immediate, Reply
+from polysight_pi.bursts import Edge
+from polysight_shared.config import Stage
+from polysight_shared.errors import DeviceError
+from polysight_shared.stage_line import Immediate, Reply
 
 
 class FakeDriver:

@@ -9,10 +9,10 @@ from typing import Any
 
 import zmq
 
-from polysight.shared import messages as m
-from polysight.shared.config import Instrument
-from polysight.shared.raster import plan_raster
-from polysight.shared.sockets import requester, subscriber
+from polysight_shared import messages as m
+from polysight_shared.config import Instrument
+from polysight_shared.raster import plan_raster
+from polysight_shared.sockets import requester, subscriber
 
 LIMIT_S = 60.0
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from polysight.simulators import gpio
+from polysight_simulators import gpio
 from tests.support.paths import REPO
 
-PROGRAM = (sys.executable, "-m", "polysight.pi_controller")
+PROGRAM = (sys.executable, "-m", "polysight_pi")
 
 
 class Process:

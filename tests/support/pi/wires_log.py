@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from polysight.shared.errors import DeviceError
-from polysight.shared.wires import WireClient, WireEdge
+from polysight_shared.errors import DeviceError
+from polysight_shared.wires import WireClient, WireEdge
 
 LIMIT_S = 60.0
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import msgspec
 
-from polysight.shared.config import Instrument, NativeRadar, Radar
-from polysight.simulators.radars import FUNCTIONAL, RadarBoard
+from polysight_shared.config import Instrument, NativeRadar, Radar
+from polysight_simulators.radars import FUNCTIONAL, RadarBoard
 from tests.support.rigs import published_rig
 
 

@@ -7,12 +7,12 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from polysight.host.radar.board import RadarBoard
-from polysight.host.radar.firmware import Image, check_image
-from polysight.host.radar.program import program
-from polysight.shared.errors import DeviceError
-from polysight.simulators.radars import Fault, make_image
-from polysight.simulators.radars import RadarBoard as Simulated
+from polysight.radar.board import RadarBoard
+from polysight.radar.firmware import Image, check_image
+from polysight.radar.program import program
+from polysight_shared.errors import DeviceError
+from polysight_simulators.radars import Fault, make_image
+from polysight_simulators.radars import RadarBoard as Simulated
 from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
 
 RIG = native_rig()

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 from usb.backend import IBackend
 from usb.core import USBError
 
-from polysight.simulators.radars import UsbChip
+from polysight_simulators.radars import UsbChip
 
 VENDOR, PRODUCT = 0x0451, 0xFD03
 _PACKET = 512

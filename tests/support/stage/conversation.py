@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from polysight.shared.errors import ProtocolError
-from polysight.shared.stage_line import Command, Immediate, crc16, unseal
+from polysight_shared.errors import ProtocolError
+from polysight_shared.stage_line import Command, Immediate, crc16, unseal
 
 PRESSED = {"X": 1, "Y": 2, "E": 4, "nothing": 0}
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import serial
 
-from polysight.shared.errors import ProtocolError
-from polysight.shared.stage_line import Command, Immediate, Reply
-from polysight.shared.wires import WireEdge, WireMessage, WireMotion, parse
-from polysight.simulators.stage import NS_PER_TICK, TICK_HZ, PythonStage, Rig
-from polysight.simulators.uno import HZ, EmulatedUno
+from polysight_shared.errors import ProtocolError
+from polysight_shared.stage_line import Command, Immediate, Reply
+from polysight_shared.wires import WireEdge, WireMessage, WireMotion, parse
+from polysight_simulators.stage import NS_PER_TICK, TICK_HZ, PythonStage, Rig
+from polysight_simulators.uno import HZ, EmulatedUno
 
 LIMIT_S = 60.0
 LIMIT_TICKS = 600 * TICK_HZ

@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from polysight.shared.wires import WireEdge, WireMessage, WireMotion, parse
+from polysight_shared.wires import WireEdge, WireMessage, WireMotion, parse
 from tests.support.paths import REPO, RIG_FILE
 
 LIMIT_S = 60.0
@@ -20,7 +20,7 @@ COMMANDS = {"pc": ("stage",), "python": ("stage", "--python"), "uno": ("uno",)}
 
 
 class StageProcess:
-    """`python -m polysight.simulators.stage` or `.uno` at the port `link`.
+    """`python -m polysight_simulators.stage` or `.uno` at the port `link`.
 
     Without a `hub` the wires end here: `messages` has what came over them.
     """
@@ -31,7 +31,7 @@ class StageProcess:
         self.link = folder / "ttySTAGE"
         self.messages: list[WireMessage] = []
         module, *options = COMMANDS[kind]
-        command = [sys.executable, "-m", f"polysight.simulators.{module}", "--config", config, *options]
+        command = [sys.executable, "-m", f"polysight_simulators.{module}", "--config", config, *options]
         wires = ("--wires", hub or folder / "wires")
         command += [*wires, "--boot-ms", 50, "--link", self.link, "--time-scale", time_scale]
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from polysight.shared.stage_line import Command, Immediate, Parameter, Reply
-from polysight.simulators.uno import EmulatedUno, PinEdge
+from polysight_shared.stage_line import Command, Immediate, Parameter, Reply
+from polysight_simulators.uno import EmulatedUno, PinEdge
 
 
 class Host:

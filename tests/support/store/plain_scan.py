@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from polysight.host.capture.segment import write_index
-from polysight.host.store.events import EventWriter
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validation import validate
-from polysight.shared.messages import Fault, RunStarted
-from polysight.shared.raster import plan_raster
+from polysight.capture.segment import write_index
+from polysight.store.events import EventWriter
+from polysight.store.scan_folder import ScanFolder
+from polysight.store.validation import validate
+from polysight_shared.messages import Fault, RunStarted
+from polysight_shared.raster import plan_raster
 from tests.support.acquisition.fake_rig import small_instrument
 
 Gaps = dict[tuple[str, int], list[tuple[int, int]]]

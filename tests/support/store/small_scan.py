@@ -16,22 +16,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polysight.host.acquisition import scan as host_run
-from polysight.host.acquisition.scan import ScanProgress, ScanResult, resume_scan, run_scan
-from polysight.host.capture.packet_file import PACKETS, Evidence, write_packets
-from polysight.host.capture.packet_log import PacketLog
-from polysight.host.capture.placement import place_record
-from polysight.host.capture.receiver import RowCapture
-from polysight.host.capture.segment import Segment, write_index
-from polysight.host.store import manifest
-from polysight.host.store.scan_folder import MANIFEST, PART, ScanFolder
-from polysight.pi_controller.journal import Journal, JournalFullError
-from polysight.shared import messages as m
-from polysight.shared.config import Instrument
-from polysight.shared.errors import PolysightError
-from polysight.shared.raster import plan_raster
-from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.scene import SimulatedRig, load_scene, row_offsets_mm
+from polysight.acquisition import scan as host_run
+from polysight.acquisition.scan import ScanProgress, ScanResult, resume_scan, run_scan
+from polysight.capture.packet_file import PACKETS, Evidence, write_packets
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import place_record
+from polysight.capture.receiver import RowCapture
+from polysight.capture.segment import Segment, write_index
+from polysight.store import manifest
+from polysight.store.scan_folder import MANIFEST, PART, ScanFolder
+from polysight_pi.journal import Journal, JournalFullError
+from polysight_shared import messages as m
+from polysight_shared.config import Instrument
+from polysight_shared.errors import PolysightError
+from polysight_shared.raster import plan_raster
+from polysight_shared.tables import decode, to_builtins
+from polysight_simulators.scene import SimulatedRig, load_scene, row_offsets_mm
 from tests.support.capture.records import encode_packet
 from tests.support.pipelines import pipeline_of
 from tests.support.rigs import published_rig

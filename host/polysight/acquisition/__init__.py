@@ -1,0 +1,46 @@
+"""Acquisition: record the rows of a plan with the Pi, the radars and the capture cards.
+
+`run_scan` and `resume_scan` record every row that is not committed yet (`scan`, `scan_loop`). For each row (`row`):
+arm the radars and start the cards' records (`capture_rig`), let the Pi run the row (`pi_client`), compare the received
+data with the pulses sent (`take`), find pulses that a board missed by arrival times (`missed_pulses`, `slipped_row`),
+then commit the row or retake it. `ready` holds the checks before a row: homing, disk space, the Pi's configuration.
+`control` pauses and stops a running scan; `progress` queues committed rows for processing and reports time left.
+"""
+
+from polysight.acquisition.capture_rig import CaptureRig
+from polysight.acquisition.control import (
+    ControlFolder,
+    ScanCommand,
+    StopRequest,
+    ignore_hangup,
+    last_alive_s,
+    send_command,
+)
+from polysight.acquisition.pi_client import PiClient, RefusedError
+from polysight.acquisition.progress import OnProgress, OnRow, ScanProgress, ScanResult, time_left, typical_row_s
+from polysight.acquisition.ready import make_ready, stage_differences
+from polysight.acquisition.scan import resume_scan, run_scan
+from polysight.acquisition.take import FaultKind
+
+__all__ = [
+    "CaptureRig",
+    "ControlFolder",
+    "FaultKind",
+    "OnProgress",
+    "OnRow",
+    "PiClient",
+    "RefusedError",
+    "ScanCommand",
+    "ScanProgress",
+    "ScanResult",
+    "StopRequest",
+    "ignore_hangup",
+    "last_alive_s",
+    "make_ready",
+    "resume_scan",
+    "run_scan",
+    "send_command",
+    "stage_differences",
+    "time_left",
+    "typical_row_s",
+]

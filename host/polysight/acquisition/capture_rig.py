@@ -1,0 +1,147 @@
+"""Capture cards and receiver processes of all recorded boards.
+
+`CaptureRig` starts and stops the records of a row; `record_ended` decides if one board's record has ended.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+from polysight.capture import (
+    CardClient,
+    Progress,
+    ReceiverProcess,
+    RowCapture,
+    Status,
+    Version,
+    check_receive_buffer,
+    receiver_cores,
+)
+from polysight.store import PART
+from polysight_shared.config import CARD_TAIL_S, Instrument
+from polysight_shared.errors import PolysightError
+
+GRACE_NS = 200_000_000
+"""Silence after which a record that the card reported as completed has ended: status and data use different ports."""
+_COMPLETED_TIMEOUT_S = 0.2  # from a record's stop to its last packet and its status
+
+
+def record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int, silence_ns: int) -> bool:
+    """Return True if one board's record has ended: all bytes are there, the card reports it, or the card is silent.
+
+    `progress` is the receiver's latest report, `status` what the card reported since the record started. `since_ns`
+    (last pulse) and `now_ns` are on the monotonic clock; `silence_ns` is the silence that ends a record.
+    """
+    silent_ns = now_ns - max(progress.last_arrival_ns, since_ns)
+    reported = progress.ended or Status.RECORD_COMPLETED in status  # its short last packet, or its status
+    return progress.complete or silent_ns >= (min(GRACE_NS, silence_ns) if reported else silence_ns)
+
+
+class CaptureRig:
+    """Cards and receivers of the recorded boards; `warnings` lists what differs from the request but suffices to scan.
+
+    Raises DeviceError if a port is in use, or the receive buffer is smaller than two bursts.
+    """
+
+    def __init__(self, instrument: Instrument) -> None:
+        self._instrument = instrument
+        self.warnings: list[str] = []
+        self.cards: dict[str, CardClient] = {}
+        self.receivers: dict[str, ReceiverProcess] = {}
+        self._recording = False
+        with ExitStack() as stack:
+            for board in instrument.recorded:
+                card = CardClient(board, instrument.limits.command_timeout_s)
+                self.cards[board.name] = stack.enter_context(card)
+            wanted, burst_bytes = instrument.card.receive_buffer_bytes, instrument.burst.pulses * instrument.frame_bytes
+            cores = receiver_cores(len(instrument.recorded))
+            for board, core in zip(instrument.recorded, cores, strict=True):
+                receiver = stack.enter_context(ReceiverProcess(board, wanted, core))
+                self.receivers[board.name] = receiver
+                self.warnings += receiver.warnings
+                if warning := check_receive_buffer(board.name, receiver.granted_bytes, wanted, burst_bytes):
+                    self.warnings.append(warning)
+            if (silence_s := instrument.limits.end_of_record_s) <= CARD_TAIL_S:
+                self.warnings.append(
+                    f"limits.end_of_record_s is {silence_s:g}: a card sends the last packet after {CARD_TAIL_S:g} s of"
+                    " silence or when the record is stopped, but not every card may do the latter; 3 s is safe"
+                )
+            self._stack = stack.pop_all()
+
+    def configure(self, names: Collection[str] = ()) -> dict[str, Version]:
+        """Stop records and configure the named cards (default: all); return FPGA versions. Raises DeviceError."""
+        versions = {}
+        for name in names or self.cards:
+            card = self.cards[name]
+            card.alive()
+            card.record_stop()
+            card.configure(self._instrument.card)
+            versions[name] = card.version()
+        return versions
+
+    def begin_row(self, row: int, take: int, points: int, folder: Path) -> None:
+        """Arm the receivers, then start the records. Raises DeviceError."""
+        frame_bytes = self._instrument.frame_bytes
+        expected = points * self._instrument.burst.pulses * frame_bytes
+        for name, receiver in self.receivers.items():
+            receiver.begin_row(row, take, expected, frame_bytes, folder / "raw" / name / f"{row:04d}{PART}")
+        self._recording = True
+        for card in self.cards.values():
+            card.record_start()
+
+    @property
+    def complete(self) -> bool:
+        """True if every expected byte of the row has arrived, on every board."""
+        # Poll every receiver, also behind an incomplete one: polling is how a dead process is noticed.
+        found = [receiver.poll() for receiver in self.receivers.values()]
+        return all(progress.complete for progress in found)
+
+    def reports(self) -> dict[str, Progress]:
+        """Request the progress of every board's receiver."""
+        return {name: receiver.report() for name, receiver in self.receivers.items()}
+
+    def statuses(self) -> dict[str, Status]:
+        """Status bits that each card reported since its record start."""
+        return {name: card.take_status() for name, card in self.cards.items()}
+
+    def discard_before(self, time_ns: int) -> None:
+        """Treat data that arrived before this time (monotonic clock) as left over from an earlier record."""
+        for receiver in self.receivers.values():
+            receiver.report(time_ns)
+
+    def end_row(self, not_before_ns: int = 0) -> dict[str, RowCapture]:
+        """Stop the records and return the rows, whose files are durable then. Raises DeviceError.
+
+        Data before `not_before_ns` is left over, as in :meth:`discard_before`, with the time that is known by now.
+        """
+        self.stop_records()
+        deadline = time.monotonic() + _COMPLETED_TIMEOUT_S
+        for name, receiver in self.receivers.items():
+            if not receiver.poll().complete:  # nothing follows a complete row
+                self.cards[name].wait_completed(max(0.0, deadline - time.monotonic()))
+        statuses = self.statuses()
+        return {name: receiver.end_row(statuses[name], not_before_ns) for name, receiver in self.receivers.items()}
+
+    def stop_records(self) -> None:
+        """Stop all records. Raises DeviceError."""
+        for card in self.cards.values():
+            card.record_stop()
+        self._recording = False
+
+    def close(self) -> None:
+        """Stop records of cards that still reply, end the receiver processes, close the sockets. Safe to repeat."""
+        if self._recording:
+            self._recording = False
+            for card in self.cards.values():
+                with suppress(PolysightError):
+                    card.record_stop()
+        self._stack.close()
+
+    def __enter__(self) -> CaptureRig:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

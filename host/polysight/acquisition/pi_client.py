@@ -1,0 +1,354 @@
+"""Client for the Pi: commands with timeout and retry, events without gaps, and the host's heartbeat.
+
+`PiClient` sends commands and reads events; lost events are fetched from the Pi's journal. `HostHeartbeat` sends
+`Alive` from its own thread and socket.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import zmq
+
+from polysight.capture import take_priority
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError, ProtocolError, ScanError
+from polysight_shared.faults import PiFault
+from polysight_shared.messages import (
+    JOURNALLED,
+    Abort,
+    Accepted,
+    Alive,
+    AnyCommand,
+    AnyEvent,
+    AnyReply,
+    BeginRun,
+    EndRun,
+    ExitStatus,
+    Heartbeat,
+    Hello,
+    HelloReply,
+    Home,
+    Pulse,
+    Pulsed,
+    Refused,
+    Replay,
+    ReplayReply,
+    RowFinished,
+    RowStarted,
+    RunRow,
+    State,
+    Status,
+    StatusReply,
+    pack,
+    unpack_event,
+    unpack_reply,
+)
+from polysight_shared.sockets import HandshakeMonitor, requester, subscriber
+
+ATTEMPTS = 3  # to send a command
+REAL_TIME = 1  # real-time priority of the heartbeat: below the receiver processes
+_SILENT_BEATS = 10  # more than after which the Pi considers a host dead
+_ALIVE_TIMEOUT_S = 1.0  # for a reply to `Alive`, before it is sent again
+MOVING: tuple[State, ...] = ("homing", "running", "held", "done")  # states that change without a command
+_REST_TIMEOUT_S = 10.0
+_POLL_S = 0.05
+_REPLAY_LIMIT = 1000  # events
+R = TypeVar("R", bound=AnyReply)
+
+
+class HostHeartbeat:
+    """Sends `Alive` for run `scan_id` every `interval_s` while this process lives, in its own thread and socket.
+
+    `owner` as in `BeginRun`.
+    """
+
+    def __init__(
+        self, context: zmq.Context[Any], instrument: Instrument, scan_id: str, interval_s: float, owner: str = ""
+    ) -> None:
+        self._socket = requester(context, instrument.pi.command_address, Path(instrument.pi.key_dir))
+        self._alive, self._interval_s = pack(Alive(scan_id=scan_id, owner=owner)), interval_s
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self._thread.start()
+
+    def _beat(self) -> None:
+        take_priority(REAL_TIME)  # without permission for that, a busy machine may cause a retake
+        try:
+            while not self._stop.wait(self._interval_s):
+                with suppress(zmq.Again):  # no connection: the Pi will notice the missing heartbeat
+                    self._socket.send(self._alive)
+                waited_s = 0.0
+                while not self._stop.is_set() and waited_s < _ALIVE_TIMEOUT_S:
+                    if self._socket.poll(round(self._interval_s * 1e3)):
+                        self._socket.recv()
+                        break
+                    waited_s += self._interval_s
+        finally:
+            self._socket.close()
+
+    def stop(self) -> None:
+        """Stop sending."""
+        self._stop.set()
+        self._thread.join()
+
+
+class RefusedError(ScanError):
+    """The Pi refused a command; `number` is of shared/polysight_shared/faults.py."""
+
+    def __init__(self, command: str, refusal: Refused) -> None:
+        what = f"the Pi refused {command}: {refusal.what}"
+        super().__init__(what, refusal.why, refusal.remedy, code=ErrorCode.REFUSED_BY_PEER)
+        self.number = refusal.number
+
+
+class PiClient:
+    """Client of one Pi, for one thread; `instrument` has addresses, keys and limits.
+
+    Raises ConfigError if an address needs keys that are missing.
+    """
+
+    def __init__(self, context: zmq.Context[Any], instrument: Instrument) -> None:
+        self._context, self._instrument = context, instrument
+        self._heartbeat: HostHeartbeat | None = None
+        self._address = instrument.pi.command_address
+        self._event_address = instrument.pi.event_address
+        self._timeout_s = instrument.limits.command_timeout_s
+        self._silence_s = max(10 * instrument.pi.heartbeat_ms / 1e3, instrument.limits.command_timeout_s)
+        self._on_event: Callable[[AnyEvent], object] = lambda _: None
+        keys = Path(instrument.pi.key_dir)
+        self._events = subscriber(context, self._event_address, keys)
+        self._commands = requester(context, self._address, keys)
+        self._handshake = HandshakeMonitor(self._commands)
+        self._owner = secrets.token_hex(16)  # identifies the runs that this client begins
+        self._scan_id = ""
+        self._last_seq = 0
+        self._last_heard_s = time.monotonic()
+        self._pending: deque[AnyEvent] = deque()
+        self.gaps_filled = 0  # events that PUB lost and the journal contained
+        self.state: State = "idle"  # in the last heartbeat
+
+    @property
+    def event_socket(self) -> zmq.Socket[bytes]:
+        """The event socket, for a poller."""
+        return self._events
+
+    def follow(self, scan_id: str, last_seq: int, on_event: Callable[[AnyEvent], None]) -> None:
+        """Follow the events of a scan: call `on_event` exactly once with each event after `last_seq`, in order."""
+        self._scan_id, self._last_seq, self._on_event = scan_id, last_seq, on_event
+
+    # --- commands ---
+
+    def hello(self) -> HelloReply:
+        """Identify the Pi. Raises DeviceError if it does not answer, ProtocolError for another release."""
+        return self._ask(Hello(), HelloReply)
+
+    def status(self) -> StatusReply:
+        """Return the Pi's status. Raises DeviceError."""
+        return self._ask(Status(), StatusReply)
+
+    def begin_run(self, run: BeginRun) -> None:
+        """Begin or resume a run and send its heartbeat until the run's end. Safe to repeat.
+
+        Waits some heartbeats if the Pi still considers a killed program of the same scan alive.
+
+        Raises RefusedError, DeviceError.
+        """
+        run = msgspec.structs.replace(run, owner=self._owner)
+        deadline = time.monotonic() + _SILENT_BEATS * run.heartbeat_ms / 1e3
+        while True:
+            try:
+                self._ask(run, Accepted)
+                break
+            except RefusedError as e:
+                same_scan = e.number == PiFault.NOT_READY and self.status().scan_id == run.scan_id
+                if not same_scan or time.monotonic() > deadline:
+                    raise
+                time.sleep(_POLL_S)
+        self._stop_heartbeat()
+        if run.heartbeat_ms:
+            interval_s = run.heartbeat_ms / 1e3
+            self._heartbeat = HostHeartbeat(self._context, self._instrument, run.scan_id, interval_s, self._owner)
+
+    def end_run(self, scan_id: str, exit_status: ExitStatus, reason: str) -> None:
+        """End the run. Raises RefusedError, DeviceError."""
+        self._ask(EndRun(scan_id=scan_id, exit_status=exit_status, reason=reason[:500], owner=self._owner), Accepted)
+        self._stop_heartbeat()
+
+    def home(self) -> None:
+        """Start homing; retry without a reply if the stage does not home. Raises RefusedError, DeviceError."""
+        if self._once(Home(), self._timeout_s) is None and self.status().state != "homing":
+            self._ask(Home(), Accepted)
+
+    def run_row(self, scan_id: str, row_index: int, take: int) -> None:
+        """Begin a row. If the reply is lost, check if the row runs before a retry.
+
+        Raises RefusedError, DeviceError.
+        """
+        command = RunRow(scan_id=scan_id, row_index=row_index, take=take, owner=self._owner)
+        for _ in range(ATTEMPTS):
+            reply = self._once(command, self._timeout_s / ATTEMPTS)
+            if isinstance(reply, Accepted):
+                self.state = reply.state  # newer than the last heartbeat
+                return
+            status = self.status()
+            if status.state in ("running", "held") and (status.row_index, status.take) == (row_index, take):
+                return
+            self._catch_up(status.last_seq)
+            if any(_is_of(e, row_index, take) for e in self._pending):
+                return
+        raise self._no_answer("RunRow")
+
+    def pulse(self, pulses: int, period_us: float, width_us: float) -> Pulsed:
+        """Send one burst on SYNC_IN with the stage at rest. No retry: a second burst would add frames.
+
+        Raises RefusedError, DeviceError.
+        """
+        reply = self._once(Pulse(pulses=pulses, period_us=period_us, width_us=width_us), self._timeout_s)
+        if not isinstance(reply, Pulsed):
+            raise self._no_answer("Pulse")
+        return reply
+
+    def abort(self, reason: str) -> None:
+        """Abort the row now; safe to repeat. Raises RefusedError, DeviceError."""
+        self._ask(Abort(reason=reason[:500], owner=self._owner), Accepted)
+
+    def come_to_rest(self, reason: str) -> None:
+        """Abort the row and wait until the stage stands, which `end_run` needs; do nothing in another host's run.
+
+        Raises RefusedError, DeviceError.
+        """
+        if self.status().scan_id != self._scan_id:
+            return
+        self.abort(reason)
+        deadline = time.monotonic() + _REST_TIMEOUT_S
+        while self.status().state in MOVING and time.monotonic() < deadline:
+            time.sleep(_POLL_S)
+
+    def _ask(self, command: AnyCommand, kind: type[R]) -> R:
+        """Send a command with retries; for commands that are safe to repeat."""
+        for _ in range(ATTEMPTS):
+            reply = self._once(command, self._timeout_s / ATTEMPTS)
+            if isinstance(reply, kind):
+                return reply
+            if reply is not None:
+                what = f"the Pi answered {type(command).__name__} with {type(reply).__name__}"
+                raise ProtocolError(what, code=ErrorCode.MESSAGE_INVALID)
+        raise self._no_answer(type(command).__name__)
+
+    def _once(self, command: AnyCommand, timeout_s: float) -> AnyReply | None:
+        """Send once and return the reply, None after the timeout. A new request replaces the old (relaxed REQ)."""
+        try:
+            self._commands.send(pack(command))
+        except zmq.Again:  # no connection
+            return None
+        if not self._commands.poll(round(timeout_s * 1e3)):
+            return None
+        reply = unpack_reply(self._commands.recv())
+        self._last_heard_s = time.monotonic()
+        if isinstance(reply, Refused):
+            raise RefusedError(type(command).__name__, reply)
+        return reply
+
+    def _no_answer(self, command: str) -> DeviceError:
+        if self._handshake.refused():
+            return DeviceError(
+                f"the Pi at {self._address} refuses this host's key",
+                "the key was revoked or never allowed, or pi.key here is another Pi's",
+                f"on the Pi: `polysight-pi keys --list`; here: the key files in {self._instrument.pi.key_dir}"
+                " (docs/how-to/install.md)",
+                code=ErrorCode.REFUSED_BY_PEER,
+            )
+        return DeviceError(
+            f"the Pi at {self._address} did not answer {command} within {self._timeout_s:g} s ({ATTEMPTS} attempts)",
+            "`polysight-pi run` is not running there, the address is wrong, or the CURVE keys do not match",
+            "on the Pi: `systemctl status polysight-pi`, `journalctl -u polysight-pi -n 20`; here: check"
+            " pi.command_address (`polysight resume SCAN --config instrument.toml` resumes a scan with another one)",
+            code=ErrorCode.NO_ANSWER,
+        )
+
+    # --- events ---
+
+    def events(self) -> list[AnyEvent]:
+        """Return the scan's journalled events that have arrived, in order, without waiting; fetch lost ones.
+
+        Raises DeviceError if the Pi is silent on both sockets, or its journal lacks the lost events.
+        """
+        while self._events.poll(0):
+            parts = self._events.recv_multipart()
+            self._last_heard_s = time.monotonic()
+            event = unpack_event(parts[-1])
+            if isinstance(event, Heartbeat):
+                self.state = event.state
+            if event.scan_id != self._scan_id or not self._scan_id:
+                continue
+            if isinstance(event, JOURNALLED) and event.seq == self._last_seq + 1:
+                self._take(event)
+            elif event.seq > self._last_seq:
+                self._catch_up(event.seq)
+        if time.monotonic() - self._last_heard_s > self._silence_s:
+            self._catch_up(self.status().last_seq)  # no heartbeats: check that it answers
+        out = list(self._pending)
+        self._pending.clear()
+        return out
+
+    def _take(self, event: AnyEvent) -> None:
+        self._last_seq = event.seq
+        self._pending.append(event)
+        self._on_event(event)
+
+    def _catch_up(self, to_seq: int) -> None:
+        """Fetch the missing journalled events up to `to_seq`."""
+        while self._last_seq < to_seq:
+            reply = self._ask(
+                Replay(scan_id=self._scan_id, from_seq=self._last_seq + 1, limit=_REPLAY_LIMIT), ReplayReply
+            )
+            before = self._last_seq
+            for event in reply.events:
+                if event.seq == self._last_seq + 1:
+                    self._take(event)
+                    self.gaps_filled += 1
+            if self._last_seq == before:
+                raise DeviceError(
+                    f"the Pi's journal of scan {self._scan_id} lacks event {before + 1} (it ends at {reply.last_seq})",
+                    "the journal on the Pi was removed or damaged",
+                    "start a new scan; the committed rows of this one stay valid",
+                    code=ErrorCode.NO_DATA,
+                )
+
+    def drain(self) -> None:
+        """Fetch all events in the Pi's journal. Raises DeviceError."""
+        self._catch_up(self.status().last_seq)
+
+    def close(self) -> None:
+        """Stop the heartbeat and close the sockets."""
+        self._stop_heartbeat()
+        self._events.close()
+        self._handshake.close()
+        self._commands.close()
+
+    def _stop_heartbeat(self) -> None:
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
+            self._heartbeat = None
+
+    def __enter__(self) -> PiClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _is_of(event: AnyEvent, row_index: int, take: int) -> bool:
+    if isinstance(event, RowStarted):
+        return event.row.index == row_index and event.take == take
+    return isinstance(event, RowFinished) and (event.row_index, event.take) == (row_index, take)

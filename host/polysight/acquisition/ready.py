@@ -1,0 +1,161 @@
+"""Checks before a row begins: homed stage, free disk space, and a Pi with the same `[stage]` as the rig file.
+
+`make_ready` waits for the stage and homes it if that is safe. `check_same_stage` compares the Pi's own `[stage]` with
+the rig file's.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from polysight.acquisition.control import StopRequest
+from polysight.acquisition.pi_client import MOVING, PiClient
+from polysight.acquisition.take import ON_REQUEST
+from polysight.store import Fact
+from polysight_shared.config import Instrument, Stage
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ScanError
+from polysight_shared.faults import PiFault, explain
+from polysight_shared.messages import HelloReply, StatusReply
+from polysight_shared.stage_line import HOMING_TIMEOUT_S
+
+_HOMING_TIMEOUT_S = HOMING_TIMEOUT_S + 30.0  # longer than the Pi's own, which reports the exact reason
+STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)  # a person must look and home: `polysight-pi home`
+STAGE_NOT_REPORTED = (
+    "the Pi does not report its [stage], so it cannot be compared with the rig file's: install this release on the Pi"
+)
+
+
+def make_ready(
+    pi: PiClient, stop: StopRequest, notify: Callable[[str, str], None], scan_id: str = "", first: bool = True
+) -> bool:
+    """Wait until a row may begin, and home the stage if that is safe; return False if asked to stop now.
+
+    The stage is homed only before the first row (`first`), when the operator expects motion, and never after
+    `STAGE_FAULTS`: somebody pressed the emergency stop, or has an arm in the way. The Pi must have begun the run
+    `scan_id`; "" for any. `notify` gets phase and message.
+
+    Raises ScanError if the stage is not ready and must not be homed, or homing fails.
+    """
+    status = pi.status()
+    if status.state == "ready" and status.homed and status.scan_id == (scan_id or status.scan_id):
+        return not stop.now
+    check_between_rows(status, scan_id, first)
+    if status.state in MOVING:
+        notify("wait", f"the stage is {status.state!r}; the row begins when it is ready")
+    else:
+        notify("home", "homing the stage")
+        pi.home()
+    return _wait_ready(pi, stop, scan_id)
+
+
+def measure_lost_steps(
+    pi: PiClient, stop: StopRequest, notify: Callable[[str, str], None]
+) -> tuple[float, float] | None:
+    """Home again after the last row; return the lost steps in x and y, millimetres, or None if not possible or wanted.
+
+    Lost steps are the distance between the switches and where the count of steps expects them since the last homing.
+    Raises ScanError if homing fails.
+    """
+    if stop.after_row or pi.status().state != "ready":
+        return None
+    notify("home", "homing the stage again, to measure lost steps")
+    pi.home()
+    if not _wait_ready(pi, stop, ""):
+        return None
+    status = pi.status()
+    return status.lost_x_mm, status.lost_y_mm
+
+
+def _wait_ready(pi: PiClient, stop: StopRequest, scan_id: str) -> bool:
+    """Wait until the stage is ready; return False if asked to stop now. Raises ScanError."""
+    deadline = time.monotonic() + _HOMING_TIMEOUT_S
+    while True:
+        status = pi.status()
+        if status.state == "ready":
+            return not stop.now
+        if status.state not in MOVING:
+            check_between_rows(status, scan_id, first=False)
+        if stop.now:
+            pi.abort(ON_REQUEST.text)
+            return False
+        if time.monotonic() > deadline:
+            raise ScanError(
+                f"the stage is {status.state!r} {_HOMING_TIMEOUT_S:.0f} s after homing began",
+                "the stage stands still, or its switches are not reached",
+                "look at the stage; `journalctl -u polysight-pi -n 20` on the Pi",
+                code=ErrorCode.STAGE_NOT_READY,
+            )
+        pi.event_socket.poll(100)
+        pi.events()
+
+
+def check_between_rows(status: StatusReply, scan_id: str, first: bool) -> None:
+    """Raise ScanError if the next row needs homing and a person must look at the stage before that."""
+    problem: tuple[str, str, str] | None = None
+    if scan_id and status.scan_id not in ("", scan_id):
+        what = f"the Pi has begun another run in the meantime: {status.scan_id}"
+        problem = what, "another host uses it", "wait for its end"
+    elif scan_id and not status.scan_id:
+        why = "power was lost there, or the program ended"
+        problem = "the Pi's program restarted between two rows", why, "see `journalctl -u polysight-pi` on the Pi"
+    elif status.state == "fault" and (not first or status.fault in STAGE_FAULTS):
+        e = explain(status.fault)
+        problem = f"the stage is not ready: {e.what}: {status.reason}", e.why, e.remedy
+    elif not first and (status.state in ("idle", "homed") or (status.state == "ready" and not status.homed)):
+        what = f"the stage is {status.state!r} between two rows" + (f": {status.reason}" if status.reason else "")
+        why = "its position was lost, homing was stopped, or somebody ended the run at the Pi"
+        problem = what, why, "check that nothing is in the way, then `polysight-pi home`"
+    if problem:
+        raise ScanError(*problem, code=ErrorCode.STAGE_NOT_READY)
+
+
+def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
+    """Check that the disk has space for this number of rows and the reserve. Raises ScanError."""
+    need = rows * instrument.recorded_row_bytes
+    reserve = instrument.limits.free_disk_bytes
+    free = shutil.disk_usage(folder).free
+    if free < need + reserve:
+        raise ScanError(
+            f"{folder}: {free / 1e9:.2f} GB free, {need / 1e9:.2f} GB needed for {rows} rows and"
+            f" {reserve / 1e9:.2f} GB kept free",
+            "the disk is too full for this scan",
+            f"free space, then `polysight resume {folder}`; or lower limits.free_disk_bytes in instrument.toml, and add"
+            " --config instrument.toml",
+            code=ErrorCode.DISK_FULL,
+        )
+
+
+def pi_fact(hello: HelloReply) -> Fact:
+    """Return the manifest's description of the Pi."""
+    return {"release": hello.pi_release, "firmware": hello.firmware, "backend": hello.backend, "stage": hello.stage}
+
+
+def stage_differences(stage: Stage, hello: HelloReply) -> list[str]:
+    """List the keys of `[stage]` that place rows and differ on the Pi, with both values; [] if it reports none."""
+    own = stage.placement_settings
+    return [
+        f"stage.{key} is {own[key]:.10g} here and {hello.stage[key]:.10g} on the Pi"
+        for key in own
+        if hello.stage.get(key, own[key]) != own[key]
+    ]
+
+
+def check_same_stage(stage: Stage, hello: HelloReply, source: str) -> list[str]:
+    """Check that the Pi places rows where `stage` does; `source` names the origin of `stage`.
+
+    Returns a warning if the Pi's release does not report its `[stage]`. Raises ScanError with both values of each key
+    that differs.
+    """
+    if differing := stage_differences(stage, hello):
+        raise ScanError(
+            f"host and Pi place rows differently: {'; '.join(differing)}",
+            f"the rig file of the Pi is not that of {source}; rows of both would be two coordinate systems in one scan",
+            "copy the right [stage] to the other machine and `sudo systemctl restart polysight-pi`; rows taken with"
+            " other values belong to another scan",
+            code=ErrorCode.STAGE_DIFFERS,
+        )
+    return [] if hello.stage else [STAGE_NOT_REPORTED]

@@ -1,0 +1,39 @@
+"""One figure of a processed scan, for notebooks."""
+
+from __future__ import annotations
+
+import io
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from polysight.products import ProcessedScan
+from polysight.report import ReportContext, draw_overview, figure_label, font_families
+
+_PANEL_IN = 3.8  # width of one picture
+
+
+class NotebookFigure(Figure):
+    """A figure that notebooks show once, as the value of a cell, with or without matplotlib's inline backend."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png")
+        return buffer.getvalue()
+
+
+def plot_scan(done: ProcessedScan) -> Figure:
+    """Amplitude of H, V, P in dB, and the materials where the images are relative to metal; axes in mm."""
+    named = done.metal_referenced
+    rows, columns = (2, 2) if named else (1, 3)
+    height_in = _PANEL_IN * min(2.0, max(0.4, done.labels.shape[0] / done.labels.shape[1]))
+    size = (columns * (_PANEL_IN + 1.2), rows * (height_in + 0.4) + 0.5)
+    fig = NotebookFigure(figsize=size, dpi=100, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    draw_overview(
+        fig, list(fig.subplots(rows, columns).flat), ReportContext.of_products(done, done.labels), bar_labels=True
+    )
+    stamp = {True: " (simulated)", False: "", None: " (not known whether simulated)"}[done.simulated]
+    title = figure_label(f"Scan {done.scan_id}{stamp}", "title")
+    fig.suptitle(title, fontsize=12, family=list(font_families()), parse_math=False)
+    return fig

@@ -1,0 +1,84 @@
+"""From recorded rows to results in memory: the only file of this package that knows the pipeline."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from polysight.imaging import ChannelImages
+from polysight.materials import find_truth, pixel_accuracy
+from polysight.pipeline import Pipeline
+from polysight.polarimetry import ratio
+from polysight.process import Options, materials_content
+from polysight.products import ProcessedScan, plain, scan_facts, withhold
+from polysight.store import Source
+
+
+class Processing:
+    """Processes one source; each step runs once, when its result is first used.
+
+    `folder` is where the source was read; `truth.json` there holds the truth of a simulated scene.
+    """
+
+    def __init__(self, source: Source, folder: Path, options: Options) -> None:
+        self.source, self.folder, self.options = source, folder, options
+
+    @cached_property
+    def pipeline(self) -> Pipeline:
+        """The pipeline, without rows at first. Raises PolysightError when calibration and rig do not fit."""
+        return Pipeline(self.source, bands=self.options.bands, samples="read")
+
+    @cached_property
+    def _images(self) -> ChannelImages:
+        """Both channels from all rows that hold data. Raises DataError when there are none."""
+        for row in self.pipeline.samples.processable(self.source, self.folder):
+            self.pipeline.add_row(row)
+        images = self.pipeline.form_images()
+        self.pipeline.quality.note_imaging(self.pipeline.images, images)
+        return images
+
+    @cached_property
+    def unreferenced(self) -> ProcessedScan:
+        """Images in arbitrary units, as `polysight image` writes them. Raises PolysightError."""
+        images, none = self._images, np.zeros(self._images.h.shape, np.int32)
+        pixels = {"h": images.h, "v": images.v, "p": ratio(images.h, images.v), "valid": images.valid}
+        return self._processed(images, pixels, {}, none, None)
+
+    @cached_property
+    def referenced(self) -> ProcessedScan:
+        """Images relative to metal, patches and materials, as `polysight process` writes them.
+
+        Raises
+        ------
+        DataError
+            when no metal is found, a row is damaged, or library or metal reference do not fit the scan.
+        """
+        pipeline, options = self.pipeline, self.options
+        unnamed = options.unnamed(pipeline.rig)
+        plates, note = find_truth(self.folder)
+        if note:
+            warnings.warn(note, stacklevel=2)
+        findings = pipeline.examine(self._images, options, plates)
+        found, images = findings.found, findings.images
+        pipeline.quality.note(pixel_accuracy=pixel_accuracy(found), verdict=findings.verdict.to_dict())
+        c, labels = found.calibrated, found.segmentation.labels
+        interior = np.zeros(labels.shape, bool)
+        for patch in found.segmentation.patches:
+            interior |= patch.interior
+        materials = plain(materials_content(self.source, findings, unnamed))
+        pixels = {"h": c.h, "v": c.v, "p": c.p, "valid": images.valid, "p_sigma": found.p_sigma(images.valid)}
+        return self._processed(images, pixels, materials, labels, interior)
+
+    def _processed(self, images: ChannelImages, pixels, materials, labels, interior) -> ProcessedScan:
+        return ProcessedScan.computed(
+            self.folder,
+            labels,
+            interior,
+            image={**pixels, "x_m": images.x_m, "y_m": images.y_m},
+            scan=plain(scan_facts(self.source, self.pipeline.rig, images)),
+            quality=plain(self.pipeline.quality.to_dict()),
+            materials=withhold(materials),
+        )

@@ -1,0 +1,394 @@
+"""A scan opened for notebooks: results as datasets, computed on first use."""
+
+from __future__ import annotations
+
+import os
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from polysight.api.processing import Processing
+from polysight.data import packaged
+from polysight.materials import MODELS, SHORT
+from polysight.polarimetry import Incidence
+from polysight.process import Options
+from polysight.products import (
+    IMAGE,
+    ProcessedScan,
+    Rows,
+    SavedProducts,
+    find_products,
+    full_dataset,
+    image_dataset,
+    patch_dataset,
+    ranges_text,
+    write_netcdf,
+    write_zarr,
+)
+from polysight.store import MANIFEST, ScanFolder, Source, open_source
+from polysight.verdict import Verdict
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.figure import Figure
+
+RIG = Path("instrument.toml")
+Box = tuple[float, float, float, float]
+_PERMITTIVITY = (
+    "permittivity", "permittivity_real_standard_error", "permittivity_loss_standard_error",
+    "permittivity_real_loss_covariance", "dominated_by", "refused",
+)  # fmt: skip
+
+
+def open_scan(
+    folder: str | os.PathLike[str],
+    *,
+    rig: str | os.PathLike[str] | Instrument | None = None,
+    library: str | os.PathLike[str] | None = None,
+    model: str | None = None,
+    metal_box_mm: Box | None = None,
+    bands: int = 1,
+    incidence: Incidence = "one",
+    fresh: bool = False,
+) -> Scan:
+    """Open a scan. Rows are read later, when a result is asked for.
+
+    Parameters
+    ----------
+    folder
+        A scan folder, a folder `unsynced/<scan>` or `raw/<scan>` of the published data, or a folder of products that
+        `polysight process` or `polysight image` wrote. Saved products in a scan folder are used if they hold all of
+        its rows and none of the parameters below is given; otherwise the rows are processed.
+    rig
+        Rig file of published data, or the rig itself: `instrument.toml` in that folder, in the current folder or the
+        packaged one if not given. Scan folders bring their own.
+    library
+        Reference library of the materials; the packaged simulated one if not given.
+    model
+        Classifier: "knn", "discriminant", a full name, or "none" for no names. The library's own choice
+        if not given.
+    metal_box_mm
+        Metal reference (x0, y0, x1, y1), mm from the image centre; found automatically if not given.
+    bands
+        Number of sub-bands of the sweep to image as well, for thin layers.
+    incidence
+        "one": one incidence angle for the image; "pixel": each pixel's own.
+    fresh
+        Process the rows even where saved products could be used.
+
+    Raises
+    ------
+    DataError
+        when the folder is none of these, or is damaged.
+    ConfigError
+        when a folder of products is given with processing parameters, or a rig file is wrong.
+    """
+    _check_arguments(model, library, metal_box_mm, bands, incidence)
+    path = Path(folder)
+    options = Options(
+        metal_box_mm=metal_box_mm,
+        library=None if library is None else Path(library),
+        model=model,
+        bands=bands,
+        incidence=incidence,
+    )
+    anew = fresh or options != Options()
+    if (path / IMAGE).exists() and not (path / MANIFEST).exists():
+        return _products_only(path, options, anew)
+    source = _open_source(path, rig)
+    saved = None if anew else find_products(path)
+    if saved is not None and isinstance(source, ScanFolder) and not _is_current(saved, source):
+        saved = None
+    return Scan(path, source, saved, options)
+
+
+def _check_arguments(
+    model: str | None, library: str | os.PathLike[str] | None, box: Box | None, bands: int, incidence: str
+) -> None:
+    """Check the arguments before any row is read. Raises ConfigError."""
+    wrong = ""
+    if incidence not in ("one", "pixel"):
+        wrong = f"incidence is {incidence!r}: 'one' or 'pixel'"
+    elif not isinstance(bands, int) or bands < 1:
+        wrong = f"bands is {bands!r}: a whole number, 1 or more"
+    elif box is not None and (isinstance(box, str) or len(box) != 4 or not (box[0] < box[2] and box[1] < box[3])):
+        wrong = f"metal_box_mm is {box!r}: (x0, y0, x1, y1) in mm from the image centre, x0 < x1 and y0 < y1"
+    elif model is not None and model not in (*MODELS, *SHORT, "none"):
+        wrong = f"model is {model!r}: one of {', '.join((*SHORT, 'none'))}"
+    elif library is not None and not Path(library).is_file():
+        wrong = f"library {library}: no such file"
+    if wrong:
+        raise ConfigError(wrong, "the argument is wrong", "see help(polysight.open_scan)", code=ErrorCode.VALUE_INVALID)
+
+
+def _products_only(path: Path, options: Options, anew: bool) -> Scan:
+    if anew:
+        raise ConfigError(
+            f"{path}: products cannot be processed again", "the recorded rows are not in this folder",
+            "give the scan folder with these parameters, or leave them out to read the products",
+            code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
+    return Scan(path, None, SavedProducts(path), options)
+
+
+def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:
+    """Open recorded data of any layout; without `rig`, with the rig file beside it or the packaged one."""
+    if rig is None:
+        rig = path / RIG if (path / RIG).exists() else packaged(RIG)
+    return open_source(path, rig if isinstance(rig, Instrument) else Path(rig), dropped=True)
+
+
+def _is_current(saved: SavedProducts, scan: ScanFolder) -> bool:
+    """True unless the products say that they were made from other rows than the scan holds now. Raises DataError."""
+    committed = scan.committed()
+    for name, board in saved.quality.get("boards", {}).items():
+        made_from = board.get("raw_crc32")
+        there = {str(n): row.boards[name].crc32 for n, row in committed.items() if name in row.boards}
+        if made_from is not None and made_from != there:
+            return False
+    return True
+
+
+class Scan:
+    """A recorded scan, or the products of one. Made by :func:`open_scan`.
+
+    Results are computed once and kept. Each call returns new arrays, so that changing them changes no later result.
+    Every dataset has named dimensions (`y`, `x` in metres in the rig frame, `patch`), `units` and `long_name` on each
+    variable, and its provenance as attributes: `scan_id`, `simulated`, `rig`, `versions`, `processed_utc`,
+    `rows_missing`, `positions_masked`, `verdict`.
+
+    Attributes
+    ----------
+    folder
+        The folder that was opened.
+    """
+
+    def __init__(self, folder: Path, source: Source | None, saved: SavedProducts | None, options: Options) -> None:
+        self.folder = folder
+        self._source, self._saved_products, self._options = source, saved, options
+
+    @property
+    def scan_id(self) -> str:
+        """Name of the scan; "" when its products do not say."""
+        return self._source.scan_id if self._source is not None else self._saved.scan_id
+
+    @property
+    def simulated(self) -> bool | None:
+        """True if the data is simulated; None when the products do not say."""
+        return self._source.simulated if self._source is not None else self._saved.simulated
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Verdict of the result, with reasons; None for products of earlier releases.
+
+        Processes recorded rows where there are no products. Raises as :meth:`image`.
+        """
+        return self._saved.verdict if self._saved_products is not None else self._processed(True).verdict
+
+    @property
+    def rig(self) -> Instrument:
+        """Rig of the images: geometry, chirp, boards, as calibrated; x from TX to RX.
+
+        Raises
+        ------
+        DataError
+            when products do not say.
+        """
+        known = self._saved.rig if self._saved_products is not None else self._processing.pipeline.rig
+        if known is None and self._source is not None:
+            known = self._processing.pipeline.rig
+        if known is None:
+            raise self._unknown("rig")
+        return known
+
+    @property
+    def rows(self) -> Rows:
+        """Rows of the scan: `indices`, `planned`, `committed`, `missing`. Raises DataError when products do not say."""
+        if self._source is not None:
+            return Rows(self._source.plan.rows, tuple(self._source.rows()))
+        known = self._saved.rows
+        if known is None:
+            raise self._unknown("rows")
+        return known
+
+    def image(self, *, metal_referenced: bool = True) -> xarray.Dataset:
+        """Both channels and their ratio on one grid.
+
+        Parameters
+        ----------
+        metal_referenced
+            True: relative to metal, with the cross-polar leakage removed, as `polysight process` writes them. False:
+            as imaged, in arbitrary units, as `polysight image` writes them; needs no metal in the scene.
+
+        Returns
+        -------
+        xarray.Dataset
+            `h` (s-polarised), `v` (p-polarised), `p` (H / V) complex64 [y, x], `valid` bool [y, x], `incidence_deg`;
+            `p_sigma` (standard deviation of `p`) where it is known.
+
+        Raises
+        ------
+        DataError
+            when no row is whole, no metal is found, or the products hold the other kind and the rows are not there.
+        """
+        return image_dataset(self._processed(metal_referenced))
+
+    def patches(self) -> xarray.Dataset:
+        """Patches found in the image, with everything known about each.
+
+        Returns
+        -------
+        xarray.Dataset
+            `label` int32 [y, x] and `interior` bool [y, x]; on dimension `patch` the variables of `permittivity` and
+            `materials`, `metal_like`, `width` and `height` (m), and `band_ratio` where sub-bands were asked for.
+
+        Raises
+        ------
+        DataError
+            as :meth:`image`.
+        """
+        return patch_dataset(self._processed(True))
+
+    def permittivity(self) -> xarray.Dataset:
+        """Relative permittivity eps' - j eps'' of each patch; not a number where P is too close to metal.
+
+        Returns
+        -------
+        xarray.Dataset
+            On dimension `patch`: `permittivity` complex128, `permittivity_real_standard_error`,
+            `permittivity_loss_standard_error`, `permittivity_real_loss_covariance`, `dominated_by` (what most of the
+            error comes from), `refused` (why a patch was not judged), `ratio` (P) complex128,
+            `inverse_ratio_standard_error` (of 1 / P), `patch_incidence_deg`, `name`, `pixels`; `true_permittivity` for
+            a simulated scene.
+
+        Raises
+        ------
+        DataError
+            as :meth:`image`.
+        """
+        return self._columns(
+            *_PERMITTIVITY, "ratio", "inverse_ratio_standard_error", "patch_incidence_deg", "name", "pixels",
+            "true_permittivity",
+        )  # fmt: skip
+
+    def materials(self) -> xarray.Dataset:
+        """Name of each patch, and its permittivity with errors.
+
+        Returns
+        -------
+        xarray.Dataset
+            On dimension `patch`: `name` ("" when not named, "unknown" when it is none of the library), `confidence`,
+            `runner_up` and `runner_up_share` (the next name by number of pixels), `metal_reference`, `pixels`;
+            `permittivity`, its errors, `dominated_by` and `refused` as of :meth:`permittivity`; `true_name` for a
+            simulated scene. Attributes `library`, `model`, `verdict`.
+
+        Raises
+        ------
+        DataError
+            as :meth:`image`.
+        """
+        names = ("name", "confidence", "runner_up", "runner_up_share", "metal_reference", "pixels")
+        return self._columns(*names, *_PERMITTIVITY, "true_name")
+
+    def layers(self, *stack: str, bands: int | None = None, amplitude_percent: float = 10.0) -> xarray.Dataset:
+        """Permittivity and thickness of the one unknown layer of a stack, on dimension `patch`, with standard errors.
+
+        `stack` is typed as for `polysight permittivity --layer`: `scan.layers("sheet,?,0.5-3", "plate,metal")`. `bands`
+        are the sub-bands used (None: all where a thickness is fitted), `amplitude_percent` says how far |H| may be
+        trusted. `ambiguous` and `notes` tell what the data leave open. Raises as :meth:`image`, and ConfigError.
+        """
+        from polysight.api.layers import layer_dataset
+
+        return layer_dataset(self._processed(True), self.rig.chirp, stack, bands, amplitude_percent)
+
+    def plot(self, *, metal_referenced: bool = True) -> Figure:
+        """Figure of |H|, |V|, |P| (dB), and of the materials' names if metal-referenced; axes in mm.
+
+        Notebooks show the figure when it is the last line of a cell; `plot().savefig("scan.png")` saves it.
+
+        Raises
+        ------
+        DataError
+            as :meth:`image`.
+        """
+        from polysight.api.plot import plot_scan
+
+        return plot_scan(self._processed(metal_referenced))
+
+    def to_netcdf(self, path: str | os.PathLike[str], *, metal_referenced: bool = True) -> None:
+        """Write all results as one NetCDF file: complex variables as `h_real` and `h_imag`, see :func:`read_netcdf`.
+
+        Raises
+        ------
+        ConfigError
+            when h5netcdf is not installed.
+        DataError
+            as :meth:`image`.
+        """
+        write_netcdf(Path(path), full_dataset(self._processed(metal_referenced)))
+
+    def to_zarr(self, path: str | os.PathLike[str], *, metal_referenced: bool = True) -> None:
+        """Write all results as one Zarr store, which replaces an earlier one. Raises as :meth:`to_netcdf`."""
+        write_zarr(Path(path), full_dataset(self._processed(metal_referenced)))
+
+    def __repr__(self) -> str:
+        try:
+            rows = self.rows
+            count = f"{len(rows.committed)} of {rows.planned} rows"
+            count += f" (missing {ranges_text(rows.missing)})" if rows.missing else ""
+        except DataError:
+            count = "number of rows not known"
+        simulated = "SIMULATED, " if self.simulated else ""
+        kind = "saved products" if self._saved_products is not None else "recorded rows"
+        return f"<Scan {self.scan_id or 'without a name'}: {simulated}{count}, {kind} in {self.folder}>"
+
+    @cached_property
+    def _processing(self) -> Processing:
+        if self._source is None:
+            raise DataError(
+                f"{self.folder}: holds no recorded rows", "it is a folder of products", "open the scan folder instead",
+                code=ErrorCode.NO_DATA,
+            )  # fmt: skip
+        return Processing(self._source, self.folder, self._options)
+
+    @cached_property
+    def _saved(self) -> ProcessedScan:
+        if self._saved_products is None:
+            raise DataError(
+                f"{self.folder}: holds no products", "it was not processed", "polysight process", code=ErrorCode.NO_DATA
+            )
+        return ProcessedScan(self._saved_products.folder)
+
+    def _processed(self, metal_referenced: bool) -> ProcessedScan:
+        """The saved products if they are of this kind, otherwise processed rows. Raises DataError."""
+        if self._saved_products is not None and self._saved.metal_referenced == metal_referenced:
+            return self._saved
+        if self._source is None:
+            raise self._other_kind(metal_referenced)
+        return self._processing.referenced if metal_referenced else self._processing.unreferenced
+
+    def _other_kind(self, metal_referenced: bool) -> DataError:
+        if metal_referenced:
+            return DataError(
+                f"{self.folder}: these images are not referenced to metal", "only images were made of this scan",
+                "image(metal_referenced=False) reads them; `polysight process` finds metal, patches and materials",
+                code=ErrorCode.MISMATCH,
+            )  # fmt: skip
+        return DataError(
+            f"{self.folder}: these images are referenced to metal", "products do not keep the images before that",
+            "open the scan folder, or ask for metal_referenced=True", code=ErrorCode.MISMATCH,
+        )  # fmt: skip
+
+    def _unknown(self, what: str) -> DataError:
+        return DataError(
+            f"{self.folder}: the {what} of the products is unknown", "an earlier release made them, or scan.json or"
+            " quality.json is missing", "open the scan folder instead", code=ErrorCode.KEY_MISSING,
+        )  # fmt: skip
+
+    def _columns(self, *names: str) -> xarray.Dataset:
+        """These variables of the patches, where they exist, with the coordinates of their dimension."""
+        patches = self.patches()
+        return patches[[name for name in names if name in patches]].drop_vars(["x", "y"], errors="ignore")

@@ -1,0 +1,68 @@
+"""Calibration from recorded scans: antenna positions, high-pass filters, metal reference, start frequencies.
+
+`polysight calibrate` estimates one kind at a time (`fit_places`, `fit_filter`, `fit_start`, `write_metal`) and writes a
+dated calibration file. The rig file names the files that apply; a new scan gets copies (`copy_into_scan`).
+`calibration_of_scan` loads the active calibration of a scan: its `Calibration` corrects the rig, and gives the measured
+filters and the metal reference.
+"""
+
+from polysight.calibration.active import (
+    Calibration,
+    calibration_of_rig,
+    calibration_of_scan,
+    checked_calibration,
+    copy_into_scan,
+)
+from polysight.calibration.direct_signal import (
+    FULL_SCALE,
+    DirectSignal,
+    band_hz,
+    find_direct,
+    fit_start,
+    jitter_hz,
+    unwrapped,
+)
+from polysight.calibration.files import (
+    CalibrationFile,
+    FilterFile,
+    MetalFile,
+    StartFile,
+    header,
+    read_calibration,
+    write_calibration,
+    write_metal,
+)
+from polysight.calibration.filters import fit_filter
+from polysight.calibration.places import Prior, fit_places, load_echoes, places_file, read_target
+from polysight.calibration.scans import open_raw, source_scan
+
+__all__ = [
+    "FULL_SCALE",
+    "Calibration",
+    "CalibrationFile",
+    "DirectSignal",
+    "FilterFile",
+    "MetalFile",
+    "Prior",
+    "StartFile",
+    "band_hz",
+    "calibration_of_rig",
+    "calibration_of_scan",
+    "checked_calibration",
+    "copy_into_scan",
+    "find_direct",
+    "fit_filter",
+    "fit_places",
+    "fit_start",
+    "header",
+    "jitter_hz",
+    "load_echoes",
+    "open_raw",
+    "places_file",
+    "read_calibration",
+    "read_target",
+    "source_scan",
+    "unwrapped",
+    "write_calibration",
+    "write_metal",
+]

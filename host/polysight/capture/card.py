@@ -1,0 +1,316 @@
+"""Control of one DCA1000 over UDP: start, stop and reset it, and program the addresses in its EEPROM.
+
+The socket is never connected: replies come from the card's port 1024, whatever port the command went to. Only commands
+that are safe to repeat are retried. If no reply comes before the timeout, the error names the hop that does not work.
+`program_eeprom` writes new addresses and a new MAC address, which take effect when the card is next switched on.
+"""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import select
+import struct
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from polysight.capture import dca1000
+from polysight.capture.dca1000 import Code, Reply, Status, Version
+from polysight.capture.network import bind_udp, no_route, silent_card
+from polysight_shared.config import Board, Card
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DeviceError, ProtocolError
+
+ATTEMPTS = 3
+EEPROM_REPORT_S = 0.5
+_PORTS = struct.Struct("<HH")  # in the EEPROM
+DEFAULT_MAC = "12:34:56:78:90:12"
+_OTHER_MAC = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"
+
+
+class CardClient:
+    """Client of one capture card.
+
+    Parameters
+    ----------
+    board
+        Name, addresses and ports.
+    timeout_s
+        Timeout of a command, all attempts together.
+    kernel_root
+        Folder with `proc` and `sys`, for the diagnosis of a silent card.
+
+    Raises
+    ------
+    DeviceError
+        if the command port is in use or the host address is not this machine's.
+    """
+
+    def __init__(self, board: Board, timeout_s: float, kernel_root: Path = Path("/")) -> None:
+        self.board = board
+        self._timeout_s = timeout_s
+        self._kernel_root = kernel_root
+        self._address = (board.card_address, board.command_port)
+        self._socket = bind_udp(board.host_address, board.command_port, f"{board.name} commands")
+        self._status = Status(0)
+        self.strangers = 0  # datagrams that were neither replies nor status of this card
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when the card reports a status."""
+        return self._socket.fileno()
+
+    def alive(self) -> None:
+        """Check that the card replies; otherwise raise DeviceError with the first hop that does not work."""
+        self._command(Code.ALIVE)
+
+    def version(self) -> Version:
+        """Return the card's FPGA version. Raises DeviceError."""
+        return dca1000.decode_version(self._exchange(Code.VERSION, b"", ATTEMPTS).status)
+
+    def configure(self, card: Card, lanes: int = 4) -> None:
+        """Configure raw 16-bit capture of `lanes` LVDS lanes to Ethernet, and the packet delay. Raises DeviceError."""
+        self._command(Code.CONFIGURE_FPGA, dca1000.configure_fpga_data(lanes))
+        self._command(Code.CONFIGURE_PACKET, dca1000.configure_packet_data(card.packet_bytes, card.packet_delay_us))
+
+    def reset_fpga(self) -> None:
+        """Reset the FPGA; its configuration is lost. Raises DeviceError."""
+        self._command(Code.RESET_FPGA)
+
+    def reset_radar(self) -> None:
+        """Reset the radar board on the card; it must be armed again. Raises DeviceError."""
+        self._command(Code.RESET_RADAR)
+
+    def write_eeprom(self, body: bytes) -> Status:
+        """Send the 18 bytes of command 0x04; return the status bits that the card reports. For `program_eeprom`.
+
+        No retry: the card may be writing. Raises DeviceError when the card refuses or is silent.
+        """
+        self._status = Status(0)
+        self._check(self._exchange(Code.CONFIGURE_EEPROM, body, 1), Code.CONFIGURE_EEPROM)
+        self._receive(EEPROM_REPORT_S)  # a failure is a separate message, perhaps after the reply
+        return self.take_status()
+
+    def record_start(self) -> None:
+        """Start a record; before a retry it is stopped, because it may run already. Raises DeviceError."""
+        for attempt in range(ATTEMPTS):
+            self.take_status()
+            self._status = Status(0)  # of the previous record
+            reply = self._try(Code.RECORD_START, b"", self._timeout_s / ATTEMPTS)
+            self._status &= ~Status.RECORD_COMPLETED  # before the reply: of the previous record
+            if reply is not None:
+                self._check(reply, Code.RECORD_START)
+                return
+            if attempt < ATTEMPTS - 1:
+                self.record_stop()
+        raise self._silent(Code.RECORD_START, ATTEMPTS)
+
+    def record_stop(self) -> None:
+        """Stop the record; a card that does not record may refuse. Raises DeviceError if there is no reply."""
+        self._exchange(Code.RECORD_STOP, b"", ATTEMPTS)
+
+    def wait_completed(self, limit_s: float) -> None:
+        """After a stop, wait until the card reports the record as completed, or for the limit.
+
+        Before that status, but after the reply to the stop, the card sends the rest of the record as a short packet,
+        which must not be taken for the next record's.
+        """
+        deadline = time.monotonic() + limit_s
+        while Status.RECORD_COMPLETED not in self.take_status() and (left := deadline - time.monotonic()) > 0:
+            select.select([self._socket], [], [], left)
+
+    def take_status(self) -> Status:
+        """Return the status bits that the card reported since the last record start, without waiting."""
+        while self._receive(0.0) is not None:
+            pass
+        return self._status
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def __enter__(self) -> CardClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _command(self, code: Code, data: bytes = b"") -> None:
+        self._check(self._exchange(code, data, ATTEMPTS), code)
+
+    def _check(self, reply: Reply, code: Code) -> None:
+        if reply.status != 0:
+            raise DeviceError(
+                f"{self._name()} refused {code.name} with status {reply.status}",
+                "the card is in another state than expected, or its switches select another mode",
+                "power-cycle the card, and check its mode switches (docs/spec/dca1000.md)",
+                code=ErrorCode.REFUSED_BY_PEER,
+            )
+
+    def _exchange(self, code: Code, data: bytes, attempts: int) -> Reply:
+        for _ in range(attempts):
+            reply = self._try(code, data, self._timeout_s / attempts)
+            if reply is not None:
+                return reply
+        raise self._silent(code, attempts)
+
+    def _try(self, code: Code, data: bytes, limit_s: float) -> Reply | None:
+        """Send once and wait for the reply to this code."""
+        while self._receive(0.0) is not None:
+            pass  # late replies to an earlier attempt
+        try:
+            self._socket.sendto(dca1000.encode_request(code, data), self._address)
+        except OSError as e:
+            if e.errno in (errno.ENETUNREACH, errno.EHOSTUNREACH):
+                raise no_route(self.board, f"no way to {self._name()} from {self.board.host_address}") from None
+            what = f"sending to {self._name()} failed: {e.strerror}"
+            raise silent_card(self.board, what, self._kernel_root) from e
+        deadline = time.monotonic() + limit_s
+        while (left := deadline - time.monotonic()) > 0:
+            reply = self._receive(left)
+            if reply is not None and reply.code == code:
+                return reply
+        return None
+
+    def _receive(self, limit_s: float) -> Reply | None:
+        """Return the next reply, None after the timeout; collect status bits and count foreign datagrams."""
+        deadline = time.monotonic() + limit_s
+        while True:
+            left = max(0.0, deadline - time.monotonic())
+            if not select.select([self._socket], [], [], left)[0]:
+                return None
+            try:
+                raw, (address, _) = self._socket.recvfrom(2048)
+            except (BlockingIOError, ConnectionError):
+                continue
+            if address != self.board.card_address:
+                self.strangers += 1
+                continue
+            try:
+                reply = dca1000.decode_reply(raw)
+            except ProtocolError:
+                self.strangers += 1
+                continue
+            if reply.code != Code.STATUS:
+                return reply
+            self._status |= Status(reply.status & 0x0FFF)
+
+    def _name(self) -> str:
+        return f"capture card of {self.board.name} at {self.board.card_address}:{self.board.command_port}"
+
+    def _silent(self, code: Code, attempts: int) -> DeviceError:
+        """Return the error for a card that does not answer, with the hop that does not work, if known."""
+        tried = f"{attempts} attempts" if attempts > 1 else "1 attempt"
+        what = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({tried})"
+        return silent_card(self.board, what, self._kernel_root)
+
+
+@dataclass(frozen=True)
+class EepromSettings:
+    """Settings in the EEPROM; they take effect when the card is next switched on.
+
+    Raises
+    ------
+    ConfigError
+        if a card with these settings could not be reached.
+    """
+
+    host_address: str
+    card_address: str
+    card_mac: str = DEFAULT_MAC
+    command_port: int = 4096
+    data_port: int = 4098
+
+    def __post_init__(self) -> None:
+        host, card = self._address(self.host_address), self._address(self.card_address)
+        if host == card:
+            raise self._wrong(f"host and card both have the address {card}")
+        if int(host) >> 8 != int(card) >> 8:
+            raise self._wrong(f"host {host} and card {card} are in different /24 subnets")
+        for address in (host, card):
+            if address.is_multicast or int(address) & 0xFF in (0, 0xFF):
+                raise self._wrong(f"{address} is not the address of one machine")
+        try:
+            mac = self._mac()
+        except ValueError:
+            raise self._wrong(f"{self.card_mac!r} is not a MAC address such as {DEFAULT_MAC}", _OTHER_MAC) from None
+        if len(mac) != 6 or mac[0] & 1 or not any(mac):
+            raise self._wrong(f"{self.card_mac} is not the MAC address of one machine", _OTHER_MAC)
+        for port in (self.command_port, self.data_port):
+            if not 1024 < port <= 0xFFFF:
+                raise self._wrong(f"port {port} is outside 1025..65535")
+        if self.command_port == self.data_port:
+            raise self._wrong(f"commands and data both use port {self.data_port}")
+
+    @staticmethod
+    def of_board(board: Board, card_mac: str = DEFAULT_MAC) -> EepromSettings:
+        """Return the settings for a board of the rig file. Cards on one network need different MAC addresses."""
+        return EepromSettings(board.host_address, board.card_address, card_mac, board.command_port, board.data_port)
+
+    @property
+    def confirmation(self) -> str:
+        """The text that confirms writing: the card's new address."""
+        return self.card_address
+
+    def encode(self) -> bytes:
+        """Return the 18 bytes of the command: host, card and MAC address with reversed bytes, and the ports."""
+        parts = (self._address(self.host_address).packed, self._address(self.card_address).packed, self._mac())
+        return b"".join(part[::-1] for part in parts) + _PORTS.pack(self.command_port, self.data_port)
+
+    def text(self) -> str:
+        """Describe the settings in a sentence."""
+        return (
+            f"card {self.card_address} ({self.card_mac}) answers to {self.host_address}:{self.command_port} and sends"
+            f" data to port {self.data_port} after it is next switched on"
+        )
+
+    def _mac(self) -> bytes:
+        return bytes.fromhex(self.card_mac.replace(":", "").replace("-", ""))
+
+    def _address(self, text: str) -> ipaddress.IPv4Address:
+        try:
+            return ipaddress.IPv4Address(text)
+        except ValueError:
+            raise self._wrong(f"{text!r} is not an IPv4 address") from None
+
+    @staticmethod
+    def _wrong(what: str, remedy: str = "correct the board in instrument.toml") -> ConfigError:
+        why = "a card with them could not be reached"
+        return ConfigError(f"EEPROM settings refused: {what}", why, remedy, code=ErrorCode.VALUE_INVALID)
+
+
+def program_eeprom(card: CardClient, settings: EepromSettings, confirmed: str) -> None:
+    """Write the settings to the EEPROM of a card.
+
+    Parameters
+    ----------
+    card
+        Client of the card at its present address and ports.
+    settings
+        Settings after the next power-up.
+    confirmed
+        Must be equal to `settings.confirmation`, as typed by the user.
+
+    Raises
+    ------
+    ConfigError
+        if the confirmation differs; nothing was sent.
+    DeviceError
+        if the card is silent, refuses, or reports an EEPROM failure.
+    """
+    if confirmed != settings.confirmation:
+        raise ConfigError(
+            f"EEPROM not written: confirmed with {confirmed!r}, not {settings.confirmation!r}",
+            settings.text(),
+            f"repeat the card's new address, {settings.confirmation}, to write it",
+            code=ErrorCode.VALUE_INVALID,
+        )
+    card.alive()
+    status = card.write_eeprom(settings.encode())
+    if Status.EEPROM_FAILURE in status:
+        raise DeviceError(
+            f"card at {card.board.card_address} reports an EEPROM failure after {Code.CONFIGURE_EEPROM.name}",
+            "the EEPROM could not be written",
+            "write it again before switching the card off; its addresses may be damaged",
+            code=ErrorCode.REFUSED_BY_PEER,
+        )

@@ -1,0 +1,148 @@
+"""Formats of the DCA1000: requests, replies, asynchronous status and data packet headers, as the host uses them.
+
+Specification: docs/spec/dca1000.md. Everything is little-endian.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ProtocolError
+
+REQUEST_MAGIC = 0xA55A
+FOOTER = 0xEEAA
+MAX_REQUEST_DATA = 504
+CARD_SOURCE_PORT = 1024  # of replies and data, whatever port the card listens on
+PACKET_HEADER_BYTES = 10
+MAX_PAYLOAD_BYTES = 1456
+MAX_PACKET_BYTES = PACKET_HEADER_BYTES + MAX_PAYLOAD_BYTES
+BYTE_COUNT_BITS = 48
+SEQUENCE_BITS = 32
+DELAY_TICKS_PER_US = 125  # the card counts 8 ns ticks
+_HEAD = struct.Struct("<HHH")
+_REPLY = struct.Struct("<HHHH")
+_PACKET = struct.Struct("<IIH")
+_FOOTER = struct.Struct("<H")
+
+
+class Code(IntEnum):
+    """Command codes."""
+
+    RESET_FPGA = 0x01
+    RESET_RADAR = 0x02
+    CONFIGURE_FPGA = 0x03
+    CONFIGURE_EEPROM = 0x04
+    RECORD_START = 0x05
+    RECORD_STOP = 0x06
+    ALIVE = 0x09
+    STATUS = 0x0A
+    CONFIGURE_PACKET = 0x0B
+    VERSION = 0x0E
+
+
+class Status(IntFlag):
+    """Bits of the asynchronous status (code 0x0A)."""
+
+    NO_LVDS_DATA = 1 << 0
+    NO_HEADER = 1 << 1
+    EEPROM_FAILURE = 1 << 2
+    SD_CARD_DETECTED = 1 << 3
+    SD_CARD_REMOVED = 1 << 4
+    SD_CARD_FULL = 1 << 5
+    MODE_CONFIGURATION_FAILED = 1 << 6
+    DDR_FULL = 1 << 7
+    RECORD_COMPLETED = 1 << 8
+    LVDS_BUFFER_FULL = 1 << 9
+    PLAYBACK_COMPLETED = 1 << 10
+    PLAYBACK_OUT_OF_SEQUENCE = 1 << 11
+
+
+LOST_BEFORE_PACKETS = Status.DDR_FULL | Status.LVDS_BUFFER_FULL
+"""Status bits that report data dropped before the packets were numbered: bytes are lost without a counter gap."""
+
+
+@dataclass(frozen=True)
+class Reply:
+    """Eight bytes from the card: the reply to a command, or (code STATUS) an asynchronous status."""
+
+    code: int
+    status: int
+
+
+@dataclass(frozen=True)
+class Version:
+    """FPGA version of a card."""
+
+    major: int
+    minor: int
+    playback: bool
+
+    def __str__(self) -> str:
+        return f"{self.major}.{self.minor}{' (playback)' if self.playback else ''}"
+
+
+@dataclass(frozen=True)
+class Counters:
+    """The card's counters at a packet: byte count of its first byte, and its sequence. Both wrap."""
+
+    byte_count: int
+    sequence: int
+
+    def after(self, size: int, packets: int) -> Counters:
+        """Return the counters `size` bytes and `packets` packets later."""
+        return Counters(
+            (self.byte_count + size) % (1 << BYTE_COUNT_BITS), (self.sequence + packets) % (1 << SEQUENCE_BITS)
+        )
+
+
+def encode_request(code: int, data: bytes = b"") -> bytes:
+    """Encode a request to the card. Raises ProtocolError if `data` is longer than the card takes."""
+    if len(data) > MAX_REQUEST_DATA:
+        what = f"request data of {len(data)} bytes is longer than {MAX_REQUEST_DATA}"
+        raise ProtocolError(what, code=ErrorCode.VALUE_INVALID)
+    return _HEAD.pack(REQUEST_MAGIC, code, len(data)) + data + _FOOTER.pack(FOOTER)
+
+
+def decode_reply(raw: bytes) -> Reply:
+    """Decode a reply or asynchronous status. Raises ProtocolError if the bytes are not one."""
+    if len(raw) == _REPLY.size:
+        magic, code, status, footer = _REPLY.unpack(raw)
+        if magic == REQUEST_MAGIC and footer == FOOTER:
+            return Reply(code, status)
+    what = f"not a DCA1000 reply of {_REPLY.size} bytes: {len(raw)} bytes, {raw[:16].hex(' ')}"
+    raise ProtocolError(what, code=ErrorCode.MESSAGE_INVALID)
+
+
+def configure_fpga_data(lanes: int = 4, timer: int = 30) -> bytes:
+    """Encode the body of 0x03: raw mode, LVDS lanes (4: AWR2243, 2: xWR16xx/18xx/68xx), Ethernet, 16 bit, timer."""
+    if lanes not in (2, 4):
+        raise ProtocolError(f"the card captures 2 or 4 LVDS lanes, not {lanes}", code=ErrorCode.VALUE_INVALID)
+    return bytes([1, 1 if lanes == 4 else 2, 1, 2, 3, timer])
+
+
+def configure_packet_data(packet_bytes: int, delay_us: float) -> bytes:
+    """Encode the body of 0x0B: packet size, delay in 8 ns ticks, zero. 1470 and 25 us gives `be 05 35 0c 00 00`."""
+    ticks = round(delay_us * DELAY_TICKS_PER_US)
+    if not 0 <= ticks <= 0xFFFF:
+        what = f"packet delay of {delay_us} us is {ticks} ticks of 8 ns, outside 0..65535"
+        raise ProtocolError(what, code=ErrorCode.VALUE_INVALID)
+    return struct.pack("<HHH", packet_bytes, ticks, 0)
+
+
+def decode_version(status: int) -> Version:
+    """Decode the FPGA version in the status of the reply to 0x0E: bits 0-6 major, 7-13 minor, 14 playback."""
+    return Version(status & 0x7F, (status >> 7) & 0x7F, bool(status >> 14 & 1))
+
+
+def decode_packet_header(packet: bytes | memoryview) -> tuple[int, int]:
+    """Decode (sequence, byte count); the byte count is the number of payload bytes before this packet.
+
+    Raises ProtocolError if there is no payload.
+    """
+    if len(packet) <= PACKET_HEADER_BYTES:
+        raise ProtocolError(f"data packet of {len(packet)} bytes has no payload", code=ErrorCode.MESSAGE_INVALID)
+    sequence, low, high = _PACKET.unpack_from(packet)
+    return sequence, low | high << 32

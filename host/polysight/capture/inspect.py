@@ -1,0 +1,235 @@
+"""Inspect a recording of a DCA1000: range profile, clipping, silent antennas, order of I and Q.
+
+The layout is given, by the rig file or by the user. A file of whole packets, with headers, is recognised and placed by
+byte count first. `pcap.py` reads packet captures; `polysight.jobs.recordings` prints and plots the report.
+`kind_of` recognises other kinds of files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.capture import dca1000
+from polysight.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Status
+from polysight.capture.decode import decode_row, decode_two_lane
+from polysight.capture.earlier_records import counter_differences
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import Placed, place_record
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+
+MAX_BYTES = 256 << 20
+"""Part of a file that is read: eleven rows of the published scan."""
+MAX_CHIRPS = 4096  # enough for the statistics
+_HEADERS_READ = 16  # to recognise a file of whole packets
+_FULL_SCALE = 32767  # ADC counts
+_MUCH_DC = 0.05 * _FULL_SCALE
+MAGIC = {
+    b"\x7fELF": "a program", b"\x89PNG": "a picture (PNG)", b"\xff\xd8\xff": "a picture (JPEG)", b"%PDF": "a PDF",
+    b"PK\x03\x04": "an archive (zip)", b"\x1f\x8b": "compressed (gzip)", b"\x89HDF": "HDF5",
+    b"BZh": "compressed (bzip2)", b"\xfd7zXZ": "compressed (xz)", b"\x93NUMPY": "a numpy array",
+    b"RIFF": "sound or video (RIFF)", b"MATLAB 5.0": "a MATLAB file",
+}  # fmt: skip
+
+
+def kind_of(head: bytes) -> str:
+    """Describe the kind of file that begins with these bytes: `a picture (PNG)`, `text`, or `unknown bytes`."""
+    for magic, kind in MAGIC.items():
+        if head.startswith(magic):
+            return kind
+    if not head:
+        return "empty"
+    text = head.decode("utf-8", "ignore")
+    printable = all(c.isprintable() or c.isspace() for c in text)
+    return "text" if len(text.encode()) > len(head) - 4 and printable else "unknown bytes"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Layout of complex samples in a recording: LVDS lanes (2 or 4), samples of a chirp, antennas, order of I and Q."""
+
+    lanes: int = 4
+    samples: int = 256
+    rx: int = 4
+    q_first: bool = False
+
+    @property
+    def chirp_bytes(self) -> int:
+        """Bytes of one chirp of all antennas."""
+        return self.samples * self.rx * 4
+
+
+@dataclass
+class CardReport:
+    """A card in a packet capture: replies (code, status), FPGA version, status, the record."""
+
+    address: str
+    replies: list[tuple[str, int]]
+    version: str
+    status: Status
+    record: Placed | None
+    tail_bytes: int
+    tail_after_s: float
+
+
+@dataclass
+class Report:
+    """Content of a recording.
+
+    `profile_db` is the power range profile, Hann window, mean over chirps and antennas, in dB over its median;
+    float64 [samples]. `rx_profile_db` is the same for every antenna over the same median. `rx_rms` and `rx_dc` are one
+    value per antenna, ADC counts.
+    """
+
+    path: Path
+    bytes: int
+    layout: Layout
+    chirps: int
+    peak_bin: int
+    peak_db: float
+    clipped: int
+    rx_dc: list[float]
+    rx_rms: list[float]
+    left_over_bytes: int
+    profile_db: NDArray[np.float64]
+    rx_profile_db: NDArray[np.float64]
+    remarks: list[str] = field(default_factory=list)
+    card: CardReport | None = None
+    simulated: bool = False
+
+
+def packets_in_file(payload: NDArray[np.uint8]) -> list[bytes]:
+    """Return the packets of a file of consecutive full packets, the last perhaps short; [] for any other file.
+
+    Some programs write packets as they come: 1456 bytes of payload, each behind ten bytes of counters.
+    """
+    count = min(_HEADERS_READ, payload.size // MAX_PACKET_BYTES)
+    if count < 2:
+        return []
+    some = payload[: count * MAX_PACKET_BYTES].reshape(count, MAX_PACKET_BYTES)
+    heads = [dca1000.decode_packet_header(row.tobytes()) for row in some]
+    (sequence, byte_count), k = heads[0], range(count)
+    if heads != [(sequence + i, byte_count + i * MAX_PAYLOAD_BYTES) for i in k]:
+        return []
+    pieces = [payload[a : a + MAX_PACKET_BYTES].tobytes() for a in range(0, payload.size, MAX_PACKET_BYTES)]
+    return [piece for piece in pieces if len(piece) > dca1000.PACKET_HEADER_BYTES]
+
+
+def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
+    """Place a record of unknown length, from the lowest to the highest byte count.
+
+    Returns its bytes, uint8 [n], and the result. Raises DataError if the packets are not of one record.
+    """
+    counts = np.array([dca1000.decode_packet_header(p)[1] for p in packets])
+    ahead = counter_differences(counts, int(counts[0]), dca1000.BYTE_COUNT_BITS)
+    sizes = np.array([len(p) for p in packets]) - dca1000.PACKET_HEADER_BYTES
+    size = int((ahead + sizes).max() - ahead.min())
+    if size > 1 << 34:
+        what = f"byte counts span {size} bytes: more than one record, or corrupted packets"
+        raise DataError(what, code=ErrorCode.FILE_DAMAGED)
+    log = PacketLog(size)
+    for packet in packets:
+        log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), 0)
+    placed, out = place_record(log)
+    return out, placed
+
+
+def inspect_bin(path: Path, layout: Layout = Layout()) -> Report:
+    """Inspect a payload file in this layout.
+
+    Raises DataError if the file is missing, of another kind, or shorter than one chirp.
+    """
+    try:
+        size = path.stat().st_size
+        payload = np.fromfile(path, dtype=np.uint8, count=MAX_BYTES)
+    except OSError as e:
+        raise unreadable(path, e) from None
+    kind = kind_of(payload[:4096].tobytes())
+    if kind not in ("empty", "unknown bytes"):
+        what, remedy = f"{path}: not a capture: it begins as {kind}", "give a row (.bin) or a packet capture (.pcap)"
+        raise DataError(what, "a card records samples", remedy, code=ErrorCode.FILE_FOREIGN)
+    packets = packets_in_file(payload)
+    report = inspect_payload(path, place_packets(packets)[0] if packets else payload, layout)
+    if packets:
+        report.remarks.append("whole packets, not payload: programs must remove the counters of each packet first")
+    if size > MAX_BYTES:
+        report.remarks.append(f"only the first {MAX_BYTES >> 20} MiB of {size >> 20} MiB were read")
+    return report
+
+
+def unreadable(path: Path, e: OSError) -> DataError:
+    """Return the error for a recording that cannot be read."""
+    what = f"{path}: cannot be read: {e.strerror}"
+    return DataError(what, "the path is wrong", "give a recording", code=ErrorCode.FILE_UNREADABLE)
+
+
+def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> Report:
+    """Inspect payload bytes, uint8 [n]; `path` is for the report. Raises DataError as :func:`inspect_bin`."""
+    chirps = payload.size // layout.chirp_bytes
+    if not chirps:
+        raise DataError(
+            f"{path}: {payload.size} bytes are less than a chirp of {layout.samples} samples x {layout.rx} RX",
+            "empty or truncated file",
+            "record again; `polysight inspect` needs at least one chirp",
+            code=ErrorCode.NOT_ENOUGH_DATA,
+        )
+    words = payload[: payload.size // 2 * 2].view("<i2")
+    shape = min(chirps, MAX_CHIRPS), layout.samples, layout.rx
+    if layout.lanes == 4:
+        cube = decode_row(payload, (), *shape, layout.q_first)[0]
+    else:
+        cube = decode_two_lane(payload, *shape, layout.q_first)
+    power = (np.abs(np.fft.fft(cube * np.hanning(layout.samples), axis=-1)) ** 2).mean(axis=1)
+    mean = power.mean(axis=0)
+    floor = max(float(np.median(mean)), 1e-12)
+    profile, each = (10 * np.log10(np.maximum(p, 1e-12) / floor) for p in (mean, power))
+    peak = 2 + int(np.argmax(profile[2:-1]))  # without the bins that a constant offset fills, on both sides of zero
+    report = Report(
+        path=path,
+        bytes=int(payload.size),
+        layout=layout,
+        chirps=chirps,
+        peak_bin=peak,
+        peak_db=float(profile[peak]),
+        clipped=int(((words >= _FULL_SCALE) | (words <= -_FULL_SCALE - 1)).sum()),
+        rx_dc=[float(v) for v in np.abs(cube.mean(axis=(1, 2)))],
+        rx_rms=[float(v) for v in np.sqrt(np.mean(np.abs(cube) ** 2, axis=(1, 2)))],
+        left_over_bytes=int(payload.size % layout.chirp_bytes),
+        profile_db=profile,
+        rx_profile_db=each,
+    )
+    report.remarks = _remarks(report, is_mirrored(mean))
+    return report
+
+
+def is_mirrored(power: NDArray[np.float64]) -> bool:
+    """True if a complex spectrum, float64 [bin], is at negative frequencies: I and Q are swapped.
+
+    For complex 1x (IF up to 0.9 sample rates) power in the upper half is no proof, so the last quarter is compared with
+    the first: returns come from near. The bins next to zero are left out.
+    """
+    n, rim = power.size, 3
+    return bool(power[n - n // 4 : n - rim].sum() > 4 * power[rim + 1 : n // 4 + 1].sum())
+
+
+def _remarks(r: Report, mirrored: bool) -> list[str]:
+    found = []
+    if max(r.rx_rms) == 0:
+        return ["every sample is zero: nothing was recorded"]
+    if mirrored:
+        found.append("most power is at negative frequencies: I and Q seem to be swapped (--q-first)")
+    if silent := [k for k, v in enumerate(r.rx_rms) if v < 0.01 * max(r.rx_rms)]:
+        found.append(f"RX {', '.join(map(str, silent))} have no signal: antennas off, or another lane layout")
+    if r.clipped:
+        found.append(f"{r.clipped} values are at full scale: the receiver clips, lower its gain")
+    if r.left_over_bytes:
+        found.append(f"{r.left_over_bytes} bytes after the last complete chirp: truncated, or another layout")
+    if max(r.rx_dc) > _MUCH_DC:
+        found.append(f"constant offset of {max(r.rx_dc):.0f} counts, which this radar's high-pass filter would remove")
+    if r.peak_db < 10:
+        found.append("no clear peak in the range profile: noise, or a wrong layout (--lanes, --samples)")
+    return found

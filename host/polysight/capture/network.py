@@ -1,0 +1,362 @@
+"""UDP sockets for the capture cards, and diagnosis of the network path to a card that does not answer.
+
+`bind_udp` and `enlarge_receive_buffer` make the socket; the kernel may grant a smaller buffer than requested.
+`BatchReceiver` fetches many packets with one `recvmmsg` call into one block of memory, so that a packet costs one copy.
+`silent_hop` finds the first hop that does not work (address, route, link, card), for `silent_card` and `silent_radar`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import os
+import socket
+import struct
+import sys
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.capture.dca1000 import MAX_PAYLOAD_BYTES, Status
+from polysight.capture.receiver import RowCapture
+from polysight_shared.config import Board
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError
+
+SO_RCVBUFFORCE = 33  # Linux; may exceed net.core.rmem_max, needs CAP_NET_ADMIN
+SO_MEMINFO = 55  # Linux: nine 32-bit words about the socket's memory
+KERNEL_BYTES_A_PACKET = 2304  # of a receive buffer that a full packet occupies (measured)
+_MEMINFO_DROPS = 8
+_RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
+_STRIDE = 1536  # bytes per packet: more than the largest, to detect longer ones
+_MSG_DONTWAIT = socket.MSG_DONTWAIT if hasattr(socket, "MSG_DONTWAIT") else 0x40
+_GATEWAY, _UP = 0x2, 0x1  # flags in /proc/net/route
+_ARP_COMPLETE = 0x2  # flag in /proc/net/arp
+_ROOT = Path("/")
+
+
+class _IoVec(ctypes.Structure):
+    _fields_ = (("base", ctypes.c_size_t), ("length", ctypes.c_size_t))
+
+
+class _Header(ctypes.Structure):
+    """`struct msghdr`; addresses as integers, so that numpy can view an array of them."""
+
+    _fields_ = (
+        ("name", ctypes.c_size_t),
+        ("name_length", ctypes.c_uint32),
+        ("vector", ctypes.c_size_t),
+        ("vector_length", ctypes.c_size_t),
+        ("control", ctypes.c_size_t),
+        ("control_length", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _Message(ctypes.Structure):
+    """`struct mmsghdr`."""
+
+    _fields_ = (("header", _Header), ("received", ctypes.c_uint32))
+
+
+def bind_udp(address: str, port: int, what: str) -> socket.socket:
+    """Return a bound, non-blocking, unconnected UDP socket; `what` names it in errors.
+
+    Raises
+    ------
+    DeviceError
+        if the port is in use or the address is not this machine's.
+    """
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setblocking(False)
+    try:
+        sock.bind((address, port))
+    except OSError as e:
+        sock.close()
+        if e.errno == errno.EADDRINUSE:
+            raise DeviceError(
+                f"{what}: {address}:{port} (UDP) is in use",
+                "another program receives from this card, perhaps an earlier one that still runs",
+                f"`ss -ulnp 'sport = :{port}'` shows it; stop it",
+                code=ErrorCode.BUSY,
+            ) from None
+        if e.errno == errno.EADDRNOTAVAIL:
+            raise DeviceError(
+                f"{what}: {address} is not an address of this machine",
+                "the network interface to the cards is down or has another address",
+                f"`ip address add {address}/24 dev <interface>`, or correct host_address in instrument.toml"
+                " (for a scan to resume: `polysight resume SCAN --config instrument.toml`)",
+                code=ErrorCode.VALUE_INVALID,
+            ) from None
+        raise DeviceError(f"{what}: cannot bind {address}:{port} (UDP): {e.strerror}", "", "check host_address") from e
+    return sock
+
+
+def enlarge_receive_buffer(sock: socket.socket, wanted_bytes: int) -> int:
+    """Request a receive buffer; return the granted size, bytes."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted_bytes)
+    if granted_bytes(sock) < wanted_bytes and sys.platform == "linux":
+        with contextlib.suppress(PermissionError):
+            sock.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, wanted_bytes)
+    return granted_bytes(sock)
+
+
+def granted_bytes(sock: socket.socket) -> int:
+    """Return the size of the receive buffer; Linux reports twice the request, for its overhead."""
+    size = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    return size // 2 if sys.platform == "linux" else size
+
+
+def kernel_drops(sock: socket.socket) -> int:
+    """Return the number of packets that the kernel dropped at this socket; 0 if the system does not report it."""
+    try:
+        return struct.unpack("9I", sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 36))[_MEMINFO_DROPS]
+    except (OSError, struct.error):
+        return 0
+
+
+class BatchReceiver:
+    """Receives up to `batch` packets at a time into one preallocated block."""
+
+    def __init__(self, sock: socket.socket, source_address: str, batch: int = 256) -> None:
+        self._socket = sock
+        self._source = int.from_bytes(socket.inet_aton(source_address), sys.byteorder)
+        self.packets: NDArray[np.uint8] = np.zeros((batch, _STRIDE), dtype=np.uint8)  # of the last `receive`
+        self.lengths: NDArray[np.uint32] = np.zeros(batch, dtype=np.uint32)  # bytes of each, with header
+        self.strangers = 0  # packets from another address than the card's
+        self._names = np.zeros((batch, 16), dtype=np.uint8)  # struct sockaddr_in of each packet
+        self._sources = self._names[:, 4:8].view(np.uint32)[:, 0]
+        self._vectors = (_IoVec * batch)()
+        self._messages = (_Message * batch)()
+        for i in range(batch):
+            self._vectors[i] = _IoVec(self.packets.ctypes.data + i * _STRIDE, _STRIDE)
+            header = self._messages[i].header
+            header.name, header.name_length = self._names.ctypes.data + 16 * i, 16
+            header.vector, header.vector_length = ctypes.addressof(self._vectors[i]), 1
+        view: Any = np.frombuffer(memoryview(self._messages), dtype=np.dtype(_Message))
+        self._received = view["received"]
+        self._name_lengths = view["header"]["name_length"]
+        self._recvmmsg = getattr(ctypes.CDLL(None, use_errno=True), "recvmmsg", None)
+
+    def receive(self) -> int:
+        """Fetch the pending packets; return the number from the card. Packets from elsewhere are counted, removed."""
+        n = self._fetch()
+        if n == 0:
+            return 0
+        known = self._sources[:n] == self._source
+        if not known.all():
+            self.strangers += int((~known).sum())
+            keep = np.flatnonzero(known)
+            self.packets[: keep.size] = self.packets[keep]
+            self.lengths[: keep.size] = self.lengths[keep]
+            n = int(keep.size)
+        return n
+
+    def _fetch(self) -> int:
+        if self._recvmmsg is None:
+            return self._fetch_one()
+        n = self._recvmmsg(self._socket.fileno(), self._messages, len(self._messages), _MSG_DONTWAIT, None)
+        if n < 0:
+            number = ctypes.get_errno()
+            if number in (errno.EAGAIN, errno.EINTR):
+                return 0
+            raise DeviceError(f"receiving from the capture card failed: {os.strerror(number)}")
+        self.lengths[:n] = self._received[:n]
+        self._name_lengths[:n] = 16
+        return n
+
+    def _fetch_one(self) -> int:
+        """Fetch one packet, where `recvmmsg` is missing."""
+        try:
+            size, sender = self._socket.recvfrom_into(memoryview(self.packets[0]))
+        except BlockingIOError:
+            return 0
+        self.lengths[0] = size
+        self._sources[0] = int.from_bytes(socket.inet_aton(sender[0]), sys.byteorder)
+        return 1
+
+
+def usable_packets(buffer_bytes: int) -> int:
+    """Return the number of full packets that a receive buffer holds."""
+    return 2 * buffer_bytes // KERNEL_BYTES_A_PACKET
+
+
+def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int, rmem_max: Path = _RMEM_MAX) -> str:
+    """Return a warning if the kernel granted less than requested, otherwise "".
+
+    Parameters
+    ----------
+    name
+        Board, for the message.
+    granted, wanted
+        Granted and requested bytes of the receive buffer.
+    burst_bytes
+        Data of one burst; the buffer must hold two, to bridge a pause of the receiver.
+    rmem_max
+        File with the kernel's limit.
+
+    Raises
+    ------
+    DeviceError
+        if the buffer holds less than two bursts; the remedy is the command that raises the limit.
+    """
+    enough = max(wanted, (2 * burst_bytes // MAX_PAYLOAD_BYTES + 2) * KERNEL_BYTES_A_PACKET // 2)
+    remedy = f"`sysctl -w net.core.rmem_max={enough}`, and the same in /etc/sysctl.d/ to keep it"
+    try:
+        limit = f"net.core.rmem_max is {int(rmem_max.read_text(encoding='ascii'))}"
+    except (OSError, ValueError):
+        limit = "net.core.rmem_max limits it"
+    if usable_packets(granted) * MAX_PAYLOAD_BYTES < 2 * burst_bytes:
+        raise DeviceError(
+            f"{name}: the kernel grants a receive buffer of {granted} bytes, less than two bursts of {burst_bytes}",
+            limit if granted < wanted else "card.receive_buffer_bytes asks for no more",
+            remedy if granted < wanted else f"card.receive_buffer_bytes = {enough} in instrument.toml; {remedy}",
+            code=ErrorCode.VALUE_INVALID,
+        )
+    if granted < wanted:
+        return f"{name}: receive buffer of {granted} bytes granted, {wanted} requested ({limit}); {remedy}"
+    return ""
+
+
+class Hop(Enum):
+    """Reason why a card does not answer: the first hop that does not work."""
+
+    ROUTE = "no route"
+    LINK = "no link"
+    NEIGHBOUR = "no device at the address"
+    CARD = "the card is mute"
+    UNKNOWN = "unknown"
+
+
+def silent_hop(card_address: str, root: Path = _ROOT) -> Hop:
+    """Find the first hop to a card (IPv4 address) that does not work.
+
+    `root` is the folder with `proc/net/route`, `proc/net/arp` and `sys/class/net`; unreadable files are skipped.
+    """
+    if card_address.startswith("127."):
+        return Hop.UNKNOWN  # loopback is in none of these tables
+    interface = route_interface(card_address, root)
+    if interface == "":
+        return Hop.ROUTE
+    if interface is not None and has_link(interface, root) is False:
+        return Hop.LINK
+    neighbour = neighbour_answers(card_address, root)
+    if neighbour is None:
+        return Hop.UNKNOWN
+    return Hop.CARD if neighbour else Hop.NEIGHBOUR
+
+
+def route_interface(address: str, root: Path = _ROOT) -> str | None:
+    """Return the interface in whose subnet the address lies, "" if there is none, None if unknown.
+
+    Routes over a gateway do not count: capture cards are not reached through a router.
+    """
+    try:
+        lines = (root / "proc/net/route").read_text(encoding="ascii").splitlines()[1:]
+    except OSError:
+        return None
+    wanted = struct.unpack("=I", socket.inet_aton(address))[0]
+    best, found = -1, ""
+    for line in lines:
+        words = line.split()
+        if len(words) < 8:
+            continue
+        destination, flags, mask = int(words[1], 16), int(words[3], 16), int(words[7], 16)
+        length = mask.bit_count()
+        if flags & _UP and wanted & mask == destination and length > best:
+            best, found = length, "" if flags & _GATEWAY else words[0]
+    return found
+
+
+def has_link(interface: str, root: Path = _ROOT) -> bool | None:
+    """True if the interface has a carrier; None if unknown."""
+    folder = root / "sys/class/net" / interface
+    try:
+        return (folder / "carrier").read_text(encoding="ascii").strip() == "1"
+    except OSError:
+        pass  # `carrier` of an interface that is down is not readable
+    try:
+        return False if (folder / "operstate").read_text(encoding="ascii").strip() == "down" else None
+    except OSError:
+        return None
+
+
+def neighbour_answers(address: str, root: Path = _ROOT) -> bool | None:
+    """True if a device answered for this address on the local network; None if the kernel does not know."""
+    try:
+        lines = (root / "proc/net/arp").read_text(encoding="ascii").splitlines()[1:]
+    except OSError:
+        return None
+    for line in lines:
+        words = line.split()
+        if len(words) >= 3 and words[0] == address:
+            return bool(int(words[2], 16) & _ARP_COMPLETE)
+    return None
+
+
+def silent_card(board: Board, what: str, root: Path = _ROOT) -> DeviceError:
+    """Return the error for a card that does not answer: `what` happened, and the hop that does not work, if known."""
+    hop, interface = silent_hop(board.card_address, root), route_interface(board.card_address, root)
+    if hop is Hop.ROUTE:
+        return no_route(board, what)
+    why = "the card is off, or listens at another address or port"
+    remedy = (
+        f"the card answers to the host address and ports in its EEPROM: it must send to {board.host_address}"
+        f" port {board.command_port}; `ss -ulnp` shows other programs that listen there"
+    )
+    if hop is Hop.LINK:
+        why = f"no link: network interface {interface} has no carrier, the cable is out or the card has no power"
+        remedy = f"check the card's power, the cable and the LEDs; `ip link show {interface}` must contain LOWER_UP"
+    elif hop is Hop.NEIGHBOUR:
+        why = (
+            f"the link is up, but no device has the address {board.card_address}: another card is on this cable, or its"
+            " EEPROM holds another address"
+        )
+        remedy = (
+            "check card_address in instrument.toml (for a scan to resume: `polysight resume SCAN --config"
+            " instrument.toml`); with the card's EEPROM switch off it has its default address"
+        )
+    elif hop is Hop.CARD:
+        why = (
+            "the card is mute: a device has its address, but its program does not answer; wrong command port, or its"
+            " replies go to another host address"
+        )
+    return DeviceError(what, why, remedy, code=ErrorCode.NO_ANSWER)
+
+
+def no_route(board: Board, what: str) -> DeviceError:
+    """Return the error for a card that is in no subnet of this machine."""
+    return DeviceError(
+        what,
+        f"no route: no network interface of this machine is in the subnet of {board.card_address}",
+        f"`ip address add {board.host_address}/24 dev <interface>`; `ip route get {board.card_address}` shows the"
+        " present route",
+        code=ErrorCode.NO_ANSWER,
+    )
+
+
+def silent_radar(board: Board, row: RowCapture | None = None) -> DeviceError:
+    """Return the error for a card that replies but sends no data, with the likeliest cause from the capture `row`."""
+    what = f"no data from {board.name} (card {board.card_address} to {board.host_address}:{board.data_port})"
+    remedy = "arm the radar, check the SYNC_IN wire (`polysight doctor` sends pulses), the data port in the EEPROM"
+    status = Status(row.card_status) if row is not None else Status(0)
+    if row is not None and row.strangers:
+        why = f"{row.strangers} packets came from another address than {board.card_address}"
+        remedy = (
+            "two boards may have each other's ports; check card_address and data_port in instrument.toml, then"
+            " `polysight resume SCAN --config instrument.toml`"
+        )
+    elif Status.NO_LVDS_DATA in status:
+        why = "the card replies, and reports that the radar sends nothing over LVDS: it is not streaming"
+    elif Status.NO_HEADER in status:
+        why = "the card replies, and reports LVDS data without a header: it is set to another mode"
+    else:
+        why = (
+            "the card replies, but the radar is not streaming (not armed, or SYNC_IN does not reach it), or the card"
+            " sends its data to another address or port"
+        )
+    return DeviceError(what, why, remedy, code=ErrorCode.NO_DATA)

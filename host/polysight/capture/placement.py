@@ -1,0 +1,284 @@
+"""Place the payload of a row's packets when the row has ended, bit-exact.
+
+`find_record` selects the row's packets and its start; `place_record` puts their payload in place, compares overlapping
+packets and lists missing bytes. A row that cannot be located with certainty is masked as a whole: data is original or
+masked, never guessed. The model: docs/spec/placement.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.capture.earlier_records import Past
+from polysight.capture.next_record import past_after
+from polysight.capture.packet_counts import PacketCounts, count_packets
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.record_search import Found, find_record
+
+Gap = tuple[int, int]
+Bytes = NDArray[np.uint8]
+Counts = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+_RESTARTED = "the card restarted"
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Missing bytes: before the first packet, in gaps between packets, after the last one."""
+
+    head_bytes: int = 0
+    gaps: int = 0
+    gap_bytes: int = 0
+    tail_bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Result of placing one record."""
+
+    expected: int  # bytes
+    received: int  # bytes
+    missing: list[Gap]  # byte ranges (start, stop) that are missing or uncertain: sorted, not touching
+    located: bool  # the place of every byte is certain; if not, `missing` is the whole record
+    reason: str  # why it is not located
+    counts: PacketCounts
+    losses: Losses  # missing bytes by kind; for a record that is not located, by its counters only
+    past: Past  # knowledge for the next record
+    at: Counts  # int64 [packet]: offset of its payload in the row, -1 outside the row
+    arrivals: Counts  # int64 [n, 2]: time (monotonic, ns), bytes received by then; no growth: the socket was empty
+    conflicts: list[Gap] = field(default_factory=list)  # byte ranges with different bytes in two packets; missing
+    holes: list[Gap] = field(default_factory=list)  # missing ranges below the furthest byte, in the card's order
+    slipped: bool = False  # not located only because frames may be missing (missed triggers)
+
+    @property
+    def complete(self) -> bool:
+        """True if every byte is there and nothing more came."""
+        return self.located and not self.missing
+
+    def facts(self) -> dict[str, Any]:
+        """Return the entries of the row's index (docs/spec/scan-folder.md)."""
+        return {
+            "expected": self.expected,
+            "received": self.received,
+            "located": self.located,
+            "reason": self.reason,
+            "missing": self.missing,
+            "holes": self.holes,
+            "clock": "CLOCK_MONOTONIC of the host, ns",
+            **{name: int(value) for name, value in (vars(self.counts) | vars(self.losses)).items()},
+        }
+
+
+@dataclass(frozen=True)
+class Preview:
+    """Progress of a running row: bytes in place, all bytes in place, the furthest packet is a short one."""
+
+    received: int
+    complete: bool
+    ended: bool
+
+
+def place_record(
+    log: PacketLog, frame_bytes: int = 1, past: Past | None = None, not_before_ns: int = 0, dropped_by_card: str = ""
+) -> tuple[Placed, Bytes]:
+    """Place one row's packets; return the result and the row: uint8 [expected], zero where masked.
+
+    Parameters
+    ----------
+    log
+        The packets; the returned row may share its memory.
+    frame_bytes
+        Bytes of one frame, 1 if the record has no frames. A record that ends a whole number of frames early has missed
+        triggers at unknown places.
+    past
+        Knowledge from earlier records.
+    not_before_ns
+        Time before the first pulse of the row (clock of the arrivals); 0 if unknown.
+    dropped_by_card
+        Names of the status bits by which the card reported data dropped before the packets were numbered: bytes are
+        missing without a gap in the counters, so that no byte's place is certain.
+    """
+    past = past or Past()
+    found = find_record(log, frame_bytes, past, not_before_ns)
+    row = _Row(log, found, past)
+    located, reason = found.located, found.reason
+    if dropped_by_card:
+        located, reason = False, f"the card dropped data before numbering it ({dropped_by_card})"
+    row.put_in_place()
+    if located and row.conflicts and not found.start_known:
+        located, reason = False, "packets with the same counters have different bytes: the card may have restarted"
+    if not located and row.counts.restarted and _RESTARTED not in reason:
+        reason = f"{_RESTARTED} within it" + (f"; {reason}" if found.certain else "")
+    holes = _merged([*_gaps(row.covered, row.extent), *row.conflicts])
+    missing = _merged([*holes, *([(row.extent, log.expected)] if row.extent < log.expected else [])])
+    out = row.bytes(missing if located else holes)
+    placed = Placed(
+        log.expected,
+        row.received,
+        missing if located else [(0, log.expected)] if log.expected else [],
+        located,
+        reason,
+        row.counts,
+        _losses(missing, row.extent, log.expected),
+        past_after(past, found, log, located, frame_bytes),
+        row.at,
+        row.arrivals(),
+        _merged(row.conflicts),
+        holes,
+        slipped=not located
+        and (found.certain or (found.fresh and not row.counts.restarted))
+        and row.extent > 0
+        and not dropped_by_card,
+    )
+    return placed, out
+
+
+def preview(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int) -> Preview:
+    """Return the progress of a row from its packets so far, without comparing or copying payload."""
+    found = find_record(log, frame_bytes, past, not_before_ns)
+    own = found.own & (found.offsets < log.expected)
+    if not own.any():
+        return Preview(0, log.expected == 0, ended=False)
+    starts, ends = found.offsets[own], np.minimum((found.offsets + log.sizes)[own], log.expected)
+    order = np.lexsort((ends, starts))
+    reached = np.maximum.accumulate(ends[order])
+    fresh = reached - np.maximum(np.append(0, reached[:-1]), starts[order])
+    received = int(np.maximum(fresh, 0).sum())
+    ended = bool((log.sizes[own][ends == ends.max()] < found.full).all())
+    return Preview(received, found.located and received == log.expected, ended)
+
+
+class _Row:
+    """Puts the packets of a record in place."""
+
+    def __init__(self, log: PacketLog, found: Found, past: Past) -> None:
+        self._log, self._found, self._past = log, found, past
+        self._sizes, self._starts = log.sizes, np.cumsum(log.sizes) - log.sizes
+        kept = np.arange(log.count) < log.kept
+        self._own = found.own & (found.offsets < log.expected) & kept
+        self.at: Counts = np.full(log.count, -1, dtype=np.int64)
+        self.covered: list[Gap] = []  # sorted, joined
+        self.conflicts: list[Gap] = []
+        self.received = self.extent = 0
+        self._stops = np.minimum(found.offsets + self._sizes, log.expected)
+        self._placed, self._duplicate, self._conflicting = np.zeros((3, log.count), dtype=np.bool_)
+        self.counts = PacketCounts()
+
+    def put_in_place(self) -> None:
+        """Select the packets to place, and compare those that overlap."""
+        self._place()
+        self.counts = count_packets(
+            self._log, self._found, self._past, self._placed, self._duplicate, self._conflicting
+        )
+        mine = np.flatnonzero(self._placed)
+        if not mine.size:
+            return
+        starts, stops = self._found.offsets[mine], self._stops[mine]
+        order = np.argsort(starts, kind="stable")
+        a, b = starts[order], np.maximum.accumulate(stops[order])
+        new = np.flatnonzero(np.append(True, a[1:] > b[:-1]))
+        self.covered = list(zip(a[new].tolist(), b[np.append(new[1:] - 1, len(b) - 1)].tolist(), strict=True))
+        self.extent, self.received = int(b[-1]), sum(stop - start for start, stop in self.covered)
+        reached = np.maximum.accumulate(np.append(0, stops))[:-1]
+        behind = reached - starts
+        self.counts.late = int((behind > 0).sum())
+        self.counts.late_by_bytes = max(0, int(behind.max()))
+        self.counts.short = int((self._sizes[mine] < self._found.full).sum())
+
+    def _place(self) -> None:
+        """Of packets at the same place, select the first and any with more bytes."""
+        own = np.flatnonzero(self._own)
+        offsets = self._found.offsets[own]
+        order = np.argsort(offsets, kind="stable")
+        sorted_offsets = offsets[order]
+        new = np.append(True, np.diff(sorted_offsets) != 0)[: order.size]
+        self._placed[own] = True
+        self.at[own] = offsets
+        if new.all():
+            return
+        firsts = np.flatnonzero(new)
+        for i, j in zip(firsts.tolist(), [*firsts[1:].tolist(), order.size], strict=True):
+            if j - i > 1:
+                self._overlap(own[order[i:j]].tolist())
+
+    def _overlap(self, packets: list[int]) -> None:
+        """Compare packets of one place, in order of arrival, with the longest so far."""
+        longest = packets[0]
+        for k in packets[1:]:
+            offset = int(self._found.offsets[k])
+            both = min(int(self._stops[k]), int(self._stops[longest])) - offset
+            if not np.array_equal(self._payload(k)[:both], self._payload(longest)[:both]):
+                self.conflicts.append((offset, offset + both))
+                self._placed[k], self._conflicting[k], self.at[k] = False, True, -1
+                if self._stops[k] > self._stops[longest]:
+                    self.conflicts.append((offset, int(self._stops[k])))
+                    self.conflicts.append((offset, int(self._stops[longest])))
+            elif self._stops[k] > self._stops[longest]:
+                longest = k
+            else:
+                self._placed[k], self._duplicate[k] = False, True
+
+    def _payload(self, k: int) -> Bytes:
+        return self._log.payload[self._starts[k] : self._starts[k] + self._sizes[k]]
+
+    def arrivals(self) -> Counts:
+        """Return the arrival time of each batch and the bytes received by then, int64 [n, 2]."""
+        batches = self._log.batches
+        if not batches.size:
+            return np.zeros((0, 2), dtype=np.int64)
+        reached = np.append(0, np.maximum.accumulate(np.where(self._placed, self._stops, 0)))
+        pairs = np.column_stack([batches[:, 0], reached[batches[:, 1]]])
+        return np.ascontiguousarray(pairs[pairs[:, 1] > 0])
+
+    def bytes(self, holes: list[Gap]) -> Bytes:
+        """Return the row: the log's own memory if the packets came in order, otherwise a copy. Zero at the holes."""
+        log, mine = self._log, np.flatnonzero(self._placed)
+        out = log.payload[: log.expected]
+        if (self.at[mine] != self._starts[mine]).any() or log.payload.size < log.expected:
+            out = np.zeros(log.expected, dtype=np.uint8)
+            self._copy(mine, out)
+        out[self.extent :] = 0
+        for start, stop in holes:
+            out[start:stop] = 0
+        return out
+
+    def _copy(self, mine: Counts, out: Bytes) -> None:
+        """Copy runs of packets that are consecutive in the log and in the row."""
+        if not mine.size:
+            return
+        offsets, sizes, starts, stops = self.at[mine], self._sizes[mine], self._starts[mine], self._stops[mine]
+        joined = (starts[1:] == starts[:-1] + sizes[:-1]) & (offsets[1:] == offsets[:-1] + sizes[:-1])
+        firsts = np.flatnonzero(np.append(True, ~joined))
+        lasts = np.append(firsts[1:] - 1, len(mine) - 1)
+        for i, j in zip(firsts.tolist(), lasts.tolist(), strict=True):
+            a, b = int(offsets[i]), int(stops[j])
+            out[a:b] = self._log.payload[starts[i] : starts[i] + b - a]
+
+
+def _losses(missing: list[Gap], extent: int, expected: int) -> Losses:
+    if not extent:
+        return Losses(tail_bytes=expected)
+    head = sum(b - a for a, b in missing if a == 0)
+    inner = [min(b, extent) - a for a, b in missing if 0 < a < extent]
+    return Losses(head, len(inner), sum(inner), expected - extent)
+
+
+def _gaps(covered: list[Gap], extent: int) -> list[Gap]:
+    """Return the ranges of [0, extent) that are not covered."""
+    edges = [0, *(edge for gap in covered for edge in gap), extent]
+    return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
+
+
+def _merged(gaps: list[Gap]) -> list[Gap]:
+    """Return the same bytes as sorted ranges that do not touch."""
+    out: list[Gap] = []
+    for start, stop in sorted(gaps):
+        if out and start <= out[-1][1]:
+            out[-1] = (out[-1][0], max(out[-1][1], stop))
+        else:
+            out.append((start, stop))
+    return out

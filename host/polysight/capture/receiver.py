@@ -1,0 +1,324 @@
+"""Start and control the receiver process of one card; the messages between host and process.
+
+Requests and answers are msgpack structs on an inherited connection. For each row: `BeginRow` with the file to write,
+`Progress` during reception, `EndRow`, and a `RowCapture` with the result. The process itself is `receiver_process.py`.
+"""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, Status
+from polysight.capture.scheduling import Core
+from polysight_shared.config import Board
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError
+
+_START_TIMEOUT_S = 30.0
+_ANSWER_TIMEOUT_S = 60.0  # ending a row waits for the disk
+
+
+class _Message(msgspec.Struct, frozen=True, tag=True):
+    pass
+
+
+class Open(_Message, frozen=True):
+    """Bind the data socket. Answered with Opened or Failed."""
+
+    board: str
+    host_address: str
+    data_port: int
+    card_address: str
+    buffer_bytes: int
+    core: int | None = None
+    own_core: bool = True
+
+
+class BeginRow(_Message, frozen=True):
+    """Drop pending packets and receive a row into the file at `path`. Answered with Began or Failed."""
+
+    row: int
+    take: int
+    expected_bytes: int
+    frame_bytes: int
+    path: str
+
+
+class EndRow(_Message, frozen=True):
+    """End the row: fetch pending packets, make the file durable. Answered with RowCapture or Failed.
+
+    `card_status` has the bits that the card reported since record start; some report lost data. `not_before_ns` as in
+    Report.
+    """
+
+    card_status: int = 0
+    not_before_ns: int = 0
+
+
+class Report(_Message, frozen=True):
+    """Request Progress. `not_before_ns` is a time before the first pulse (monotonic clock), 0 if unknown."""
+
+    not_before_ns: int = 0
+
+
+class Opened(_Message, frozen=True):
+    """The socket is bound. `scheduling` has core and priority, `warnings` what the system did not permit."""
+
+    granted_bytes: int
+    data_port: int
+    scheduling: str = ""
+    warnings: list[str] = []
+
+
+class Began(_Message, frozen=True):
+    """Ready for the row; `stale` packets from between rows were dropped."""
+
+    stale: int
+
+
+class Progress(_Message, frozen=True):
+    """Progress of the row; also sent without a request when every byte has arrived, and on the short last packet."""
+
+    row: int
+    take: int
+    received: int
+    complete: bool
+    last_arrival_ns: int  # monotonic clock; 0 before the first packet
+    ended: bool = False  # the furthest packet is short, as only the last of a record is
+
+
+class RowCapture(_Message, frozen=True):
+    """Reception of one row of one board.
+
+    `bytes` counts placed bytes, `missing` are the other byte ranges (the whole row if `located` is False). Arrival
+    times are of the host's monotonic clock, 0 without packets. Packet counts as in
+    :class:`polysight.capture.packet_counts.PacketCounts`, lost bytes as in
+    :class:`polysight.capture.placement.Losses`, `holes` and `slipped` as in
+    :class:`polysight.capture.placement.Placed`. `card_status` are the bits the card reported during the row.
+    """
+
+    row: int
+    take: int
+    expected: int
+    bytes: int
+    missing: list[tuple[int, int]]
+    located: bool
+    reason: str
+    packets: int
+    duplicates: int
+    late: int
+    outside: int
+    disagreeing: int
+    malformed: int
+    short: int
+    strangers: int
+    stale: int
+    kernel_drops: int
+    first_arrival_ns: int
+    last_arrival_ns: int
+    crc32: int
+    index_crc32: int
+    leftover: int = 0
+    late_by_bytes: int = 0
+    head_bytes: int = 0
+    gaps: int = 0
+    gap_bytes: int = 0
+    tail_bytes: int = 0
+    card_status: int = 0
+    holes: list[tuple[int, int]] = []
+    slipped: bool = False
+    conflicting: int = 0
+    restarted: int = 0
+    before_pulses: int = 0
+    clock_jumps: int = 0
+    packets_crc32: int = 0
+
+    @property
+    def missing_bytes(self) -> int:
+        """Number of missing or uncertain bytes."""
+        return sum(stop - start for start, stop in self.missing)
+
+    @property
+    def lost_before_packets(self) -> Status:
+        """The status bits that report data dropped by the card before numbering; 0 if none."""
+        return Status(self.card_status) & LOST_BEFORE_PACKETS
+
+    @property
+    def complete(self) -> bool:
+        """True if every byte of the row is there."""
+        return self.located and not self.missing
+
+
+class Failed(_Message, frozen=True):
+    """The request failed; fields as of a PolysightError."""
+
+    what: str
+    why: str = ""
+    remedy: str = ""
+    code: str = ErrorCode.OTHER
+
+
+Request = Open | BeginRow | EndRow | Report
+Answer = Opened | Began | Progress | RowCapture | Failed
+A = TypeVar("A", bound=Answer)
+_encoder = msgspec.msgpack.Encoder()
+_requests: Any = msgspec.msgpack.Decoder(Request)
+_answers: Any = msgspec.msgpack.Decoder(Answer)
+
+
+def send(connection: Connection, message: Request | Answer) -> None:
+    """Send one message. Raises DeviceError if the connection is closed."""
+    try:
+        connection.send_bytes(_encoder.encode(message))
+    except OSError as e:
+        what, why = f"the receiver's pipe broke: {e}", "the other process ended"
+        raise DeviceError(what, why, code=ErrorCode.NO_ANSWER) from None
+
+
+def next_request(connection: Connection) -> Request:
+    """Receive a request. Raises EOFError if the host has closed the connection."""
+    return _requests.decode(connection.recv_bytes())
+
+
+class ReceiverProcess:
+    """The receiver process of one card: `begin_row`, then `poll` until complete or timeout, then `end_row`.
+
+    Attributes `granted_bytes`, `scheduling` and `warnings` as in :class:`Opened`.
+
+    Parameters
+    ----------
+    board
+        Board with the addresses and ports.
+    buffer_bytes
+        Requested receive buffer.
+    core
+        Core to pin the process to, as chosen by :func:`polysight.capture.scheduling.receiver_cores`; None: any. A
+        shared core is used only with real-time priority.
+
+    Raises
+    ------
+    DeviceError
+        if the process does not start, or its address and port cannot be bound.
+    """
+
+    def __init__(self, board: Board, buffer_bytes: int, core: Core | None = None) -> None:
+        self.board = board
+        self._progress = Progress(-1, 0, 0, False, 0)
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "polysight.capture.receiver_process", str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,  # only the host handles Ctrl-C
+            )
+        self._connection = Connection(ours.detach())
+        try:
+            number, own = core or (None, True)
+            request = Open(
+                board.name, board.host_address, board.data_port, board.card_address, buffer_bytes, number, own
+            )
+            opened = self._ask(request, Opened, _START_TIMEOUT_S)
+        except DeviceError:
+            self.close()
+            raise
+        self.granted_bytes = opened.granted_bytes
+        self.scheduling, self.warnings = opened.scheduling, [f"{board.name}: {w}" for w in opened.warnings]
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def fileno(self) -> int:
+        """Return the descriptor that becomes readable when the process has sent a message."""
+        return self._connection.fileno()
+
+    def begin_row(self, row: int, take: int, expected_bytes: int, frame_bytes: int, path: Path) -> int:
+        """Receive a row into the file at `path`, with its index beside it; return the number of dropped stray packets.
+
+        Raises DeviceError if the file cannot be made.
+        """
+        request = BeginRow(row, take, expected_bytes, frame_bytes, str(path))
+        stale = self._ask(request, Began, _ANSWER_TIMEOUT_S).stale
+        self._progress = Progress(row, take, 0, expected_bytes == 0, 0)
+        return stale
+
+    def poll(self) -> Progress:
+        """Return the latest progress that the process has sent, without waiting."""
+        while self._connection.poll():
+            self._take(self._next())
+        return self._progress
+
+    def report(self, not_before_ns: int = 0) -> Progress:
+        """Request the progress; `not_before_ns` as in :class:`Report`."""
+        return self._ask(Report(not_before_ns), Progress, _ANSWER_TIMEOUT_S)
+
+    def end_row(self, card_status: Status | None = None, not_before_ns: int = 0) -> RowCapture:
+        """End the row; its file is durable on return. Raises DeviceError.
+
+        Packets from before `not_before_ns` (monotonic clock), a time before the first pulse, are left over. With bit 7
+        or 9 in `card_status`, the card dropped data before numbering it, and the row is masked as a whole.
+        """
+        return self._ask(EndRow(int(card_status or 0), not_before_ns), RowCapture, _ANSWER_TIMEOUT_S)
+
+    def close(self) -> None:
+        """End the process. Safe to repeat."""
+        self._connection.close()
+        try:
+            self._process.wait(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def __enter__(self) -> ReceiverProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _take(self, answer: Answer) -> None:
+        if isinstance(answer, Progress):
+            self._progress = answer
+        elif isinstance(answer, Failed):
+            raise DeviceError(answer.what, answer.why, answer.remedy, code=ErrorCode(answer.code))
+
+    def _next(self) -> Answer:
+        try:
+            return _answers.decode(self._connection.recv_bytes())
+        except (EOFError, OSError):
+            raise self._ended() from None
+
+    def _ended(self) -> DeviceError:
+        return DeviceError(
+            f"{self.board.name}: the receiver process ended with status {self._process.poll()}",
+            "it was killed, or it failed; its message is above",
+            "check with `dmesg` if the kernel ended it for lack of memory",
+            code=ErrorCode.NO_ANSWER,
+        )
+
+    def _ask(self, request: Request, kind: type[A], timeout_s: float) -> A:
+        try:
+            send(self._connection, request)
+        except DeviceError:
+            raise self._ended() from None
+        deadline = time.monotonic() + timeout_s
+        while self._connection.poll(max(0.0, deadline - time.monotonic())):
+            answer = self._next()
+            self._take(answer)
+            if isinstance(answer, kind):
+                return answer
+        raise DeviceError(
+            f"{self.board.name}: the receiver process did not answer {type(request).__name__} within {timeout_s:g} s",
+            "the machine or its disk is overloaded",
+            "check the load of the machine and its disk",
+            code=ErrorCode.NO_ANSWER,
+        )

@@ -1,0 +1,231 @@
+"""Receiver process of one card: `python -m polysight.capture.receiver_process FD`.
+
+A separate process, so that processing in the host cannot delay reception. It waits in one poll() for requests on the
+inherited socket FD and for the card's data, and ends when the socket closes, which happens at the latest when the host
+ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import signal
+import socket
+import sys
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.capture import receiver as messages
+from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, Status
+from polysight.capture.earlier_records import Past
+from polysight.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
+from polysight.capture.packet_file import PACKETS, Evidence, write_packets
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import Preview, place_record, preview
+from polysight.capture.scheduling import take_core, take_priority
+from polysight.capture.segment import Segment, write_index
+from polysight_shared.errors import DeviceError, PolysightError
+
+_MAX_BATCHES = 64  # batches fetched before requests are checked again
+_PREVIEW_SHARE = 20  # previews take at most 1/20 of the time
+_GATHER_MS = 1  # pause in which packets gather in the kernel's buffer: fewer, larger batches
+
+
+class _Row:
+    """A row during reception."""
+
+    def __init__(self, request: messages.BeginRow, segment: Segment, log: PacketLog, past: Past) -> None:
+        self.request, self.segment, self.log, self.past = request, segment, log, past
+        self.stale = self.strangers = self.drops = 0
+        self.not_before_ns = 0
+        self._reported = (False, False)
+        self._previewed = 0  # packets
+        self._next_preview_ns = 0
+        self._preview = Preview(0, request.expected_bytes == 0, ended=False)
+
+    def has_news(self) -> bool:
+        """True if the host must be notified: the row has become complete, or its last packet came."""
+        log = self.log
+        if log.payload_bytes < log.expected and not log.last_is_short:
+            return False
+        if log.count == self._previewed or (began := time.monotonic_ns()) < self._next_preview_ns:
+            return False
+        self._update()
+        self._next_preview_ns = time.monotonic_ns() + _PREVIEW_SHARE * (time.monotonic_ns() - began)
+        reported, self._reported = self._reported, (self._preview.complete, self._preview.ended)
+        return self._reported != reported and any(self._reported)
+
+    def progress(self) -> messages.Progress:
+        self._update()
+        p, r = self._preview, self.request
+        return messages.Progress(r.row, r.take, p.received, p.complete, self.log.last_arrival_ns, p.ended)
+
+    def _update(self) -> None:
+        if self.log.count != self._previewed:
+            self._previewed = self.log.count
+            self._preview = preview(self.log, self.request.frame_bytes, self.past, self.not_before_ns)
+
+
+class Receiver:
+    """Serves one card until the host closes the connection."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._socket: socket.socket | None = None
+        self._batches: BatchReceiver | None = None
+        self._row: _Row | None = None
+        self._past = Past()  # knowledge from earlier records
+        self._memory: NDArray[np.uint8] | None = None  # of the previous row, to be reused
+
+    def serve(self) -> None:
+        """Answer requests and receive until the connection closes."""
+        poll, requests = select.poll(), select.poll()
+        poll.register(self._connection.fileno(), select.POLLIN)
+        requests.register(self._connection.fileno(), select.POLLIN)
+        while True:
+            ready = dict(poll.poll())
+            if self._socket is not None and self._socket.fileno() in ready and self._row is not None:
+                self._receive()
+                requests.poll(_GATHER_MS)
+            if self._connection.fileno() in ready:
+                try:
+                    request = messages.next_request(self._connection)
+                except (EOFError, OSError):
+                    break
+                try:
+                    answer = self._answer(request)
+                except PolysightError as e:
+                    answer = messages.Failed(e.what, e.why, e.remedy, e.code)
+                messages.send(self._connection, answer)
+                # Between rows the socket is not polled: stray packets wait there until the next row drops them.
+                if self._socket is not None and self._row is not None:
+                    poll.register(self._socket.fileno(), select.POLLIN)
+                elif self._socket is not None:
+                    with contextlib.suppress(KeyError):
+                        poll.unregister(self._socket.fileno())
+        if self._row is not None:
+            self._row.segment.discard()
+
+    def _answer(self, request: messages.Request) -> messages.Answer:
+        if isinstance(request, messages.Open):
+            return self._open(request)
+        if isinstance(request, messages.BeginRow):
+            return self._begin(request)
+        if isinstance(request, messages.EndRow):
+            return self._end(request)
+        if self._row is None:
+            return messages.Progress(-1, 0, 0, False, 0)
+        self._row.not_before_ns = request.not_before_ns or self._row.not_before_ns
+        return self._row.progress()
+
+    def _open(self, request: messages.Open) -> messages.Answer:
+        self._socket = bind_udp(request.host_address, request.data_port, f"{request.board} data")
+        granted = enlarge_receive_buffer(self._socket, request.buffer_bytes)
+        self._batches = BatchReceiver(self._socket, request.card_address)
+        priority, ordinary = take_priority()
+        core, unpinned = take_core(request.core, request.own_core, urgent=not ordinary)
+        scheduling = f"{'any core' if core is None else f'core {core}'}, {priority}"
+        port = self._socket.getsockname()[1]
+        return messages.Opened(granted, port, scheduling, [w for w in (unpinned, ordinary) if w])
+
+    def _begin(self, request: messages.BeginRow) -> messages.Answer:
+        if self._socket is None or self._batches is None:
+            raise DeviceError("the receiver has no socket yet")
+        if self._row is not None:
+            self._discard()
+        segment = Segment(Path(request.path), request.expected_bytes)
+        try:
+            log = PacketLog(request.expected_bytes, self._memory)
+        except MemoryError:
+            segment.discard()
+            what = f"{request.path}: no memory for a row of {request.expected_bytes} bytes"
+            raise DeviceError(what, "the row is larger than memory") from None
+        strays = PacketLog(0)
+        while n := self._batches.receive():
+            strays.add(self._batches.packets[:n], self._batches.lengths[:n], time.monotonic_ns())
+        self._past = self._past.starts_after(strays)
+        self._row = row = _Row(request, segment, log, self._past)
+        row.stale, row.strangers = strays.count + strays.malformed, self._batches.strangers
+        row.drops = kernel_drops(self._socket)
+        return messages.Began(row.stale)
+
+    def _discard(self) -> None:
+        """Discard the row; the end of its record is unknown then."""
+        if self._row is not None:
+            self._row.segment.discard()
+        self._row, self._past = None, Past(spans=self._past.spans)
+
+    def _receive(self) -> None:
+        row, batches = self._row, self._batches
+        if row is None or batches is None:
+            return
+        for _ in range(_MAX_BATCHES):
+            read_ns = time.monotonic_ns()
+            n = batches.receive()
+            if n == 0:
+                row.log.note_quiet(read_ns)
+                break
+            row.log.add(batches.packets[:n], batches.lengths[:n], time.monotonic_ns())
+        if row.has_news():
+            messages.send(self._connection, row.progress())
+
+    def _end(self, request: messages.EndRow) -> messages.Answer:
+        row = self._row
+        if row is None or self._socket is None or self._batches is None:
+            raise DeviceError("no row is being received")
+        self._receive()
+        self._row = None
+        begun, log, path = row.request, row.log, Path(row.request.path)
+        dropped = (Status(request.card_status) & LOST_BEFORE_PACKETS).name or ""
+        not_before_ns = max(request.not_before_ns, row.not_before_ns)
+        evidence = Evidence(begun.expected_bytes, begun.frame_bytes, not_before_ns, dropped, row.past)
+        placed, out = place_record(log, begun.frame_bytes, row.past, not_before_ns, dropped)
+        self._past, self._memory = placed.past, log.payload
+        crc = row.segment.finish(out)
+        facts = {"row": begun.row, "take": begun.take, **placed.facts(), "card_status": request.card_status}
+        index_crc = write_index(path.with_suffix(".idx"), facts, placed.arrivals)
+        counts, losses, arrivals = vars(placed.counts).copy(), vars(placed.losses), placed.arrivals
+        counts["packets"] = counts.pop("placed")
+        return messages.RowCapture(
+            row=begun.row,
+            take=begun.take,
+            expected=placed.expected,
+            bytes=placed.received,
+            missing=placed.missing,
+            located=placed.located,
+            reason=placed.reason,
+            strangers=self._batches.strangers - row.strangers,
+            stale=row.stale,
+            kernel_drops=kernel_drops(self._socket) - row.drops,
+            first_arrival_ns=int(arrivals[0, 0]) if arrivals.size else 0,
+            last_arrival_ns=int(arrivals[-1, 0]) if arrivals.size else 0,
+            crc32=crc,
+            index_crc32=index_crc,
+            packets_crc32=write_packets(path.with_suffix(PACKETS), log, evidence, placed),
+            card_status=request.card_status,
+            holes=placed.holes,
+            slipped=placed.slipped,
+            **counts,
+            **losses,
+        )
+
+
+def main(argv: list[str]) -> int:
+    """Run the receiver on the inherited socket; its descriptor is the only argument."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the host decides when a row ends
+    with Connection(int(argv[1])) as connection:
+        try:
+            Receiver(connection).serve()
+        except PolysightError as e:
+            with contextlib.suppress(DeviceError):  # the host may have ended
+                messages.send(connection, messages.Failed(e.what, e.why, e.remedy, e.code))
+            return e.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv))

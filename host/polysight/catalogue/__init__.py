@@ -1,0 +1,55 @@
+"""Recorded and processed scans for lists, pages and commands; nothing is processed here.
+
+`Scans` lists the scans under a folder and finds the folder of one by its name. `Notes` are the operator's notes and
+tags beside a scan. Of a processed scan, `result_of` gives the results as plain data, `draw_products` draws its maps and
+`probe` reads one place; `compare` takes two scans. They share `Pixels`: images with permittivity and errors.
+"""
+
+from polysight.catalogue.compare import DIFFERENCE, Comparison, compare, draw_comparison
+from polysight.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes, write_notes
+from polysight.catalogue.pictures import (
+    AMPLITUDE,
+    MAPS,
+    PHASE,
+    Picture,
+    colour_bar,
+    draw,
+    draw_products,
+    thumbnail,
+)
+from polysight.catalogue.pixels import Pixels
+from polysight.catalogue.probe import probe
+from polysight.catalogue.result import EXPORT, files_of, result_of
+from polysight.catalogue.scans import Scans, folder_bytes
+from polysight.catalogue.summary import PROGRAM, Summary, log_tail
+
+__all__ = [
+    "AMPLITUDE",
+    "DIFFERENCE",
+    "EXPORT",
+    "MAPS",
+    "NOTES",
+    "PHASE",
+    "PROGRAM",
+    "Comparison",
+    "Notes",
+    "Picture",
+    "Pixels",
+    "Scans",
+    "Summary",
+    "colour_bar",
+    "compare",
+    "draw",
+    "draw_comparison",
+    "draw_products",
+    "files_of",
+    "folder_bytes",
+    "is_plain",
+    "log_tail",
+    "printable",
+    "probe",
+    "read_notes",
+    "result_of",
+    "thumbnail",
+    "write_notes",
+]

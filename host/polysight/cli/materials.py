@@ -1,0 +1,319 @@
+"""The commands on materials: materials, report, permittivity, concentration, classify, train, export, label."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from polysight.cli.options import Add, add_config_option, add_json_option, add_model_option, count, number
+from polysight.data import packaged
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+
+if TYPE_CHECKING:
+    from polysight.materials import Layer
+
+
+def _materials(args: argparse.Namespace) -> int:
+    from polysight.jobs.materials import materials
+
+    return materials(args.data, args.json)
+
+
+def _report(args: argparse.Namespace) -> int:
+    from polysight.jobs.materials import report
+
+    return report(args.scan)
+
+
+def _permittivity(args: argparse.Namespace) -> int:
+    from polysight.jobs.materials import permittivity
+
+    given = {"--bands": args.bands, "--amplitude": args.amplitude, "--config": args.config}
+    useless = [name for name, value in given.items() if value is not None]
+    if useless and not args.layer:
+        raise ConfigError(
+            f"{' and '.join(useless)} without --layer would do nothing",
+            "it says how layers are fitted; one interface needs none of it",
+            "add the layers (--layer), or leave it out",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
+    amplitude = 10.0 if args.amplitude is None else args.amplitude
+    return permittivity(args.products, args.config, args.layer, args.segment, args.json, args.bands, amplitude / 100)
+
+
+def _concentration(args: argparse.Namespace) -> int:
+    from polysight.jobs.materials import concentration
+
+    return concentration(args.data, dict(args.value), args.confidence, args.json)
+
+
+def _classify(args: argparse.Namespace) -> int:
+    from polysight.jobs.classify import classify
+
+    return classify(args.data, args.library, args.model, args.json)
+
+
+def _layer(text: str) -> Layer:
+    from polysight.materials import LAYER_FORMS, parse_layer
+
+    try:
+        return parse_layer(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no layer: write {LAYER_FORMS}") from None
+
+
+def _value(text: str) -> tuple[str, float]:
+    name, _, number = text.rpartition("=")
+    try:
+        return name, float(number)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=PERCENT, e.g. water=0") from None
+
+
+_percent = number(float, "a percentage from 0 to 100", lambda value: 0 <= value <= 100)
+
+
+_share = number(float, "a share from 0.5 to below 1", lambda value: 0.5 <= value < 1)
+
+
+def add_commands(add: Add) -> None:
+    """Register the commands."""
+    _add_results(add)
+    _add_permittivity(add)
+    _add_concentration(add)
+    _add_classify(add)
+    _add_train(add)
+    _add_export(add)
+    _add_label(add)
+
+
+def _add_results(add: Add) -> None:
+    sub = add(
+        "materials",
+        _materials,
+        "print names and permittivities of the patches of processed scans",
+        "polysight materials out/one",
+    )
+    sub.add_argument("data", type=Path, nargs="+", metavar="DATA", help="scan folders, or folders of products")
+    add_json_option(sub)
+
+    sub = add(
+        "report", _report, "print where a scan's report is; make it if it is missing", "polysight report scans/one"
+    )
+    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder, or a folder of products")
+
+
+def _add_permittivity(add: Add) -> None:
+    sub = add(
+        "permittivity",
+        _permittivity,
+        "print the permittivity of patches, also of a layer in a stack",
+        "polysight permittivity out/one --segment 3 --layer glass,5.5,0.05,3 --layer liquid,?\n"
+        "  polysight permittivity out/one --layer sheet,?,0.5-3 --layer plate,metal",
+    )
+    sub.add_argument("products", type=Path, metavar="PRODUCTS", help="folder of products, or a scan folder")
+    sub.add_argument("--segment", type=int, metavar="N", help="this patch only (default: all)")
+    sub.add_argument(
+        "--layer",
+        type=_layer,
+        action="append",
+        default=[],
+        metavar="LAYER",
+        help="a layer, in the order the wave meets them; known: NAME,REAL,LOSS,MM or NAME,metal; unknown: NAME,?,MM,"
+        " with its thickness fitted NAME,?,A-B (mm) or NAME,?,?; without MM the last layer has no back",
+    )
+    add_json_option(sub)
+    group = sub.add_argument_group("with --layer")
+    group.add_argument(
+        "--bands",
+        type=count,
+        metavar="K",
+        help="use K sub-bands, as processed with --bands K (default: all where a thickness is fitted, else none)",
+    )
+    group.add_argument(
+        "--amplitude", type=_percent, metavar="PERCENT", help="error of |H| (default: 10; 0: use the ratio alone)"
+    )
+    group.add_argument("--config", type=Path, metavar="FILE", help="rig file of the chirp (default: the products')")
+
+
+def _add_concentration(add: Add) -> None:
+    sub = add(
+        "concentration",
+        _concentration,
+        "estimate the concentration of solutions from the polarisation angle",
+        "polysight concentration sugar.npz --value water=0",
+    )
+    sub.add_argument("data", type=Path, metavar="LIBRARY", help="library (.npz), or folder of published material files")
+    sub.add_argument(
+        "--value",
+        type=_value,
+        action="append",
+        default=[],
+        metavar="NAME=PERCENT",
+        help="concentration of a material without one in its name, such as '(3.8%%)'",
+    )
+    sub.add_argument("--confidence", type=_share, default=0.9, help="of the intervals (default: 0.9)")
+    add_json_option(sub)
+
+
+def _add_classify(add: Add) -> None:
+    sub = add(
+        "classify",
+        _classify,
+        "name the patches of processed scans, or judge the classifiers on a library",
+        "polysight classify out/at-60 out/at-55",
+    )
+    sub.add_argument(
+        "data",
+        type=Path,
+        nargs="+",
+        metavar="DATA",
+        help="folders of products, one for each angle the patches were scanned under; or one library (.npz) or folder"
+        " of published material files",
+    )
+    sub.add_argument("--library", type=Path, metavar="FILE", help="reference library (default: the simulated one)")
+    add_model_option(sub)
+    add_json_option(sub)
+
+
+def _train(args: argparse.Namespace) -> int:
+    if args.authors is not None and (args.data or args.simulate):
+        raise ConfigError(
+            f"{'DATA' if args.data else '--simulate'} and --authors together",
+            "a library is made of scans of this rig, or of the published files: not of both",
+            "give one of them",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
+    if args.authors is not None:
+        from polysight_papers.sensys2026.dataset import train_authors
+
+        return train_authors(args.authors, args.config, args.out)
+    from polysight.jobs.train import train
+
+    scenes = None if args.simulate is None else packaged(args.simulate)
+    return train(scenes, args.data, args.config, args.out, args.times)
+
+
+def _add_train(add: Add) -> None:
+    sub = add(
+        "train",
+        _train,
+        "make a reference library from labelled or simulated scans",
+        "polysight train --simulate examples/library --out library.npz",
+        ("--simulate", "--authors"),
+    )
+    sub.add_argument("data", type=Path, nargs="*", metavar="DATA", help="labelled or simulated scans")
+    sub.add_argument("--simulate", type=Path, metavar="DIR", help="simulate every scene in DIR and use it")
+    sub.add_argument(
+        "--times", type=count, default=1, metavar="N", help="simulate each scene N times, with other specimens"
+    )
+    sub.add_argument("--authors", type=Path, metavar="DIR", help="the published data set (materials/, labels/)")
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help="library to write (.npz)")
+    add_config_option(sub, shipped=True)
+
+
+_FORMATS = {
+    "csv": "materials.csv: a line a patch, permittivity with standard errors",
+    "hdf5": "image.h5: arrays with axes, units, config, versions (needs h5py)",
+    "netcdf": "image.nc: an xarray dataset; complex variables as h_real, h_imag (needs h5netcdf)",
+    "zarr": "image.zarr: the same dataset as a Zarr store (needs zarr)",
+    "mat": "image.mat: for MATLAB and Octave",
+}
+
+
+def _export(args: argparse.Namespace) -> int:
+    formats = [name for name in _FORMATS if getattr(args, name)]
+    if args.cphd:
+        from polysight.jobs.phase_history import export_cphd
+
+        export_cphd(args.products, args.out)
+        if not formats:
+            return 0
+    from polysight.report import export
+
+    return export(args.products, formats, args.out)
+
+
+def _add_export(add: Add) -> None:
+    sub = add(
+        "export",
+        _export,
+        "export a processed scan to HDF5, NetCDF, Zarr, MATLAB, CSV or CPHD",
+        "polysight export out/one --hdf5 --csv",
+        ("--csv", "--hdf5", "--netcdf"),
+    )
+    sub.add_argument("products", type=Path, metavar="DIR", help="folder of products, or a scan folder")
+    for name, text in _FORMATS.items():
+        sub.add_argument(f"--{name}", action="store_true", help=text)
+    sub.add_argument(
+        "--cphd",
+        action="store_true",
+        help="phase-history.cphd: the rows as bistatic phase history, for SAR processors (needs sarkit)",
+    )
+    sub.add_argument("--out", type=Path, metavar="DIR", help="folder to write into (default: DIR-export beside it)")
+
+
+_LABEL_EXAMPLES = (
+    "polysight label scans/one                               # asks for the name of each patch\n"
+    "  polysight label scans/one --from-patches --metal 1 --rename 2=oak --rename 3=glass\n"
+    "  polysight label scans/one --box oak=-20,-20,20,20 --specimen 'oak=board 7'"
+)
+
+
+def _label(args: argparse.Namespace) -> int:
+    from polysight.jobs.label import Edits, label
+
+    edits = Edits(args.from_patches, args.remove, args.rename, args.box, args.specimen, args.metal)
+    return label(args.scan, edits, args.list, input if sys.stdin.isatty() else None)
+
+
+def _box(text: str) -> tuple[str, tuple[float, float, float, float]]:
+    name, _, corners = text.rpartition("=")
+    try:
+        x0, y0, x1, y1 = (float(part) for part in corners.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=x0,y0,x1,y1 in mm") from None
+    return name, (x0, y0, x1, y1)
+
+
+def _pair(text: str) -> str:
+    if "=" not in text.strip("="):
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=TEXT")
+    return text
+
+
+def _add_label(add: Add) -> None:
+    sub = add(
+        "label",
+        _label,
+        "draw and name boxes on a processed scan, as training data",
+        _LABEL_EXAMPLES,
+        ("--from-patches", "--rename", "--box"),
+    )
+    sub.add_argument("scan", type=Path, metavar="SCAN", help="processed scan folder, or a folder of products")
+    sub.add_argument("--from-patches", action="store_true", help="begin with the patches found, named by number")
+    sub.add_argument(
+        "--rename", type=_pair, action="append", default=[], metavar="OLD=NEW", help="rename a box or a patch's number"
+    )
+    sub.add_argument(
+        "--box",
+        type=_box,
+        action="append",
+        default=[],
+        metavar="NAME=x0,y0,x1,y1",
+        help="draw a box: corners in mm from the image centre; NAME#2 is a second piece of the same material",
+    )
+    sub.add_argument("--remove", action="append", default=[], metavar="NAME", help="remove a box")
+    sub.add_argument("--metal", metavar="NAME", help="the metal reference (default: the box with a metal's name)")
+    sub.add_argument(
+        "--specimen",
+        type=_pair,
+        action="append",
+        default=[],
+        metavar="NAME=WHICH",
+        help="name the piece of material in a box, the same in every scan of it",
+    )
+    sub.add_argument("--list", action="store_true", help="print boxes and patches, and write nothing")

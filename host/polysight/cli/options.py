@@ -1,0 +1,219 @@
+"""The parser of commands, its short help, and options that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from polysight.data import packaged
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+
+RIG = Path("instrument.toml")
+_FIRST = 3  # options before "more options"
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser with a short help: usage, one sentence, example, arguments, the most used options, then the rest.
+
+    Attributes
+    ----------
+    most_used
+        Options that are shown first, besides the required ones; others follow in the order of their definition.
+    """
+
+    most_used: tuple[str, ...] = ()
+
+    def format_usage(self) -> str:
+        """One line: required options and arguments, and `[options]` for all others."""
+        named = [a for a in self._actions if a.option_strings]
+        formatter = self._get_formatter()
+        formatter.add_usage(None, [a for a in self._actions if a.required or not a.option_strings], [])
+        optional = " [options]" if any(not a.required for a in named) else ""
+        return formatter.format_help().rstrip() + f"{optional}\n"
+
+    def format_help(self) -> str:
+        """The help text."""
+        groups = self._action_groups[2:]  # the first two are argparse's own
+        grouped = [a for group in groups for a in group._group_actions]
+        named = [a for a in self._actions if a.option_strings and a not in grouped]
+        named.sort(key=lambda a: (not a.required, not set(self.most_used) & set(a.option_strings), a.dest == "help"))
+        first = _FIRST if len(named) > _FIRST + 1 else len(named)  # no section for --help alone
+        formatter = self._get_formatter()
+        formatter.add_text(self.description)
+        formatter.add_text(self.epilog)
+        for title, text, actions in (
+            ("arguments", None, [a for a in self._actions if not a.option_strings and a not in grouped]),
+            ("options", None, named[:first]),
+            ("more options", None, named[first:]),
+            *((group.title, group.description, group._group_actions) for group in groups),
+        ):
+            formatter.start_section(title)
+            formatter.add_text(text)
+            formatter.add_arguments(actions)
+            formatter.end_section()
+        return f"{self.format_usage()}\n{formatter.format_help()}"
+
+
+def describe(sub: argparse.ArgumentParser, text: str, example: str) -> None:
+    """Set the description and the example of a command's help."""
+    sub.description, sub.epilog = f"{text[0].upper()}{text[1:]}.", f"example:\n  {example}"
+    sub.formatter_class = argparse.RawDescriptionHelpFormatter
+
+
+class Add(Protocol):
+    """Adds a command to `polysight`, and returns its parser."""
+
+    def __call__(
+        self,
+        name: str,
+        run: Callable[[argparse.Namespace], int],
+        text: str,
+        example: str,
+        most_used: tuple[str, ...] = (),
+    ) -> CommandParser:
+        """A parser for the options of the command; `most_used` are shown first in its help."""
+        ...
+
+
+def add_action(
+    actions: argparse._SubParsersAction[Any],
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    text: str,
+    example: str,
+) -> argparse.ArgumentParser:
+    """Add an action of a command, such as `polysight card reset`; returns its parser."""
+    sub = actions.add_parser(name, help=text)
+    describe(sub, text, example)
+    sub.set_defaults(run=run)
+    return sub
+
+
+def add_json_option(sub: argparse.ArgumentParser) -> None:
+    """Add `--json`."""
+    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+
+
+def material_request(args: argparse.Namespace) -> dict[str, Any]:
+    """Fields of a ProcessRequest from the options of :func:`add_material_options`.
+
+    Raises
+    ------
+    ConfigError
+        when an option would have no effect.
+    """
+    given = {"--library": args.library, "--metal": args.metal, "--labels": args.labels, "--model": args.model}
+    asked = [name for name, value in given.items() if value is not None]
+    if asked and getattr(args, "no_process", False):
+        raise ConfigError(
+            f"{' and '.join(asked)} with --no-process would do nothing",
+            "it says how the scan is processed, and it will only be recorded",
+            "give it to `polysight process` later, or leave --no-process out",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
+    if args.library is not None and args.model == "none":
+        raise ConfigError(
+            "--library with --model none would do nothing", "nothing is named", "leave one of them out",
+            code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
+    return {
+        "metal_box_mm": args.metal,
+        "library": text_of(args.library),
+        "model": args.model,
+        "labels": text_of(args.labels),
+    }
+
+
+def text_of(path: Path | None) -> str | None:
+    """A path as text, for a request."""
+    return None if path is None else str(path)
+
+
+def rig_file(config: Path | None, data: Path) -> Path | None:
+    """The rig file that is given, or the one in the folder of the data, or in the current folder."""
+    return config or next((rig for rig in (data / RIG, RIG) if rig.exists()), None)
+
+
+def box(text: str) -> tuple[float, float, float, float]:
+    """Parse `x,y,width,height` in millimetres into corners (x0, y0, x1, y1)."""
+    try:
+        x, y, w, h = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not of the form x,y,width,height in mm, e.g. 0,0,40,40"
+        ) from None
+    if w <= 0 or h <= 0:
+        raise argparse.ArgumentTypeError(f"width and height of {text!r} must be positive")
+    return x - w / 2, y - h / 2, x + w / 2, y + h / 2
+
+
+def joined(words: Sequence[str]) -> list[str]:
+    """Return the words such that argparse takes `-45,0,40,40` for a value: `--metal -45,0,40,40`, `probe -60,0`."""
+    out: list[str] = []
+    for word in words:
+        if not re.fullmatch(r"-[\d.]+(,[-\d.]+)+", word):
+            out.append(word)
+        elif out and out[-1].startswith("--") and "=" not in out[-1]:
+            out[-1] += f"={word}"
+        else:
+            out.append(f" {word}")  # a blank in front: no option
+    return out
+
+
+def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
+    """Add `--model`; with `none` also the choice to name nothing."""
+    names = ["knn", "discriminant", *(["none"] if none else [])]
+    text = "classifier (default: discriminant; knn is the paper's"
+    sub.add_argument("--model", choices=names, help=text + ("; none: name nothing)" if none else ")"))
+
+
+def add_config_option(sub: argparse.ArgumentParser, shipped: bool = False) -> None:
+    """Add `--config`; with `shipped` the packaged rig file is used where the current folder has none."""
+    where = "instrument.toml here, or the packaged one" if shipped else "instrument.toml"
+    default = packaged(RIG) if shipped else RIG
+    sub.add_argument("--config", type=Path, default=default, metavar="FILE", help=f"rig file (default: {where})")
+
+
+def add_material_options(sub: argparse.ArgumentParser) -> None:
+    """Add the options that say how patches are named."""
+    sub.add_argument("--library", type=Path, metavar="FILE", help="reference library (default: the simulated one)")
+    sub.add_argument(
+        "--metal",
+        type=box,
+        metavar="X,Y,W,H",
+        help="metal reference: centre and size in mm from the image centre, e.g. -60,0,40,40 (default: found)",
+    )
+    sub.add_argument(
+        "--labels",
+        type=Path,
+        metavar="FILE",
+        help="use the boxes of this file (polysight label, or the authors') instead of finding patches",
+    )
+    add_model_option(sub, none=True)
+
+
+Number = TypeVar("Number", int, float)
+
+
+def number(kind: Callable[[str], Number], rule: str, holds: Callable[[Number], bool]) -> Callable[[str], Number]:
+    """A `type` for argparse: a number for which `holds` is true; else the error is "... is not `rule`"."""
+
+    def convert(text: str) -> Number:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not holds(value):
+            raise argparse.ArgumentTypeError(f"{text} is not {rule}")
+        return value
+
+    return convert
+
+
+positive = number(float, "a number above 0", lambda value: 0 < value < math.inf)
+count = number(int, "a whole number, 1 or more", lambda value: value >= 1)

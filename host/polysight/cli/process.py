@@ -1,0 +1,161 @@
+"""The commands that turn recorded data into images: process, image, focus, sync-report."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from polysight.cli.options import (
+    Add,
+    add_material_options,
+    count,
+    material_request,
+    positive,
+    rig_file,
+    text_of,
+)
+
+if TYPE_CHECKING:
+    from polysight.process import ProcessRequest
+
+
+def request_of(args: argparse.Namespace, data: Path, out: Path) -> ProcessRequest:
+    """The request of `polysight process` for one scan. Raises ConfigError."""
+    from polysight.process import ProcessRequest
+
+    return ProcessRequest(
+        data=str(data),
+        out=str(out),
+        config=text_of(rig_file(args.config, data)),
+        reference=text_of(args.reference),
+        incidence=args.incidence,
+        bands=args.bands,
+        **material_request(args),
+    )
+
+
+def _process(args: argparse.Namespace) -> int:
+    from polysight.jobs.batch import process_several, scans_of
+    from polysight.jobs.process import process
+
+    scans = scans_of(args.data)
+    if len(args.data) == 1 and scans == args.data and args.dask is None:
+        return process(request_of(args, args.data[0], args.out))
+    requests = [request_of(args, data.absolute(), args.out.absolute() / data.absolute().name) for data in scans]
+    return process_several(requests, args.out, args.jobs, args.dask, args.again)
+
+
+def _image(args: argparse.Namespace) -> int:
+    from polysight.imaging import View
+    from polysight.jobs.process import image
+
+    view = View(args.depth, *(args.grid or (None, None, None)))
+    return image(args.data, args.out, rig_file(args.config, args.data), view)
+
+
+def _focus(args: argparse.Namespace) -> int:
+    from polysight.jobs.process import focus
+
+    return focus(args.data, args.out, rig_file(args.config, args.data), args.depth)
+
+
+def _sync_report(args: argparse.Namespace) -> int:
+    from polysight.jobs.process import sync_report
+
+    return sync_report(args.data, args.out, rig_file(args.config, args.data))
+
+
+def add_commands(add: Add) -> None:
+    """Register the commands."""
+    sub = add(
+        "process",
+        _process,
+        "make images, material names and a report from recorded data",
+        "polysight process scans/one --out out/one",
+        ("--library", "--metal"),
+    )
+    _add_data(sub, several=True)
+    add_material_options(sub)
+    _add_polarimetry_options(sub)
+    _add_several_options(sub)
+    sub = add("image", _image, "make only the images from recorded data", "polysight image scans/one --out out/one")
+    _add_data(sub)
+    sub.add_argument(
+        "--depth",
+        type=float,
+        default=0.0,
+        metavar="MM",
+        help="shift of the imaged plane, away from the rig (default: 0)",
+    )
+    sub.add_argument(
+        "--grid", type=grid, metavar="COLUMNSxROWS@MM", help="number and distance of pixels (default: the rig file's)"
+    )
+    sub = add(
+        "focus",
+        _focus,
+        "find the distance and tilt of the object plane by the sharpness of the image",
+        "polysight focus scans/one --out out/focus",
+    )
+    _add_data(sub)
+    sub.add_argument(
+        "--depth", type=positive, default=8.0, metavar="MM", help="search range to either side (default: 8 mm)"
+    )
+    sub = add(
+        "sync-report",
+        _sync_report,
+        "report the errors that synchronisation leaves, beside the Cramer-Rao bound",
+        "polysight sync-report scans/one --out out/sync",
+    )
+    _add_data(sub)
+
+
+def _add_data(sub: argparse.ArgumentParser, several: bool = False) -> None:
+    """Recorded data, the folder of results, and the rig file of published data."""
+    text = "scan folder, or published unsynced/<scan> or raw/<scan>" + ("; or several, or a folder of them" * several)
+    sub.add_argument("data", type=Path, nargs="+" if several else None, metavar="DATA", help=text)
+    sub.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the results; earlier ones are replaced"
+    )
+    sub.add_argument(
+        "--config", type=Path, metavar="FILE", help="rig file of published data (default: instrument.toml beside it)"
+    )
+
+
+def _add_several_options(sub: argparse.ArgumentParser) -> None:
+    group = sub.add_argument_group(
+        "several scans", "their products go to DIR/<scan>/, their messages to DIR/<scan>.log"
+    )
+    group.add_argument("--jobs", type=count, metavar="N", help="scans at a time (default: as cores and memory allow)")
+    group.add_argument("--again", action="store_true", help="process finished scans again")
+    group.add_argument(
+        "--dask", metavar="ADDRESS", help="use a Dask cluster with the same folders, e.g. tcp://host:8786"
+    )
+
+
+def grid(text: str) -> tuple[int, int, float]:
+    """`COLUMNSxROWS@MM`: pixels and their distance."""
+    words = re.fullmatch(r"(\d{1,4})x(\d{1,4})@(\d+(?:\.\d+)?)", text)
+    columns, rows, pixel_mm = (int(words[1]), int(words[2]), float(words[3])) if words else (0, 0, 0.0)
+    if min(columns, rows) < 2 or pixel_mm <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: a grid is COLUMNSxROWS@MM, for example 300x300@1")
+    return columns, rows, pixel_mm
+
+
+def _add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--reference",
+        type=Path,
+        metavar="SCAN",
+        help="scan of a metal plate as reference (default: metal in the scene)",
+    )
+    sub.add_argument(
+        "--incidence",
+        choices=["one", "pixel"],
+        default="one",
+        help="incidence angle: one for the image (default), or each pixel's own",
+    )
+    sub.add_argument(
+        "--bands", type=count, default=1, metavar="K", help="also image K sub-bands, to fit layers (default: none)"
+    )

@@ -1,0 +1,317 @@
+"""The commands around a rig: plan, doctor, card, inspect, radar."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from polysight.cli.options import Add, add_action, add_config_option, add_json_option, count, number, positive
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+
+
+def add_commands(add: Add) -> None:
+    """Register the commands."""
+    _add_plan(add)
+    _add_doctor(add)
+    _add_card(add)
+    _add_inspect(add)
+    _add_radar(add)
+
+
+# --- plan ---
+
+_NUMBERS = (
+    ("--columns", count, "positions in a row"),
+    ("--rows", count, "rows"),
+    ("--step-x-mm", positive, "distance of positions in a row; the aperture keeps its size"),
+    ("--step-y-mm", positive, "distance of rows; the aperture keeps its size"),
+    ("--width-mm", positive, "aperture in x"),
+    ("--height-mm", positive, "aperture in y"),
+    ("--object-distance-mm", positive, "z of the object plane"),
+    ("--speed-mm-s", positive, "stage speed in a row"),
+    ("--accel-mm-s2", positive, "acceleration of the stage"),
+    ("--pulses", count, "chirps a position"),
+    ("--period-us", positive, "time from one chirp of a burst to the next"),
+)
+
+
+def _plan(args: argparse.Namespace) -> int:
+    from polysight.plan import Changes, PlanOptions, run_plan
+
+    names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
+    options = PlanOptions(
+        args.minutes, args.count, args.like, args.snr_db, args.row_overhead_s, args.scene_mm, args.json
+    )
+    return run_plan(args.config, Changes(**{name: getattr(args, name) for name in names}), options)
+
+
+def _size(text: str) -> tuple[float, float]:
+    try:
+        width, height = (positive(part) for part in text.split(","))
+    except (ValueError, argparse.ArgumentTypeError):
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form WIDTH,HEIGHT in mm, e.g. 170,170") from None
+    return width, height
+
+
+def _add_plan(add: Add) -> None:
+    sub = add(
+        "plan",
+        _plan,
+        "predict time, resolution, noise and data of a scan, or propose the best scans within a time",
+        "polysight plan --minutes 30\n  polysight plan --speed-mm-s 100 --pulses 16 --period-us 750",
+        ("--minutes", "--like"),
+    )
+    add_config_option(sub, shipped=True)
+    sub.add_argument("--minutes", type=positive, metavar="M", help="propose the best plans within this time")
+    sub.add_argument("--count", type=count, default=5, metavar="N", help="number of proposals (default: 5)")
+    sub.add_argument("--like", type=Path, metavar="SCAN", help="take noise and standstill between rows from this scan")
+    sub.add_argument("--scene-mm", type=_size, metavar="W,H", help="size of the scene (default: the image's)")
+    sub.add_argument(
+        "--snr-db",
+        type=number(float, "a finite number", math.isfinite),
+        metavar="DB",
+        help="direct path over noise per channel, sample and chirp (default: 5.5)",
+    )
+    sub.add_argument(
+        "--row-overhead-s",
+        type=number(float, "a number, 0 or more", lambda s: 0 <= s < math.inf),
+        metavar="S",
+        help="standstill between rows (default: 0.3, simulated)",
+    )
+    add_json_option(sub)
+    group = sub.add_argument_group("numbers of the plan", "instead of the rig file's")
+    for flag, kind, text in _NUMBERS:
+        group.add_argument(flag, type=kind, metavar="N", help=text)
+
+
+# --- doctor ---
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from polysight.doctor import DoctorOptions, run_doctor
+
+    if args.move and not args.pulse:
+        raise ConfigError(
+            "--move and --no-pulse", "each point of the row is a burst of SYNC_IN pulses", "leave one of them out",
+            code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
+    options = DoctorOptions(args.config, args.out, args.move, args.pulse, args.bursts)
+    return run_doctor(options, args.json, bundle=args.bundle)
+
+
+_bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
+
+
+def _add_doctor(add: Add) -> None:
+    sub = add(
+        "doctor",
+        _doctor,
+        "check every hop of the rig in order and say what to do; nothing moves without --move",
+        "polysight doctor --config instrument.toml --out scans",
+        ("--config", "--move", "--bundle"),
+    )
+    add_config_option(sub)
+    sub.add_argument(
+        "--move", action="store_true", help="THE STAGE MOVES: home it and run a short row with SYNC_IN pulses"
+    )
+    sub.add_argument(
+        "--bundle",
+        type=Path,
+        metavar="FILE.zip",
+        help="write findings, versions, rig file, logs and last lines of manifests, to send; no raw data, no keys",
+    )
+    sub.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="test the disk of this folder")
+    sub.add_argument(
+        "--no-pulse",
+        dest="pulse",
+        action="store_false",
+        help="send no SYNC_IN pulses (default: a few bursts at rest; armed radars transmit)",
+    )
+    sub.add_argument("--bursts", type=_bursts, default=4, metavar="N", help="bursts to capture (default: 4)")
+    add_json_option(sub)
+
+
+# --- card ---
+
+
+def _card(args: argparse.Namespace) -> int:
+    """`polysight card` without an action."""
+    from polysight.jobs.cards import show_cards
+
+    return show_cards(args.config, args.listen, args.json)
+
+
+def _card_program(args: argparse.Namespace) -> int:
+    from polysight.jobs.cards import program_card
+
+    return program_card(args.config, args.board, args.mac, args.at, args.yes, args.wait)
+
+
+def _card_reset(args: argparse.Namespace) -> int:
+    from polysight.jobs.cards import reset_card
+
+    return reset_card(args.config, args.board, args.radar)
+
+
+_seconds = number(float, "a number of seconds from 0 to 3600", lambda value: 0 <= value <= 3600)
+
+
+def _add_board(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("board", metavar="BOARD", help="name of the board in the rig file, e.g. RH")
+
+
+def _add_own_config(sub: argparse.ArgumentParser) -> None:
+    """`--config` of an action, without a default, so that the one given before the action stays."""
+    sub.add_argument("--config", type=Path, default=argparse.SUPPRESS, metavar="FILE", help="rig file")
+
+
+def _add_card(add: Add) -> None:
+    card = add("card", _card, "check the network path to each capture card; program or reset a card", "polysight card")
+    add_config_option(card)
+    card.add_argument(
+        "--listen",
+        type=_seconds,
+        default=0.0,
+        metavar="S",
+        help="record from every card for S seconds, to see whether its radar streams (default: 0)",
+    )
+    add_json_option(card)
+    actions = card.add_subparsers(dest="action", metavar="ACTION")
+
+    sub = add_action(
+        actions,
+        "program",
+        _card_program,
+        "write a board's addresses and ports from the rig file into its card's EEPROM",
+        "polysight card program RH --mac 12:34:56:78:90:13 --at 192.168.33.180:4096",
+    )
+    _add_board(sub)
+    sub.add_argument("--mac", required=True, help="new MAC address of the card, unique in its network")
+    sub.add_argument(
+        "--at",
+        default="",
+        metavar="ADDRESS:PORT",
+        help="present address of the card (default: the rig file's; a new card: 192.168.33.180:4096)",
+    )
+    sub.add_argument("--yes", action="store_true", help="do not ask for confirmation")
+    sub.add_argument(
+        "--wait", type=_seconds, default=120.0, metavar="S", help="look for the card afterwards (default: 120 s; 0: no)"
+    )
+    _add_own_config(sub)
+    sub = add_action(actions, "reset", _card_reset, "reset a card's FPGA, or its radar", "polysight card reset RH")
+    _add_board(sub)
+    sub.add_argument("--radar", action="store_true", help="reset the radar board, which must be armed again")
+    _add_own_config(sub)
+
+
+# --- inspect ---
+
+
+def _inspect(args: argparse.Namespace) -> int:
+    from polysight.jobs.recordings import inspect_file, inspect_placement
+
+    if args.placement:
+        return inspect_placement(args.file, args.json)
+    given = {name: value for name in ("lanes", "samples", "q_first") if (value := getattr(args, name)) is not None}
+    return inspect_file(args.file, args.config, args.plot, args.card, args.json, given)
+
+
+def _add_inspect(add: Add) -> None:
+    sub = add(
+        "inspect", _inspect, "describe a recording of a capture card", "polysight inspect scans/one/raw/RH/0000.bin"
+    )
+    sub.add_argument("file", type=Path, metavar="FILE", help="payload (.bin), or packets recorded by tcpdump (.pcap)")
+    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the range profile of every antenna")
+    sub.add_argument("--config", type=Path, metavar="RIG", help="rig file of the recording (default: the scan's)")
+    sub.add_argument("--placement", action="store_true", help="show how the packets of a scan's row are placed")
+    sub.add_argument("--card", default="", metavar="ADDRESS", help="the card, in a recording of several")
+    sub.add_argument(
+        "--samples",
+        type=number(int, "an even number, 8 or more", lambda n: n >= 8 and n % 2 == 0),
+        metavar="N",
+        help="samples of a chirp (default: the rig file's, or 256)",
+    )
+    sub.add_argument("--lanes", type=int, choices=(2, 4), help="LVDS lanes (default: 4)")
+    sub.add_argument("--q-first", action="store_true", default=None, help="Q precedes I in the recording")
+    add_json_option(sub)
+
+
+# --- radar ---
+
+
+def _radar_plan(args: argparse.Namespace) -> int:
+    from polysight.jobs.radar import plan_radars
+
+    return plan_radars(args.config)
+
+
+def _radar_check(args: argparse.Namespace) -> int:
+    from polysight.jobs.radar import check_radar
+
+    return check_radar(args.config, args.board, args.trace, args.slow, args.json)
+
+
+def _radar_firmware(args: argparse.Namespace) -> int:
+    from polysight.jobs.radar import load_firmware
+
+    return load_firmware(args.config, args.board, args.image, args.flash, args.trace, args.slow)
+
+
+def _radar_replay(args: argparse.Namespace) -> int:
+    from polysight.jobs.radar import replay_radar
+
+    return replay_radar(args.config, args.trace, args.json)
+
+
+def _add_link(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--trace", type=Path, metavar="FILE", help="record all words between host and board")
+    sub.add_argument("--slow", action="store_true", help="send words one by one at 1 MHz, for doubtful wiring")
+
+
+def _add_radar(add: Add) -> None:
+    radar = add(
+        "radar",
+        _radar_plan,
+        "check one radar board, load its firmware, or replay a trace",
+        "polysight radar check RH",
+    )
+    add_config_option(radar)
+    actions = radar.add_subparsers(dest="action", metavar="ACTION")
+
+    sub = add_action(
+        actions, "plan", _radar_plan, "show all constraints and the settings of each board", "polysight radar plan"
+    )
+    _add_own_config(sub)
+    sub = add_action(
+        actions,
+        "check",
+        _radar_check,
+        "check one board step by step, from USB to one frame",
+        "polysight radar check RH --trace first-day.jsonl",
+    )
+    _add_board(sub)
+    _add_link(sub)
+    _add_own_config(sub)
+    add_json_option(sub)
+    sub = add_action(
+        actions,
+        "firmware",
+        _radar_firmware,
+        "load TI's firmware into a board's RAM, or write it to its flash",
+        "polysight radar firmware RH xwr22xx_metaImage.bin --flash",
+    )
+    _add_board(sub)
+    sub.add_argument("image", type=Path, metavar="IMAGE", help="TI's xwr22xx_metaImage.bin")
+    sub.add_argument(
+        "--flash", action="store_true", help="write the board's flash (default: RAM, until its next reset)"
+    )
+    _add_link(sub)
+    _add_own_config(sub)
+    sub = add_action(
+        actions, "replay", _radar_replay, "run the check against a trace", "polysight radar replay first-day.jsonl"
+    )
+    sub.add_argument("trace", type=Path, metavar="TRACE", help="file written by --trace")
+    _add_own_config(sub)
+    add_json_option(sub)

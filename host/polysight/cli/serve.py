@@ -1,0 +1,193 @@
+"""The operator's page, and its functions as commands: serve, preview, scans, note, ask, probe, compare."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from polysight.cli.options import RIG, Add, add_json_option
+from polysight_shared.errors import ConfigError
+
+if TYPE_CHECKING:
+    from polysight.serve import Place
+
+SCAN_COMMANDS = ("pause", "continue", "stop", "abort")
+
+
+def add_commands(add: Add) -> None:
+    """Register the commands."""
+    _add_serve(add)
+    _add_lists(add)
+    _add_results(add)
+
+
+def _serve(args: argparse.Namespace) -> int:
+    _check_extra()
+    sys.stderr.write("polysight serve: starting\n")  # what it shows takes seconds to load
+    from polysight.serve import serve
+
+    config = args.config if args.config is not None else RIG if RIG.exists() else None
+    if config is not None and not config.is_file():
+        raise ConfigError(f"{config}: no such file", "--config names it", "give a rig file, or leave it out")
+    return serve(args.scans, _place(args), config, not args.read_only)
+
+
+def _preview(args: argparse.Namespace) -> int:
+    _check_extra()
+    if args.folder.exists() and not args.folder.is_dir():
+        raise ConfigError(f"{args.folder} is a file", "a scan is a folder, there or not yet", "give a scan folder")
+    sys.stderr.write("polysight preview: starting\n")
+    from polysight.serve import preview
+
+    return preview(args.folder, _place(args), args.control)
+
+
+def _check_extra() -> None:
+    if any(importlib.util.find_spec(name) is None for name in ("starlette", "uvicorn")):
+        raise ConfigError(
+            "starlette and uvicorn are not installed",
+            "the page is an extra of the host half",
+            "pip install '.[serve]', from the repository",
+        )
+
+
+def _place(args: argparse.Namespace) -> Place:
+    from polysight.serve import Place
+
+    return Place(args.host, args.port, tuple(args.allow_host), args.certificate, args.key)
+
+
+def _port(text: str) -> int:
+    """A TCP port, 0 for any that is free."""
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port, 0..65535")
+    return int(text)
+
+
+def _add_serve(add: Add) -> None:
+    sub = add(
+        "serve",
+        _serve,
+        "serve the operator's page: plan, start, watch, label and compare scans in a browser",
+        "polysight serve scans --config instrument.toml        # then open the address that it prints",
+        ("--config", "--port", "--host"),
+    )
+    _add_folder(sub)
+    sub.add_argument("--config", type=Path, metavar="FILE", help="rig file of new scans (default: instrument.toml)")
+    sub.add_argument("--read-only", action="store_true", help="show scans, but start and control nothing")
+    _add_place(sub)
+    sub = add(
+        "preview",
+        _preview,
+        "serve the live view of one running or finished scan",
+        "polysight preview scans/one                           # then open http://127.0.0.1:8080/\n"
+        "  polysight preview scans/one --control --port 8081     # with buttons to pause and stop",
+        ("--control", "--port", "--host"),
+    )
+    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder; it may not exist yet")
+    sub.add_argument(
+        "--control", action="store_true", help="let whoever has the printed address pause and stop the scan"
+    )
+    _add_place(sub)
+
+
+def _add_folder(sub: argparse.ArgumentParser) -> None:
+    text = "folder of scans (default: scans)"
+    sub.add_argument("scans", type=Path, nargs="?", default=Path("scans"), metavar="SCANS", help=text)
+
+
+def _add_place(sub: argparse.ArgumentParser) -> None:
+    """Options of the address."""
+    sub.add_argument("--port", type=_port, default=8080, help="TCP port (default: 8080; 0: any free one)")
+    sub.add_argument(
+        "--host", default="127.0.0.1", metavar="ADDRESS", help="address (default: this machine; 0.0.0.0: the network)"
+    )
+    sub.add_argument(
+        "--allow-host", action="append", default=[], metavar="NAME", help="accept requests to this host name too"
+    )
+    sub.add_argument("--certificate", type=Path, metavar="FILE", help="certificate of TLS (PEM), with --key")
+    sub.add_argument("--key", type=Path, metavar="FILE", help="its private key (PEM)")
+
+
+def _scans(args: argparse.Namespace) -> int:
+    from polysight.jobs.scans import scans
+
+    return scans(args.scans, args.tag, args.find, args.json)
+
+
+def _note(args: argparse.Namespace) -> int:
+    from polysight.jobs.scans import note
+
+    return note(args.scan, args.text, args.tag, args.untag)
+
+
+def _ask(args: argparse.Namespace) -> int:
+    from polysight.jobs.scans import ask_scan
+
+    return ask_scan(args.scan, args.request)
+
+
+def _add_lists(add: Add) -> None:
+    sub = add("scans", _scans, "list the scans under a folder", "polysight scans scans")
+    _add_folder(sub)
+    sub.add_argument("--find", default="", metavar="TEXT", help="search names, notes, tags and materials")
+    sub.add_argument("--tag", action="append", default=[], metavar="TAG", help="only scans with this tag")
+    add_json_option(sub)
+    sub = add(
+        "note",
+        _note,
+        "show or change notes and tags of a scan",
+        "polysight note scans/one --text 'second board' --tag oak",
+    )
+    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder")
+    sub.add_argument("--text", metavar="TEXT", help="replace the notes")
+    sub.add_argument("--tag", action="append", default=[], metavar="TAG", help="add a tag")
+    sub.add_argument("--untag", action="append", default=[], metavar="TAG", help="remove a tag")
+    sub = add("ask", _ask, "pause, continue, stop or abort a running scan", "polysight ask scans/one pause")
+    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder")
+    sub.add_argument(
+        "request",
+        choices=SCAN_COMMANDS,
+        help="pause: before the next row; stop: after this row; abort: now, this row is lost; continue: after a pause",
+    )
+
+
+def _probe(args: argparse.Namespace) -> int:
+    from polysight.jobs.scans import probe_scan
+
+    return probe_scan(args.data, args.at, args.library, args.json)
+
+
+def _compare(args: argparse.Namespace) -> int:
+    from polysight.jobs.scans import compare_scans
+
+    return compare_scans(args.first, args.second, args.png, args.json)
+
+
+def _point(text: str) -> tuple[float, float]:
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form X,Y in mm, e.g. 45,0") from None
+    return x, y
+
+
+def _add_results(add: Add) -> None:
+    sub = add("probe", _probe, "print all results at one place of a processed scan", "polysight probe scans/one 45,0")
+    sub.add_argument("data", type=Path, metavar="DATA", help="scan folder, or a folder of products")
+    sub.add_argument("at", type=_point, metavar="X,Y", help="place, mm from the image's centre")
+    sub.add_argument("--library", type=Path, metavar="FILE", help="reference library (default: the simulated one)")
+    add_json_option(sub)
+    sub = add(
+        "compare",
+        _compare,
+        "compare two processed scans: differences of P and permittivity",
+        "polysight compare scans/one scans/two --png difference.png",
+    )
+    for name in ("first", "second"):
+        sub.add_argument(name, type=Path, metavar="DATA", help="scan folder, or a folder of products")
+    sub.add_argument("--png", type=Path, metavar="FILE", help="draw the difference of P in standard deviations")
+    add_json_option(sub)

@@ -1,0 +1,21 @@
+"""Files that come with the package: the rig file `instrument.toml` and the scenes of `examples/`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parent
+_REPOSITORY = _PACKAGE.parents[2]
+
+# `host/setup.py` copies the files into a wheel. Where the sources are used in place they lie at the top of the repository.
+FOLDER = _PACKAGE if (_PACKAGE / "instrument.toml").exists() else _REPOSITORY
+
+
+def packaged(path: Path) -> Path:
+    """`path` where it exists; otherwise the file or folder of that name that comes with the package, if there is one.
+
+    So `instrument.toml` and `examples/nine-materials.toml` are found from any folder, and a file of one's own comes
+    first.
+    """
+    ours = FOLDER / path
+    return ours if not path.is_absolute() and not path.exists() and ours.exists() else path

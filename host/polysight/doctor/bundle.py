@@ -1,0 +1,177 @@
+"""`polysight doctor --bundle FILE.zip`: findings, versions, logs and manifests for remote help; no raw data, no keys.
+
+docs/how-to/doctor.md and the archive's README.txt list its files. Each is text and passes a `Redactor` first.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import resource
+import zipfile
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from importlib.metadata import distributions
+from pathlib import Path
+
+from polysight.doctor.context import DoctorOptions, Finding
+from polysight.doctor.kernel import read_interface
+from polysight.store import MANIFEST, utc_now, versions
+from polysight_shared.config import Instrument
+from polysight_shared.errors import DataError, DeviceError
+from polysight_shared.files import open_to_write, read_bounded
+
+README = """Findings of `polysight doctor --bundle`, {utc}.
+
+findings.txt, findings.json  the finding for each hop
+rig.toml                     the rig file
+versions.json                releases of this program, Python and every installed package; the system
+kernel.txt                   kernel, limits of this login, receive buffers
+network.json                 interfaces, routes and neighbours, from the kernel
+scans/                       the last {lines} lines of the manifest of the newest {scans} scans under --out
+logs/                        the last {kilobytes} kB of the logs beside the rig file and under --out
+traces/                      the newest {traces} traces of radars (radar.trace_dir)
+
+Not included: raw data, images, labels, keys. Words from files in pi.key_dir, and values of names like `token` or
+`secret`, are replaced by {hidden}. Read the files before you send them: they contain paths, addresses and names of
+this computer.
+"""
+HIDDEN = "[removed]"
+_LINES, _SCANS, _LOGS, _TRACES = 60, 3, 20, 6
+_TAIL_BYTES, _TRACE_BYTES, _KEY_BYTES, _MANIFEST_BYTES = 64 << 10, 4 << 20, 64 << 10, 64 << 20
+_KERNEL = ("proc/version", "proc/sys/net/core/rmem_max", "proc/sys/net/core/rmem_default", "proc/loadavg",
+           "proc/meminfo", "proc/net/udp", "proc/net/snmp")  # fmt: skip
+_NAMED = re.compile(
+    r"""(?ix)((?:[\w-]*(?:secret|token|password|passphrase)[\w-]*|(?:private|public|curve|api)[_-]?key|authorization)
+    ["']?\s*[=:]\s*["']?(?:bearer\s+|basic\s+)?|\bbearer\s+)([^\s"',}]{2,})"""
+)
+_IN_URL = re.compile(r"(://[^\s/:@]+:)[^\s/@]+(?=@)")
+_TOKENS = re.compile(r"\b(?:gh[opsu]_|github_pat_|glpat-|sk-|xox[abp]-|AKIA)[A-Za-z0-9_-]{10,}")
+_PEM = re.compile(r"-----BEGIN [^-]*KEY-----.*?(?:-----END [^-]*KEY-----|\Z)", re.DOTALL)
+
+
+class Redactor:
+    """Remove keys from text: those of the key folders by their content, others by name or form."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        words: set[str] = set()
+        for folder in folders:
+            with suppress(OSError):
+                for path in sorted(p for p in folder.iterdir() if p.is_file()):
+                    with suppress(OSError, DataError):
+                        text = read_bounded(path, _KEY_BYTES).decode("utf-8", "replace")
+                        words |= {w for w in re.split(r"[\s\"'=]+", text) if len(w) >= 16}
+        self._words = sorted(words, key=len, reverse=True)
+
+    def __call__(self, text: str) -> str:
+        """Return the text with keys replaced by `HIDDEN`."""
+        for word in self._words:
+            text = text.replace(word, HIDDEN)
+        text = _PEM.sub(HIDDEN, text)
+        for pattern in (_NAMED, _IN_URL):
+            text = pattern.sub(rf"\1{HIDDEN}", text)
+        return _TOKENS.sub(HIDDEN, text)
+
+
+def write_bundle(
+    path: Path,
+    options: DoctorOptions,
+    rig: Instrument | None,
+    findings: Sequence[Finding],
+    text: str,
+    root: Path = Path("/"),
+) -> None:
+    """Write the archive `path`; an existing file is overwritten.
+
+    `rig` is None if the rig file could not be read; `text` is the printed form of `findings`; `root` is the root of
+    the file system. Raises DeviceError if the file cannot be written.
+    """
+    keys = [options.config.resolve().parent / "keys"]
+    if rig is not None and rig.pi.key_dir:
+        keys.append(Path(rig.pi.key_dir))
+    redacted = Redactor(keys)
+    try:
+        with open_to_write(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in _contents(options, rig, findings, text, root):
+                archive.writestr(name, redacted(content))
+    except OSError as e:
+        raise DeviceError(
+            f"{path}: cannot be written: {e.strerror}", "the disk is full, or the path is wrong", "give another FILE"
+        ) from None
+
+
+def _contents(
+    options: DoctorOptions, rig: Instrument | None, findings: Sequence[Finding], text: str, root: Path
+) -> Iterator[tuple[str, str]]:
+    """Yield name and text of every file."""
+    about = {"utc": utc_now(), "lines": _LINES, "scans": _SCANS, "kilobytes": _TAIL_BYTES >> 10, "traces": _TRACES}
+    yield "README.txt", README.format(hidden=HIDDEN, **about)
+    yield "findings.txt", text
+    yield "findings.json", json.dumps([asdict(f) for f in findings], indent=1)
+    yield "versions.json", json.dumps(_versions(), indent=1)
+    yield "kernel.txt", _kernel(root)
+    yield "network.json", json.dumps(_network(root), indent=1)
+    if (config := _tail(options.config, _TAIL_BYTES)) is not None:
+        yield "rig.toml", config
+    for folder in _newest_scans(options.out):
+        with suppress(OSError, DataError):
+            lines = read_bounded(folder / MANIFEST, _MANIFEST_BYTES).decode("utf-8", "replace").splitlines()
+            yield f"scans/{folder.resolve().name}.jsonl", "\n".join(lines[-_LINES:]) + "\n"
+    places = [options.config.parent, options.config.parent / "logs", options.out, options.out / "logs"]
+    yield from _files("logs", _newest(places, "*.log", _LOGS), _TAIL_BYTES)
+    if rig is not None and rig.radar.trace_dir:
+        yield from _files("traces", _newest([Path(rig.radar.trace_dir)], "*", _TRACES), _TRACE_BYTES)
+
+
+def _files(folder: str, paths: Sequence[Path], most: int) -> Iterator[tuple[str, str]]:
+    for number, path in enumerate(paths):
+        if (text := _tail(path, most)) is not None:
+            yield f"{folder}/{number}-{path.name}", text
+
+
+def _tail(path: Path, most: int) -> str | None:
+    """Return at most the last `most` bytes of a file as text; None if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - most))
+            return file.read(most).decode("utf-8", "replace")
+    except OSError:
+        return None
+
+
+def _newest(folders: Sequence[Path], pattern: str, count: int) -> list[Path]:
+    found = {p.resolve(): p for folder in folders for p in folder.glob(pattern) if p.is_file() and not p.is_symlink()}
+    return sorted(found, key=lambda p: p.stat().st_mtime, reverse=True)[:count]
+
+
+def _newest_scans(out: Path) -> list[Path]:
+    manifests = _newest([out, *(p for p in out.glob("*") if p.is_dir())], MANIFEST, _SCANS)
+    return [path.parent for path in manifests]
+
+
+def _versions() -> dict[str, object]:
+    system = {name: getattr(platform, name)() for name in ("platform", "machine", "python_version", "libc_ver")}
+    installed = {d.metadata["Name"]: d.version for d in distributions()}
+    return {**versions(), **system, "cores": os.cpu_count(), "packages": dict(sorted(installed.items()))}
+
+
+def _kernel(root: Path) -> str:
+    limits = ("RLIMIT_RTPRIO", "RLIMIT_MEMLOCK", "RLIMIT_NOFILE", "RLIMIT_NICE")
+    parts = [f"{platform.uname()}", *(f"{name} {resource.getrlimit(getattr(resource, name))}" for name in limits)]
+    for name in _KERNEL:
+        text = _tail(root / name, _TAIL_BYTES)
+        parts.append(f"== /{name}\n{'not available' if text is None else text.rstrip()}")
+    return "\n".join(parts) + "\n"
+
+
+def _network(root: Path) -> dict[str, object]:
+    try:
+        names = sorted(p.name for p in (root / "sys/class/net").iterdir())
+    except OSError:
+        names = []
+    kept = {name: _tail(root / "proc/net" / name, _TAIL_BYTES) for name in ("route", "arp", "dev")}
+    return {"interfaces": [asdict(read_interface(name, root)) for name in names], **kept}

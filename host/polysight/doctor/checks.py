@@ -1,0 +1,168 @@
+"""The list of checks (`CHECKS`), `run_checks`, which runs them, and `run_doctor`, which prints their findings."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from polysight.doctor.bundle import write_bundle
+from polysight.doctor.check_capture import (
+    check_buffer,
+    check_card,
+    check_direct_path,
+    check_level,
+    check_network,
+    check_pulses,
+    check_radar,
+    check_skew,
+)
+from polysight.doctor.check_host import (
+    check_calibration,
+    check_config,
+    check_disk,
+    check_host_clock,
+    check_library,
+    check_pi_clock,
+    check_receivers,
+    check_time,
+)
+from polysight.doctor.check_pi import SIMULATED, check_free, check_keys, check_pi, check_stage, check_trigger
+from polysight.doctor.context import CheckContext, DoctorOptions, Finding, System, error, not_checked
+from polysight_shared.config import Board
+from polysight_shared.errors import PolysightError, no_such, os_error
+from polysight_shared.messages import is_simulated
+
+_VERDICT_WIDTH, _NAME_WIDTH = 12, 16  # the operator's page parses these columns
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check of a hop.
+
+    It is skipped if a check in `needs` failed or was skipped because of a failure, or if a check in `unless` failed.
+    `each_board`: run once for every recorded board.
+    """
+
+    name: str
+    run: Callable[..., Finding]
+    needs: tuple[str, ...] = ()
+    unless: tuple[str, ...] = ()
+    each_board: bool = False
+
+
+CHECKS = (
+    Check("config", check_config),
+    Check("host clock", check_host_clock),
+    Check("keys", check_keys, ("config",)),
+    Check("pi", check_pi, ("keys",)),
+    Check("pi clock", check_pi_clock, ("pi",)),
+    Check("rig is free", check_free, ("pi",)),
+    Check("calibration", check_calibration, ("config",)),
+    Check("library", check_library, ("config",)),
+    Check("stage", check_stage, ("pi",)),
+    Check("card", check_card, ("config",), ("rig is free",), each_board=True),
+    Check("network", check_network, ("config",), each_board=True),
+    Check("buffer", check_buffer, ("card",), each_board=True),
+    Check("receivers", check_receivers, ("config",), ("rig is free",)),
+    Check("disk", check_disk, ("config",), ("rig is free",)),
+    Check("scan time", check_time, ("config",)),
+    Check("trigger line", check_trigger, ("rig is free", "stage")),
+    Check("pulses", check_pulses, ("pi", "rig is free")),
+    Check("radar", check_radar, ("buffer", "pulses"), each_board=True),
+    Check("level", check_level, ("radar",), each_board=True),
+    Check("direct path", check_direct_path, ("level",), each_board=True),
+    Check("trigger skew", check_skew, ("direct path",)),
+)
+
+
+def run_checks(context: CheckContext) -> Iterator[Finding]:
+    """Run every check in order and yield its finding at once."""
+    blocked: dict[tuple[str, str], str] = {}  # (check, board) that failed or was skipped: title of the failed check
+    for check in CHECKS:
+        rig = context.loaded_rig
+        for board in rig.recorded if check.each_board and rig is not None else (None,):
+            key = (check.name, board.name if board is not None else "")
+            title = " ".join(key).rstrip()
+            if failed := _failed_prerequisite(check, board, blocked):
+                blocked[key], finding = failed, not_checked(f"{failed} failed")
+            else:
+                finding = _run_check(check, context, board)
+                if finding.verdict == "error":
+                    blocked[key] = title
+            yield replace(finding, check=title)
+
+
+def _failed_prerequisite(check: Check, board: Board | None, blocked: dict[tuple[str, str], str]) -> str:
+    """Title of the failed check because of which this one is skipped; "" if there is none.
+
+    A check of one board depends on the same board's checks, and one of the whole rig on those of every board.
+    """
+    for need in check.needs:
+        for (name, of), failed in blocked.items():
+            if name == need and (board is None or of in ("", board.name)):
+                return failed
+    return next((name for name in check.unless if blocked.get((name, "")) == name), "")
+
+
+def _run_check(check: Check, context: CheckContext, board: Board | None) -> Finding:
+    try:
+        return check.run(context) if board is None else check.run(context, board)
+    except PolysightError as e:
+        return error(e.what, e.why, e.remedy)
+    except OSError as e:
+        e = os_error(e)
+        return error(e.what, e.why, e.remedy)
+
+
+def run_doctor(
+    options: DoctorOptions,
+    as_json: bool,
+    system: System = System(),  # noqa: B008 - immutable
+    bundle: Path | None = None,
+) -> int:
+    """Run and print all checks; return 1 if a check failed, otherwise 0. `bundle`: also write an archive for helpers.
+
+    Raises
+    ------
+    DataError
+        if the bundle's folder is missing.
+    DeviceError
+        if the bundle cannot be written.
+    """
+    findings: list[Finding] = []
+    if bundle is not None and not bundle.resolve().parent.is_dir():
+        raise no_such(bundle.parent)
+    with CheckContext(options, system) as context:
+        for finding in run_checks(context):
+            findings.append(finding)
+            if not as_json:
+                sys.stdout.write(_lines(finding))
+                sys.stdout.flush()
+    failed = [f.check for f in findings if f.verdict == "error"]
+    simulated = context.hello is not None and is_simulated(context.hello.backend)
+    summary = _summary(findings, failed) + (f" ({SIMULATED})" if simulated else "") + "\n"
+    if as_json:
+        document = {"ok": not failed, "simulated": simulated, "findings": [asdict(f) for f in findings]}
+        sys.stdout.write(json.dumps(document, indent=1) + "\n")
+    else:
+        sys.stdout.write(summary)
+    if bundle is not None:
+        text = "".join(map(_lines, findings)) + summary
+        write_bundle(bundle, options, context.loaded_rig, findings, text, system.root)
+        sys.stderr.write(f"{bundle}: written, without raw data and keys. Read it before you send it\n")
+    return 1 if failed else 0
+
+
+def _lines(finding: Finding) -> str:
+    head = f"{finding.verdict:{_VERDICT_WIDTH}}{finding.check:{_NAME_WIDTH}} {finding.found}".rstrip() + "\n"
+    more = (("why", finding.why), ("do", finding.remedy))
+    return head + "".join(f"{'':{_VERDICT_WIDTH + _NAME_WIDTH}} {word}: {text}\n" for word, text in more if text)
+
+
+def _summary(findings: list[Finding], failed: list[str]) -> str:
+    count = {v: sum(f.verdict == v for f in findings) for v in ("ok", "warning", "not checked")}
+    text = f"{count['ok']} ok, {count['warning']} warnings, {len(failed)} errors, {count['not checked']} not checked"
+    return f"{text}: begin with {failed[0]}" if failed else text

@@ -1,0 +1,68 @@
+"""Imaging: from synchronised rows to the H and V images.
+
+`ImageBuilder` reduces each row to the range gate, chooses an imager and returns `ChannelImages`, divided by the
+footprint (the image of a mirror); `SubBandImages` does the same for parts of the sweep. The three imagers have one
+interface (`samples.Imager`): direct sum (`backproject` and its adjoint `project`), spectral, and incremental row by
+row. `move_to_plane` estimates the plane of the plates and images on it, `focus_sweep` finds the plane by sharpness,
+`correct_tilt` removes the effect of tilted plates, `imaging_facts` measures the point response. `ImagedWith` lists the
+settings that the gains of an image depend on.
+"""
+
+from polysight.imaging.aperture import Aperture, window_weights
+from polysight.imaging.direct import backproject, project
+from polysight.imaging.focus import Focus, focus_sweep
+from polysight.imaging.gain_conditions import ImagedWith
+from polysight.imaging.geometry import Antennas, ImageGrid, image_grid, row_offsets_m, scan_offsets_m
+from polysight.imaging.images import (
+    AS_IN_RIG_FILE,
+    TAPERS,
+    ChannelImages,
+    ImageBuilder,
+    SubBand,
+    SubBandImages,
+    View,
+    needed_gate_m,
+    sub_bands,
+)
+from polysight.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, move_to_plane
+from polysight.imaging.reduce import reduction, scene_gate_m
+from polysight.imaging.resolution import PointResponse, imaging_facts, point_response
+from polysight.imaging.samples import ReducedRow
+from polysight.imaging.tilt import Illumination, Rise, correct_tilt
+
+__all__ = [
+    "AS_IN_RIG_FILE",
+    "PLANE_REACH_M",
+    "TAPERS",
+    "UNKNOWN_PLANE",
+    "Antennas",
+    "Aperture",
+    "ChannelImages",
+    "Focus",
+    "Illumination",
+    "ImageBuilder",
+    "ImageGrid",
+    "ImagedWith",
+    "PlaneEstimate",
+    "PointResponse",
+    "ReducedRow",
+    "Rise",
+    "SubBand",
+    "SubBandImages",
+    "View",
+    "backproject",
+    "correct_tilt",
+    "focus_sweep",
+    "image_grid",
+    "imaging_facts",
+    "move_to_plane",
+    "needed_gate_m",
+    "point_response",
+    "project",
+    "reduction",
+    "row_offsets_m",
+    "scan_offsets_m",
+    "scene_gate_m",
+    "sub_bands",
+    "window_weights",
+]

@@ -1,0 +1,159 @@
+"""Direct imager: matched filter by direct summation, for any antennas, positions and voxels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from polysight.imaging.aperture import Aperture, device_of, namespace
+from polysight.imaging.geometry import excess_path_m, turn
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+_CHUNK = 1 << 20  # products of position and voxel in memory
+
+
+def backproject(samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any) -> Any:
+    """Backproject samples (paper, equation 6, with the exponent's sign of the conjugate of the received phase).
+
+    `image(v) = sum_p sum_f samples[p, f] exp(-j 2 pi f (|v - tx_p| + |v - rx_p| - reference_p) / c)`
+
+    Parameters
+    ----------
+    samples
+        complex [position, frequency], phase +2 pi f tau, of any array API library and device. One antenna pair per
+        position; several RX are several positions.
+    frequencies_hz
+        float [frequency]; evenly spaced ones are summed by Horner's rule.
+    tx_m, rx_m
+        float [position, 3], metres.
+    voxels_m
+        float [n, 3], metres.
+    reference_m
+        float [position]: path already removed from the phase (the direct path; twice the range to the scene's centre
+        for a monostatic radar referenced to it; 0 for raw phase).
+
+    Returns
+    -------
+    complex128 [n].
+
+    Raises
+    ------
+    ValueError
+        if the shapes do not fit.
+    """
+    scene = _Scene(samples, frequencies_hz, tx_m, rx_m, voxels_m, reference_m)
+    xp = scene.xp
+    s = xp.asarray(samples, dtype=xp.complex128)
+    image = xp.zeros(scene.voxels.shape[0], dtype=xp.complex128, device=scene.device)
+    for part, delay in scene.delays():
+        if scene.step is None:
+            for k, f in enumerate(scene.frequencies):
+                image += xp.sum(s[part, k : k + 1] * turn(xp, delay * f, xp.float64, xp.complex128), axis=0)
+            continue
+        turned = turn(xp, delay * scene.step, xp.float64, xp.complex128)
+        total = s[part, -1:] * xp.ones_like(turned)
+        for k in range(len(scene.frequencies) - 2, -1, -1):
+            total *= turned
+            total += s[part, k : k + 1]
+        image += xp.sum(total * turn(xp, delay * scene.frequencies[0], xp.float64, xp.complex128), axis=0)
+    return image
+
+
+def project(reflectivity: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any) -> Any:
+    """Compute the echoes of voxels [n], complex128 [position, frequency]; the adjoint of :func:`backproject`."""
+    voxels = namespace(reflectivity).asarray(reflectivity)
+    pairs = np.empty((len(tx_m), len(frequencies_hz)))
+    scene = _Scene(pairs, frequencies_hz, tx_m, rx_m, voxels_m, reference_m, like=voxels)
+    xp = scene.xp
+    v = xp.asarray(voxels, dtype=xp.complex128)[:, None]
+    rows = []
+    for _, delay in scene.delays():
+        columns = [
+            xp.matmul(xp.conj(turn(xp, delay * f, xp.float64, xp.complex128)), v)[:, 0] for f in scene.frequencies
+        ]
+        rows.append(xp.stack(columns, axis=1))
+    return xp.concat(rows, axis=0)
+
+
+class _Scene:
+    """Checked geometry of a direct sum as arrays of the samples' library, and delays by chunks of positions."""
+
+    def __init__(
+        self, samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any, like: Any = None
+    ) -> None:
+        like = samples if like is None else like
+        self.xp, self.device = namespace(like), device_of(like)
+        shape = tuple(samples.shape) if hasattr(samples, "shape") else np.shape(samples)
+        self.frequencies = [float(f) for f in frequencies_hz]
+        if len(shape) != 2 or not self.frequencies or len(self.frequencies) != shape[1]:
+            raise ValueError(
+                f"samples must be [position, frequency] with frequencies_hz [frequency]: {shape},"
+                f" ({len(self.frequencies)},)"
+            )
+        self.tx, self.rx, self.voxels, self.reference = (
+            self.xp.asarray(a, dtype=self.xp.float64, device=self.device) for a in (tx_m, rx_m, voxels_m, reference_m)
+        )
+        if self.tx.shape != (shape[0], 3) or self.rx.shape != (shape[0], 3) or self.reference.shape != (shape[0],):
+            raise ValueError(
+                f"tx_m and rx_m must be [{shape[0]}, 3], reference_m [{shape[0]}]:"
+                f" {self.tx.shape}, {self.rx.shape}, {self.reference.shape}"
+            )
+        if self.voxels.ndim != 2 or self.voxels.shape[1] != 3:
+            raise ValueError(f"voxels_m must be [n, 3]: {self.voxels.shape}")
+
+    @property
+    def step(self) -> float | None:
+        """Spacing of three or more evenly spaced frequencies, Hz; otherwise None."""
+        f = np.array(self.frequencies)
+        step = (f[-1] - f[0]) / max(1, f.size - 1)
+        even = f.size > 2 and np.allclose(np.diff(f), step, rtol=1e-9, atol=1e-6 * abs(step))
+        return float(step) if even else None
+
+    def delays(self) -> Iterator[tuple[slice, Any]]:
+        """Yield chunks of positions and their delays to all voxels, float64 [position, voxel], seconds."""
+        v = self.voxels
+        size = max(1, _CHUNK // max(1, v.shape[0]))
+        for first in range(0, self.tx.shape[0], size):
+            part = slice(first, min(first + size, self.tx.shape[0]))
+            tx, rx, reference = self.tx[part, None, :], self.rx[part, None, :], self.reference[part, None]
+            d = excess_path_m(self.xp, v[None, :, 0], v[None, :, 1], v[None, :, 2], tx, rx, reference)
+            yield part, d / SPEED_OF_LIGHT_M_S
+
+
+class DirectImager:
+    """Imager by direct sum: exact for any positions and pixels, but slow. See `samples.Imager`."""
+
+    def __init__(self, aperture: Aperture) -> None:
+        self.aperture = aperture
+
+    def image(self, samples: Any) -> Any:
+        """Return the matched filter of samples [rx, frequency, row, column], complex128 [ny, nx]."""
+        xp = namespace(samples)
+        rx, m, rows, columns = self.aperture.shape
+        total = 0
+        for r in range(rx):
+            by_position = xp.permute_dims(xp.reshape(samples[r, ...], (m, rows * columns)), (1, 0))
+            total = total + backproject(by_position, *self._places(r))
+        return xp.reshape(total, self.aperture.grid.shape)
+
+    def constant(self, echo: Any, weights: Any) -> Any:
+        """Return the image of an echo [rx, frequency] at every position, times weights [row, column]."""
+        xp = namespace(echo)
+        return self.image(echo[:, :, None, None] * xp.astype(weights, echo.dtype)[None, None, :, :])
+
+    def samples(self, image: Any) -> Any:
+        """Return the echoes of pixels [ny, nx], [rx, frequency, row, column]; the adjoint of :meth:`image`."""
+        xp = namespace(image)
+        rx, m, rows, columns = self.aperture.shape
+        pixels = xp.reshape(image, (-1,))
+        answers = [xp.permute_dims(project(pixels, *self._places(r)), (1, 0)) for r in range(rx)]
+        return xp.reshape(xp.stack(answers), (rx, m, rows, columns))
+
+    def _places(self, rx: int) -> tuple[Any, ...]:
+        """Return the arguments of `backproject` after the samples."""
+        a = self.aperture
+        shift = a.offsets_m.reshape(-1, 3)
+        places = (a.antennas.tx_m + shift, a.antennas.rx_m[rx] + shift, a.grid.voxels_m)
+        return a.frequencies_hz, *places, np.full(len(shift), a.antennas.direct_m[rx])

@@ -1,0 +1,131 @@
+"""Positions of pixels, antennas and stage, common to all imagers."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight_shared.config import Board, Instrument
+from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.raster import Row, mean_burst_travel_mm, plan_raster
+
+
+def distance_m(xp: Any, x: Any, y: Any, z: Any, place_m: Any) -> Any:
+    """Return `|(x, y, z) - place|`, broadcast; `place_m` is [..., 3]."""
+    return xp.sqrt((x - place_m[..., 0]) ** 2 + (y - place_m[..., 1]) ** 2 + (z - place_m[..., 2]) ** 2)
+
+
+def excess_path_m(xp: Any, x: Any, y: Any, z: Any, tx_m: Any, rx_m: Any, reference_m: Any) -> Any:
+    """Return the excess path of scatterers at (x, y, z) for antennas at `tx_m` and `rx_m`, float64, broadcast.
+
+    Parameters
+    ----------
+    xp
+        Array API namespace.
+    x, y, z
+        Positions of scatterers, metres.
+    tx_m, rx_m
+        Positions of antennas [..., 3], metres.
+    reference_m
+        Path already removed from the phase (here the direct path).
+    """
+    return distance_m(xp, x, y, z, tx_m) + distance_m(xp, x, y, z, rx_m) - reference_m
+
+
+def turn(xp: Any, cycles: Any, real: Any, kind: Any) -> Any:
+    """Return exp(-j 2 pi cycles) in the given real and complex dtypes; whole cycles are removed in float64 first.
+
+    Separate cosine and sine are many times faster than the exponential of a complex array.
+    """
+    phase = xp.astype((cycles - xp.round(cycles)) * (-2.0 * math.pi), real)
+    return xp.astype(xp.cos(phase), kind) + xp.astype(xp.sin(phase), kind) * 1j
+
+
+@dataclass(frozen=True)
+class ImageGrid:
+    """Pixels of an image: `x_m` [nx] and `y_m` [ny] ascend with spacing `pixel_m`.
+
+    `z_m` is the plane of the pixels, or a surface as float64 [ny, nx].
+    """
+
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]
+    z_m: float | NDArray[np.float64]
+    pixel_m: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx)."""
+        return self.y_m.size, self.x_m.size
+
+    @property
+    def voxels_m(self) -> NDArray[np.float64]:
+        """Positions of all pixels, float64 [ny * nx, 3], row by row."""
+        y, x = np.meshgrid(self.y_m, self.x_m, indexing="ij")
+        return np.stack([x.ravel(), y.ravel(), np.broadcast_to(self.z_m, x.shape).ravel()], axis=1)
+
+
+def image_grid(rig: Instrument) -> ImageGrid:
+    """Return the configured grid on the object plane, centred on the specular midpoint of TX and H."""
+    x, y, z = specular_midpoint_m(rig, rig.receivers[0])
+    pixel = rig.image.pixel_mm / 1e3
+
+    def axis(n: int, centre: float) -> NDArray[np.float64]:
+        return centre + (np.arange(n, dtype=np.float64) - (n - 1) / 2) * pixel
+
+    return ImageGrid(axis(rig.image.columns, x), axis(rig.image.rows, y), z, pixel)
+
+
+@dataclass(frozen=True)
+class Antennas:
+    """TX [3] and RX [rx, 3] of one board at stage offset zero, metres."""
+
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, rig: Instrument, board: Board) -> Antennas:
+        """Return the transmit and receive antennas of a board's image."""
+        return cls(np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board)))
+
+    @property
+    def direct_m(self) -> NDArray[np.float64]:
+        """Direct path to each RX, [rx]."""
+        return np.sqrt(((self.rx_m - self.tx_m) ** 2).sum(axis=1))
+
+    def excess_m(
+        self, dx: NDArray[np.float64], dy: NDArray[np.float64], z: float | NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the excess path of points at `(dx, dy, z)` relative to the stage offset, metres, [rx, ...]."""
+        pairs = zip(self.rx_m, self.direct_m, strict=True)
+        return np.stack([excess_path_m(np, dx, dy, z, self.tx_m, rx, direct) for rx, direct in pairs])
+
+    def mirror_m(self, z: float) -> NDArray[np.float64]:
+        """Return the path from TX over a mirror in the plane `z` to each RX, [rx]: distance from TX's image."""
+        image = self.tx_m * [1, 1, -1] + [0, 0, 2 * z]
+        return np.sqrt(((self.rx_m - image) ** 2).sum(axis=1))
+
+
+def row_offsets_m(rig: Instrument, row: Row) -> NDArray[np.float64]:
+    """Return the mean stage offset (x, y) during each burst of a row, metres [position, 2], in order of recording.
+
+    The stage does not stop: a burst is centred half its duration after the trigger point, so even and odd rows differ.
+    """
+    travel = row.direction * mean_burst_travel_mm(rig.burst, rig.stage)
+    x = np.array(row.x_mm) + travel
+    return np.stack([x, np.full(row.points, row.y_mm)], axis=1) / 1e3
+
+
+def scan_offsets_m(rig: Instrument) -> NDArray[np.float64]:
+    """Return the mean stage offsets of all rows, metres [row, column, 3], columns from the smallest x."""
+    plan = plan_raster(rig.grid)
+    out = np.zeros((plan.rows, plan.columns, 3))
+    along = {row.direction: row_offsets_m(rig, row)[:: row.direction, 0] for row in itertools.islice(plan, 2)}
+    for row in plan:
+        out[row.index, :, 0], out[row.index, :, 1] = along[row.direction], row.y_mm / 1e3
+    return out

@@ -1,0 +1,277 @@
+"""Estimate distance and tilt of the object plane from the echoes of flat plates.
+
+A plate's echo gives its range in two ways: coarse but unambiguous from the change of the image's amplitude with range
+(bandwidth of the sweep), and fine but ambiguous by half a wavelength of height from its phase. The first gives the
+plane within about a millimetre and resolves the second. Both are compared with a mirror on the rig file's plane, seen
+from the same positions, so that aperture, taper and masked positions have no influence.
+
+One plane is fitted to all plates; the height of each plate is returned too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.imaging.images import ChannelImages, ImageBuilder
+from polysight.imaging.samples import BoardSamples
+from polysight_shared.config import Instrument
+from polysight_shared.geometry import incidence_deg
+
+PLANE_REACH_M = 0.015
+"""Search range to either side of the rig file's plane."""
+MOUNT_STD_M = 1e-3
+"""Standard deviation of the antennas' positions in the rig file, in addition to that of the plane's distance."""
+PRIOR_STD_M = 5.8e-3
+"""Standard deviation of the plane's distance if the scene does not determine it: uniform within 10 mm."""
+_WORTH_M = 5e-4
+_STEP_M = 2e-4
+"""Height step to find the change of range and phase with height."""
+_COHERENT = 0.7
+"""Smallest coherence of the pixels of a plate (1: all equal)."""
+_TILT_PRIOR_RAD = 0.02
+"""Prior standard deviation of the tilt: one degree."""
+_MIN_STD_M = 3e-4
+"""Smallest standard deviation of a plate's range, due to sidelobes of its neighbours."""
+_MAX_TILT = 0.035
+_PHASE_FITS_RAD = 0.5
+"""Largest RMS phase error of plates on one plane; a fifth of the value for random phases."""
+_PHASE_STD_M = 5e-5
+"""Standard deviation of a height from the phase of the reflection (some degrees for lossy plates) and roughness."""
+
+
+@dataclass(frozen=True)
+class PlaneEstimate:
+    """Plane of the plates relative to the rig file's plane.
+
+    Attributes
+    ----------
+    offset_m, offset_std_m
+        Distance of the plane behind the rig file's plane at the middle of the image, and its standard deviation.
+    tilt_rad, tilt_std_rad
+        Rise of the plane's z along x and along y, radians, and their standard deviations.
+    heights_m
+        float64 [patch]: height of each patch from its range (from its phase if `by_phase`); NaN if undetermined.
+    by_phase
+        The plates' phases lie on one plane and determine it.
+    plates
+        Number of patches with a height.
+    """
+
+    offset_m: float
+    offset_std_m: float
+    tilt_rad: tuple[float, float]
+    tilt_std_rad: tuple[float, float]
+    heights_m: NDArray[np.float64]
+    by_phase: bool
+    plates: int
+
+    @property
+    def known(self) -> bool:
+        """True if the scene determines the plane."""
+        return self.plates > 0
+
+    @property
+    def worth_moving(self) -> bool:
+        """True if the offset from the rig file's plane is large enough to form images and angles again."""
+        return self.known and abs(self.offset_m) > _WORTH_M and abs(self.offset_m) < PLANE_REACH_M
+
+    def applied_to(self, rig: Instrument) -> Instrument:
+        """Return a rig with its object plane at the plates."""
+        if not self.worth_moving:
+            return rig
+        distance = rig.geometry.object_distance_mm + 1e3 * self.offset_m
+        return msgspec.structs.replace(rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=distance))
+
+    def incidence_std_rad(self, rig: Instrument) -> float:
+        """Return the standard deviation of the incidence angle due to plane distance and antenna positions, radians.
+
+        d theta / d z = sin theta cos theta / z.
+        """
+        theta = np.radians(incidence_deg(rig, rig.receivers[0]))
+        known = float(np.hypot(self.offset_std_m, MOUNT_STD_M)) if self.known else PRIOR_STD_M
+        return float(np.sin(theta) * np.cos(theta) / (rig.geometry.object_distance_mm / 1e3) * known)
+
+    def transposed(self) -> PlaneEstimate:
+        """Return the estimate with x and y swapped."""
+        return replace(self, tilt_rad=self.tilt_rad[::-1], tilt_std_rad=self.tilt_std_rad[::-1])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers for quality.json; millimetres and degrees."""
+        if not self.known:
+            return {"known": False}
+        return {
+            "known": True,
+            "offset_mm": round(1e3 * self.offset_m, 3),
+            "offset_std_mm": round(1e3 * self.offset_std_m, 3),
+            "tilt_deg": [round(float(np.degrees(t)), 4) for t in self.tilt_rad],
+            "tilt_std_deg": [round(float(np.degrees(t)), 4) for t in self.tilt_std_rad],
+            "by": "phase" if self.by_phase else "range",
+            "plates": self.plates,
+        }
+
+
+UNKNOWN_PLANE = PlaneEstimate(0.0, np.inf, (0.0, 0.0), (np.inf, np.inf), np.zeros(0), False, 0)
+"""Plane undetermined: use the rig file's plane."""
+
+
+def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> PlaneEstimate:
+    """Estimate the plane from the insides of flat patches.
+
+    Parameters
+    ----------
+    builder
+        Has the rows, and a range gate that includes the plane (`depth_m`).
+    masks
+        bool [ny, nx], one per patch, on the builder's grid.
+    """
+    grid = builder.grid
+    x, y = grid.x_m - grid.x_m.mean(), grid.y_m - grid.y_m.mean()
+    ranges = [_ranges(board, masks) for board in builder.boards.values()]
+    precision = np.stack([1 / std**2 for _, std in ranges])
+    total = precision.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        heights = sum(precision[i] * np.nan_to_num(ranges[i][0]) for i in range(len(ranges))) / total
+    stds = np.sqrt(1 / np.where(total > 0, total, np.nan))
+    determined = np.isfinite(heights)
+    if not determined.any():
+        return replace(UNKNOWN_PLANE, heights_m=np.full(len(masks), np.nan))
+    places = np.array([(x[m.any(axis=0)].mean(), y[m.any(axis=1)].mean()) if m.any() else (0.0, 0.0) for m in masks])
+    plane, covariance = _fit(places[determined], heights[determined], np.hypot(stds[determined], _MIN_STD_M))
+    phase = _heights_by_phase(next(iter(builder.boards.values())), masks, places, plane)
+    fine = determined & np.isfinite(phase[0])
+    by_phase = False
+    if fine.sum() >= 2:
+        finer, fine_covariance = _fit(places[fine], phase[0][fine], np.full(int(fine.sum()), _PHASE_STD_M))
+        off = phase[0][fine] - _at(finer, places[fine])
+        agree = float(np.sqrt(np.mean((off * phase[1]) ** 2))) < _PHASE_FITS_RAD
+        # Thin sheets change the phase themselves: accept the plane only if the ranges agree.
+        apart = np.abs(finer - plane) < 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, 3e-3, 3e-3]
+        if agree and fine.sum() >= 4 and bool(apart.all()) and float(np.hypot(*finer[1:])) < _MAX_TILT:
+            plane, covariance, heights, by_phase = finer, fine_covariance, phase[0], True
+    std = np.sqrt(np.diag(covariance))
+    return PlaneEstimate(
+        float(plane[0]),
+        float(std[0]),
+        (float(np.arctan(plane[1])), float(np.arctan(plane[2]))),
+        (float(std[1]), float(std[2])),
+        np.asarray(heights, np.float64),
+        by_phase,
+        int(determined.sum()),
+    )
+
+
+def move_to_plane(
+    builder: ImageBuilder, images: ChannelImages, masks: Sequence[NDArray[np.bool_]], transposed: bool, move: bool
+) -> tuple[PlaneEstimate, ChannelImages]:
+    """Estimate the plane of patches; return it and the images on it, if it differs from the rig file's plane.
+
+    Parameters
+    ----------
+    builder, images
+        Builder with all rows, and its images.
+    masks
+        bool [ny, nx] insides of the patches, on the images' grid.
+    transposed
+        The images are the builder's with x and y swapped.
+    move
+        False: return the images unchanged.
+    """
+    plane = find_plane(builder, [mask.T if transposed else mask for mask in masks])
+    if move and plane.worth_moving:
+        images = builder.finish(plane.offset_m)
+        images = images.transposed() if transposed else images
+    return plane, images
+
+
+def _ranges(board: BoardSamples, masks: Sequence[NDArray[np.bool_]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the height of each patch from the range of its echo, and its standard deviation, metres."""
+    image, footprint, _ = board.image()
+    slope, mirror_slope = board.range_slope()
+    moved, moved_slope = board.mirror_image(_STEP_M), board.mirror_slope(_STEP_M)
+    heights, stds = np.full(len(masks), np.nan), np.full(len(masks), np.inf)
+    for i, mask in enumerate(masks):
+        power = np.abs(image[mask].astype(np.complex128)) ** 2
+        if not power.sum() > 0:
+            continue
+        weight = power / power.sum()
+        with np.errstate(invalid="ignore", divide="ignore"):
+            own = np.real(slope[mask] / image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
+            by_height = (np.real(moved_slope[mask] / moved[mask]) - np.real(mirror_slope[mask] / footprint[mask])) / (
+                _STEP_M
+            )
+        per_metre = float(np.nansum(weight * by_height))
+        own = np.where(np.isfinite(own), own, 0.0)
+        mean = float(np.sum(weight * own))
+        spread = float(np.sqrt(np.sum(weight * (own - mean) ** 2)))
+        height, std = mean / per_metre, spread / abs(per_metre)
+        if std < 0.05 and np.isfinite(height):
+            heights[i], stds[i] = height, max(std, _MIN_STD_M)
+    return heights, stds
+
+
+def _heights_by_phase(
+    board: BoardSamples,
+    masks: Sequence[NDArray[np.bool_]],
+    places: NDArray[np.float64],
+    plane: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], float]:
+    """Return the height of each patch from its phase, unwrapped with a plane near `plane`; and radians per metre."""
+    image, footprint, _ = board.image()
+    moved = board.mirror_image(_STEP_M)
+    phases = np.full(len(masks), np.nan)
+    rates = []
+    for i, mask in enumerate(masks):
+        flat = -image[mask].astype(np.complex128) * np.conj(footprint[mask])  # r_s is nearly real and negative
+        coherent = abs(flat.sum()) / max(float(np.abs(flat).sum()), 1e-300)
+        if mask.any() and coherent > _COHERENT:
+            phases[i] = np.angle(flat.sum())
+            rates.append(float(np.angle(np.vdot(footprint[mask], moved[mask]))) / _STEP_M)
+    if not rates:
+        return phases, 1.0
+    rate = float(np.median(rates))
+    turn = 2 * np.pi / abs(rate)
+    known = np.flatnonzero(np.isfinite(phases))
+    best: tuple[float, NDArray[np.float64]] = (np.inf, np.full(len(masks), np.nan))
+    # The range leaves an ambiguity of some turns, common to all plates except for the tilt: try several tilts.
+    for tilt_x in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
+        for tilt_y in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
+            guess = _at(plane + np.array([0.0, tilt_x, tilt_y]), places[known])
+            heights = phases[known] / rate
+            common = np.angle(np.mean(np.exp(2j * np.pi * (heights - guess) / turn))) / (2 * np.pi) * turn
+            heights = heights + turn * np.round((guess + common - heights) / turn)
+            shift = turn * np.round((np.median(guess) - np.median(heights)) / turn)
+            fitted, _ = _fit(places[known], heights + shift, np.full(known.size, _PHASE_STD_M))
+            miss = float(np.sum((heights + shift - _at(fitted, places[known])) ** 2)) / _PHASE_STD_M**2
+            miss += float(np.sum((fitted[1:] / _TILT_PRIOR_RAD) ** 2))
+            if miss < best[0]:
+                out = np.full(len(masks), np.nan)
+                out[known] = heights + shift
+                best = (miss, out)
+    return best[1], rate
+
+
+def _fit(
+    places: NDArray[np.float64], heights: NDArray[np.float64], stds: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Fit a plane (height, rise along x, rise along y) with a prior on its tilt; return it and its covariance.
+
+    The covariance is scaled up if the scatter around the plane exceeds the standard deviations of the heights.
+    """
+    rows = np.column_stack([np.ones(len(places)), places]) / stds[:, None]
+    information = rows.T @ rows + np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
+    plane = np.asarray(np.linalg.solve(information, rows.T @ (heights / stds)), np.float64)
+    covariance = np.linalg.inv(information)
+    off = (heights - _at(plane, places)) / stds
+    freedom = max(len(places) - 3, 1)
+    return plane, np.asarray(covariance * max(1.0, float(np.sum(off**2)) / freedom), np.float64)
+
+
+def _at(plane: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the heights of a plane at places [patch, 2]."""
+    return plane[0] + places @ plane[1:]

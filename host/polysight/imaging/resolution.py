@@ -1,0 +1,171 @@
+"""Point response of an aperture: measured widths and sidelobes, the paper's formula and the limit of the geometry.
+
+`point_response` images a point in the middle of the scene with the aperture's taper and mask; `imaging_facts` gives the
+entry `imaging` of quality.json.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.imaging.aperture import Aperture
+from polysight.imaging.direct import DirectImager, backproject
+from polysight.imaging.geometry import ImageGrid
+from polysight.imaging.images import ChannelImages, ImageBuilder
+from polysight.imaging.samples import BoardSamples
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+_BLOCKS = 32  # blocks of positions per axis: exact within 16 resolution cells to either side
+_CELLS = 6.0  # resolution cells evaluated to either side
+_POINTS = 20  # points per resolution cell
+_HALF_POWER = np.sqrt(0.5)
+
+
+@dataclass(frozen=True)
+class PointResponse:
+    """Response to a point in the middle of the image, for (x, y).
+
+    Attributes
+    ----------
+    width_mm
+        Measured between the half-power points, with the actual taper, window and missing positions.
+    limit_mm
+        Limit of the geometry: 0.886 over the spread of `(sin theta_tx + sin theta_rx) / lambda` along the aperture
+        (half-power width of an evenly filled band); for a plane at height h about 0.886 lambda h / (2 L cos^3) in x and
+        / (2 L cos) in y.
+    paper_mm
+        The paper's formula `r lambda / L` (section 6.1) with r the plane's distance.
+    sidelobe_db
+        Strongest sidelobe.
+    """
+
+    width_mm: tuple[float, float]
+    limit_mm: tuple[float, float]
+    paper_mm: tuple[float, float]
+    sidelobe_db: tuple[float, float]
+
+
+def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointResponse:
+    """Return the point response of an aperture with weights [row, column], 0 where a position is missing.
+
+    Positions are combined into at most 32 x 32 blocks at their mean positions, exact enough within the evaluated range.
+    """
+    small, total = _blocks(aperture, weights)
+    grid = aperture.grid
+    point = np.array([grid.x_m.mean(), grid.y_m.mean(), float(np.mean(grid.z_m))])
+    limit = [limit_m(small, point, axis) for axis in (0, 1)]
+    one = ImageGrid(point[:1], point[1:2], float(point[2]), grid.pixel_m)
+    answer = DirectImager(replace(small, grid=one)).samples(np.ones((1, 1))) * total
+    cuts = [_cut(small, answer, point, axis, limit[axis]) for axis in (0, 1)]
+    wave = SPEED_OF_LIGHT_M_S / aperture.frequencies_hz.mean()
+    length = np.ptp(aperture.offsets_m[..., :2], axis=(0, 1))
+    distance = point[2] - aperture.offsets_m[..., 2].mean()
+    paper = [1e3 * distance * wave / n if n > 0 else np.inf for n in length]
+    widths = [1e3 * _width(cut) * step for cut, step in cuts]
+    sidelobes = [_sidelobe_db(cut) for cut, _ in cuts]
+    return PointResponse(
+        (float(widths[0]), float(widths[1])),
+        (1e3 * limit[0], 1e3 * limit[1]),
+        (float(paper[0]), float(paper[1])),
+        (sidelobes[0], sidelobes[1]),
+    )
+
+
+def _blocks(aperture: Aperture, weights: NDArray[np.floating]) -> tuple[Aperture, NDArray[np.float64]]:
+    """Return the aperture with neighbouring positions combined, and the sums of their weights."""
+    rows, columns = weights.shape
+    at_rows, at_columns = (np.unique(np.linspace(0, n, _BLOCKS + 1).astype(int)[:-1]) for n in (rows, columns))
+
+    def summed(values: NDArray[np.floating]) -> NDArray[np.float64]:
+        return np.add.reduceat(np.add.reduceat(values.astype(float), at_rows, axis=0), at_columns, axis=1)
+
+    count = summed(np.ones((rows, columns)))
+    offsets = np.stack([summed(aperture.offsets_m[..., i]) / count for i in range(3)], axis=-1)
+    return replace(aperture, offsets_m=offsets), summed(weights)
+
+
+def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
+    """Return the half-power width along an axis from the spread of wavenumbers in the aperture, metres."""
+    middle = tuple(n // 2 for n in aperture.offsets_m.shape[:2])
+    line = aperture.offsets_m[middle[0]] if axis == 0 else aperture.offsets_m[:, middle[1]]
+    slope = np.zeros(len(line))
+    for place in (aperture.antennas.tx_m, aperture.antennas.rx_m[0]):
+        away = point - line - place
+        slope += away[:, axis] / np.linalg.norm(away, axis=1)
+    spread = np.ptp(slope) * aperture.frequencies_hz.mean() / SPEED_OF_LIGHT_M_S
+    return float(0.886 / spread) if spread > 0 else float("inf")
+
+
+def _cut(
+    aperture: Aperture, answer: NDArray[np.complex128], point: NDArray[np.float64], axis: int, cell_m: float
+) -> tuple[NDArray[np.float64], float]:
+    """Return the amplitude along an axis through the point, relative to the point, and the step in metres."""
+    count = int(_CELLS * _POINTS)
+    step = (cell_m if np.isfinite(cell_m) else aperture.grid.pixel_m) / _POINTS
+    voxels = np.tile(point, (2 * count + 1, 1))
+    voxels[:, axis] += np.arange(-count, count + 1) * step
+    shift, a = aperture.offsets_m.reshape(-1, 3), aperture.antennas
+    total = np.zeros(len(voxels), complex)
+    for rx, samples in enumerate(answer):
+        places = (a.tx_m + shift, a.rx_m[rx] + shift, voxels, np.full(len(shift), a.direct_m[rx]))
+        total += backproject(samples.reshape(len(samples), -1).T, aperture.frequencies_hz, *places)
+    cut = np.abs(total)
+    return cut / (cut[count] or 1.0), step
+
+
+def _width(cut: NDArray[np.float64]) -> float:
+    """Return the half-power width in points; infinite if the amplitude never falls that low."""
+    middle = cut.size // 2
+    sides = []
+    for side in (cut[middle:], cut[middle::-1]):
+        below = np.flatnonzero(side < _HALF_POWER)
+        if not below.size:
+            return float("inf")
+        i = below[0]
+        sides.append(i - 1 + (side[i - 1] - _HALF_POWER) / (side[i - 1] - side[i]))
+    return float(sum(sides))
+
+
+def _sidelobe_db(cut: NDArray[np.float64]) -> float:
+    """Return the strongest value beyond the first minimum on either side, dB."""
+    middle = cut.size // 2
+    levels = []
+    for side in (cut[middle:], cut[middle::-1]):
+        rising = np.flatnonzero(np.diff(side) > 0)
+        levels.append(side[rising[0] :].max() if rising.size else side[-1])
+    return float(20 * np.log10(max(max(levels), 1e-9)))
+
+
+def imaging_facts(builder: ImageBuilder, images: ChannelImages) -> dict[str, Any]:
+    """Return the entry `imaging` of quality.json, by board."""
+    out: dict[str, Any] = {name: board_facts(board) for name, board in builder.boards.items()}
+    if images.notices:
+        out["notices"] = list(images.notices)
+    return out
+
+
+def board_facts(board: BoardSamples) -> dict[str, Any]:
+    """Return the figures of one board.
+
+    `masked` is the share of the tapered aperture without data, `loss_db` the loss of a point's sum due to it,
+    `-20 log10(1 - masked)`. Image amplitudes do not change, for images are divided by the number of valid positions.
+    """
+    weights = board.weights
+    masked = 1 - float(weights.sum() / board.taper.sum())
+    facts: dict[str, Any] = {
+        "positions": int(board.valid.size),
+        "masked_positions": int(board.valid.size - board.valid.sum()),
+        "rows_without_data": int((~board.valid.any(axis=1)).sum()),
+        "masked": round(masked, 6),
+        "frequencies": board.aperture.frequencies_hz.size,
+    }
+    if masked < 1:
+        response = point_response(board.aperture, weights)
+        facts["loss_db"] = round(-20 * float(np.log10(1 - masked)), 4) + 0.0
+        for key in ("width_mm", "limit_mm", "paper_mm", "sidelobe_db"):
+            facts[f"point_{key}"] = [round(v, 3) if np.isfinite(v) else None for v in getattr(response, key)]
+    return facts

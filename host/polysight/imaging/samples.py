@@ -1,0 +1,383 @@
+"""Reduced samples of one board, and its image.
+
+`BoardSamples` reduces each row to the range gate, stores it and images the rows with the imager that `choose_imager`
+selects. The samples of an ideal mirror on the object plane (`mirror_samples`) give the footprint, by which images are
+divided.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.imaging.aperture import Aperture, irregular, row_starts_m
+from polysight.imaging.direct import DirectImager
+from polysight.imaging.geometry import Antennas, ImageGrid, scan_offsets_m
+from polysight.imaging.reduce import Reduction, burst_filters, undo_burst_motion
+from polysight.imaging.spectral import SLACK_M, IncrementalImager, SpectralImager
+from polysight.sync import SyncedRow
+from polysight_shared.config import Board, Chirp, Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+from polysight_shared.raster import plan_raster
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+Image = NDArray[np.complex64]
+_log = logging.getLogger(__name__)
+_CHUNK = 120  # positions per matrix product: larger ones are slower by half (OpenBLAS)
+
+
+class Imager(Protocol):
+    """Matched filter of an aperture at its pixels, and its adjoint; sums, not means.
+
+    With the forward model A, `samples(x)` is A x and `image(y)` is A^H y.
+    """
+
+    @property
+    def aperture(self) -> Aperture:
+        """Positions, antennas, frequencies and pixels."""
+        ...
+
+    def image(self, samples: Any) -> Any:
+        """Image weighted samples, complex64 [rx, frequency, row, column], 0 where masked: complex [ny, nx]."""
+        ...
+
+    def constant(self, echo: Any, weights: Any) -> Any:
+        """Image an echo, complex [rx, frequency], at every position, times weights [row, column]."""
+        ...
+
+    def samples(self, image: Any) -> Any:
+        """Return the echoes of pixels, complex [ny, nx]: complex [rx, frequency, row, column]."""
+        ...
+
+
+def choose_imager(aperture: Aperture) -> tuple[Imager, str | None]:
+    """Choose the imager: spectral if the aperture is regular, otherwise the slower direct sum (with a notice)."""
+    reason = irregular(aperture)
+    if reason is None:
+        return SpectralImager(aperture), None
+    rx, _, rows, columns = aperture.shape
+    sums = rx * rows * columns * aperture.grid.x_m.size * aperture.grid.y_m.size
+    notice = f"imaging by direct sum, {sums:.1e} terms, about {sums / 1e7:.0f} s per board: {reason}"
+    return DirectImager(aperture), notice
+
+
+def mirror_samples(antennas: Antennas, z_m: float, chirp: Chirp) -> NDArray[np.complex128]:
+    """Return the referenced samples of a mirror, [rx, sample]; amplitude relative to a direct path of one metre."""
+    path = antennas.mirror_m(z_m)
+    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    phase = 2j * np.pi * np.outer(path - antennas.direct_m, sweep) / SPEED_OF_LIGHT_M_S
+    return (np.exp(phase) / path[:, None]).astype(np.complex128)
+
+
+def mirror_reduced(antennas: Antennas, z_m: float, chirp: Chirp, reduction: Reduction) -> NDArray[np.complex128]:
+    """Return the samples of a mirror after the range gate, [rx, frequency]."""
+    return mirror_samples(antennas, z_m, chirp) @ reduction.matrix.T
+
+
+class ReducedRow(NamedTuple):
+    """A row of a board after the range gate, columns from the smallest x.
+
+    samples complex64 [rx, frequency, column], direct path complex64 [rx, column], valid bool [column].
+    """
+
+    samples: NDArray[np.complex64]
+    direct: NDArray[np.complex64]
+    valid: NDArray[np.bool_]
+
+
+class BoardSamples:
+    """Samples of one board, [rx, frequency, row, column], columns from the smallest x; missing ones are 0 and masked.
+
+    Parameters
+    ----------
+    rig, board
+        Rig of the scan, and one of its receiving boards.
+    grid
+        Pixels.
+    reduction
+        Range gate.
+    taper
+        float32 [row, column]: weight of every position.
+    live
+        Keep running sums over rows for :meth:`current`.
+    """
+
+    def __init__(
+        self,
+        rig: Instrument,
+        board: Board,
+        grid: ImageGrid,
+        reduction: Reduction,
+        taper: NDArray[np.float32],
+        live: bool = False,
+    ) -> None:
+        self.board, self.taper = board, taper
+        self._plan, self._grid = plan_raster(rig.grid), grid
+        a, b = rig.chirp.linear_samples
+        self._reduction, self._linear = reduction, slice(2 * a, 2 * b)
+        self._maps = _on_pairs(np.vstack([reduction.matrix, reduction.direct])[:, a:b])
+        self._filters = burst_filters(rig)
+        self._antennas, self._chirp = Antennas.of(rig, board), rig.chirp
+        self.mirror = mirror_reduced(self._antennas, float(np.mean(grid.z_m)), rig.chirp, reduction)
+        self._offsets = scan_offsets_m(rig)
+        self._planned = row_starts_m(self._offsets)
+        rx, shape = len(self._antennas.rx_m), taper.shape
+        self._cube = np.zeros((rx, reduction.frequencies_hz.size, *shape), np.complex64)
+        self._direct = np.zeros((rx, *shape), np.complex64)
+        self.valid = np.zeros(shape, bool)
+        regular = irregular(self.aperture) is None
+        self._final: SpectralImager | None = None
+        self._spectra = np.zeros(0, np.complex64)  # spectra of the rows along x, for the final image
+        self._padded = np.zeros(0, np.complex64)  # a weighted row, padded with zeros to a period
+        self._stale = set(range(shape[0]))  # rows whose spectra are out of date
+        self._moved = False  # rows differ from the lattice of the live image
+        self._live = None
+        if live and regular:
+            self._live = IncrementalImager(self.aperture, self.mirror)
+            self._prepare()  # compute kernels now instead of after the last row
+
+    @property
+    def aperture(self) -> Aperture:
+        """Geometry of antennas, positions and pixels."""
+        return Aperture(self._antennas, self._offsets, self._reduction.frequencies_hz, self._grid)
+
+    @property
+    def model(self) -> NDArray[np.complex128]:
+        """Effect of the range gate on an echo, [frequency, frequency], see `reduce.Reduction.model`."""
+        return self._reduction.model
+
+    @property
+    def weights(self) -> NDArray[np.float32]:
+        """Taper of each position, 0 where not valid, float32 [row, column]."""
+        return self.taper * self.valid
+
+    def _weights_of(self, index: int) -> NDArray[np.float32]:
+        """Return one row of :attr:`weights`."""
+        return self.taper[index] * self.valid[index]
+
+    @property
+    def count(self) -> np.float32:
+        """Divisor of a sum over positions and RX."""
+        return np.float32((self.weights.sum() or 1.0) * len(self._antennas.rx_m))
+
+    def add_row(self, index: int, row: SyncedRow, offsets_m: NDArray[np.float64] | None = None) -> None:
+        """Add a row; a row added again replaces the earlier one.
+
+        Parameters
+        ----------
+        index
+            Index of the row in the plan.
+        row
+            Positions in order of recording.
+        offsets_m
+            float64 [position, 2 or 3], same order: measured mean stage offsets; None: as planned.
+
+        Raises
+        ------
+        DataError
+            if the row is not in the plan.
+        """
+        if not 0 <= index < self._plan.rows:
+            raise _wrong_row(f"row {index} of board {self.board.name!r} is not in this scan")
+        if row.valid.shape != (self._plan.columns,):
+            raise _wrong_row(
+                f"row {index} of board {self.board.name} has {row.valid.size} positions, the plan {self._plan.columns}"
+            )
+        forward = slice(None, None, self._plan.row(index).direction)
+        reduced = self._reduced(row.samples)
+        if row.turn is not None:
+            reduced = undo_burst_motion(reduced, row.valid, row.turn, self._filters)
+        reduced, valid = reduced[..., forward], row.valid[forward]
+        self._put(index, ReducedRow(reduced[:, :-1] * valid, reduced[:, -1] * valid, valid), offsets_m, forward)
+
+    def put(self, index: int, row: ReducedRow) -> None:
+        """Add a row from :meth:`reduced`, reduced by the same range gate."""
+        self._put(index, row)
+
+    def reduced(self, index: int) -> ReducedRow:
+        """Return a row after the range gate."""
+        return ReducedRow(self._cube[:, :, index], self._direct[:, index], self.valid[index])
+
+    def _put(
+        self,
+        index: int,
+        row: ReducedRow,
+        offsets_m: NDArray[np.float64] | None = None,
+        forward: slice = slice(None),
+    ) -> None:
+        self._show(index, -1)
+        self._cube[:, :, index], self._direct[:, index], self.valid[index] = row
+        if offsets_m is not None:
+            self._offsets[index, :, : offsets_m.shape[1]] = offsets_m[forward]
+            self._final, self._moved = None, True
+            moved = abs(row_starts_m(self._offsets)[index] - self._planned[index])
+            if moved > SLACK_M or irregular(self.aperture) is not None:
+                self._live = None
+        self._stale.add(index)
+        self._show(index, 1)
+
+    def _reduced(self, samples: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """Apply the range gate to a row; return samples and the direct path, [rx, frequency + 1, position]."""
+        if samples.strides[1] < 0:  # reversed positions make the product slow
+            return self._reduced(samples[:, ::-1])[..., ::-1]
+        pairs = np.asarray(samples, np.complex64).view(np.float32)[..., self._linear]
+        out = np.empty((*pairs.shape[:2], self._maps.shape[1]), np.float32)
+        for first in range(0, pairs.shape[1], _CHUNK):
+            part = slice(first, first + _CHUNK)
+            np.matmul(pairs[:, part], self._maps, out=out[:, part])
+        return out.view(np.complex64).mT
+
+    def _prepare(self) -> None:
+        """Create the spectral imager of all rows if the aperture is regular; keep it while positions do not change."""
+        if self._final is None and irregular(self.aperture) is None:
+            self._final = SpectralImager(self.aperture, slack_m=SLACK_M)  # shares spectra with the live imager
+            self._spectra = np.zeros((*self._cube.shape[:3], self._final.lattice.band.size), np.complex64)
+            self._padded = np.zeros((*self._cube.shape[:2], self._final.period), np.complex64)
+            self._stale = set(range(len(self.valid)))
+
+    def _transformed(self, imager: SpectralImager, index: int) -> NDArray[np.complex64]:
+        """Return the spectra of a row, [rx, frequency, k]; row by row, so that results are bit-exact in any order."""
+        if index in self._stale:
+            row = self._padded[..., : self.taper.shape[1]]
+            np.multiply(self._cube[:, :, index], self._weights_of(index), out=row)
+            self._spectra[:, :, index] = imager.spectra_of_row(self._padded, index)
+            self._stale.remove(index)
+        return self._spectra[:, :, index]
+
+    def keep(self, positions: NDArray[np.bool_]) -> None:
+        """Mask all positions except those in `positions` [row, column], as if they had not been scanned."""
+        self.valid &= positions
+        self._live = None
+        self._stale = set(range(len(self.valid)))
+
+    def _show(self, index: int, sign: int) -> None:
+        """Add a row to the live image, or subtract it (`sign` -1)."""
+        weights = sign * self._weights_of(index)
+        if self._live is None or not weights.any():
+            return
+        if self._final is not None and not self._moved:
+            white = self._final.spectra_of_row(weights.astype(np.complex64), index)
+            self._live.add_spectra(index, sign * self._transformed(self._final, index), white)
+        else:
+            start = float(row_starts_m(self._offsets)[index])
+            self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
+
+    def rx_calibration(self) -> NDArray[np.complex128]:
+        """Return the complex gain of each RX, [rx]: mean direct path of all positions times its known length."""
+        total = (self._direct * self.valid).sum(axis=(1, 2), dtype=np.complex128)
+        gain = total / max(1, int(self.valid.sum())) * self._antennas.direct_m
+        return np.where(gain == 0, 1, gain)
+
+    def calibrated(self) -> NDArray[np.complex64]:
+        """Return the samples divided by the gain of each RX, not weighted."""
+        return self._cube * (1 / self.rx_calibration()).astype(np.complex64)[:, None, None, None]
+
+    def current(self) -> tuple[Image, Image, str | None]:
+        """Return :meth:`image` from running sums if there are any: fast, and equal within 1e-6 of the peak."""
+        if self._live is None:
+            return self.image()
+        image = self._live.image_of_sum(1 / self.rx_calibration())
+        return image / self.count, self._live.constant_of_sum() / self.count, None
+
+    def image(self, grid: ImageGrid | None = None) -> tuple[Image, Image, str | None]:
+        """Return image and footprint of the rows so far, complex64 [ny, nx], and a notice if imaging is slow.
+
+        The result is bit-exact for the same rows in any order.
+
+        Parameters
+        ----------
+        grid
+            Other pixels than the rig file's, within the range gate.
+        """
+        gains, notice = (1 / self.rx_calibration()).astype(np.complex64), None
+        if grid is None:
+            self._prepare()
+        if grid is None and self._final is not None:
+            for index in range(len(self.valid)):
+                self._transformed(self._final, index)
+            imager: Imager = self._final
+            image: Any = self._final.image_of_spectra(self._spectra, gains)
+        else:
+            imager, notice = self._imager(grid)
+            image = imager.image(self._cube * (gains[:, None, None, None] * self.weights))
+        mirror = self.mirror if grid is None else self._mirror_at(float(np.mean(grid.z_m)))
+        footprint: Any = imager.constant(mirror.astype(np.complex64), self.weights) / self.count
+        return (image / self.count).astype(np.complex64), footprint.astype(np.complex64), notice
+
+    def range_profile(self, point_m: NDArray[np.float64], shifts_m: NDArray[np.float64]) -> NDArray[np.complex64]:
+        """Return the matched filter for paths longer by `shifts_m` than that of a point, complex64 [shift].
+
+        All positions are focused on `point_m` [3], rig frame. An echo from there has its peak at 0, echoes from behind
+        it at positive shifts.
+        """
+        at = point_m - self._offsets.reshape(-1, 3)
+        weights = (self.weights / self.count).ravel()
+        excess = self._antennas.excess_m(at[:, 0], at[:, 1], at[:, 2])
+        f, gains = self._reduction.frequencies_hz, 1 / self.rx_calibration()
+        cube = self._cube.reshape(*self._cube.shape[:2], -1) * weights
+        turned = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * f[None, :, None] * excess[:, None, :])
+        focused = (gains[:, None] * (cube * turned).sum(axis=-1)).sum(axis=0)
+        return (np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(shifts_m, f)) @ focused).astype(np.complex64)
+
+    def range_slope(self) -> tuple[Image, Image]:
+        """Return the derivative of image and footprint by range (excess path), without carrier; 1 / m.
+
+        The matched filter of path d is S(d) = sum_m y_m exp(-j 2 pi f_m d / c), so its derivative is the image of the
+        samples times -j 2 pi (f_m - f) / c, with f the middle of the sweep.
+        """
+        imager, _ = self._imager(None)
+        factors = self._by_range()
+        gains = (1 / self.rx_calibration()).astype(np.complex64)
+        image: Any = imager.image(self._cube * (gains[:, None, None, None] * factors[:, None, None] * self.weights))
+        return (image / self.count).astype(np.complex64), self.mirror_slope(0.0)
+
+    def mirror_image(self, height_m: float) -> Image:
+        """Return the footprint of a mirror `height_m` behind the rig file's plane, complex64 [ny, nx]."""
+        return self._constant_image(self._mirror_at(float(np.mean(self._grid.z_m)) + height_m))
+
+    def mirror_slope(self, height_m: float) -> Image:
+        """Return the derivative of :meth:`mirror_image` by range, see :meth:`range_slope`."""
+        return self._constant_image(self._mirror_at(float(np.mean(self._grid.z_m)) + height_m) * self._by_range())
+
+    def _constant_image(self, echo: NDArray[np.complexfloating]) -> Image:
+        imager, _ = self._imager(None)
+        image: Any = imager.constant(echo.astype(np.complex64), self.weights)
+        return (image / self.count).astype(np.complex64)
+
+    def _by_range(self) -> NDArray[np.complex64]:
+        f = self._reduction.frequencies_hz
+        return (-2j * np.pi * (f - f.mean()) / SPEED_OF_LIGHT_M_S).astype(np.complex64)
+
+    def _mirror_at(self, z_m: float) -> NDArray[np.complex128]:
+        return mirror_reduced(self._antennas, z_m, self._chirp, self._reduction)
+
+    def _imager(self, grid: ImageGrid | None) -> tuple[Imager, str | None]:
+        """Return the imager of the rig file's grid or of another one, and a notice if it is slow."""
+        if grid is None and self._final is not None:
+            return self._final, None
+        imager, notice = choose_imager(replace(self.aperture, grid=self._grid if grid is None else grid))
+        if notice:
+            _log.warning("%s: %s", self.board.name, notice)
+        return imager, notice
+
+
+def _on_pairs(maps: NDArray[np.complex128]) -> NDArray[np.float32]:
+    """Return complex maps [map, sample] as real ones for pairs (re, im), float32 [2 sample, 2 map].
+
+    `pairs @ out` are the pairs of `maps @ x`: a real product is 1.5 times as fast as such a narrow complex one.
+    """
+    out = np.empty((maps.shape[1], 2, maps.shape[0], 2), np.float32)
+    out[:, 0, :, 0], out[:, 1, :, 0] = maps.real.T, -maps.imag.T  # contributions to the real part
+    out[:, 0, :, 1], out[:, 1, :, 1] = maps.imag.T, maps.real.T
+    return out.reshape(2 * maps.shape[1], -1)
+
+
+def _wrong_row(what: str) -> DataError:
+    return DataError(
+        what, "the data were recorded with another rig file", "use the rig file of this scan", code=ErrorCode.MISMATCH
+    )

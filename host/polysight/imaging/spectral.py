@@ -1,0 +1,284 @@
+"""Spectral imagers: for a plane parallel to the stage, imaging is a convolution.
+
+TX and RX move together, so the matched filter of a position u at a pixel v depends only on `v - u`:
+`image = sum over rx, f of g * k`, with the kernel `k(x, y) = exp(-j 2 pi f d_rx(x, y) / c)`. All products are summed in
+the spectrum, and one inverse transform gives the image.
+
+Along y, rows and pixels share a lattice on which the kernel is sampled, without interpolation. Along x each row has its
+own shift (travel of the stage within a burst, backlash), a phase ramp in the spectrum.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from polysight.imaging.aperture import Aperture, fft_of, row_starts_m
+from polysight.imaging.lattice import Lattice, cached, key_of, lattice, lattice_key, spectra_along_x
+
+SLACK_M = 2e-3
+"""Largest deviation of a row's start along x from the aperture."""
+_LEFT_OUT = 6e-6  # relative to the strongest principal component: weaker ones are left out
+_CHUNK = 32  # wavenumbers processed in double precision at a time
+
+
+class RowSpectra:
+    """Transforms along x for both spectral imagers: rows to the kernel's band, and the band to pixels.
+
+    Parameters
+    ----------
+    aperture
+        A regular aperture, see :func:`polysight.imaging.aperture.irregular`.
+    xp, device
+        Array API namespace and device.
+    slack_m
+        Largest shift of rows along x from the aperture.
+    """
+
+    def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
+        self.aperture, self.xp, self.device = aperture, xp, device
+        self.lattice: Lattice = cached(lattice_key(aperture, slack_m), lambda: lattice(aperture, slack_m))
+        self._fft = fft_of(xp)
+        self.period = self.lattice.size_x // self.lattice.stride_x
+        self._take = self.put(self.lattice.band % self.period)
+        self._origin = float(row_starts_m(aperture.offsets_m).min())
+        at = aperture.grid.x_m - self._origin - self.lattice.first_lag_m[0]
+        wave = np.exp(2j * np.pi * np.outer(self.lattice.wavenumbers, at)) / self.lattice.size_x
+        self._to_pixels = self.put(wave.astype(np.complex64))
+
+    def put(self, array: Any) -> Any:
+        """Copy a numpy array to the imager's device."""
+        return self.xp.asarray(array, device=self.device)
+
+    def kernels(self) -> Any:
+        """Return the kernels, complex64 [rx * frequency, lag y, k]."""
+        return spectra_along_x(self.aperture, self.lattice, self.xp, self.device)
+
+    def key(self, *more: Any) -> tuple[Any, ...]:
+        """Return the cache key of an array made from the kernels."""
+        return (*more, *key_of(self.aperture, self.lattice, self.xp, self.device))
+
+    def ramps(self, starts_m: Any) -> Any:
+        """Return phase ramps that shift rows to their starts, complex64 [row, k]."""
+        cycles = np.outer(starts_m - self._origin, self.lattice.wavenumbers)
+        return self.put(np.exp(-2j * np.pi * cycles).astype(np.complex64))
+
+    def of_rows(self, rows: Any, ramps: Any) -> Any:
+        """Return the spectra of rows [..., row, column] in the kernel's band, [..., row, k]."""
+        whole = self._fft.fft(rows, n=self.period, axis=-1)
+        return self.xp.take(whole, self._take, axis=-1) * ramps
+
+    def to_rows(self, spectra: Any, ramps: Any) -> Any:
+        """Apply the adjoint of :meth:`of_rows`."""
+        xp, count, columns = self.xp, self.lattice.band.size, self.aperture.offsets_m.shape[1]
+        rest = xp.zeros((*spectra.shape[:-1], self.lattice.size_x - count), dtype=xp.complex64, device=self.device)
+        whole = xp.roll(xp.concat([spectra * xp.conj(ramps), rest], axis=-1), int(self.lattice.band[0]), axis=-1)
+        folded = xp.sum(xp.reshape(whole, (*spectra.shape[:-1], self.lattice.stride_x, self.period)), axis=-2)
+        return self._fft.ifft(folded, axis=-1)[..., :columns] * self.period
+
+    def of_pixels(self, image: Any) -> Any:
+        """Apply the adjoint of :meth:`to_pixels`: [..., ny, nx] to [..., ny, k]."""
+        return self.xp.matmul(image, self.xp.conj(self._to_pixels).mT)
+
+    def to_pixels(self, spectra: Any) -> Any:
+        """Evaluate the spectra of rows of pixels [..., ny, k] at the pixels, [..., ny, nx]."""
+        return self.xp.matmul(spectra, self._to_pixels)
+
+
+class SpectralImager(RowSpectra):
+    """Imager of all rows at once: one 2-D product per RX and frequency, one inverse transform."""
+
+    def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
+        super().__init__(aperture, xp, device, slack_m)
+        self._ramps = self.ramps(row_starts_m(aperture.offsets_m))
+        self._echo: Any = None  # the last constant echo, and its kernel
+        sizes, rows, lines = self.lattice, aperture.offsets_m.shape[0], aperture.grid.shape[0]
+        self._last = sizes.row_stride * (rows - 1)  # lattice row of the first row of pixels
+        count = sizes.size_y // sizes.row_stride
+        self._tall = self.xp.zeros((count, sizes.band.size), dtype=self.xp.complex64, device=device)  # zeros below rows
+        self._repeat = self.put(np.arange(sizes.size_y) % count)
+        self._rows = self.put(np.arange(rows) * sizes.row_stride)
+        self._pixel_rows = self.put(self._last + np.arange(lines) * sizes.pixel_stride)
+        self._kernels = cached(
+            self.key("2d", self.lattice.size_y), lambda: self._fft.fft(self.kernels(), n=self.lattice.size_y, axis=-2)
+        )
+
+    def image(self, samples: Any) -> Any:
+        """Return the matched filter of samples [rx, frequency, row, column], complex64 [ny, nx]."""
+        rx, m, rows, columns = self.aperture.shape
+        channels = self.xp.reshape(samples, (rx * m, rows, columns))
+        total = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
+        for c in range(rx * m):
+            total += self._kernels[c, :, :] * self._along_y(self.of_rows(channels[c, :, :], self._ramps))
+        return self._inverse(total)
+
+    def spectra_of_row(self, samples: Any, index: int) -> Any:
+        """Return the spectra [..., k] of a row [..., column] for :meth:`image_of_spectra`."""
+        return self.of_rows(samples, self._ramps[index, :])
+
+    def image_of_spectra(self, spectra: Any, factors: Any) -> Any:
+        """Return :meth:`image` of rows transformed along x [rx, frequency, row, k], with a factor per RX."""
+        rx, m = self.aperture.shape[:2]
+        total = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
+        for r in range(rx):
+            part = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
+            for c in range(m):
+                part += self._kernels[r * m + c, :, :] * self._along_y(spectra[r, c, :, :])
+            total += part * factors[r]
+        return self._inverse(total)
+
+    def constant(self, echo: Any, weights: Any) -> Any:
+        """Return the image of an echo [rx, frequency] at every position, times weights [row, column]."""
+        xp, echo = self.xp, self.xp.asarray(echo, dtype=self.xp.complex64)
+        if self._echo is None or not bool(xp.all(self._echo[0] == echo)):
+            channels = xp.reshape(echo, (-1,))
+            total = xp.zeros(self._kernels.shape[1:], dtype=xp.complex64, device=self.device)
+            for c in range(channels.shape[0]):
+                total += self._kernels[c, :, :] * channels[c]
+            self._echo = (echo, total)
+        white = self._along_y(self.of_rows(xp.astype(weights, xp.complex64), self._ramps))
+        return self._inverse(self._echo[1] * white)
+
+    def samples(self, image: Any) -> Any:
+        """Return the echoes of pixels [ny, nx], [rx, frequency, row, column]; the adjoint of :meth:`image`."""
+        xp, sizes = self.xp, self.lattice
+        lines = self.of_pixels(image)
+        spread = xp.zeros((sizes.size_y, lines.shape[-1]), dtype=xp.complex64, device=self.device)
+        end = self._last + sizes.pixel_stride * lines.shape[0]
+        spread[self._last : end : sizes.pixel_stride, :] = lines
+        spectrum = self._fft.fft(spread, axis=0)
+        out = []
+        for c in range(self._kernels.shape[0]):
+            product = self._fft.ifft(xp.conj(self._kernels[c, :, :]) * spectrum, axis=0)
+            out.append(self.to_rows(xp.take(product, self._rows, axis=0), self._ramps))
+        return xp.reshape(xp.stack(out), self.aperture.shape)
+
+    def _along_y(self, lines: Any) -> Any:
+        """Return the 2-D spectrum on the lattice [ky, k] of the rows' spectra [row, k]."""
+        self._tall[: lines.shape[0], :] = lines
+        whole = self._fft.fft(self._tall, axis=0)
+        return whole if self.lattice.row_stride == 1 else self.xp.take(whole, self._repeat, axis=0)
+
+    def _inverse(self, total: Any) -> Any:
+        lines = self.xp.take(self._fft.ifft(total, axis=0), self._pixel_rows, axis=0)
+        return self.to_pixels(lines)
+
+
+class IncrementalImager(RowSpectra):
+    """Imager that adds row by row to the image.
+
+    Parameters
+    ----------
+    aperture
+        The nominal aperture; rows may start up to 2 mm along x from it.
+    echo
+        complex [rx, frequency]: constant echo that is imaged as well; None for none.
+    xp, device
+        Array API namespace and device.
+    """
+
+    def __init__(self, aperture: Aperture, echo: Any = None, xp: Any = np, device: Any = None) -> None:
+        super().__init__(aperture, xp, device, SLACK_M)
+        rows, lines = aperture.shape[2], aperture.grid.shape[0]
+        self._last = self.lattice.row_stride * (rows - 1)
+        self._span = self.lattice.pixel_stride * (lines - 1) + 1
+        self._kernels, self._components = cached(self.key("rows"), self._principal_kernels)
+        self._clear(np.zeros(aperture.shape[:2]) if echo is None else echo)
+
+    def add_row(self, index: int, samples: Any, weights: Any, start_m: float) -> None:
+        """Add a row to the image.
+
+        Parameters
+        ----------
+        index
+            Index of the row.
+        samples
+            complex64 [rx, frequency, column], weighted. To replace a row, give the difference.
+        weights
+            float32 [column], for the constant echo. To replace a row, give the difference.
+        start_m
+            Stage offset of the first column.
+        """
+        ramp = self.ramps(np.array([start_m]))[0, :]
+        white = self.of_rows(self.xp.astype(weights, self.xp.complex64), ramp)
+        self.add_spectra(index, self.of_rows(samples, ramp), white)
+
+    def add_spectra(self, index: int, lines: Any, white: Any) -> None:
+        """Add a row that is transformed along x, [rx, frequency, k], and its weights, [k]."""
+        xp, (rx, m) = self.xp, self.aperture.shape[:2]
+        by_rx = xp.zeros((lines.shape[-1], rx * m, rx), dtype=xp.complex64, device=self.device)
+        for r in range(rx):
+            by_rx[:, r * m : (r + 1) * m, r] = lines[r, :, :].mT
+        at = self._lags(index)
+        self._sum += xp.matmul(self._kernels[:, at, :], xp.matmul(self._components, by_rx))
+        self._constant += self._echo_kernel[:, at] * white[:, None]
+
+    def image_of_sum(self, factors: Any) -> Any:
+        """Return the image of the rows so far, with a factor per RX [rx], complex64 [ny, nx]."""
+        total = self.xp.matmul(self._sum, self.put(np.asarray(factors, np.complex64))[:, None])[:, :, 0]
+        return self.to_pixels(total.mT)
+
+    def constant_of_sum(self) -> Any:
+        """Return the image of the constant echo for the rows so far, complex64 [ny, nx]."""
+        return self.to_pixels(self._constant.mT)
+
+    def image(self, samples: Any) -> Any:
+        """See :class:`polysight.imaging.samples.Imager`; removes all rows first."""
+        rx, m, rows, columns = self.aperture.shape
+        self._clear(np.zeros((rx, m)))
+        self._add_all(samples, self.xp.zeros((rows, columns), dtype=self.xp.float32, device=self.device))
+        return self.image_of_sum(np.ones(rx))
+
+    def constant(self, echo: Any, weights: Any) -> Any:
+        """See :class:`polysight.imaging.samples.Imager`; removes all rows first."""
+        self._clear(echo)
+        self._add_all(self.xp.zeros(self.aperture.shape, dtype=self.xp.complex64, device=self.device), weights)
+        return self.constant_of_sum()
+
+    def samples(self, image: Any) -> Any:
+        """See :class:`polysight.imaging.samples.Imager`."""
+        xp, (rx, m, rows, columns) = self.xp, self.aperture.shape
+        lines = self.of_pixels(image).mT[:, :, None]
+        ramps = self.ramps(row_starts_m(self.aperture.offsets_m))
+        out = []
+        for index in range(rows):
+            parts = xp.matmul(xp.conj(self._kernels[:, self._lags(index), :]).mT, lines)
+            answer = xp.matmul(xp.conj(self._components).mT, parts)[:, :, 0]
+            out.append(self.to_rows(answer.mT, ramps[index, :]))
+        return xp.permute_dims(xp.reshape(xp.stack(out), (rows, rx, m, columns)), (1, 2, 0, 3))
+
+    def _clear(self, echo: Any) -> None:
+        """Remove all rows."""
+        xp, (rx, _, _, _) = self.xp, self.aperture.shape
+        size = (self.lattice.band.size, self.aperture.grid.shape[0])
+        self._sum = xp.zeros((*size, rx), dtype=xp.complex64, device=self.device)
+        self._constant = xp.zeros(size, dtype=xp.complex64, device=self.device)
+        channels = xp.reshape(xp.asarray(echo, dtype=xp.complex64, device=self.device), (-1,))[:, None]
+        self._echo_kernel = xp.matmul(self._kernels, xp.matmul(self._components, channels))[:, :, 0]
+
+    def _add_all(self, samples: Any, weights: Any) -> None:
+        for index, start in enumerate(row_starts_m(self.aperture.offsets_m)):
+            self.add_row(index, samples[:, :, index, :], weights[index, :], float(start))
+
+    def _lags(self, index: int) -> slice:
+        """Return the lags in y between a row of positions and every row of pixels."""
+        first = self._last - index * self.lattice.row_stride
+        return slice(first, first + self._span, self.lattice.pixel_stride)
+
+    def _principal_kernels(self) -> tuple[Any, Any]:
+        """Return kernels [k, lag, component], and the transform from channels, [k, component, channel]."""
+        xp = self.xp
+        whole = self.kernels()
+        by_k = xp.empty(whole.shape[::-1], dtype=xp.complex64, device=self.device)
+        by_k[...] = xp.permute_dims(whole, (2, 1, 0))  # contiguous, so that products are fast
+        squares = []
+        for first in range(0, by_k.shape[0], _CHUNK):
+            last = min(first + _CHUNK, by_k.shape[0])
+            exact = xp.astype(by_k[first:last, :, :], xp.complex128)  # weak components need the digits
+            squares.append(xp.matmul(xp.conj(exact).mT, exact))
+        power, vectors = xp.linalg.eigh(xp.concat(squares))
+        strongest = xp.max(power, axis=0)  # ascending: the last component is the strongest at every wavenumber
+        count = int(xp.sum(xp.astype(strongest > _LEFT_OUT**2 * strongest[-1], xp.int64)))
+        vectors_used = xp.astype(vectors[:, :, -count:], xp.complex64)
+        return xp.matmul(by_k, vectors_used), xp.asarray(xp.conj(vectors_used).mT, copy=True)

@@ -1,0 +1,144 @@
+"""Estimate the tilt of plates, and correct its effect on the images.
+
+A flat plate is visible where it reflects TX into RX: from the stage position whose specular point on the object plane
+is the pixel. A plate that rises by s (radians, along x and y) is visible from other positions, like the object plane at
+a distance
+
+    d = H^-1 C s        H = d2 (r1 + r2) / dx dy,   C = cos of TX's leg + cos of RX's leg to the plane's normal
+
+away: with the directions e1, e2 of both legs, specular reflection requires (e1 + e2)_xy + s (e1 + e2)_z = 0, and
+(e1 + e2)_xy grows with H from the specular point. There the aperture has another weight, which differs between H and V
+because their specular points differ: 2.5 % of V / H per degree on the published rig (simulated). So a pixel of a
+tilted plate is divided by the mirror's footprint `d` away. The tilt follows from the image: its phase grows by k C s
+per metre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from polysight.imaging.geometry import Antennas
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+Rise = tuple[float, float]
+"""Growth of a plate's height along x and along y."""
+MAX_RISE = 0.06
+"""Largest tilt of a plate (3.4 degrees); a steeper phase has another cause."""
+MIN_RISE = 2e-3
+"""Smallest tilt that is corrected (0.11 degrees); smaller ones may come from sidelobes of neighbours."""
+_COHERENT = 0.5
+"""Smallest coherence of the phase steps between pixels (1: all equal)."""
+_MAX_CHANGE = 2.0
+"""Largest change of the footprint over the distance `d`; a larger one occurs only at the edge of the aperture."""
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """Illumination of the object plane by both channels.
+
+    Attributes
+    ----------
+    footprints
+        complex64 [2, ny, nx]: the image of a uniform mirror, H and V.
+    moved_m
+        float64 [2, 2, 2]: `d` of each channel (x, y) for a rise of 1 along x and along y, metres.
+    steepness_rad_m
+        float64 [2]: growth of the phase, radians a metre, for a rise of 1.
+    pixel_m
+        Pitch of the pixels along x and y.
+    """
+
+    footprints: NDArray[np.complex64]
+    moved_m: NDArray[np.float64]
+    steepness_rad_m: NDArray[np.float64]
+    pixel_m: tuple[float, float]
+
+    @property
+    def across(self) -> int:
+        """Axis across the plane of incidence, 0 (x) or 1 (y), where a rise moves the specular point least."""
+        return int(np.argmin(np.abs(np.diagonal(self.moved_m.mean(axis=0)))))
+
+    def transposed(self) -> Illumination:
+        """Return the illumination with x and y swapped."""
+        turned = np.ascontiguousarray(self.footprints.transpose(0, 2, 1))
+        return replace(self, footprints=turned, moved_m=self.moved_m[:, ::-1, ::-1], pixel_m=self.pixel_m[::-1])
+
+    def rise(self, h: NDArray[np.complexfloating], v: NDArray[np.complexfloating], mask: NDArray[np.bool_]) -> Rise:
+        """Estimate the rise of a patch along x and y from its phase, radians; zero if undetermined.
+
+        `h`, `v` complex [ny, nx] are reflectivities (conjugates of the samples), `mask` bool [ny, nx] is the inside of
+        the patch.
+        """
+        out = []
+        for along in (0, 1):
+            # The phase of the conjugate falls where the plate rises.
+            step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in (h, v)) / 2
+            slope = float(np.angle(step)) / self.pixel_m[along] / float(self.steepness_rad_m.mean())
+            out.append(slope if abs(step) > _COHERENT and abs(slope) < MAX_RISE else 0.0)
+        return out[0], out[1]
+
+    def to_level(self, mask: NDArray[np.bool_], rise: Rise) -> NDArray[np.float64]:
+        """Return factors [2, n] that convert H and V of a patch's pixels to those of a level plate.
+
+        They use only the magnitude of the footprint, for its phase ripples with the rows of the grid; and only the rise
+        across the plane of incidence. Along it, H and V are illuminated equally (|H| changes by 7 % per degree), and
+        the phase is less reliable: plates at the sides of the image seem to rise by up to 0.3 degrees (0.8 degrees
+        with a narrow aperture).
+        """
+        slope = rise[self.across]
+        if abs(slope) < MIN_RISE:
+            return np.ones((2, int(mask.sum())))
+        return np.stack([self._change(k, mask, self.moved_m[k][:, self.across] * slope) for k in (0, 1)])
+
+    def _change(self, channel: int, mask: NDArray[np.bool_], moved_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the footprint at a patch's pixels divided by that `moved_m` away, [n]; 1 beyond the aperture."""
+        rows, columns = np.nonzero(mask)
+        level = np.abs(self.footprints[channel])
+        at = np.stack([rows + moved_m[1] / self.pixel_m[1], columns + moved_m[0] / self.pixel_m[0]])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change = level[rows, columns] / scipy.ndimage.map_coordinates(level, at, order=1, mode="nearest")
+        return np.where((change > 1 / _MAX_CHANGE) & (change < _MAX_CHANGE), change, 1.0)
+
+
+def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -> tuple[NDArray[np.float64], float]:
+    """Return `moved_m` [2, 2] and `steepness_rad_m` of a board at its specular point on the plane at `z_m`."""
+    tx, rx = antennas.tx_m, antennas.rx_m.mean(axis=0)
+    z_tx, z_rx = z_m - tx[2], z_m - rx[2]
+    point = np.append((tx[:2] * z_rx + rx[:2] * z_tx) / (z_tx + z_rx), z_m)
+    bend, cosines = np.zeros((2, 2)), 0.0
+    for place in (tx, rx):
+        leg = point - place
+        r = float(np.linalg.norm(leg))
+        e = leg / r
+        bend += (np.eye(2) - np.outer(e[:2], e[:2])) / r
+        cosines += float(e[2])
+    wave = 2 * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S
+    return np.asarray(np.linalg.inv(bend) * cosines, np.float64), wave * cosines
+
+
+def correct_tilt(
+    h: NDArray[np.complexfloating],
+    v: NDArray[np.complexfloating],
+    lit: Illumination,
+    masks: Sequence[NDArray[np.bool_]],
+    rises: Sequence[Rise],
+) -> tuple[NDArray[np.complexfloating], NDArray[np.complexfloating]]:
+    """Return both channels with the tilt of every patch corrected; other pixels are unchanged."""
+    out = (h.copy(), v.copy())
+    for mask, rise in zip(masks, rises, strict=True):
+        for channel, factor in zip(out, lit.to_level(mask, rise), strict=True):
+            channel[mask] *= factor
+    return out
+
+
+def _step(image: NDArray[np.complexfloating], mask: NDArray[np.bool_], axis: int) -> complex:
+    """Return exp(j mean phase step between pixels of a patch) times the coherence of the steps."""
+    inside = np.where(mask & np.isfinite(image), image, 0).astype(np.complex128)
+    ahead, behind = (np.take(inside, range(k, inside.shape[axis] - 1 + k), axis) for k in (1, 0))
+    product = ahead * np.conj(behind)
+    return complex(product.sum()) / max(float(np.abs(product).sum()), 1e-300)

@@ -1,0 +1,364 @@
+"""Many scans at once: one program each, as many at a time as cores and memory allow, here or on a Dask cluster.
+
+A scan that fails, or is killed for want of memory, takes no other with it. What is finished carries a mark that says
+what it was made with; a later run passes over it unless data, options, rig file or version have changed since.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from threading import Event
+from typing import Any, Literal
+
+import msgspec
+
+from polysight.process import ProcessRequest, cores
+from polysight.products import FINISHED, SavedProducts, write_json
+from polysight.store import COLLECTION, MANIFEST, ScanFolder, is_source, versions
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, PolysightError
+from polysight_shared.files import read_json
+
+SUMMARY = "processed.json"
+Status = Literal["done", "skipped", "failed", "stopped"]
+_PRODUCTS = ("image.npz", "quality.json")
+PROGRAM = (sys.executable, "-m", "polysight.jobs.batch_worker")
+"""Module that processes the job on its standard input."""
+ALIVE = "POLYSIGHT_PARENT_ALIVE"
+"""Environment of the program: number of a pipe that ends with the program that started it."""
+_FREE = 0.8  # of the free memory is used
+_POLL_S = 0.2
+
+
+class Job(msgspec.Struct, frozen=True):
+    """One scan to process, as plain data: request, dependencies of its products, rows at a time."""
+
+    request: ProcessRequest
+    made_with: dict[str, Any]
+    threads: int = 1
+
+    @property
+    def out(self) -> Path:
+        """Folder of its products."""
+        return Path(self.request.out)
+
+    @property
+    def name(self) -> str:
+        """Name of the scan's folder."""
+        return self.out.name
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of one scan, with the time and largest memory (GB) of its program."""
+
+    name: str
+    status: Status
+    seconds: float = 0.0
+    memory_gb: float = 0.0
+    message: str = ""
+
+
+def scans_of(paths: Sequence[Path]) -> list[Path]:
+    """Return the scans at paths: scan folders themselves, and the scans in other folders."""
+    out: list[Path] = []
+    for path in paths:
+        inside = [] if is_source(path) or not path.is_dir() else sorted(p for p in path.iterdir() if is_source(p))
+        out += inside or [path]
+    return out
+
+
+def jobs_of(requests: Sequence[ProcessRequest]) -> list[Job]:
+    """Make a job for each request.
+
+    Raises
+    ------
+    ConfigError
+        when two scans have one name, and so one folder of products.
+    """
+    jobs: dict[str, Job] = {}
+    for request in (r.absolute() for r in requests):
+        data = Path(request.data)
+        if data.name in jobs:
+            raise ConfigError(
+                f"two scans are named {data.name}: {jobs[data.name].request.data} and {data}",
+                "their products would go into one folder",
+                "process them in two runs, each with its own --out",
+                code=ErrorCode.NAME_TAKEN,
+            )
+        if (data / MANIFEST).exists():  # it brings its own rig file
+            request = msgspec.structs.replace(request, config=None)
+        jobs[data.name] = Job(request, made_with(request))
+    return list(jobs.values())
+
+
+PRODUCTS_VERSION = 4  # counts changes of what products of the same data hold
+NOT_DATA = ("samples", "products", ".products.new", ".products.old", "products-export", "control")  # folders of a scan
+
+
+def made_with(request: ProcessRequest) -> dict[str, Any]:
+    """Return the dependencies of products: releases, options (files by digest), data files by size and time."""
+    data = Path(request.data)
+    choices = {**request.choices(), **{name: _digest(path) for name, path in request.paths().items()}}
+    files = sorted(p for p in data.rglob("*") if p.is_file() and p.relative_to(data).parts[0] not in NOT_DATA)
+    listing = [f"{p.relative_to(data)} {s.st_size} {s.st_mtime_ns}" for p in files for s in (p.stat(),)]
+    digest = hashlib.sha256("\n".join(listing).encode()).hexdigest()
+    return {"versions": versions(), "products": PRODUCTS_VERSION, "options": choices, "data": digest}
+
+
+def _digest(path: Path) -> Any:
+    """Digest of a file's content, or of the names, sizes and times of a folder's files."""
+    if path.is_file():
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    if path.is_dir():
+        return [f"{p.name} {p.stat().st_size} {p.stat().st_mtime_ns}" for p in sorted(path.iterdir()) if p.is_file()]
+    return str(path)
+
+
+def finished(job: Job) -> bool:
+    """True if the products exist and have exactly these dependencies."""
+    try:
+        mark = read_json(job.out / FINISHED)
+    except (OSError, ValueError, PolysightError):
+        return False
+    same = isinstance(mark, dict) and mark.get("made_with") == json.loads(json.dumps(job.made_with))
+    return same and all((job.out / name).exists() for name in _PRODUCTS)
+
+
+def run_scan(job: Job, stop: Event | None = None) -> Outcome:
+    """Process one scan in a program of its own; its output goes to `<out>.log`. Failures are part of the result.
+
+    That program ends when this one does, however this one ends. A scan that carries its mark is done: a Dask worker
+    may have been killed between the mark and its answer.
+    """
+    if finished(job):
+        return _done(job)
+    began = time.monotonic()
+    log = job.out.with_name(job.name + ".log")
+    log.parent.mkdir(parents=True, exist_ok=True)
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    alive, promise = os.pipe()  # nothing is written: the child sees its end when this program is gone
+    try:
+        environment[ALIVE] = str(alive)
+        with log.open("wb") as output:
+            child = subprocess.Popen(
+                PROGRAM, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment, pass_fds=(alive,)
+            )
+            _follow(child, job, stop)
+    finally:
+        os.close(alive)
+        os.close(promise)
+    seconds = time.monotonic() - began
+    if child.returncode == 0 or finished(job):  # it may be killed after the mark
+        return _done(job, seconds)
+    if stop is not None and stop.is_set():
+        return Outcome(job.name, "stopped", seconds)
+    return Outcome(job.name, "failed", seconds, message=_failure(log, child.returncode, on_dask=stop is None))
+
+
+def _follow(child: subprocess.Popen[bytes], job: Job, stop: Event | None) -> None:
+    """Send a program its job and wait for its end; terminate it when `stop` is set."""
+    if child.stdin is not None:
+        with suppress(BrokenPipeError):  # it ended before it read; its log says why
+            child.stdin.write(msgspec.msgpack.encode(job))
+            child.stdin.close()
+    while child.poll() is None:
+        if stop is not None and stop.wait(_POLL_S):
+            child.terminate()
+            child.wait()
+        elif stop is None:
+            child.wait()
+
+
+def _done(job: Job, seconds: float = 0.0) -> Outcome:
+    mark = read_json(job.out / FINISHED)
+    return Outcome(job.name, "done", seconds or float(mark.get("seconds", 0.0)), float(mark["memory_gb"]))
+
+
+def _failure(log: Path, status: int, on_dask: bool) -> str:
+    """The last message in a program's log, or the signal that killed it."""
+    if status < 0:
+        fewer = "start fewer workers on one machine" if on_dask else "give --jobs 1"
+        return f"killed by signal {-status}; signal 9 is usually the system running out of memory: {fewer}"
+    lines = [x.strip() for x in log.read_text(encoding="utf-8", errors="replace").splitlines() if x.strip()]
+    messages = [x for x in lines if not x.startswith(("why:", "do:"))]
+    return messages[-1] if messages else f"exit status {status}"
+
+
+def run_here(jobs: Sequence[Job], at_once: int) -> Iterator[Outcome]:
+    """Yield outcomes as they come, `at_once` programs at a time; terminate the programs if stopped early."""
+    stop = Event()
+    with ThreadPoolExecutor(at_once) as pool:
+        try:
+            pending = [pool.submit(run_scan, job, stop) for job in jobs]
+            for done in as_completed(pending):
+                yield done.result()
+        finally:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+
+
+def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iterator[Outcome]:
+    """Yield outcomes as they come from a Dask cluster whose workers see the same folders.
+
+    Raises
+    ------
+    ConfigError
+        when Dask is not installed, or nothing answers at the address.
+    """
+    try:
+        from dask.distributed import Client, as_completed  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise ConfigError(
+            "Dask is not installed here",
+            "it is needed for --dask alone, and not installed with the rest",
+            "pip install 'polysight[dask]' here and on the workers (in the repository: '.[dask]')",
+            code=ErrorCode.PACKAGE_MISSING,
+        ) from None
+    try:
+        client = Client(address, timeout=timeout)
+    except (OSError, TimeoutError, ValueError) as e:
+        raise ConfigError(
+            f"no Dask scheduler at {address}: {e}",
+            "it is not running, or a firewall is between",
+            "start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`",
+            code=ErrorCode.NO_ANSWER,
+        ) from None
+    with client:
+        jobs_by_name = {job.name: job for job in jobs}
+        named = {client.submit(run_scan, job, pure=False): job.name for job in jobs}
+        for future in as_completed(list(named)):
+            if future.status == "finished":
+                yield future.result()
+            elif finished(jobs_by_name[named[future]]):  # its worker was lost behind the mark
+                yield _done(jobs_by_name[named[future]])
+            else:
+                yield Outcome(named[future], "failed", message=f"its workers were lost: {future.exception()}")
+
+
+def memory_bytes(positions: int) -> int:
+    """Estimate the memory of processing one scan from its positions (measured, docs/how-to/authors-data.md)."""
+    return 400_000_000 + 6_000 * positions
+
+
+def at_once(positions: int, cores: int, free_bytes: int) -> int:
+    """Number of scans that fit cores and free memory; at least one."""
+    return max(1, min(cores, int(_FREE * free_bytes / memory_bytes(positions))))
+
+
+def free_memory_bytes() -> int:
+    """Available memory without swapping."""
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def process_many(
+    jobs: Sequence[Job], out: Path, jobs_at_once: int, dask: str | None = None, again: bool = False
+) -> list[Outcome]:
+    """Process unfinished scans; report each on stderr and update `processed.json` after each.
+
+    Raises
+    ------
+    ConfigError
+        when there is no Dask, or no cluster, where it is asked for.
+    """
+    passed_over = [] if again else [j for j in jobs if finished(j)]
+    todo = [j for j in jobs if j not in passed_over]
+    outcomes = {j.name: Outcome(j.name, "skipped") for j in passed_over}
+    where = f"on the cluster at {dask}" if dask else f"{jobs_at_once} at a time"
+    sys.stderr.write(f"{len(jobs)} scans: {len(passed_over)} finished before, {len(todo)} to process, {where}\n")
+    out.mkdir(parents=True, exist_ok=True)
+    for job in todo:
+        (job.out / FINISHED).unlink(missing_ok=True)  # from now on a mark is one of this run
+    results = run_on_dask(todo, dask) if dask else run_here(todo, jobs_at_once)
+    for n, outcome in enumerate(results if todo else (), 1):
+        outcomes[outcome.name] = outcome
+        tail = f": {outcome.message}" if outcome.message else ""
+        sys.stderr.write(f"[{n}/{len(todo)}] {outcome.name}: {outcome.status}, {outcome.seconds:.0f} s{tail}\n")
+        write_json(out / SUMMARY, {"scans": [asdict(outcomes[j.name]) for j in jobs if j.name in outcomes]})
+    return [outcomes[j.name] for j in jobs]
+
+
+def process_several(
+    requests: Sequence[ProcessRequest], out: Path, at_a_time: int | None, dask: str | None, again: bool
+) -> int:
+    """Process several scans, `at_a_time` (None: as many as fit); prints their table and returns the exit status.
+
+    Raises
+    ------
+    PolysightError
+        when none can be begun.
+    """
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out} is a file", "several scans need a folder", "give another --out")
+    jobs = jobs_of(requests)
+    positions = max((_positions(Path(r.data)) for r in requests), default=0)
+    n = at_a_time or at_once(positions, cores(), free_memory_bytes())
+    n = min(n, len(jobs))
+    if dask is None:
+        jobs = [msgspec.structs.replace(job, threads=max(1, cores() // n)) for job in jobs]
+    outcomes = process_many(jobs, out, n, dask, again)
+    sys.stdout.write(table(outcomes, out))
+    return 0 if all(o.status in ("done", "skipped") for o in outcomes) else 1
+
+
+def _positions(data: Path) -> int:
+    """Number of positions of a scan; of the published grid if it cannot be read quickly."""
+    try:
+        if (data / COLLECTION).exists():
+            s = read_json(data / COLLECTION)
+            return int(s["total_x"]) * int(s["total_y"])
+        return ScanFolder.load(data).plan.positions
+    except (PolysightError, OSError, ValueError, KeyError, TypeError):  # its own program will say what is wrong
+        return 350 * 200
+
+
+def table(outcomes: Sequence[Outcome], out: Path) -> str:
+    """Table of the results of all scans, and their counts."""
+    rows = [("scan", "result", "seconds", "memory", "masked", "patches", "")]
+    for o in outcomes:
+        masked, patches, verdict = _results(out / o.name) if o.status in ("done", "skipped") else ("", "", "")
+        seconds = f"{o.seconds:.0f}" if o.seconds else ""
+        memory = f"{o.memory_gb:.1f} GB" if o.memory_gb else ""
+        rows.append((o.name, o.status, seconds, memory, masked, patches, o.message or verdict))
+    widths = [max(len(row[k]) for row in rows) for k in range(6)]
+    lines = []
+    for row in rows:
+        words = [cell.ljust(w) for cell, w in zip(row[:2], widths[:2], strict=True)]
+        numbers = [cell.rjust(w) for cell, w in zip(row[2:6], widths[2:], strict=True)]
+        lines.append("  ".join([*words, *numbers, row[6]]).rstrip())
+    count = {status: sum(o.status == status for o in outcomes) for status in ("done", "skipped", "failed", "stopped")}
+    counts = ", ".join(f"{n} {status}" for status, n in count.items() if n)
+    end = f"{len(outcomes)} scans: {counts}; products in {out}/<scan>/, all of this in {out / SUMMARY}"
+    return "\n".join([*lines, end, ""])
+
+
+def _results(products: Path) -> tuple[str, str, str]:
+    """Share of masked or missing positions, number of patches, and the verdict unless it is `good`; "" if unknown."""
+    saved = SavedProducts(products)
+    try:
+        boards = saved.quality["boards"].values()
+        absent = saved.quality.get("coverage", {}).get("positions_absent", 0)  # of each board
+        lost = sum(b["positions_masked"] + absent for b in boards)
+        share = lost / max(1, sum(b["positions"] + absent for b in boards))
+        masked, patches, verdict = f"{100 * share:.2g} %", str(len(saved.materials["segments"])), saved.verdict
+    except (PolysightError, AttributeError, KeyError, TypeError):
+        return "", "", ""
+    if verdict is None or verdict.level == "good":
+        return masked, patches, ""
+    return masked, patches, f"{verdict.text}: {verdict.reasons[0].what}" if verdict.reasons else verdict.text

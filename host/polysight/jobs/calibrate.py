@@ -1,0 +1,276 @@
+"""`polysight calibrate` and `polysight leakage`: calibration of the rig from recorded scans.
+
+Each `calibrate` command looks at scans, writes one dated file, and says what that changes; neither the scans nor the
+rig file are written. `leakage` prints what belongs into the rig file's [polarimetry].
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from polysight.calibration import (
+    CalibrationFile,
+    FilterFile,
+    StartFile,
+    header,
+    open_raw,
+    source_scan,
+    write_calibration,
+)
+from polysight.jobs.output import print_json, say, steps
+from polysight.jobs.process import imaged, load_reference, plane_of
+from polysight.polarimetry import (
+    Image,
+    Leakage,
+    Mask,
+    leakage_from_images,
+    specular_incidence_rad,
+)
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.tables import to_builtins
+
+LEAST_PIXELS = 100  # of a plate that serves as reference
+LEAST_LEAKAGE_STD = 1e-3
+
+
+def _print_result(
+    path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool
+) -> int:
+    """Print the result and the keys to set; return 0."""
+    if as_json:
+        print_json({"file": str(path), "simulated": file.simulated, **to_builtins(file)})
+        return 0
+    head_line = "SIMULATED data: of no use for a real rig" if file.simulated else "measured"
+    scans = ", ".join(f"{s.scan_id} ({s.rows} rows)" for s in file.sources)
+    sys.stdout.write(f"{head_line}: {scans}\n" + "".join(f"  {line}\n" for line in lines))
+    sys.stdout.write(f"written: {path}\nnothing else was changed; to use it, in the rig file:\n")
+    sys.stdout.write("".join(f"  {line}\n" for line in what_to_set))
+    return 0
+
+
+def with_places_of(scanned: Instrument, other: Instrument) -> Instrument:
+    """Return a scan's rig with antennas, mounts and object plane of another rig file. Raises ConfigError."""
+    mounts = {b.name: b.mount for b in other.boards}
+    if set(mounts) != {b.name for b in scanned.boards}:
+        raise ConfigError(f"the rig file has the boards {sorted(mounts)}", "it is of another rig", "give the scan's")
+    boards = tuple(msgspec.structs.replace(b, mount=mounts[b.name]) for b in scanned.boards)
+    return msgspec.structs.replace(scanned, boards=boards, antennas=other.antennas, geometry=other.geometry)
+
+
+def _key(kind: str, path: Path) -> list[str]:
+    return ["[calibration]", f'{kind} = "{path.resolve()}"']
+
+
+def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, out: Path, as_json: bool) -> int:
+    """Calibrate positions of boards and plane with a scan of known points. Raises PolysightError."""
+    from polysight.calibration import Prior, calibration_of_scan, fit_places, load_echoes, places_file, read_target
+
+    points = read_target(target)
+    given = None if config is None else load_instrument(config)
+    source = open_raw(scan, given)
+    rig = source.instrument if given is None else with_places_of(source.instrument, given)
+    calibration = calibration_of_scan(source)
+    filters = {b.name: calibration.high_pass(b.name) for b in rig.receivers}
+    say("places of boards and plane")
+    fit = fit_places(load_echoes(source, rig, filters), rig, points, Prior(prior_mm, prior_mm))
+    file = places_file(rig, fit, len(points), [source_scan(source, scan)])
+    path = write_calibration(file, out)
+    lines = []
+    for name, b in file.boards.items():
+        shift = ", ".join(f"{v:+.2f} +- {e:.2f}" for v, e in zip(b.shift_mm, b.standard_error_mm, strict=True))
+        lines += [
+            f"{name}: shifted by ({shift}) mm in x, y, z",
+            f"{name}: direct path to RX1 {b.direct_path_was_mm:.2f} -> {b.direct_path_mm:.2f}"
+            f" +- {b.direct_path_standard_error_mm:.2f} mm",
+        ]
+        lines += [
+            f"{name}: the scan does not tell its shift along {axis}: a wider aperture does"
+            for axis, e in zip("xyz", b.standard_error_mm, strict=True)
+            if e > prior_mm / 2
+        ]
+    lines += [
+        f"object plane: {file.object_distance_was_mm:.2f} -> {file.object_distance_mm:.2f}"
+        f" +- {file.object_distance_standard_error_mm:.2f} mm",
+        f"the target lay at ({file.target_mm[0]:+.2f}, {file.target_mm[1]:+.2f}) mm, turned by"
+        f" {file.target_turn_deg:+.2f} degrees; its points explain {100 * file.explained:.1f} % of the echoes",
+    ]
+    return _print_result(path, file, lines, _key("direct_path", path), as_json)
+
+
+def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) -> int:
+    """Calibrate the receivers' high-pass filters with scans at several start frequencies. Raises PolysightError."""
+    from polysight.calibration import fit_filter
+
+    rig = None if config is None else load_instrument(config)
+    sources = [open_raw(folder, rig) for folder in scans]
+    chirps = {(s.instrument.chirp.hpf1_khz, s.instrument.chirp.hpf2_khz) for s in sources}
+    if len(chirps) > 1:
+        raise DataError(
+            f"the scans have different filters: {sorted(chirps)} kHz", "they are of several sweeps", "give one"
+        )
+    names = [b.name for b in sources[0].instrument.receivers]
+    boards = {name: fit_filter(sources, name) for name in steps(names, [f"filters of {name}" for name in names])}
+    found = [source_scan(source, folder) for source, folder in zip(sources, scans, strict=True)]
+    file = FilterFile(**header("hpf", found), boards=boards)
+    path = write_calibration(file, out)
+    lines = [
+        f"{name}: corners "
+        + ", ".join(
+            f"{was:.0f} -> {c:.1f} +- {e:.1f} kHz"
+            for was, c, e in zip(b.programmed_khz, b.corners_khz, b.standard_error_khz, strict=True)
+        )
+        + f"; IF {b.if_from_khz:.0f}..{b.if_to_khz:.0f} kHz, {b.chirps} chirps, the fit leaves {b.residual_db:.2f} dB"
+        for name, b in boards.items()
+    ]
+    return _print_result(path, file, lines, _key("hpf", path), as_json)
+
+
+def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool) -> int:
+    """Calibrate gains per pixel and sub-band with a scan of a metal plate. Raises PolysightError."""
+    from polysight.calibration import MetalFile, read_calibration, write_metal
+    from polysight.imaging import sub_bands
+
+    source = open_raw(scan, None if config is None else load_instrument(config))
+    parts = sub_bands(source.instrument.chirp, bands) if bands > 1 else ()
+    path = write_metal(load_reference(scan, config, bands=bands), [source_scan(source, scan)], out, parts)
+    file = read_calibration(path, MetalFile, "metal")
+    lines = [
+        f"metal on {100 * file.share_of_plane:.0f} % of the image; elsewhere pixels are masked",
+        f"gains vary over it by {file.h_variation_db:.2f} dB (H), {file.v_variation_db:.2f} dB (V),"
+        f" {file.ratio_variation_db:.2f} dB and {file.ratio_variation_deg:.1f} degrees (H / V)",
+        f"scatter of its own pixels: {file.spread:.4f}",
+        f"images: {file.images}, beside the file",
+    ]
+    if file.bands:
+        edges = ", ".join(f"{b.first_hz / 1e9:.2f}..{b.last_hz / 1e9:.2f}" for b in file.bands)
+        lines.append(f"{len(file.bands)} sub-bands kept: {edges} GHz; for process --bands {len(file.bands)} alone")
+    else:
+        lines.append("sub-bands are not kept: calibrate with --bands K for process --bands K")
+    return _print_result(path, file, lines, _key("metal", path), as_json)
+
+
+def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
+    """Choose start offsets that centre the direct paths in the IF band. Raises PolysightError."""
+    from polysight.calibration import fit_start
+
+    source = open_raw(scan, None if config is None else load_instrument(config))
+    names = [b.name for b in source.instrument.receivers]
+    boards = {name: fit_start(source, name) for name in steps(names, [f"direct path of {name}" for name in names])}
+    file = StartFile(**header("start_frequency", [source_scan(source, scan)]), boards=boards)
+    path = write_calibration(file, out)
+    lines, what_to_set = [], []
+    rate_khz = source.instrument.chirp.sample_rate_hz / 1e3
+    for name, b in boards.items():
+        line = f"{name}: direct path at {b.direct_if_hz / 1e3:.1f} +- {b.direct_if_standard_error_hz / 1e3:.1f} kHz"
+        line += f" ({b.expected_if_hz / 1e3:.0f} kHz by the rig file)"
+        line += f", an alias of {b.direct_if_hz / 1e3 + b.alias * rate_khz:.0f} kHz" if b.alias else ""
+        lines += [
+            line,
+            f"{name}: start_offset_hz {b.start_offset_was_hz:.0f} -> {b.start_offset_hz:.0f} puts it at"
+            f" {b.middle_hz / 1e3:.0f} kHz; where mmWave Studio programs the board:"
+            f" {b.start_offset_hz - b.start_offset_was_hz:+.0f} Hz to its start frequency",
+        ]
+        what_to_set += [f'[[boards]]  name = "{name}"', f"start_offset_hz = {b.start_offset_hz:.0f}"]
+    return _print_result(path, file, lines, what_to_set, as_json)
+
+
+def leakage_of_scans(
+    plate: Path, strips: Sequence[tuple[float, Path]], config: Path | None = None
+) -> tuple[Leakage, dict[str, Any]]:
+    """Estimate leakage and gain imbalance from scans of a metal plate and of metal strips in its place.
+
+    Parameters
+    ----------
+    plate
+        Scan of a whole metal plate that covers the plane.
+    strips
+        (degrees from the vertical towards +x, scan) of strips that cover the plane: two orientations or more; one
+        gives the axial ratio alone, the same in both boards.
+    config
+        Rig file for scans in the authors' layout.
+
+    Returns
+    -------
+    leakage, facts
+        facts are plain: simulated, scan ids, pixels, incidence_deg.
+
+    Raises
+    ------
+    DataError
+        when the scans are of different rigs, do not show metal at the same pixels, or are too alike in orientation.
+    """
+    pipeline, images = imaged(plate, config)
+    whole = plane_of(pipeline, images)
+    theta = specular_incidence_rad(pipeline.rig)
+    mask, turned, names = whole.valid & images.valid, [], [pipeline.source.scan_id]
+    simulated = pipeline.source.simulated
+    for degrees, folder in strips:
+        other, seen = imaged(folder, config)
+        whole.check_rig(other.calibration.imaged_with(other.rig), str(plate))
+        whole.check_axes(seen.x_m, seen.y_m)
+        mask = mask & seen.valid
+        turned.append((float(np.radians(degrees)), seen.h, seen.v))
+        names.append(other.source.scan_id)
+        simulated = simulated or other.source.simulated
+    if int(mask.sum()) < LEAST_PIXELS:
+        raise DataError(
+            f"the scans show metal at {int(mask.sum())} common pixels only",
+            "plate and strips must cover the same part of the plane",
+            "scan them in the same place, larger than the grid on every side",
+        )
+    found = leakage_from_images((whole.h, whole.v), turned, mask, theta)
+    std = _leakage_std((whole.h, whole.v), turned, mask, theta)
+    facts = {"scans": names, "simulated": simulated, "pixels": int(mask.sum()), "leakage_std": std}
+    return found, {**facts, "incidence_deg": float(np.degrees(theta))}
+
+
+def _leakage_std(
+    plate: tuple[Image, Image], strips: Sequence[tuple[float, Image, Image]], mask: Mask, theta_rad: float
+) -> float:
+    """Standard error of each part of the leakage: how far the quarters of the plane disagree, not less than 0.001.
+
+    What makes it wrong (edges, wires that are not straight, uneven light) differs from place to place as speckle does,
+    and is no smaller over the whole than half of what it is in a quarter.
+    """
+    rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
+    middle = [float(np.median(at[mask])) for at in (rows, columns)]
+    parts = []
+    for up in (rows > middle[0], rows <= middle[0]):
+        for right in (columns > middle[1], columns <= middle[1]):
+            try:
+                found = leakage_from_images(plate, strips, mask & up & right, theta_rad)
+            except DataError:
+                continue
+            parts.append([found.h.real, found.h.imag, found.v.real, found.v.imag])
+    if len(parts) < 2:
+        return LEAST_LEAKAGE_STD
+    return max(LEAST_LEAKAGE_STD, float(np.sqrt(np.mean(np.var(parts, axis=0, ddof=1)))) / 2)
+
+
+def leakage(plate: Path, strips: Sequence[tuple[float, Path]], config: Path | None, as_json: bool) -> int:
+    """`polysight leakage`: print the keys for the rig file's [polarimetry]; return the exit status."""
+    found, facts = leakage_of_scans(plate, strips, config)
+    rows = {key: [round(z.real, 5), round(z.imag, 5)] for key, z in (("leakage_h", found.h), ("leakage_v", found.v))}
+    imbalance = {"db": 20 * float(np.log10(abs(found.imbalance))), "deg": float(np.degrees(np.angle(found.imbalance)))}
+    if as_json:
+        out = {**facts, **rows, "imbalance_db": imbalance["db"], "imbalance_deg": imbalance["deg"]}
+        print_json({**out, "residual_rad": found.residual, "alike": len(strips) == 1})
+        return 0
+    source = "# simulated scans\n" if facts["simulated"] else ""
+    alike = "# one orientation: both boards are taken to leak alike (the axial ratio)\n" if len(strips) == 1 else ""
+    rest = f", the standards agree within {found.residual:.4f} rad" if len(strips) > 2 else ""
+    sys.stdout.write(
+        f"{source}{alike}[polarimetry]\n"
+        f"leakage_h = {rows['leakage_h']}\nleakage_v = {rows['leakage_v']}\n"
+        f"leakage_std = {facts['leakage_std']:.4f}\n"
+        f"# H over V in the images: {imbalance['db']:+.2f} dB, {imbalance['deg']:+.1f} degrees;"
+        f" from {facts['pixels']} pixels{rest}\n"
+    )
+    return 0

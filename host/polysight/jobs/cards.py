@@ -1,0 +1,168 @@
+"""`polysight card`: check the network path to the cards, write a card's addresses, reset a card."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+
+from polysight.capture import CardClient, CardSurvey, EepromSettings, HopFinding, program_eeprom, survey_cards
+from polysight.jobs.output import print_json
+from polysight_shared.config import Board, Instrument, load_instrument
+from polysight_shared.errors import ConfigError, DeviceError
+
+_ASK_S = 1.5  # limit of one question to a card that is perhaps just starting, all attempts together
+_PAUSE_S = 0.2
+
+
+def confirm(what: str, word: str, yes: bool) -> str:
+    """Print the planned action and return the typed answer; with `yes` return `word` without asking."""
+    sys.stdout.write(f"{what}\n")
+    if yes:
+        return word
+    sys.stdout.write(f"type {word} to do it: ")
+    sys.stdout.flush()
+    return sys.stdin.readline().strip()
+
+
+def show_cards(config: Path, listen_s: float, as_json: bool) -> int:
+    """Check every hop to every card; return 0 if all recorded cards can be used. Raises ConfigError."""
+    rig = load_instrument(config)
+    if listen_s:
+        sys.stderr.write(f"listening for at most {listen_s:g} s: let the radars be triggered now\n")
+    surveys = survey_cards(rig, listen_s)
+    if as_json:
+        print_json([_facts(s) for s in surveys])
+    else:
+        sys.stdout.write("\n".join(_text(s) for s in surveys))
+    return 0 if all(s.ok for s in surveys if s.board.record) else 1
+
+
+def _facts(survey: CardSurvey) -> dict[str, object]:
+    """Survey results as plain data."""
+    board = survey.board
+    keys = ("name", "role", "record", "card_address", "host_address", "command_port", "data_port")
+    return {
+        **{key: getattr(board, key) for key in keys},
+        "ok": survey.ok,
+        "silent_hop": survey.silent,
+        "fpga_version": survey.version,
+        "hops": [vars(hop) for hop in survey.hops],
+    }
+
+
+def _text(survey: CardSurvey) -> str:
+    """Survey results as text."""
+    b = survey.board
+    unused = "" if b.record else ", not recorded: only asked"
+    head = (
+        f"{b.name} ({b.role}{unused}): card {b.card_address}:{b.command_port}, data to {b.host_address}:{b.data_port}\n"
+    )
+    unchecked = [hop.hop for hop in survey.hops if hop.verdict == "not checked" and not hop.found]
+    tail = f"  not checked {', '.join(unchecked)}\n" if unchecked else ""
+    return head + "".join(_line(hop) for hop in survey.hops if hop.hop not in unchecked) + tail
+
+
+def _line(hop: HopFinding) -> str:
+    more = "".join(f"{'':24}{word}: {text}\n" for word, text in (("why", hop.why), ("do", hop.remedy)) if text)
+    return f"  {hop.verdict:12}{hop.hop:10}{hop.found}".rstrip() + f"\n{more}"
+
+
+def _board(rig: Instrument, name: str, config: Path) -> Board:
+    try:
+        return rig.by_name(name)
+    except KeyError:
+        raise ConfigError(
+            f"{config} has no board {name!r}",
+            "a typing error, or another rig file",
+            f"give one of {', '.join(b.name for b in rig.boards)}",
+        ) from None
+
+
+def _present(board: Board, at: str) -> Board:
+    """Return the board with its card's present address, `ADDRESS` or `ADDRESS:PORT`. Raises ConfigError."""
+    address, _, port = at.partition(":")
+    number = int(port) if port.isdigit() else board.command_port
+    if (port and not port.isdigit()) or not 1 <= number <= 65535:
+        raise ConfigError(
+            f"--at {at!r} is not of the form ADDRESS:PORT", "a typing error", "e.g. --at 192.168.33.180:4096"
+        )
+    return msgspec.structs.replace(board, card_address=address or board.card_address, command_port=number)
+
+
+def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: float) -> int:
+    """Write a board's addresses into its card after confirmation, and check that it answers there.
+
+    Raises
+    ------
+    ConfigError
+        for a wrong board, MAC address or confirmation: nothing was written.
+    DeviceError
+        when the card is silent or refuses, or was not seen at its new address within `wait_s`.
+    """
+    rig = load_instrument(config)
+    board = _board(rig, name, config)
+    settings = EepromSettings.of_board(board, mac)
+    twins = [b.name for b in rig.boards if b.name != name and b.card_address == board.card_address]
+    if twins:
+        raise ConfigError(
+            f"{config} gives {board.card_address} to {', '.join(twins)} too",
+            "two cards share one address",
+            "give each its own card_address",
+        )
+    now = _present(board, at)
+    with CardClient(now, rig.limits.command_timeout_s) as card:
+        what = (
+            f"{name}: a card, FPGA {card.version()}, answers at {now.card_address}:{now.command_port}; its EEPROM is"
+            f" written anew, and cannot be read back.\n{name}: {settings.text()}"
+        )
+        program_eeprom(card, settings, confirm(what, settings.confirmation, yes))
+    sys.stdout.write(f"{name}: written, and the card reports no failure. Now switch the card off and on.\n")
+    sys.stdout.flush()
+    if wait_s > 0:
+        version = _seen_again(board, wait_s, same_place=now == board)
+        sys.stdout.write(f"{name}: it answers at {board.card_address}:{board.command_port}, FPGA {version}.\n")
+        sys.stdout.write("Whether it sends data to the right port is seen with `polysight card --listen 10`.\n")
+    else:
+        sys.stdout.write("Then `polysight card` tells whether it answers at its new address.\n")
+    return 0
+
+
+def _seen_again(board: Board, wait_s: float, same_place: bool) -> str:
+    """Return the FPGA version that the card reports at its new address."""
+    sys.stdout.write(f"{board.name}: looking for it at {board.card_address} for at most {wait_s:g} s\n")
+    sys.stdout.flush()
+    deadline, was_off = time.monotonic() + wait_s, not same_place
+    while time.monotonic() < deadline:
+        try:
+            with CardClient(board, _ASK_S) as card:
+                version = str(card.version())
+        except DeviceError:
+            was_off = True
+        else:
+            if was_off:
+                return version
+        time.sleep(_PAUSE_S)  # an interface that is down answers at once
+    raise DeviceError(
+        f"{board.name}: written, but "
+        + (f"not seen at {board.card_address}:{board.command_port}" if was_off else "the card was not switched off")
+        + f" within {wait_s:g} s",
+        "a card takes its addresses when it is switched on; with its EEPROM switch off it keeps its defaults",
+        "switch it off and on, then `polysight card`; if it stays silent, its EEPROM switch brings the defaults back",
+    )
+
+
+def reset_card(config: Path, name: str, radar: bool) -> int:
+    """Reset a card's FPGA, or with `radar` the radar board on it. Raises ConfigError or DeviceError."""
+    rig = load_instrument(config)
+    with CardClient(_board(rig, name, config), rig.limits.command_timeout_s) as card:
+        if radar:
+            card.reset_radar()
+            sys.stdout.write(f"{name}: the radar is reset; it must be armed again\n")
+        else:
+            card.reset_fpga()
+            sys.stdout.write(f"{name}: the card is reset; a scan configures it anew\n")
+        sys.stdout.write(f"{name}: the card answers, FPGA {card.version()}\n")
+    return 0

@@ -1,0 +1,157 @@
+"""`polysight demo`: the simulated rig and the host as separate processes, and the report at the end.
+
+The simulators are started as programs, never imported: nothing at run time depends on them.
+"""
+
+from __future__ import annotations
+
+import selectors
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from polysight.verdict import NoResult
+from polysight_shared.config import load_instrument
+from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError
+
+_MARK = ".polysight-demo"
+_START_LIMIT_S = 60.0
+_STOP_LIMIT_S = 10.0
+TIME_SCALE = 40.0
+"""Simulated seconds per second: a row of 18 s takes about half a second."""
+
+
+def run_simulator(arguments: Sequence[str]) -> int:
+    """Run `python -m polysight_simulators ...` and return its exit status."""
+    return subprocess.run([sys.executable, "-m", "polysight_simulators", *arguments], check=False).returncode
+
+
+def check_scenes(scenes: Iterable[Path], config: Path) -> None:
+    """Check scene files against the rig before they are used.
+
+    Raises
+    ------
+    ConfigError
+        naming the file, the key and the rule that is broken.
+    """
+    command = [sys.executable, "-m", "polysight_simulators", "check", *map(str, scenes), "--config", str(config)]
+    checked = subprocess.run(command, capture_output=True, text=True, check=False)
+    if checked.returncode != 0:
+        raise _error_of(checked.returncode, checked.stderr)
+
+
+def _error_of(status: int, output: str) -> PolysightError:
+    """Return the error of a simulator that failed: its message and exit status."""
+    kind = {e.exit_status: e for e in (ConfigError, DataError)}.get(status, DeviceError)
+    return kind(output.strip().removeprefix("error: ") or f"a simulator ended with status {status}, without a message")
+
+
+def _check_folder(out: Path) -> None:
+    """Raise ConfigError if a folder contains anything but an existing demo."""
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out} is a file", "a demo needs a folder", "give another --out")
+    if out.exists() and any(out.iterdir()) and not (out / _MARK).exists():
+        raise ConfigError(f"{out} is not empty", "it holds something else than a demo", "give another --out")
+
+
+def _fresh_folder(out: Path) -> None:
+    """Make an empty folder; an existing demo folder is overwritten."""
+    if out.exists() and any(out.iterdir()):
+        shutil.rmtree(out)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / _MARK).touch()
+
+
+@contextmanager
+def simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) -> Iterator[Path]:
+    """Run the simulated rig with its Pi process; yield the rig file with their addresses.
+
+    It runs in a session of its own, so that Ctrl-C ends the scan first and the rig after it.
+
+    Raises
+    ------
+    PolysightError
+        when it does not start, with its own message; its logs are in `folder`/logs.
+    """
+    command = [sys.executable, "-m", "polysight_simulators.rig", "--config", str(config), "--scene", str(scene)]
+    command += ["--dir", str(folder), "--time-scale", str(time_scale), "--with-pi", "--native"]
+    rig = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        yield _wait_ready(rig, folder)
+    finally:
+        rig.send_signal(signal.SIGTERM)
+        try:
+            rig.communicate(timeout=_STOP_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            rig.kill()
+            rig.communicate()
+
+
+def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
+    """Return the rig file named by the rig's `ready` line."""
+    if rig.stdout is None or rig.stderr is None:
+        raise DeviceError("the simulated rig has no output to read")
+    deadline = time.monotonic() + _START_LIMIT_S
+    with selectors.DefaultSelector() as selector:
+        selector.register(rig.stdout, selectors.EVENT_READ)
+        while (left := deadline - time.monotonic()) > 0:
+            if not selector.select(left):
+                continue
+            line = rig.stdout.readline()
+            if line.startswith("ready "):
+                return Path(line.removeprefix("ready ").strip())
+            if not line:
+                output = rig.stderr.read()
+                raise _error_of(rig.wait(), output)
+    raise DeviceError(
+        f"the simulated rig was not ready within {_START_LIMIT_S:.0f} s",
+        "an overloaded machine",
+        f"see {folder / 'logs'}",
+    )
+
+
+def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> int:
+    """Scan a scene with the simulated rig; returns the scan's exit status.
+
+    Raises
+    ------
+    PolysightError
+        when a file is wrong, the folder is taken, or a part of the rig does not start.
+    KeyboardInterrupt
+        after the scan and the rig have been ended.
+    """
+    began = time.monotonic()
+    load_instrument(config)
+    _check_folder(out)
+    check_scenes([scene], config)
+    _fresh_folder(out)
+    sys.stderr.write(f"simulated rig: no hardware is involved. Scene {scene}\n")
+    with simulated_rig(config, scene, out / "rig", time_scale or TIME_SCALE) as rig_file:
+        scan = [sys.executable, "-m", "polysight", "scan", "--config", str(rig_file), "--out", str(out / "scan")]
+        scan += ["--truth", str(rig_file.parent / "truth.json")]
+        status = _run_to_its_end(scan)
+    if status in (0, NoResult.exit_status):
+        sys.stdout.write(f"simulated demo: {time.monotonic() - began:.0f} s in all\n")
+    else:
+        sys.stderr.write(f"the logs of the simulated rig are in {out / 'rig' / 'logs'}\n")
+    return abs(status)
+
+
+def _run_to_its_end(command: Sequence[str]) -> int:
+    """Run a program and return its status. Ctrl-C stops the program first, cleanly, with a single signal."""
+    child = subprocess.Popen(command, start_new_session=True)
+    try:
+        return child.wait()
+    finally:
+        if child.poll() is None:
+            child.terminate()
+            try:
+                child.wait(_STOP_LIMIT_S)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()

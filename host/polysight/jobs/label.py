@@ -1,0 +1,365 @@
+"""`polysight label`: boxes of a scan drawn or taken from its patches, named, and saved for training.
+
+`edited` applies options to boxes, `asked` asks a person at a terminal. What results is checked as a whole before
+anything is written.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from rich.cells import cell_len
+
+from polysight.jobs.output import print_lines
+from polysight.materials import (
+    SPECIMEN,
+    Box,
+    Labels,
+    SegmentSettings,
+    box_mask,
+    box_name,
+    check_labels,
+    clean_name,
+    format_box,
+    image_extent_mm,
+    material_of,
+    name_taken,
+    no_box,
+    pack_labels,
+)
+from polysight.products import (
+    IMAGE,
+    LABELS,
+    LABELS_PICTURE,
+    SavedProducts,
+    find_labels,
+    find_products,
+    label_folder,
+    write_atomically,
+)
+from polysight.report import label_figure
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DataError
+
+METAL, REFERENCE = "metal", "the metal reference"
+FEW = 16
+"""Largest number of pixels of a box that a library uses; with fewer it would learn speckle."""
+_LARGEST_MARGIN = 0.3  # of a patch's side
+Ask = Callable[[str], str]
+
+
+@dataclass(frozen=True)
+class FoundPatch:
+    """A patch of the products: its number, a box inside it in millimetres, and its name."""
+
+    number: int
+    box: Box
+    description: str
+
+
+@dataclass(frozen=True)
+class Edits:
+    """Changes to labels, applied in this order.
+
+    `from_patches` begins with a box inside each patch that was found, called by its number; `renames` are `OLD=NEW`,
+    `specimens` `NAME=WHICH`; corners of `boxes` are millimetres from the image centre.
+    """
+
+    from_patches: bool = False
+    removed: Sequence[str] = ()
+    renames: Sequence[str] = ()
+    boxes: Sequence[tuple[str, Box]] = ()
+    specimens: Sequence[str] = ()
+    metal: str | None = None
+
+    @property
+    def given(self) -> bool:
+        """True if there is any change."""
+        several = (self.removed, self.renames, self.boxes, self.specimens)
+        return self.from_patches or self.metal is not None or any(several)
+
+
+def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None = None) -> int:
+    """Draw, name and save the boxes of a scan or of its products; return the exit status.
+
+    Without `edits` the person is asked for the name of each patch; where nobody can be asked (`ask` is None), and with
+    `list_only`, boxes and patches are printed and nothing is written.
+
+    Raises
+    ------
+    PolysightError
+        when there is no image, or a box or name is refused; nothing was written then.
+    """
+    products = find_products(folder)
+    if products is None:
+        out = folder / "products" if (folder / "manifest.jsonl").exists() else "OUT"
+        raise DataError(
+            f"{folder}: no {IMAGE} to draw on",
+            "the scan was not processed yet, its products lie elsewhere, or the path is wrong",
+            f"polysight process {folder} --out {out}; or give the folder of its products",
+            code=ErrorCode.FILE_MISSING,
+        )
+    there, found = find_labels(folder), found_patches(products)
+    if edits.given and list_only:
+        raise ConfigError(
+            "--list with other options would not do them", "it writes nothing", "leave --list out",
+            code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
+    labels = there[1].in_mm(products.x_m, products.y_m) if there else Labels({}, "mm")
+    if edits.given:
+        labels, left_out = edited(labels, found, edits)
+    elif list_only or ask is None:
+        sys.stdout.write(_listing(folder, products, there, found))
+        return 0
+    else:
+        sys.stdout.write(_listing(folder, products, there, found))
+        if there and ask("name the patches anew, in place of the boxes drawn by hand? type yes: ").strip() != "yes":
+            raise ConfigError(
+                "nothing was changed", "yes was asked for", "options edit boxes: polysight label --help",
+                code=ErrorCode.VALUE_INVALID,
+            )  # fmt: skip
+        labels, left_out = asked(found, ask), []
+    place = label_folder(products.folder)
+    checked, notes = save_labels(place, products, labels)
+    print_lines(_table(checked))
+    if left_out:
+        sys.stdout.write(f"left out, without a name: {', '.join(left_out)}\n")
+    sys.stdout.write("".join(f"note: {note}\n" for note in notes))
+    sys.stdout.write(f"labels:   {place / LABELS}\npicture:  {place / LABELS_PICTURE}\n")
+    return 0
+
+
+def save_labels(place: Path, products: SavedProducts, labels: Labels) -> tuple[Labels, list[str]]:
+    """Check boxes drawn on products, and write them with their picture into `place`; return them with notes on them.
+
+    Raises
+    ------
+    DataError
+        when there is none, or one is refused; nothing was written then.
+    """
+    if not labels.boxes:
+        raise DataError(
+            "no box is left",
+            "every patch was left out, or every box removed",
+            f"to have none, delete {place / LABELS}",
+            code=ErrorCode.NO_DATA,
+        )
+    checked = check_labels(labels, products.x_m, products.y_m, products.valid)
+    checked = replace(
+        checked, by_hand=True, description=f"boxes of scan {products.scan_id}, in mm from the image centre"
+    )
+    write_atomically(place / LABELS, pack_labels(checked))
+    write_atomically(place / LABELS_PICTURE, label_figure(products, checked.boxes, checked.metal))
+    masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked.boxes.items()}
+    few = [name for name, mask in masks.items() if (mask & products.valid).sum() < FEW]
+    notes = [f"fewer than {FEW} pixels: {', '.join(few)}; speckle decides what is learnt of so few"] if few else []
+    if dark := _dark(products, masks):
+        notes.append(f"dark, as where nothing lies: {', '.join(dark)}; look at the picture")
+    if checked.metal is None:
+        notes.append("no box is metal; train then needs a rig with `polysight calibrate metal`")
+    return checked, notes
+
+
+def remove_labels(folder: Path) -> Path:
+    """Delete the boxes drawn by hand of a scan or its products, and their picture; return the deleted label file.
+
+    Raises
+    ------
+    DataError
+        if there are none.
+    """
+    found = find_labels(folder)
+    if found is None:
+        raise DataError(f"{folder}: has no boxes", "none were saved", "draw some first", code=ErrorCode.FILE_MISSING)
+    path = found[0]
+    path.unlink()
+    path.with_name(LABELS_PICTURE).unlink(missing_ok=True)
+    return path
+
+
+def _dark(products: SavedProducts, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
+    """Names of boxes too dark in both channels to be detected as plates automatically."""
+    power = np.where(products.valid, np.abs(products.h) ** 2 + np.abs(products.v) ** 2, np.nan)
+    if not np.isfinite(power).any():
+        return []
+    least = np.nanpercentile(power, 99) * 10 ** (SegmentSettings().dimmest_db / 10)
+    inside = {name: power[mask & products.valid] for name, mask in masks.items()}
+    return [name for name, p in inside.items() if p.size and np.nanmedian(p) < least]
+
+
+def found_patches(products: SavedProducts) -> list[FoundPatch]:
+    """Patches of materials.json, each with a box inside it that avoids its edges if it is wide enough."""
+    margin_mm, out = SegmentSettings().margin_mm, []
+    for row in products.segments:
+        x0, y0, x1, y1 = row["box_mm"]
+        mx, my = (min(margin_mm, _LARGEST_MARGIN * (b - a)) for a, b in ((x0, x1), (y0, y1)))
+        sure = f" {100 * row['confidence']:.0f} %" if row.get("confidence") is not None else ""
+        text = f"named {row['name']}{sure}" if row.get("name") else "not named"
+        text = REFERENCE if row.get("metal_reference") else text
+        text = row["box"] if row.get("box") else "not judged" if row.get("refused") else text
+        out.append(FoundPatch(int(row["label"]), (x0 + mx, y0 + my, x1 - mx, y1 - my), text))
+    return out
+
+
+def edited(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tuple[Labels, list[str]]:
+    """Return boxes after the edits, and the numbers of unnamed patches.
+
+    Raises
+    ------
+    DataError
+        when a name is not there, is there twice, or cannot be used.
+    """
+    boxes, specimens, metal = dict(labels.boxes), dict(labels.specimens), labels.metal
+    if edits.from_patches:
+        if not found:
+            raise DataError("no patch was found", "only images were made, or nothing is in them", "draw it: --box")
+        boxes, specimens, metal = {str(f.number): f.box for f in found}, {}, None
+    names = {name: name for name in boxes}  # as it was to as it is
+    for name in (_known(n, boxes) for n in edits.removed):
+        del boxes[name], names[name]
+        specimens.pop(name, None)
+        metal = None if name == metal else metal
+    if edits.from_patches and edits.metal in boxes:  # a patch's number: it is called metal, unless it gets a name
+        given = {old for old, _ in (_split(text, boxes) for text in edits.renames)}
+        edits = edits if edits.metal in given else replace(edits, renames=(*edits.renames, f"{edits.metal}={METAL}"))
+    for text in edits.renames:
+        old, new = _split(text, boxes)
+        names[old] = box_name(new)
+    boxes = _renamed(boxes, names)
+    specimens, metal = {names[n]: s for n, s in specimens.items()}, names.get(metal or "")
+    for name, box in edits.boxes:
+        clean = box_name(name)
+        _refuse_twin(clean, boxes)
+        boxes[clean] = box
+    left_out = [name for name in boxes if name.isdecimal()]
+    boxes = {n: b for n, b in boxes.items() if n not in left_out}
+    for text in edits.specimens:
+        name, which = _split(text, boxes)
+        specimens[name] = clean_name(which, "specimen")
+    if edits.metal is not None:
+        metal = names.get(edits.metal) if edits.from_patches and edits.metal in names else None
+        metal = metal or _known(edits.metal, boxes)
+    return Labels(boxes, "mm", metal, specimens), left_out
+
+
+def _renamed(boxes: Mapping[str, Box], names: Mapping[str, str]) -> dict[str, Box]:
+    out: dict[str, Box] = {}
+    for old, box in boxes.items():
+        _refuse_twin(names[old], out)
+        out[names[old]] = box
+    return out
+
+
+def _refuse_twin(name: str, boxes: Mapping[str, Box]) -> None:
+    if twin := next((other for other in boxes if other.casefold() == name.casefold()), None):
+        raise name_taken(name, twin)
+
+
+def _known(name: str, boxes: Mapping[str, Box]) -> str:
+    """Find the box that an option names. Raises DataError if there is none."""
+    if name in boxes:
+        return name
+    clean = box_name(name) if not name.strip().isdecimal() else name.strip()
+    if clean not in boxes:
+        raise no_box(clean, boxes)
+    return clean
+
+
+def _split(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
+    """Split `NAME=TEXT`, where NAME is a box and may contain `=`. Raises DataError."""
+    parts = text.split("=")
+    for at in range(len(parts) - 1, 0, -1):
+        name = "=".join(parts[:at])
+        if name in boxes:
+            return name, "=".join(parts[at:])
+    name, _, rest = text.partition("=")
+    return _known(name, boxes), rest
+
+
+def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
+    """Ask for the names of patches. Raises DataError without patches, ConfigError when the input ends."""
+    if not found:
+        raise DataError("no patch was found", "only images were made, or nothing is in them", "draw it: --box")
+    boxes: dict[str, Box] = {}
+    metal = None
+    sys.stdout.write(f"name each patch; Enter leaves it out, m is the metal reference (called {METAL})\n")
+    try:
+        for patch in found:
+            question = f"patch {patch.number}, {format_box(patch.box)}, {patch.description}: "
+            name, is_metal = _asked_name(question, boxes, ask, metal is None)
+            if name:
+                boxes[name] = patch.box
+                metal = name if is_metal else metal
+        if len(boxes) > 1 and metal is None:
+            metal = _asked_metal(boxes, ask)
+    except EOFError:
+        raise ConfigError(
+            "nothing was written: the answers ended", "the input was closed", "give options instead",
+            code=ErrorCode.KEY_MISSING,
+        ) from None  # fmt: skip
+    return Labels(boxes, "mm", metal)
+
+
+def _asked_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missing: bool) -> tuple[str, bool]:
+    """Ask until the answer is a valid new name or empty; return it, and True if it is the metal."""
+    while True:
+        answer = ask(question).strip()
+        is_metal = answer in ("m", "M") and metal_missing
+        if not answer:
+            return "", False
+        try:
+            name = box_name(METAL if is_metal else answer)
+            if name not in boxes:
+                _refuse_twin(name, boxes)
+                return name, is_metal
+            piece = ask(f"  {name} is there already. Another piece of it? Its name, such as 2 (Enter: another name): ")
+            if piece.strip():
+                name = box_name(f"{material_of(name)}{SPECIMEN}{piece}")
+                _refuse_twin(name, boxes)
+                return name, is_metal
+        except DataError as e:
+            sys.stdout.write(f"  {e.what}: {e.why}\n")
+
+
+def _asked_metal(boxes: Mapping[str, Box], ask: Ask) -> str | None:
+    """Return the metal box; None if no option names it."""
+    while answer := ask("which of them is the metal reference (Enter: the one with a metal's name): ").strip():
+        try:
+            return _known(answer, boxes)
+        except DataError as e:
+            sys.stdout.write(f"  {e.what}; {e.why}\n")
+    return None
+
+
+def _table(labels: Labels) -> list[str]:
+    """The boxes as lines of a table."""
+    rows = [("name", "specimen", "box", "")]
+    for name, box in labels.boxes.items():
+        text = "metal reference" if name == labels.metal else ""
+        rows.append((material_of(name), labels.specimen(name) or "-", format_box(box), text))
+    widths = [max(cell_len(row[i]) for row in rows) for i in range(3)]
+    return ["  ".join(c + " " * (w - cell_len(c)) for c, w in zip(r, (*widths, 0), strict=True)).rstrip() for r in rows]
+
+
+def _listing(
+    folder: Path, products: SavedProducts, there: tuple[Path, Labels] | None, found: Sequence[FoundPatch]
+) -> str:
+    """Text of the boxes drawn, the patches found, and how to name them."""
+    kind = "simulated " if products.simulated else ""
+    lines = [f"{products.folder}: {kind}scan {products.scan_id}"]
+    lines.append(f"image: {format_box(image_extent_mm(products.x_m, products.y_m))} from its centre")
+    if there:
+        boxes = there[1].in_mm(products.x_m, products.y_m)
+        lines += [f"drawn by hand: {there[0]}", *(f"  {line}" for line in _table(boxes))]
+    if found:
+        lines += ["patches that were found, a box inside each:"]
+        lines += [f"  {f.number:>3}  {format_box(f.box)}  {f.description}" for f in found]
+        metal = next((f.number for f in found if f.description == REFERENCE), "NUMBER")
+        lines.append(f"to name them: polysight label {folder} --from-patches --metal {metal} --rename NUMBER=NAME ...")
+    lines.append(f"to draw one:  polysight label {folder} --box NAME=x0,y0,x1,y1 (mm)")
+    return "".join(f"{line}\n" for line in lines)

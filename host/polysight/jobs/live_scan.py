@@ -1,0 +1,247 @@
+"""`polysight scan` and `resume`: a scan that is processed while it runs, with a progress bar.
+
+Rows go into the images as they are committed, so that the products are there soon after the last row.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from polysight.acquisition import (
+    ControlFolder,
+    OnProgress,
+    OnRow,
+    ScanProgress,
+    ScanResult,
+    StopRequest,
+    ignore_hangup,
+    resume_scan,
+    run_scan,
+)
+from polysight.calibration import Calibration, calibration_of_rig, calibration_of_scan
+from polysight.imaging import image_grid
+from polysight.jobs.process import check_options, load_options, make_products, publish_images, truth_of
+from polysight.materials import TRUTH, read_truth
+from polysight.pipeline import Pipeline
+from polysight.process import Options, ProcessRequest
+from polysight.products import check_products_folder
+from polysight.store import MANIFEST, ScanFolder, check_same_scan, manifest, require_raw
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.errors import ConfigError, PolysightError, ScanError, advice
+
+PRODUCTS = "products"
+_BESIDE = ("program", "operator.json")
+"""Entries allowed in a folder before its scan begins: a program's log, notes."""
+RunScan = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
+
+
+def _clock(seconds: float | None) -> str:
+    """`1:02:03` or `2:03` left; empty when unknown."""
+    if seconds is None:
+        return ""
+    whole = round(seconds)
+    hours, minutes = divmod(whole // 60, 60)
+    return f"{hours}:{minutes:02d}:{whole % 60:02d} left" if hours else f"{minutes}:{whole % 60:02d} left"
+
+
+class _PlainConsole(Console):
+    """Console that raises OSError for a closed pipe; rich's own would exit and silence stdout."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError("nobody reads the messages any more")
+
+
+class ScanBar:
+    """Shows :class:`ScanProgress`: bars on a terminal, elsewhere a line at every tenth of the scan.
+
+    Only `update` raises OSError if the output cannot be written.
+    """
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or _PlainConsole(stderr=True)
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[left]}"),
+        )
+        self._bars = Progress(*columns, console=self._console, disable=not self._console.is_terminal)
+        self._rows = self._bars.add_task("rows", total=None, left="")
+        self._points = self._bars.add_task("points", total=None, left="", visible=False)
+        self._printed_tenth = -1
+
+    def __enter__(self) -> ScanBar:
+        with suppress(OSError):
+            self._bars.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, e: BaseException | None, trace: TracebackType | None) -> None:
+        with suppress(OSError):
+            self._bars.stop()
+
+    def update(self, p: ScanProgress) -> None:
+        """Show the progress of the scan."""
+        self._bars.update(self._rows, total=p.rows, completed=p.committed, left=_clock(p.remaining_s))
+        if p.row_points:
+            text = f"row {p.row}" + (f" take {p.take}" if p.take > 1 else "")
+            self._bars.update(self._points, description=text, total=p.row_points, completed=p.points, visible=True)
+        if p.phase in ("warning", "retake", "home", "check", "connect", "stop", "held", "wait"):
+            self._console.print(f"{p.phase}: {p.message}", highlight=False)
+        if p.phase == "end" and p.committed < p.rows:  # processing may still take a while; the error comes behind it
+            self._console.print(f"{p.phase}: {p.message}", highlight=False)
+        if not self._console.is_terminal and p.phase == "committed":
+            tenth = 10 * p.committed // max(1, p.rows)
+            if tenth != self._printed_tenth:
+                self._printed_tenth = tenth
+                self._console.print(f"{p.committed} of {p.rows} rows, {_clock(p.remaining_s)}", highlight=False)
+
+
+class _Live:
+    """Feeds committed rows to a pipeline (made with the first row) and writes the images after the last one."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._source: ScanFolder | None = None
+        self.pipeline: Pipeline | None = None
+
+    def add_row(self, row: int) -> None:
+        """Process one committed row."""
+        if self._source is None or self.pipeline is None:
+            self._source = ScanFolder.load(self._folder)
+            self.pipeline = Pipeline(self._source, live=True, samples="keep")
+        self._source.reload()
+        self.pipeline.add_row(row)
+        if self._source.complete:
+            publish_images(self.pipeline, self._folder / PRODUCTS)
+
+
+@ignore_hangup()
+def _run(folder: Path, options: Options, process: bool, run_rows: RunScan) -> int:
+    live = _Live(folder)
+    stop = StopRequest()
+    with ScanBar() as bar, ControlFolder(folder, stop) as control:
+
+        def show(progress: ScanProgress) -> None:
+            if progress.phase != "connect":
+                control.open()  # the scan folder is there, and locked by this program
+            bar.update(progress)
+
+        result = run_rows(live.add_row if process else None, show, stop)
+    if result.exit_status == "success":
+        _print(f"{folder}: every row is committed\n")
+    if result.processing_error is not None:
+        raise _unprocessed(folder, result, result.processing_error)
+    if result.exit_status != "success":
+        raise ScanError(f"{folder}: {result.reason}", "", f"polysight resume {folder}")
+    if live.pipeline is not None:
+        products = make_products(live.pipeline, folder / PRODUCTS, options, truth_of(folder))
+        sys.stdout.write(products.summary())
+        return products.exit_status
+    return 0
+
+
+def _print(text: str) -> None:
+    """Print to stdout; a closed stdout does not stop processing."""
+    with suppress(OSError):
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+
+def _unprocessed(folder: Path, result: ScanResult, e: BaseException) -> PolysightError:
+    """Return the error to raise if processing failed while the scan continued."""
+    again = f"the rows are safe: `polysight process {folder} --out DIR` processes them again"
+    if result.exit_status != "success":
+        again = f"{result.reason}: `polysight resume {folder}` goes on, and processes all of them again"
+    if isinstance(e, PolysightError):
+        e.remedy = advice(e.remedy, again)
+        return e
+    traceback.print_exception(e)
+    return ScanError(
+        f"processing failed, the scan did not: {type(e).__name__}: {e}",
+        "a fault of this program, or there was no memory or room on the disk; the lines above tell where",
+        again,
+    )
+
+
+def _check_options(options: Options, rig: Instrument, calibration: Calibration) -> None:
+    """Check before the rig moves that the options can be used after the scan. Raises PolysightError."""
+    placed = calibration.rig(rig)
+    grid = image_grid(placed)
+    metal = check_options(options, placed, (grid.x_m, grid.y_m))
+    in_scene = options.metal_box_mm is not None or metal is not None
+    plane = calibration.metal_plane(placed, None, in_scene, options.bands)
+    if plane is not None:
+        plane.check_axes(grid.x_m, grid.y_m)
+
+
+def _check_new(folder: Path) -> None:
+    """Raise ConfigError before the rig moves if the folder is not empty."""
+    if not folder.exists():
+        return
+    if (folder / MANIFEST).exists() and manifest.read(folder / MANIFEST).length:
+        raise ConfigError(
+            f"{folder} holds a scan already",
+            "scans are never overwritten",
+            f"`polysight resume {folder}` goes on with it; or give another --out",
+        )
+    if not folder.is_dir() or any(p.name not in (MANIFEST, *_BESIDE) for p in folder.iterdir()):
+        raise ConfigError(f"{folder} is not an empty folder", "a scan has a folder of its own", "give another --out")
+
+
+def scan(config: Path, request: ProcessRequest, truth: Path | None, keep_incomplete: bool, process: bool) -> int:
+    """Run a new scan into the request's `data`, and process it; returns the exit status. Raises PolysightError."""
+    options, folder = load_options(request), Path(request.data)
+    rig = load_instrument(config)
+    _check_new(folder)
+    if truth is not None and not truth.is_file():
+        raise ConfigError(f"{truth}: no such file", "--truth names it", "give truth.json, or leave --truth out")
+    if process:
+        _check_options(options, rig, calibration_of_rig(rig))
+        if truth is not None:
+            read_truth(truth)
+
+    def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
+        def show(progress: ScanProgress) -> None:
+            if truth is not None and progress.phase == "row" and not (folder / TRUTH).exists():
+                with suppress(OSError):  # noted below: a row is worth more
+                    shutil.copyfile(truth, folder / TRUTH)
+            on_progress(progress)
+
+        result = run_scan(rig, folder, on_row=on_row, progress=show, keep_incomplete=keep_incomplete, stop=stop)
+        if truth is not None and not (folder / TRUTH).exists():
+            sys.stderr.write(f"note: {truth} was not copied into {folder}; a report does without\n")
+        return result
+
+    return _run(folder, options, process, run_rows)
+
+
+def resume(request: ProcessRequest, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
+    """Resume the scan `data` at its first uncommitted row; return the exit status. Raises PolysightError.
+
+    `config` is a rig file that says how the rig is reached from now on; the scan's own, where it is None.
+    """
+    options, folder = load_options(request), Path(request.data)
+    source = ScanFolder.load(folder)
+    require_raw(source)
+    rig_now = None if config is None else load_instrument(config)
+    if rig_now is not None:
+        check_same_scan(source.instrument, rig_now, str(config))
+    if process:
+        _check_options(options, source.instrument, calibration_of_scan(source))
+        check_products_folder(folder / PRODUCTS, source.scan_id)
+
+    def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
+        return resume_scan(
+            folder, on_row=on_row, progress=on_progress, keep_incomplete=keep_incomplete, stop=stop, rig_now=rig_now
+        )
+
+    return _run(folder, options, process, run_rows)

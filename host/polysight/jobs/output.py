@@ -1,0 +1,75 @@
+"""What commands print: results on stdout; progress on stderr, as bars on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from time import monotonic
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from polysight.process import Progress
+
+T = TypeVar("T")
+_LINE_S = 5.0  # at least, from one line to the next
+
+
+def print_json(content: Any) -> None:
+    """Print a result for programs."""
+    sys.stdout.write(json.dumps(content, indent=1) + "\n")
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print a result for people."""
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+
+
+def say(step: str) -> None:
+    """Print the name of a step that begins. A closed stderr is ignored."""
+    with suppress(OSError):
+        sys.stderr.write(f"{step} ...\n")
+        sys.stderr.flush()
+
+
+def steps(things: Sequence[T], names: Sequence[str]) -> Iterator[T]:
+    """Yield the things; print the name of each before it begins, and its time when it is done."""
+    for k, (thing, name) in enumerate(zip(things, names, strict=True), 1):
+        sys.stderr.write(f"[{k}/{len(things)}] {name} ...")
+        sys.stderr.flush()
+        began = monotonic()
+        yield thing
+        sys.stderr.write(f" {monotonic() - began:.0f} s\n")
+
+
+def counted(things: Iterable[T], total: int, name: str) -> Iterator[T]:
+    """Yield the things with a bar; without a terminal a line at the start, then at tenths, 5 s apart or more."""
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    if console.is_terminal:
+        yield from track(things, name, total=total, console=console)
+        return
+    say(f"{total} {name}")
+    printed, tenth = monotonic(), 0
+    for done, thing in enumerate(things, 1):
+        yield thing
+        if 10 * done // total > tenth and monotonic() - printed > _LINE_S:
+            printed, tenth = monotonic(), 10 * done // total
+            say(f"{done} of {total} {name}")
+
+
+@contextmanager
+def current_step(first: str) -> Iterator[Progress]:
+    """Show the current step, beginning with `first`: on a terminal as a status line, elsewhere as lines."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if console.is_terminal:
+        with console.status(first) as status:
+            yield status.update
+    else:
+        say(first)
+        yield say

@@ -1,0 +1,249 @@
+"""Commands that check recordings: `validate` lists all faults of a scan folder, `inspect` describes a recording.
+
+`inspect --placement` shows how the packets of a row are placed, `validate --replace` places all rows again. Nothing of
+the processing is loaded, so that these commands start at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.capture import PACKETS, CardReport, Code, Layout, Report, inspect_bin, inspect_pcap, is_pcap
+from polysight.jobs.output import print_json, print_lines
+from polysight.store import (
+    MANIFEST,
+    PlacedAgain,
+    Replaced,
+    ScanFolder,
+    damage_of,
+    place_again,
+    replace_rows,
+    to_json,
+    validate,
+)
+from polysight_shared.config import load_instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError, PolysightError
+
+_SHOWN = 8  # missing ranges that are printed
+BOTTOM_DB = -20.0  # of the plot of a range profile
+
+
+def main_text(report: Report) -> str:
+    """The report as text."""
+    r = report
+    lines = [f"{r.path}: {r.bytes} bytes{' of a simulated scan' if r.simulated else ''}"]
+    if r.card is not None:
+        lines += _card_lines(r.card)
+    if r.chirps:
+        shape = r.layout
+        lines += [
+            f"shape      {r.chirps} chirps x {shape.rx} RX x {shape.samples} samples, {shape.lanes}-lane,"
+            f" {'Q' if shape.q_first else 'I'} first",
+            f"peak       {r.peak_db:.1f} dB over the median at bin {r.peak_bin} of {shape.samples}",
+            f"level      rms {', '.join(f'{v:.0f}' for v in r.rx_rms)} counts on RX 0.., DC {max(r.rx_dc):.1f}",
+            f"clipping   {r.clipped} values at full scale",
+            f"profile    {_sparkline(r.profile_db)}",
+        ]
+    return "\n".join(lines + [f"note       {remark}" for remark in r.remarks]) + "\n"
+
+
+def _card_lines(card: CardReport) -> list[str]:
+    lines = [f"card       {card.address}, {len(card.replies)} replies: {', '.join(n for n, _ in card.replies)}"]
+    refused = [n for n, s in card.replies if s and n not in (Code.STATUS.name, Code.VERSION.name)]
+    if refused:
+        lines.append(f"refused    {', '.join(refused)}")
+    if card.version:
+        lines.append(f"FPGA       {card.version}")
+    if card.status:
+        lines.append(f"status     {' '.join(s.name or '?' for s in card.status)}")
+    if card.record is not None:
+        c = card.record.counts
+        lines.append(
+            f"record     {card.record.received} of {card.record.expected} bytes in {c.placed} packets, {c.duplicates}"
+            f" duplicates, {c.late} late, {c.disagreeing} disagreeing"
+        )
+    if card.tail_bytes:
+        lines.append(f"tail       {card.tail_bytes} bytes, {card.tail_after_s:.3f} s after the packet before")
+    return lines
+
+
+def _sparkline(profile_db: NDArray[np.float64], width: int = 64) -> str:
+    bars = " ▁▂▃▄▅▆▇█"
+    groups = np.array_split(profile_db, min(width, profile_db.size))
+    tops = np.array([g.max() for g in groups])
+    span = max(float(tops.max()), 1e-9)
+    return "".join(bars[int(np.clip(round(t / span * 8), 0, 8))] for t in tops)
+
+
+def validate_folder(folder: Path, as_json: bool) -> int:
+    """Print all faults of a scan folder; return 0 if there are none."""
+    findings = validate(folder)
+    if as_json:
+        sys.stdout.write(to_json(findings) + "\n")
+    else:
+        sys.stdout.write("".join(f"{f}\n" for f in findings) or f"{folder}: whole\n")
+    return 1 if any(f.severity == "error" for f in findings) else 0
+
+
+def _is_pcap(file: Path) -> bool:
+    """True if the first bytes, or the file name, are those of a packet capture."""
+    with file.open("rb") as f:
+        return is_pcap(f.read(4)) or file.suffix == ".pcap"
+
+
+def scan_of(file: Path) -> ScanFolder | None:
+    """The scan of a row's file, if its manifest can be read."""
+    folders = file.resolve().parents
+    if len(folders) < 3 or folders[1].name != "raw" or not (folders[2] / MANIFEST).is_file():
+        return None
+    try:
+        return ScanFolder.load(folders[2])
+    except PolysightError:
+        return None  # `polysight validate` says what is wrong with it
+
+
+def inspect_file(
+    file: Path,
+    config: Path | None,
+    plot: Path | None,
+    card_address: str,
+    as_json: bool,
+    given: dict[str, Any] | None = None,
+) -> int:
+    """Describe a capture and draw its range profile; return the exit status, that of DataError if it holds no signal.
+
+    `config` is the rig file it was recorded with; a row of a scan folder brings its own. `given` are fields of `Layout`
+    that replace the rig's. Raises PolysightError.
+    """
+    scan = scan_of(file)
+    rig = load_instrument(config) if config is not None else None if scan is None else scan.instrument
+    layout = replace(Layout() if rig is None else Layout(samples=rig.chirp.samples), **(given or {}))
+    pcap = file.is_file() and _is_pcap(file)
+    report = inspect_pcap(file, layout, card_address) if pcap else inspect_bin(file, layout)
+    report.simulated = scan is not None and scan.simulated
+    if as_json:
+        from polysight.products import plain
+
+        content = asdict(report)
+        content |= content.pop("layout")
+        print_json(plain(content))
+    else:
+        sys.stdout.write(main_text(report))
+    if plot is not None:
+        plot_profile(report, plot)
+        sys.stderr.write(f"range profile: {plot}\n")
+    return DataError.exit_status if report.chirps and not any(report.rx_rms) else 0
+
+
+def plot_profile(report: Report, path: Path) -> None:
+    """Write the range profile, every antenna and their mean, as a PNG.
+
+    Raises
+    ------
+    DataError
+        when the recording holds no chirp, or the file cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    if not report.profile_db.size:
+        raise DataError(f"{report.path}: no chirp to plot", "the recording holds no data", "record again")
+    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for rx, profile in enumerate(report.rx_profile_db):
+        silent = " (no signal)" if profile.max() < BOTTOM_DB else ""
+        axes.plot(profile, linewidth=0.8, label=f"RX{rx}{silent}")
+    axes.plot(report.profile_db, color="black", linewidth=1.4, label="mean")
+    axes.axvline(report.peak_bin, color="grey", linestyle=":", linewidth=1.0)
+    axes.set_xlabel(f"range bin of {report.layout.samples} samples")
+    axes.set_ylabel("power over the median [dB]")
+    name = f"{'simulated ' if report.simulated else ''}{report.path.name}"
+    axes.set_title(f"{name}: {report.chirps} chirps, peak {report.peak_db:.1f} dB at bin {report.peak_bin}")
+    axes.set_ylim(bottom=BOTTOM_DB)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", ncols=5)
+    try:
+        figure.savefig(path, format="png", dpi=120)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be written: {e.strerror}", "no such folder, or no permission") from None
+
+
+# --- placement of packets ---
+
+
+def inspect_placement(file: Path, as_json: bool) -> int:
+    """Print how the packets of a row are placed; return 0 if the row was committed so.
+
+    `file` is the row's file, or one of those beside it. Raises DataError when a file is damaged, or is not the one that
+    the scan's manifest has committed.
+    """
+    row = file.with_suffix(".bin")
+    if scan := scan_of(row):
+        if strange := damage_of(scan, row):
+            why, remedy = "a damaged file, or one of another row", "`polysight validate SCAN`"
+            raise DataError(f"{row}: {strange}", why, remedy, code=ErrorCode.FILE_DAMAGED)
+        if not row.with_suffix(PACKETS).exists():
+            why = "the scan was simulated without cards, or recorded by an older release"
+            raise DataError(
+                f"{row}: its packets were not kept", why, "`polysight validate SCAN` says whether it is whole"
+            )
+    again = place_again(row)
+    same = again.moved or again.missing == again.placed.missing
+    if as_json:
+        print_json({**again.placed.facts(), "committed_missing": again.missing, "same": same})
+    else:
+        sys.stdout.write("\n".join(_placement_lines(file, again, same)) + "\n")
+    return 0 if same else 1
+
+
+def _placement_lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
+    p, e = again.placed, again.evidence
+    counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in vars(p.counts).items() if n)
+    if e.past.base is None:
+        start = "not known from the records before"
+    elif len(e.past.ends) == 1:
+        start = "known from the record before"
+    else:
+        start = f"one of {len(e.past.ends)} places behind the record before"
+    missing = ", ".join(f"{a}..{b}" for a, b in p.missing[:_SHOWN]) + (", ..." if len(p.missing) > _SHOWN else "")
+    lines = [
+        f"{file}: {p.received} of {p.expected} bytes in place",
+        f"packets    {counts or 'none'}",
+        f"start      {start}",
+        f"located    {'yes' if p.located else f'no: {p.reason}'}",
+        f"missing    {missing or 'nothing'}",
+    ]
+    if e.dropped_by_card:
+        lines.append(f"card       dropped data before numbering it ({e.dropped_by_card})")
+    if again.moved:
+        lines.append("committed  with its frames at their pulses")
+    else:
+        result = "the same" if same else "differently: `polysight validate SCAN --replace` commits it as it is here"
+        lines.append(f"committed  {result}")
+    return lines
+
+
+def replace_folder(folder: Path, as_json: bool) -> int:
+    """Repeat the placement of all rows of a scan and commit changed rows; return 0 if no row is damaged."""
+    rows = replace_rows(ScanFolder.load(folder))
+    if as_json:
+        print_json([asdict(r) for r in rows])
+    else:
+        print_lines(_replaced_lines(folder, rows))
+    return 1 if any(r.damaged for r in rows) else 0
+
+
+def _replaced_lines(folder: Path, rows: list[Replaced]) -> list[str]:
+    lines = [f"row {r.row} of {r.board}: {r.before} bytes missing before, {r.after} now" for r in rows if r.changed] + [
+        f"row {r.row} of {r.board}: left as it is: {r.left}" for r in rows if r.left
+    ]
+    same = sum(not (r.changed or r.left) for r in rows)
+    return [*lines, f"{folder}: {same} of {len(rows)} files come out as they were committed"]

@@ -1,0 +1,294 @@
+"""`polysight train`: a reference library from scans whose materials are known.
+
+The materials come from labels (`labels.json` of `polysight label`) or, without labels, from the truth of a simulated
+scan. Rows are processed as by `polysight process`; if the raw rows are deleted, the saved images are used.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import combinations, product
+from pathlib import Path
+
+import numpy as np
+
+from polysight.jobs.demo import check_scenes, run_simulator
+from polysight.jobs.output import print_lines, steps
+from polysight.jobs.process import all_rows
+from polysight.materials import (
+    TRUTH,
+    ImagePair,
+    KnownScene,
+    Labels,
+    Library,
+    MaterialsResult,
+    MetalChoice,
+    Optics,
+    TrainingScan,
+    analyse,
+    check_labels,
+    make_library,
+    material_of,
+    patches_from_plates,
+    read_truth,
+    specimen_seed,
+)
+from polysight.polarimetry import incidence_choice
+from polysight.process import Options
+from polysight.products import (
+    IMAGE,
+    LABELS,
+    RAW_DROPPED,
+    SCAN,
+    SavedProducts,
+    find_labels,
+    find_products,
+    read_products,
+    scan_folder_of,
+)
+from polysight.store import open_source, versions
+from polysight_shared.errors import ConfigError, DataError, ScanError
+
+EDGE_MM = 9.0
+"""Rim of a known plate that is not used for training: about the resolution in x."""
+
+
+def training_scan(data: Path, config: Path) -> TrainingScan:
+    """Return a scan for the library, its patches named by labels or truth.
+
+    `data` is a scan folder of any layout, or a folder of products; `config` the rig file of layouts without one.
+
+    Raises
+    ------
+    DataError
+        if neither labels nor truth exist, no metal is marked, or the labels cannot be used.
+    NoResult
+        if the verdict of a labelled scan is "no result".
+    """
+    scan = scan_folder_of(data) or data
+    check_labelled(data)
+    if (there := find_labels(data)) is not None:
+        path, labels = there
+        try:
+            saved = _products_without_rows(data, scan)
+            return _from_images(saved, labels) if saved is not None else _from_rows(scan, config, labels)
+        except DataError as e:
+            raise DataError(f"{path}: {e.what}" if str(path) not in e.what else e.what, e.why, e.remedy) from None
+    return _from_truth(scan, config)
+
+
+def check_labelled(data: Path) -> None:
+    """Check labels or truth of a scan before any row is read.
+
+    Raises
+    ------
+    DataError
+        as :func:`training_scan`, as far as the saved image shows it.
+    """
+    scan = scan_folder_of(data) or data
+    if not data.is_dir():
+        raise DataError(f"{data}: no such folder", "the path is wrong", "give scan folders, or folders of products")
+    if (there := find_labels(data)) is None:
+        if (scan / TRUTH).exists():
+            return
+        raise DataError(
+            f"{data}: neither {LABELS} nor {TRUTH} is in it",
+            "the materials of this scan are not known",
+            f"polysight label {data}; then train again",
+        )
+    if (saved := find_products(data)) is not None:
+        path, labels = there
+        try:
+            check_labels(labels, saved.x_m, saved.y_m)
+        except DataError as e:
+            raise DataError(f"{path}: {e.what}", e.why, e.remedy) from None
+
+
+def _products_without_rows(data: Path, scan: Path) -> SavedProducts | None:
+    """Return the products if the raw rows are deleted, else None. Raises DataError."""
+    if scan_folder_of(data) is None:
+        return read_products(data)
+    if (scan / "products" / IMAGE).exists():
+        saved = SavedProducts(scan / "products")
+        return saved if saved.quality.get(RAW_DROPPED) else None
+    return None
+
+
+def _from_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
+    """Process a labelled scan from its rows, as `polysight process --labels`."""
+    source = open_source(data, config)
+    pipeline = all_rows(source, data)
+    images = pipeline.form_images()
+    checked = check_labels(labels, images.x_m, images.y_m, images.valid)
+    options = Options(labels=checked, model="none")
+    if checked.metal is None and pipeline.metal_plane(options) is None:
+        raise _no_metal(data)
+    findings = pipeline.examine(images, options)
+    if not findings.verdict.usable:
+        raise findings.verdict.error("no library was written")
+    return _labelled(source.scan_id, findings.found, source.simulated, checked)
+
+
+def _from_images(saved: SavedProducts, labels: Labels) -> TrainingScan:
+    """Use the saved images of a labelled scan."""
+    if saved.verdict is not None and not saved.verdict.usable:
+        raise saved.verdict.error("no library was written")
+    checked = check_labels(labels, saved.x_m, saved.y_m, saved.valid)
+    segmentation, names = checked.patches(saved.x_m, saved.y_m)
+    metal = next((label for label, name in names.items() if name == checked.metal), None)
+    if metal is None:
+        raise _no_metal(saved.folder)
+    pair = ImagePair(saved.h, saved.v, saved.x_m, saved.y_m, saved.valid)
+    found = analyse(pair, _optics_of(saved), MetalChoice(label=metal), KnownScene(segmentation))
+    return _labelled(saved.scan_id, found, saved.simulated is not False, checked)
+
+
+def _optics_of(saved: SavedProducts) -> Optics:
+    """Return incidence angle and leakage of saved images; leakage that processing removed is zero here."""
+    rig, path = saved.rig, saved.folder / SCAN
+    if rig is None:
+        raise DataError(f"{path}: names no rig", "an earlier release processed the scan", "process the scan again")
+    optics = Optics.of(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
+    budget = saved.materials.get("error_budget") or {}
+    if not budget:
+        return optics
+    angle, leakage = budget["incidence"], budget["leakage"]
+    return replace(
+        optics,
+        theta_rad=float(np.radians(angle["deg"])),
+        theta_std_rad=float(np.radians(angle["std_deg"])),
+        leakage=(0j, 0j),
+        leakage_std=float(np.max(leakage["std"])),
+        leakage_measured=True,
+    )
+
+
+def _labelled(scan: str, found: MaterialsResult, simulated: bool, labels: Labels) -> TrainingScan:
+    """Return the training scan with names and specimens of the boxes."""
+    boxes = dict(enumerate(labels.boxes, 1))
+    for patch in found.patches:
+        if patch.patch.label in boxes and not (patch.patch.interior & (found.p != 0)).any():
+            sys.stderr.write(f"note: {scan}: the box of {boxes[patch.patch.label]} holds no pixel that can be used\n")
+    names = {label: material_of(box) for label, box in boxes.items()}
+    specimens = {label: piece for label, box in boxes.items() if (piece := labels.specimen(box)) is not None}
+    return TrainingScan(scan, found, simulated, versions=versions(), names=names, specimens=specimens)
+
+
+def _from_truth(data: Path, config: Path) -> TrainingScan:
+    """Process a simulated scan with known plates."""
+    source = open_source(data, config)
+    plates = read_truth(data / TRUTH)
+    metal = next((t for t in plates if t.metal), None)
+    if metal is None:
+        raise DataError(f"{data}: no metal plate in {TRUTH}", "features are relative to metal", "add one to the scene")
+    pipeline = all_rows(source, data)
+    images = pipeline.form_images()
+    known, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
+    found = pipeline.find_materials(images, MetalChoice(metal.box_mm), KnownScene(known, plates))
+    drawn = specimen_seed(data / TRUTH)
+    specimens = {} if drawn is None else {n: f"{source.scan_id}/{drawn}/{n}" for n in names}
+    return TrainingScan(source.scan_id, found, source.simulated, versions=versions(), names=names, specimens=specimens)
+
+
+def _no_metal(folder: Path) -> DataError:
+    return DataError(
+        f"{folder}: no box is metal",
+        "features of materials are relative to metal",
+        f"polysight label {folder} --metal NAME, or measure the rig with `polysight calibrate metal`",
+    )
+
+
+def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, times: int = 1) -> int:
+    """Make a library from labelled scans, simulated scans with truth, or scenes; return the exit status.
+
+    Each scene is simulated `times` times, with other specimens and noise each time.
+
+    Raises
+    ------
+    PolysightError
+        if a file is wrong (checked before anything is simulated), or a scan cannot be used.
+    """
+    data, files = list(data), [] if scenes is None else sorted(scenes.glob("*.toml"))
+    if not data and scenes is None:
+        raise ConfigError(
+            "no scans to train on",
+            "neither DATA nor --simulate was given",
+            "polysight train SCAN... --out FILE; polysight label SCAN names the materials",
+        )
+    if scenes is not None and not files:
+        raise DataError(f"{scenes}: no scene files", "the folder is wrong", "give a folder of scene files (*.toml)")
+    if not out.parent.is_dir():
+        raise ConfigError(f"{out}: no such folder {out.parent}", "the library would be lost", "make it first")
+    for folder in data:
+        check_labelled(folder)
+    if files:
+        check_scenes(files, config)
+    scans = [training_scan(folder, config) for folder in steps(data, [str(folder) for folder in data])]
+    if files:
+        with tempfile.TemporaryDirectory(prefix="polysight-train-") as temporary:
+            drawn = list(product(files, range(times)))
+            called = [f"simulating and imaging {file.name}, specimens {again}" for file, again in drawn]
+            for file, again in steps(drawn, called):
+                folder = Path(temporary) / f"{file.stem}-{again}"
+                command = ["simulate", str(file), "--config", str(config), "--out", str(folder)]
+                if run_simulator([*command, "--specimens", str(again)]):
+                    raise ScanError(f"{file}: simulation failed, see above")
+                scans.append(training_scan(folder, config))
+                shutil.rmtree(folder)
+    note = (
+        "simulated scans of " + ", ".join(dict.fromkeys(s.scan for s in scans))
+        if all(s.simulated for s in scans)
+        else ""
+    )
+    library = make_library(with_unique_names(scans), note)
+    library.save(out)
+    print_lines(_summary(out, library))
+    sys.stdout.write(f"{json.dumps(library.fit, indent=1)}\n")
+    return 0
+
+
+def with_unique_names(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
+    """Number the scans of equal names.
+
+    Raises
+    ------
+    DataError
+        if a scan is given twice: cross-validation would test it on itself.
+    """
+    out: list[TrainingScan] = []
+    for scan in scans:
+        alike = [s for s in scans[: len(out)] if s.scan == scan.scan]
+        if any(np.array_equal(s.result.h, scan.result.h, equal_nan=True) for s in alike):
+            raise DataError(
+                f"scan {scan.scan} is given twice",
+                "cross-validation would test it on itself",
+                "leave one out (a scan folder and its products are one scan)",
+            )
+        out.append(replace(scan, scan=f"{scan.scan} ({len(alike) + 1})") if alike else scan)
+    return out
+
+
+def _summary(out: Path, library: Library) -> list[str]:
+    """Describe the contents of a library by material; note names that differ only in case."""
+    lines = [f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans"]
+    for name in library.names:
+        mine = [e for e in library.entries if e.name == name]
+        pieces = len({e.specimen for e in mine if e.specimen is not None})
+        specimens = f", {pieces} specimens" if pieces > 1 else ""
+        scans = len({e.scan for e in mine})
+        patches = "1 patch" if len(mine) == 1 else f"{len(mine)} patches"
+        lines.append(f"  {name}: {patches} in {scans} scan{'s' * (scans > 1)}{specimens}")
+    if all(e.specimen is None for e in library.entries):
+        lines.append(
+            "note: no box names its specimen, so differences between specimens and placements cannot be"
+            " separated and probabilities are more cautious than necessary; polysight label SCAN --specimen NAME=WHICH"
+        )
+    for one, other in combinations(library.names, 2):
+        if one.casefold() == other.casefold():
+            lines.append(f"note: {one} and {other} are two materials here; if they are one: polysight label --rename")
+    return lines

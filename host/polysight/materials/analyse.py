@@ -1,0 +1,353 @@
+"""Find and name patches in the two images: segmentation, metal reference, joint inversion, classification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from polysight.materials.classify import UNKNOWN, Classifier, NamedPatch, add_explanation, features_of
+from polysight.materials.inputs import (
+    FOUND,
+    UNKNOWN_SCENE,
+    Image,
+    ImagePair,
+    KnownScene,
+    MetalChoice,
+    Optics,
+    level,
+)
+from polysight.materials.inversion import Inversion, PatchMeasurement, RigPrior, invert
+from polysight.materials.measure import (
+    AMPLIFIES,
+    BELOW_AIR,
+    LEAST_STD,
+    Refused,
+    background,
+    check_patches,
+    measure_patch,
+    reference_std,
+)
+from polysight.materials.metal import (
+    MetalReference,
+    find_metal,
+    metal_by_label,
+    metal_evidence,
+    metal_in_box,
+    no_metal,
+)
+from polysight.materials.permittivity import Permittivity, inverse_spread, permittivity_of_patch
+from polysight.materials.result import MaterialsResult, PatchResult
+from polysight.materials.samples import SceneErrors
+from polysight.materials.segment import Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
+from polysight.materials.specimens import features, relative, softened
+from polysight.materials.truth import match_truth
+from polysight.polarimetry import (
+    Calibrated,
+    IncidenceChoice,
+    PlaneReference,
+    calibrate,
+    calibrate_by_reference,
+    correct_leakage,
+    fresnel,
+    permittivity_from_ratio,
+    ratio,
+    smooth,
+)
+from polysight_shared.errors import DataError
+
+FILLED = 0.1
+"""Least |H| relative to metal at which an image without edges counts as filled with one material."""
+ACTIVE = 2.0
+"""Limit in standard deviations of gain, or of a real part below 1, for a permittivity to be impossible."""
+
+
+def analyse(
+    images: ImagePair,
+    optics: Optics,
+    metal: MetalChoice = FOUND,
+    known: KnownScene = UNKNOWN_SCENE,
+    classifier: Classifier | None = None,
+) -> MaterialsResult:
+    """Find the patches of an image pair, estimate their permittivities, and name them if there is a classifier.
+
+    A scene without patches or without metal is no error; see `metal` and `refused` of the result.
+
+    Raises
+    ------
+    DataError
+        if the image has no valid pixel, or the given metal box or patch number does not exist.
+    """
+    plane = metal.plane
+    if plane is not None:
+        plane.check_axes(images.x_m, images.y_m)
+        images = images.within(plane.valid)
+    found = _patches(images, plane, known)
+    images, tilts = level(images, found)
+    reference = _reference(images, metal, found)
+    raw = to_metal(images.h, images.v, reference, plane)
+    rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
+    refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
+    std = reference_std(reference_spread(rh, rv, reference, plane))
+    common, local = (std, 0.0) if plane is None else (LEAST_STD, std)
+    prior = optics.prior(common)
+    judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
+    theta = np.asarray(optics.theta_rad, np.float64)
+    measured = [measure_patch(p, rh, rv, _angle(theta, p), local) for p in judged]
+    if plane is None:
+        channel = _channel_ratio(images, reference) if optics.channel_ratio_known else None
+        reference = replace(reference, evidence=metal_evidence(measured, prior, channel))
+    inversion = invert(measured, prior)
+    calibrated = without_leakage(raw, inversion.leakage)
+    sh, sv = (smooth_inside(c, found, optics.smooth_px) for c in (calibrated.h, calibrated.v))
+    sp = ratio(sh, sv)
+    labels = [p.label for p in judged]
+    estimates = dict(zip(labels, inversion.patches, strict=True))
+    off = dict(zip(labels, (inversion.misfit * inversion.brightness_std).tolist(), strict=True))
+    patches = {
+        p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _angle(theta, p), estimates.get(p.label))
+        for p in found.patches
+    }
+    refused |= {label: why for label, e in patches.items() if (why := _no_material(e)) is not None}
+    errors = scene_errors(inversion, prior, measured) if judged else None
+    named = _names(classifier, (sh, sv, sp), inversion, judged, errors, float(np.mean(theta)))
+    truth = match_truth(found.patches, known.plates)
+    results = tuple(
+        PatchResult(p, patches[p.label], named.get(p.label), truth.get(p.label), refused.get(p.label))
+        for p in found.patches
+    )
+    return MaterialsResult(
+        calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, tilts=tilts,
+        library=() if classifier is None else classifier.library.names,
+        brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
+        errors=None if errors is None else (tuple(labels), errors),
+    )  # fmt: skip
+
+
+def _names(
+    classifier: Classifier | None,
+    channels: tuple[Image, Image, Image],
+    inversion: Inversion,
+    judged: list[Patch],
+    errors: SceneErrors | None,
+    theta_rad: float,
+) -> dict[int, NamedPatch]:
+    """Name the judged patches, with the scene's error budget; return patch number to name."""
+    if classifier is None or not judged:
+        return {}
+    h, v, p = channels
+    features = []
+    for patch, estimate in zip(judged, inversion.patches, strict=True):
+        at = patch.interior
+        by_h, by_q = _to_angle(estimate.permittivity, theta_rad + inversion.theta_error_rad, classifier.angles_deg)
+        features.append(features_of(np.abs(h[at]) * by_h, np.abs(v[at]) * by_h * abs(by_q), p[at] / by_q))
+    named = classifier.scan(features, errors)
+    return {
+        patch.label: add_explanation(name, e.permittivity, e.covariance, classifier)
+        for patch, name, e in zip(judged, named, inversion.patches, strict=True)
+    }
+
+
+def _to_angle(permittivity: complex | None, theta_rad: float, angles_deg: Sequence[float]) -> tuple[float, complex]:
+    """Return the factors of |H| and of V / H that convert a half space from the scan's angle to the library's."""
+    if permittivity is None or len(angles_deg) != 1 or permittivity.real < 1:
+        return 1.0, 1.0 + 0j
+    (s, p), (own_s, own_p) = (fresnel(permittivity, angle) for angle in (np.radians(angles_deg[0]), theta_rad))
+    return float(abs(s / own_s)), complex((p / s) / (own_p / own_s))
+
+
+def _no_material(e: Permittivity) -> Refused | None:
+    """Return why a permittivity is impossible for a passive material, beyond its error; None if it is possible."""
+    if e.value is None or e.real_std is None or e.loss_std is None:
+        return None
+    remedy = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
+    why = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
+    if e.value.imag > ACTIVE * e.loss_std + 0.02:
+        return Refused(AMPLIFIES, why, remedy)
+    if e.value.real < 1 - ACTIVE * e.real_std - 0.02:
+        return Refused(BELOW_AIR, why, remedy)
+    return None
+
+
+def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
+    """Return the mean incidence angle over a patch, radians."""
+    inside = theta[patch.interior] if theta.ndim and patch.interior.any() else theta
+    return float(np.mean(inside))
+
+
+def _channel_ratio(images: ImagePair, metal: MetalReference) -> complex | None:
+    """Return V / H of the metal reference in the images; None without signal."""
+    h, v = images.h[metal.mask], images.v[metal.mask]
+    power = float(np.sum(np.abs(h.astype(np.complex128)) ** 2))
+    return complex(np.vdot(h.astype(np.complex128), v)) / power if power > 0 else None
+
+
+def _patches(images: ImagePair, plane: PlaneReference | None, known: KnownScene) -> Segmentation:
+    """Return the known patches, cut to the valid pixels, or else find them."""
+    given = _within(known.segmentation, images.valid)
+    if given:
+        return given
+    if plane is None:
+        return segment(images.h, images.v, images.x_m, images.y_m, images.valid, known.settings)
+    even = plane.apply(images.h, images.v)
+    found = segment(even.h, even.v, images.x_m, images.y_m, images.valid, known.settings)
+    if not found.patches and float(np.median(np.abs(even.h[images.valid]))) > FILLED:
+        margin_mm = (known.settings or SegmentSettings()).margin_mm
+        return whole_plane(plane.valid if images.valid is None else images.valid, images.x_m, images.y_m, margin_mm)
+    return found
+
+
+def _reference(images: ImagePair, metal: MetalChoice, found: Segmentation) -> MetalReference:
+    """Return the chosen metal reference, or else the brightest patch; none without patches."""
+    if metal.plane is not None:
+        return MetalReference(metal.plane.valid, None, metal.plane.how, given=True)
+    if metal.box_mm is not None:
+        return metal_in_box(metal.box_mm, found, images.x_m, images.y_m, images.valid)
+    if metal.label is not None:
+        return metal_by_label(metal.label, found)
+    return find_metal(images.h, images.v, found) or no_metal(images.usable)
+
+
+def to_metal(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> Calibrated:
+    """Divide both channels by metal, in the scene or scanned separately; leakage is not removed.
+
+    Without any signal of metal to divide by, the images are returned unchanged.
+    """
+    if reference is not None:
+        return reference.apply(h, v)
+    try:
+        return calibrate(h, v, metal.mask)
+    except DataError:
+        if metal.given:
+            raise
+        return calibrate_by_reference(h, v, 1.0 + 0j, 1.0 + 0j)
+
+
+def without_leakage(c: Calibrated, leakage: tuple[complex, complex]) -> Calibrated:
+    """Remove the leakage from metal-referenced channels."""
+    h, v = correct_leakage(c.h, c.v, *leakage)
+    return Calibrated(h, v, ratio(h, v), c.metal_h, c.metal_v)
+
+
+def reference_spread(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
+    """Return the relative spread of the metal's pixels."""
+    spread = inverse_spread(h[metal.mask], v[metal.mask]) if reference is None else reference.spread
+    return spread if np.isfinite(spread) else 0.0
+
+
+def _within(found: Segmentation | None, valid: npt.NDArray[np.bool_] | None) -> Segmentation | None:
+    """Cut the interiors of patches to the valid pixels."""
+    if found is None or valid is None:
+        return found
+    return replace(found, patches=tuple(replace(p, interior=p.interior & valid) for p in found.patches))
+
+
+def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
+    """Apply a Gaussian filter inside each patch separately; NaN elsewhere."""
+    out = np.full(image.shape, complex(np.nan, np.nan), image.dtype)
+    reach = int(np.ceil(4 * sigma_px))
+    for patch in found.patches:
+        if patch.interior.any():
+            lines, columns = (np.flatnonzero(patch.interior.any(axis=axis)) for axis in (1, 0))
+            near = tuple(slice(max(0, at[0] - reach), at[-1] + reach + 1) for at in (lines, columns))
+            inside = patch.interior[near]
+            one = smooth(np.where(inside, image[near], complex(np.nan, np.nan)).astype(image.dtype), sigma_px)
+            out[near] = np.where(inside, one, out[near])
+    return out
+
+
+def pixel_accuracy(result: MaterialsResult) -> float | None:
+    """Return the share of interior pixels named right over all patches of known truth; None without such patches.
+
+    Patches rightly called unknown, because the library does not hold their material, do not count.
+    """
+    right = [n.names == truth for n, truth in _pixels_with_truth(result)]
+    return float(np.concatenate(right).mean()) if right else None
+
+
+def expected_pixel_accuracy(result: MaterialsResult) -> float | None:
+    """Return the share of the pixels of :func:`pixel_accuracy` that the best classifier is expected to name right.
+
+    It is the mean probability of each pixel's likeliest material, so that no choice of names is expected to do better
+    on these data. None without known truth, or if the classifier gives no probabilities.
+    """
+    shares = [n.confidence for n, _ in _pixels_with_truth(result)]
+    known = [s for s in shares if s is not None]
+    return float(np.concatenate(known).mean()) if known and len(known) == len(shares) else None
+
+
+def _pixels_with_truth(result: MaterialsResult) -> list[tuple[NamedPatch, str]]:
+    """Return the named patches of known truth, each with the true name; without those rightly called unknown."""
+    judged = [(r.named, r.verdict.name, r.truth.name) for r in result.patches if r.named and r.verdict and r.truth]
+    return [(n, truth) for n, name, truth in judged if n.names.size and (name != UNKNOWN or truth in result.library)]
+
+
+def image_centre_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[float, float]:
+    """Return the image centre in the rig frame, millimetres: the origin of boxes and outlines."""
+    x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
+    return float(x[0] * 1e3 - axis_mm(x)[0]), float(y[0] * 1e3 - axis_mm(y)[0])
+
+
+def permittivity_change(found: MaterialsResult, angles: IncidenceChoice) -> dict[str, Any]:
+    """Return the largest relative change of a patch's permittivity (Eq. 3) with the other angle, for quality.json.
+
+    `largest_permittivity_change` is |eps_other / eps - 1|, `of_patch` its number; empty without any permittivity.
+    """
+    changes = []
+    for r in found.patches:
+        at = r.patch.interior
+        if r.permittivity.value is not None and at.any():
+            used, other = (float(np.mean(a[at])) for a in (angles.used_rad, angles.other_rad))
+            eps = permittivity_from_ratio(r.permittivity.ratio, np.array([used, other]))
+            changes.append((float(abs(eps[1] / eps[0] - 1)), r.patch.label))
+    if not changes:
+        return {}
+    largest, label = max(changes)
+    return {"largest_permittivity_change": round(largest, 5), "of_patch": label}
+
+
+REFERENCE_BRIGHTNESS_STD = 0.1
+"""Standard deviation of ln|H| and ln|V| of all patches by a metal plate that lies high or tilted; an assumed prior."""
+
+
+def scene_errors(found: Inversion, prior: RigPrior, seen: Sequence[PatchMeasurement]) -> SceneErrors:
+    """Return the remaining errors of ln|H|, ln|V| and arg P of the patches after the inversion, for naming them.
+
+    Common to all patches are the leakage of p into H (da) and of s into V (db), the metal reference (rho), the angle,
+    and the reference's brightness, which V / H does not determine. Each patch has the errors of its own V / H and of
+    its brightness, equal in both channels.
+    To first order about the solution, for the patches' true features with t = r_p / r_s and fixed permittivity:
+    d ln|H| = Re((1 - t) da), d t = -(1 - t) (t da + db) - t rho - (dt / dtheta) dtheta.
+    """
+    t = np.array([p.inverse_ratio for p in found.patches], np.complex128)
+    none = np.zeros_like(t)
+    by_h = np.stack([1 - t, none, none], axis=1)
+    by_t = np.stack([-(1 - t) * t, -(1 - t), -t], axis=1)
+    scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
+    columns = [relative((unit * scale * by_h).real, unit * scale * by_t, t[:, None]) for unit in (1.0, 1j)]
+    design = np.stack(columns, axis=2).reshape(len(t), 6, 3)
+    bright = np.tile([1.0, 1.0, 0.0], (len(t), 1, 1))
+    design = np.concatenate([design, _by_angle(found, prior, seen)[:, None], bright], axis=1).swapaxes(1, 2)
+    covariance = np.zeros((8, 8))
+    covariance[:7, :7] = found.nuisance_covariance[:7, :7]
+    covariance[7, 7] = REFERENCE_BRIGHTNESS_STD**2
+    own_h = np.zeros((len(t), 3, 3))
+    own_h[:, :2, :2] = found.brightness_std**2
+    noise = np.array([s.std for s in seen]) / softened(t)
+    return SceneErrors(own_h + noise[:, None, None] ** 2 * np.diag([0.0, 1.0, 1.0]), design, covariance)
+
+
+def _by_angle(found: Inversion, prior: RigPrior, seen: Sequence[PatchMeasurement]) -> npt.NDArray[np.float64]:
+    """Return the change of the features by one standard deviation of the angle, at fixed permittivity, [patch, 3]."""
+    out = np.zeros((len(seen), 3))
+    for i, (patch, one) in enumerate(zip(found.patches, seen, strict=True)):
+        if patch.permittivity is not None:
+            step = prior.theta_std_rad
+            (here_h, here_t), (there_h, there_t) = (
+                features(patch.permittivity, [one.theta_rad + found.theta_error_rad + more]) for more in (0.0, step)
+            )
+            out[i] = relative(here_h - there_h, here_t - there_t, here_t)[0]
+    return out

@@ -1,0 +1,232 @@
+"""Half spaces as seen by the rig: the effect of differences between specimens, and patches of unknown materials.
+
+Two plates of the same material differ by some per cent in the real part of the permittivity and by tens of per cent in
+the loss (Fig. 17 of the paper). `(ln eps', ln eps'')` is assumed to be normal; Eq. 2 converts its spread to correlated
+errors of ln|H|, ln|V| and arg P, for all angles together because they show the same specimen.
+
+`cost_of_none` is the likelihood of a patch that is none of the library's materials but any half space: ln eps' is
+uniform from nearly air's to beyond water's, and so is the loss on a scale that is logarithmic above `SOFT_LOSS` and
+linear below. The integral over all half spaces is by Laplace's method about the best fitting one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from polysight.polarimetry import fresnel, permittivity_from_ratio
+
+Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+PUBLISHED_SPREAD = (0.027, 0.19)
+"""Standard deviations of ln eps' and ln eps'' if a library has no estimate: root mean square of PET's and ceramic's in
+Fig. 17 of the paper (variances 0.0021 and 0.0295 of 3.78 and 4.75; 0.0255 and 0.1081 of 0.70 and 2.43)."""
+PRIOR_FREEDOM = 4.0
+"""Weight of that prior, in number of specimens."""
+OWN_FREEDOM = 20.0
+"""Weight of the mean of all materials in one material's own spread, in number of specimens."""
+SOFT = 0.05
+"""|V / H| below which its errors are additive (leakage, noise) instead of relative (gain, phase)."""
+_STEP = 1e-4
+_ROUNDS = 300
+_SETTLED = 1e-3
+_LEAST_LOSS = 1e-3
+_METAL = 0.1  # |t - 1| below which a material is metal; specimens of metal do not differ
+
+
+def softened(t: npt.ArrayLike) -> Real:
+    """Return the scale of errors of t = V / H, `sqrt(|t|^2 + SOFT^2)`: V may vanish (Brewster's angle)."""
+    return np.asarray(np.hypot(np.abs(t), SOFT), np.float64)
+
+
+def features(permittivity: npt.ArrayLike, angles_rad: Sequence[float]) -> tuple[Real, Complex]:
+    """Return ln|H| and V / H of half spaces relative to metal (Eq. 2), each [..., angles]."""
+    both = [fresnel(permittivity, angle) for angle in angles_rad]
+    log_h = np.stack([np.log(np.abs(s)) for s, _ in both], axis=-1)
+    return log_h, np.stack([p / s for s, p in both], axis=-1)
+
+
+def effect(t: Complex, angles_rad: Sequence[float]) -> Real:
+    """Return the derivatives of ln|H|, ln|V| and arg P of a material by ln eps' and ln eps'', [3 * angles, 2].
+
+    Parameters
+    ----------
+    t
+        complex128 [angles], V / H of the material.
+    angles_rad
+        Its incidence angles.
+
+    Returns
+    -------
+    Zero for metal, and if the angles are not known.
+    """
+    if len(angles_rad) != len(t) or not np.isfinite(t).all() or bool((np.abs(t - 1) < _METAL).any()):
+        return np.zeros((3 * len(t), 2))
+    eps = apparent_permittivity(t, angles_rad)
+    here_h, here_t = features(eps, angles_rad)
+    columns = []
+    for stretched in (complex(eps.real * np.exp(_STEP), eps.imag), complex(eps.real, eps.imag * np.exp(_STEP))):
+        there_h, there_t = features(stretched, angles_rad)
+        columns.append(relative(there_h - here_h, there_t - here_t, here_t).ravel() / _STEP)
+    return np.stack(columns, axis=1)
+
+
+def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
+    """Convert deviations of ln|H| and of t, [..., angles] each, to those of ln|H|, ln|V| and arg P, [..., angles, 3].
+
+    To first order; with :func:`softened` instead of |t|, so that they stay finite if V vanishes.
+    """
+    along = dt * np.exp(-1j * np.angle(t)) / softened(t)
+    return np.stack([log_h, log_h + along.real, -along.imag], axis=-1)
+
+
+def without(log_h: Real, t: Complex, deviations: Real) -> tuple[Real, Complex]:
+    """Subtract deviations [..., angles, 3] from ln|H| and t [..., angles]: inverse of :func:`relative`."""
+    h, v, phase = (deviations[..., i] for i in range(3))
+    return log_h - h, t - softened(t) * ((v - h) - 1j * phase) * np.exp(1j * np.angle(t))
+
+
+def apparent_permittivity(t: Complex, angles_rad: Sequence[float]) -> complex:
+    """Return the half space with ratios t [angles]: mean of Eq. 3 over the angles, limited to passive materials."""
+    eps = complex(np.mean([complex(permittivity_from_ratio(q, angle)) for q, angle in zip(t, angles_rad, strict=True)]))
+    return complex(max(eps.real, 1.01), min(eps.imag, -_LEAST_LOSS))
+
+
+def fit_spread(
+    residuals: Real,
+    material: npt.NDArray[np.intp],
+    specimen: npt.NDArray[np.intp],
+    effects: Real,
+    noise: Real,
+    gains_alike: bool = True,
+) -> tuple[Real, Real]:
+    """Estimate the spread of specimens and the covariance of placements from patches, by expectation maximisation.
+
+    A patch's residual is `F_m s + u`: s is the specimen's deviation, equal in all its patches, u the placement's.
+
+    Parameters
+    ----------
+    residuals
+        float64 [patches, d]: patch means minus their material's mean.
+    material, specimen
+        Numbers for each patch; specimens are numbered over all materials.
+    effects
+        float64 [materials, d, 2], of :func:`effect`.
+    noise
+        float64 [d, d], covariance to start from.
+    gains_alike
+        True if the features are ln|H|, ln|V|, arg P of each angle, with equal gain errors of H and V (:func:`alike`).
+
+    Returns
+    -------
+    spread : float64 [materials, 2], variances of ln eps' and ln eps''
+        The spread of all materials together, with the published spread as prior, corrected by each material's own. A
+        material with a single specimen is ignored.
+    placement : float64 [d, d]
+    """
+    one = np.array([np.unique(specimen[material == k]).size < 2 for k in range(len(effects))])
+    telling = ~one & (np.abs(effects).max(axis=(1, 2), initial=0) > 0)
+    _, group = np.unique(specimen, return_inverse=True)
+    count = np.bincount(group)
+    kind = np.zeros(count.size, np.intp)
+    kind[group] = material
+    sums = np.stack([np.bincount(group, c) for c in residuals.T], axis=1)
+    used, f = telling[kind], effects[kind]
+    prior = np.square(PUBLISHED_SPREAD)
+    pooled, placement, second = prior, noise, np.zeros((count.size, 2))
+    for _ in range(_ROUNDS):
+        information = f.mT @ np.linalg.inv(placement + _floor(noise))
+        spread = np.linalg.inv(np.diag(1 / pooled) + count[:, None, None] * (information @ f))
+        spread[~used] = 0.0
+        mean = np.einsum("gab,gbd,gd->ga", spread, information, sums)
+        second = mean**2 + np.einsum("gaa->ga", spread)
+        before = pooled
+        pooled = (PRIOR_FREEDOM * prior + second[used].sum(axis=0)) / (PRIOR_FREEDOM + used.sum())
+        left = residuals - np.einsum("gda,ga->gd", f, mean)[group]
+        blur = np.einsum("g,gda,gab,geb->de", count.astype(float), f, spread, f)
+        placement = (left.T @ left + blur) / len(residuals)
+        placement = alike(placement) if gains_alike else placement
+        if np.abs(pooled / before - 1).max() < _SETTLED:
+            break
+    return _each(pooled, second, kind, telling), placement
+
+
+def _each(pooled: Real, second: Real, kind: npt.NDArray[np.intp], telling: npt.NDArray[np.bool_]) -> Real:
+    """Return the spread of each material: the pooled one, corrected by its own specimens' squares [specimen, 2]."""
+    own = np.tile(pooled, (telling.size, 1))
+    for k in np.flatnonzero(telling):
+        mine = second[kind == k]
+        own[k] = (OWN_FREEDOM * pooled + mine.sum(axis=0)) / (OWN_FREEDOM + len(mine))
+    return own
+
+
+def alike(covariance: Real) -> Real:
+    """Return a covariance of ln|H|, ln|V|, arg P, [3 * angles, 3 * angles], with equal gain errors of H and V.
+
+    A specimen's deviation changes mostly V, so that the gain error of V cannot be separated from it; that of H can.
+    """
+    out = np.zeros_like(covariance)
+    for i in range(0, len(covariance), 3):
+        h, v, phase = range(i, i + 3)
+        out[h, h] = out[v, v] = (covariance[h, h] + covariance[v, v]) / 2
+        out[h, v] = out[v, h] = covariance[h, v]
+        out[phase, phase] = covariance[phase, phase]
+    return out
+
+
+def _floor(covariance: Real) -> Real:
+    return (1e-9 * np.trace(covariance) + 1e-14) * np.eye(len(covariance))
+
+
+REAL_RANGE = (1.2, 30.0)
+LOSS_RANGE = (0.0, 30.0)
+SOFT_LOSS = 0.05
+_STEPS, _STEP = 8, 1e-4
+_PRIOR = 1 / (np.log(REAL_RANGE[1] / REAL_RANGE[0]) * np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS))
+
+
+def cost_of_none(log_h: Real, t: Complex, covariances: Real, angles_rad: Sequence[float]) -> Real:
+    """Return minus twice the log likelihood of each patch as any half space.
+
+    Parameters
+    ----------
+    log_h, t
+        ln|H| and V / H of the patches, [patch, angles].
+    covariances
+        float64 [patch, 3 * angles, 3 * angles] of their ln|H|, ln|V|, arg P, without the specimens' spread.
+    angles_rad
+        Incidence angles.
+    """
+    inverse = np.asarray(np.linalg.inv(covariances), np.float64)
+    constant = np.linalg.slogdet(covariances)[1] + covariances.shape[1] * np.log(2 * np.pi)
+    start = np.array([apparent_permittivity(q, angles_rad) for q in t], np.complex128)
+    low = np.array([np.log(REAL_RANGE[0]), 0.0])
+    high = np.array([np.log(REAL_RANGE[1]), np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS)])
+    at: Real = np.stack([np.log(start.real), np.arcsinh(-start.imag / SOFT_LOSS)], axis=1)
+    at = np.asarray(np.clip(at, low, high), np.float64)
+    best, curvature = np.full(len(t), np.inf), np.tile(np.eye(2), (len(t), 1, 1))
+    for _ in range(_STEPS):
+        off, slope = _off(at, log_h, t, angles_rad)
+        weighed = slope.mT @ inverse
+        information = weighed @ slope + 1e-9 * np.eye(2)
+        cost = np.einsum("pd,pde,pe->p", off, inverse, off)
+        better = cost < best
+        best, curvature = np.where(better, cost, best), np.where(better[:, None, None], information, curvature)
+        step = np.linalg.solve(information, weighed @ off[..., None])[..., 0]
+        at = np.asarray(np.clip(at - step, low, high), np.float64)
+    return np.asarray(constant + best - 2 * np.log(_PRIOR * 2 * np.pi) + np.linalg.slogdet(curvature)[1], np.float64)
+
+
+def _off(at: Real, log_h: Real, t: Complex, angles_rad: Sequence[float]) -> tuple[Real, Real]:
+    """Return deviations of half spaces at [patch, 2] from the data, [patch, d], and derivatives, [patch, d, 2]."""
+
+    def deviations(where: Real) -> Real:
+        own_h, own_t = features(np.exp(where[:, 0]) - 1j * SOFT_LOSS * np.sinh(where[:, 1]), angles_rad)
+        return relative(own_h - log_h, own_t - t, t).reshape(len(t), -1)
+
+    here = deviations(at)
+    columns = [(deviations(at + step) - here) / _STEP for step in np.eye(2) * _STEP]
+    return here, np.stack(columns, axis=-1)

@@ -1,0 +1,235 @@
+"""Ratios of the patches in sub-bands of the sweep, to separate thin layers from thick ones.
+
+The error of a ratio has a part common to all sub-bands of a patch (leakage, metal reference, edges and tilt) and a part
+of its own in each (noise, sidelobes). Differences between sub-bands are therefore known better than each of them: their
+full covariance is stored.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from polysight.imaging import ChannelImages, SubBand
+from polysight.materials.analyse import reference_spread, smooth_inside, to_metal, without_leakage
+from polysight.materials.inputs import ImagePair, Optics, level
+from polysight.materials.inversion import ratio_slopes
+from polysight.materials.layers import Bands, Spectrum
+from polysight.materials.measure import measure_patch
+from polysight.materials.permittivity import inverse_spread, median_ratio
+from polysight.materials.result import MaterialsResult
+from polysight.polarimetry import PlaneReference
+from polysight_shared.config import Chirp
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+
+Image = npt.NDArray[np.complexfloating]
+AMPLITUDE_ERROR = 0.1
+"""Relative standard deviation of |H| of a patch by its size, edges and tilt, which do not affect ratios."""
+BAND_SHARE = 0.75
+"""Error of V / H of one sub-band relative to the others, per spread of the pixels about the whole sweep's V / H.
+
+All of these constants are measured in simulated scenes of layered plates (benchmarks/layers).
+"""
+BAND_STD = 5e-4
+"""Least value of that error, even with uniform pixels."""
+BAND_AMPLITUDE_STD = 3e-3
+"""Relative error of |H| of one sub-band relative to the others."""
+LAYERED_STD_RAD = 2.5e-3
+"""Error of the incidence angle with layered plates: echoes from inside make their plane look farther, by 2.5 mm in
+simulated scenes of layered plates only."""
+PHASE_PER_ANGLE = 4.5
+"""Phase of V / H in radians per radian of that error: H and V are illuminated from different points of a plane that is
+out of focus. Measured in the same scenes."""
+
+
+def with_bands(
+    found: MaterialsResult,
+    bands: Sequence[SubBand],
+    images: Sequence[ChannelImages],
+    optics: Optics,
+    plane: PlaneReference | None = None,
+) -> MaterialsResult:
+    """Return the result with each patch's ratios in sub-bands; unchanged without sub-bands.
+
+    `plane` is metal scanned separately, imaged in the same sub-bands. Parameters and errors as :func:`band_rows`.
+    """
+    if not bands:
+        return found
+    parts = None if plane is None else plane.bands
+    return replace(found, bands=band_rows(found, bands, images, found.inversion.leakage, optics.smooth_px, parts))
+
+
+def band_rows(
+    found: MaterialsResult,
+    bands: Sequence[SubBand],
+    images: Sequence[ChannelImages],
+    leakage: tuple[complex, complex],
+    smooth_px: float,
+    references: Sequence[PlaneReference] | None = None,
+) -> dict[int, list[dict[str, Any]]]:
+    """Return each patch's ratio in each sub-band, for materials.json.
+
+    Parameters
+    ----------
+    found
+        Patches and metal reference, from the whole sweep.
+    bands, images
+        Sub-bands and their image pairs, [K].
+    leakage, smooth_px
+        Those of the whole sweep.
+    references
+        Metal scanned separately, for each sub-band; None: the metal region of the scene.
+
+    Returns
+    -------
+    Patch number to K dicts: first_hz, last_hz, ratio {real, imag} or null, inverse_ratio_std, own_std (the part that
+    the other sub-bands do not share), amplitude_h, covariance [2][2 K] of the real and the imaginary part of 1 / ratio
+    with those of all sub-bands (real, imaginary part of the first, of the second, ...). Null if the sub-band shows no
+    pixel of the patch or of the metal: its footprint differs from the whole sweep's.
+
+    Raises
+    ------
+    DataError
+        if the reference was not imaged in these sub-bands.
+    """
+    if references is not None and len(references) != len(bands):
+        raise DataError(
+            f"the metal reference has {len(references)} sub-bands, not {len(bands)}",
+            "a sub-band is divided by metal in the same part of the sweep",
+            f"give a reference with --bands {len(bands)}",
+            code=ErrorCode.MISMATCH,
+        )
+    parts: dict[int, list[dict[str, Any]]] = {r.patch.label: [] for r in found.patches}
+    for k, (band, made) in enumerate(zip(bands, images, strict=True)):
+        reference = references[k] if references is not None else None
+        h, v, error = _relative_to_metal(found, made, leakage, smooth_px, reference)
+        for r in found.patches:
+            at = r.patch.interior & made.valid
+            whole = (found.h[at], found.v[at])
+            parts[r.patch.label].append(
+                {"first_hz": band.first_hz, "last_hz": band.last_hz, **_measure_band(h[at], v[at], whole, error)}
+            )
+    common = {r.patch.label: measure_patch(r.patch, found.h, found.v, 0.0).std for r in found.patches}
+    return {label: _with_covariance(rows, found, common[label]) for label, rows in parts.items()}
+
+
+def _with_covariance(rows: list[dict[str, Any]], found: MaterialsResult, common: float) -> list[dict[str, Any]]:
+    """Add the covariance of the errors to one patch's sub-bands; `common` is the deviation common to all of them."""
+    if any(row["ratio"] is None for row in rows) or not math.isfinite(common):
+        return [row | {"covariance": None} for row in rows]
+    inverse = np.array([1 / complex(row["ratio"]["real"], row["ratio"]["imag"]) for row in rows])
+    slopes = ratio_slopes(found.inversion, found.prior, inverse).reshape(2 * len(rows), 6)
+    place = common * np.tile(np.eye(2), (len(rows), 1))
+    own = np.repeat([row["own_std"] ** 2 for row in rows], 2)
+    covariance = slopes @ slopes.T + place @ place.T + np.diag(own)
+    std = np.sqrt(np.diag(covariance).reshape(-1, 2).mean(axis=1))
+    return [
+        row | {"inverse_ratio_std": float(std[k]), "covariance": covariance[2 * k : 2 * k + 2].tolist()}
+        for k, row in enumerate(rows)
+    ]
+
+
+def _relative_to_metal(
+    found: MaterialsResult,
+    made: ChannelImages,
+    leakage: tuple[complex, complex],
+    smooth_px: float,
+    reference: PlaneReference | None,
+) -> tuple[Image, Image, float]:
+    """Return H and V of a sub-band, [ny, nx], relative to metal, and the reference's relative standard error.
+
+    All are NaN if the sub-band shows no metal.
+    """
+    metal = replace(found.metal, mask=found.metal.mask & made.valid)
+    if not metal.mask.any():
+        nothing = np.full(made.valid.shape, complex(np.nan, np.nan))
+        return nothing, nothing, float("nan")
+    pair, _ = level(ImagePair.of(made), found.segmentation, found.tilts)
+    h, v = (np.where(made.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (pair.h, pair.v))
+    relative = without_leakage(to_metal(h, v, metal, reference), leakage)
+    h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
+    return h, v, reference_spread(h, v, metal, reference)
+
+
+def _measure_band(h: Image, v: Image, whole: tuple[Image, Image], error: float) -> dict[str, Any]:
+    """Return ratio of a patch's pixels [n] in a sub-band, its standard deviations, and |H|; null without usable pixels.
+
+    `whole` are H and V of the same pixels of the whole sweep, `error` the relative error of the metal reference.
+    """
+    ratio = median_ratio(h, v)
+    std = math.hypot(inverse_spread(h, v), error / abs(ratio)) if ratio else float("nan")
+    if not (math.isfinite(abs(ratio)) and math.isfinite(std)):
+        return {"ratio": None, "inverse_ratio_std": None, "own_std": None, "amplitude_h": None}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        apart = inverse_spread(np.ones_like(h), v / h - whole[1] / whole[0])
+    return {
+        "ratio": {"real": ratio.real, "imag": ratio.imag},
+        "inverse_ratio_std": std,
+        "own_std": math.hypot(BAND_STD, BAND_SHARE * apart) if math.isfinite(apart) else std,
+        "amplitude_h": float(np.nanmedian(np.abs(h))),
+    }
+
+
+def bands_of_row(
+    row: Mapping[str, Any],
+    chirp: Chirp,
+    count: int = 1,
+    amplitude_error: float = AMPLITUDE_ERROR,
+    theta_std_rad: float = 0.0,
+) -> Bands | None:
+    """Return the input of :func:`polysight.materials.layer_fit.fit_layer` from a row of materials.json.
+
+    Parameters
+    ----------
+    row
+        One segment.
+    chirp
+        Chirp of the scan.
+    count
+        Number of sub-bands: as in the row, or 1 for the whole sweep.
+    amplitude_error
+        Relative standard deviation of |H|, common to all sub-bands; 0: |H| is not used.
+    theta_std_rad
+        Standard deviation of the incidence angle.
+
+    Returns
+    -------
+    None if the segment has no usable ratio.
+
+    Raises
+    ------
+    DataError
+        if the segment was not processed with so many sub-bands.
+    """
+    parts = [row] if count == 1 else list(row.get("bands") or ())
+    if len(parts) != count:
+        raise DataError(
+            f"segment {row.get('label')} has {len(parts) or 'no'} sub-bands, not {count}",
+            "sub-bands are imaged from the recorded rows",
+            f"process the scan again with --bands {count}",
+            code=ErrorCode.MISMATCH,
+        )
+    if any(p.get("ratio") is None or not p.get("inverse_ratio_std") for p in parts):
+        return None
+    inverse = np.array([1 / complex(p["ratio"]["real"], p["ratio"]["imag"]) for p in parts])
+    spectrum, level = Spectrum.of(chirp, count), [p.get("amplitude_h") for p in parts]
+    sigma = np.array([float(p["inverse_ratio_std"]) for p in parts])
+    covariance = None
+    if count > 1 and all(p.get("covariance") for p in parts):
+        covariance = np.array([line for p in parts for line in p["covariance"]], np.float64)
+    else:
+        # Products of earlier releases have no covariance: K bands are then no better than one.
+        sigma = np.sqrt(count) * sigma
+    turn = (float(np.hypot(theta_std_rad, LAYERED_STD_RAD)), PHASE_PER_ANGLE) if theta_std_rad else (0.0, 0.0)
+    if not amplitude_error or any(a is None for a in level):
+        return Bands(spectrum, inverse, sigma, None, None, covariance, 0.0, *turn)
+    h = np.array(level, np.float64)
+    if covariance is None:
+        return Bands(spectrum, inverse, sigma, h, np.sqrt(count) * amplitude_error * h, None, 0.0, *turn)
+    return Bands(spectrum, inverse, sigma, h, BAND_AMPLITUDE_STD * h, covariance, amplitude_error, *turn)

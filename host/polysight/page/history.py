@@ -1,0 +1,318 @@
+"""Rows, takes, counts of each board, times and faults of a scan, collected from its manifest and events.
+
+No files and no clocks are read here, so that the same facts always give the same history. A fault becomes a `Notice`:
+a sentence with its likely cause and remedy (`CAUSES`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, Literal
+
+from polysight.acquisition import FaultKind, typical_row_s
+from polysight.plan import scan_time
+from polysight.store import Fact, with_connection
+from polysight_shared.config import Instrument
+from polysight_shared.errors import PolysightError
+from polysight_shared.faults import PiFault, explain
+from polysight_shared.messages import AnyEvent, Capture, Fault
+from polysight_shared.messages import Fault as FaultEvent
+from polysight_shared.raster import RasterPlan, plan_raster
+from polysight_shared.tables import decode as decode_config
+
+Level = Literal["bad", "warn", "note"]
+
+K = FaultKind
+CAUSES: dict[FaultKind, tuple[str, str]] = {
+    K.ON_REQUEST: ("Somebody stopped the scan in this row", "Nothing; `polysight resume` takes the row again"),
+    K.RADAR_STOPPED: (
+        "The radar hit a fault of its own",
+        "It is armed again; if that fails, power-cycle the board",
+    ),
+    K.RADAR_WAITS: ("SYNC_IN pulses did not reach the board", "Check its SYNC_IN wire and the fan-out buffer"),
+    K.NO_END: ("The Pi or the network was busy", "Nothing, while it is rare; else the Pi's load and network"),
+    K.COUNTS_DIFFER: ("The stage and the Pi counted different numbers of points", "Check the stage's trigger wire"),
+    K.NO_DATA: (
+        "The radar is not armed, or its card has lost network or power",
+        "`polysight card` names the silent hop",
+    ),
+    K.HELD: ("Somebody held the stage for more than 2 s", "Nothing"),
+    K.PULSES_MISSED: (
+        "The board missed SYNC_IN pulses",
+        "Check its SYNC_IN wire; after the scan run `polysight doctor`",
+    ),
+    K.SLIPPED: (
+        "The board saw edges on SYNC_IN that the Pi did not send",
+        "Check its SYNC_IN wire and ground, and cables beside it",
+    ),
+    K.FRAMES_MISSING: (
+        "The board missed SYNC_IN pulses, or the end of its data was lost",
+        "Check its SYNC_IN wire; after the scan run `polysight doctor`",
+    ),
+    K.CARD_DROPPED: ("The card could not send as fast as the radar measured", "Check its cable and the switch"),
+    K.LOST_BY_HOST: ("This machine was too busy to receive the packets", "Close other programs on the host"),
+    K.LOST_ON_THE_WAY: (
+        "Packets were lost between card and host",
+        "Nothing, while it is rare; else check cable and switch",
+    ),
+    K.CONFLICTING: (
+        "Packets with the same counters brought different bytes",
+        "Nothing: the row is retaken. If it comes back, reset the card: `polysight card reset BOARD`",
+    ),
+    K.UNLOCATED: (
+        "Packets were lost at the row's beginning, or the radar saw triggers that were not sent",
+        "Nothing, while it is rare; else check cable, switch and SYNC_IN wire",
+    ),
+}
+"""Likely cause and remedy by kind of fault. Those of the Pi are in shared/polysight_shared/faults.py."""
+RowMark = Literal["committed", "kept", "rejected"]
+_RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A message to the operator: what, why, what to do, and `detail` on demand.
+
+    `row` is -1 if no row is concerned, `utc` is empty if the time is not known.
+    """
+
+    level: Level
+    what: str
+    why: str = ""
+    do: str = ""
+    detail: str = ""
+    row: int = -1
+    utc: str = ""
+
+
+def sentence(text: str) -> str:
+    """Return the text with a capital letter first; a command stays as it is."""
+    return text if text.startswith("polysight") else text[:1].upper() + text[1:]
+
+
+def notice_of_error(error: PolysightError, level: Level = "warn") -> Notice:
+    """Notice of an error that was raised."""
+    return Notice(level, sentence(error.what), sentence(error.why), sentence(error.remedy))
+
+
+def notice_of_fault(event: Fault) -> Notice:
+    """Notice of a fault of the Pi; a warning if the Pi retakes the row by itself."""
+    table = explain(event.number)
+    passing = PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in (
+        PiFault.HOST_LOST, PiFault.POINTS_MISMATCH, PiFault.ABORTED,
+    )  # fmt: skip
+    return Notice(
+        "warn" if passing else "bad",
+        f"Fault {event.number} at the Pi: {table.what}",
+        sentence(event.why or table.why),
+        sentence(event.remedy or table.remedy),
+        event.what if event.what != table.what else "",
+    )
+
+
+def _cause(faults: Sequence[Fact]) -> tuple[str, str]:
+    """Likely cause and remedy of a row's faults: those of the first known kind."""
+    for fault in faults:
+        if fault["kind"] == K.PI_FAULT and fault.get("number"):
+            table = explain(int(fault["number"]))
+            return sentence(table.why), sentence(table.remedy)
+        if fault["kind"] in CAUSES:
+            return CAUSES[fault["kind"]]
+    return "", ""
+
+
+def notice_of_rejection(row: int, take: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) -> Notice:
+    """Notice of a rejected take."""
+    why, do = _cause(faults)
+    do = do or "Nothing: the row is retaken automatically"
+    return Notice("warn", f"Row {row}, take {take}, was rejected", why, do, "; ".join(reasons), row, utc)
+
+
+def notice_of_kept_row(row: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) -> Notice:
+    """Notice of a row that is kept with gaps."""
+    why, do = _cause(faults)
+    return Notice("warn", f"Row {row} is kept with gaps, which are masked", why, do, "; ".join(reasons), row, utc)
+
+
+@dataclass
+class BoardCounts:
+    """Data of one board over the committed rows; `retaken` counts takes that were rejected because of it."""
+
+    frames_expected: int = 0
+    frames_received: int = 0
+    missing_bytes: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+    retaken: int = 0
+
+
+@dataclass
+class TriggerHealth:
+    """Longest SYNC_IN pulse and largest jitter of one row, measured by the Pi."""
+
+    width_max_ns: int = 0
+    jitter_max_ns: int = 0
+
+    def add(self, event: Capture) -> None:
+        """Add one burst."""
+        self.width_max_ns = max(self.width_max_ns, event.width_max_ns)
+        self.jitter_max_ns = max(self.jitter_max_ns, event.jitter_ns)
+
+
+def seconds(utc: str) -> float:
+    """An ISO time as seconds since 1970."""
+    return datetime.fromisoformat(utc).timestamp()
+
+
+class ScanHistory:
+    """A scan according to its manifest and events.
+
+    Attributes
+    ----------
+    instrument, plan
+        Of the scan; the manifest's first fact has them.
+    takes
+        Committed rows and the take that counts, in the order they were committed.
+    marks
+        Outcome of each row so far.
+    ended
+        Last fact of a run that ended; None while it goes on, or if it was killed.
+    paused
+        True while the scan is paused on request.
+    """
+
+    def __init__(self, started: Fact) -> None:
+        self.started = started
+        self.instrument: Instrument = decode_config(started["instrument"], Instrument, "the manifest's instrument")
+        self.plan: RasterPlan = plan_raster(self.instrument.grid)
+        self.scan_id, self.simulated = str(started["scan_id"]), bool(started["simulated"])
+        self.takes: dict[int, int] = {}
+        self.marks: dict[int, RowMark] = {}
+        self.notices: list[Notice] = []
+        self.ended: Fact | None = None
+        self.paused = False
+        self.run_started_s = seconds(started.get("started_utc") or "1970-01-01T00:00:00+00:00")
+        self.last_commit_s = 0.0
+        self.trigger: dict[int, TriggerHealth] = {}
+        self.rows_since_trouble = 0  # rows committed whole since one was rejected or kept with gaps
+        self._rows: dict[int, dict[str, Any]] = {}
+        self._rejected: dict[str, int] = {b.name: 0 for b in self.instrument.recorded}
+        self._row_seconds: list[float] = []
+        self._paused_at = 0.0
+        self._fault_seqs: set[int] = set()
+
+    # --- the manifest ---
+
+    def add_fact(self, fact: Fact) -> None:
+        """Add the next fact; unknown kinds are ignored."""
+        handlers = {
+            "row_committed": self._row_committed,
+            "row_rejected": self._row_rejected,
+            "row_withdrawn": self._row_withdrawn,
+            "scan_resumed": self._scan_resumed,
+            "scan_paused": self._scan_paused,
+            "scan_continued": self._scan_continued,
+            "scan_ended": self._scan_ended,
+        }
+        if fact["fact"] in handlers:
+            handlers[fact["fact"]](fact)
+
+    def _row_committed(self, fact: Fact) -> None:
+        row, kept = int(fact["row"]), fact.get("kept_incomplete")
+        self.takes.pop(row, None)
+        self.takes[row] = int(fact["take"])
+        self.marks[row] = "kept" if kept else "committed"
+        self._rows[row] = fact["boards"]
+        self.rows_since_trouble = 0 if kept else self.rows_since_trouble + 1
+        if kept:
+            self.notices.append(notice_of_kept_row(row, kept, fact.get("faults", []), fact.get("committed_utc", "")))
+        if not fact.get("committed_utc"):
+            return  # made in one step, by `polysight simulate`
+        at = seconds(fact["committed_utc"])
+        if self.last_commit_s > self.run_started_s:
+            self._row_seconds.append(at - self.last_commit_s)
+        self.last_commit_s = at
+
+    def _row_rejected(self, fact: Fact) -> None:
+        row, reasons, faults = int(fact["row"]), [str(r) for r in fact["reasons"]], fact.get("faults", [])
+        self.marks[row] = "rejected"
+        self.rows_since_trouble = 0
+        for name in self._rejected:
+            named = any(f.get("board") == name for f in faults)
+            self._rejected[name] += named if faults else any(r.startswith(f"{name}:") for r in reasons)  # older scans
+        self.notices.append(notice_of_rejection(row, int(fact["take"]), reasons, faults, fact.get("rejected_utc", "")))
+
+    def _row_withdrawn(self, fact: Fact) -> None:
+        row = int(fact["row"])
+        self.takes.pop(row, None)
+        self._rows.pop(row, None)
+        self.marks.pop(row, None)
+        why = "; ".join(map(str, fact["reasons"]))
+        self.notices.append(
+            Notice(
+                "warn",
+                f"Row {row} on the disk differs from what was committed",
+                "The disk is faulty, or the file was changed",
+                "Nothing: the row is retaken",
+                why,
+                row,
+                fact.get("withdrawn_utc", ""),
+            )
+        )
+
+    def _scan_resumed(self, fact: Fact) -> None:
+        self.ended, self.paused = None, False
+        self.run_started_s = seconds(fact["resumed_utc"])
+        if fact.get("rig"):  # the Pi has another address from now on
+            self.instrument = with_connection(self.instrument, fact["rig"])
+
+    def _scan_paused(self, fact: Fact) -> None:
+        self.paused, self._paused_at = True, seconds(fact["paused_utc"])
+
+    def _scan_continued(self, fact: Fact) -> None:
+        self.paused = False
+        if self.last_commit_s:
+            self.last_commit_s += seconds(fact["continued_utc"]) - self._paused_at  # a pause does not count
+
+    def _scan_ended(self, fact: Fact) -> None:
+        self.ended, self.paused = fact, False
+
+    # --- the Pi's events ---
+
+    def add_events(self, events: Iterable[AnyEvent]) -> None:
+        """Add events of the event log; repeated ones change nothing."""
+        for event in events:
+            if isinstance(event, Capture):
+                self.trigger.setdefault(event.row_index, TriggerHealth()).add(event)
+            elif isinstance(event, FaultEvent) and event.seq not in self._fault_seqs:
+                self._fault_seqs.add(event.seq)
+                self.notices.append(notice_of_fault(event))
+
+    # --- derived ---
+
+    @property
+    def boards(self) -> dict[str, BoardCounts]:
+        """Counts over the committed rows, by board."""
+        found = {name: BoardCounts(retaken=n) for name, n in self._rejected.items()}
+        for boards in self._rows.values():
+            for name, facts in boards.items():
+                board = found.setdefault(name, BoardCounts())
+                board.frames_expected += int(facts["frames_expected"])
+                board.frames_received += int(facts["frames_received"])
+                board.missing_bytes += int(facts["missing_bytes"])
+                for kind in _RECEPTION:
+                    if kind in facts:
+                        board.counts[kind] = board.counts.get(kind, 0) + int(facts[kind])
+        return found
+
+    @property
+    def row_seconds(self) -> tuple[float, str] | None:
+        """Duration of a row and its origin (`measured`, `first row`, `plan`); None if it is not known."""
+        if self._row_seconds:
+            return typical_row_s(self._row_seconds), "measured"
+        if self.last_commit_s > self.run_started_s:
+            return self.last_commit_s - self.run_started_s, "first row"
+        if self.simulated:
+            return None  # the speed of simulated time is not known
+        return scan_time(self.instrument).total_s / self.instrument.grid.rows, "plan"

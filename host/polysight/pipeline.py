@@ -1,0 +1,114 @@
+"""The whole flow on one screen: recorded rows -> synchronised rows -> images -> plane -> materials -> verdict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Unpack
+
+from polysight import calibration, imaging, materials, polarimetry, process, store, sync
+from polysight.process import Progress, no_progress
+
+
+class Pipeline:
+    """Processes one scan: add its rows, in any order, then `finish`.
+
+    `choices` are the settings of imaging and kept samples, see `process.Choices`.
+    """
+
+    def __init__(self, source: store.Source, **choices: Unpack[process.Choices]) -> None:
+        self.source, self.calibration = source, calibration.calibration_of_scan(source)
+        rig = self.calibration.rig(source.instrument)
+        filters, self.plane = self.calibration.high_passes(rig), imaging.UNKNOWN_PLANE
+        self.synchroniser, self.quality = sync.RowSynchroniser(source, rig, filters), process.Quality(rig, source)
+        self.samples = process.KeptSamples(source, rig, filters, self.quality, **choices)
+        self.images, self.sub_bands = self.samples.images, self.samples.sub_bands
+        self.rig = store.mirrored(self.images.rig) if source.mirrored else self.images.rig  # x from TX to RX
+
+    def add_row(self, row: int) -> None:
+        """Add one row of every board to the images: from kept samples, or from raw data."""
+        if not self.samples.restore(row):
+            self.synchronise_row(row)
+            self.samples.save(row)
+
+    def synchronise_row(self, row: int) -> dict[str, sync.SyncedRow]:
+        """Read, synchronise and reduce one row of every board for the images; return the synchronised rows."""
+        return process.map_boards(self.quality.boards, lambda board: self._synchronise(board, row), self.images.live)
+
+    def _synchronise(self, board: str, row: int) -> sync.SyncedRow:
+        with self.quality.timed("read and synchronise"):
+            recorded = self.source.read_row(board, row)
+            synced, frames_whole = self.synchroniser.synchronise(board, recorded)
+        with self.quality.timed("reduce"):
+            self.images.add_row(board, row, synced)
+            self.sub_bands.add_row(board, row, synced)
+        self.quality.boards[board].add(row, recorded, frames_whole, synced)
+        return synced
+
+    def form_images(self, from_sums: bool = False) -> imaging.ChannelImages:
+        """Form both images on the rig file's plane, divided by the footprint, not referenced; `from_sums`: live."""
+        with self.quality.timed("image"):
+            images = self.images.current() if from_sums else self.images.finish()
+        self.quality.note(**self.calibration.quality_facts(), **self.synchroniser.recording_facts())
+        return images.transposed() if self.source.mirrored else images
+
+    def metal_plane(self, options: process.Options, in_scene: bool = False) -> polarimetry.PlaneReference | None:
+        """Return the metal plate given in `options`, or the calibrated one unless metal `in_scene` is given."""
+        named = in_scene or options.metal_box_mm is not None
+        return self.calibration.metal_plane(self.rig, options.reference, named, options.bands)
+
+    def place_plane(self, images: imaging.ChannelImages, move: bool = True) -> imaging.ChannelImages:
+        """Estimate the plane of the plates; return the images on it (unchanged if `move` is False)."""
+        with self.quality.timed("plane"):
+            masks, swapped = materials.insides(images), self.source.mirrored
+            self.plane, images = imaging.move_to_plane(self.images, images, masks, swapped, move)
+        return images
+
+    def find_materials(
+        self,
+        images: imaging.ChannelImages,
+        metal: materials.MetalChoice = materials.FOUND,
+        known: materials.KnownScene = materials.UNKNOWN_SCENE,
+        classifier: materials.Classifier | None = None,
+        incidence: polarimetry.Incidence = "one",
+    ) -> materials.MaterialsResult:
+        """Find patches (unless known), metal reference, permittivities and names; in sub-bands too, if imaged."""
+        with self.quality.timed("materials"):
+            rig, std = self.plane.applied_to(self.rig), self.plane.incidence_std_rad(self.rig)
+            angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, incidence)
+            optics = materials.Optics.of(self.rig, angles, std, self.synchroniser.direct_path_known)
+            found = materials.analyse(materials.ImagePair.of(images), optics, metal, known, classifier)
+            self.quality.note_materials(found, angles, images.valid, metal.plane)
+        with self.quality.timed("sub-bands"):
+            moved = self.plane.offset_m if self.plane.worth_moving else 0.0
+            parts = self.sub_bands.finish(self.source.mirrored, moved)
+            return materials.with_bands(found, self.sub_bands.bands, parts, optics, metal.plane)
+
+    def examine(
+        self, images: imaging.ChannelImages, options: process.Options, plates: materials.Plates = ()
+    ) -> process.Findings:
+        """Find plane and materials, and judge them; a verdict "no result" removes names and permittivities."""
+        classifier, boxes = options.classifier(self.rig), options.drawn(images.x_m, images.y_m)
+        plane = self.metal_plane(options, boxes.metal is not None)
+        images = self.place_plane(images)
+        if plane is not None:
+            images = replace(images, valid=images.valid & plane.valid_on(images.x_m, images.y_m))
+        metal = materials.MetalChoice(options.metal_box_mm, boxes.metal, plane)
+        known = materials.KnownScene(boxes.segmentation, plates)
+        found = replace(self.find_materials(images, metal, known, classifier, options.incidence), boxes=boxes.names)
+        verdict = process.judge(self.quality, found, self.plane, classifier)
+        shown = found if verdict.usable else found.without_result()
+        return process.Findings(images, shown, verdict, self.plane, classifier, plates)
+
+    def finish(
+        self, out: Path, options: process.Options, plates: materials.Plates = (), progress: Progress = no_progress
+    ) -> process.Products:
+        """Write all products into `out`: images first, so that they stay if a later step fails."""
+        images = self.form_images()
+        process.save_images(out, self.source, self.rig, images, self.quality)
+        progress("point response")
+        self.quality.note_imaging(self.images, images)
+        progress("materials")
+        findings = self.examine(images, options, plates)
+        progress("figures and report")
+        return process.save_materials(out, self.source, self.rig, findings, options.unnamed(self.rig), self.quality)

@@ -1,0 +1,29 @@
+"""`polysight plan`: predict a scan before it is made: time, data, resolution, noise, aliases, warnings.
+
+`forecast` predicts the scan of a rig file to which `Changes` were applied; `propose` searches for the plans with the
+least noise within a time. `scan_time` estimates the duration, `field_limits` the alias-free field of view. `run_plan`
+is the command; it can take noise and standstill from an earlier scan.
+"""
+
+from polysight.plan.field import FieldLimits, field_limits
+from polysight.plan.forecast import Forecast, Noise, forecast
+from polysight.plan.plan_command import PlanOptions, forecast_values, run_plan
+from polysight.plan.search import Changes, propose
+from polysight.plan.timing import ScanTime, row_motion_s, scan_time, straight_move_s
+
+__all__ = [
+    "Changes",
+    "FieldLimits",
+    "Forecast",
+    "Noise",
+    "PlanOptions",
+    "ScanTime",
+    "field_limits",
+    "forecast",
+    "forecast_values",
+    "propose",
+    "row_motion_s",
+    "run_plan",
+    "scan_time",
+    "straight_move_s",
+]

@@ -1,0 +1,330 @@
+"""Predict a scan from its rig file: time, data, point response, alias-free field, noise, and warnings.
+
+`forecast` returns all of it; `find_warnings` only the warnings, which include settings that stage, Pi or radars would
+refuse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.imaging import (
+    TAPERS,
+    Antennas,
+    Aperture,
+    PointResponse,
+    image_grid,
+    point_response,
+    reduction,
+    scan_offsets_m,
+    scene_gate_m,
+    window_weights,
+)
+from polysight.plan.field import FieldLimits, PhaseSlope, field_limits
+from polysight.plan.timing import ROW_OVERHEAD_S, ScanTime, scan_time, tail_s, whole_packets
+from polysight.process import Options
+from polysight.radar import constraints
+from polysight_shared.config import Instrument
+from polysight_shared.errors import ConfigError
+from polysight_shared.raster import burst_duration_s, check_burst_fits, plan_raster
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+Real = NDArray[np.float64]
+
+MAX_STEPS_PER_S = 20_000  # of the stage's firmware (docs/spec/stage-line.md, timing)
+SIMULATED_DIRECT_SNR_DB = 5.5
+_PUBLISHED_SPEED_MM_S = 20.0
+_PUBLISHED_PHASE_RAD = 0.022  # standard deviation of the phase of the object's peak, paper section 9.1
+_MAX_BURST_LOSS_DB = 0.5
+_WIRE_BYTES = 1470 + 42 + 24  # a full packet on Ethernet: headers, preamble, checksum, gap
+_ETHERNET_BYTES_PER_US = 125.0
+_FAST_TIME_WINDOW = "hann"  # as in host.imaging.ImageBuilder
+
+
+class PlanWarning(NamedTuple):
+    """Something to know before the scan. `refused`: stage, Pi or radars would refuse the plan."""
+
+    topic: str
+    text: str
+    refused: bool = False
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Assumed power of the direct path over noise (one channel, sample and chirp), dB, and its source."""
+
+    direct_snr_db: float = SIMULATED_DIRECT_SNR_DB
+    source: str = "the simulated rig's"
+
+
+@dataclass(frozen=True)
+class BurstForecast:
+    """Burst of one position.
+
+    Attributes
+    ----------
+    duration_ms
+        Pulses x period: the minimum time to the next position.
+    between_ms
+        Time from one position to the next.
+    travel_mm, travel_wavelengths
+        Travel of the stage from the first to the last chirp.
+    edge_loss_db
+        Loss of a point's echo in the average over a burst at the aperture's ends, where its phase changes fastest.
+        An average is placed at the middle of its burst, so that no shift remains.
+    """
+
+    duration_ms: float
+    between_ms: float
+    travel_mm: float
+    travel_wavelengths: float
+    edge_loss_db: float
+
+    @property
+    def duty(self) -> float:
+        """Fraction of the time in which chirps are sent."""
+        return self.duration_ms / self.between_ms
+
+
+@dataclass(frozen=True)
+class NoiseForecast:
+    """Signal-to-noise ratios after averaging.
+
+    Attributes
+    ----------
+    position_db
+        Direct path over noise in a position's average, one channel, one sample.
+    direct_phase_rad
+        Standard deviation of the direct path's phase, the phase reference of a position: Cramer-Rao bound of one tone
+        in all channels, 1 / sqrt(2 N snr) (Rife and Boorstyn 1974).
+    image_db
+        Peak over noise in the image, for a point whose echo is as strong as the direct path.
+    """
+
+    position_db: float
+    direct_phase_rad: float
+    image_db: float
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Prediction of a scan."""
+
+    rig: Instrument
+    time: ScanTime
+    raw_bytes: int
+    burst: BurstForecast
+    response: PointResponse
+    field: FieldLimits
+    noise: NoiseForecast
+    noise_source: str
+    warnings: tuple[PlanWarning, ...]
+
+    @property
+    def possible(self) -> bool:
+        """False if stage, Pi or radars would refuse the plan."""
+        return not any(w.refused for w in self.warnings)
+
+
+def forecast(
+    rig: Instrument,
+    noise: Noise | None = None,
+    row_overhead_s: float = ROW_OVERHEAD_S,
+    scene_mm: tuple[float, float] | None = None,
+) -> Forecast:
+    """Predict a scan of a rig file to which `Changes` were applied.
+
+    `noise`: default the simulated rig's. `row_overhead_s`: standstill for each row apart from motion. `scene_mm`: width
+    and height of the scene in the object plane; default: the image's.
+    """
+    noise = noise or Noise()
+    aperture, taper = aperture_of(rig)
+    return Forecast(
+        rig,
+        scan_time(rig, row_overhead_s),
+        rig.scan_bytes,
+        predict_burst(rig),
+        point_response(aperture, taper),
+        field_limits(rig),
+        predict_noise(rig, noise),
+        noise.source,
+        find_warnings(rig, noise, scene_mm),
+    )
+
+
+def aperture_of(rig: Instrument) -> tuple[Aperture, Real]:
+    """Return the aperture of the H receiver and its taper [row, column]."""
+    plan, grid = plan_raster(rig.grid), image_grid(rig)
+    antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
+    frequencies = reduction(rig.chirp, scene_gate_m(antennas, plan, grid), _FAST_TIME_WINDOW).frequencies_hz
+    return Aperture(antennas[0], scan_offsets_m(rig), frequencies, grid), np.outer(*_tapers(rig))
+
+
+def _tapers(rig: Instrument) -> tuple[Real, Real]:
+    name = TAPERS[rig.image.apodisation]
+    return window_weights(name, rig.grid.rows), window_weights(name, rig.grid.columns)
+
+
+def predict_burst(rig: Instrument) -> BurstForecast:
+    """Predict duration and travel of a burst, and the loss by motion."""
+    grid, stage, burst = rig.grid, rig.stage, rig.burst
+    travel_mm = stage.speed_mm_s * burst_duration_s(burst)
+    middle_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * sum(rig.chirp.linear_samples) / 2
+    half_m = (grid.columns - 1) / 2 * grid.step_x_mm / 1e3
+    change_rad = travel_mm / 1e3 * abs(PhaseSlope(rig, 0).at(half_m, middle_hz))
+    return BurstForecast(
+        duration_ms=burst.pulses * burst.period_us * 1e-3,
+        between_ms=1e3 * grid.step_x_mm / stage.speed_mm_s,
+        travel_mm=travel_mm,
+        travel_wavelengths=travel_mm / 1e3 * middle_hz / SPEED_OF_LIGHT_M_S,
+        edge_loss_db=float(-20 * np.log10(max(abs(np.sinc(change_rad / (2 * np.pi))), 1e-6))),
+    )
+
+
+def predict_noise(rig: Instrument, noise: Noise) -> NoiseForecast:
+    """Predict signal-to-noise ratios after averaging, and in the image.
+
+    A weighted sum of n equal signals in independent noise gains `(sum w)^2 / sum w^2`: over pulses, RX, fast time and
+    positions.
+    """
+    a, b = rig.chirp.linear_samples
+    rx = len(rig.antennas.rx_mm)
+    position = 10 ** (noise.direct_snr_db / 10) * rig.burst.chirps_a_position
+    gain = rx
+    for window in (window_weights(_FAST_TIME_WINDOW, b - a), *_tapers(rig)):
+        gain *= window.sum() ** 2 / (window**2).sum()
+    return NoiseForecast(
+        position_db=float(10 * np.log10(position)),
+        direct_phase_rad=float(1 / np.sqrt(2 * (b - a) * rx * position)),
+        image_db=float(10 * np.log10(position * gain)),
+    )
+
+
+# --- warnings ---
+
+
+def find_warnings(
+    rig: Instrument, noise: Noise, scene_mm: tuple[float, float] | None = None
+) -> tuple[PlanWarning, ...]:
+    """Return every warning about a plan, refusals first; much faster than the whole forecast."""
+    image_mm = (rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm)
+    scene_mm = scene_mm or image_mm
+    found = [
+        *_stage_warnings(rig),
+        *_burst_warnings(rig, predict_burst(rig)),
+        *_card_warnings(rig),
+        *_radar_warnings(rig),
+        *_field_warnings(rig, scene_mm, image_mm),
+    ]
+    phase = predict_noise(rig, noise).direct_phase_rad
+    if phase > _PUBLISHED_PHASE_RAD:
+        text = f"standard deviation of the direct path's phase {phase:.3f} rad (published rig after all stages:"
+        found.append(PlanWarning("noise", f"{text} {_PUBLISHED_PHASE_RAD}): use more pulses a position"))
+    if text := Options().unnamed(rig):
+        found.append(PlanWarning("library", text.replace("was named", "will be named", 1)))
+    return tuple(sorted(found, key=lambda w: not w.refused))
+
+
+def _stage_warnings(rig: Instrument) -> Iterator[PlanWarning]:
+    stage, grid = rig.stage, rig.grid
+    rate, limit = stage.speed_mm_s * stage.steps_per_mm, MAX_STEPS_PER_S / stage.steps_per_mm
+    if rate > MAX_STEPS_PER_S:
+        text = f"{stage.speed_mm_s:g} mm/s are {rate:g} steps/s; the maximum of the stage is {limit:g} mm/s"
+        yield PlanWarning("speed", text, True)
+    for axis, step in (("x", grid.step_x_mm), ("y", grid.step_y_mm)):
+        steps = step * stage.steps_per_mm
+        if abs(steps - round(steps)) > 1e-6:
+            text = f"a step of {step:g} mm in {axis} is {steps:g} motor steps, not a whole number"
+            yield PlanWarning(f"step {axis}", text, True)
+    if stage.speed_mm_s > _PUBLISHED_SPEED_MM_S:
+        yield PlanWarning(
+            "speed",
+            f"faster than the published rig's {_PUBLISHED_SPEED_MM_S:g} mm/s: vibration of a real stage at"
+            f" {stage.speed_mm_s:g} mm/s was not measured (a jitter of 0.2 mm towards the object costs 0.9 dB,"
+            " simulated)",
+        )
+
+
+def _burst_warnings(rig: Instrument, burst: BurstForecast) -> Iterator[PlanWarning]:
+    max_pulses = int(1e3 * burst.between_ms / rig.burst.period_us)
+    try:
+        check_burst_fits(rig.grid, rig.burst, rig.stage)
+    except ConfigError as e:
+        remedy = f"at most {1e3 * rig.grid.step_x_mm / burst.duration_ms:.3g} mm/s"
+        remedy += f", or at most {max_pulses} pulses" if max_pulses else ""
+        yield PlanWarning("burst", f"too fast for the burst: {e.what}; {remedy}", True)
+    if burst.edge_loss_db > _MAX_BURST_LOSS_DB:
+        yield PlanWarning(
+            "motion",
+            f"the stage moves {burst.travel_mm:.2f} mm ({burst.travel_wavelengths:.2f} wavelengths) during a burst:"
+            f" echoes at the aperture's ends lose {burst.edge_loss_db:.1f} dB in the average; use fewer or faster"
+            " pulses",
+        )
+    if rig.burst.pulses > 1 and burst.duty < 0.5:
+        text = f"the radars are idle for {1 - burst.duty:.0%} of a row: up to {max_pulses} pulses a position take no"
+        yield PlanWarning("idle", f"{text} extra time")
+    if rig.burst.chirps_a_position == 1:
+        text = "with one chirp a position, noise and the residual of the alignment cannot be measured"
+        yield PlanWarning("burst", text)
+
+
+def _card_warnings(rig: Instrument) -> Iterator[PlanWarning]:
+    if tail := tail_s(rig):
+        fits = int(1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us)
+        whole = [n for n in range(2, fits + 1) if rig.burst.chirps == 1 and whole_packets(rig, n)]
+        nearest = min(whole, key=lambda n: abs(n - rig.burst.pulses), default=0)
+        yield PlanWarning(
+            "card",
+            f"a row of {rig.row_bytes} bytes does not fill whole packets of {rig.card.payload_bytes}: the card delays"
+            f" its last packet, {tail * rig.grid.rows / 60:.1f} min in total"
+            + (f"; {nearest} pulses avoid this" if nearest else ""),
+        )
+    packet_us = max(rig.card.packet_delay_us, _WIRE_BYTES / _ETHERNET_BYTES_PER_US)
+    frame_us = rig.frame_bytes / rig.card.payload_bytes * packet_us
+    if frame_us > rig.burst.period_us:
+        text = f"a card needs {frame_us:.0f} us to send a frame and gets one every {rig.burst.period_us:g} us"
+        yield PlanWarning("card", text)
+
+
+def _radar_warnings(rig: Instrument) -> Iterator[PlanWarning]:
+    native = rig.radar.control == "native"
+    offsets_known = native or any(b.start_offset_hz for b in rig.boards)
+    for c in constraints(rig, rig.grid.columns * rig.burst.pulses):
+        about_if = c.name.startswith("IF")
+        if not c.holds and (offsets_known or not about_if):
+            yield PlanWarning("IF" if about_if else "radar", f"{c}: {c.remedy}", native)
+    if not offsets_known:
+        yield PlanWarning(
+            "IF",
+            "the rig file has no start_offset_hz, so the IF depends on the program that configures the radars: the"
+            f" direct path needs a margin of {rig.chirp.slope_hz_per_s * 5e-9 / 1e3:.0f} kHz for 5 ns of trigger"
+            " jitter",
+        )
+
+
+def _field_warnings(
+    rig: Instrument, scene_mm: tuple[float, float], image_mm: tuple[float, float]
+) -> Iterator[PlanWarning]:
+    grid, field = rig.grid, field_limits(rig)
+    axes = (("x", grid.step_x_mm, grid.columns), ("y", grid.step_y_mm, grid.rows))
+    for i, (axis, step, count) in enumerate(axes):
+        scene, free, zone, size = scene_mm[i], field.alias_free_mm[i], field.mirror_zone_mm[i], (count - 1) * step
+        need = (scene + image_mm[i]) / 2
+        if free < need:
+            yield PlanWarning(
+                "aliasing",
+                f"in {axis}, steps of {step:g} mm make ghosts {free:.0f} mm from each object; a scene of {scene:.0f} mm"
+                f" in an image of {image_mm[i]:.0f} mm needs {need:.0f} mm: use steps of at most"
+                f" {step * free / need:.2g} mm, a smaller image, or polysight.imaging.sparse",
+            )
+        if (good := max(0.0, size - 2 * zone)) < scene:
+            yield PlanWarning(
+                "aperture",
+                f"flat plates are mirrors: an aperture of {size:.0f} mm in {axis} images {good:.0f} mm of them well"
+                f" ({zone:.0f} mm of margin on either side); the scene has {scene:.0f} mm",
+            )

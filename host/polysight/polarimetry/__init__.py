@@ -1,0 +1,70 @@
+"""Polarimetry: from the H and V images to reflection and permittivity.
+
+`calibrate` divides the images by a metal region in the scene, a `PlaneReference` by a metal plate from another scan.
+`correct_leakage` removes cross-polar leakage; `leakage_from_images` estimates it from metal at two orientations.
+`incidence_choice` gives the incidence angle of each pixel. `fresnel` and `multilayer` compute the reflection of a
+material, `permittivity_from_ratio` the permittivity from a polarisation ratio (Eq. 2 and 3 of the paper).
+"""
+
+from polysight.polarimetry.calibrate import (
+    Calibrated,
+    Image,
+    Mask,
+    calibrate,
+    calibrate_by_reference,
+    correct_leakage,
+    ratio,
+    smooth,
+)
+from polysight.polarimetry.fresnel import (
+    brewster_angle_rad,
+    fresnel,
+    multilayer,
+    permittivity_from_ratio,
+    ratio_from_permittivity,
+)
+from polysight.polarimetry.incidence import (
+    Incidence,
+    IncidenceChoice,
+    incidence_choice,
+    specular_incidence_rad,
+)
+from polysight.polarimetry.leakage import (
+    Leakage,
+    Standard,
+    common_direction,
+    estimate_axial_ratio,
+    estimate_leakage,
+    leakage_from_images,
+    strips_wave,
+)
+from polysight.polarimetry.reference import PlaneReference, plane_reference
+
+__all__ = [
+    "Calibrated",
+    "Image",
+    "Incidence",
+    "IncidenceChoice",
+    "Leakage",
+    "Mask",
+    "PlaneReference",
+    "Standard",
+    "brewster_angle_rad",
+    "calibrate",
+    "calibrate_by_reference",
+    "common_direction",
+    "correct_leakage",
+    "estimate_axial_ratio",
+    "estimate_leakage",
+    "fresnel",
+    "incidence_choice",
+    "leakage_from_images",
+    "multilayer",
+    "permittivity_from_ratio",
+    "plane_reference",
+    "ratio",
+    "ratio_from_permittivity",
+    "smooth",
+    "specular_incidence_rad",
+    "strips_wave",
+]

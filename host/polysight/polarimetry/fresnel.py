@@ -1,0 +1,212 @@
+"""Reflection of plane waves: Fresnel coefficients, their ratio, the permittivity from a ratio, and layered media.
+
+Time convention `exp(+j omega t)`: a passive medium has permittivity `eps' - j eps''` with `eps'' >= 0`, and waves in it
+decay. Signs of Eq. 2 of the paper: metal has r_s = r_p = -1, so that P = r_s / r_p = +1 at every angle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import PolysightError
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+Complex = npt.NDArray[np.complex128]
+Real = npt.NDArray[np.float64]
+_AIR = np.asarray(1.0 + 0j)
+_NAN = complex(np.nan, np.nan)
+_CONDUCTOR = 1 - 1e24j  # replaces infinite permittivity: reflects -1 within 1e-12
+
+
+def _normal_wavenumber(eps: Complex, sine: Real) -> Complex:
+    """Return index times cosine in the medium, sqrt(eps - sin^2 theta_i), the root that decays (Im <= 0)."""
+    q: Complex = np.sqrt(eps - sine**2)
+    return np.where((q.real == 0) & (q.imag > 0), -q, q)
+
+
+def _media(
+    eps: npt.ArrayLike, theta_rad: npt.ArrayLike
+) -> tuple[Complex, Real, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Broadcast permittivity and angle; return them made finite, and masks of metal (infinite) and of NaN."""
+    eps, theta = np.broadcast_arrays(np.asarray(eps, np.complex128), np.asarray(theta_rad, np.float64))
+    unknown = np.isnan(eps) | ~np.isfinite(theta)  # of a complex number: either part
+    metal = np.isinf(eps) & ~unknown
+    return np.where(metal | unknown, 1.0, eps), np.where(unknown, 0.5, theta), metal, unknown
+
+
+def fresnel(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> tuple[Complex, Complex]:
+    """Return the reflection coefficients of a half space in air (Eq. 2 of the paper).
+
+    Parameters
+    ----------
+    eps
+        Relative permittivity `eps' - j eps''`, any shape; infinite means a perfect conductor.
+    theta_rad
+        Incidence angle in radians, broadcast against `eps`.
+
+    Returns
+    -------
+    r_s, r_p
+        complex128, broadcast shape: s (perpendicular to the plane of incidence) and p (parallel to it). NaN where
+        `eps` or the angle is NaN.
+    """
+    eps, theta, metal, unknown = _media(eps, theta_rad)
+    c, s = np.cos(theta), np.sin(theta)
+    q = _normal_wavenumber(eps, s)
+    r_s = np.where(metal, -1.0, (c - q) / (c + q))
+    # cos(theta_t) = q / n, so n_i cos(theta_t) -+ n_t cos(theta_i) is (q -+ eps c) / n: no square root of eps needed.
+    r_p = np.where(metal, -1.0, (q - eps * c) / (q + eps * c))
+    return np.where(unknown, _NAN, r_s)[()], np.where(unknown, _NAN, r_p)[()]
+
+
+def ratio_from_permittivity(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
+    """Return the polarisation ratio P = r_s / r_p of a half space (Eq. 2 of the paper), complex128.
+
+    Evaluated as (q cos + sin^2) / (q cos - sin^2) with q = sqrt(eps - sin^2), which has no 0/0 at eps = 1. Infinite
+    permittivity gives 1 (metal), the Brewster angle of a lossless medium infinity. Parameters as :func:`fresnel`.
+    """
+    eps, theta, metal, unknown = _media(eps, theta_rad)
+    s = np.sin(theta)
+    a = _normal_wavenumber(eps, s) * np.cos(theta)
+    pole = a == s**2
+    ratio = (a + s**2) / np.where(pole, 1.0, a - s**2)
+    ratio = np.where(metal, 1.0, np.where(pole, complex(np.inf, 0.0), ratio))
+    return np.where(unknown, _NAN, ratio)[()]
+
+
+def permittivity_from_ratio(p: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
+    """Return the permittivity of a half space from its polarisation ratio (Eq. 3 of the paper).
+
+    Eq. 3 is evaluated as sin^2 (1 + tan^2 ((1 + P) / (1 - P))^2), the same expression without cancellation. P and 1/P
+    give the same result.
+
+    P = 1 (a perfect conductor, at any angle) returns `inf + 0j`. Near it the permittivity grows as 4 / |P - 1|^2, and
+    errors of P with it: a metal-like material has no determinable permittivity.
+
+    Parameters
+    ----------
+    p
+        Complex ratio H / V, metal-referenced, any shape; infinite at the Brewster angle.
+    theta_rad
+        Incidence angle in radians, broadcast against `p`.
+
+    Returns
+    -------
+    eps
+        complex128; NaN where `p` is NaN.
+    """
+    p, theta = np.broadcast_arrays(np.asarray(p, np.complex128), np.asarray(theta_rad, np.float64))
+    # Use P or 1/P, whichever has modulus <= 1: no overflow near the Brewster angle.
+    big = np.abs(p) > 1
+    with np.errstate(invalid="ignore"):
+        small = np.where(np.isinf(p), 0.0, np.where(big, 1.0 / np.where(big, p, 1.0), p))
+        pole = small == 1
+        u = (1 + small) / np.where(pole, 1.0, 1 - small)
+        eps = np.sin(theta) ** 2 * (1 + np.tan(theta) ** 2 * u**2)
+    return np.where(pole, complex(np.inf, 0.0), eps)[()]
+
+
+def brewster_angle_rad(eps: npt.ArrayLike) -> Real:
+    """Return the angle of smallest |r_p| of a half space, radians: arctan(sqrt|eps|), exact for lossless media.
+
+    The paper calls it the angle of lowest *s* reflectance; it is the p-polarised wave that vanishes there.
+    """
+    return np.arctan(np.sqrt(np.abs(np.asarray(eps, np.complex128))))[()]
+
+
+def _entries(value: Sequence[npt.ArrayLike] | npt.ArrayLike) -> list[Any]:
+    """Return the entries of a list, tuple or array; a number becomes a list of one."""
+    if isinstance(value, list | tuple):
+        return list(value)
+    array = np.asarray(value)
+    return [array] if array.ndim == 0 else list(array)
+
+
+def _stack(
+    eps: Sequence[npt.ArrayLike] | npt.ArrayLike, thickness_m: Sequence[npt.ArrayLike] | npt.ArrayLike
+) -> tuple[list[Complex], list[Real]]:
+    """Return the permittivities of air and all media, and the thicknesses of the layers between, metres.
+
+    Raises PolysightError as :func:`multilayer`.
+    """
+    media: list[Complex] = [np.asarray(e, np.complex128) for e in _entries(eps)]
+    media = [np.where(np.isinf(e), _CONDUCTOR, e) for e in media]
+    layers = [np.asarray(d, np.float64) for d in _entries(thickness_m)]
+    if not media or len(layers) not in (len(media) - 1, len(media)):
+        raise PolysightError(
+            f"multilayer: {len(media)} permittivities with {len(layers)} thicknesses",
+            "each medium needs a thickness; only that of the last one may be left out (half space)",
+            code=ErrorCode.MISMATCH,
+        )
+    if len(layers) == len(media):
+        if np.all(np.isinf(layers[-1])):
+            layers.pop()
+        else:
+            media.append(_AIR)
+    if any(np.any(~np.isfinite(d)) or np.any(d < 0) for d in layers):
+        raise PolysightError(
+            "multilayer: a thickness is negative or not finite",
+            "only the last medium may be infinitely thick",
+            code=ErrorCode.VALUE_INVALID,
+        )
+    return [_AIR, *media], layers
+
+
+def multilayer(
+    eps: Sequence[npt.ArrayLike] | npt.ArrayLike,
+    thickness_m: Sequence[npt.ArrayLike] | npt.ArrayLike,
+    frequency_hz: npt.ArrayLike,
+    theta_rad: npt.ArrayLike,
+) -> tuple[Complex, Complex]:
+    """Return the reflection coefficients of a stack of flat layers in air.
+
+    Transfer-matrix solution in recursive form (Rouard; Born & Wolf, section 1.6), from the last interface to the first:
+    r = (r_front + r_behind z) / (1 + r_front r_behind z) with z = exp(-2 j k0 d q). All exponentials decay, so thick
+    lossy layers do not overflow.
+
+    Parameters
+    ----------
+    eps
+        Relative permittivity of each medium from the front; each entry a number or an array that broadcasts against
+        frequency and angle. A single number is one medium. Infinite: a perfect conductor.
+    thickness_m
+        Thickness of each medium, metres. The last medium is a half space if its thickness is infinite or left out;
+        otherwise air follows. `multilayer(eps, inf, f, theta)` is :func:`fresnel`, `multilayer(eps, d, f, theta)` a
+        sheet in air.
+    frequency_hz
+        Frequency, number or array.
+    theta_rad
+        Incidence angle in air, radians, number or array.
+
+    Returns
+    -------
+    r_s, r_p
+        complex128, broadcast shape, phase referred to the front surface, signs of Eq. 2.
+
+    Raises
+    ------
+    PolysightError
+        if the numbers of permittivities and thicknesses do not fit, or a thickness is negative, or infinite before the
+        last medium.
+    """
+    media, layers = _stack(eps, thickness_m)
+    theta = np.asarray(theta_rad, np.float64)
+    s = np.sin(theta)
+    k0 = 2 * np.pi * np.asarray(frequency_hz, np.float64) / SPEED_OF_LIGHT_M_S
+    q = [np.cos(theta).astype(np.complex128), *(_normal_wavenumber(e, s) for e in media[1:])]
+    y = [qi / ei for qi, ei in zip(q, media, strict=True)]
+    r_s: Complex = (q[-2] - q[-1]) / (q[-2] + q[-1])
+    r_p: Complex = (y[-1] - y[-2]) / (y[-1] + y[-2])
+    for i in range(len(layers) - 1, -1, -1):
+        z = np.exp(-2j * k0 * layers[i] * q[i + 1])
+        front_s = (q[i] - q[i + 1]) / (q[i] + q[i + 1])
+        front_p = (y[i + 1] - y[i]) / (y[i + 1] + y[i])
+        r_s = (front_s + r_s * z) / (1 + front_s * r_s * z)
+        r_p = (front_p + r_p * z) / (1 + front_p * r_p * z)
+    shape = np.broadcast_shapes(r_s.shape, k0.shape)
+    return np.broadcast_to(r_s, shape)[()], np.broadcast_to(r_p, shape)[()]

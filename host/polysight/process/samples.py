@@ -1,0 +1,394 @@
+"""Kept samples: the reduced samples of a scan on disk, from which images are formed without raw data.
+
+`KeptSamples` belongs to one pipeline. It restores a row from disk if the row was made from the same raw bytes with the
+same settings; otherwise the pipeline synchronises the row and saves it. Missing, truncated or damaged records are
+synchronised again. File format: docs/spec/samples.md.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import math
+import os
+import threading
+import weakref
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypedDict, Unpack
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.imaging import (
+    AS_IN_RIG_FILE,
+    PLANE_REACH_M,
+    ImageBuilder,
+    ImagedWith,
+    ReducedRow,
+    SubBandImages,
+    View,
+    needed_gate_m,
+    reduction,
+)
+from polysight.process.quality import Quality
+from polysight.store import (
+    SAMPLE_ROWS,
+    SAMPLES,
+    ScanFolder,
+    Source,
+    dropped_rows,
+    inside,
+    manifest,
+    open_records,
+    raw_digest,
+    read_sample_rows,
+    record_digest,
+    require_raw,
+)
+from polysight.sync import HighPass
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+from polysight_shared.files import read_json
+
+HEAD = "samples.json"
+FORMAT = 1
+MAKING = 1
+"""Version of the method that makes samples from raw data."""
+Use = Literal["none", "read", "keep"]
+Filters = Mapping[str, HighPass | None]
+Gate = tuple[float, float]
+Count = Annotated[int, msgspec.Meta(ge=0)]
+_FIGURES = ("direct_hz", "direct_snr")  # of a row's quality figures: one number a position
+_log = logging.getLogger(__name__)
+
+
+class Choices(TypedDict, total=False):
+    """Settings of imaging a scan.
+
+    Attributes
+    ----------
+    live
+        Keep running sums, so that images can be formed after every row.
+    depth_m
+        The range gate keeps echoes from planes up to this much nearer or farther than the rig file's (default 15 mm).
+    bands
+        Number of sub-bands to image; 1 (default): none.
+    view
+        Another plane or other pixels than the rig file's.
+    samples
+        Kept samples: "none" (default) ignores them, "read" restores rows, "keep" also saves missing rows.
+    """
+
+    live: bool
+    depth_m: float
+    bands: int
+    view: View
+    samples: Use
+
+
+def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
+    """Return the settings that samples depend on besides raw data and gate: the calibrated rig and its filters."""
+    imaged = msgspec.to_builtins(ImagedWith.of(rig, filters))
+    imaged.pop("apodisation")
+    parts = {name: msgspec.to_builtins(getattr(rig, name)) for name in ("chirp", "burst", "grid")}
+    return json.loads(json.dumps({"making": MAKING, **imaged, **parts, "speed_mm_s": rig.stage.speed_mm_s}))
+
+
+class _RowFigures(msgspec.Struct):
+    """Quality figures of a row and board as rows.jsonl has them, see `Quality`."""
+
+    frames_expected: Count
+    frames_received: Count
+    bytes_missing: Count
+    crc32: str
+    positions: Count
+    positions_masked: Count
+    masked_columns: list[tuple[Count, Count]]
+    stages: list[tuple[str, float, float, float]]
+
+
+def _read_figures(entry: object) -> dict[str, Any] | None:
+    """Return the figures of a row from its line; None if they have another form."""
+    try:
+        figures = msgspec.convert(entry, _RowFigures)
+    except msgspec.ValidationError:
+        return None
+    stages = {name: tuple(spread) for name, *spread in figures.stages}
+    columns = [list(run) for run in figures.masked_columns]
+    return {**msgspec.structs.asdict(figures), "masked_columns": columns, "stages": stages}
+
+
+class KeptSamples:
+    """Kept samples of a scan folder; nothing is kept for other sources.
+
+    Parameters
+    ----------
+    source
+        The scan.
+    rig, filters
+        Its calibrated rig, and its receivers' filters by board name; None: as the chirp profile programs them.
+    quality
+        Quality figures: restored rows are added to it, saved rows are read from it.
+    choices
+        See :class:`Choices`.
+
+    Attributes
+    ----------
+    images, sub_bands
+        Image builders: restored rows are added to them, saved rows are read from them. They use the range gate of the
+        samples on disk if it covers what they need. Rows of a wider gate than usual are not saved.
+    """
+
+    def __init__(
+        self, source: Source, rig: Instrument, filters: Filters, quality: Quality, **choices: Unpack[Choices]
+    ) -> None:
+        use, depth_m = choices.get("samples", "none"), choices.get("depth_m", PLANE_REACH_M)
+        self._scan = source if isinstance(source, ScanFolder) and use != "none" else None
+        self._folder = Path() if self._scan is None else self._scan.path / SAMPLES
+        self._plan, self._made, self._quality = source.plan, made_with(rig, filters), quality
+        self._bands, self._keep = choices.get("bands", 1), use == "keep"
+        self._lines: dict[int, dict[str, Any]] = {}
+        self._read_bytes = 0
+        self._rows: int | None = None  # file descriptor of rows.jsonl, locked, while rows are written
+        self._arrays: dict[str, NDArray[Any]] = {}
+        self._lock = threading.Lock()
+        self._head = self._read_head()
+        viewed = choices.get("view", AS_IN_RIG_FILE).of(rig, source.mirrored)
+        gate = self._gate_m(rig, needed_gate_m(viewed, depth_m), needed_gate_m(rig, PLANE_REACH_M))
+        self.images = ImageBuilder(viewed, live=choices.get("live", False), gate_m=gate)
+        self.sub_bands = SubBandImages(viewed, self._bands, gate)
+        self._builders = {"samples": self.images}
+        self._builders |= {f"band_{k}": builder for k, builder in enumerate(self.sub_bands.builders)}
+        self._keep &= not self._head or set(self._builders) == set(self._head["frequencies_hz"])
+
+    def _gate_m(self, rig: Instrument, needed: Gate, usual: Gate) -> Gate:
+        """Return the gate on disk (without samples: the usual one) if it covers the needed one, else the latter."""
+        kept = tuple(self._head.get("gate_m", usual))
+        if self._head and not _has_frequencies(self._head, rig, kept, usual):
+            self._head, kept = {}, usual
+        if kept[0] <= needed[0] and needed[1] <= kept[1]:
+            return kept
+        self._head, self._keep = {}, False
+        return needed
+
+    def processable(self, source: Source, folder: Path) -> list[int]:
+        """Rows of a source with raw data or whole samples; `folder` is for messages. Logs which rows have neither.
+
+        Raises
+        ------
+        DataError
+            if there are none.
+        """
+        rows = list(source.rows())
+        gone = dropped_rows(source) if isinstance(source, ScanFolder) else set()
+        lost = [row for row in rows if row in gone and not self.is_kept(row)]
+        if lost and len(lost) == len(rows) and isinstance(source, ScanFolder):
+            require_raw(source)
+        if lost:
+            _log.warning(
+                "%s: rows %s are left out: their samples are damaged or missing, and their raw data was dropped;"
+                " `polysight validate %s` names the files; restore them from a copy",
+                self._folder, ", ".join(map(str, lost)), folder,
+            )  # fmt: skip
+        if not rows:
+            raise DataError(
+                f"{folder}: no row is recorded whole",
+                "the scan was stopped in its first row, or files are missing",
+                f"`polysight resume {folder}` takes the missing rows of a scan folder",
+                code=ErrorCode.NO_DATA,
+            )
+        return [row for row in rows if row not in lost]
+
+    def is_kept(self, row: int) -> bool:
+        """True if a row can be restored."""
+        return self._records(row) is not None
+
+    def restore(self, row: int) -> bool:
+        """Restore a row into the images; return False if it must be synchronised instead."""
+        records = self._records(row)
+        for board, (record, figures) in (records or {}).items():
+            self._put(board, row, record, figures)
+        return records is not None
+
+    def _records(self, row: int) -> dict[str, tuple[Any, dict[str, Any]]] | None:
+        """Return a row's record and figures by board; None if one of them is missing, damaged or outdated."""
+        line, found = self._line(row), {}
+        for board, entry in ({} if line is None else line["boards"]).items():
+            array, figures = self._array(board), _read_figures(entry["figures"])
+            if array is None or figures is None or record_digest(array[row]) != entry["crc32"]:
+                return None
+            found[board] = (array[row], figures)
+        return found or None
+
+    def save(self, row: int) -> None:
+        """Save a row that was just added to the images; log a warning if it cannot be written."""
+        digests = self._digests(row)
+        if digests is not None:
+            with self._lock:
+                self._save(row, digests)
+
+    def _save(self, row: int, digests: dict[str, str]) -> None:
+        if not self._keep:
+            return
+        try:
+            rows = self._open() if self._rows is None else self._rows
+            if rows is None:
+                return
+            boards = {}
+            for board, digest in digests.items():
+                record, figures = self._record(board, row)
+                with (self._folder / f"{board}.npy").open("r+b") as file:
+                    file.seek(-(self._plan.rows - row) * record.nbytes, 2)
+                    file.write(record.tobytes())
+                boards[board] = {"crc32": record_digest(record), "raw": digest, "figures": figures}
+            os.write(rows, manifest.encode_line({"fact": "row", "row": row, "boards": boards}))
+        except (OSError, ValueError, DataError) as e:
+            self._keep = False
+            _log.warning("samples are not kept in %s: %s", self._folder, e)
+
+    def _digests(self, row: int) -> dict[str, str] | None:
+        """Return the digests of a committed row's raw data, by receiver; None if this source keeps no samples."""
+        committed = self._scan.committed().get(row) if self._scan is not None else None
+        if committed is None or any(name not in committed.boards for name in self._quality.boards):
+            return None
+        return {name: raw_digest(committed.boards[name]) for name in self._quality.boards}
+
+    def _line(self, row: int) -> dict[str, Any] | None:
+        """Return the line of rows.jsonl for a row, if it was made from the committed raw data."""
+        digests = self._digests(row)
+        if digests is None or not self._head:
+            return None
+        with self._lock:
+            if self._kept_digests(row) != digests:
+                self._read_lines()
+            return self._lines[row] if self._kept_digests(row) == digests else None
+
+    def _kept_digests(self, row: int) -> dict[str, str] | None:
+        """Return the digests of the raw data that a saved row was made from; None if it is not saved."""
+        return {name: b["raw"] for name, b in self._lines[row]["boards"].items()} if row in self._lines else None
+
+    def _read_head(self) -> dict[str, Any]:
+        """Return samples.json if its samples can be used, otherwise an empty dict."""
+        if self._scan is None:
+            return {}
+        try:
+            head = read_json(self._folder / HEAD)
+        except (OSError, ValueError, DataError):
+            return {}
+        wanted = {"format": FORMAT, "scan_id": self._scan.scan_id, "made_with": self._made}
+        if not isinstance(head, dict) or any(head.get(key) != value for key, value in wanted.items()):
+            return {}
+        if self._bands not in (1, head.get("bands")) or not _is_valid_head(head):
+            return {}
+        return head
+
+    def _read_lines(self) -> None:
+        """Read new lines of rows.jsonl; skip a truncated or damaged one."""
+        lines, self._read_bytes = read_sample_rows(self._folder, self._read_bytes)
+        self._lines |= lines
+
+    def _array(self, board: str) -> NDArray[Any] | None:
+        """Return a board's records, memory-mapped; None if the file does not fit samples.json."""
+        if board not in self._arrays:
+            found = open_records(self._folder / f"{board}.npy")
+            if found is None or found.dtype != self._type(board) or found.shape != (self._plan.rows,):
+                return None
+            self._arrays[board] = found
+        return self._arrays[board]
+
+    def _type(self, board: str) -> np.dtype[Any]:
+        """Return the structured type of one board's record of a row."""
+        columns, rx = self._plan.columns, len(self._builders["samples"].boards[board].aperture.antennas.rx_m)
+        parts: list[Any] = []
+        for name, frequencies in self._head["frequencies_hz"].items():
+            parts += [(name, "<c8", (rx, len(frequencies), columns)), (f"{name}_direct", "<c8", (rx, columns))]
+        parts += [("echo", "<c8", (rx, columns)), *((name, "<f8", (columns,)) for name in _FIGURES)]
+        return np.dtype([*parts, ("valid", "?", (columns,))])
+
+    def _record(self, board: str, row: int) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Return the record of a row, and its quality figures for rows.jsonl."""
+        out, forward = np.zeros((), self._type(board)), slice(None, None, self._plan.row(row).direction)
+        for name, builder in self._builders.items():
+            out[name], out[f"{name}_direct"], out["valid"] = builder.boards[board].reduced(row)
+        quality = self._quality.boards[board]
+        out["echo"] = quality.echoes[row][:, forward]
+        for name in _FIGURES:
+            out[name] = quality.rows[row][name][forward]
+        figures = {name: value for name, value in quality.rows[row].items() if name not in _FIGURES}
+        return out, {**figures, "stages": [[name, *spread] for name, spread in figures["stages"].items()]}
+
+    def _put(self, board: str, row: int, record: Any, figures: dict[str, Any]) -> None:
+        """Add a record to the images and its figures to the quality; the inverse of `_record`."""
+        forward = slice(None, None, self._plan.row(row).direction)
+        for name, builder in self._builders.items():
+            builder.boards[board].put(row, ReducedRow(record[name], record[f"{name}_direct"], record["valid"]))
+        values: dict[str, Any] = {name: np.array(record[name][forward]) for name in _FIGURES}
+        self._quality.boards[board].put(row, {**figures, **values}, np.array(record["echo"][:, forward]))
+
+    def _open(self) -> int | None:
+        """Open and lock rows.jsonl; start new files if those on disk do not fit. None if another program locked it."""
+        self._folder.mkdir(exist_ok=True)
+        if self._scan is not None:
+            for name in (HEAD, SAMPLE_ROWS, f"{HEAD}.part", *(f"{board}.npy" for board in self._quality.boards)):
+                inside(self._scan.path, f"{SAMPLES}/{name}", SAMPLES)  # a link could overwrite another file
+        rows = os.open(self._folder / SAMPLE_ROWS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+        weakref.finalize(self, os.close, rows)
+        try:
+            fcntl.flock(rows, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._keep = False
+            return None
+        if not self._head or any(self._array(board) is None for board in self._quality.boards):
+            self._create(rows)
+        self._read_lines()
+        os.truncate(rows, self._read_bytes)  # drop a line that was cut by a kill
+        self._rows = rows
+        return rows
+
+    def _create(self, rows: int) -> None:
+        """Create samples.json and empty records for all rows."""
+        (self._folder / HEAD).unlink(missing_ok=True)
+        os.truncate(rows, 0)
+        self._lines, self._read_bytes, self._arrays = {}, 0, {}
+        scan, first = self._scan, next(iter(self._quality.boards))
+        self._head = {
+            "format": FORMAT,
+            "scan_id": "" if scan is None else scan.scan_id,
+            "simulated": scan is not None and scan.simulated,
+            "bands": self._bands,
+            "gate_m": self._builders["samples"].gate_m,
+            "frequencies_hz": {n: b.boards[first].aperture.frequencies_hz.tolist() for n, b in self._builders.items()},
+            "made_with": self._made,
+        }
+        for board in self._quality.boards:
+            (self._folder / f"{board}.npy").unlink(missing_ok=True)  # programs that have it mapped keep it
+            np.lib.format.open_memmap(self._folder / f"{board}.npy", "w+", self._type(board), (self._plan.rows,))
+        part = self._folder / f"{HEAD}.part"
+        part.write_text(json.dumps(self._head, indent=1) + "\n", encoding="utf-8")
+        part.replace(self._folder / HEAD)
+
+
+def _is_valid_head(head: Mapping[str, Any]) -> bool:
+    """True if samples.json has a gate of two finite numbers, and lists of frequencies."""
+    gate, frequencies = head.get("gate_m"), head.get("frequencies_hz")
+    if not (isinstance(gate, list) and isinstance(frequencies, dict) and "samples" in frequencies):
+        return False
+    numbers = [gate, *frequencies.values()]
+    good = all(isinstance(part, list) and part and all(_is_finite(v) for v in part) for part in numbers)
+    return good and len(gate) == 2
+
+
+def _has_frequencies(head: Mapping[str, Any], rig: Instrument, gate: Gate, usual: Gate) -> bool:
+    """True if the frequencies in samples.json are those of its gate; a gate twice as wide as usual is damage."""
+    if not 0 < gate[1] - gate[0] < 2 * (usual[1] - usual[0]):
+        return False
+    kept, expected = head["frequencies_hz"]["samples"], reduction(rig.chirp, gate).frequencies_hz
+    return len(kept) == expected.size and np.allclose(kept, expected, rtol=1e-9, atol=0)
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)

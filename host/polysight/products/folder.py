@@ -1,0 +1,280 @@
+"""Write a folder of products atomically, and find the label files of a scan.
+
+New products are written beside the old folder and replace it when complete. If the program is killed at any time, the
+folder holds either the old or the new products.
+
+Boxes drawn by hand are kept in `labels.json` of the scan folder. The `labels.json` among products is the classifier's
+unless it contains `by_hand`; such a file is kept when products of the same scan are replaced.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from polysight.materials import PATCHES, Labels, read_labels
+from polysight.products.files import (
+    FINISHED,
+    IMAGE,
+    LABELS,
+    MATERIALS,
+    QUALITY,
+    REPORT,
+    SCAN,
+    SavedProducts,
+    write_atomically,
+)
+from polysight.store import is_source, sync_folder
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DataError, DeviceError
+
+LABELS_PICTURE = "labels.png"
+PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, REPORT, "figures")
+RAW_DROPPED = "raw_dropped"
+"""Key of quality.json: the scan whose raw data was deleted after these products were made."""
+_BY_HAND = b'"by_hand": true'
+_HERE = -100  # AT_FDCWD of renameat2(2)
+_EXCHANGE = 2
+
+
+def check_products_folder(out: Path, scan_id: str) -> None:
+    """Raise ConfigError if products must not replace this folder; call it before processing.
+
+    That is the case for a file, a folder with other files, a mount point, the current folder, and for the only
+    remaining products of another scan, whose raw data was deleted.
+    """
+    try:
+        _check_writable(out.resolve().parent)
+        foreign = sorted(p.name for p in out.iterdir() if not (_is_product(p.name) or p.name.startswith(".")))
+    except FileNotFoundError:
+        return
+    except OSError as e:
+        raise _no_folder(out, e) from None
+    if foreign:
+        raise ConfigError(
+            f"{out} is not empty: it contains {foreign[0]}",
+            "products need a folder of their own",
+            "give another --out",
+            code=ErrorCode.FILE_EXISTS,
+        )
+    place = out.resolve()
+    if Path.cwd().is_relative_to(place) or place.is_mount():
+        what = "a mount point" if place.is_mount() else "the current folder"
+        raise ConfigError(
+            f"{out} is {what}",
+            "products replace their whole folder",
+            "give a folder inside it as --out",
+            code=ErrorCode.VALUE_INVALID,
+        )
+    dropped = raw_dropped(out)
+    if dropped and dropped.get("scan_id") != scan_id:
+        raise ConfigError(
+            f"{out} holds the only products of scan {dropped.get('scan_id')}",
+            f"its raw rows were dropped on {str(dropped.get('dropped_utc'))[:10]}, so they cannot be made again",
+            "give another --out",
+            code=ErrorCode.NAME_TAKEN,
+        )
+
+
+@contextmanager
+def making_products(out: Path, scan_id: str) -> Iterator[Path]:
+    """Yield a new folder for products; it replaces `out` if the block ends without an error.
+
+    After an error `out` is unchanged. Hidden files of other programs, and boxes drawn by hand for this scan, are kept.
+
+    Raises
+    ------
+    ConfigError
+        as :func:`check_products_folder`; if the folder cannot be created, or another program writes products there.
+    DeviceError
+        if the new folder cannot replace `out`; the error names the new folder, which is kept.
+    """
+    place = out.resolve()  # the target of a link
+    new, old = place.with_name(f".{place.name}.new"), place.with_name(f".{place.name}.old")
+    if old.exists() and not place.exists():
+        old.rename(place)  # a program was killed between the two renames of _replace
+    shutil.rmtree(old, ignore_errors=True)  # or after them
+    check_products_folder(out, scan_id)
+    lock, keep = _lock(out, new), False
+    try:
+        yield new
+        for name, content in _hand_labels(place, scan_id).items():
+            write_atomically(new / name, content)
+        try:
+            _replace(new, place, old)
+        except OSError as e:
+            keep = True
+            raise DeviceError(
+                f"{out}: cannot be replaced: {e.strerror}",
+                "it is a mount point, or you have no permission to write beside it",
+                f"the new products are in {new}: copy them before the next run; then give another --out",
+            ) from None
+    finally:
+        os.close(lock)
+        if not keep:
+            shutil.rmtree(new, ignore_errors=True)
+
+
+@contextmanager
+def products_locked(out: Path) -> Iterator[None]:
+    """Keep other programs from replacing the products in `out`. Raises ConfigError as :func:`making_products`."""
+    place = out.resolve()
+    new = place.with_name(f".{place.name}.new")
+    lock = _lock(out, new)
+    try:
+        yield
+    finally:
+        os.close(lock)
+        shutil.rmtree(new, ignore_errors=True)
+
+
+def _lock(out: Path, new: Path) -> int:
+    """Create and lock the new folder beside `out`; return the file descriptor of the lock. Raises ConfigError."""
+    try:
+        new.parent.mkdir(parents=True, exist_ok=True)
+        return _create_locked(new)
+    except BlockingIOError:
+        raise ConfigError(
+            f"{out}: another program is writing products there",
+            "it was started twice",
+            "give another --out, or wait",
+            code=ErrorCode.BUSY,
+        ) from None
+    except OSError as e:
+        raise _no_folder(out, e) from None
+
+
+def _no_folder(out: Path, e: OSError) -> ConfigError:
+    return ConfigError(
+        f"{out}: cannot create the folder for products: {e.strerror}",
+        "a file has that name, or you have no permission to write there",
+        "give another --out",
+        code=ErrorCode.FILE_UNREADABLE,
+    )
+
+
+def _check_writable(folder: Path) -> None:
+    """Raise PermissionError or NotADirectoryError if no folder can be created in `folder`, which need not exist."""
+    parent = next(p for p in (folder, *folder.parents) if p.exists())
+    if not parent.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(parent))
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(parent))
+
+
+def _create_locked(new: Path) -> int:
+    """Create and lock the folder, delete leftovers of a killed program; return the file descriptor of the lock."""
+    new.mkdir(exist_ok=True)
+    lock = os.open(new, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)  # never follow a link
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not os.path.samestat(os.fstat(lock), new.stat()):
+            raise BlockingIOError(errno.EAGAIN, "it has just replaced the old folder")
+        for entry in new.iterdir():
+            shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
+    except BaseException:
+        os.close(lock)
+        raise
+    return lock
+
+
+def _replace(new: Path, place: Path, old: Path) -> None:
+    """Swap `new` and `place`, then move files of other programs from the old folder to the new one."""
+    sync_folder(new)
+    if not place.exists():
+        new.rename(place)
+        sync_folder(place.parent)
+        return
+    if not _exchange(new, place):
+        place.rename(old)
+        new.rename(place)
+        old.rename(new)
+    sync_folder(place.parent)
+    for entry in new.iterdir():
+        if not _is_product(entry.name) and not entry.name.endswith(".part"):
+            entry.rename(place / entry.name)
+
+
+def _exchange(a: Path, b: Path) -> bool:
+    """Swap two folders atomically (Linux, renameat2). False if system or file system do not support it."""
+    renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if renameat2 is None:
+        return False
+    if renameat2(_HERE, os.fsencode(a), _HERE, os.fsencode(b), _EXCHANGE) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
+        return False
+    raise OSError(code, os.strerror(code), str(b))
+
+
+def _is_product(name: str) -> bool:
+    return name in PRODUCTS or name == FINISHED
+
+
+def raw_dropped(out: Path) -> dict[str, Any]:
+    """Return the entry `raw_dropped` of quality.json; empty without it."""
+    try:
+        dropped = SavedProducts(out).quality.get(RAW_DROPPED)
+    except DataError:
+        return {}
+    return dropped if isinstance(dropped, dict) else {}
+
+
+def scan_folder_of(folder: Path) -> Path | None:
+    """Return the scan folder of a scan or of its products; None for products outside a scan folder."""
+    if is_source(folder):
+        return folder
+    above = folder.resolve().parent
+    if not is_source(above):
+        return None
+    return folder.parent if folder.parent.resolve() == above else above  # the parent of `.` is `.`
+
+
+def label_folder(folder: Path) -> Path:
+    """Return the folder for `labels.json` of a scan or of products."""
+    return scan_folder_of(folder) or folder
+
+
+def find_labels(folder: Path) -> tuple[Path, Labels] | None:
+    """Find boxes drawn by hand for a scan or its products; return their file and content, or None.
+
+    Raises
+    ------
+    DataError
+        if the file cannot be read.
+    """
+    scan = scan_folder_of(folder)
+    if scan is not None and (path := scan / LABELS).exists():
+        return path, read_labels(path)
+    for path in (folder / LABELS, folder / "products" / LABELS):
+        if path.exists() and (labels := read_labels(path)).by_hand:
+            return path, labels
+    return None
+
+
+def _hand_labels(products: Path, scan_id: str) -> dict[str, bytes]:
+    """Return the label file by hand among products of this scan and its picture, name to content."""
+    path = products / LABELS
+    try:
+        if not path.exists() or SavedProducts(products).scan_id != scan_id or not _is_by_hand(path):
+            return {}
+        files = (path, products / LABELS_PICTURE)
+        return {f.name: f.read_bytes() for f in files if f.exists()}
+    except (OSError, DataError):  # damaged: not known to belong to this scan
+        return {}
+
+
+def _is_by_hand(path: Path) -> bool:
+    """True for a label file drawn by hand, even if it is damaged."""
+    try:
+        return read_labels(path).by_hand
+    except DataError:
+        return _BY_HAND in path.read_bytes()

@@ -1,0 +1,183 @@
+"""Read and check TI's firmware image, and download it to a board.
+
+An image goes to the device's RAM, which the next reset clears, or to the serial flash; decision 11 has the reasons
+(docs/decisions/0011-firmware-of-radars.md). The file format is that of public copies of TI's `xwr22xx_metaImage.bin`;
+TI documents only magic and CRC. Not run on hardware yet.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from polysight.radar.commands import FileChunk
+from polysight.radar.messages import BODY_LIMIT
+from polysight.radar.spi import Link
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.files import read_bounded
+
+TO_RAM = 0  # lost at the next reset (ICD 302)
+TO_FLASH = 4  # the first of four areas in the board's serial flash
+CHUNK_TIMEOUT_S = 10.0  # TI's limit for each part; the first one is acknowledged after erasing the flash
+MAX_BYTES = 2**20  # of a flash area, more than any image of TI
+GENERATION = 2  # major ROM version of AWR2243
+FAMILIES = {  # by major ROM version
+    1: "AWR1243 or another of the first generation",
+    GENERATION: "AWR2243",
+    6: "xWR6243, 57..64 GHz",
+}
+_CORES = ("main", "RF")  # an image has a part for each
+
+_MAGIC, _END, _PART = b"MSTR", b"MEND", b"RPRC"
+_LENGTH_AT, _HEADER_BYTES = 20, 128
+_ROM_AT, _PATCH_AT = 0x38, 0x48  # offsets in a part: version, then year, month, day
+_REMEDY = "copy xwr22xx_metaImage.bin from TI's mmWave DFP 2.2 again, and compare its size with TI's"
+
+
+@dataclass(frozen=True)
+class Image:
+    """A checked image.
+
+    Attributes
+    ----------
+    name
+        File name.
+    data
+        The whole file with its CRC.
+    rom
+        Version of the main core's ROM to which the patch applies: major, minor, build, debug.
+    patches
+        Version of each part's patch, main core first, in the form of `describe_patch`.
+    """
+
+    name: str
+    data: bytes
+    rom: tuple[int, ...]
+    patches: tuple[str, ...]
+
+    def chunks(self, to: int) -> list[tuple[FileChunk, int]]:
+        """Return the download commands, each with the number of commands after it."""
+        return file_chunks(self.data, to)
+
+
+def describe_patch(major: int, minor: int, build: int, debug: int) -> str:
+    """Return a patch's version as text."""
+    return f"{major}.{minor}.{build}.{debug}"
+
+
+def read_image(path: Path) -> Image:
+    """Read and check an image file. Raises ConfigError, OSError."""
+    return check_image(read_bounded(path, MAX_BYTES), path.name)
+
+
+def check_image(data: bytes, name: str) -> Image:
+    """Check the bytes of a file. Raises ConfigError if they are not a complete, undamaged image for an AWR2243."""
+    if data[:4] != _MAGIC:
+        begin = data[:12].decode("latin-1") if data else "nothing"
+        raise _refused(name, f"begins with {begin!r} instead of {_MAGIC.decode()!r}", "another file, or an empty one")
+    if len(data) < _HEADER_BYTES:
+        raise _refused(name, f"{len(data)} bytes are too few for its header", "an interrupted copy")
+    length = int.from_bytes(data[_LENGTH_AT : _LENGTH_AT + 4], "little")
+    if len(data) == length:
+        raise _refused(name, "its CRC is missing", "made from TI's .h file, which has no CRC")
+    if len(data) != length + 4 or len(data) > MAX_BYTES:
+        raise _refused(
+            name, f"{len(data)} bytes, its header has {length + 4}", "an interrupted copy, or another format"
+        )
+    found, expected = zlib.crc32(data[:-4]), int.from_bytes(data[-4:], "little")
+    if found != expected:
+        raise _refused(name, f"CRC-32 {found:08x} instead of {expected:08x}", "damaged during the copy")
+    begins = [at for at in range(_HEADER_BYTES, len(data) - _PATCH_AT - 8, 4) if data[at : at + 4] == _PART]
+    if _END not in data[:_HEADER_BYTES] or not begins or begins[0] != _HEADER_BYTES:
+        raise _refused(name, "no program part after its header", "an image of another kind")
+    if len(begins) != len(_CORES):
+        raise _refused(name, f"{len(begins)} program parts, an AWR2243 has two cores", "an image of another kind")
+    roms = [tuple(data[at + _ROM_AT : at + _ROM_AT + 4]) for at in begins]
+    if others := [rom[0] for rom in roms if rom[0] != GENERATION]:
+        raise _refused(
+            name,
+            f"for devices of generation {others[0]} ({_family(others[0])}); an AWR2243 has generation {GENERATION}",
+            "an image for another device",
+        )
+    patches = tuple(describe_patch(*data[at + _PATCH_AT : at + _PATCH_AT + 4]) for at in begins)
+    if others := [p for p in patches if not p.startswith(f"{GENERATION}.")]:
+        raise _refused(name, f"its patches are {', '.join(others)}, those of an AWR2243 2.x", "an image for xWR6243")
+    return Image(name, data, roms[0], patches)
+
+
+def _family(generation: int) -> str:
+    return FAMILIES.get(generation, "an unknown device")
+
+
+def require_family(name: str, core: str, version: bytes) -> None:
+    """Raise ConfigError if the version answer is not that of an AWR2243; the settings would not apply to it."""
+    release = version[3:7]
+    if release[0] == GENERATION:
+        return
+    rom = ".".join(map(str, release))
+    stuck = set(release) in ({0x00}, {0xFF})
+    raise ConfigError(
+        f"{name}: its {core} core's ROM is {rom}, generation {release[0]} ({_family(release[0])});"
+        " only AWR2243 is supported",
+        "the board's data line is stuck" if stuck else "the board has another device",
+        "check the 60-pin connector" if stuck else "use an AWR2243 board; docs/spec/mmwavelink.md, Other boards",
+        code=ErrorCode.MISMATCH,
+    )
+
+
+def require_rom(name: str, version: bytes, image: Image) -> None:
+    """Raise ConfigError if the image is for another ROM than that of the version answer."""
+    require_family(name, _CORES[0], version)
+    if tuple(version[3:7]) != image.rom:
+        found, expected = (".".join(map(str, rom)) for rom in (version[3:7], image.rom))
+        raise ConfigError(
+            f"{name}: its main core's ROM is {found}, {image.name} is for ROM {expected}; nothing was sent",
+            "another version of the device, or an image for another one",
+            "use the image of this device's DFP",
+            code=ErrorCode.MISMATCH,
+        )
+
+
+def file_chunks(image: bytes, file_type: int = TO_FLASH) -> list[tuple[FileChunk, int]]:
+    """Return the commands that download an image, each with the number of commands after it.
+
+    Raises ValueError if the image is empty.
+    """
+    if not image:
+        raise ValueError("the firmware image is empty")
+    whole = struct.pack("<II", file_type, len(image)) + image
+    parts = [whole[at : at + BODY_LIMIT] for at in range(0, len(whole), BODY_LIMIT)]
+    return [(FileChunk(part), len(parts) - 1 - n) for n, part in enumerate(parts)]
+
+
+def send_image(
+    link: Link, name: str, image: Image, to: int, progress: Callable[[int, int], None] = lambda _sent, _total: None
+) -> None:
+    """Send every part of an image; call `progress` with the parts sent and their total.
+
+    Raises DeviceError for the part that failed. The flash is then incomplete; the board still accepts a download.
+    """
+    parts = image.chunks(to)
+    progress(0, len(parts))
+    for n, (part, remaining) in enumerate(parts):
+        try:
+            link.call(part, timeout_s=CHUNK_TIMEOUT_S, remaining=remaining)
+        except DeviceError as e:
+            rest = "its flash has no complete image now; " if to == TO_FLASH else ""
+            raise DeviceError(
+                f"{name}: part {n + 1} of {len(parts)} of {image.name} was not accepted: {e.what}",
+                f"{rest}{e.why}",
+                "remove the cause and download it again: a board without firmware still accepts a download",
+                code=e.code,
+            ) from None
+        progress(n + 1, len(parts))
+
+
+def _refused(name: str, what: str, why: str) -> ConfigError:
+    return ConfigError(
+        f"{name} is no firmware for an AWR2243: {what}; nothing was sent", why, _REMEDY, code=ErrorCode.FILE_FOREIGN
+    )

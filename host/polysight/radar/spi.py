@@ -1,0 +1,365 @@
+"""mmWaveLink over 16-bit words: send commands with timeouts and retries, receive answers and events.
+
+Procedure: ICD section 3. After a timeout the same message is sent again with the retry flag, so that the device answers
+without executing it twice; after a NACK it is sent with a new sequence number. Every wait has a timeout, also with a
+device that sends events without end. Not run on hardware yet.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple, Protocol
+
+from polysight.radar.commands import RF_POWER_UP, Command
+from polysight.radar.events import RESTARTED, Event, decode_event, describe_refusal
+from polysight.radar.messages import (
+    DEVICE_SYNC,
+    HEADER_BYTES,
+    READY_TO_READ,
+    SYNC_BYTES,
+    Direction,
+    Kind,
+    Message,
+    command,
+    decode,
+    decode_header,
+    encode,
+)
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError, ProtocolError
+
+RESPONSE_TIMEOUT_S = 1.0
+ATTEMPTS = 3
+SETTLE_S = 30e-6  # from the interrupt to the first word (ICD 20)
+DATA_DELAY_S = 1e-3  # from the falling interrupt to the first word read, as in TI's port
+_INTERVAL_S = 0.5e-3  # between two polls
+_INTERRUPT_TIMEOUT_S = 0.1
+_RESTART_EVENT_S = 0.1  # in which a power-up event arrives after a refusal
+MAX_MESSAGES = 64  # of one poll
+MAX_POLL_S = 0.25
+_MAX_WARNINGS = 100
+_SYNC_SEARCH_BYTES = 252
+_FLUSH_BYTES = 244  # read after an invalid header, to resynchronise with the device
+_REMEDY = "check the board's power, the 60-pin connector and the USB cable, then `polysight resume SCAN`"
+
+
+class Problem(NamedTuple):
+    """Reason for a lost message, and its likely cause."""
+
+    what: str
+    why: str
+
+
+_SILENT = "the board has no power, hangs, or its interrupt line is not connected"
+_NOT_CLOCKED = "the board gets no SPI clock or chip select, or its interrupt line is stuck"
+_NO_MISO = "the board's data line (MISO) is not connected, or SPI is disturbed"
+_DISTURBED = "disturbed SPI lines: noise, a loose 60-pin connector, or a clock that is too fast"
+
+
+class NotReportedError(DeviceError):
+    """Timeout of an expected event; the link itself works."""
+
+
+class UnexpectedRestartError(DeviceError):
+    """A board has restarted by itself and lost its settings."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(
+            f"{name}: it restarted by itself",
+            "a supply that drops when the RF core starts, a loose 5 V plug, or its reset button or line",
+            "measure the 5 V of the radar board while it starts; the operation is repeated after a reset",
+            code=ErrorCode.RADAR_RESTARTED,
+        )
+
+
+class WordLink(Protocol):
+    """Connection to one board: 16-bit words, its host interrupt, its reset and sense lines."""
+
+    def write(self, words: Sequence[int]) -> None:
+        """Shift words out, each with its own chip select. Raises DeviceError if the link is lost."""
+        ...
+
+    def read(self, count: int) -> list[int]:
+        """Shift words in. Raises DeviceError if the link is lost."""
+        ...
+
+    def interrupt(self) -> bool:
+        """Return True if the host interrupt is high. Raises DeviceError if the link is lost."""
+        ...
+
+    def reset(self, held: bool) -> None:
+        """Hold the board in reset, or release it in functional mode (sense-on-power mode 4)."""
+        ...
+
+    def close(self) -> None:
+        """Close the connection; may be called twice."""
+        ...
+
+
+class Clock(Protocol):
+    """Clock of a link; tests use a virtual one."""
+
+    def now(self) -> float:
+        """Return the time, seconds."""
+        ...
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        ...
+
+
+class SystemClock:
+    """Monotonic clock of this machine."""
+
+    def now(self) -> float:
+        """Return the time, seconds."""
+        return time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        time.sleep(seconds)
+
+
+class Link:
+    """Message link to one board.
+
+    Parameters
+    ----------
+    name
+        Name of the board, for errors.
+    words
+        Word link.
+    on_sent
+        Called with every message that is sent.
+
+    Attributes
+    ----------
+    sequence
+        Number of the next command, 0..15.
+    may_start
+        True if a power-up event is expected; an unexpected one raises UnexpectedRestartError.
+    warnings
+        Errors that a retry corrected, at most 100.
+    """
+
+    def __init__(self, name: str, words: WordLink, clock: Clock, on_sent: Callable[[bytes], None]) -> None:
+        self._name, self._words, self._clock, self._on_sent = name, words, clock, on_sent
+        self.sequence = 0
+        self._events: deque[Event] = deque()
+        self.may_start = True
+        self.warnings: list[str] = []
+
+    def restart(self) -> None:
+        """Start again after a reset of the device: sequence number zero, no pending events."""
+        self.sequence = 0
+        self._events.clear()
+        self.may_start = True
+
+    def call(self, sent: Command, *, timeout_s: float = RESPONSE_TIMEOUT_S, remaining: int = 0) -> Message:
+        """Send a command, with retries, and return the device's answer; RF power-up is never sent twice.
+
+        Raises DeviceError if the device does not answer or refuses the command.
+        """
+        problems: list[Problem] = []
+        retry = False
+        for _ in range(1 if sent is RF_POWER_UP else ATTEMPTS):
+            request = command((sent.block(),), sequence=self.sequence, retry=retry, remaining=remaining)
+            self._write(encode(request))
+            answer, problem = self._await_answer(request, timeout_s)
+            if answer is None:
+                problems.append(problem)
+                retry = True
+                continue
+            self.sequence = (self.sequence + 1) % 16
+            if answer.kind is Kind.NACK:
+                problems.append(Problem("the device received a damaged message", _DISTURBED))
+                retry = False
+                continue
+            if problems:
+                self._warn(f"{sent.name} (0x{sent.ID:04X}) sent {len(problems) + 1} times: {problems[-1].what}")
+            if answer.error is not None:
+                self._detect_restart()
+                raise DeviceError(
+                    f"{self._name}: the radar refuses {sent}: {describe_refusal(*answer.error)}",
+                    "the device does not support a setting, or it is in an unexpected state",
+                    "correct [chirp], [burst] or [radar]; docs/spec/mmwavelink.md",
+                    code=ErrorCode.REFUSED_BY_PEER,
+                )
+            return answer
+        raise DeviceError(
+            f"{self._name}: no valid answer to {sent} after {len(problems)} attempts:"
+            f" {'; '.join(dict.fromkeys(p.what for p in problems))}",
+            "; ".join(dict.fromkeys(p.why for p in problems)),
+            _REMEDY,
+            code=ErrorCode.NO_ANSWER,
+        )
+
+    def _detect_restart(self) -> None:
+        """Raise UnexpectedRestartError if a power-up event follows the refusal of a command."""
+        until = self._clock.now() + _RESTART_EVENT_S
+        while self._clock.now() < until:
+            self._read_messages()
+            self._clock.sleep(_INTERVAL_S)
+
+    def poll(self) -> list[Event]:
+        """Read pending messages and return the new events. Raises DeviceError if the link is lost."""
+        self._read_messages()
+        events = list(self._events)
+        self._events.clear()
+        return events
+
+    def wait_for(self, ids: Sequence[int], timeout_s: float, on_event: Callable[[Event], None]) -> Event:
+        """Wait for the first of these events; call `on_event` with every event until then.
+
+        Raises NotReportedError after the timeout, DeviceError if the link is lost.
+        """
+        deadline = self._clock.now() + timeout_s
+        lost: Problem | None = None
+        while True:
+            lost = self._read_messages() or lost
+            events = list(self._events)
+            self._events.clear()
+            for event in events:
+                on_event(event)
+            for event in events:
+                if event.id in ids:
+                    return event
+            if self._clock.now() > deadline:
+                names = ", ".join(f"0x{i:04X}" for i in ids)
+                raise NotReportedError(
+                    f"{self._name}: the radar did not report {names} within {timeout_s:g} s"
+                    + (f"; a message was lost meanwhile: {lost.what}" if lost else ""),
+                    lost.why if lost else f"it was reset, or: {_SILENT}",
+                    _REMEDY,
+                    code=ErrorCode.NO_ANSWER,
+                )
+            self._clock.sleep(_INTERVAL_S)
+
+    def _read_messages(self) -> Problem | None:
+        """Read pending messages, within limits, and keep their events; return the reason if one was lost."""
+        deadline = self._clock.now() + MAX_POLL_S
+        for _ in range(MAX_MESSAGES):
+            if not self._words.interrupt():
+                return None
+            message, problem = self._receive()
+            if message is None:
+                self._warn(problem.what)
+                return problem
+            self._keep(message)
+            if self._clock.now() > deadline:
+                break
+        self._warn("it sends messages without a pause; the rest is read later")
+        return None
+
+    def _await_answer(self, request: Message, timeout_s: float) -> tuple[Message | None, Problem]:
+        """Return the answer to the last message, or None and the reason; keep events that arrive before it."""
+        deadline = self._clock.now() + timeout_s
+        problem = Problem(f"no answer within {timeout_s:g} s", _SILENT)
+        parts: list[Message] = []
+        while self._clock.now() <= deadline:
+            if not self._words.interrupt():
+                self._clock.sleep(_INTERVAL_S)
+                continue
+            message, found = self._receive()
+            if message is None:
+                problem = found
+            elif message.kind is Kind.EVENT:
+                self._keep(message)
+            elif not _answers(message, request):
+                self._warn(f"late answer to an earlier message (sequence {message.sequence})")
+            elif parts and message.remaining_chunks != parts[-1].remaining_chunks - 1:
+                return None, Problem("parts of the answer are missing", _DISTURBED)
+            else:
+                parts.append(message)
+                if message.remaining_chunks == 0:
+                    return _joined(parts), problem
+        return None, Problem("parts of the answer are missing", _DISTURBED) if parts else problem
+
+    def _receive(self) -> tuple[Message | None, Problem]:
+        """Read one message while the interrupt is high; return None and the reason if it cannot be read."""
+        self._clock.sleep(SETTLE_S)
+        self._write(READY_TO_READ)
+        if not self._wait_for_low():
+            self._write(READY_TO_READ)
+            if not self._wait_for_low():
+                return None, Problem("the host interrupt stays high", _NOT_CLOCKED)
+        self._clock.sleep(DATA_DELAY_S)
+        head = self._read(SYNC_BYTES)
+        searched = 0
+        while head[-SYNC_BYTES:] != DEVICE_SYNC:
+            if searched >= _SYNC_SEARCH_BYTES:
+                same = len(set(head)) == 1
+                return None, Problem(f"no sync word in {searched} bytes", _NO_MISO if same else _DISTURBED)
+            head += self._read(2)
+            searched += 2
+        head = head[-SYNC_BYTES:] + self._read(HEADER_BYTES)
+        try:
+            header = decode_header(head)
+        except ProtocolError as e:
+            self._read(_FLUSH_BYTES)
+            return None, Problem(e.what, _DISTURBED)
+        body = self._read(header.body_bytes)
+        try:
+            return decode(head + body), Problem("", "")
+        except ProtocolError as e:
+            return None, Problem(e.what, _DISTURBED)
+
+    def _wait_for_low(self) -> bool:
+        deadline = self._clock.now() + _INTERRUPT_TIMEOUT_S
+        while self._words.interrupt():
+            if self._clock.now() > deadline:
+                return False
+            self._clock.sleep(SETTLE_S)
+        return True
+
+    def _keep(self, message: Message) -> None:
+        """Keep the events of a message for the next poll. Raises UnexpectedRestartError."""
+        if message.kind is not Kind.EVENT:
+            self._warn(f"unexpected answer (sequence {message.sequence})")
+            return
+        for event in map(decode_event, message.blocks):
+            self._events.append(event)
+            if event.id in RESTARTED:
+                if not self.may_start:
+                    self._warn(str(event))
+                    raise UnexpectedRestartError(self._name)
+                self.may_start = False
+
+    def _write(self, raw: bytes) -> None:
+        self._on_sent(raw)
+        self._words.write(struct.unpack(f"<{len(raw) // 2}H", raw))
+
+    def _read(self, size: int) -> bytes:
+        words = self._words.read((size + 1) // 2)
+        return struct.pack(f"<{len(words)}H", *words)[:size]
+
+    def _warn(self, what: str) -> None:
+        if len(self.warnings) < _MAX_WARNINGS:
+            self.warnings.append(f"{self._name}: {what}")
+
+
+def _answers(message: Message, request: Message) -> bool:
+    """Return True if a response or NACK belongs to a command, by its message id and sequence number.
+
+    A refusal has message id 0 (ICD 4.4). The only known refusal without a body had sequence number 0; it is not known
+    if such a device repeats the number of the command. One with number 0 therefore always ends the command.
+    """
+    if message.kind is Kind.NACK:
+        return True
+    back = {Direction.HOST_TO_RF: Direction.RF_TO_HOST}.get(request.direction, Direction.MAIN_TO_HOST)
+    of_device = message.direction in (Direction.RF_TO_HOST, Direction.MAIN_TO_HOST)
+    if message.error == (None, None) and message.sequence == 0 and of_device:
+        return True
+    if message.kind is not Kind.RESPONSE or message.direction is not back:
+        return False
+    known = message.message_id == request.message_id or message.error is not None
+    return known and message.sequence == request.sequence
+
+
+def _joined(parts: Sequence[Message]) -> Message:
+    """Join the chunks of an answer (ICD 2.3.2, REMCHUNKS)."""
+    return parts[0] if len(parts) == 1 else replace(parts[-1], blocks=tuple(b for p in parts for b in p.blocks))

@@ -1,0 +1,398 @@
+"""Word links to a board: the FT4232H of a DCA1000 over USB, or its four channels over TCP.
+
+`UsbWords` translates words, interrupt, reset and sense lines to MPSSE commands on the chip's four channels. `open_usb`
+opens them by serial number or USB path with pyftdi (the extra `radar`), `open_tcp` those of a TCP server. Not run on
+hardware yet.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+import struct
+import time
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any, NamedTuple, Protocol
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DeviceError
+
+# The FT4232H over USB.
+VENDOR, PRODUCT = 0x0451, 0xFD03
+PATH = "usb:"  # prefix of a USB path, "usb:1-4.2"; without it, a serial number
+_READ_TIMEOUT_S = 0.5
+_LATENCY_MS = 1
+_CHECK = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists the chips"
+
+# Channels over TCP.
+SCHEME = "tcp://"
+_HEAD = struct.Struct("<ccH")
+_TIMEOUT_S = 30.0
+
+# Pins and MPSSE commands.
+SPI_DIRECTION = 0b0100_1011  # clock, data out, chip select, PMIC reset are outputs
+SELECTED_WRITE, SELECTED_READ, IDLE = 0xC0, 0xC2, 0xC8
+INTERRUPT_DIRECTION = 0b0101_1011  # bit 5, the interrupt, is an input
+INTERRUPT_IDLE = 0b0001_0011
+INTERRUPT_BIT = 5
+RESET_DIRECTION, RESET_PIN, WARM_RESET_PIN = 0b1111_1001, 6, 7
+SENSE_DIRECTION, FUNCTIONAL_MODE = 0b1111_1111, 0b0001_0000  # D4 = 1, D3 = D2 = 0
+_PINS, _READ_PINS, _WRITE_BYTES, _READ_BYTES, _NOW = 0x80, 0x81, 0x11, 0x20, 0x87
+_FULL_SPEED, _NO_ADAPTIVE, _NO_THREE_PHASE, _THREE_PHASE, _DIVISOR = 0x8A, 0x97, 0x8D, 0x8C, 0x86
+_NO_LOOPBACK = 0x85
+SPI_DIVISOR, SLOW_DIVISOR = 2, 29  # 60 MHz / (2 x (2 + 1)) = 10 MHz; 1 MHz
+# One pin command holds its pins for 0.2 us (FTDI AN_114), two clocks at 10 MHz; ICD 3.2.4 wants two at least.
+_SELECT_COMMANDS, _IDLE_COMMANDS = 2, 3
+_SLOW_GAP_S = 100e-6
+_DESELECT = bytes((_PINS, IDLE, SPI_DIRECTION)) * _IDLE_COMMANDS
+_RESET_S = 0.01
+
+
+class Port(Protocol):
+    """One open channel of the chip."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes. Raises DeviceError if the chip is lost."""
+        ...
+
+    def read(self, size: int) -> bytes:
+        """Receive up to `size` bytes. Raises DeviceError if the chip is lost."""
+        ...
+
+    def close(self) -> None:
+        """Close the channel."""
+        ...
+
+
+def set_up_spi(divisor: int = SPI_DIVISOR) -> bytes:
+    """Return the initial commands of channel A."""
+    clock = bytes((_FULL_SPEED, _NO_ADAPTIVE, _NO_THREE_PHASE, _DIVISOR, divisor, 0))
+    return clock + bytes((_PINS, IDLE, SPI_DIRECTION, _NO_LOOPBACK))
+
+
+def set_up_interrupt() -> bytes:
+    """Return the initial commands of channel B."""
+    return bytes((_FULL_SPEED, _NO_ADAPTIVE, _THREE_PHASE, _PINS, INTERRUPT_IDLE, INTERRUPT_DIRECTION, _NO_LOOPBACK))
+
+
+def write_words(words: Sequence[int]) -> bytes:
+    """Return commands that shift words out: for each, chip select low, two bytes on the falling edge, select high."""
+    select = bytes((_PINS, SELECTED_WRITE, SPI_DIRECTION)) * _SELECT_COMMANDS
+    parts = bytearray()
+    for word in words:
+        parts += select + bytes((_WRITE_BYTES, 1, 0, word >> 8, word & 0xFF)) + _DESELECT
+    return bytes(parts) + bytes((_NOW,))
+
+
+def read_words(count: int) -> bytes:
+    """Return commands that shift words in: for each, chip select low, two bytes on the rising edge, select high."""
+    select = bytes((_PINS, SELECTED_READ, SPI_DIRECTION)) * _SELECT_COMMANDS
+    return (select + bytes((_READ_BYTES, 1, 0)) + _DESELECT) * count + bytes((_NOW,))
+
+
+class UsbWords:
+    """Word link (`spi.WordLink`) through the four channels of a chip.
+
+    `slow`: one word in each USB transfer, every 0.1 ms, at 1 MHz.
+    """
+
+    def __init__(
+        self,
+        spi: Port,
+        interrupt: Port,
+        reset: Port,
+        sense: Port,
+        sleep: Callable[[float], None] = time.sleep,
+        slow: bool = False,
+    ) -> None:
+        self._spi, self._interrupt, self._reset, self._sense, self._sleep = spi, interrupt, reset, sense, sleep
+        self._slow = slow
+        self._spi.write(set_up_spi(SLOW_DIVISOR if slow else SPI_DIVISOR))
+        self._interrupt.write(set_up_interrupt())
+
+    def write(self, words: Sequence[int]) -> None:
+        """Shift words out. Raises DeviceError."""
+        for part in [[w] for w in words] if self._slow else [words]:
+            self._spi.write(write_words(part))
+            self._pause()
+
+    def read(self, count: int) -> list[int]:
+        """Shift words in. Raises DeviceError."""
+        words: list[int] = []
+        for part in [1] * count if self._slow else [count]:
+            self._spi.write(read_words(part))
+            data = _read_exactly(self._spi, 2 * part)
+            words += [int.from_bytes(data[at : at + 2], "big") for at in range(0, 2 * part, 2)]
+            self._pause()
+        return words
+
+    def _pause(self) -> None:
+        if self._slow:
+            self._sleep(_SLOW_GAP_S)
+
+    def interrupt(self) -> bool:
+        """Return True if the host interrupt is high. Raises DeviceError."""
+        self._interrupt.write(bytes((_READ_PINS, _NOW)))
+        return bool(_read_exactly(self._interrupt, 1)[0] >> INTERRUPT_BIT & 1)
+
+    def reset(self, held: bool) -> None:
+        """Set the sense lines to functional mode, then hold or release the reset. Raises DeviceError."""
+        self._sense.write(bytes((FUNCTIONAL_MODE,)))
+        self._reset.write(bytes((1 << WARM_RESET_PIN | (0 if held else 1 << RESET_PIN),)))
+        self._sleep(_RESET_S)
+
+    def close(self) -> None:
+        """Close the channels."""
+        for port in (self._spi, self._interrupt, self._reset, self._sense):
+            port.close()
+
+
+def _read_exactly(port: Port, size: int) -> bytes:
+    data = port.read(size)
+    if len(data) != size:
+        raise DeviceError(
+            f"timeout: received {len(data)} of {size} bytes over USB",
+            "the cable is loose",
+            "check the USB cable",
+            code=ErrorCode.NO_ANSWER,
+        )
+    return data
+
+
+class FtdiPort:
+    """One channel of a chip over USB, in MPSSE or bit-bang mode; errors of the USB library become DeviceError."""
+
+    def __init__(self, place: str, chip: Any, interface: int, direction: int, bit_bang: bool) -> None:
+        self._library = _library()
+        ftdi = self._library.ftdi
+        self._place = place
+        self._ftdi = ftdi()
+        try:
+            if VENDOR not in ftdi.PRODUCT_IDS:
+                ftdi.add_custom_vendor(VENDOR, "ti")
+                ftdi.add_custom_product(VENDOR, PRODUCT, "devpack")
+            self._ftdi.open_from_device(self._library.share(chip), interface)
+            self._ftdi.set_bitmode(0, ftdi.BitMode.RESET)
+            self._ftdi.set_latency_timer(_LATENCY_MS)
+            self._ftdi.purge_buffers()
+            self._ftdi.set_bitmode(direction, ftdi.BitMode.BITBANG if bit_bang else ftdi.BitMode.MPSSE)
+        except self._library.errors as e:
+            self.close()
+            what = f"{place}, channel {'ABCD'[interface - 1]}: cannot be opened: {e}"
+            raise _usb_error(what, e, "it was unplugged, or libusb is missing") from None
+
+    def write(self, data: bytes) -> None:
+        """Send bytes. Raises DeviceError."""
+        try:
+            self._ftdi.write_data(data)
+        except self._library.errors as e:
+            raise _usb_error(f"{self._place}: {e}", e, _PULLED) from None
+
+    def read(self, size: int) -> bytes:
+        """Receive up to `size` bytes, with a timeout of half a second. Raises DeviceError."""
+        found, deadline = bytearray(), time.monotonic() + _READ_TIMEOUT_S
+        try:
+            while len(found) < size and time.monotonic() < deadline:
+                found += self._ftdi.read_data_bytes(size - len(found), attempt=4)
+        except self._library.errors as e:
+            raise _usb_error(f"{self._place}: {e}", e, _PULLED) from None
+        return bytes(found)
+
+    def close(self) -> None:
+        """Close the channel, also of a lost chip; the pins keep their levels."""
+        device = self._ftdi.usb_dev
+        try:
+            self._ftdi.close(freeze=True)
+        except (*self._library.errors, TypeError):  # lost, or not opened completely by pyftdi
+            self._library.tools.release_device(device)  # otherwise pyftdi counts it as open
+
+
+_CAUSES = {
+    errno.EBUSY: "another program uses this chip: mmWave Studio, or a second polysight; end it",
+    errno.EACCES: "no permission: the udev rule for 0451:fd03 (docs/how-to/install.md)",
+    errno.EPERM: "no permission: the udev rule for 0451:fd03 (docs/how-to/install.md)",
+    errno.ETIMEDOUT: "the chip does not answer: a loose cable, or a hub without power",
+}
+
+
+_PULLED = "the cable was pulled, or the board lost power"
+
+
+def _usb_error(what: str, e: BaseException | None, otherwise: str) -> DeviceError:
+    """Return an error with the likely cause by errno, also of the errors behind `e`, where pyftdi keeps libusb's."""
+    while e is not None and getattr(e, "errno", None) not in _CAUSES:
+        e = e.__cause__ or e.__context__
+    number = getattr(e, "errno", 0)
+    code = ErrorCode.BUSY if number == errno.EBUSY else ErrorCode.NO_ANSWER
+    return DeviceError(f"radar USB {what}", _CAUSES.get(number, otherwise), _CHECK, code=code)
+
+
+def open_usb(place: str, slow: bool = False) -> UsbWords:
+    """Open a board by the serial number of its USB chip, or by `usb:` and its path; scans the bus each time.
+
+    Raises
+    ------
+    ConfigError
+        if pyftdi is not installed.
+    DeviceError
+        if the chip cannot be opened.
+    """
+    library = _library()
+    library.tools.flush_cache()
+    chip = library.chip_at(place)
+    ports: list[FtdiPort] = []
+    try:
+        for interface, (direction, bit_bang) in enumerate(
+            (
+                (SPI_DIRECTION, False),
+                (INTERRUPT_DIRECTION, False),
+                (RESET_DIRECTION, True),
+                (SENSE_DIRECTION, True),
+            ),
+            start=1,
+        ):
+            ports.append(FtdiPort(place, chip, interface, direction, bit_bang))
+        spi, interrupt, reset, sense = ports
+        return UsbWords(spi, interrupt, reset, sense, slow=slow)
+    except (ConfigError, DeviceError):
+        for port in ports:
+            port.close()
+        raise
+
+
+class _Library(NamedTuple):
+    """The parts of pyftdi and pyusb that are used here."""
+
+    ftdi: Any
+    tools: Any
+    errors: tuple[type[Exception], ...]
+    find: Callable[..., Any]
+
+    def chip_at(self, place: str) -> Any:
+        """Return the chip with this serial number or path. Raises DeviceError if there is none, or more than one."""
+        name = place.removeprefix(PATH)
+        try:
+            backends = (import_module(name).get_backend() for name in self.tools.BACKENDS)  # pyftdi's, in its order
+            backend = next((b for b in backends if b is not None), None)
+            chips = list(self.find(find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend))
+            paths = {f"{d.bus}-{'.'.join(map(str, d.port_numbers or ()))}": d for d in chips}
+            by_path = place.startswith(PATH)
+            matching = [p for p, d in paths.items() if (p if by_path else self._serial(d)) == name]
+        except self.errors as e:
+            raise _usb_error(f"{place}: {e}", e, "libusb is missing, or the chip was unplugged") from None
+        found = f"chips at {', '.join(sorted(paths))}" if paths else "no chip on the bus"
+        if not matching:
+            what = "at this path" if by_path else "with this serial number"
+            raise DeviceError(
+                f"radar USB {place}: cannot be opened: no chip 0451:fd03 {what}; {found}",
+                "unplugged, another serial number or path, or no permission (a udev rule for 0451:fd03)",
+                _CHECK,
+                code=ErrorCode.NO_ANSWER,
+            )
+        if len(matching) > 1:
+            raise DeviceError(
+                f"radar USB {place}: {len(matching)} chips have this serial number, at {', '.join(sorted(matching))}",
+                "the serial number does not identify the board; none was opened",
+                f'use its path instead of usb_serial: usb_path = "{min(matching)}", or another one',
+                code=ErrorCode.VALUES_CONFLICT,
+            )
+        return paths[matching[0]]
+
+    def _serial(self, chip: Any) -> str | None:
+        """Return a chip's serial number; None if it has none or cannot be read."""
+        try:
+            return self.tools.get_string(chip, chip.iSerialNumber) if chip.iSerialNumber else None
+        except self.errors:
+            return None
+
+    def share(self, chip: Any) -> Any:
+        """Return a chip for one more channel, and count it in pyftdi's list.
+
+        pyftdi's own search by bus and address alone returns any chip.
+        """
+        with self.tools.Lock:
+            opened = self.tools.Devices.setdefault((chip.bus, chip.address, VENDOR, PRODUCT), [chip, 0])
+            opened[1] += 1
+        return opened[0]
+
+
+def _library() -> _Library:
+    """Import pyftdi, which only this backend needs. Raises ConfigError."""
+    try:
+        from pyftdi.ftdi import Ftdi
+        from pyftdi.usbtools import UsbTools, UsbToolsError
+        from usb.core import find
+    except ImportError:
+        raise ConfigError(
+            'radar.control = "native" needs pyftdi, which is not installed',
+            "it comes with the host's extra `radar`",
+            "pip install 'polysight[radar]' (in this repository: .venv/bin/pip install -e '.[radar]')",
+            code=ErrorCode.PACKAGE_MISSING,
+        ) from None
+    # FtdiError and USBError are OSErrors
+    return _Library(Ftdi, UsbTools, (OSError, ValueError, UsbToolsError), find)
+
+
+class _TcpPort:
+    """One channel over TCP; all four share a connection."""
+
+    def __init__(self, address: str, connection: socket.socket, channel: bytes) -> None:
+        self._address, self._connection, self._channel = address, connection, channel
+
+    def write(self, data: bytes) -> None:
+        """Send bytes. Raises DeviceError."""
+        self._send(_HEAD.pack(self._channel, b"W", len(data)) + data)
+
+    def read(self, size: int) -> bytes:
+        """Receive up to `size` bytes. Raises DeviceError."""
+        self._send(_HEAD.pack(self._channel, b"R", size))
+        (count,) = struct.unpack("<H", self._receive(2))
+        return self._receive(count)
+
+    def close(self) -> None:
+        """Close the connection of all channels."""
+        self._connection.close()
+
+    def _send(self, data: bytes) -> None:
+        try:
+            self._connection.sendall(data)
+        except OSError as e:
+            raise self._lost(e.strerror or str(e)) from None
+
+    def _receive(self, size: int) -> bytes:
+        data = b""
+        try:
+            while len(data) < size:
+                part = self._connection.recv(size - len(data))
+                if not part:
+                    raise self._lost("closed by the other side")
+                data += part
+        except OSError as e:
+            raise self._lost(e.strerror or str(e)) from None
+        return data
+
+    def _lost(self, what: str) -> DeviceError:
+        return DeviceError(
+            f"radar at {self._address}: {what}",
+            "its USB cable was pulled, or its program ended",
+            "check that machine",
+            code=ErrorCode.NO_ANSWER,
+        )
+
+
+def open_tcp(address: str, slow: bool = False) -> UsbWords:
+    """Open a board by `tcp://address:port`. Raises DeviceError if there is no server."""
+    host, _, port = address.removeprefix(SCHEME).rpartition(":")
+    try:
+        connection = socket.create_connection((host, int(port)), _TIMEOUT_S)
+    except (OSError, ValueError) as e:
+        raise DeviceError(
+            f"radar at {address}: cannot be reached: {e}",
+            "no server for a USB chip at this address",
+            "start it, or correct the address",
+            code=ErrorCode.NO_ANSWER,
+        ) from None
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    spi, interrupt, reset, sense = (_TcpPort(address, connection, c) for c in (b"A", b"B", b"C", b"D"))
+    return UsbWords(spi, interrupt, reset, sense, slow=slow)

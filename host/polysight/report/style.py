@@ -1,0 +1,257 @@
+"""Style of all figures: colours, fonts, axes in millimetres, titles, colour bars, labels, legends, PNG bytes.
+
+Materials have the colour-blind safe palette of Paul Tol ("muted", then "light"). Only matplotlib's object interface is
+used: no global state, no display. Its own font has no Chinese, Japanese or Korean: other installed fonts are tried, and
+a name that no font can draw becomes a short ASCII label. The page itself shows all names in full, by the browser's
+fonts.
+"""
+
+from __future__ import annotations
+
+import io
+import unicodedata
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
+from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont, fontManager, get_font
+from matplotlib.legend import Legend
+from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox, BboxBase
+
+from polysight.materials import axis_mm
+from polysight.report.context import ReportContext
+
+INK, MUTED, STAMP = "#1b2330", "#5b6675", "#b3261e"
+"""Colours of a figure's text: titles, axes, and the word SIMULATED."""
+PALETTE = (
+    "#332288", "#88CCEE", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255", "#AA4499",
+    "#77AADD", "#EE8866", "#EEDD88", "#FFAABB", "#99DDFF", "#44BB99", "#BBCC33", "#AAAA00",
+)  # fmt: skip
+UNKNOWN_COLOUR = "#BBBBBB"
+METAL_COLOUR, REFUSED_COLOUR = "#C9D3DE", "#8d949e"  # the metal reference; patches that were not judged
+HATCH = "////"
+_GAP_PT = 8.0  # between names side by side
+_LONGEST = 26  # characters of a name in a legend
+
+
+OWN = "DejaVu Sans"
+"""The font that comes with matplotlib."""
+FALLBACKS = (
+    "Noto Sans CJK JP", "Noto Sans CJK SC", "Noto Sans CJK TC", "Noto Sans CJK KR", "Noto Sans JP", "Noto Sans SC",
+    "Source Han Sans", "Source Han Sans JP", "Source Han Sans SC", "Source Han Sans CN", "WenQuanYi Zen Hei",
+    "WenQuanYi Micro Hei", "IPAexGothic", "IPAGothic", "TakaoGothic", "VL Gothic", "Hiragino Sans", "PingFang SC",
+    "PingFang HK", "Heiti TC", "Apple SD Gothic Neo", "Yu Gothic", "Meiryo", "MS Gothic", "Microsoft YaHei", "SimHei",
+    "Microsoft JhengHei", "Malgun Gothic", "NanumGothic", "Arial Unicode MS", "Droid Sans Fallback", "Noto Sans",
+)  # fmt: skip
+"""Families with CJK glyphs, in the order in which they are tried."""
+
+
+@cache
+def font_families() -> tuple[str, ...]:
+    """Return the fonts for texts that hold names: matplotlib's own, then the installed ones of FALLBACKS."""
+    installed = {entry.name for entry in fontManager.ttflist}
+    return (OWN, *(family for family in FALLBACKS if family in installed))
+
+
+@cache
+def _glyphs() -> frozenset[int]:
+    return frozenset(code for family in font_families() for code in get_font(findfont(family)).get_charmap())
+
+
+def is_drawable(text: str) -> bool:
+    """True if the installed fonts have every glyph of a text and it runs from left to right.
+
+    Matplotlib neither turns right-to-left text nor joins its letters: Hebrew would be read backwards.
+    """
+    if any(unicodedata.bidirectional(character) in ("R", "AL") for character in text):
+        return False
+    return all(character == "\n" or ord(character) in _glyphs() for character in text)
+
+
+def figure_label(name: str, number: str) -> str:
+    """Return a material's or plate's name if the fonts can draw it, else e.g. `patch 3: ??`.
+
+    `number` identifies the patch or plate without its name, such as `patch 3`; missing glyphs become `?`.
+    """
+    if is_drawable(name):
+        return name
+    return f"{number}: {''.join(c if c.isascii() and c.isprintable() else '?' for c in name)}"
+
+
+def colours_of(ctx: ReportContext) -> dict[str, str]:
+    """Return the colour of each material in the results or the truth, the same in all figures."""
+    names = {str(r["name"]) for r in ctx.materials if r.get("name")}
+    names |= {str(t["name"]) for t in ctx.truth or []}
+    for pixels, _ in ctx.pixel_names.values():
+        names |= set(np.unique(pixels).tolist())
+    names.discard("unknown")
+    table = {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(sorted(names))}
+    return {**table, "unknown": UNKNOWN_COLOUR}
+
+
+def extent_mm(ctx: ReportContext) -> tuple[float, float, float, float]:
+    """Return the left, right, bottom, top edge of the image, millimetres from its centre."""
+    x, y = axis_mm(ctx.x_m), axis_mm(ctx.y_m)
+    hx, hy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
+    return float(x[0] - hx), float(x[-1] + hx), float(y[0] - hy), float(y[-1] + hy)
+
+
+def new_axes(width: float = 5.0, height: float = 4.6) -> tuple[Figure, Axes]:
+    """Return a white figure of this size in inches, and its only axes."""
+    fig = Figure(figsize=(width, height), dpi=160, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    ax = fig.add_subplot()
+    return fig, ax
+
+
+def dress(ax: Axes, title: str, simulated: bool) -> None:
+    """Draw the title, axis labels in millimetres, grey ticks, and the word SIMULATED for simulated data."""
+    ax.set_title(title, loc="left", fontsize=11, color=INK, fontweight="bold")
+    if simulated:
+        ax.text(
+            1.0, 1.015, "SIMULATED", transform=ax.transAxes, ha="right", va="bottom",
+            fontsize=8, color=STAMP, fontweight="bold",
+        )  # fmt: skip
+    ax.set_xlabel("x (mm)", fontsize=9, color=MUTED)
+    ax.set_ylabel("y (mm)", fontsize=9, color=MUTED)
+    ax.tick_params(labelsize=8, colors=MUTED, length=3)
+    ax.set_aspect("equal")
+    ax.set_facecolor("#d9dde3")
+    for spine in ax.spines.values():
+        spine.set_color("#c3c9d1")
+
+
+def colour_bar(fig: Figure, ax: Axes, shown: ScalarMappable, label: str = "", extend: str = "neither") -> Colorbar:
+    """Draw a colour bar beside an axes; it is opaque even if the image fades."""
+    bar = fig.colorbar(shown, ax=ax, fraction=0.046, pad=0.03, extend=extend)
+    bar.set_label(label, fontsize=8, color=MUTED)
+    bar.ax.tick_params(labelsize=8, colors=MUTED, length=2)
+    if bar.solids is not None:
+        bar.solids.set_alpha(1)
+    return bar
+
+
+def write_label(
+    ax: Axes, x: float, y: float, text: str, size: float = 8.0, above: bool = False, on_dark: bool = False
+) -> Text:
+    """Write a name or number with a halo, centred on a point or `above` it."""
+    ink, halo = ("white", "#10141b") if on_dark else (INK, "white")
+    return ax.text(
+        x, y, text, ha="center", va="bottom" if above else "center", fontsize=size, color=ink, linespacing=1.2,
+        path_effects=[withStroke(linewidth=2.4, foreground=halo)], family=list(font_families()), parse_math=False,
+    )  # fmt: skip
+
+
+def patch_label(row: dict[str, Any]) -> str:
+    """Return the text beside a patch in figures."""
+    number = f"patch {row['label']}"
+    if not row.get("name"):
+        return "metal reference" if row.get("metal_reference") else number
+    return figure_label(str(row["name"]), number)
+
+
+def short_label(text: str) -> str:
+    """Return a name cut to the length of a legend's line."""
+    text = " ".join(text.split())
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
+
+
+def patch_colour(row: dict[str, Any], colours: dict[str, str]) -> str:
+    """Return a patch's colour: that of its name, of refused patches, or of the metal reference."""
+    if row.get("refused"):
+        return REFUSED_COLOUR
+    if not row.get("name") and row.get("metal_reference"):
+        return METAL_COLOUR
+    return colours.get(str(row.get("name") or "unknown"), UNKNOWN_COLOUR)
+
+
+def plate_label(plate: dict[str, Any], number: int) -> str:
+    """Return the text beside a plate in the figure of the truth; `number` counts plates from 1."""
+    return figure_label(str(plate["name"]), f"plate {number}")
+
+
+def outline_of(row: dict[str, Any], **style: Any) -> Polygon | Rectangle:
+    """Return a patch's outline, or its box if it has none; `style` are options of matplotlib's patches."""
+    if row.get("outline_mm"):
+        return Polygon(row["outline_mm"], closed=True, **style)
+    x0, y0, x1, y1 = row["box_mm"]
+    return Rectangle((x0, y0), x1 - x0, y1 - y0, **style)
+
+
+@dataclass(frozen=True)
+class MapLabel:
+    """A name drawn on a map, and its replacement if there is no room for it.
+
+    Attributes
+    ----------
+    text
+        The drawn text.
+    number, name, colour
+        The number that replaces the name on the map, and the entry in the legend.
+    below
+        Second line that is kept, such as the confidence; may be empty.
+    """
+
+    text: Text
+    number: str
+    name: str
+    colour: str
+    below: str = ""
+
+
+def shorten_labels(fig: Figure, labels: Sequence[MapLabel]) -> list[MapLabel]:
+    """Replace all labels by numbers if two touch or one leaves the frame; return the replaced labels."""
+    if not labels:
+        return []
+    fig.draw_without_rendering()
+    gap = _GAP_PT * fig.dpi / 72
+    boxes = [one.text.get_window_extent() for one in labels]
+    frames = [one.text.axes.bbox if one.text.axes else fig.bbox for one in labels]
+    outside = any(b.x0 < f.x0 - 1 or b.x1 > f.x1 + 1 for b, f in zip(boxes, frames, strict=True))
+    if not outside and not any(a.overlaps(b) for a, b in combinations([_widened(b, gap) for b in boxes], 2)):
+        return []
+    for one in labels:
+        one.text.set_text(f"{one.number}: {one.below}" if one.below else one.number)
+    return list(labels)
+
+
+def _widened(box: BboxBase, gap: float) -> Bbox:
+    return Bbox.from_extents(box.x0 - gap / 2, box.y0, box.x1 + gap / 2, box.y1)
+
+
+def fit_labels(fig: Figure, labels: Sequence[MapLabel], height: float) -> None:
+    """Replace names by numbers if they lack room, with a legend below the axes; `height` of the figure then, inches."""
+    replaced = shorten_labels(fig, labels)
+    if not replaced:
+        return
+    fig.set_figheight(height + 0.17 * ((len(replaced) + 1) // 2))
+    handles = [
+        Patch(facecolor=one.colour, edgecolor=INK, linewidth=0.6, label=f"{one.number}  {short_label(one.name)}")
+        for one in replaced
+    ]
+    legend = fig.legend(handles=handles, loc="outside lower left", ncols=2, handlelength=1.1, frameon=False)
+    style_legend(legend)
+
+
+def style_legend(legend: Legend) -> None:
+    """Set the fonts of a legend that holds names."""
+    for text in legend.get_texts():
+        text.set(family=list(font_families()), parse_math=False, color=INK, fontsize=7.5)
+
+
+def png(fig: Figure) -> bytes:
+    """Return a figure as PNG bytes without a time stamp: the same data gives the same file."""
+    buffer = io.BytesIO()
+    fig.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()

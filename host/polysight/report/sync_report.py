@@ -1,0 +1,182 @@
+"""Residual frequency, phase and amplitude errors after synchronisation, for any scan: `polysight sync-report`.
+
+It is the paper's Fig. 15 for one scan: histograms after each of four stages, with the Cramer-Rao bounds.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from polysight.products import write_atomically, write_json
+from polysight.report.style import INK, MUTED, STAMP, png
+from polysight.sync import STAGES, SyncedRow
+
+PAPER = {"frequency_hz": 138.0, "phase_rad": 0.022}
+"""Standard deviations after all stages, paper section 9.1."""
+
+QUANTITIES = ("frequency_hz", "phase_rad", "amplitude")
+_LABELS = ("frequency (Hz)", "phase (rad)", "amplitude / mean - 1")
+_BINS = 121
+_REACH = 5.0  # standard deviations shown on either side, of the first row's
+
+
+@dataclass
+class _Stage:
+    """Running sums of one stage: squares, count, and a histogram over the range of the first row."""
+
+    reach: NDArray[np.float64]
+    squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros((3, _BINS), np.int64))
+    n: int = 0
+
+    def add(self, values: NDArray[np.float64]) -> None:
+        """Errors [3, n]."""
+        self.squares += (values**2).sum(axis=1)
+        self.n += values.shape[1]
+        for i, reach in enumerate(self.reach):
+            self.counts[i] += np.histogram(values[i], bins=_BINS, range=(-reach, reach))[0]
+
+    @property
+    def std(self) -> NDArray[np.float64]:
+        """Root mean square of each quantity, [3]."""
+        return np.sqrt(self.squares / max(self.n, 1))
+
+
+class SyncReport:
+    """Accumulates the residual errors of one board, row by row, in constant memory."""
+
+    def __init__(self, sample_rate_hz: float, linear: tuple[int, int], rx: int) -> None:
+        self._rate, self._samples, self._rx = sample_rate_hz, linear[1] - linear[0], rx
+        self.stages: dict[str, _Stage] = {}
+        self.positions = self.chirps = 0
+        self._snr: list[tuple[float, int]] = []
+
+    def add(self, row: SyncedRow) -> None:
+        """Add a synchronised row."""
+        self.positions += int(row.valid.sum())
+        self.chirps += int(row.chirps[row.valid].sum())
+        for name, values in row.errors.items():
+            if values.size:
+                if name not in self.stages:
+                    reach = _REACH * np.maximum(np.sqrt((values**2).mean(axis=1)), 1e-12)
+                    self.stages[name] = _Stage(reach)
+                self.stages[name].add(values)
+        several = row.valid & (row.chirps > 1)  # one chirp alone has no noise estimate
+        if row.noise is not None and several.any():
+            ratio = np.median(row.direct_amplitude[several]) ** 2 / np.median(row.noise[several])
+            self._snr.append((float(ratio), int(several.sum())))
+
+    @property
+    def snr(self) -> float:
+        """Power ratio of direct path and noise in one channel of one chirp; NaN without an estimate."""
+        ratios, positions = np.array(self._snr or [(np.nan, 1)]).T
+        return float(np.average(ratios, weights=positions))
+
+    def bounds(self) -> dict[str, tuple[float, float, float]]:
+        """Return Cramer-Rao bounds (Hz, rad, relative amplitude) of one tone as strong as the direct path, by stage.
+
+        Rife and Boorstyn 1974: var(w) = 6 / (snr N (N^2 - 1)), var(phase at the centre) = 1 / (2 snr N), and the same
+        for relative amplitude; N samples on every RX. A chirp with an echo close to the direct path may lie below.
+        """
+        if not self.chirps or not self._snr:
+            return {}
+        n, chirps = self._samples, self.chirps / max(self.positions, 1)
+
+        def tone(snr: float) -> tuple[float, float, float]:
+            phase = 1 / np.sqrt(2 * snr * n)
+            f = np.sqrt(6 / (snr * n * (n**2 - 1))) / (2 * np.pi) * self._rate
+            return float(f), float(phase), float(phase)
+
+        one, mean = tone(self.snr * self._rx), tone(self.snr * self._rx * chirps)
+        f, phase, amplitude = (float(np.sqrt(2)) * bound for bound in mean)
+        return {"aligned": one, "averaged": mean, "referenced": (f, phase, amplitude)}
+
+    def summary(self) -> dict[str, Any]:
+        """Return the content of sync.json."""
+        bounds = self.bounds()
+        return {
+            "positions": self.positions,
+            "chirps": self.chirps,
+            "direct_snr_db": round(10 * np.log10(self.snr), 2) if self._snr else None,
+            "stages": {
+                name: {
+                    "samples": stage.n,
+                    **{f"{q}_std": float(s) for q, s in zip(QUANTITIES, stage.std, strict=True)},
+                    **{f"{q}_bound": b for q, b in zip(QUANTITIES, bounds.get(name, ()), strict=False)},
+                }
+                for name, stage in self.stages.items()
+            },
+        }
+
+
+def figure_png(report: SyncReport, title: str, simulated: bool) -> bytes:
+    """Return a PNG: histograms of errors after each stage, the bounds as normal distributions, the paper's values."""
+    fig = Figure(figsize=(11, 9), dpi=110, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    fig.suptitle(title + ("   SIMULATED" if simulated else ""), color=STAMP if simulated else INK, fontsize=12)
+    bounds = report.bounds()
+    axes = fig.subplots(len(STAGES), 3, squeeze=False)
+    for line, (name, what) in zip(axes, STAGES.items(), strict=True):
+        stage = report.stages.get(name)
+        for i, ax in enumerate(line):
+            ax.tick_params(labelsize=8, colors=MUTED)
+            ax.set_yticks([])
+            ax.locator_params(axis="x", nbins=5)
+            if i == 0:
+                ax.set_ylabel(f"{name}\n{textwrap.fill(what, 34)}", fontsize=8, color=INK)
+            if name == list(STAGES)[-1]:
+                ax.set_xlabel(_LABELS[i], fontsize=9, color=MUTED)
+            if stage is None or stage.n == 0:
+                ax.text(0.5, 0.5, "nothing to measure", ha="center", transform=ax.transAxes, fontsize=8, color=MUTED)
+                continue
+            reach, std = stage.reach[i], stage.std[i]
+            x = (np.arange(_BINS) + 0.5) / _BINS * 2 * reach - reach
+            density = stage.counts[i] / max(stage.counts[i].sum(), 1) / (2 * reach / _BINS)
+            ax.fill_between(x, density, step="mid", color="#88CCEE", label=f"std {std:.3g}")
+            if name in bounds:
+                b = bounds[name][i]
+                normal = np.exp(-(x**2) / (2 * b**2)) / (b * np.sqrt(2 * np.pi))
+                ax.plot(x, normal, color="#CC6677", lw=1.2, label=f"Cramér-Rao, one tone {b:.3g}")
+            if name == "referenced" and i < 2:
+                for sign in (-1, 1):
+                    ax.axvline(sign * PAPER[QUANTITIES[i]], color=INK, lw=0.8, ls=":")
+                ax.plot([], [], color=INK, lw=0.8, ls=":", label=f"paper ±{PAPER[QUANTITIES[i]]:g}")
+                ax.set_xlim(-1.1 * max(reach, PAPER[QUANTITIES[i]]), 1.1 * max(reach, PAPER[QUANTITIES[i]]))
+            ax.legend(fontsize=7, loc="upper right", frameon=False)
+    return png(fig)
+
+
+def text_of(boards: dict[str, dict[str, Any]], simulated: bool) -> str:
+    """Return the report as text."""
+    lines = ["Synchronisation residuals (standard deviations)" + (", simulated data" if simulated else ""), ""]
+    for board, s in boards.items():
+        snr = "" if s["direct_snr_db"] is None else f", direct path {s['direct_snr_db']} dB over noise a channel"
+        lines.append(f"{board}: {s['chirps']} chirps at {s['positions']} positions{snr}")
+        for name, stage in s["stages"].items():
+            values = f"{stage['frequency_hz_std']:10.2f} Hz {stage['phase_rad_std']:9.5f} rad"
+            values += f" {stage['amplitude_std']:9.5f}"
+            bound = ""
+            if "phase_rad_bound" in stage:
+                bound = f"   bound {stage['frequency_hz_bound']:.2f} Hz {stage['phase_rad_bound']:.5f} rad"
+            lines.append(f"  {name:11s}{values}{bound}   ({STAGES[name]})")
+    lines += ["", f"paper, after all stages: {PAPER['frequency_hz']:g} Hz, {PAPER['phase_rad']:g} rad"]
+    return "\n".join(lines) + "\n"
+
+
+def write_sync_report(out: Path, reports: dict[str, SyncReport], scan: str, simulated: bool) -> str:
+    """Write sync.json, sync.txt and sync-BOARD.png into a folder; return the text."""
+    boards = {name: report.summary() for name, report in reports.items()}
+    write_json(out / "sync.json", {"scan": scan, "simulated": simulated, "paper": PAPER, "boards": boards})
+    for name, report in reports.items():
+        write_atomically(out / f"sync-{name}.png", figure_png(report, f"{scan}, {name}", simulated))
+    text = text_of(boards, simulated)
+    write_atomically(out / "sync.txt", text.encode())
+    return text

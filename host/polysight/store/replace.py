@@ -1,0 +1,163 @@
+"""Place committed rows again from their stored packets, with the present placement algorithm.
+
+A row with a different result is written to new files and committed with a new line; the old files are deleted
+afterwards. A crash at any moment leaves either the old or the new row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from polysight.capture import (
+    PACKETS,
+    Evidence,
+    Placed,
+    place_record,
+    read_index,
+    read_packets,
+    valid_frames,
+    write_durably,
+    write_index,
+    write_packets,
+)
+from polysight.store.append_only import crc32, sync_folder
+from polysight.store.manifest import Fact, ManifestWriter
+from polysight.store.scan_folder import BoardRow, CommittedRow, ScanFolder, utc_now
+from polysight.store.validation import board_faults
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+
+
+@dataclass(frozen=True)
+class Replaced:
+    """Result for one board's row."""
+
+    row: int
+    board: str
+    before: int  # missing bytes as committed
+    after: int  # missing bytes now
+    left: str = ""  # why the row was left unchanged
+    changed: bool = False
+    damaged: bool = False  # left unchanged because its files differ from the commit or are unreadable
+
+
+@dataclass(frozen=True)
+class PlacedAgain:
+    """A row placed again from its packets."""
+
+    evidence: Evidence
+    placed: Placed
+    out: np.ndarray  # uint8, the payload
+    missing: list[tuple[int, int]]  # the committed gaps
+    moved: bool  # the committed frames were moved to their pulses: the row is left unchanged
+
+
+def place_again(path: Path) -> PlacedAgain:
+    """Place a row again; `path` is its file, with `.idx` and `.pkt` beside it. Raises DataError."""
+    try:
+        row = np.fromfile(path, dtype=np.uint8)
+    except OSError as e:
+        why = "the path is wrong, or the raw data was dropped"
+        what, remedy = f"{path}: cannot be read: {e.strerror}", "give SCAN/raw/BOARD/ROW.bin"
+        raise DataError(what, why, remedy, code=ErrorCode.FILE_UNREADABLE) from None
+    facts, _ = read_index(path.with_suffix(".idx"))
+    evidence, log = read_packets(path.with_suffix(PACKETS), row)
+    e = evidence
+    placed, out = place_record(log, e.frame_bytes, e.past, e.not_before_ns, e.dropped_by_card)
+    missing = [(int(a), int(b)) for a, b in facts.get("missing", [])]
+    return PlacedAgain(evidence, placed, out, missing, moved="frames" in facts)
+
+
+def replace_rows(scan: ScanFolder) -> list[Replaced]:
+    """Place every committed row again, and commit those with a different result.
+
+    Raises
+    ------
+    DeviceError
+        if the scan is in use, or the disk fails; the remaining rows are unchanged.
+    """
+    found = []
+    with scan.writer() as writer:
+        scan.reload()
+        for row in scan.committed().values():
+            boards = {name: _place(scan, row, board) for name, board in row.boards.items()}
+            found += [report for report, _ in boards.values()]
+            changed = {name: again for name, (report, again) in boards.items() if report.changed and again is not None}
+            if changed:
+                _commit(scan, writer, row.row, changed)
+    scan.reload()
+    return found
+
+
+def _place(scan: ScanFolder, row: CommittedRow, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
+    name, path = Path(board.file).parent.name, scan.path / board.file
+    unchanged = Replaced(row.row, name, board.missing_bytes, board.missing_bytes)
+    if not board.packets_crc32:
+        return replace(unchanged, left="its packets were not kept"), None
+    try:
+        if faults := board_faults(scan, board, row.pulses):
+            return replace(unchanged, left="; ".join(map(str, faults)), damaged=True), None
+        again = place_again(path)
+    except DataError as e:
+        return replace(unchanged, left=str(e), damaged=True), None
+    if again.moved:
+        return replace(unchanged, left="its frames were placed by their pulses"), None
+    after = sum(b - a for a, b in again.placed.missing)
+    same = again.missing == again.placed.missing and f"{crc32(again.out.tobytes()):08x}" == board.crc32
+    return replace(unchanged, after=after, changed=not same), again
+
+
+def _commit(scan: ScanFolder, writer: ManifestWriter, row: int, changed: dict[str, PlacedAgain]) -> None:
+    """Write the new files, then the line, then delete the old files."""
+    fact = next(f for f in reversed(scan.facts("row_committed")) if f["row"] == row)
+    boards, old = dict(fact["boards"]), []
+    for name, again in changed.items():
+        path = scan.path / boards[name]["file"]
+        old += [path.with_suffix(suffix) for suffix in (".bin", ".idx", PACKETS)]
+        boards[name] = {**boards[name], **_write(scan, path, again)}
+    kept = {k: v for k, v in fact.items() if k not in ("crc", "count", "previous", "boards")}
+    complete = all(b["missing_bytes"] == 0 for b in boards.values())
+    if complete:
+        kept = {k: v for k, v in kept.items() if k not in ("kept_incomplete", "faults")}
+    elif "kept_incomplete" not in kept:
+        kept["kept_incomplete"] = ["placed again: some bytes are not certain"]
+    new: Fact = {**kept, "boards": boards, "replaced_utc": utc_now()}
+    writer.append(new)
+    for path in old:
+        path.unlink(missing_ok=True)
+
+
+def _write(scan: ScanFolder, path: Path, again: PlacedAgain) -> Fact:
+    """Write a row's new files durably; return their entry for the manifest."""
+    placed, frame = again.placed, scan.instrument.frame_bytes
+    facts, _ = read_index(path.with_suffix(".idx"))
+    _, log = read_packets(path.with_suffix(PACKETS), np.fromfile(path, dtype=np.uint8))
+    new = _free_name(path)
+    crc = write_durably(new, again.out.tobytes())
+    index_crc = write_index(new.with_suffix(".idx"), {**facts, **placed.facts()}, placed.arrivals)
+    packets_crc = write_packets(new.with_suffix(PACKETS), log, again.evidence, placed)
+    sync_folder(new.parent)
+    frames = placed.expected // frame
+    return {
+        "file": str(new.relative_to(scan.path)),
+        "frames_received": int(valid_frames(placed.missing, frames, frame).sum()),
+        "missing_bytes": sum(b - a for a, b in placed.missing),
+        "crc32": f"{crc:08x}",
+        "index_crc32": f"{index_crc:08x}",
+        "packets_crc32": f"{packets_crc:08x}",
+        "located": placed.located,
+        "received_bytes": placed.received,
+        **msgspec.to_builtins(placed.losses),
+    }
+
+
+def _free_name(path: Path) -> Path:
+    """`0003-1.bin` for `0003.bin`, or the next number that is free."""
+    stem, number = path.stem.split("-")[0], 1
+    while (new := path.with_name(f"{stem}-{number}.bin")).exists():
+        number += 1
+    return new

@@ -1,0 +1,150 @@
+"""The `Source` protocol: recorded rows of one scan in any layout, as processing reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.store.manifest import ManifestFault
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+from polysight_shared.raster import RasterPlan
+
+Pieces = Callable[[int], Iterator[NDArray[np.uint8]]]
+"""Given a size in bytes (0: everything), iterates over a payload in pieces of this size; each is valid until the next.
+
+Raises DataError if the payload cannot be read or is damaged, at the latest after the last piece.
+"""
+
+
+def pieces_of(payload: NDArray[np.uint8]) -> Pieces:
+    """Return the pieces of a payload in memory."""
+    return lambda size: (
+        payload[i : i + (size or payload.size)] for i in range(0, payload.size, size or payload.size or 1)
+    )
+
+
+@dataclass(frozen=True)
+class RowData:
+    """One board's recording of one row. It is read when needed: in pieces, which stay in the cache, or as a whole."""
+
+    pieces: Pieces  # of the payload as sent by the card, [frames_expected * bytes of a chirp]; zero where missing
+    missing: list[tuple[int, int]]  # byte ranges (start, stop) that never arrived: sorted, not touching, half open
+    frames_expected: int  # chirps in `payload`: points of the row x chirps of a position; most frames are one chirp
+    crc32: str = ""  # digest of the recorded payload, hexadecimal; "" if the recording has none
+
+    @cached_property
+    def payload(self) -> NDArray[np.uint8]:
+        """The whole payload."""
+        return ([*self.pieces(0)] or [np.empty(0, np.uint8)])[0]
+
+    @property
+    def missing_bytes(self) -> int:
+        """Number of bytes that never arrived."""
+        return sum(stop - start for start, stop in self.missing)
+
+    @property
+    def mask(self) -> NDArray[np.bool_] | None:
+        """Bool [bytes], True where a byte is missing; None if the row is complete."""
+        if not self.missing:
+            return None
+        mask = np.zeros(self.payload.size, dtype=np.bool_)
+        for start, stop in self.missing:
+            mask[start:stop] = True
+        return mask
+
+
+@dataclass(frozen=True)
+class CubeRow:
+    """One board's row of a scan that another program has synchronised; the card's data is not available."""
+
+    cube: NDArray[np.complex64]  # [rx, position, sample], in the order of recording, with that program's reference
+    missing_bytes: int = 0
+    crc32: str = ""
+
+    @property
+    def frames_expected(self) -> int:
+        """One for each position."""
+        return self.cube.shape[1]
+
+
+class Scan(Protocol):
+    """Description of a scan in any layout."""
+
+    @property
+    def instrument(self) -> Instrument:
+        """The rig file of the scan; mirrored in x = y for a mirrored scan."""
+        ...
+
+    @property
+    def plan(self) -> RasterPlan:
+        """The plan of positions."""
+        ...
+
+    @property
+    def simulated(self) -> bool:
+        """True for simulated data."""
+        ...
+
+    @property
+    def scan_id(self) -> str:
+        """Name of the scan."""
+        ...
+
+
+class Source(Scan, Protocol):
+    """Recorded rows of one scan: a scan folder of ours, or the published data read as one."""
+
+    @property
+    def mirrored(self) -> bool:
+        """True if recorded column by column: rig, plan and images are then mirrored in x = y."""
+        ...
+
+    @property
+    def synchronised(self) -> bool:
+        """True if another program has synchronised the scan and the chirps are not available."""
+        ...
+
+    @property
+    def manifest_faults(self) -> tuple[ManifestFault, ...]:
+        """Damaged and missing lines of the manifest; empty for a recording without one."""
+        ...
+
+    def rows(self) -> Iterator[int]:
+        """Indices of the rows with data, ascending."""
+        ...
+
+    def read_row(self, board_name: str, row: int) -> RowData | CubeRow:
+        """Read one board's recording of one row. Raises DataError if it is missing or damaged."""
+        ...
+
+    def recording_facts(self) -> dict[str, Any]:
+        """Entries of quality.json about the recording: rows retaken, losses by board, notices."""
+        ...
+
+
+class RawSource(Source, Protocol):
+    """A source that contains the chirps. Construct with :func:`raw_source`."""
+
+    def read_row(self, board_name: str, row: int) -> RowData:
+        """Read one board's recording of one row. Raises DataError if it is missing or damaged."""
+        ...
+
+
+def raw_source(source: Source, where: Path) -> RawSource:
+    """Return the source if it contains the chirps. Raises DataError if another program has synchronised it."""
+    if source.synchronised:
+        raise DataError(
+            f"{where}: does not contain the chirps",
+            "these cubes were synchronised already, by the authors",
+            "give the same scan's unsynced/ folder",
+            code=ErrorCode.NO_DATA,
+        )
+    return cast(RawSource, source)

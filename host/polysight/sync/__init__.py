@@ -1,0 +1,39 @@
+"""Synchronisation of the rows of a board: from raw chirps to samples referenced to the direct path.
+
+`synchronise_row` processes a row of raw chirps with a board's `BoardSetup`: compensate the high-pass filter, align the
+chirps of each burst and average them (`align_row`), find the direct path and remove its frequency and phase
+(`reference`). The result is a `SyncedRow`, with the residual errors after each stage. `RowSynchroniser` does this for
+every row of a source, and converts cubes that another program has synchronised. The loops run compiled (C) if possible,
+otherwise in NumPy with equal results. `estimate_backlash` measures the backlash of the stage from the echoes.
+"""
+
+from polysight.sync.align import AlignedRow, align_row, whole_blocks
+from polysight.sync.backlash import echo_of_row, estimate_backlash, object_filter
+from polysight.sync.chain import BoardSetup, SyncedRow, synchronise_row
+from polysight.sync.direct_path import reference
+from polysight.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
+from polysight.sync.numpy_passes import FOLD
+from polysight.sync.residuals import STAGES, noise_power
+from polysight.sync.rows import RowSynchroniser
+from polysight.sync.tone import cis
+
+__all__ = [
+    "FOLD",
+    "STAGES",
+    "AlignedRow",
+    "BoardSetup",
+    "HighPass",
+    "RowSynchroniser",
+    "SyncedRow",
+    "align_row",
+    "cis",
+    "echo_of_row",
+    "estimate_backlash",
+    "fit_high_pass",
+    "high_pass",
+    "noise_power",
+    "object_filter",
+    "reference",
+    "synchronise_row",
+    "whole_blocks",
+]

@@ -1,0 +1,114 @@
+"""Estimate the backlash of the stage from the data: the shift of odd rows along x relative to even rows.
+
+Neighbouring rows have nearly the same echo. If odd rows, which run in the opposite direction, are shifted by `d` along
++x, they differ from their neighbours by `d` times the slope of the echo along x. Least squares gives `d`, the jackknife
+over groups of rows its standard deviation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.sync.chain import SyncedRow
+from polysight.sync.direct_path import excess_path_m
+from polysight_shared.config import Board, Instrument
+from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.raster import mean_burst_travel_mm, plan_raster
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+_GROUPS = 10  # groups of rows for the jackknife
+_STEPS = 3  # Gauss-Newton
+_ALIASED = 0.02  # largest share of power in the upper fifth of the spectrum; more means aliasing
+
+
+def object_filter(rig: Instrument, board: Board) -> NDArray[np.complex64]:
+    """Return weights [sample] that select the mirror point's range cell and suppress the direct path."""
+    a, b = rig.chirp.linear_samples
+    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    excess = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).mean()
+    n = np.arange(b - a)
+    weights = np.zeros(rig.chirp.samples, np.complex64)
+    weights[a:b] = np.hanning(b - a + 2)[1:-1] / (b - a)
+    weights[a:b] *= np.exp(-2j * np.pi * rig.chirp.hz_per_sample * n * excess / SPEED_OF_LIGHT_M_S)
+    return weights
+
+
+def echo_of_row(row: SyncedRow, weights: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    """Return the echo of a row through :func:`object_filter`, complex64 [rx, position], in order of recording."""
+    return (row.samples @ weights) * row.valid
+
+
+@dataclass(frozen=True)
+class Backlash:
+    """Shift of odd rows along +x relative to even ones, and its standard deviation."""
+
+    shift_mm: float
+    std_mm: float
+
+
+def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -> Backlash | None:
+    """Estimate the backlash of a scan.
+
+    Parameters
+    ----------
+    rows
+        Echoes by row index, from :func:`echo_of_row`. Rows without both neighbours are left out.
+    rig
+        Rig of the scan.
+
+    Returns
+    -------
+    Backlash | None
+        None if undetermined: too few rows, steps too coarse for the echo along x, or a standard deviation above a
+        quarter of the step.
+    """
+    plan = plan_raster(rig.grid)
+    inner = [r for r in sorted(rows) if r - 1 in rows and r + 1 in rows]
+    if len(inner) < _GROUPS:
+        return None
+    k = 2 * np.pi * np.fft.fftfreq(2 * plan.columns, plan.step_x_mm)
+    travel = mean_burst_travel_mm(rig.burst, rig.stage)
+    window = np.pad(np.hanning(plan.columns + 2)[1:-1], (0, plan.columns))
+
+    def spectrum(r: int, shift_mm: float) -> NDArray[np.complex128]:
+        direction = plan.row(r).direction
+        return _spectrum(rows[r][:, ::direction], k, direction * travel + (shift_mm if r % 2 else 0.0))
+
+    def sums(shift_mm: float) -> NDArray[np.float64]:
+        """Return sums over groups of rows: slope times difference, slope squared, power, power at the highest k."""
+        out = np.zeros((_GROUPS, 4))
+        recent = {r: spectrum(r, shift_mm) for r in (inner[0] - 1, inner[0])}
+        for i, r in enumerate(inner):
+            recent = {q: recent[q] if q in recent else spectrum(q, shift_mm) for q in (r - 1, r, r + 1)}
+            mean = (recent[r - 1] + recent[r + 1]) / 2
+            slope, rest = np.fft.ifft(1j * k * mean, axis=-1), np.fft.ifft(recent[r] - mean, axis=-1)
+            power = np.abs(mean) ** 2
+            out[i * _GROUPS // len(inner)] += (
+                (1 if r % 2 else -1) * (window * slope.conj() * rest).real.sum(),
+                (window * np.abs(slope) ** 2).sum(),
+                power.sum(),
+                power[:, np.abs(k) > 0.8 * np.abs(k).max()].sum(),
+            )
+        return out
+
+    shift, without = 0.0, np.zeros(_GROUPS)
+    for _ in range(_STEPS):
+        s = sums(shift)
+        left = s.sum(axis=0) - s  # sums without one group: jackknife, Efron 1982
+        if s[:, 1].sum() == 0 or left[:, 1].min() <= 0 or s[:, 3].sum() > _ALIASED * s[:, 2].sum():
+            return None
+        without = shift + left[:, 0] / left[:, 1]
+        shift += float(np.clip(s[:, 0].sum() / s[:, 1].sum(), -plan.step_x_mm / 2, plan.step_x_mm / 2))
+    std = float(np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((without - without.mean()) ** 2)))
+    return Backlash(shift, std) if std < plan.step_x_mm / 4 else None
+
+
+def _spectrum(row: NDArray[np.complex64], k: NDArray[np.floating], off_mm: float) -> NDArray[np.complex128]:
+    """Return the spectrum of a row along x, [rx, 2 position], shifted back by `off_mm` to the planned positions.
+
+    The row is continued by its mirror image to avoid a jump at its ends. `k` is in radians per millimetre.
+    """
+    return np.fft.fft(np.concatenate([row, row[:, ::-1]], axis=-1), axis=-1) * np.exp(-1j * k * off_mm)

@@ -1,0 +1,126 @@
+"""Compile the loops of `burst.c` and `direct_path.c` into `kernels.so`: `python -m polysight.sync.build`.
+
+`setup.py` does this when the package is installed, with the system's C compiler or that of the package `ziglang`. This
+module uses only the standard library, for nothing else is available during installation.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+LIBRARY = "kernels.so"
+SOURCES = ("burst.c", "direct_path.c")
+"""Compiled once per vector width."""
+
+_FLAGS = "-std=c99 -O3 -fPIC -fopenmp-simd -ffp-contract=fast -fno-math-errno -fno-trapping-math -fno-signed-zeros"
+_FLAGS += " -fassociative-math"  # not -ffast-math, which changes rounding in other libraries
+_WIDTHS = {
+    128: "",
+    256: "-mavx2 -mfma",
+    512: "-mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector-width=512",
+}
+TARGETS = {
+    "manylinux_2_17_x86_64": "x86_64-linux-gnu.2.17",
+    "manylinux_2_17_aarch64": "aarch64-linux-gnu.2.17",
+}
+"""Platforms of wheels for other machines, with their names for `zig cc`."""
+
+
+class BuildError(Exception):
+    """No compiler was found, or it failed."""
+
+
+def source_digest() -> str:
+    """Return the digest of the C sources. A library ends with it: another, truncated or foreign file is not loaded."""
+    digest = hashlib.sha256()
+    for path in sorted([*HERE.glob("*.c"), *HERE.glob("*.h")]):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def find_compiler(environment: Mapping[str, str] = os.environ) -> list[str] | None:
+    """Return the command of a C compiler: $CC, the system's or ziglang's; None without any."""
+    if environment.get("CC"):
+        return shlex.split(environment["CC"])
+    for name in ("cc", "gcc", "clang"):
+        path = shutil.which(name, path=environment.get("PATH"))
+        if path:
+            return [path]
+    return _zig()
+
+
+def build(folder: Path = HERE, target: str = "") -> Path:
+    """Compile the library into a folder and return its path.
+
+    `target` is a key of `TARGETS` for another machine; "": this machine.
+
+    Raises
+    ------
+    BuildError
+        if there is no compiler, or it fails.
+    """
+    from concurrent.futures import ThreadPoolExecutor  # `compiled.py` needs this module, but no threads
+
+    compiler = _zig() if target else find_compiler()
+    if compiler is None:
+        raise BuildError("no C compiler was found")
+    if target:
+        compiler = [*compiler, "-target", TARGETS[target]]
+    machine = target or platform.machine().lower()
+    widths = _WIDTHS if machine.endswith(("x86_64", "amd64")) else {128: ""}
+    with tempfile.TemporaryDirectory(prefix="polysight-build-") as made:
+        jobs = [
+            ([source, f"-DWIDTH={bits}", *flags.split()], f"{source}-{bits}.o")
+            for bits, flags in widths.items()
+            for source in SOURCES
+        ]
+        jobs.append((["width.c"], "width.o"))
+        with ThreadPoolExecutor(os.cpu_count()) as workers:
+            commands = [[*compiler, *_FLAGS.split(), "-c", *words, "-o", f"{made}/{name}"] for words, name in jobs]
+            list(workers.map(_run, commands))
+        library = f"{made}/{LIBRARY}"
+        objects = [f"{made}/{name}" for _, name in jobs]
+        _run([*compiler, "-O3", "-fno-sanitize=undefined", "-s", "-shared", "-o", library, *objects, "-lm"])
+        new = folder / f".{LIBRARY}-{os.getpid()}"
+        new.write_bytes(Path(library).read_bytes() + source_digest().encode())
+        new.replace(folder / LIBRARY)  # atomic: programs that use the old library keep it
+    return folder / LIBRARY
+
+
+def _zig() -> list[str] | None:
+    return [sys.executable, "-m", "ziglang", "cc"] if importlib.util.find_spec("ziglang") else None
+
+
+def _run(command: Sequence[str]) -> None:
+    try:
+        done = subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
+        message, failed = done.stderr.strip(), done.returncode != 0
+    except OSError as e:
+        message, failed = str(e), True
+    if failed:
+        raise BuildError(f"{shlex.join(command)}\n{message}")
+
+
+def main() -> int:
+    """Compile for this machine; the library lies beside this file."""
+    try:
+        sys.stdout.write(f"{build()}\n")
+    except (BuildError, OSError) as e:
+        sys.stderr.write(f"{e}\ninstall a C compiler (apt install gcc, or pip install ziglang) and run this again\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,255 @@
+"""Direct path from TX to RX: find it in the average of every position and remove its frequency and phase.
+
+The object's echo is as strong as the direct path and lies only 3.5 IF bins above it, so the estimate of the direct path
+must suppress the object. Both are known from the geometry: the direct path has fixed delays along the RX array, and the
+object lies on the object plane. With the object as coloured noise of covariance R, the best linear unbiased estimate of
+a direct path `A exp(j w t)` near `w = 0`, with the model `x = A g + A w (jt g)`, is
+
+    [A, A w] = (G^H R^-1 G)^-1 G^H R^-1 x,   G = [g, j t g]
+
+(generalised least squares; Kay 1993, section 6.4). This is a fixed 2 x (4 RX x samples) matrix: a beamformer in space
+and frequency with nulls at the object. Gauss-Newton steps `w += Re(A w / A)` converge. Its input is the average after
+burst alignment: mixed to zero frequency, with four consecutive samples averaged.
+
+The crystals of the boards differ by some ppm, and with them the chirp slopes, so the IF drifts by some kilohertz within
+a chirp, equally for all paths and positions. A third column `jt^2/2 g` estimates this drift; its median over the row is
+removed first.
+
+The amplitude of the direct path is constant during a scan. If a position's amplitude is an outlier in its row, the
+second of the two strongest peaks is tried. Nothing is smoothed.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from polysight.sync import compiled, numpy_direct_path
+from polysight.sync.align import AlignedRow, whole_blocks
+from polysight.sync.numpy_passes import FOLD
+from polysight.sync.tone import cis
+from polysight_shared.config import Board, Chirp, Instrument
+from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+Loops = compiled.Library | ModuleType
+"""The compiled loops, or `numpy_direct_path`, which has the same functions."""
+
+_FFT = 256  # size of the search FFT, over averaged samples
+_SPREAD_M = 0.1  # standard deviation in x and y of the echoes' origin, around the mirror point
+_GAIN_SPREAD = 0.3  # relative gain and phase differences of the RX that the nulls tolerate
+_NOISE = 1e-2  # noise power of a sample relative to an echo as strong as the direct path
+_COMPARABLE = 0.35  # a second peak this strong, one object distance below the first, is the direct path
+_LOST = 0.3  # smallest amplitude of a direct path, relative to the row's median
+_OUTLIER = 5.0  # standard deviations from the row's amplitude
+_PRESENT = 30.0  # smallest power of a direct path relative to the noise; noise reaches 12 once in 100,000 positions
+
+
+class DirectPath(NamedTuple):
+    """Steering and estimators for a board's direct path, from geometry alone; fixed for a scan.
+
+    Attributes
+    ----------
+    steering
+        complex64 [rx, sample]: `exp(-j 2 pi f(t) (tau_r - tau_0))`, after which all RX share the direct path's tone.
+    folded_steering
+        complex64 [rx, block]: steering at the middle of each block of `FOLD` linear samples.
+    estimator
+        complex128 [2, rx * block]: rows give A and A w (w in radians per sample) of the steered, demodulated samples.
+    drift_estimator
+        complex128 [3, rx * block]: A, A w and A q, q the drift in radians per sample squared.
+    half_estimators
+        complex128 [2, 2, rx / 2 * block]: A and A w from every other RX alone.
+    beam
+        complex64 [rx]: weights of the steered RX for the search, sum 1, with low gain towards the object.
+    object_bins
+        IF distance of the nearest and farthest echo from the direct path, in bins of the search FFT.
+    """
+
+    steering: NDArray[np.complex64]
+    folded_steering: NDArray[np.complex64]
+    estimator: NDArray[np.complex128]
+    drift_estimator: NDArray[np.complex128]
+    half_estimators: NDArray[np.complex128]
+    beam: NDArray[np.complex64]
+    object_bins: tuple[float, float]
+
+
+class Referenced(NamedTuple):
+    """Samples referenced to the direct path.
+
+    Attributes
+    ----------
+    samples
+        complex64 [rx, position, sample]: an echo of excess path d is `exp(j 2 pi f(t) d / c)`, the direct path a
+        constant.
+    frequency
+        float64 [position]: IF of the direct path in cycles per sample, 0..1 (complex 1x) or -1/2..1/2.
+    amplitude
+        complex128 [position]: its amplitude, phase at the centre of the linear samples.
+    found
+        bool [position]: False without a credible direct path.
+    drift
+        IF drift of the row, radians per sample squared.
+    halves
+        complex64 [position, 2, rx, block]: the two halves of the burst, referenced like `samples`.
+    """
+
+    samples: NDArray[np.complex64]
+    frequency: NDArray[np.float64]
+    amplitude: NDArray[np.complex128]
+    found: NDArray[np.bool_]
+    drift: float
+    halves: NDArray[np.complex64]
+
+
+def excess_path_m(
+    tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], points_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return `|v - tx| + |v - rx| - |tx - rx|`, metres, [rx, point], for rx [rx, 3] and points [point, 3]."""
+    out = np.linalg.norm(points_m - tx_m, axis=-1) + np.linalg.norm(points_m[None] - rx_m[:, None], axis=-1)
+    return out - np.linalg.norm(rx_m - tx_m, axis=-1)[:, None]
+
+
+def prepare(rig: Instrument, board: Board) -> DirectPath:
+    """Return steering, search beam and estimators of a board, from geometry alone."""
+    chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
+    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    middles = sweep[a:b].reshape(-1, FOLD).mean(axis=1)
+    direct = np.linalg.norm(rx - tx, axis=-1)
+    lag_s = (direct - direct[0])[:, None] / SPEED_OF_LIGHT_M_S
+
+    # Echoes in the steered, demodulated samples: a tone at the excess path, with the object's phases at the RX.
+    grid = np.linspace(-3, 3, 25) * _SPREAD_M
+    dx, dy = (m.ravel() for m in np.meshgrid(grid, grid))
+    weight = np.sqrt(np.exp(-(dx**2 + dy**2) / (2 * _SPREAD_M**2)))
+    points = np.array(specular_midpoint_m(rig, board)) + np.stack([dx, dy, 0 * dx], axis=1)
+    excess = excess_path_m(tx, rx, points)
+    echoes = np.exp(2j * np.pi * middles * excess.T[:, :, None] / SPEED_OF_LIGHT_M_S)
+    echoes *= (weight / np.linalg.norm(weight))[:, None, None]
+    n_rx, n = len(rx), middles.size
+    flat = echoes.reshape(len(points), n_rx * n)
+    same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
+    noise = _NOISE / FOLD * np.eye(n_rx * n)
+    covariance = (flat.T @ flat.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + noise
+    time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
+    model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
+    own = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]
+
+    centre = echoes[:, :, n // 2]
+    spatial = (centre.T @ centre.conj()) * (1 + _GAIN_SPREAD**2 * np.eye(n_rx)) + _NOISE * np.eye(n_rx)
+    beam = np.linalg.solve(spatial, np.ones(n_rx)).conj()
+    bins = chirp.hz_per_sample * FOLD * _FFT / SPEED_OF_LIGHT_M_S
+    return DirectPath(
+        cis(-2 * np.pi * sweep * lag_s),
+        cis(-2 * np.pi * middles * lag_s),
+        _least_squares(model[:, :2], covariance),
+        _least_squares(model, covariance),
+        np.stack([_least_squares(model[at, :2], covariance[np.ix_(at, at)]) for at in own]),
+        (beam / beam.sum()).astype(np.complex64),
+        (float(excess.min() * bins), float(excess.max() * bins)),
+    )
+
+
+def _least_squares(model: NDArray[np.complex128], covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return `(G^H R^-1 G)^-1 G^H R^-1` for a model G [sample, parameter] and a covariance R."""
+    whitened = np.asarray(scipy.linalg.solve(covariance, model, assume_a="pos"), np.complex128)
+    return np.linalg.solve(model.conj().T @ whitened, whitened.conj().T).astype(np.complex128)
+
+
+def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | None = None) -> Referenced:
+    """Find the direct path of every position and remove its frequency and phase from all RX.
+
+    Parameters
+    ----------
+    aligned
+        Aligned averages of a row. Positions without a good chirp are not found.
+    path
+        From :func:`prepare`.
+    chirp
+        The chirp the samples were taken with.
+    by
+        Its loops: compiled or `numpy_direct_path`, with equal results; None: compiled where that is possible.
+    """
+    loops = by or (compiled.library() if len(path.beam) == compiled.RX else None) or numpy_direct_path
+    a, b = whole_blocks(chirp.linear_samples)
+    n = (b - a) // FOLD
+    usable: NDArray[np.bool_] = np.any(aligned.good, axis=1)
+    window = np.hanning(n + 2)[1:-1].astype(np.float32)
+    nearest, farthest = int(path.object_bins[0] * 0.9), int(path.object_bins[1] * 1.1)
+    beam = _c64(path.beam[:, None] * path.folded_steering * window)
+    bins, median = loops.search(aligned.halves, beam, _FFT, (nearest, farthest), _COMPARABLE)
+    peaks = ((bins + _FFT // 2) % _FFT - _FFT // 2) / _FFT / FOLD
+    floor = median**2 / np.log(2) / (window**2).sum()  # from the median bin, for tones fill few bins
+    three, two = _c64(path.drift_estimator), _c64(path.estimator)
+    frequency, estimate, _ = loops.refine(aligned.halves, path.folded_steering, three, peaks[0])
+    drifts = _ratio(estimate[:, 2], estimate[:, 0])[usable]
+    drift = float(np.median(drifts)) if usable.any() else 0.0
+    flat = _c64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
+    frequency, estimate, step = loops.refine(aligned.halves, flat, two, frequency)
+    _try_others(aligned.halves, peaks, usable, (loops, flat, two), frequency, estimate, step)
+
+    # An IF outside the receiver's band is an alias; if the last step is large, no tone was found.
+    amplitude = estimate[:, 0] * np.sinc(frequency) / np.sinc(frequency * FOLD)  # averaging attenuated the tone
+    heard = aligned.centre + frequency
+    heard = heard % 1.0 if chirp.if_mode == "complex1x" else (heard + 0.5) % 1.0 - 0.5
+    band = heard < 0.9 if chirp.if_mode == "complex1x" else np.abs(heard) < 0.45
+    strength = np.abs(amplitude)
+    chirps = np.maximum(aligned.good.sum(axis=1), 1)
+    # All chirps of a row have the same noise.
+    floor = np.median((floor * chirps)[usable]) / chirps if usable.any() else floor
+    noise = floor / (np.abs(path.beam) ** 2).sum()  # noise power of an averaged sample of one RX
+    present = strength**2 > _PRESENT * noise * (np.abs(path.estimator[0]) ** 2).sum()
+    found = usable & band & present & (np.abs(step) < 0.02 / (b - a))
+    if found.any():
+        found &= strength > _LOST * np.median(strength[found])
+
+    origin = (a + b - 1) / 2
+    steering = _c64(path.steering * cis(-0.5 * drift * (np.arange(chirp.samples) - origin) ** 2))
+    samples, halves = loops.turn(
+        aligned.mean, aligned.halves, steering, flat, origin, frequency, np.angle(amplitude), found
+    )
+    return Referenced(samples, heard, amplitude, found, drift, halves)
+
+
+def _try_others(
+    halves: NDArray[np.complex64],
+    peaks: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    how: tuple[Loops, NDArray[np.complex64], NDArray[np.complex64]],
+    *found: NDArray[np.generic],
+) -> None:
+    """Use the second peak where the amplitude is an outlier in its row; changes `found` in place.
+
+    `how` are the loops, the steering and the estimator; `found` are frequency, estimate and last step from `refine`.
+    An outlier is beyond `_OUTLIER` standard deviations, estimated from the median absolute deviation of the row.
+    """
+    level = np.log(np.maximum(np.abs(found[1][:, 0]), 1e-30))
+    if not usable.any():
+        return
+    middle = np.median(level[usable])
+    spread = 1.4826 * np.median(np.abs(level[usable] - middle))  # of a normal distribution
+    odd = np.flatnonzero(usable & (np.abs(level - middle) > _OUTLIER * spread) & (peaks[0] != peaks[1]))
+    if odd.size == 0:
+        return
+    loops, steering, estimator = how
+    other = loops.refine(halves[odd], steering, estimator, peaks[1, odd])
+    other_level = np.log(np.maximum(np.abs(other[1][:, 0]), 1e-30))
+    better = np.abs(other_level - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
+    for whole, part in zip(found, other, strict=True):
+        whole[odd[better]] = part[better]
+
+
+def _ratio(moment: NDArray[np.complex128], amplitude: NDArray[np.complex128]) -> NDArray[np.float64]:
+    ratio = np.zeros(amplitude.shape, complex)
+    np.divide(moment, amplitude, out=ratio, where=amplitude != 0)
+    return np.real(ratio)
+
+
+def _c64(values: NDArray[np.complexfloating]) -> NDArray[np.complex64]:
+    return np.ascontiguousarray(values, np.complex64)

@@ -1,0 +1,181 @@
+"""Model, compensation and fit of the receiver's high-pass filter.
+
+The AWR2243 has two high-pass sections in the IF, with corners selected in the profile (175/235/350/700 kHz and
+350/700/1400/2800 kHz). Direct path and object have different IF, which change with the timing of every chirp, so the
+filter is compensated before anything else is estimated (paper, section 5.2).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from polysight_shared.config import Chirp
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+
+SMALLEST_GAIN = 0.25
+"""Smallest filter gain that is fully compensated."""
+
+REACH_BINS = 3.0
+"""Distance of direct path and object from their middle, in IF bins."""
+
+
+@dataclass(frozen=True)
+class HighPass:
+    """A linear constant-coefficient filter: a product of first-order high-pass sections.
+
+    `H(f) = prod_i (jf / f_i) / (1 + jf / f_i)`, the response of `y' + 2 pi f_i y = x'` for each corner `f_i`.
+    Without corners: the identity.
+    """
+
+    corners_hz: tuple[float, ...] = ()
+
+    def response(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the complex response at IF frequencies (Hz, any shape)."""
+        h = np.ones(np.shape(frequency_hz), complex)
+        for corner in self.corners_hz:
+            x = 1j * np.asarray(frequency_hz) / corner
+            h *= x / (1 + x)
+        return h
+
+    def inverse(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return `conj(H) / max(|H|^2, 1/16)`: 1/H where the gain allows it, and at most fourfold noise."""
+        f = np.where(np.abs(frequency_hz) < 1.0, 1.0, frequency_hz)
+        inverse: NDArray[np.complex128] = np.ones(np.shape(f), complex)
+        for corner in self.corners_hz:
+            inverse *= 1 - 1j * corner / f
+        return inverse * np.minimum(1.0, (inverse.real**2 + inverse.imag**2) ** -1 / SMALLEST_GAIN**2)
+
+
+@dataclass(frozen=True)
+class Equaliser:
+    """Compensates the filter in the narrow band of a chirp's signal, with three taps.
+
+    After mixing down by its centre f, the signal of a chirp lies within some tens of kHz of zero. Taps t at -spacing, 0
+    and +spacing samples have the response `t_0 exp(-jw) + t_1 + t_2 exp(jw)`, which equals the inverse filter at f and
+    at `reach` on either side. It is periodic beyond, so that noise far away is not amplified by the slope of 1/H.
+
+    Attributes
+    ----------
+    model
+        The filter.
+    sample_rate_hz, signed
+        Sample rate; IF of -1/2..1/2 of it (complex 2x, signed) or 0..1 (complex 1x).
+    spacing
+        Samples between taps.
+    reach
+        Cycles per sample.
+    """
+
+    model: HighPass
+    sample_rate_hz: float
+    signed: bool
+    spacing: int
+    reach: float
+
+    @classmethod
+    def of(cls, model: HighPass, chirp: Chirp, spacing: int) -> Equaliser:
+        """Return the equaliser of a chirp: exact at the signal's centre and `REACH_BINS` IF bins away."""
+        a, b = chirp.linear_samples
+        return cls(model, chirp.sample_rate_hz, chirp.if_mode == "complex2x", spacing, REACH_BINS / (b - a))
+
+    def taps(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the taps [..., 3] for signals centred at frequencies [...] in cycles per sample."""
+        f = frequency[..., None] + self.reach * np.array([-1.0, 0.0, 1.0])
+        f = ((f + 0.5) % 1.0 - 0.5 if self.signed else f % 1.0) * self.sample_rate_hz
+        low, middle, high = np.moveaxis(self.model.inverse(f), -1, 0)
+        w = 2 * np.pi * self.reach * self.spacing
+        both = ((low + high) / 2 - middle) / (np.cos(w) - 1)
+        apart = (high - low) / (2j * np.sin(w))
+        return np.stack([(both - apart) / 2, middle - both, (both + apart) / 2], axis=-1)
+
+
+def shifted(terms: NDArray[np.complexfloating], spacing: int) -> NDArray[np.complexfloating]:
+    """Shift each of the terms [position, tap, rx, sample] by its tap; a single tap is not shifted.
+
+    Beyond its ends a term is extrapolated by the parabola through three of its samples.
+    """
+    if terms.shape[1] == 1:
+        return terms
+    out, s = terms.copy(), spacing
+    before, after = terms[:, 0], terms[:, 2]
+    out[:, 0, :, s:] = before[..., :-s]
+    out[:, 0, :, :s] = 3 * (before[..., :s] - before[..., s : 2 * s]) + before[..., 2 * s : 3 * s]
+    out[:, 2, :, :-s] = after[..., s:]
+    out[:, 2, :, -s:] = 3 * (after[..., -s:] - after[..., -2 * s : -s]) + after[..., -3 * s : -2 * s]
+    return out
+
+
+def filtered(signal: NDArray[np.complex64], taps: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    """Filter a signal [position, chirp, rx, sample] with taps [position, chirp, tap], one sample apart."""
+    terms = signal[:, :, None] * taps[..., None, None]
+    return shifted(terms.reshape(-1, *terms.shape[2:]), 1).sum(axis=1).reshape(signal.shape)
+
+
+def high_pass(chirp: Chirp) -> HighPass:
+    """Return the filter in a chirp profile; a corner of 0 means no section (simulated rigs only)."""
+    return HighPass(tuple(khz * 1e3 for khz in (chirp.hpf1_khz, chirp.hpf2_khz) if khz))
+
+
+def fit_high_pass(
+    if_hz: NDArray[np.float64],
+    amplitude: NDArray[np.float64],
+    phase_rad: NDArray[np.float64] | None = None,
+    sections: int = 2,
+) -> HighPass:
+    """Fit the filter to a sweep: one reflector, measured at several IF by changing the start frequency.
+
+    Least squares of log amplitude, and of phase if known, over the corners and a common gain (paper, Fig. 9).
+
+    Parameters
+    ----------
+    if_hz, amplitude
+        float64 [point]: IF and linear amplitude, in any unit.
+    phase_rad
+        float64 [point], up to a constant; None if the phases of the measurements are unrelated.
+    sections
+        First-order sections to fit.
+
+    Raises
+    ------
+    DataError
+        if there are too few points, or no points near a corner.
+    """
+    if_hz, amplitude = np.asarray(if_hz, np.float64), np.asarray(amplitude, np.float64)
+    if if_hz.size < 2 * (sections + 2) or np.any(amplitude <= 0) or np.any(if_hz <= 0):
+        raise DataError(
+            f"{if_hz.size} points do not determine {sections} corners",
+            "a sweep needs IF and amplitude above zero, at twice as many points as unknowns",
+            "measure the same reflector at more start frequencies",
+            code=ErrorCode.NOT_ENOUGH_DATA,
+        )
+    measured = np.log(amplitude)
+    turns = None if phase_rad is None else np.exp(1j * np.asarray(phase_rad))
+
+    def misfit(log_corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        h = HighPass(tuple(np.exp(log_corners))).response(if_hz)
+        gain = measured - np.log(np.abs(h))
+        out = gain - gain.mean()
+        if turns is None:
+            return out
+        turn = turns * np.conj(h) / np.abs(h)
+        return np.concatenate([out, np.angle(turn * np.conj(turn.mean()))])
+
+    limits = np.log(if_hz.min() / 10), np.log(if_hz.max() * 3)
+    starts = itertools.combinations(np.linspace(*limits, 6)[1:-1], sections)  # the corners may be in any two octaves
+    fits = [scipy.optimize.least_squares(misfit, start, bounds=limits, loss="soft_l1", f_scale=0.1) for start in starts]
+    corners = np.exp(np.sort(min(fits, key=lambda fit: fit.cost).x))
+    if corners[0] < 1.1 * np.exp(limits[0]) or corners[-1] > 0.9 * np.exp(limits[1]):
+        raise DataError(
+            f"no filter fits the sweep: corners of {', '.join(f'{c / 1e3:.0f}' for c in corners)} kHz",
+            "the IF range does not include the filter's corners, or the reflector moved",
+            "measure at mean IFs from about 250 kHz, which trigger jitter of 200 kHz spreads to half the lower corner,"
+            " to several times the upper corner (docs/how-to/calibration.md)",
+            code=ErrorCode.MISMATCH,
+        )
+    return HighPass(tuple(float(c) for c in corners))

@@ -1,0 +1,278 @@
+"""Rules of the verdict: each turns one kind of evidence into reasons (what was found, why it matters, what to do).
+
+A rule returns no reasons if its evidence is good. All limits are constants of this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from polysight.verdict.verdict import Reason
+
+FEW_POSITIONS = 0.5
+"""Share of absent or masked positions above which there is no result."""
+SOME_POSITIONS = 0.005
+"""Share of masked positions above which the result needs care."""
+DIRECT_SNR_NONE_DB = -14.0
+"""Direct path over noise in one sample of one chirp and channel, below which it counts as missing."""
+DIRECT_SNR_CARE_DB = 0.0
+"""Same, below which it counts as weak. The simulated rig has 5.5 dB, as the paper's phase errors suggest."""
+DIRECT_LEVELS = (0.4, 3.0)
+"""Range of metal's brightness relative to the direct path; in published data both are equal within a factor of 1.5."""
+DIRECT_PHASE_CARE_RAD = 0.05
+"""Standard deviation of the object's phase from position to position; usually 0.004."""
+PLANE_FAR_MM, PLANE_TILT_DEG = 3.0, 0.5
+"""Distance and tilt of the plates' plane against the rig file, above which the result needs care."""
+PLANE_GATE_MM = 13.0
+"""Distance at which the plates lie at the edge of the range gate."""
+PLATE_ACROSS_DEG = 0.5
+"""Tilt of a plate across the plane of incidence; turns the polarisation by 0.4 degrees: 3 to 6 % of a permittivity."""
+BRIGHTNESS_CARE = 0.2
+"""ln of |H| over that of a half space: rough, tilted, high plates stay within 0.13 (simulated), thin sheets to 0.5."""
+LEAKAGE_SHARE = 0.02
+"""Relative error of permittivities by leakage, above which the result needs care."""
+LIBRARY_ANGLE_DEG = 0.3
+"""Difference from the library's angle; the ratio of a material changes by 3 % in 0.3 degrees."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Counts of recorded rows and frames against the plan, and the faults of the manifest."""
+
+    rows_planned: int
+    rows_recorded: int
+    frames_planned: int
+    frames_received: int
+    manifest: Sequence[str] = ()
+
+    @classmethod
+    def of(cls, coverage: Mapping[str, object]) -> Coverage:
+        """Read `coverage` of quality.json."""
+        manifest = coverage.get("manifest", ())
+        faults = tuple(map(str, manifest)) if isinstance(manifest, list | tuple) else ()
+        keys = ("rows_planned", "rows_recorded", "frames_planned", "frames_received")
+        rows, recorded, frames, received = (int(str(coverage[k])) for k in keys)
+        return cls(rows, recorded, frames, received, faults)
+
+
+def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Reason]:
+    """Judge rows, frames and manifest against the plan; `masked_share` of the recorded positions is masked."""
+    out = []
+    absent = 1 - coverage.rows_recorded / coverage.rows_planned if coverage.rows_planned else 1.0
+    if coverage.rows_recorded < coverage.rows_planned:
+        level = "none" if absent > FEW_POSITIONS else "care"
+        missing = coverage.rows_planned - coverage.rows_recorded
+        out.append(Reason(
+            level, f"{missing} of {coverage.rows_planned} rows are absent ({100 * absent:.1f} % of the positions)",
+            "the scan was stopped, or rows were lost; plates there are missing or distorted",
+            "`polysight resume SCAN` records the missing rows", 5 + absent,
+        ))  # fmt: skip
+    out += [
+        Reason("care", fault, "a recorded row is missing in the images", "run `polysight validate SCAN`", 6.0)
+        for fault in coverage.manifest
+    ]
+    frames = 1 - coverage.frames_received / coverage.frames_planned if coverage.frames_planned else 1.0
+    lost = max(masked_share, frames - absent)
+    if lost > SOME_POSITIONS:
+        out.append(Reason(
+            "none" if lost > FEW_POSITIONS else "care",
+            f"{100 * lost:.1f} % of the recorded positions or frames are masked",
+            "packets were lost, or the direct path was not found there",
+            "look at each board's frames in the report; `polysight doctor` checks the network", 4 + lost,
+        ))  # fmt: skip
+    return out
+
+
+def direct_path_reasons(board: str, snr_db: float | None, phase_rad: float | None, found_share: float) -> list[Reason]:
+    """Judge one board's direct path: its level over noise, the residual phase, and the share of positions with one."""
+    if found_share < FEW_POSITIONS or (snr_db is not None and snr_db < DIRECT_SNR_NONE_DB):
+        return [Reason(
+            "none", f"{board}: the direct path is missing ({100 * found_share:.0f} % of the positions have one)",
+            "without it no position is synchronised, and the images are meaningless",
+            "clear the line of sight from transmitter to receiver; check that the transmitter is on", 10.0,
+        )]  # fmt: skip
+    out = []
+    if snr_db is not None and snr_db < DIRECT_SNR_CARE_DB:
+        out.append(Reason(
+            "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise in one chirp (5 dB are usual)",
+            "it is partly blocked, or the antennas point elsewhere; it is the reference of all phases",
+            "clear the line of sight; check the antennas' direction", 3.0,
+        ))  # fmt: skip
+    if phase_rad is not None and phase_rad > DIRECT_PHASE_CARE_RAD:
+        out.append(Reason(
+            "care", f"{board}: residual phase {phase_rad:.3f} rad from position to position (0.004 is usual)",
+            "a weak direct path, or a strong reflector near it", "look at the synchronisation table of the report", 2.5,
+        ))  # fmt: skip
+    return out
+
+
+def level_reasons(levels: Mapping[str, float | None]) -> list[Reason]:
+    """Judge metal's brightness relative to the direct path in each channel (None: not known)."""
+    out = []
+    for channel, level in levels.items():
+        if level is not None and not DIRECT_LEVELS[0] <= level <= DIRECT_LEVELS[1]:
+            weak = level > DIRECT_LEVELS[1]
+            state = "weak" if weak else "strong"
+            what = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+.0f} dB relative to it"
+            why = (
+                "something in its way weakens the direct path; the object disturbs its estimate"
+                if weak
+                else "the object is far weaker than the direct path: the antennas point elsewhere, or it is not metal"
+            )
+            do = "clear the line of sight from transmitter to receivers, and check the antennas' direction"
+            out.append(Reason("care", what, why, do, 3.5))
+    return out
+
+
+def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Reason]:
+    """Judge the patches; `refused` maps numbers of patches that are no plates to why (noise, several materials)."""
+    if patches == 0:
+        return [Reason(
+            "none", "no patch was found", "nothing in the image stands out from its background",
+            "check that the object lies on the plane and in the image (polysight image)", 9.0,
+        )]  # fmt: skip
+    if len(refused) == patches:
+        why = sorted(set(refused.values()))
+        return [Reason(
+            "none", f"none of the {patches} patches is a plate: {'; '.join(why)}",
+            "there is no flat object on the plane, or the data are noise",
+            "look at the images; check the direct path and the range profile (polysight doctor)", 9.0,
+        )]  # fmt: skip
+    by_reason: dict[str, list[int]] = {}
+    for label, what in refused.items():
+        by_reason.setdefault(what, []).append(label)
+    return [
+        Reason(
+            "care",
+            f"patch{'es' * (len(labels) > 1)} {', '.join(map(str, labels))} not judged: {what}",
+            "results hold for one flat plate per patch",
+            "move the plates apart, or draw their boxes (polysight label; process --labels)",
+            2.0,
+        )
+        for what, labels in by_reason.items()
+    ]
+
+
+def metal_reasons(
+    patch: str, likely: bool, certain: bool, given: bool, contradicted: bool, only_patch: bool
+) -> list[Reason]:
+    """Judge the metal reference `patch` ("patch 3").
+
+    By the other patches it is `likely` or `certain` to be metal, or `contradicted`; `only_patch`: there are no others.
+    `given`: the user chose it.
+    """
+    do = "lay a metal plate into the scene and name it (--metal X,Y,W,H), or use `polysight calibrate metal`"
+    if given and contradicted:
+        return [Reason(
+            "care" if likely or only_patch else "none",
+            f"the given metal reference ({patch}) does not look like metal",
+            "it reflects H and V differently, or relative to it the other patches are impossible materials", do, 8.0,
+        )]  # fmt: skip
+    if given or certain:
+        return []
+    if likely:
+        return [Reason(
+            "care", f"the metal reference ({patch}) is likely metal, not certainly",
+            "a wet or conducting plate could look like it; all permittivities depend on it", do, 2.8,
+        )]  # fmt: skip
+    why = "relative to it the other patches are impossible materials, or too few of them give evidence"
+    if only_patch:
+        why = "nothing else in the scene can show that it is metal"
+    return [Reason("none", f"no metal reference: {patch} is not shown to be metal", why, do, 8.0)]
+
+
+def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> list[Reason]:
+    """Judge leakage that was not measured; `relative_error` is its median effect on the permittivities."""
+    if measured or relative_error < LEAKAGE_SHARE:
+        return []
+    source = "estimated from the scene" if determined else "never measured; its prior is used"
+    return [Reason(
+        "care",
+        f"leakage was {source}: permittivities are uncertain by {100 * relative_error:.0f} %, names less reliable",
+        "the rig file has no leakage_std: leakage up to 0.1 of any phase is possible",
+        "measure it once with metal strips: `polysight leakage` (docs/how-to/calibration.md)", 1.5,
+    )]  # fmt: skip
+
+
+def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], theta_std_deg: float) -> list[Reason]:
+    """Judge the position of the plates' plane against the rig file."""
+    if not known:
+        return [Reason(
+            "care",
+            f"the plane was not found; the angle is the rig file's, +-{theta_std_deg:.2f} degrees",
+            "no patch has a clear echo", "measure the plane's distance, or scan a flat plate (polysight focus)", 2.0,
+        )]  # fmt: skip
+    if abs(offset_mm) > PLANE_GATE_MM:
+        return [Reason(
+            "none", f"the plates lie {offset_mm:+.0f} mm off the rig file's plane",
+            "they are at the edge of the range gate",
+            "measure geometry.object_distance_mm and correct the rig file", 7.0,
+        )]  # fmt: skip
+    out, tilt = [], max(abs(t) for t in tilt_deg)
+    if abs(offset_mm) > PLANE_FAR_MM:
+        out.append(Reason(
+            "care", f"the plates lie {offset_mm:+.1f} mm off the rig file's plane; the angle was corrected for it",
+            "the object is at another distance, or object_distance_mm is wrong",
+            "correct geometry.object_distance_mm in the rig file", 1.6,
+        ))  # fmt: skip
+    if tilt > PLANE_TILT_DEG:
+        out.append(Reason(
+            "care", f"the plates' plane is tilted by {tilt:.1f} degrees",
+            "tilted plates reflect past the scanned positions",
+            "lay the plates parallel to the stage", 1.4,
+        ))  # fmt: skip
+    return out
+
+
+def tilt_reasons(across_deg: Mapping[int, float]) -> list[Reason]:
+    """Judge the tilts of plates across the plane of incidence: patch number to degrees."""
+    tilted = {label: angle for label, angle in across_deg.items() if abs(angle) > PLATE_ACROSS_DEG}
+    if not tilted:
+        return []
+    worst = max(tilted, key=lambda label: abs(tilted[label]))
+    more = "" if len(tilted) == 1 else f" ({len(tilted)} patches in all)"
+    return [Reason(
+        "care", f"patch {worst} rises by {tilted[worst]:+.1f} degrees across the plane of incidence{more}",
+        "its illumination is corrected, but the polarisation turns with it: 5 to 13 % of a permittivity per degree",
+        "lay plates and metal flat; shim the tilted one", 1.3,
+    )]  # fmt: skip
+
+
+def passivity_reasons(gaining: Mapping[int, str]) -> list[Reason]:
+    """Judge patches whose permittivity is impossible for a passive material: number to the fault."""
+    return [
+        Reason(
+            "care", f"patch {label} has no permittivity: {what}",
+            "it points to leakage, a layered plate, a wrong metal reference, or H and V not on the same place",
+            "measure leakage; if the plate is thin, fit it as a layer (polysight permittivity --layer)", 2.2,
+        )
+        for label, what in gaining.items()
+    ]  # fmt: skip
+
+
+def brightness_reasons(off: Mapping[int, float]) -> list[Reason]:
+    """Judge brightness: patch number to ln of |H| over that of a half space of its permittivity."""
+    out = []
+    for label, ln in off.items():
+        if abs(ln) > BRIGHTNESS_CARE:
+            share, than = 100 * abs(float(np.expm1(ln))), "brighter" if ln > 0 else "darker"
+            out.append(Reason(
+                "care", f"patch {label} is {share:.0f} % {than} than a half space of its permittivity",
+                "it may be thin, layered, rough, or partly in a shadow; the permittivity of a thin plate is then wrong",
+                "fit it as a layer (polysight permittivity --layer), or lay it flat and free", 1.7,
+            ))  # fmt: skip
+    return out
+
+
+def incidence_reasons(angle_deg: float, library_deg: float | None) -> list[Reason]:
+    """Judge the incidence angle against the library's."""
+    if library_deg is None or abs(angle_deg - library_deg) <= LIBRARY_ANGLE_DEG:
+        return []
+    return [Reason(
+        "care", f"the scan has an incidence angle of {angle_deg:.2f} degrees, the library {library_deg:.2f}",
+        "the ratio of a material changes by 10 % in a degree: names may be wrong",
+        "make a library at this angle, or move the plane", 1.8,
+    )]  # fmt: skip

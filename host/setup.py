@@ -1,0 +1,70 @@
+"""What pyproject.toml cannot say: installing compiles `polysight/sync/*.c`, and a wheel is for one platform, any Python.
+
+With POLYSIGHT_WHEEL set to a platform of `polysight/sync/build.py`, wheels are made for that one.
+"""
+
+import importlib.util
+import os
+import shutil
+import sys
+from pathlib import Path
+
+from setuptools import Distribution, setup
+from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools.command.build_py import build_py
+
+spec = importlib.util.spec_from_file_location("build_kernels", Path("polysight", "sync", "build.py"))
+kernels = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(kernels)
+TOP = Path("..")
+TARGET = os.environ.get("POLYSIGHT_WHEEL", "")
+
+
+def copy_data(folder):
+    """Copy the rig file and the scenes into the package that is built; sources used in place read them where they lie."""
+    files = [Path("instrument.toml"), *(p.relative_to(TOP) for p in (TOP / "examples").rglob("*.toml"))]
+    for file in files:
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(TOP / file, folder / file)
+
+
+class PlatformDistribution(Distribution):
+    """A distribution with compiled code."""
+
+    def has_ext_modules(self):
+        """Yes: not through Python's own headers, so setuptools cannot know."""
+        return True
+
+
+class BuildWithKernels(build_py):
+    """Copies the package and its data files, and compiles the kernels into it; into the sources where these are used in place."""
+
+    def run(self):
+        """Without a compiler that works the same runs in NumPy, more slowly: say so, and go on."""
+        super().run()
+        sources = Path("polysight", "sync")
+        folder = sources if self.editable_mode else Path(self.build_lib) / sources
+        if not self.editable_mode:
+            copy_data(Path(self.build_lib, "polysight", "data"))
+        try:
+            kernels.build(folder.resolve(), TARGET)
+        except kernels.BuildError as error:
+            if TARGET:
+                raise
+            sys.stderr.write(f"polysight: synchronisation was not compiled and will be slow: {error}\n")
+
+
+class PlatformWheel(bdist_wheel):
+    """The kernels need no Python: one wheel serves all versions on a platform."""
+
+    def get_tag(self):
+        """Such as py3-none-linux_x86_64."""
+        return "py3", "none", TARGET or super().get_tag()[2]
+
+
+setup(
+    distclass=PlatformDistribution,
+    cmdclass={"build_py": BuildWithKernels, "bdist_wheel": PlatformWheel},
+    # Asked for at building, and only where it is needed: 100 MB.
+    setup_requires=["ziglang"] if TARGET or kernels.find_compiler() is None else [],
+)

@@ -1,0 +1,360 @@
+"""The published data set as libraries: its `materials/`, its `labels/`, and our own images of its raw data.
+
+Each source is judged separately. Materials get the names of Table 2's rows, if `row_of` finds a row for their names.
+`train_authors` makes one library of the first two sources for `polysight train`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from polysight.materials import (
+    METALS,
+    Entry,
+    LabelledScan,
+    Library,
+    angle_in_text,
+    entries_of_boxes,
+    fit_library,
+    image_orientation,
+    label_folders,
+    read_labelled_scan,
+    read_material,
+)
+from polysight.polarimetry import correct_leakage
+from polysight.store import COLLECTION, open_npz, read_settings, rig_of
+from polysight_papers.sensys2026.table2 import Published, table2
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+from polysight_shared.files import read_json
+from polysight_shared.geometry import incidence_deg
+
+T = TypeVar("T")
+SAME_ANGLE_DEG = 2.5
+"""Largest difference of a scan's incidence angle from the paper's angles, 55 and 60 degrees."""
+MATERIALS, LABELS, IMAGES = "materials/", "labels/", "images made here"
+_ALIKE = 0.35  # least correlation of two images of one scan
+
+# Names of materials.
+_FILLING = {"with", "w", "in", "on", "mm", "percent", "sample", "sheet", "plate", "the", "of", "box", "container"}
+_ALIASES = {"fibre": "fiber", "fiberglass": "fiber glass", "plywood": "wood", "soya": "soy", "salts": "salt"}
+_CONTAINERS = {"glass", "plastic"}
+_ENOUGH = 0.5  # least share of common words
+
+PIXELS = 16
+"""Pixels of a patch, at even intervals, as in our own libraries."""
+
+
+@dataclass(frozen=True)
+class AuthorsData:
+    """The data set that was read.
+
+    Attributes
+    ----------
+    folder, base
+        Folder of the data set, and the rig file for values that it lacks.
+    sources
+        `materials/`, `labels/`, `images made here` to a library with the names of Table 2; without empty ones.
+    meaning
+        Their names to the rows of Table 2.
+    notices
+        Skipped files and names, and assumptions.
+    """
+
+    folder: Path
+    base: Instrument
+    sources: dict[str, Library]
+    meaning: dict[str, int]
+    notices: tuple[str, ...]
+
+    @property
+    def simulated(self) -> bool:
+        """True if any of it was simulated."""
+        return any(library.simulated for library in self.sources.values())
+
+    def at(self, source: str, numbers: range, angle_deg: float) -> Library:
+        """Return the entries of a source for these rows of Table 2, under about this angle."""
+        names = {m.name for m in table2() if m.number in numbers}
+        library = self.sources[source]
+        near = (e for e in library.entries if abs(e.incidence_deg - angle_deg) <= SAME_ANGLE_DEG)
+        return Library(tuple(e for e in near if e.name in names), {}, library.note)
+
+
+def read_authors(folder: Path, config: Path, images: Path | None = None, names: Path | None = None) -> AuthorsData:
+    """Read a data set.
+
+    Parameters
+    ----------
+    folder
+        Holds `materials/`, `labels/`, or both; `unsynced/` or `raw/` beside them tell the labelled scans' angles.
+    config
+        Rig file, for what the files do not tell.
+    images
+        Folder with what `polysight process` made of its scans, `<scan>/image.npz`.
+    names
+        JSON file that says which row of Table 2 a name means.
+
+    Raises
+    ------
+    DataError
+        when nothing of it can be used.
+    """
+    if not folder.is_dir():
+        raise DataError(
+            f"{folder}: no such folder",
+            "the path is wrong",
+            "give the folder with materials/",
+            code=ErrorCode.FILE_MISSING,
+        )
+    base, notices, found = load_instrument(config), [], {}
+    if pickles := sorted((folder / "materials").glob("*.pkl")):
+        found[MATERIALS] = _readable(read_material, pickles, notices)
+    scans = _readable(read_labelled_scan, label_folders(folder / "labels"), notices)
+    if scans:
+        how = image_orientation(scans)
+        notices.append(f"boxes of labels/ are read with {how}: so they explain the images' brightness best")
+        turned = [s.oriented(how) for s in scans]
+        angles = {s.scan: _angle(folder, s, base, notices) for s in scans}
+        found[LABELS] = _entries(turned, angles, notices)
+        if images is not None:
+            ours = [s for scan in turned if (s := _imaged_here(scan, images, notices)) is not None]
+            found[IMAGES] = _entries(ours, angles, notices)
+    elif images is not None:
+        notices.append("images made here are left out: labels/ holds no boxes to look at them with")
+    meaning, sources = _named({k: e for k, e in found.items() if e}, read_names(names) if names else {}, notices)
+    if not sources:
+        raise DataError(
+            f"{folder}: neither materials/*.pkl nor labels/<scan> with a known material is in it",
+            "; ".join(notices) or "the download is not complete, or this is another folder",
+            "give the folder of the published data set; `polysight reproduce --names FILE` says what its names mean",
+        )
+    return AuthorsData(folder, base, sources, meaning, tuple(dict.fromkeys(notices)))
+
+
+def _readable(read: Callable[[Path], T], paths: Sequence[Path], notices: list[str]) -> list[T]:
+    """Read the files at these paths; damaged or refused files are listed in the notices and skipped."""
+    out = []
+    for path in paths:
+        try:
+            out.append(read(path))
+        except DataError as e:
+            notices.append(f"left out: {e.what} ({e.why})" if e.why else f"left out: {e.what}")
+    return out
+
+
+def _entries(scans: list[LabelledScan], angles: Mapping[str, float], notices: list[str]) -> list[Entry]:
+    entries = []
+    for scan in scans:
+        try:
+            entries += entries_of_boxes(scan, angles[scan.scan])
+        except DataError as e:
+            notices.append(f"left out: {e.what}")
+    return entries
+
+
+def _angle(folder: Path, scan: LabelledScan, base: Instrument, notices: list[str]) -> float:
+    """Return the incidence angle of a labelled scan: from its raw data, else from its text, else the rig's."""
+    for form in ("unsynced", "raw"):
+        path = folder / form / scan.scan
+        if (path / COLLECTION).exists():
+            rig, found = rig_of(read_settings(path), base, path)
+            notices += found
+            return incidence_deg(rig, rig.receivers[0])
+    if (angle := angle_in_text([scan.description, scan.scan])) is not None:
+        return angle
+    angle = incidence_deg(base, base.receivers[0])
+    notices.append(f"{scan.scan}: no file has its incidence angle; that of the rig file is used, {angle:.1f} degrees")
+    return angle
+
+
+def _imaged_here(scan: LabelledScan, images: Path, notices: list[str]) -> LabelledScan | None:
+    """Return the scan's boxes with our own images, in the orientation of the authors' images."""
+    file = images / scan.scan / "image.npz"
+    try:
+        with open_npz(file) as z:
+            h, v, valid = z["h"], z["v"], z["valid"]
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile, DataError) as e:
+        notices.append(f"{scan.scan}: no image made here: {e}")
+        return None
+    seen = valid & np.isfinite(h) & np.isfinite(v)
+    h, v = (np.where(seen, x, 0) for x in (h, v))
+    theirs = np.abs(scan.h)
+    ways = [(k, flip) for k in range(4) for flip in (False, True)]
+
+    def turn(image: np.ndarray, way: tuple[int, bool]) -> np.ndarray:
+        return np.rot90(image[::-1] if way[1] else image, way[0])
+
+    alike = {w: _correlation(np.abs(turn(h, w)), theirs) for w in ways if turn(h, w).shape == theirs.shape}
+    best = max(alike, key=lambda w: alike[w], default=None)
+    if best is None or not alike[best] >= _ALIKE:
+        notices.append(f"{scan.scan}: the image made here does not show what sar_h.npy shows; left out")
+        return None
+    return replace(scan, h=turn(h, best), v=turn(v, best))
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-30))
+
+
+def _named(
+    found: Mapping[str, list[Entry]], given: Mapping[str, int], notices: list[str]
+) -> tuple[dict[str, int], dict[str, Library]]:
+    """Rename the entries as in Table 2; entries of unknown names are skipped and listed in the notices."""
+    rows = rows_of(((e.name, e.thickness_mm) for entries in found.values() for e in entries), given)
+    titles = {m.number: m.name for m in table2()}
+    sources, unknown = {}, set()
+    for source, entries in found.items():
+        kept = []
+        for e in entries:
+            number = rows.get((e.name, e.thickness_mm))
+            if number is None:
+                unknown.add(e.name)
+            else:
+                kept.append(replace(e, name=titles[number]))
+        if kept:
+            sources[source] = Library(tuple(kept), {}, source)
+    if unknown:
+        skipped = ", ".join(sorted(unknown))
+        notices.append(
+            f"not judged, names without a row of Table 2: {skipped}; `polysight reproduce --names FILE` says what"
+            " they mean"
+        )
+    meaning = {f"{n}, {t:g} mm" if t else n: number for (n, t), number in rows.items()}
+    return dict(sorted(meaning.items())), sources
+
+
+def words(name: str) -> frozenset[str]:
+    """Return words and numbers of a name, in lower case; "metal" for metals."""
+    text = re.sub(r"\\?\bw/?\s", " with ", name.lower().replace("_", " "))
+    out: list[str] = []
+    for word in re.findall(r"[a-z]+|\d+(?:\.\d+)?", text):
+        if word in _FILLING:
+            continue
+        if word[0].isdigit():
+            number = f"0.{word[1:]}" if re.fullmatch(r"0\d+", word) else word  # "pet_05mm"
+            out.append(f"{float(number):g}")
+        else:
+            out += ["metal"] if word in METALS else str(_ALIASES.get(word, word)).split()
+    return frozenset(out)
+
+
+def _alike(theirs: frozenset[str], row: Published) -> float:
+    """Return the share of common words and numbers; the container of a row is optional."""
+    ours = words(row.name)
+    optional = ours & _CONTAINERS if " with " in row.name or "(with" in row.name else frozenset()
+    union = (ours | theirs) - (optional - theirs)
+    return len(ours & theirs) / len(union) if union else 0.0
+
+
+def row_of(name: str, thickness_mm: float | None = None) -> int | None:
+    """Return the number of the row of Table 2 for a name, or None."""
+    theirs = words(name)
+    if "metal" in theirs:
+        return 1
+    tries = [theirs]
+    if thickness_mm is not None:
+        tries.insert(0, theirs | {f"{thickness_mm:g}"})
+    best = sorted(((max(_alike(t, row) for t in tries), row.number) for row in table2()), key=lambda b: -b[0])
+    (first, number), (second, _) = best[:2]
+    return number if first >= _ENOUGH and first > second else None
+
+
+def read_names(path: Path) -> dict[str, int]:
+    """Read a file of names: JSON, {name: row of Table 2}. Raises DataError."""
+    try:
+        content = read_json(path)
+        given = {str(name): int(number) for name, number in content.items()}
+    except (OSError, ValueError, AttributeError, TypeError) as e:
+        raise DataError(
+            f"{path}: not a list of names: {e}",
+            'expected JSON, {"their name": row of Table 2}',
+            code=ErrorCode.FILE_UNREADABLE,
+        ) from None
+    wrong = [n for n in given.values() if not 1 <= n <= len(table2())]
+    if wrong:
+        raise DataError(
+            f"{path}: Table 2 has no row {wrong[0]}", f"its rows are 1 to {len(table2())}", code=ErrorCode.VALUE_INVALID
+        )
+    return given
+
+
+def rows_of(
+    names: Iterable[tuple[str, float | None]], given: Mapping[str, int] | None = None
+) -> dict[tuple[str, float | None], int]:
+    """Return the rows of names with their thicknesses; names without a row are skipped."""
+    found = {(n, t): (given or {}).get(n) or row_of(n, t) for n, t in set(names)}
+    return {key: number for key, number in found.items() if number is not None}
+
+
+def train_authors(folder: Path, config: Path, out: Path) -> int:
+    """Make a library from `materials/` and `labels/`, fitted for each incidence angle; returns the exit status.
+
+    Raises
+    ------
+    DataError
+        when nothing can be used, or no angle has scans enough to choose a model with.
+    """
+    data = read_authors(folder, config)
+    for notice in data.notices:
+        sys.stderr.write(f"note: {notice}\n")
+    library = authors_library(data)
+    fits: dict[str, Any] = {}
+    fitted: list[Entry] = []
+    for angle in library.angles_deg:
+        own = library.at(angle)
+        try:
+            fits |= fit_library(own).fit["angles"]
+            fitted += own.entries
+        except DataError as e:
+            sys.stderr.write(f"note: {angle:g} degrees left out: {e.what}\n")
+    if not fitted:
+        raise DataError(
+            f"{folder}: no angle has scans enough", "models are chosen with whole scans left out", "add more scans"
+        )
+    library = Library(tuple(fitted), {"angles": fits}, library.note)
+    library.save(out)
+    scores = {a: {k: f[k] for k in ("model", "pixel_accuracy", "patch_accuracy")} for a, f in fits.items()}
+    sys.stdout.write(
+        f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans\n"
+        f"{json.dumps(scores, indent=1)}\n"
+    )
+    return 0
+
+
+def authors_library(data: AuthorsData) -> Library:
+    """Return the patches of all sources except our own images, without leakage and without duplicates."""
+    a, b = complex(*data.base.polarimetry.leakage_h), complex(*data.base.polarimetry.leakage_v)
+    kept: dict[tuple[str, str, int], list[Entry]] = {}
+    for source, library in data.sources.items():
+        if source == IMAGES:
+            continue
+        found: dict[tuple[str, str, int], list[Entry]] = {}
+        for e in library.entries:
+            found.setdefault((e.name, e.scan, round(e.incidence_deg)), []).append(_without_leakage(e, a, b))
+        kept = {**kept, **found}
+    entries = tuple(e for group in kept.values() for e in group)
+    return Library(entries, {}, f"{'simulated files' if data.simulated else 'files'} of {data.folder.name}")
+
+
+def _without_leakage(entry: Entry, leak_hv: complex, leak_vh: complex) -> Entry:
+    """Return an entry with at most `PIXELS` pixels, with the cross-polar leakage removed."""
+    at = np.unique(np.linspace(0, entry.p.size - 1, min(PIXELS, entry.p.size)).round().astype(int))
+    v = entry.v[at].astype(np.complex128)  # a common phase of H and V has no effect
+    h, v = correct_leakage(entry.p[at] * v, v, leak_hv, leak_vh)
+    return replace(
+        entry,
+        h=np.abs(h).astype(np.float32),
+        v=np.abs(v).astype(np.float32),
+        p=(h / v).astype(np.complex64),
+    )

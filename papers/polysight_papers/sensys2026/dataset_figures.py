@@ -1,0 +1,333 @@
+"""Fig. 18, 20 and 21 from the published files, beside the published values.
+
+Two ways to keep training and test apart: whole scans left out, which judges materials that at least two scans hold; and
+by pixel, which is optimistic, because pixels of one patch know each other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from polysight.materials import (
+    CHANNELS,
+    DISCRIMINANT,
+    PAPER,
+    Library,
+    Samples,
+    Score,
+    concentrations,
+    fit_concentration,
+    polarisation_angle_rad,
+    score,
+)
+from polysight.report import INK, PALETTE
+from polysight_papers.sensys2026.classification import confusion_figure
+from polysight_papers.sensys2026.concentration import WATER
+from polysight_papers.sensys2026.dataset import AuthorsData
+from polysight_papers.sensys2026.item import Item, Picture, Table, dress, new_figure, percent
+from polysight_papers.sensys2026.patches import groups
+from polysight_papers.sensys2026.table2 import published, table2
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+
+SECOND_ANGLE_DEG = 55.0
+TASKS = ("solids", "solids, two angles", "liquids", "powders")
+ALL, AT_LEAST = 1500, 6
+"""Pixels of a task, and least number of pixels of a patch."""
+LEFT_OUT = "scans left out"
+OPTIMISTIC = "by pixel (optimistic)"
+
+
+def task_samples(data: AuthorsData, source: str, task: str) -> Samples | None:
+    """Return the pixels of a task of Fig. 18; None with fewer than two materials in the source."""
+    name, _, two = task.partition(", ")
+    group = groups()[name]
+    numbers = range(group.materials[0].number, group.materials[-1].number + 1)
+    first = data.at(source, numbers, group.angle_deg)
+    if not two:
+        return _samples(first) if len(first.names) > 1 else None
+    second = data.at(source, numbers, SECOND_ANGLE_DEG)
+    if not first.entries or not second.entries:
+        return None
+    first, second = paired(first, second)
+    shared = {(e.name, e.scan) for e in first.entries} & {(e.name, e.scan) for e in second.entries}
+    if len({name for name, _ in shared}) < 2:
+        return None
+    return _samples(first).joined(_samples(second))
+
+
+def _samples(library: Library) -> Samples:
+    """Return pixels of a library, of each patch so few that all can be compared with all."""
+    return Samples.of(library, max(AT_LEAST, ALL // len(library.entries)))
+
+
+def paired(first: Library, second: Library) -> tuple[Library, Library]:
+    """Scans of two angles in pairs, those with most materials in common first; a pair has one name in both.
+
+    No scan is in two pairs, so that a pair can be left out as a whole. Scans without a partner are left out.
+    """
+    held = [{s: {e.name for e in lib.entries if e.scan == s} for s in lib.scans} for lib in (first, second)]
+    pairs = sorted(
+        ((len(a & b), s, t) for s, a in held[0].items() for t, b in held[1].items() if a & b),
+        key=lambda p: (-p[0], p[1], p[2]),
+    )
+    names: tuple[dict[str, str], dict[str, str]] = ({}, {})
+    for _, s, t in pairs:
+        if s not in names[0] and t not in names[1]:
+            names[0][s] = names[1][t] = f"{s} and {t}"
+
+    def renamed(library: Library, to: dict[str, str]) -> Library:
+        return Library(tuple(replace(e, scan=to[e.scan]) for e in library.entries if e.scan in to), {}, library.note)
+
+    return renamed(first, names[0]), renamed(second, names[1])
+
+
+def repeated(samples: Samples) -> Samples | None:
+    """The materials that at least two scans hold; None when these are fewer than two, or the scans fewer than three.
+
+    The classifiers fit their weights with scans kept apart: two must remain when one is left out.
+    """
+    scans = {n: np.unique(samples.groups[samples.names == n]).size for n in np.unique(samples.names)}
+    kept = samples.take(np.isin(samples.names, [n for n, count in scans.items() if count > 1]))
+    return kept if np.unique(kept.names).size > 1 and np.unique(kept.groups).size > 2 else None
+
+
+def _halved(samples: Samples) -> Samples:
+    """Pixels of one scan as if of two, every other pixel each: only for the split by pixel, which is no better."""
+    if np.unique(samples.groups).size > 1:
+        return samples
+    return replace(samples, groups=np.array(["even", "odd"])[np.arange(samples.names.size) % 2])
+
+
+class Judgements:
+    """Scores of the classifiers on a data set; each is computed once."""
+
+    def __init__(self, data: AuthorsData) -> None:
+        self.data = data
+        self._samples: dict[tuple[str, str], Samples | None] = {}
+        self._scores: dict[tuple[str, str, str, str], tuple[Score, Score | None]] = {}
+
+    def samples(self, source: str, task: str) -> Samples | None:
+        """Return the pixels of a task; None with fewer than two materials in the source."""
+        if (source, task) not in self._samples:
+            self._samples[source, task] = task_samples(self.data, source, task)
+        return self._samples[source, task]
+
+    def found(self, tasks: tuple[str, ...]) -> list[tuple[str, str, Samples]]:
+        """Return source, task and pixels of all that can be judged. Raises DataError if there is nothing."""
+        found = [(s, t, x) for s in self.data.sources for t in tasks if (x := self.samples(s, t)) is not None]
+        if not found:
+            raise DataError(
+                "nothing to classify: no source holds two materials of one group under its angle",
+                "solids and powders are judged at 60 degrees, liquids at 55, as in the paper",
+                "see what the names were taken for, and --names",
+                code=ErrorCode.NO_DATA,
+            )
+        return found
+
+    def judged(self, source: str, task: str, model: str, channels: str = "H+V+P") -> tuple[Score, Score | None]:
+        """Return the scores of a model by pixel, and with whole scans left out if possible."""
+        key = source, task, model, channels
+        samples = self.samples(source, task)
+        if samples is None:
+            raise DataError(f"{source} has no {task}", code=ErrorCode.NO_DATA)
+        if key not in self._scores:
+            several = repeated(samples)
+            mixed = score(_halved(samples), model, channels, by_pixel=True)
+            self._scores[key] = (
+                mixed,
+                (None if several is None else score(several, model, channels, folds=np.unique(several.groups).size)),
+            )
+        return self._scores[key]
+
+
+def authors_fig18(judge: Judgements) -> Item:
+    """Accuracy of the paper's KNN and of the discriminant, with confusion matrices. Raises DataError."""
+    printed, rows, content, pictures = published()["classification"], [], {}, {}
+    for source, task, samples in judge.found(TASKS):
+        name, _, two = task.partition(", ")
+        paper = printed[name]["two_angles_percent" if two else "all_percent"] / 100
+        several = repeated(samples)
+        scores = [s for m in (PAPER, DISCRIMINANT) for s in judge.judged(source, task, m)]
+        h_only = judge.judged(source, task, PAPER, "H")
+        names, held = np.unique(samples.names), 0 if several is None else np.unique(several.names).size
+        rows.append((
+            f"{names.size} {task}", source, str(np.unique(samples.groups).size),
+            "–" if two else percent(printed[name]["h_percent"] / 100), *(_share(s) for s in h_only), percent(paper),
+            *(_share(s) for s in scores), "–" if scores[3] is None else percent(scores[3].patches), str(held),
+        ))  # fmt: skip
+        content[f"{task}, {source}"] = {
+            "published_percent": 100 * paper,
+            "scores": [None if s is None else asdict(s) for s in (*scores, *h_only)],
+            "judged_with_scans_left_out": held,
+        }
+        split = LEFT_OUT if several is not None else OPTIMISTIC
+        h, best = (h_only[0], scores[2]) if several is None else (h_only[1], scores[3])
+        if h is None or best is None:
+            continue
+        panels = [
+            (h, h.confusion, f"H alone: {percent(h.pixels)}\n{PAPER}"),
+            (best, best.confusion, f"H, V and P, pixels alone: {percent(best.pixels)}\n{DISCRIMINANT}"),
+            (best, best.patch_confusion, f"H, V and P, by patch: {percent(best.by_patch)}\n{DISCRIMINANT}"),
+        ]
+        fig = confusion_figure([m for m in table2() if m.name in best.names], panels)
+        key = f"{task}-{source}".replace(", ", "-").replace(" ", "-").replace("/", "")
+        pictures[key] = Picture(
+            fig, f"{task[0].upper()}{task[1:]}, {source}, {split}. Rows are the truth, adding to 100 %."
+        )
+    head = (
+        "Task", "source", "scans", "H, published", f"H, KNN {OPTIMISTIC}", f"H, KNN {LEFT_OUT}", "H+V+P, published",
+        f"KNN, {OPTIMISTIC}", f"KNN, {LEFT_OUT}", f"discriminant, {OPTIMISTIC}", f"discriminant, {LEFT_OUT}",
+        "discriminant, patches, scans left out", "materials in two scans or more",
+    )  # fmt: skip
+    return Item(
+        "fig18",
+        "Fig. 18: classification of solids, liquids and powders",
+        (
+            "The paper does not say how training and test pixels were kept apart; its numbers fit a split by pixel,"
+            " which lets a patch know itself and is optimistic. With whole scans left out no pixel of a test scan was"
+            " trained on; only materials that two scans or more hold can be judged so (last column), and a dash stands"
+            " where these, or the scans, are too few.",
+            "Solids and powders are taken at 60 degrees, liquids at 55; the second angle is 55. Two angles: scans in"
+            " pairs, those with most materials in common, and pairs left out.",
+        ),
+        (Table("Share of pixels named right, mean over materials", head, tuple(rows)),),
+        pictures,
+        content,
+    )
+
+
+def authors_fig20(judge: Judgements) -> Item:
+    """H, V, P alone and together by the paper's KNN. Raises DataError."""
+    printed, tasks, rows, content = published()["channels_percent"], ("solids", "liquids", "powders"), [], {}
+    found = judge.found(tasks)
+    sources = list(dict.fromkeys(s for s, _, _ in found))
+    fig = new_figure(8.4, 4.2)
+    ax = fig.subplots()
+    bars = [("published", [printed[c] for c in CHANNELS])]
+    for source in sources:
+        mine = [(t, x) for s, t, x in found if s == source]
+        means: dict[str, tuple[float, float | None]] = {}
+        for channel in CHANNELS:
+            pairs = [judge.judged(source, t, PAPER, channel) for t, _ in mine]
+            weight = [np.unique(x.names).size for _, x in mine]
+            mixed = float(np.average([p[0].pixels for p in pairs], weights=weight))
+            left = [(p[1], len(p[1].names)) for p in pairs if p[1] is not None]
+            held = float(np.average([s.pixels for s, _ in left], weights=[n for _, n in left])) if left else None
+            means[channel] = (mixed, held)
+            rows.append((channel, source, f"{printed[channel]:.2f} %", percent(mixed), percent(held),
+                         ", ".join(f"{t} {_share(p[1])}" for (t, _), p in zip(mine, pairs, strict=True))))  # fmt: skip
+            content[f"{channel}, {source}"] = {
+                "published_percent": printed[channel], "by_pixel": mixed, "scans_left_out": held,
+            }  # fmt: skip
+        bars.append((f"{source}, {OPTIMISTIC}", [100 * means[c][0] for c in CHANNELS]))
+        if all(means[c][1] is not None for c in CHANNELS):
+            bars.append((f"{source}, {LEFT_OUT}", [100 * (means[c][1] or 0.0) for c in CHANNELS]))
+    width = 0.84 / len(bars)
+    for k, (label, heights) in enumerate(bars):
+        at = np.arange(len(CHANNELS)) + width * (k - (len(bars) - 1) / 2)
+        drawn = ax.bar(
+            at, heights, 0.92 * width, label=label, color=PALETTE[k], hatch="//" if OPTIMISTIC in label else ""
+        )
+        ax.bar_label(drawn, fmt="%.0f", fontsize=7)
+    dress(ax, "Accuracy by channel, weighted KNN of the paper", "", "pixels named right (%)")
+    ax.set_xticks(range(len(CHANNELS)), list(CHANNELS))
+    ax.set_ylim(0, 135)
+    ax.legend(fontsize=8, frameon=False, loc="upper left", ncols=2)
+    head = ("Channels", "source", "published", OPTIMISTIC, LEFT_OUT, f"each group, {LEFT_OUT}")
+    return Item(
+        "fig20",
+        "Fig. 20: H, V and P alone and together",
+        (
+            "Mean over the materials of the groups that are in the data, each classified among its own group; the"
+            " paper does not say how its mean was taken.",
+        ),
+        (Table("Share of pixels named right by the paper's KNN", head, tuple(rows)),),
+        {"channels": Picture(fig, "Accuracy of each channel, published and from the files.")},
+        content,
+    )
+
+
+def authors_fig21(data: AuthorsData) -> Item:
+    """Concentration of sugar by a line through the other concentrations. Raises DataError."""
+    printed = published()["sugar_median_error_percent"]
+    tables, content, plots, why = [], {}, [], []
+    for source, library in data.sources.items():
+        known = concentrations(library.names, {WATER: 0.0})
+        angles = [e.incidence_deg for e in library.entries if e.name in known]
+        if not angles:
+            continue
+        best = max(set(angles), key=lambda a: len({e.name for e in library.entries if abs(e.incidence_deg - a) < 1}))
+        near = Library(tuple(e for e in library.entries if e.name in known and abs(e.incidence_deg - best) < 1))
+        try:
+            result = fit_concentration(near, {WATER: 0.0})
+        except DataError as e:
+            why.append(f"{source}: {e.what}")
+            continue
+        x = np.array([float(np.median(polarisation_angle_rad(e.p))) for e in near.entries])
+        y = np.array([known[e.name] for e in near.entries])
+        seen = float(np.median(np.abs(result.line.percent(x) - y)))
+        rows = []
+        for name in sorted(near.names, key=lambda n: known[n]):
+            of = [r for r in result.left_out if r.name == name]
+            error = np.median([abs(r.percent - r.true_percent) for r in of])
+            rows.append((name, f"{known[name]:.1f} %", f"{np.mean([r.percent for r in of]):.2f} %", str(len(of)),
+                         f"{error:.2f} %"))  # fmt: skip
+        rows.append(("median error, each concentration left out", f"published {printed:g} %",
+                     f"{result.median_error:.3f} %", str(len(result.left_out)), ""))  # fmt: skip
+        rows.append(("median error, line has seen them (optimistic)", "", f"{seen:.3f} %", "", ""))
+        tables.append(Table(f"Concentration estimated from the others, {source}, {best:.0f} degrees",
+                            ("Solution", "true", "found", "patches", "median error"), tuple(rows)))  # fmt: skip
+        content[source] = {
+            "published_median_error_percent": printed, "median_error_percent": result.median_error,
+            "median_error_seen_percent": seen, "angle_deg": best, "line": asdict(result.line),
+            "left_out": [asdict(r) for r in result.left_out],
+        }  # fmt: skip
+        plots.append((source, x, y, result))
+    if not plots:
+        raise DataError(
+            "no sugar solutions to draw a line through",
+            "; ".join(why) or "none of the names means water or cane sugar",
+            "see what the names were taken for, and --names",
+            code=ErrorCode.NO_DATA,
+        )
+    return Item(
+        "fig21",
+        "Fig. 21: concentration of sugar in water",
+        (
+            "A straight line from the polarisation angle to the concentration, each concentration estimated by a line"
+            " through the others. The paper does not say whether its line had seen the concentration it was asked for;"
+            " the last row is for a line that has.",
+        ),
+        tuple(tables),
+        {"sugar": Picture(_sugar_figure(plots, printed), "The lines, and the distribution of errors.")},
+        content,
+    )
+
+
+def _sugar_figure(plots: list[tuple[str, Any, Any, Any]], printed: float) -> Any:
+    fig = new_figure(11.0, 4.3)
+    left, right = fig.subplots(1, 2)
+    for k, (source, x, y, result) in enumerate(plots):
+        colour = (PALETTE[0], PALETTE[6], PALETTE[3])[k % 3]
+        angle = np.degrees(x)
+        at = np.linspace(angle.min() - 0.1, angle.max() + 0.1, 50)
+        left.plot(angle, y, "osD"[k % 3], ms=4, color=colour, label=source)
+        left.plot(at, result.line.percent(np.radians(at)), color=colour, lw=1.2)
+        error = np.sort([abs(r.percent - r.true_percent) for r in result.left_out])
+        share = np.arange(error.size + 1) / error.size
+        label = f"{source}: median {result.median_error:.3f} %"
+        right.step(np.concatenate([[0], error]), share, where="post", color=colour, label=label)
+    right.axvline(printed, color=INK, ls="--", lw=1.2, label=f"published median {printed:g} %")
+    dress(left, "Concentration by polarisation angle", "polarisation angle arctan |P| (degrees)", "sugar (% by weight)")
+    dress(right, "Error, each concentration left out", "error (% by weight)", "share of patches")
+    left.legend(fontsize=8, frameon=False)
+    right.legend(fontsize=8, frameon=False)
+    return fig
+
+
+def _share(s: Score | None) -> str:
+    return percent(None if s is None else s.pixels)

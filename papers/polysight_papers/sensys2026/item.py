@@ -1,0 +1,86 @@
+"""Structure of a reproduced table or figure, for `polysight reproduce` and its page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from polysight.report import INK, MUTED
+
+MARKERS = "osD^vP*X<>"
+
+
+@dataclass(frozen=True)
+class Run:
+    """Options of a run: quick or full, and the rig file of the scans to simulate."""
+
+    quick: bool = False
+    config: Path = Path("instrument.toml")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts; also written as CSV."""
+
+    caption: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure and the sentence below it."""
+
+    figure: Figure
+    caption: str
+
+
+@dataclass(frozen=True)
+class Item:
+    """A reproduced table or figure.
+
+    Attributes
+    ----------
+    key, title
+        Short name ("fig18") and heading.
+    text
+        Paragraphs: the method, and the comparison with the published values.
+    tables, pictures
+        Shown in this order; pictures by file name.
+    data
+        Numbers for the JSON file.
+    """
+
+    key: str
+    title: str
+    text: tuple[str, ...]
+    tables: tuple[Table, ...] = ()
+    pictures: dict[str, Picture] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of this size, inches."""
+    fig = Figure(figsize=(width, height), dpi=130, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    return fig
+
+
+def dress(ax: Axes, title: str, x: str, y: str) -> None:
+    """Set the title, the axis labels and a light grid."""
+    ax.set_title(title, loc="left", fontsize=10.5, color=INK, fontweight="bold")
+    ax.set_xlabel(x, fontsize=9, color=MUTED)
+    ax.set_ylabel(y, fontsize=9, color=MUTED)
+    ax.tick_params(labelsize=8, colors=MUTED)
+    ax.grid(color="#e6e9ee", linewidth=0.8)
+    ax.set_axisbelow(True)
+
+
+def percent(share: float | None) -> str:
+    """Format a share as a percentage with two decimals; a dash for None."""
+    return "–" if share is None else f"{100 * share:.2f} %"

@@ -1,0 +1,201 @@
+"""`polysight reproduce`: make items (tables and figures), write their files, then the page."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import sys
+from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from matplotlib.figure import Figure
+
+from polysight.jobs.output import steps
+from polysight.products import write_atomically, write_json
+from polysight.report import STAMP, png
+from polysight_papers.sensys2026.classification import fig18, fig20
+from polysight_papers.sensys2026.concentration import fig21
+from polysight_papers.sensys2026.images import fig4, fig13, fig14, fig19
+from polysight_papers.sensys2026.item import Item, Run, Table
+from polysight_papers.sensys2026.permittivities import fig3, fig16, fig17, table2_item
+from polysight_papers.sensys2026.synchronisation import fig9, fig12, fig15
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, PolysightError
+
+TITLES: dict[str, str] = {
+    "fig3": "Fresnel reflection of common materials",
+    "fig4": "0 degrees against steep incidence",
+    "fig9": "spectrogram and high-pass response",
+    "fig12": "images before and after synchronisation",
+    "fig13": "image of seven materials",
+    "fig14": "phase of H, V and P",
+    "fig15": "errors by stage of synchronisation",
+    "fig16": "contrast across incidence angles",
+    "fig17": "location independence",
+    "fig18": "classification of solids, liquids and powders",
+    "fig19": "qualitative images",
+    "fig20": "H, V and P alone and together",
+    "fig21": "concentration of sugar in water",
+    "table2": "permittivity of 36 materials",
+}
+MAKERS: dict[str, Callable[[Run], Item]] = {
+    "fig3": fig3,
+    "fig16": fig16,
+    "table2": table2_item,
+    "fig18": fig18,
+    "fig20": fig20,
+    "fig21": fig21,
+    "fig17": fig17,
+    "fig19": fig19,
+    "fig14": fig14,
+    "fig13": fig13,
+    "fig4": fig4,
+    "fig12": fig12,
+    "fig15": fig15,
+    "fig9": fig9,
+}
+
+
+def reproduce(out: Path, keys: Sequence[str] = (), run: Run | None = None) -> int:
+    """Make items (default: all) into a folder.
+
+    An item that fails is listed on the page and on stderr; the others are made.
+
+    Returns
+    -------
+    int
+        Exit status; 0 if all items were made.
+
+    Raises
+    ------
+    ConfigError
+        if an item's name is not known, or the item is not implemented.
+    """
+    run = run or Run()
+    for key in keys:
+        if key not in MAKERS:
+            why = f"{TITLES[key]}: not reproduced yet" if key in TITLES else "the paper has no such item"
+            raise ConfigError(
+                f"item {key!r} cannot be made",
+                why,
+                f"give some of: {' '.join(MAKERS)}",
+                code=ErrorCode.KEY_UNKNOWN,
+            )
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise ConfigError(
+            f"{out} is a file", "the results need a folder", "give another --out", code=ErrorCode.FILE_EXISTS
+        ) from None
+    items: list[Item] = []
+    pictures: dict[str, bytes] = {}
+    failed: dict[str, str] = {}
+    made = list(dict.fromkeys(keys) or MAKERS)
+    for key in steps(made, [f"simulating {TITLES[key]}" for key in made]):
+        try:
+            item = MAKERS[key](run)
+            pictures |= write_item(out, item)
+        except PolysightError as e:
+            failed[key] = str(e)
+            sys.stderr.write(f"\n{key}: {e}\n")
+            continue
+        items.append(item)
+    page = write_page(out, items, pictures, failed, run.quick)
+    sys.stdout.write(f"{page}: {len(items)} simulated items beside the published values\n")
+    return 1 if failed else 0
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Origin of the numbers of a page.
+
+    Attributes
+    ----------
+    word, sentence
+        Stamp of figures, tables and headings, and its explanation on the page.
+    title
+        Title of the page.
+    simulated
+        True if any of it was simulated.
+    notes
+        Paragraphs above the items.
+    """
+
+    word: str
+    sentence: str
+    title: str
+    simulated: bool
+    notes: tuple[str, ...] = ()
+
+
+SIMULATED = Origin(
+    "simulated",
+    "Every value and figure on this page that is not headed “published” comes from simulation. Nothing here was"
+    " measured.",
+    "The paper's tables and figures, simulated beside published",
+    True,
+)
+
+
+def stamped_png(figure: Figure, origin: Origin = SIMULATED) -> bytes:
+    """Return a figure as PNG with its origin, such as SIMULATED, above it."""
+    figure.suptitle(origin.word.upper(), x=0.995, ha="right", fontsize=9, color=STAMP, fontweight="bold")
+    return png(figure)
+
+
+def write_item(out: Path, item: Item, origin: Origin = SIMULATED) -> dict[str, bytes]:
+    """Write an item's JSON, CSV and PNG files; return the pictures by file name."""
+    pictures = {f"{item.key}-{name}.png": stamped_png(p.figure, origin) for name, p in item.pictures.items()}
+    for name, data in pictures.items():
+        write_atomically(out / "figures" / name, data)
+    for i, table in enumerate(item.tables):
+        name = f"{item.key}.csv" if i == 0 else f"{item.key}-{i + 1}.csv"
+        write_atomically(out / name, _csv(table, origin).encode("utf-8"))
+    head = {"item": item.key, "title": item.title, "simulated": origin.simulated}
+    write_json(out / f"{item.key}.json", {**head, **item.data})
+    return pictures
+
+
+def _csv(table: Table, origin: Origin) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([[f"{origin.word}: {table.caption}"], table.head, *table.rows])
+    return text.getvalue()
+
+
+def write_page(
+    out: Path,
+    items: Sequence[Item],
+    pictures: dict[str, bytes],
+    failed: dict[str, str],
+    quick: bool,
+    origin: Origin = SIMULATED,
+    makers: Container[str] | None = None,
+) -> Path:
+    """Write `reproduce.html` with the items and a list of missing ones; return its path.
+
+    `makers` are the keys of possible items; None: all.
+    """
+    makers = MAKERS if makers is None else makers
+    environment = Environment(
+        loader=PackageLoader("polysight_papers.sensys2026", "."),
+        autoescape=select_autoescape(["html"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+    )
+    held = {i.key for i in items}
+    page = environment.get_template("reproduce.html").render(
+        items=sorted(items, key=lambda i: list(TITLES).index(i.key)),
+        images={name: base64.b64encode(data).decode("ascii") for name, data in pictures.items()},
+        left_out=[(k, t) for k, t in TITLES.items() if k in makers and k not in held and k not in failed],
+        missing=[(k, t) for k, t in TITLES.items() if k not in makers],
+        failed=[(k, TITLES[k], why) for k, why in failed.items()],
+        quick=quick,
+        origin=origin,
+    )
+    path = out / "reproduce.html"
+    write_atomically(path, page.encode("utf-8"))
+    return path

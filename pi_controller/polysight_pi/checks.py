@@ -1,0 +1,227 @@
+"""`polysight-pi check`: tests lines, permissions, ports, keys and disk. Moves nothing, sends no pulse."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import zmq
+
+from polysight_pi import AS_THE_SERVICE, system
+from polysight_pi.bursts import MIN_PART, BurstSpec, spi_burst
+from polysight_pi.journal import Journal
+from polysight_pi.lines import (
+    GpiodLines,
+    SpiDevice,
+    TriggerInput,
+    find_chip,
+    load_gpiod,
+    open_lines,
+    request_output,
+)
+from polysight_pi.stage import BenchStage
+from polysight_shared.config import Instrument, Pi
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError, PolysightError, os_error
+from polysight_shared.raster import MAX_WIDTH_NS, WIDTH_TEXT, check_burst_fits
+from polysight_shared.sockets import is_loopback, publisher, replier
+
+JOURNAL_BYTES = 100 << 20  # a scan of 70,000 positions journals about 20 MB
+TRANSFERS = 5
+MAX_PART = 1.05  # of the nominal duration: the system call adds some 100 us to 22 ms
+PAIRS, PAUSE_NS = 500, 300_000  # pairs of system calls to time, and the pause between them
+MODEL, MODULES = Path("/proc/device-tree/model"), Path("/sys/module")
+STRICT = "put `dtparam=strict_gpiod` into /boot/firmware/config.txt and reboot the Pi"
+
+
+class Finding(NamedTuple):
+    """Result of one check; `remedy` says what to do if the verdict is not ok."""
+
+    name: str
+    verdict: Literal["ok", "warn", "fail"]
+    found: str
+    remedy: str = ""
+
+
+def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Finding:
+    """Run a check. Text it returns becomes an ok finding, an error it raises a failed one."""
+    try:
+        found = check(*args)
+    except PolysightError as e:
+        return Finding(name, "fail", e.what + (f" ({e.why})" if e.why else ""), e.remedy)
+    except OSError as e:
+        return Finding(name, "fail", os_error(e).what, AS_THE_SERVICE)
+    return found if isinstance(found, Finding) else Finding(name, "ok", found)
+
+
+def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
+    """Run every check, in the order of bring-up."""
+    pi, keys = instrument.pi, Path(instrument.pi.key_dir)
+    yield attempt("plan", _plan, instrument)
+    if wires is not None:
+        yield attempt("simulated wires", _wires, instrument, wires)
+    else:
+        yield _real_time()
+        yield from check_lines(instrument)
+    yield attempt("stage", _stage, instrument)
+    yield attempt("journal", _journal, Path(pi.journal_dir), min(instrument.limits.free_disk_bytes, JOURNAL_BYTES))
+    yield attempt("keys", _keys, keys, (pi.command_address, pi.event_address))
+    yield attempt("command address", _address, replier, pi.command_address, keys)
+    yield attempt("event address", _address, publisher, pi.event_address, keys)
+
+
+def _plan(instrument: Instrument) -> str:
+    check_burst_fits(instrument.grid, instrument.burst, instrument.stage)
+    b = instrument.burst
+    return f"burst of {b.pulses} x {b.period_us:g} us ends before the next point"
+
+
+def _wires(instrument: Instrument, wires: Path) -> str:
+    open_lines(instrument, wires).close()
+    return f"{wires}: trigger {instrument.pi.trigger_in}, SYNC_IN {', '.join(map(str, instrument.pi.sync_out))}"
+
+
+def _real_time() -> Finding:
+    """Request the same real-time rights as the service, so that pulse widths are measured with them."""
+    refused = dict.fromkeys(system.prepare_process() + system.prepare_thread())
+    if refused:
+        remedy = "the systemd unit grants both (LimitRTPRIO, LimitMEMLOCK); a shell does not"
+        return Finding("real time", "warn", "; ".join(refused), remedy)
+    return Finding("real time", "ok", "SCHED_FIFO and locked memory are permitted")
+
+
+def _stage(instrument: Instrument) -> str:
+    with BenchStage(instrument.stage) as stage:
+        x_mm, y_mm = stage.position()
+        return f"{instrument.stage.port} answers, firmware {stage.firmware or '?'}, at {x_mm:.2f}, {y_mm:.2f} mm"
+
+
+def _journal(path: Path, needed: int) -> str:
+    Journal(path).close()
+    free = shutil.disk_usage(path).free
+    if free < needed:
+        wanted = f"{path}: {free >> 20} MiB free, {needed >> 20} MiB wanted"
+        raise DeviceError(wanted, "the disk fills", "remove old journals there", code=ErrorCode.DISK_FULL)
+    return f"{path} can be written, {free >> 20} MiB are free"
+
+
+def _keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
+    if all(is_loopback(a) for a in addresses):
+        return "not needed: both addresses are loopback"
+    secret = folder / "pi.key_secret"
+    if not secret.is_file():
+        raise DeviceError(f"{secret} is missing", "keys were not made yet", "polysight-pi keys")
+    if secret.stat().st_mode & 0o077:
+        found = f"{secret} can be read by others than its owner"
+        return Finding("keys", "warn", found, f"chmod 600 {secret}; new ones with `polysight-pi keys --replace`")
+    return f"{secret}"
+
+
+def _address(make: Callable[..., zmq.Socket[bytes]], address: str, key_dir: Path) -> str:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    try:
+        make(context, address, key_dir).close()
+    finally:
+        context.destroy(linger=0)
+    return f"{address} can be bound" + (" (loopback, no keys needed)" if is_loopback(address) else " with CURVE keys")
+
+
+# --- the lines --------------------------------------------------------------------------------------------------------
+
+
+def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MODULES) -> Iterator[Finding]:
+    """Check every line of [pi] and measure the pulse width on this computer; SYNC_IN stays low.
+
+    `model` is the device tree's file with the computer's name, `modules` the folder of the kernel modules' parameters.
+    """
+    pi = instrument.pi
+    chip = attempt("GPIO chip", _chip, pi)
+    yield chip
+    if chip.verdict == "ok":
+        yield attempt(f"trigger line {pi.trigger_in}", _trigger, pi)
+        yield attempt(f"SYNC_IN line {pi.sync_out[0]}", _spi if pi.wiring == "spi" else _output, pi)
+        yield attempt("pulse width", measure_clock if pi.wiring == "spi" else measure_width, instrument)
+    if pi.wiring != "spi" and model.exists() and model.read_bytes().startswith(b"Raspberry Pi"):
+        yield _release(modules)
+
+
+def _chip(pi: Pi) -> str:
+    path = find_chip(pi.gpio_chip)
+    try:
+        with load_gpiod().Chip(path) as c:
+            return f"{path} is {c.get_info().label!r}"
+    except OSError as e:
+        raise DeviceError(f"{path}: {e.strerror}", "no such device, or no right", "set pi.gpio_chip; group gpio") from e
+
+
+def _trigger(pi: Pi) -> str:
+    TriggerInput(pi).close()
+    return f"rising edges with time stamps, {pi.trigger_bias}, debounced by {pi.trigger_debounce_us} us"
+
+
+def _output(pi: Pi) -> str:
+    request_output(pi).release()
+    return "is available, and is low"
+
+
+def _spi(pi: Pi) -> str:
+    device = SpiDevice(pi.spi_device)
+    device.close()
+    return f"MOSI of {pi.spi_device}, low; it accepts transfers of {device.bufsiz} bytes"
+
+
+def measure_width(instrument: Instrument) -> str | Finding:
+    """Time the system calls of a pulse, with SYNC_IN low. Raises DeviceError."""
+    lines = GpiodLines(instrument.pi)
+    widths_ns: list[int] = []
+    try:
+        for _ in range(PAIRS):
+            lines.sleep_until(lines.now_ns() + PAUSE_NS)
+            widths_ns.append(lines.measure())
+    finally:
+        lines.close()
+    return judge_widths(widths_ns, instrument.pi.one_shot)
+
+
+def measure_clock(instrument: Instrument) -> str | Finding:
+    """Time transfers of zeros as long as a burst; the shortest gives the SPI clock. Raises DeviceError."""
+    device = SpiDevice(instrument.pi.spi_device)
+    try:
+        burst = spi_burst(BurstSpec.of(instrument.burst), device.bufsiz)
+        zeros = bytes(len(burst.data))
+        took = [after - before for before, after in (device.transfer(zeros, burst.clock_hz) for _ in range(TRANSFERS))]
+    finally:
+        device.close()
+    bit_ns = min(took) / (8 * len(zeros))
+    found = f"a bit lasts {bit_ns / 1e3:.3f} us, nominal {burst.bit_ns / 1e3:.3f} us; the same clock sets the period"
+    if MIN_PART <= bit_ns / burst.bit_ns <= MAX_PART:
+        return found + " (SPI controller, measured now with the line low)"
+    remedy = "fix the Pi's core clock in /boot/firmware/config.txt: `core_freq=250` on a 3, `core_freq_min=500` on a 4"
+    return Finding("pulse width", "fail", found, remedy)
+
+
+def judge_widths(widths_ns: list[int], one_shot: bool) -> str | Finding:
+    """Judge measured widths: a row needs thousands of pulses below 4 us, so 1 % above it is too much."""
+    widths_ns = sorted(widths_ns)
+    middle, high = widths_ns[len(widths_ns) // 2], widths_ns[len(widths_ns) * 99 // 100]
+    found = f"two system calls take {middle / 1e3:.1f} us (median), {high / 1e3:.1f} us (99th percentile)"
+    if one_shot:
+        return f"{found}; a one-shot sets the width"
+    if high <= MAX_WIDTH_NS:
+        return f"{found} (measured now with the line low)"
+    found += f": the radar accepts {WIDTH_TEXT}; rows would end with fault 105"
+    remedy = 'wire SYNC_IN to MOSI and set wiring = "spi", or fit a one-shot and set one_shot = true'
+    return Finding("pulse width", "fail", found, f"{remedy} (docs/how-to/wiring.md)")
+
+
+def _release(modules: Path) -> Finding:
+    found = "this kernel does not say if outputs are released when their program dies"
+    for module in ("pinctrl_bcm2835", "pinctrl_rp1"):
+        parameter = modules / module / "parameters" / "persist_gpio_outputs"
+        if parameter.exists():
+            if parameter.read_text().strip() != "Y":
+                return Finding("line release", "ok", "lines become inputs again when their program ends")
+            found = f"{module} keeps outputs as they were: a program killed during a pulse leaves them high"
+    return Finding("line release", "warn", found, STRICT)

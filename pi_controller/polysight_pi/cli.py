@@ -1,0 +1,280 @@
+"""`polysight-pi`: the command line of the Raspberry Pi half."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from polysight_pi import AS_THE_SERVICE
+from polysight_shared import __version__
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.errors import PolysightError, os_error
+from polysight_shared.faults import explain
+from polysight_shared.raster import WIDTH_TEXT
+
+# Commands import their modules when they are called, so `--help` needs no other package.
+
+
+PAUSE_NS = 10_000_000  # between the bursts of `pulse`
+
+
+def _write(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def _run(args: argparse.Namespace, instrument: Instrument) -> int:
+    from polysight_pi.service import run
+
+    return run(instrument, args.wires)
+
+
+def _check(args: argparse.Namespace, instrument: Instrument) -> int:
+    from polysight_pi.checks import check_all
+    from polysight_pi.client import refuse_beside_service
+
+    refuse_beside_service(instrument)
+    findings = []
+    for f in check_all(instrument, args.wires):
+        findings.append(f)
+        if not args.json:
+            _write(f"{f.verdict:5} {f.name}: {f.found}" + (f"\n        do: {f.remedy}" if f.remedy else ""))
+    if args.json:
+        _write(json.dumps([f._asdict() for f in findings]))
+    return int(any(f.verdict == "fail" for f in findings))
+
+
+def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
+    from polysight_pi import system
+    from polysight_pi.bursts import BurstSpec, send_burst
+    from polysight_pi.client import refuse_beside_service
+    from polysight_pi.lines import open_lines
+    from polysight_pi.service import log
+
+    refuse_beside_service(instrument)
+    lines = open_lines(instrument, args.wires)
+    try:
+        if args.wires is None:
+            for sentence in dict.fromkeys(system.prepare_process() + system.prepare_thread()):  # each once
+                log(sentence)
+        lines.check_width = False  # the width is printed below
+        spec, end_ns, records = BurstSpec.of(instrument.burst), lines.now_ns(), []
+        for _ in range(args.count):
+            records.append(send_burst(lines, spec, end_ns + PAUSE_NS))
+            end_ns = records[-1].end_ns
+    finally:
+        lines.close()
+    width, jitter = max(r.width_max_ns for r in records), max(r.jitter_ns for r in records)
+    if args.json:
+        _write(json.dumps([r._asdict() for r in records]))
+    else:
+        _write(f"{sum(r.pulses for r in records)} pulses in {len(records)} bursts on SYNC_IN {instrument.pi.sync_out}")
+        _write(f"longest pulse at most {width / 1e3:.2f} us (the radar accepts {WIDTH_TEXT})")
+        _write(f"latest rising edge {jitter / 1e3:.2f} us after its deadline")
+    faults = [r.fault for r in records if r.fault]
+    for number in sorted(set(faults)):
+        e = explain(number)
+        sys.stderr.write(f"error: fault {number} in {faults.count(number)} of {len(records)} bursts: {e.what}\n")
+        sys.stderr.write(f"  why: {e.why}\n  do: {e.remedy}\n")
+    return 1 if faults else 0
+
+
+def _jog(args: argparse.Namespace, instrument: Instrument) -> int:
+    from polysight_pi.client import refuse_beside_service
+    from polysight_pi.stage import BenchStage
+
+    refuse_beside_service(instrument)
+    with BenchStage(instrument.stage) as stage:
+        speed_mm_s = instrument.stage.travel_speed_mm_s if args.speed is None else args.speed
+        return _print_position(args, stage.jog(args.dx, args.dy, speed_mm_s))
+
+
+def _home(args: argparse.Namespace, instrument: Instrument) -> int:
+    from polysight_pi.client import home_by_service
+    from polysight_pi.stage import BenchStage
+
+    status = home_by_service(instrument)
+    if status is None:
+        with BenchStage(instrument.stage) as stage:
+            return _print_position(args, stage.home())
+    if status.lost_x_mm or status.lost_y_mm:
+        lost = f"{status.lost_x_mm:.3f} mm in x, {status.lost_y_mm:.3f} mm in y"
+        sys.stderr.write(f"polysight-pi: steps were lost since the previous homing: {lost}; check the drive\n")
+    return _print_position(args, status)
+
+
+def _print_position(args: argparse.Namespace, at: Any) -> int:
+    where = {"x_mm": at.x_mm, "y_mm": at.y_mm}
+    _write(json.dumps(where) if args.json else f"stage at x {at.x_mm:.3f} mm, y {at.y_mm:.3f} mm")
+    return 0
+
+
+def _events(args: argparse.Namespace, instrument: Instrument) -> int:
+    from polysight_pi.client import follow_events, replay_events
+
+    if args.scan_id:
+        events = replay_events(instrument, args.scan_id, args.from_seq)
+    else:
+        events = follow_events(instrument, args.limit_s)
+    for n, event in enumerate(events, 1):
+        _write(json.dumps(event))
+        if n == args.count:
+            break
+    return 0
+
+
+def _keys(args: argparse.Namespace) -> int:
+    from polysight_pi.keys import COPY, allow, make_keys, read_allowed, revoke
+
+    folder = args.dir or Path(_rig(args).pi.key_dir)
+    if args.revoke:
+        revoke(folder, args.revoke)
+    if args.client:
+        for path in allow(folder, args.client):
+            _write(str(path))
+        _write(f"copy them to that client as host.key and host.key_secret, with {folder / 'pi.key'}")
+    if args.revoke or args.client or args.list:
+        for key, name in read_allowed(folder).items():
+            _write(f"allowed: {key} {name}")
+        return 0
+    for path in make_keys(folder, args.replace):
+        _write(str(path))
+    _write(COPY)
+    return 0
+
+
+def _take_over(args: argparse.Namespace, instrument: Instrument) -> int:
+    from polysight_pi.client import take_over
+
+    _write(f"the state is {take_over(instrument, args.what)}")
+    return 0
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return value
+
+
+def _speed(text: str) -> float:
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError("must be above 0")
+    return value
+
+
+def _option(*names: str, **how: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
+    return names, how
+
+
+def _rig(args: argparse.Namespace) -> Instrument:
+    """Load the rig file, with the values given on the command line."""
+    rig, given = load_instrument(args.config), {k: v for k, v in vars(args).items() if v is not None}
+    replaced = {k: given[k] for k in ("journal_dir", "command_address", "event_address") if k in given}
+    stage = {"port": given["stage_port"]} if "stage_port" in given else {}
+    replace = msgspec.structs.replace
+    return replace(rig, pi=replace(rig.pi, **replaced), stage=replace(rig.stage, **stage))
+
+
+WIRES = _option("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
+STAGE_PORT = _option("--stage-port", metavar="TTY", help="serial port of the stage; replaces stage.port")
+JOURNAL = _option(
+    "--journal", dest="journal_dir", metavar="DIR", help="folder of the journals; replaces pi.journal_dir"
+)
+JSON = _option("--json", action="store_true", help="print JSON, for programs")
+COUNT = {"type": _positive, "metavar": "N"}
+MM = {"type": float, "default": 0.0, "metavar": "MM"}
+# name, action, help, example, options
+COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str, Any]], ...]], ...] = (
+    ("run", _run, "serve the host until SIGTERM or SIGINT", "--config instrument.toml", (
+        WIRES, STAGE_PORT, JOURNAL,
+        _option("--command-address", metavar="tcp://HOST:PORT", help="replaces pi.command_address"),
+        _option("--event-address", metavar="tcp://HOST:PORT", help="replaces pi.event_address"),
+    )),
+    ("check", _check, "check lines, ports, permissions, keys and disk; nothing moves", "--config instrument.toml", (
+        WIRES, STAGE_PORT, JOURNAL, JSON,
+    )),
+    ("pulse", _pulse, "send bursts on SYNC_IN and print their width and jitter", "--count 100", (
+        WIRES, JSON, _option("--count", **COUNT, default=10, help="number of bursts (%(default)s)"),
+    )),
+    ("jog", _jog, "move the stage by a distance (home it first)", "--dx 10 --dy -5", (
+        STAGE_PORT, JSON, _option("--dx", **MM, help="along x, millimetres (0)"),
+        _option("--dy", **MM, help="along y, millimetres (0)"),
+        _option("--speed", type=_speed, metavar="MM_S", help="mm/s (default: stage.travel_speed_mm_s)"),
+    )),
+    ("home", _home, "home the stage, through the service if it runs", "--config instrument.toml", (
+        STAGE_PORT, JSON,
+    )),
+    ("events", _events, "print events as JSON lines, live or from the journal", "--scan-id my-scan --from-seq 1", (
+        _option("--scan-id", metavar="ID", help="print the journal of this scan instead of live events"),
+        _option("--from-seq", **COUNT, default=1, help="first event from the journal (%(default)s)"),
+        _option("--count", **COUNT, help="stop after this number of events"),
+        _option("--limit-s", type=float, default=10.0, metavar="S", help="timeout without an event (%(default)s)"),
+    )),
+    ("keys", _keys, "make CURVE keys for addresses that are not loopback", "--dir /etc/polysight/keys", (
+        _option("--dir", type=Path, metavar="DIR", help="folder of the keys; replaces pi.key_dir"),
+        _option("--replace", action="store_true", help="replace existing keys"),
+        _option("--client", metavar="NAME", help="make keys for one more client and allow it"),
+        _option("--revoke", metavar="NAME", help="remove this client from the list, at once"),
+        _option("--list", action="store_true", help="list the allowed clients"),
+    )),
+    ("take-over", _take_over, "control the run of another program, as a person at the Pi", "abort", (
+        _option("what", choices=("hold", "resume", "abort", "end"), help="action on the run"), JOURNAL,
+    )),
+)  # fmt: skip
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="polysight-pi",
+        description="The Raspberry Pi half of the instrument: controls the stage, answers its triggers with SYNC_IN "
+        "pulses, and reports to the host.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="examples:\n  polysight-pi check\n  polysight-pi run --config instrument.toml",
+    )
+    parser.add_argument("--version", action="version", version=f"polysight-pi {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for name, action, text, example, options in COMMANDS:
+        p = commands.add_parser(
+            name,
+            help=text,
+            description=text[0].upper() + text[1:] + ".",
+            epilog=f"example:  polysight-pi {name} {example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        p.set_defaults(action=action)
+        p.add_argument(
+            "--config", type=Path, default=Path("instrument.toml"), metavar="FILE", help="rig file (%(default)s)"
+        )
+        for names, how in options:
+            p.add_argument(*names, **how)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point. Returns 0 on success; an error is one message on stderr, without a trace."""
+    args = _parser().parse_args(argv)
+    try:
+        return args.action(args) if args.action is _keys else args.action(args, _rig(args))
+    except PolysightError as e:
+        sys.stderr.write(f"error: {e}\n")
+        return e.exit_status
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+    except BrokenPipeError:
+        # The reader has closed the pipe; nothing must be flushed to it at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as e:
+        error = os_error(e, "a path is wrong, the disk is full, or it belongs to another user", AS_THE_SERVICE)
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_status

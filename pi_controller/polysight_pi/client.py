@@ -1,0 +1,143 @@
+"""Client of the running service, for the commands `home`, `take-over` and `events`. The host has its own."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import zmq
+
+from polysight_pi import AS_THE_SERVICE
+from polysight_pi.service import TAKE_OVER_KEY
+from polysight_pi.stage import MOTION_TIMEOUT_S
+from polysight_shared import messages as m
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError, os_error
+from polysight_shared.sockets import Socket, requester, subscriber
+
+CONNECT_TIMEOUT_S = 2.0
+Ask = Callable[..., Any]
+
+
+def _no_answer(address: str) -> DeviceError:
+    why = "polysight-pi run is not running here"
+    return DeviceError(f"no answer from {address}", why, "start it", code=ErrorCode.NO_ANSWER)
+
+
+@contextmanager
+def _service(instrument: Instrument) -> Iterator[Ask]:
+    """Connect; the value sends a command and returns its reply. It raises DeviceError for silence and refusals."""
+    context: zmq.Context[Socket] = zmq.Context()
+    address = instrument.pi.command_address
+    try:
+        client = requester(context, address, Path(instrument.pi.key_dir))
+
+        def ask(command: m.AnyCommand) -> m.AnyReply:
+            try:
+                client.send(m.pack(command))
+            except zmq.Again:  # not connected
+                raise _no_answer(address) from None
+            if not client.poll(round(instrument.limits.command_timeout_s * 1e3)):
+                raise _no_answer(address)
+            reply = m.unpack_reply(client.recv())
+            if isinstance(reply, m.Refused):
+                what = f"{type(command).__name__} was refused: {reply.what}"
+                raise DeviceError(what, reply.why, reply.remedy, code=ErrorCode.REFUSED_BY_PEER)
+            return reply
+
+        yield ask
+    finally:
+        context.destroy(linger=0)
+
+
+def _listens(address: str) -> bool:
+    """True if any program listens there. Needs no answer, which a busy machine would give late."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT_S).close()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def refuse_beside_service(instrument: Instrument) -> None:
+    """Raise DeviceError if the service of this rig runs: it holds lines, stage and ports."""
+    if _listens(instrument.pi.command_address):
+        raise DeviceError(
+            f"polysight-pi run serves at {instrument.pi.command_address}",
+            "it holds the lines, the stage and the ports",
+            "use `polysight doctor` on the host, or `sudo systemctl stop polysight-pi`, this command, and"
+            " `sudo systemctl start polysight-pi`",
+            code=ErrorCode.BUSY,
+        )
+
+
+def home_by_service(instrument: Instrument) -> m.StatusReply | None:
+    """Home through the running service and wait for the end; return None if no service runs.
+
+    Raises DeviceError if the service refuses or homing fails.
+    """
+    if not _listens(instrument.pi.command_address):
+        return None
+    with _service(instrument) as ask:
+        ask(m.Home())
+        deadline = time.monotonic() + MOTION_TIMEOUT_S
+        while time.monotonic() < deadline:
+            status = ask(m.Status())
+            if status.state == "fault":
+                raise DeviceError(f"homing failed: {status.reason}", "see the fault", "remove its cause, home again")
+            if status.state != "homing":
+                return status
+            time.sleep(0.1)
+        raise DeviceError("homing has not ended", "the motors stall", "look at the stage")
+
+
+def take_over(instrument: Instrument, what: str) -> str:
+    """Hold, resume, abort or end the active run of any client; return the state after it.
+
+    Raises DeviceError if the service refuses or does not answer, or if the take-over key cannot be read.
+    """
+    try:
+        owner = (Path(instrument.pi.journal_dir) / TAKE_OVER_KEY).read_text(encoding="ascii").strip()
+    except OSError as e:
+        raise os_error(e, "polysight-pi run is not running here, or you are not its user", AS_THE_SERVICE) from None
+    reason = "a person at the Pi took over"
+    with _service(instrument) as ask:
+        if what == "end":
+            scan_id = ask(m.Status()).scan_id
+            return ask(m.EndRun(scan_id=scan_id, exit_status="abort", reason=reason, owner=owner)).state
+        if what == "abort":
+            return ask(m.Abort(reason=reason, owner=owner)).state
+        return ask({"hold": m.Hold, "resume": m.Resume}[what](owner=owner)).state
+
+
+def follow_events(instrument: Instrument, timeout_s: float) -> Iterator[Any]:
+    """Yield live events as plain objects. Raises DeviceError after `timeout_s` without one."""
+    context: zmq.Context[Socket] = zmq.Context()
+    try:
+        listener = subscriber(context, instrument.pi.event_address, Path(instrument.pi.key_dir))
+        while listener.poll(round(timeout_s * 1e3)):
+            yield msgspec.to_builtins(m.unpack_event(listener.recv_multipart()[-1]))
+        raise _no_answer(instrument.pi.event_address)
+    finally:
+        context.destroy(linger=0)
+
+
+def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterator[Any]:
+    """Yield a scan's journalled events as plain objects. Raises DeviceError without an answer or a journal."""
+    with _service(instrument) as ask:
+        while True:
+            reply = ask(m.Replay(scan_id=scan_id, from_seq=from_seq))
+            if reply.last_seq == 0:
+                what = f"the Pi has no journal of scan {scan_id!r}"
+                raise DeviceError(what, "another name", "see its journal folder", code=ErrorCode.FILE_MISSING)
+            if not reply.events:
+                return
+            yield from map(msgspec.to_builtins, reply.events)
+            from_seq = reply.events[-1].seq + 1  # a lost journal leaves a gap in the numbers

@@ -1,0 +1,396 @@
+"""The executor: one thread that processes commands, replies of the stage and bursts from one queue, in order.
+
+It executes the host's commands and manages the run; machine.py and row_machine.py control stage and row.
+docs/spec/wire.md describes each command.
+"""
+
+from __future__ import annotations
+
+import queue
+import secrets
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from polysight_pi.bursts import BurstSpec
+from polysight_pi.journal import Journal, JournalFullError
+from polysight_pi.machine import RefusedError
+from polysight_pi.row_machine import RowMachine
+from polysight_pi.stage import StageDriver
+from polysight_pi.stage_link import StageLost, StageNews
+from polysight_pi.trigger import BurstSent, LoopFault, TriggerLoop
+from polysight_shared import __version__
+from polysight_shared import messages as m
+from polysight_shared.config import Stage
+from polysight_shared.errors import PolysightError, os_error
+from polysight_shared.faults import PiFault, explain
+from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, MIN_WIDTH_NS, WIDTH_TEXT
+from polysight_shared.stage_line import Reply
+from polysight_shared.units import us_to_ns
+
+TURN_TIMEOUT_S = 0.2  # the rest of the queue waits for the next turn, so that a queue that never empties is not a hang
+TURN_S = 1.0  # longest turn without work
+HUNG_S = 10.0  # time without a turn after which the executor counts as hung
+COMMANDS_WAITING, REPLAYS_WAITING = 64, 4
+LINES_WAITING = 64  # of the stage: further lines are dropped, so that an endless flood cannot fill the memory
+REPLAYED_AT_REST = 1000  # events per reply: half a second on a Pi
+REPLAYED_IN_A_ROW = 20  # events per reply during a row: packing more would delay the trigger thread
+OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)  # commands that count as a heartbeat of the run's host
+OWNED = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)  # commands that only the run's owner may send
+
+
+class Request(NamedTuple):
+    """A command and the callback for its reply."""
+
+    command: m.AnyCommand
+    answer: Callable[[m.AnyReply], None]
+
+
+def refused(number: int, what: str, why: str = "", remedy: str = "") -> m.Refused:
+    """Return a refusal, with texts of limited length; missing ones are those of shared/polysight_shared/faults.py."""
+    table = explain(number)
+    return m.Refused(
+        number=int(number), what=what[:1000], why=(why or table.why)[:1000], remedy=(remedy or table.remedy)[:1000]
+    )
+
+
+class Executor:
+    """Runs in its own thread; all threads may use :meth:`submit`, :meth:`post`, `status` and `hello`.
+
+    `turned` is called after every turn, at least once a second: it feeds the watchdog.
+    """
+
+    def __init__(
+        self, stage: StageDriver, loop: TriggerLoop, journal: Journal, turned: Callable[[], None] = lambda: None
+    ) -> None:
+        self._loop, self._journal, self._turned = loop, journal, turned
+        self.take_over_key = secrets.token_hex(16)  # accepted as the owner of every run: a person at the Pi
+        self._turned_s = time.monotonic()
+        self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._room, self._replay_room = map(threading.Semaphore, (COMMANDS_WAITING, REPLAYS_WAITING))
+        self._machine = RowMachine(stage, loop, journal, self._inbox.put)
+        self._run: m.BeginRun | None = None
+        self._last_row: tuple[int, int] | None = None
+        self._after_row: Request | None = None
+        self._replies: list[tuple[Request, m.AnyReply]] = []
+        self._pulsing: list[Request] = []
+        self._ending = self._ended = False
+        self.crash: BaseException | None = None
+        self._thread = threading.Thread(target=self._live, name="executor", daemon=True)
+        self._refresh()
+
+    # --- for other threads ------------------------------------------------------------------------------------------
+
+    def post(self, item: StageNews | BurstSent | m.Pulsed | LoopFault | Callable[[], object]) -> None:
+        """Append an item to the queue; return at once. Replies of the stage are dropped if too many wait."""
+        if isinstance(item, Reply) and self._inbox.qsize() > LINES_WAITING:
+            return  # the end of a row or of homing is requested again
+        self._inbox.put(item)
+
+    def submit(self, command: m.AnyCommand, answer: Callable[[m.AnyReply], None]) -> bool:
+        """Queue a command whose reply is passed to `answer`. Return False, without queueing, if too many wait."""
+        room = self._replay_room if isinstance(command, m.Replay) else self._room
+        if not room.acquire(blocking=False):
+            return False
+
+        def execute() -> None:
+            room.release()
+            self._execute(Request(command, answer))
+
+        self._inbox.put(execute)
+        return True
+
+    @property
+    def unresponsive_s(self) -> float:
+        """Time since the last turn; below :data:`HUNG_S` unless the executor hangs."""
+        return time.monotonic() - self._turned_s
+
+    def host_alive(self, scan_id: str, owner: str) -> m.Accepted | m.Refused:
+        """Answer `Alive`, a heartbeat of the run's host. From any thread; does not wait for the executor."""
+        run = self._run
+        if run is None or run.scan_id != scan_id:
+            return refused(PiFault.NOT_READY, f"run {scan_id} is not begun", remedy="BeginRun")
+        if run.owner != owner:
+            return refused(PiFault.NOT_OWNER, f"run {scan_id} is another program's")
+        self._machine.note_host_alive()
+        return m.Accepted(state=self.status.state)
+
+    def start(self) -> None:
+        """Start the thread. The stage has to be connected."""
+        self._refresh()
+        self._thread.start()
+
+    def stop(self, timeout_s: float) -> None:
+        """Stop the stage, end the row as aborted, end the thread."""
+        self.post(self._end)
+        self._thread.join(timeout_s)
+
+    # --- the thread -------------------------------------------------------------------------------------------------
+
+    def _live(self) -> None:
+        try:
+            while not self._ended:
+                self._turn()
+        except BaseException as e:
+            self.crash = e
+            raise
+
+    def _turn(self) -> None:
+        try:
+            left_s = self._machine.seconds_left()
+            self._handle(self._inbox.get(timeout=TURN_S if left_s is None else min(left_s, TURN_S)))
+            until_s = time.monotonic() + TURN_TIMEOUT_S
+            while time.monotonic() < until_s:
+                self._handle(self._inbox.get_nowait())
+        except queue.Empty:
+            pass
+        self._machine.check_deadlines()
+        try:
+            self._journal.commit()
+        except JournalFullError as e:
+            self._machine.happen("lasting fault", e.number, str(e))
+            self._journal.commit()
+        self._refresh()
+        replies, self._replies = self._replies, []
+        for request, reply in replies:
+            self._count_as_heartbeat(request.command)
+            request.answer(reply)
+        self._turned_s = time.monotonic()
+        self._turned()
+
+    def _count_as_heartbeat(self, command: m.AnyCommand) -> None:
+        """Count a command of the run's host as its heartbeat: it sends no `Alive` while it waits for the reply."""
+        run = self._run
+        if run and isinstance(command, OF_THE_RUN) and (command.scan_id, command.owner) == (run.scan_id, run.owner):
+            self._machine.note_host_alive()
+
+    def _handle(self, item: Any) -> None:
+        machine, row = self._machine, self._machine.row
+        if isinstance(item, BurstSent):
+            machine.on_burst(item)
+        elif isinstance(item, m.Pulsed):
+            self._answer_pulses(item)
+        elif isinstance(item, LoopFault):
+            machine.on_loop_fault(item)
+            self._answer_pulses(refused(item.number, item.detail))
+        elif isinstance(item, Reply):
+            machine.on_stage(item)
+        elif isinstance(item, StageLost):
+            machine.happen("stage lost", PiFault.STAGE_LOST, item.reason)
+        else:
+            item()
+        if row is not None and machine.row is not row:
+            self._row_ended((row.row.index, row.take))
+
+    def _answer_pulses(self, reply: m.AnyReply) -> None:
+        self._replies += [(request, reply) for request in self._pulsing]
+        self._pulsing.clear()
+
+    # --- commands ---------------------------------------------------------------------------------------------------
+
+    def _execute(self, request: Request) -> None:
+        """Execute a command. Every error becomes a refusal; no message can end the program."""
+        try:
+            reply = self._on_command(request)
+        except PolysightError as e:
+            reply = refused(getattr(e, "number", PiFault.BAD_REQUEST), e.what, e.why, e.remedy)
+        except OSError as e:
+            reply = refused(
+                PiFault.BAD_REQUEST, os_error(e).what, "the operating system refused it", "check the Pi's disk"
+            )
+        except Exception as e:  # noqa: BLE001 - reported to the client and in the log
+            traceback.print_exc()
+            reply = refused(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
+        self._count_as_heartbeat(request.command)  # before the deadlines are checked: it may have taken long
+        if reply is not None:
+            self._replies.append((request, reply))
+
+    def _on_command(self, request: Request) -> m.AnyReply | None:
+        """Return the reply, or None if it follows later."""
+        command, run = request.command, self._run
+        if isinstance(command, m.Replay):
+            return self._replay(command)
+        if self._ending:
+            raise RefusedError(PiFault.NOT_READY, "polysight-pi is ending", "SIGTERM or SIGINT", "start it again")
+        if run and isinstance(command, OWNED) and command.owner not in (run.owner, self.take_over_key):
+            raise RefusedError(PiFault.NOT_OWNER, f"run {run.scan_id} is another program's")
+        match command:
+            case m.BeginRun():
+                return None if self._postpone(request, command) else self._begin(command)
+            case m.EndRun():
+                return self._end_run(command)
+            case m.RunRow():
+                return self._run_row(command)
+            case m.Abort():
+                return self._accept("Abort", command.reason or "requested by the host")
+            case m.Pulse():
+                return self._pulse(request, command)
+            case _:  # Home, Hold, Resume
+                return self._accept(type(command).__name__)
+
+    def _replay(self, command: m.Replay) -> m.ReplayReply:
+        limit = min(command.limit, REPLAYED_AT_REST)
+        if self._machine.row is not None:
+            if command.scan_id != self._journal.scan_id:  # its whole file would be read
+                raise RefusedError(
+                    PiFault.NOT_READY,
+                    f"a row of scan {self._journal.scan_id} runs",
+                    "reading another scan's journal would delay its pulses",
+                    "retry when the row has ended",
+                )
+            limit = min(limit, REPLAYED_IN_A_ROW)
+        found, last = self._journal.read(command.scan_id, command.from_seq, limit)
+        return m.ReplayReply(events=[m.unpack_event(raw) for raw in found], last_seq=last)
+
+    def _accept(self, event: str = "", *args: Any) -> m.Accepted:
+        """Execute a command of the state machine. Raises RefusedError."""
+        if event:
+            self._machine.command(event, *args)
+        return m.Accepted(state=self._machine.wire_state)
+
+    def _pulse(self, request: Request, command: m.Pulse) -> None:
+        """Pass a burst to the trigger loop; the reply follows when it has been sent."""
+        if self._run is not None:
+            begun = f"run {self._run.scan_id} is begun"
+            raise RefusedError(PiFault.NOT_READY, begun, "pulses would belong to no point", "wait for the scan's end")
+        self._machine.require("Pulse")
+        if not self._loop.alive:
+            raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
+        spec = burst_of(command)
+        if spec.pulses * spec.period_ns > m.MAX_PULSES_AT_REST_S * 1e9:
+            lasts = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MAX_PULSES_AT_REST_S:g} s"
+            raise RefusedError(PiFault.NOT_READY, lasts, "the lines are busy meanwhile", "ask for fewer pulses")
+        self._pulsing.append(request)
+        self._loop.send(spec)
+
+    def _postpone(self, request: Request, run: m.BeginRun) -> bool:
+        """Check a run; return True if a row has to be aborted before it can begin. Raises RefusedError."""
+        check_run(run, self._machine.stage.config)
+        self._loop.check(burst_of(run))
+        begun = self._run
+        other = begun is not None and (run.scan_id, run.owner) != (begun.scan_id, begun.owner)
+        if begun is not None and other and self._machine.host_lives:
+            raise RefusedError(
+                PiFault.NOT_READY,
+                f"run {begun.scan_id} is active, and its host is alive",
+                "another program, perhaps on another machine, scans with this Pi",
+                "wait for that scan's end, or stop it there",
+            )
+        if self._machine.row is not None:
+            # The host that started the row is gone, so nothing of the row is committed.
+            self._after_row = request
+            self._machine.happen("Abort", f"run {run.scan_id} was begun again")
+        return self._machine.row is not None
+
+    def _begin(self, run: m.BeginRun) -> m.Accepted:
+        resumed, lost = self._journal.open(run.scan_id, run.plan, run.last_seq)
+        self._run, self._last_row = None, None
+        self._machine.happen("EndRun")
+        self._add_synced(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
+        self._run = run
+        return self._accept("BeginRun", run.heartbeat_ms)
+
+    def _end_run(self, command: m.EndRun) -> m.Accepted:
+        if self._run is None and command.scan_id == self._journal.scan_id:
+            return self._accept()  # a repeated request
+        self._need_run(command.scan_id)
+        self._machine.require("EndRun")
+        self._add_synced(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
+        self._run = None
+        return self._accept("EndRun")
+
+    def _add_synced(self, kind: type[m.RunStarted | m.RunStopped], **fields: Any) -> None:
+        """Write an event that has to be on the disk before its command is accepted. Raises JournalFullError."""
+        self._journal.broken = False  # there may be space again
+        self._journal.add(kind, **fields)
+        try:
+            self._journal.commit()
+        except JournalFullError as e:
+            self._machine.happen("lasting fault", e.number, str(e))
+            raise
+
+    def _need_run(self, scan_id: str) -> m.BeginRun:
+        if self._run is None or self._run.scan_id != scan_id:
+            now = f"run {self._run.scan_id} is" if self._run else "no run is"
+            raise RefusedError(PiFault.NOT_READY, f"{now} active, not {scan_id}", "the Pi was restarted", "BeginRun")
+        return self._run
+
+    def _run_row(self, command: m.RunRow) -> m.Accepted:
+        run, current = self._need_run(command.scan_id), self._machine.row
+        wanted = (command.row_index, command.take)
+        if wanted in (current and (current.row.index, current.take), self._last_row):
+            return self._accept()  # a repeated request
+        self._machine.require("RunRow")
+        _require(command.row_index < run.plan.rows, f"row {command.row_index} is not in the plan of {run.plan.rows}")
+        return self._accept("RunRow", run.plan.row(command.row_index), command.take, burst_of(run), run.speed_mm_s)
+
+    def _row_ended(self, row: tuple[int, int]) -> None:
+        self._last_row = row
+        begins, self._after_row = self._after_row, None
+        if begins is not None:
+            self._execute(begins)
+        self._ended = self._ending
+
+    def _end(self) -> None:
+        self._ending = True
+        self._ended = not self._machine.terminate()
+
+    def _refresh(self) -> None:
+        """Update the replies to Hello and Status; they are replaced as a whole, so other threads may read them."""
+        machine, stage, row, counts = self._machine, self._machine.stage, self._machine.row, self._loop.counts
+        scan_id, last_seq = self._journal.scan_id, self._journal.last_seq
+        self.status = m.StatusReply(
+            state=machine.wire_state, homed=machine.homed, x_mm=stage.x_mm, y_mm=stage.y_mm,
+            scan_id=scan_id, row_index=row.row.index if row else -1, take=row.take if row else 0,
+            points=counts.bursts if row else 0, pulses=counts.pulses if row else 0, last_seq=last_seq,
+            fault=machine.fault, reason=machine.reason, lost_x_mm=machine.lost_mm[0], lost_y_mm=machine.lost_mm[1],
+        )  # fmt: skip
+        self.hello = m.HelloReply(
+            pi_release=__version__, firmware=stage.firmware, backend=self._loop.backend, state=machine.wire_state,
+            scan_id=scan_id, last_seq=last_seq, in_run=self._run is not None, stage=stage.config.placement_settings,
+        )  # fmt: skip
+
+
+# --- limits of this rig and the radars --------------------------------------------------------------------------------
+
+
+def burst_of(asked: m.BeginRun | m.Pulse) -> BurstSpec:
+    """Return the requested burst. Raises RefusedError (PERIOD_TOO_SHORT, PULSE_TOO_LONG) if radars cannot accept it."""
+    spec = BurstSpec(asked.pulses, us_to_ns(asked.period_us), us_to_ns(asked.width_us))
+    if spec.period_ns < MIN_PERIOD_NS:
+        raise RefusedError(PiFault.PERIOD_TOO_SHORT, f"period of {asked.period_us} us is below {MIN_PERIOD_US} us")
+    if not MIN_WIDTH_NS <= spec.width_ns <= MAX_WIDTH_NS:
+        raise RefusedError(PiFault.PULSE_TOO_LONG, f"pulse width of {asked.width_us} us is outside {WIDTH_TEXT}")
+    return spec
+
+
+def check_run(run: m.BeginRun, stage: Stage) -> None:
+    """Check that this rig can execute a run. Raises RefusedError with the conflicting values."""
+    plan, spec = run.plan, burst_of(run)
+    _require(plan.columns >= 1 and plan.rows >= 1, f"plan of {plan.columns} x {plan.rows} points is empty")
+    _require(plan.step_x_mm > 0 and plan.step_y_mm > 0, "steps of the plan must be positive")
+    fastest = max(stage.speed_mm_s, stage.travel_speed_mm_s)
+    _require(
+        0 < run.speed_mm_s <= fastest,
+        f"speed of {run.speed_mm_s} mm/s is outside 0..{fastest} mm/s of this rig's [stage]",
+    )
+    steps = plan.step_x_mm * stage.steps_per_mm
+    _require(
+        abs(steps - round(steps)) < 1e-6 and round(steps) >= 1,
+        f"step of {plan.step_x_mm} mm is {steps:g} motor steps: it must be a whole number",
+    )
+    between_ms, burst_ms = 1e3 * plan.step_x_mm / run.speed_mm_s, run.pulses * spec.period_ns * 1e-6
+    _require(
+        burst_ms <= between_ms,
+        f"burst of {run.pulses} x {run.period_us} us lasts {burst_ms:.2f} ms, a point passes every "
+        f"{between_ms:.2f} ms at {run.speed_mm_s} mm/s",
+    )
+    misfit = stage.misfit(plan, run.speed_mm_s)
+    _require(not misfit, misfit)
+
+
+def _require(ok: bool, what: str) -> None:
+    if not ok:
+        raise RefusedError(PiFault.BAD_REQUEST, what)

@@ -1,0 +1,346 @@
+"""The journal: every event of a scan is on disk before it is published, so that lost messages can be replayed.
+
+One append-only file per scan: 8 bytes of magic, then records of `<length, sequence, crc32(sequence + payload)>` (three
+little-endian u32) and the packed event. Sequence numbers count from 1, without gaps unless a journal was lost and
+continues after the host's last event. A torn or damaged tail, as after a power cut, is cut off at the last good record
+when the file is opened. Specification: docs/spec/wire.md. Used by the executor's thread only.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import shutil
+import struct
+import time
+import zlib
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import msgspec
+
+from polysight_shared import messages as m
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ProtocolError
+from polysight_shared.faults import PiFault
+from polysight_shared.raster import RasterPlan
+
+MAGIC = b"PSJRNL1\n"
+MAX_RECORD_BYTES = 1 << 20
+CAPTURE_BYTES = 320  # upper limit of a position's record
+SPARE_BYTES = 4 << 20  # for faults and retakes
+SEARCHED_BYTES = 1 << 20  # length of the search for a good record after damage
+DAMAGED = ".damaged"  # suffix of the copy of a damaged journal
+_HEAD = struct.Struct("<III")
+
+
+class JournalFullError(DeviceError):
+    """The journal cannot be written; it contains nothing of the failed write."""
+
+    number = PiFault.JOURNAL_FULL
+
+    def __init__(self, path: Path, e: OSError) -> None:
+        why = "the disk is full" if e.errno in (errno.ENOSPC, errno.EDQUOT) else "the disk is read-only or broken"
+        what = f"journal {path} cannot be written: {e.strerror}"
+        super().__init__(what, why, "free space on the Pi", code=ErrorCode.DISK_FULL)
+
+
+def _crc(seq: int, payload: bytes) -> int:
+    return zlib.crc32(payload, zlib.crc32(seq.to_bytes(4, "little")))
+
+
+def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
+    """Yield (offset, sequence, payload) of the records up to the first bad one.
+
+    Raises DataError if the file is not a journal.
+    """
+    magic = file.read(len(MAGIC))
+    if magic != MAGIC:
+        if MAGIC.startswith(magic.rstrip(b"\0")):
+            return  # the power was cut before the first bytes were on the disk
+        what = f"{getattr(file, 'name', 'journal')}: not a journal"
+        remedy = "move it out of the journal folder"
+        raise DataError(what, "another program wrote it", remedy, code=ErrorCode.FILE_FOREIGN)
+    offset, last = len(MAGIC), 0
+    while len(head := file.read(_HEAD.size)) == _HEAD.size:
+        length, seq, crc = _HEAD.unpack(head)
+        if length > MAX_RECORD_BYTES or seq <= last:
+            return
+        payload = file.read(length)
+        if len(payload) < length or _crc(seq, payload) != crc:
+            return
+        yield offset, seq, payload
+        offset, last = offset + _HEAD.size + length, seq
+
+
+def _holds_records(tail: bytes) -> bool:
+    """True if a good record follows the damage; after a power cut only a torn record or zeros follow."""
+    for offset in range(1, min(len(tail) - _HEAD.size, SEARCHED_BYTES)):
+        length, seq, crc = _HEAD.unpack_from(tail, offset)
+        payload = tail[offset + _HEAD.size : offset + _HEAD.size + length] if 0 < length <= MAX_RECORD_BYTES else b""
+        if payload and len(payload) == length and _crc(seq, payload) == crc:
+            return True
+    return False
+
+
+class JournalFile:
+    """The journal of one scan, open for appending: created if missing, cut at its last good record if damaged.
+
+    `damage` describes what was cut off if that was more than the torn record of a power cut; a copy is kept then.
+    Raises DataError if the file is not a journal, JournalFullError if it cannot be created or written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.damage = path, ""
+        self.last_seq = 0  # of the newest record, or of the host's newest event if that is later
+        self._places: list[tuple[int, int]] = []  # sequence number and offset of each record
+        self._synced = True
+        try:
+            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as e:
+            raise JournalFullError(path, e) from None
+        try:
+            self._recover()
+        except (OSError, DataError) as e:
+            os.close(self._fd)
+            raise (JournalFullError(path, e) if isinstance(e, OSError) else e) from None
+
+    def _recover(self) -> None:
+        self._end = len(MAGIC)
+        with self.path.open("rb") as file:
+            for offset, self.last_seq, payload in records(file):
+                self._places.append((self.last_seq, offset))
+                self._end = offset + _HEAD.size + len(payload)
+            file.seek(self._end)
+            tail = file.read()
+        if _holds_records(tail):
+            names = (self.path.with_name(f"{self.path.name}{DAMAGED}{n or ''}") for n in (0, *range(2, 1000)))
+            copy = next(name for name in names if not name.exists())
+            shutil.copyfile(self.path, copy)
+            self.damage = (
+                f"{self.path}: damaged after event {self.last_seq}, the following {len(tail)} bytes were cut off;"
+                f" the original is kept as {copy}; the disk or card fails: replace it"
+            )
+        if not self._places:
+            os.pwrite(self._fd, MAGIC, 0)
+        os.ftruncate(self._fd, self._end)
+        os.fsync(self._fd)
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+    def number_behind(self, seq: int) -> int:
+        """Continue numbering after `seq`, the host's newest event. Return the number of skipped (lost) events."""
+        lost = max(0, seq - self.last_seq)
+        self.last_seq += lost
+        return lost
+
+    def write(self, payloads: Sequence[bytes], sync: bool = False) -> None:
+        """Append all records or none; with `sync`, wait until everything is on the disk.
+
+        Raises JournalFullError if the disk is full or broken; the file is then unchanged.
+        """
+        places, data = [], bytearray()
+        for seq, payload in enumerate(payloads, self.last_seq + 1):
+            places.append((seq, self._end + len(data)))
+            data += _HEAD.pack(len(payload), seq, _crc(seq, payload)) + payload
+        done = 0
+        try:
+            while done < len(data):
+                done += os.pwrite(self._fd, memoryview(data)[done:], self._end + done)
+            if sync and (data or not self._synced):
+                os.fsync(self._fd)
+        except OSError as e:
+            with suppress(OSError):  # the rest is overwritten, or cut off when the file is next opened
+                os.ftruncate(self._fd, self._end)
+            raise JournalFullError(self.path, e) from None
+        self._end += len(data)
+        self._places += places
+        self.last_seq += len(places)
+        self._synced = sync or (self._synced and not data)
+
+    def read(self, from_seq: int, limit: int) -> list[bytes]:
+        """Return at most `limit` payloads, starting at `from_seq`. Raises DataError for a damaged record."""
+        first, found = bisect_left(self._places, (from_seq, 0)), []
+        for seq, offset in self._places[first : first + limit]:
+            length, _, crc = _HEAD.unpack(os.pread(self._fd, _HEAD.size, offset))
+            payload = os.pread(self._fd, length, offset + _HEAD.size)
+            if _crc(seq, payload) != crc:
+                what = f"{self.path}: record {seq} is damaged"
+                raise DataError(what, "the disk or card fails", "replace it", code=ErrorCode.FILE_DAMAGED)
+            found.append(payload)
+        return found
+
+    def close(self) -> None:
+        """Close the file once everything is on the disk. Raises JournalFullError."""
+        try:
+            self.write((), sync=True)
+        finally:
+            os.close(self._fd)
+
+
+class Journal:
+    """Numbers events, writes them to the file of the current scan, then publishes them. One process per folder.
+
+    `publish` is called with packed events once they are in the file, `warn` with sentences for the log.
+    Raises ConfigError if the folder cannot be created or written, DeviceError if another process uses it.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        publish: Callable[[list[bytes]], None] = lambda _: None,
+        warn: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.folder, self._publish, self._warn = folder, publish, warn
+        self._file: JournalFile | None = None
+        self._batch: list[tuple[m.AnyEvent, bytes]] = []
+        self._pending = 0  # events of the batch that are to be written
+        self.broken = False
+        self.scan_id = ""
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as e:
+            raise ConfigError(
+                f"journal folder {folder}: {e.strerror}",
+                "it does not exist and cannot be created, or this user may not write there",
+                "create it, or choose another with --journal or pi.journal_dir",
+                code=ErrorCode.FILE_UNREADABLE,
+            ) from None
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(self._lock)
+            busy = f"journal folder {folder} is in use", "another polysight-pi runs"
+            raise DeviceError(*busy, "stop it, or give another --journal", code=ErrorCode.BUSY) from None
+
+    @property
+    def last_seq(self) -> int:
+        """Sequence number of the newest event of the current scan."""
+        return self._file.last_seq + self._pending if self._file else 0
+
+    def path_of(self, scan_id: str) -> Path:
+        """Return the path of a scan's journal file."""
+        return self.folder / f"{scan_id}.journal"
+
+    def open(self, scan_id: str, plan: RasterPlan, host_seq: int) -> tuple[bool, int]:
+        """Make `scan_id` the current scan. The next event is numbered after `host_seq`, the newest of the host.
+
+        Returns
+        -------
+        resumed
+            True if the scan was begun before.
+        lost
+            Number of the host's events that are missing in the journal.
+
+        Raises
+        ------
+        JournalFullError
+            if the journal cannot be opened, or there is no space for this plan's events.
+        DataError
+            if the file is not a journal, or the scan was begun with another plan. Nothing is changed then.
+        """
+        self.broken = False
+        self.commit()
+        self.check_room(scan_id, plan.positions)
+        file = self._file
+        if file is None or self.scan_id != scan_id:
+            file = JournalFile(self.path_of(scan_id))
+            if file.damage:
+                self._warn(file.damage)
+        try:
+            begun = _plan_of(file)
+            if begun is not None and begun != plan:
+                raise DataError(
+                    f"scan {scan_id} was begun with another plan: {begun}",
+                    "the scan's name was used before, with another grid",
+                    "resume that scan with its own plan, or give the new one another name",
+                    code=ErrorCode.NAME_TAKEN,
+                )
+        except (DataError, ProtocolError):
+            if file is not self._file:
+                file.close()
+            raise
+        if file is not self._file:
+            if self._file is not None:
+                self._file.close()
+            self._file, self.scan_id = file, scan_id
+        return begun is not None or host_seq > 0, file.number_behind(host_seq)
+
+    def check_room(self, scan_id: str, positions: int) -> None:
+        """Raise JournalFullError if the disk has no space for the rest of the scan's journal."""
+        path = self.path_of(scan_id)
+        try:
+            there = path.stat().st_size if path.exists() else 0
+            free = shutil.disk_usage(self.folder).free
+        except OSError as e:
+            raise JournalFullError(self.folder, e) from None
+        needed = max(0, positions * CAPTURE_BYTES - there) + SPARE_BYTES
+        if free < needed:
+            room = f"{free / 1e6:.1f} MB free, {needed / 1e6:.1f} MB needed for {positions} positions"
+            raise JournalFullError(self.folder, OSError(errno.ENOSPC, room))
+
+    def add(self, kind: type[m.AnyEvent], **fields: Any) -> None:
+        """Number an event and add it to the batch; long texts are shortened to the limit of the messages.
+
+        An event that is not journalled has the number of the last one that is.
+        """
+        self._pending += issubclass(kind, m.JOURNALLED) and self._file is not None and not self.broken
+        fields = {k: v[: m.MAX_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
+        event = kind(scan_id=self.scan_id, seq=self.last_seq, t_mono_ns=time.monotonic_ns(), **fields)
+        self._batch.append((event, m.pack(event)))
+
+    def commit(self) -> None:
+        """Write the batch to the file, then publish it.
+
+        Raises JournalFullError if it cannot be written. Until the scan is opened again, events are then published with
+        the last good number and not stored; of this batch only statuses, faults and the end of a row are published.
+        """
+        batch, self._batch, self._pending = self._batch, [], 0
+        if self._file is not None:
+            after = self._file.last_seq
+            kept = [(e, raw) for e, raw in batch if isinstance(e, m.JOURNALLED) and e.seq > after]
+            try:
+                if kept:
+                    self._file.write([raw for _, raw in kept], any(not isinstance(e, m.Capture) for e, _ in kept))
+            except JournalFullError:
+                self.broken = True
+                urgent = [e for e, _ in batch if isinstance(e, m.RowFinished | m.Fault | m.StageStatus)]
+                self._publish([m.pack(msgspec.structs.replace(e, seq=after)) for e in urgent])
+                raise
+        if batch:
+            self._publish([raw for _, raw in batch])
+
+    def read(self, scan_id: str, from_seq: int, limit: int) -> tuple[list[bytes], int]:
+        """Return packed events of any scan from `from_seq` on and its newest number; ([], 0) without a journal."""
+        if self._file is not None and scan_id == self.scan_id:
+            return self._file.read(from_seq, limit), self.last_seq
+        found, last = [], 0
+        with suppress(FileNotFoundError), self.path_of(scan_id).open("rb") as file:
+            for _, last, payload in records(file):
+                if last >= from_seq and len(found) < limit:
+                    found.append(payload)
+        return found, last
+
+    def close(self) -> None:
+        """Close the current file and unlock the folder. Raises JournalFullError."""
+        file, self._file = self._file, None
+        try:
+            if file is not None:
+                file.close()
+        finally:
+            os.close(self._lock)
+
+
+def _plan_of(file: JournalFile) -> RasterPlan | None:
+    """Return the plan of the first event, or None if there is no event yet."""
+    first = file.read(1, 1)
+    event = m.unpack_event(first[0]) if first else None
+    return event.plan if isinstance(event, m.RunStarted) else None

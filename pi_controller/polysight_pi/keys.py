@@ -1,0 +1,116 @@
+"""CURVE keys for addresses that are not loopback, and the list of allowed clients.
+
+`allowed_clients` in the key folder has one line per client that may connect: its public key (40 characters) and its
+name. Without that file only `host.key` is allowed, as in earlier releases. A changed file is read again.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+import zmq.utils.z85
+from zmq.auth import create_certificates, load_certificate
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+from polysight_shared.sockets import HOST_KEYS
+
+PARTIES = ("pi", "host")
+ALLOWED = "allowed_clients"
+KEY_CHARACTERS = 40
+COPY = f"copy {' and '.join(HOST_KEYS)} to the host, into its pi.key_dir; pi.key_secret stays on the Pi"
+
+
+class AllowedKeys:
+    """The clients that may connect."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._names: dict[str, str] = {}
+        self._seen = (-1, -1)
+        with suppress(OSError):
+            self._names = read_allowed(folder)
+
+    def name_of(self, key: bytes) -> str:
+        """Return the name of the client with this public key (32 bytes), or "" if it is not allowed."""
+        with suppress(OSError):  # missing or unreadable: keep the last list
+            stat = (self._folder / ALLOWED).stat()
+            if self._seen != (stat.st_mtime_ns, stat.st_size):
+                self._names = read_allowed(self._folder)
+                self._seen = (stat.st_mtime_ns, stat.st_size)
+        return self._names.get(zmq.utils.z85.encode(key).decode("ascii"), "") if len(key) == 32 else ""
+
+
+def read_allowed(folder: Path) -> dict[str, str]:
+    """Return the names of the clients that may connect, by public key (Z85 text)."""
+    try:
+        lines = (folder / ALLOWED).read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        with suppress(OSError, ValueError):
+            return {_public(folder, "host"): "host"}
+        return {}
+    keys = (line.strip().partition(" ") for line in lines)
+    return {key: name.strip() or "nameless" for key, _, name in keys if len(key) == KEY_CHARACTERS}
+
+
+# --- `polysight-pi keys`: these raise ConfigError, or OSError if the folder cannot be written -------------------------
+
+
+def make_keys(folder: Path, replace: bool = False) -> list[Path]:
+    """Make `pi.key`, `pi.key_secret`, `host.key` and `host.key_secret`; secret files are readable by the owner only.
+
+    Returns the files. Raises ConfigError if there are keys already, unless `replace`.
+    """
+    there = [p for name in PARTIES if (p := folder / f"{name}.key_secret").exists()]
+    if there and not replace:
+        raise ConfigError(
+            f"{there[0]} exists",
+            "keys were made before; new ones lock out every host that has the old ones",
+            f"keep them, or give --replace, then {COPY}",
+            code=ErrorCode.FILE_EXISTS,
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    made = [path for name in PARTIES for path in _create(folder, name)]
+    _write_allowed(folder, {_public(folder, "host"): "host"})
+    return made
+
+
+def allow(folder: Path, name: str) -> list[Path]:
+    """Make keys for one more client and allow it. Return its files; the secret one is for that client only."""
+    if not name.replace("-", "").replace("_", "").isalnum() or name in PARTIES or name in read_allowed(folder).values():
+        raise ConfigError(
+            f"client {name!r} cannot be added",
+            "its name is taken, or has characters other than a-z 0-9 - _",
+            "choose another name, or revoke that client first",
+            code=ErrorCode.NAME_TAKEN,
+        )
+    made = _create(folder, name)
+    _write_allowed(folder, read_allowed(folder) | {_public(folder, name): name})
+    return made
+
+
+def revoke(folder: Path, name: str) -> None:
+    """Remove a client from the list: its next command is refused, and it cannot connect again."""
+    names = read_allowed(folder)
+    left = {key: other for key, other in names.items() if other != name}
+    if left == names:
+        known = f"allowed: {', '.join(names.values())}"
+        raise ConfigError(f"no client {name!r} is allowed", "a typing error", known, code=ErrorCode.KEY_UNKNOWN)
+    _write_allowed(folder, left)
+
+
+def _public(folder: Path, name: str) -> str:
+    return load_certificate(folder / f"{name}.key")[0].decode("ascii")
+
+
+def _create(folder: Path, name: str) -> list[Path]:
+    public, secret = map(Path, create_certificates(folder, name))
+    secret.chmod(0o600)
+    return [public, secret]
+
+
+def _write_allowed(folder: Path, names: dict[str, str]) -> None:
+    new = folder / (ALLOWED + ".new")
+    new.write_text("".join(f"{key} {name}\n" for key, name in names.items()), encoding="utf-8")
+    new.replace(folder / ALLOWED)

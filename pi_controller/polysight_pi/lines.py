@@ -1,0 +1,325 @@
+"""Lines of the Raspberry Pi: trigger input and SYNC_IN through libgpiod v2, or SYNC_IN on MOSI through spidev.
+
+Works on any Linux GPIO chip; not run on a Pi yet. Sources of the ioctls: Linux, include/uapi/linux/gpio.h and
+include/uapi/linux/spi/spidev.h.
+"""
+
+from __future__ import annotations
+
+import array
+import errno
+import fcntl
+import os
+import struct
+import time
+from collections import deque
+from collections.abc import Callable
+from datetime import timedelta
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from polysight_pi.bursts import DEFAULT_BUFSIZ, Edge, Lines, SpiBurst
+from polysight_pi.sim_lines import SpiWireLines, WireLines
+from polysight_shared.config import Instrument, Pi
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.faults import PiFault
+from polysight_shared.messages import GPIOD, SPI
+
+EVENT_BUFFER = 1024  # edges kept by the kernel; its default of 16 would lose edges of a program without CPU time
+SPIN_NS = 100_000  # a sleep may end this much late, so the rest of a wait polls the clock
+WARM_NS = 30_000
+TWO_CALLS_NS = 1000  # pulses up to this width are as short as two system calls make them
+SET_VALUES = 0xC010B40F  # GPIO_V2_LINE_SET_VALUES_IOCTL, with the argument (bits, mask)
+_VALUES = struct.Struct("=QQ")
+BUFSIZ = Path("/sys/module/spidev/parameters/bufsiz")
+# _IOW('k', 0, struct spi_ioc_transfer[1]), _IOW('k', 1, __u8): mode 0, without chip select where the driver supports it
+MESSAGE, WRITE_MODE = 0x40206B00, 0x40016B01
+MODE_NO_CS, MODE_0 = 0x40, 0x00
+_TRANSFER = struct.Struct("=QQIIHBBBBBB")  # tx, rx, len, speed_hz, delay_us, bits, cs_change, tx_nbits, rx_nbits, ...
+_RIGHTS = "60-polysight.rules sets the device's group (udev), `sudo usermod -aG gpio,spi USER` adds the user to it"
+_REASONS = {
+    errno.EBUSY: ("it is in use", "end that program; `systemctl stop polysight-pi` if it is polysight itself"),
+    errno.EACCES: ("no permission", _RIGHTS),
+    errno.EPERM: ("no permission", _RIGHTS),
+    errno.ENOENT: ("there is no such device", "set pi.gpio_chip in instrument.toml to a label or path that exists"),
+    errno.EINVAL: ("the chip has no such line, or cannot set it so", "correct [pi] in instrument.toml (see gpioinfo)"),
+    errno.ENXIO: ("the chip reports no edges on this line", "use a line of the Pi's own header as pi.trigger_in"),
+    errno.ENODEV: ("the chip is gone", "look at the kernel's log (dmesg)"),
+}
+_SPI_REASONS = {
+    errno.ENOENT: ("SPI is off", "put `dtparam=spi=on` into /boot/firmware/config.txt and reboot the Pi"),
+    errno.EACCES: ("no permission", _RIGHTS),
+    errno.EMSGSIZE: ("the transfer is longer than spidev's buffer", "raise bufsiz as `polysight-pi check` says"),
+}
+
+
+def open_lines(instrument: Instrument, wires: Path | None = None) -> Lines:
+    """Open the rig's lines on GPIO, or on the simulated wires of the hub at `wires`.
+
+    Raises ConfigError or DeviceError if they cannot be opened.
+    """
+    pi = instrument.pi
+    if wires is not None:
+        return (SpiWireLines if pi.wiring == "spi" else WireLines)(wires, pi)
+    if pi.wiring == "gpiomem" or len(pi.sync_out) > 1:
+        raise ConfigError(
+            f'wiring = "{pi.wiring}" with sync_out = {list(pi.sync_out)} is no longer supported',
+            "a Pi sets its lines one after another, 50 to 200 ns apart, which shifts the IF by more than its band",
+            'use wiring = "spi", or "fanout", with a clock buffer behind one line (docs/how-to/wiring.md)',
+            code=ErrorCode.VALUE_INVALID,
+        )
+    return (SpiLines if pi.wiring == "spi" else GpiodLines)(pi)
+
+
+def load_gpiod() -> Any:
+    """Import gpiod. Raises ConfigError if it is missing or has the old v1 API."""
+    try:
+        import gpiod
+    except ImportError:
+        gpiod = None
+    if gpiod is None or not hasattr(gpiod, "request_lines"):
+        raise ConfigError(
+            "the Python package gpiod " + ("is not installed" if gpiod is None else "has the old v1 API"),
+            "GPIO needs the libgpiod v2 bindings; the distribution's packages are older",
+            "pip install 'gpiod>=2.1' into the program's own environment, or run with --wires on simulated wires",
+            code=ErrorCode.PACKAGE_MISSING,
+        )
+    return gpiod
+
+
+def find_chip(name: str, devices: Path = Path("/dev")) -> str:
+    """Return the path of a GPIO chip given its path or label (chip numbers differ between kernels).
+
+    Raises DeviceError, with the labels found, if there is no such chip.
+    """
+    if name.startswith("/"):
+        return name
+    gpiod, found = load_gpiod(), []
+    for path in sorted(devices.glob("gpiochip*")):
+        try:
+            with gpiod.Chip(str(path)) as chip:
+                label = chip.get_info().label
+        except OSError as e:
+            found.append(f"{path} ({e.strerror})")
+            continue
+        if label == name:
+            return str(path)
+        found.append(f"{path} is {label!r}")
+    raise DeviceError(
+        f"no GPIO chip has the label {name!r}: found {', '.join(found) or 'none'}",
+        "another Pi model, no GPIO on this machine, or no permission (group gpio)",
+        "set pi.gpio_chip in instrument.toml to one of these labels or to a path",
+        code=ErrorCode.FILE_MISSING,
+    )
+
+
+def _request(pi: Pi, line: int, buffer: int | None = None, **settings: Any) -> Any:
+    """Request a line of the rig's chip. Raises DeviceError with the reason."""
+    gpiod, path = load_gpiod(), find_chip(pi.gpio_chip)
+    config = {(line,): gpiod.LineSettings(**settings)}
+    try:
+        return gpiod.request_lines(path, config, consumer="polysight", event_buffer_size=buffer)
+    except (OSError, ValueError) as e:
+        number = (e.errno if isinstance(e, OSError) else errno.EINVAL) or 0
+        why, remedy = _REASONS.get(number, (f"the kernel says: {e}", "gpioinfo shows what the chip can do"))
+        if number == errno.EBUSY:
+            with gpiod.Chip(path) as chip:
+                why = f"it is held by {chip.get_line_info(line).consumer!r}"
+        what = f"fault {int(PiFault.TRIGGER_LINE_LOST)}: GPIO line {line} of {path}: {why}"
+        raise DeviceError(what, str(e), remedy) from None
+
+
+def request_output(pi: Pi) -> Any:
+    """Request the SYNC_IN line as an output that is low from the start. Raises DeviceError."""
+    line = load_gpiod().line
+    return _request(pi, pi.sync_out[0], direction=line.Direction.OUTPUT, output_value=line.Value.INACTIVE)
+
+
+def _lost(e: OSError) -> DeviceError:
+    return DeviceError(
+        f"GPIO lines are gone: {e.strerror}", "the chip vanished or its driver was unloaded", "`polysight-pi check`"
+    )
+
+
+class TriggerInput:
+    """The trigger input: rising edges with kernel time stamps (CLOCK_MONOTONIC), bias and debouncing.
+
+    Raises DeviceError if the chip or the line is not available.
+    """
+
+    def __init__(self, pi: Pi) -> None:
+        self.check_width = not pi.one_shot
+        self._events: deque[Any] = deque()
+        line = load_gpiod().line
+        self._input = _request(
+            pi, pi.trigger_in, EVENT_BUFFER,
+            direction=line.Direction.INPUT, edge_detection=line.Edge.RISING, event_clock=line.Clock.MONOTONIC,
+            bias=line.Bias[pi.trigger_bias.upper().replace("-", "_")],
+            debounce_period=timedelta(microseconds=pi.trigger_debounce_us),
+        )  # fmt: skip
+
+    def now_ns(self) -> int:
+        """Return the time of CLOCK_MONOTONIC, nanoseconds."""
+        return time.monotonic_ns()
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Return at `t_ns`, never before it: sleep most of the time, then poll the clock."""
+        left = t_ns - time.monotonic_ns() - SPIN_NS
+        if left > 0:
+            time.sleep(left * 1e-9)
+        while time.monotonic_ns() < t_ns:
+            pass
+
+    def wait_edge(self, timeout_s: float) -> Edge | None:
+        """Return the next rising edge, or None after a timeout. Raises DeviceError when the line is lost."""
+        try:
+            if not self._events and self._input.wait_edge_events(timedelta(seconds=timeout_s)):
+                self._events.extend(self._input.read_edge_events())
+        except OSError as e:
+            raise _lost(e) from None
+        if not self._events:
+            return None
+        event = self._events.popleft()
+        return Edge(event.timestamp_ns, event.line_seqno)
+
+    def close(self) -> None:
+        """Release the line."""
+        self._input.release()
+
+
+class GpiodLines(TriggerInput):
+    """The trigger input, and a SYNC_IN output that is low from the start.
+
+    When the program dies the kernel releases the line. A pulse is two system calls on the request's descriptor, whose
+    arguments are prepared beforehand. Raises DeviceError like :class:`TriggerInput`.
+    """
+
+    name: str = GPIOD
+
+    def __init__(self, pi: Pi) -> None:
+        self._output = request_output(pi)
+        self._set, self._clear = (partial(fcntl.ioctl, self._output.fd, SET_VALUES, _VALUES.pack(v, 1)) for v in (1, 0))
+        try:
+            super().__init__(pi)
+        except DeviceError:
+            self._output.release()
+            raise
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Return at `t_ns`, never before it.
+
+        After a sleep, one system call without effect brings the code of the pulse back into the processor's caches
+        (measured on a busy machine: period errors of 0.8 instead of 5 us).
+        """
+        if t_ns - time.monotonic_ns() > SPIN_NS + WARM_NS:
+            super().sleep_until(t_ns - WARM_NS)
+            self._make_pulse(self._clear)
+        super().sleep_until(t_ns)
+
+    def pulse(self, width_ns: int) -> tuple[int, int]:
+        """Set SYNC_IN and clear it; return the times before and after. Raises DeviceError when the line is lost."""
+        return self._make_pulse(self._set, width_ns)
+
+    def measure(self) -> int:
+        """Return the duration of a pulse, nanoseconds, without sending one: both system calls leave the line low."""
+        before, after = self._make_pulse(self._clear)
+        return after - before
+
+    def _make_pulse(self, set_line: Callable[[], object], width_ns: int = 0) -> tuple[int, int]:
+        now, clear = time.monotonic_ns, self._clear
+        try:
+            before = now()
+            set_line()
+            if width_ns > TWO_CALLS_NS:
+                super().sleep_until(before + width_ns)
+            clear()
+            return before, now()
+        except OSError as e:
+            raise _lost(e) from None
+
+    def close(self) -> None:
+        """Set SYNC_IN low and release the lines."""
+        try:
+            self._make_pulse(self._clear)
+        finally:
+            self._output.release()
+            super().close()
+
+
+class SpiDevice:
+    """A spidev device whose MOSI is SYNC_IN, low from the start. Raises DeviceError if it is not available.
+
+    The kernel completes a transfer that has begun even if this program is killed; the last bits are low.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        try:
+            self._fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError as e:
+            raise self._error(e) from None
+        try:
+            try:
+                fcntl.ioctl(self._fd, WRITE_MODE, bytes([MODE_NO_CS]))
+            except OSError:
+                fcntl.ioctl(self._fd, WRITE_MODE, bytes([MODE_0]))
+            self.transfer(bytes(1), 1_000_000)
+        except (OSError, DeviceError) as e:
+            os.close(self._fd)
+            raise (e if isinstance(e, DeviceError) else self._error(e)) from None
+
+    @property
+    def bufsiz(self) -> int:
+        """Longest transfer that spidev accepts, bytes."""
+        try:
+            return int(BUFSIZ.read_text())
+        except (OSError, ValueError):
+            return DEFAULT_BUFSIZ
+
+    def transfer(self, data: bytes, clock_hz: int) -> tuple[int, int]:
+        """Send the bytes; return the times before and after the system call. Raises DeviceError."""
+        buffer = array.array("B", data)
+        message = _TRANSFER.pack(buffer.buffer_info()[0], 0, len(data), clock_hz, 0, 8, 0, 0, 0, 0, 0)
+        try:
+            before = time.monotonic_ns()
+            fcntl.ioctl(self._fd, MESSAGE, message)
+            return before, time.monotonic_ns()
+        except OSError as e:
+            raise self._error(e) from None
+
+    def _error(self, e: OSError) -> DeviceError:
+        unknown = f"the kernel says: {e.strerror}", "look at the kernel's log (dmesg)"
+        why, remedy = _SPI_REASONS.get(e.errno or 0, unknown)
+        return DeviceError(f"fault {int(PiFault.TRIGGER_LINE_LOST)}: {self.path}: {e.strerror}", why, remedy)
+
+    def close(self) -> None:
+        """Close the device."""
+        os.close(self._fd)
+
+
+class SpiLines(TriggerInput):
+    """The trigger input, and SYNC_IN on MOSI: low before, between and after bursts."""
+
+    name: str = SPI
+
+    def __init__(self, pi: Pi) -> None:
+        self._device = SpiDevice(pi.spi_device)
+        self.bufsiz = self._device.bufsiz
+        try:
+            super().__init__(pi)
+        except DeviceError:
+            self._device.close()
+            raise
+
+    def transfer(self, burst: SpiBurst) -> tuple[int, int]:
+        """Send a burst; return the times before and after. Raises DeviceError."""
+        return self._device.transfer(burst.data, burst.clock_hz)
+
+    def close(self) -> None:
+        """Release the lines; MOSI is low."""
+        try:
+            self._device.close()
+        finally:
+            super().close()

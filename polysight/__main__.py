@@ -1,8 +1,0 @@
-"""`python -m polysight` is `polysight`."""
-
-import sys
-
-from polysight.host.cli.main import main
-
-if __name__ == "__main__":
-    sys.exit(main())

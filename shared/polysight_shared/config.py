@@ -1,0 +1,382 @@
+"""Declaration of the rig file `instrument.toml`: every setting of the instrument with its type, limits and rules.
+
+`load_instrument` reads it. An unknown key, a wrong type or a broken rule is refused with file, key, value and rule.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+
+from polysight_shared.raster import Burst, Grid, Stage
+from polysight_shared.tables import Count, NonNegative, Positive, Section, decode, read_toml, require, to_builtins
+
+Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
+GpioLine = Annotated[int, msgspec.Meta(ge=0, le=63)]
+Vector = tuple[float, float, float]
+HPF_FIRST_KHZ = (175.0, 235.0, 350.0, 700.0)
+HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
+DEBOUNCE_TICKS_US = 5_000
+CARD_TAIL_S = 2.0  # silence after which a card sends a packet that is not full (docs/spec/dca1000.md, observed)
+_MOSI = {"/dev/spidev0": 10, "/dev/spidev1": 20}  # GPIO lines of a Pi's header
+
+
+class Chirp(Section, frozen=True):
+    """FMCW chirp and ADC window (AWR2243 profile)."""
+
+    start_hz: Positive
+    slope_hz_per_s: Positive
+    adc_start_us: NonNegative
+    samples: Count
+    sample_rate_hz: Positive
+    ramp_end_us: Positive
+    if_mode: Literal["complex1x", "complex2x"] = "complex1x"
+    hpf1_khz: float = 175.0
+    hpf2_khz: float = 350.0
+    linear_samples: tuple[int, int] = (0, 192)
+
+    def __post_init__(self) -> None:
+        window_us = self.samples / self.sample_rate_hz * 1e6
+        require(
+            self.adc_start_us + window_us <= self.ramp_end_us,
+            f"adc_start_us = {self.adc_start_us} and samples / sample_rate_hz = {window_us:.2f} us"
+            f" must end inside the ramp, ramp_end_us = {self.ramp_end_us}",
+        )
+        top = self.start_hz + self.slope_hz_per_s * self.ramp_end_us * 1e-6
+        require(
+            self.start_hz >= 76e9 and top <= 81.1e9,
+            f"start_hz, slope_hz_per_s and ramp_end_us give {self.start_hz:.4g}..{top:.5g} Hz; it must be 76..81 GHz",
+        )
+        none = ", or 0 for no filter (simulated rigs only)"
+        require(self.hpf1_khz in (0.0, *HPF_FIRST_KHZ), f"hpf1_khz must be one of {HPF_FIRST_KHZ}{none}")
+        require(self.hpf2_khz in (0.0, *HPF_SECOND_KHZ), f"hpf2_khz must be one of {HPF_SECOND_KHZ}{none}")
+        a, b = self.linear_samples
+        require(
+            a >= 0 and a + 12 <= b <= self.samples,
+            f"linear_samples = [{a}, {b}] must be a range of at least 12 within 0..samples = {self.samples}",
+        )
+
+    @property
+    def first_sample_hz(self) -> float:
+        """Transmit frequency at the first ADC sample."""
+        return self.start_hz + self.slope_hz_per_s * self.adc_start_us * 1e-6
+
+    @property
+    def hz_per_sample(self) -> float:
+        """Transmit frequency step from one ADC sample to the next."""
+        return self.slope_hz_per_s / self.sample_rate_hz
+
+    @property
+    def swept_hz(self) -> float:
+        """Bandwidth swept within the ADC window."""
+        return self.hz_per_sample * self.samples
+
+
+class Pi(Section, frozen=True):
+    """Raspberry Pi: lines, sockets, journal."""
+
+    gpio_chip: str = "pinctrl-bcm2711"
+    trigger_in: GpioLine = 26
+    sync_out: tuple[GpioLine, ...] = (22,)
+    wiring: Literal["fanout", "lines", "gpiomem", "spi"] = "fanout"
+    one_shot: bool = False  # a hardware one-shot sets the width of the pulses instead of the GPIO line
+    command_address: str = "tcp://127.0.0.1:5601"
+    event_address: str = "tcp://127.0.0.1:5602"
+    journal_dir: str = "journal"
+    key_dir: str = "keys"  # a relative path counts from the rig file's folder
+    heartbeat_ms: Count = 500
+    trigger_bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
+    trigger_debounce_us: Annotated[int, msgspec.Meta(ge=0)] = 0
+    gpiomem: str = "/dev/gpiomem"  # obsolete, like `wiring = "gpiomem"`: accepted, but no longer used
+    spi_device: str = "/dev/spidev0.0"
+    host_heartbeat_ms: Annotated[int, msgspec.Meta(ge=0)] = 100  # period of the host's heartbeat; 0: none
+
+    def __post_init__(self) -> None:
+        require(len(self.sync_out) > 0, "sync_out needs at least one line")
+        require(self.trigger_in not in self.sync_out, "trigger_in must not be one of sync_out")
+        require(
+            self.wiring not in ("fanout", "spi") or len(self.sync_out) == 1,
+            f'wiring = "{self.wiring}" drives exactly one line in sync_out',
+        )
+        if self.wiring == "spi" and (mosi := _MOSI.get(self.spi_device.rpartition(".")[0])) is not None:
+            require(self.sync_out == (mosi,), f"MOSI of {self.spi_device} is GPIO {mosi}: sync_out = [{mosi}]")
+        require(
+            self.wiring != "gpiomem" or max(self.sync_out) < 32, 'wiring = "gpiomem" drives lines 0..31 of one register'
+        )
+
+
+class MountStep(Section, frozen=True):
+    """One step of a mount: a shift, or a rotation about an axis of the rig."""
+
+    shift_mm: Vector | None = None
+    turn_deg: float | None = None
+    about: Literal["x", "y", "z"] | None = None
+
+    def __post_init__(self) -> None:
+        require(
+            (self.shift_mm is not None) != (self.turn_deg is not None and self.about is not None),
+            "a mount step is either { shift_mm = [x, y, z] } or { turn_deg = a, about = axis }",
+        )
+
+
+class Antennas(Section, frozen=True):
+    """Antenna positions in the frame of a board, millimetres from RX1."""
+
+    rx_mm: tuple[Vector, ...]
+    tx_mm: tuple[Vector, ...]
+
+
+class Board(Section, frozen=True):
+    """One radar board and its capture card."""
+
+    name: str
+    role: Literal["transmit", "receive_h", "receive_v"]
+    card_address: str
+    host_address: str
+    command_port: Port
+    data_port: Port
+    mount: tuple[MountStep, ...]
+    record: bool = True
+    tx_antenna: Annotated[int, msgspec.Meta(ge=0)] = 1
+    start_offset_hz: float = 0.0
+
+
+class Card(Section, frozen=True):
+    """DCA1000 settings common to all boards."""
+
+    packet_bytes: Annotated[int, msgspec.Meta(ge=24, le=1470)] = 1470
+    packet_delay_us: NonNegative = 25.0
+    receive_buffer_bytes: Count = 8 << 20
+
+    @property
+    def payload_bytes(self) -> int:
+        """Samples in a full packet, bytes: all but 14 bytes of headers (docs/spec/dca1000.md)."""
+        return self.packet_bytes - 14
+
+
+class NativeRadar(Section, frozen=True):
+    """One board under `radar.control = "native"`.
+
+    It is identified by `usb_serial`, or by `usb_path`, the position of its plug ("1-4.2": bus, then the hub's ports).
+    With `die_id`, another board at this place is refused. `ldo_bypass` can destroy a board with 1.3 V RF supplies, so
+    it requires the board's USB serial number also in `ldo_bypass_acknowledged`.
+    """
+
+    usb_serial: str = ""
+    ldo_bypass: bool = False
+    ldo_bypass_acknowledged: str = ""
+    usb_path: Annotated[str, msgspec.Meta(pattern=r"^([0-9]+-[0-9]+(\.[0-9]+)*)?$")] = ""
+    die_id: Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{8}(-[0-9a-f]{8}){3})?$")] = ""
+
+    def __post_init__(self) -> None:
+        require(bool(self.usb_serial) != bool(self.usb_path), "each of radar.native needs usb_serial or usb_path")
+
+    @property
+    def place(self) -> str:
+        """Serial number or address of the board, or `usb:` and its path."""
+        return self.usb_serial or f"usb:{self.usb_path}"
+
+
+class Radar(Section, frozen=True):
+    """Settings of arming the radars for the pulses of a row; paths are relative to the rig file's folder.
+
+    `control`: `endless`: another program started the radars with an infinite number of frames. `line_server`: a line
+    is sent to each board's control server before each row; `servers` has its `address:port` by board name. `native`:
+    this host configures the boards over USB; the table `native` identifies each board by name, and the other keys
+    apply to all. `firmware`: TI's image, downloaded to the boards' RAM at each start ("": use the firmware in their
+    flash). `calibration_dir`: folder that stores the results of each board's RF init, which are restored at later
+    starts ("": calibrate at each start). `trace_dir`: folder for logs of all traffic between host and boards, one file
+    for each connection ("": no log). `slow_spi`: send words one by one at 1 MHz.
+    """
+
+    control: Literal["endless", "line_server", "native"] = "endless"
+    servers: dict[str, Annotated[str, msgspec.Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$")]] = msgspec.field(
+        default_factory=dict
+    )
+    native: dict[str, NativeRadar] = msgspec.field(default_factory=dict)
+    idle_us: Positive = 100.0  # before each chirp
+    rx_gain_db: int = 32
+    rf_gain_target_db: Literal[30, 33, 36] = 30
+    tx_backoff_db: Annotated[int, msgspec.Meta(ge=0)] = 0
+    firmware: str = ""
+    calibration_dir: str = ""
+    trace_dir: str = ""
+    slow_spi: bool = False
+
+    def __post_init__(self) -> None:
+        for board, address in self.servers.items():
+            port = int(address.rpartition(":")[2])
+            require(0 < port <= 65535, f"port {port} of radar.servers.{board} is outside 1..65535")
+        places = [b.place for b in self.native.values()]
+        require(len(set(places)) == len(places), f"each of radar.native needs its own usb_serial or path, not {places}")
+
+
+class Geometry(Section, frozen=True):
+    """Position of the object plane."""
+
+    object_distance_mm: Positive
+
+
+class Image(Section, frozen=True):
+    """Image grid, centred on the specular midpoint of TX and H."""
+
+    columns: Count = 150
+    rows: Count = 150
+    pixel_mm: Positive = 2.0
+    apodisation: Literal["none", "kaiser", "taylor"] = "kaiser"
+
+
+class Polarimetry(Section, frozen=True):
+    """Cross-polar leakage of the receivers as [real, imaginary] amplitude, and the Gaussian filter against speckle.
+
+    The leakage is used only with `leakage_std`, the measured standard error of each of its parts. Without it the
+    leakage counts as not measured: `leakage_h` and `leakage_v` are ignored, and `leakage_prior` is its expected size.
+    """
+
+    leakage_h: tuple[float, float] = (0.0, 0.0)
+    leakage_v: tuple[float, float] = (0.0, 0.0)
+    leakage_std: NonNegative | None = None
+    # rms magnitude of unmeasured leakage of any phase; 0.058 is the rms of amplitudes distributed uniformly up to 0.1
+    leakage_prior: NonNegative = 0.058
+    smooth_px: NonNegative = 1.5
+
+
+class CalibrationFiles(Section, frozen=True):
+    """Files of `polysight calibrate`; "" for none. Paths are relative to the rig file's folder."""
+
+    direct_path: str = ""
+    hpf: str = ""
+    metal: str = ""
+
+
+class Limits(Section, frozen=True):
+    """Limits of a scan: retakes, timeouts, disk space, queue of rows."""
+
+    row_retakes: Annotated[int, msgspec.Meta(ge=0)] = 2
+    command_timeout_s: Positive = 5.0
+    end_of_record_s: Positive = 3.0
+    free_disk_bytes: Annotated[int, msgspec.Meta(ge=0)] = 1 << 30
+    rows_waiting: Count = 8  # maximum number of rows that wait for processing while another is recorded
+
+
+class Instrument(Section, frozen=True):
+    """All tables of the rig file."""
+
+    name: str
+    chirp: Chirp
+    burst: Burst
+    grid: Grid
+    stage: Stage
+    pi: Pi
+    antennas: Antennas
+    boards: tuple[Board, ...]
+    geometry: Geometry
+    card: Card = Card()
+    radar: Radar = Radar()
+    image: Image = Image()
+    polarimetry: Polarimetry = Polarimetry()
+    limits: Limits = Limits()
+    calibration: CalibrationFiles = CalibrationFiles()
+
+    def __post_init__(self) -> None:
+        for role in ("transmit", "receive_h", "receive_v"):
+            n = sum(b.role == role for b in self.boards)
+            require(n == 1, f'boards must hold exactly one with role = "{role}", found {n}')
+        # No Pi debounces in hardware; the kernel then reads the level some ticks after the edge.
+        require(
+            self.pi.trigger_debounce_us == 0
+            or self.stage.trigger_width_us >= self.pi.trigger_debounce_us + DEBOUNCE_TICKS_US,
+            f"stage.trigger_width_us must exceed pi.trigger_debounce_us by at least {DEBOUNCE_TICKS_US} us, or every"
+            " trigger is suppressed; trigger_debounce_us = 0 disables it",
+        )
+        names = [b.name for b in self.boards]
+        for name in names:  # folders of a scan are named after them
+            rule = "boards name must be 1..64 letters, digits, spaces, _ - or ., the first a letter, a digit or _"
+            require(re.fullmatch(r"\w[\w .-]{0,63}", name) is not None, f"{rule}: {name!r}")
+        require(len(set(names)) == len(names), f"board names must differ: {names}")
+        hosts = [(b.host_address, b.data_port) for b in self.boards]
+        require(len(set(hosts)) == len(hosts), "each board needs its own host_address and data_port")
+        unknown = sorted(set(self.radar.servers) - set(names))
+        require(not unknown, f"radar.servers has unknown boards {unknown}; the boards are {names}")
+        without = [n for n in names if n not in self.radar.servers]
+        require(
+            self.radar.control != "line_server" or not without,
+            f'radar.control = "line_server" needs radar.servers for every board; it is missing for {without}',
+        )
+        require(
+            self.radar.control != "native" or set(self.radar.native) == set(names),
+            f'radar.control = "native" needs radar.native for each of the boards {names}, not {[*self.radar.native]}',
+        )
+        require(
+            self.transmitter.tx_antenna < len(self.antennas.tx_mm),
+            "boards.tx_antenna exceeds the antennas in antennas.tx_mm",
+        )
+        misfit = self.stage.misfit(self.grid)
+        require(not misfit, misfit)
+
+    @property
+    def transmitter(self) -> Board:
+        """Transmitting board."""
+        return self.by_role("transmit")
+
+    @property
+    def receivers(self) -> tuple[Board, Board]:
+        """The two receiving boards: H (s-polarised) first, then V (p-polarised)."""
+        return self.by_role("receive_h"), self.by_role("receive_v")
+
+    @property
+    def recorded(self) -> tuple[Board, ...]:
+        """Boards that are recorded."""
+        return tuple(b for b in self.boards if b.record)
+
+    def by_role(self, role: str) -> Board:
+        """Return the board with this role."""
+        return next(b for b in self.boards if b.role == role)
+
+    def by_name(self, name: str) -> Board:
+        """Return the board with this name. Raises KeyError if there is none."""
+        for b in self.boards:
+            if b.name == name:
+                return b
+        raise KeyError(name)
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one frame: chirps x samples x 4 RX x (I, Q) x int16."""
+        return self.burst.chirps * self.chirp.samples * len(self.antennas.rx_mm) * 2 * 2
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of one board in one complete row."""
+        return self.grid.columns * self.burst.pulses * self.frame_bytes
+
+    @property
+    def recorded_row_bytes(self) -> int:
+        """Bytes of all recorded boards in one complete row."""
+        return len(self.recorded) * self.row_bytes
+
+    @property
+    def scan_bytes(self) -> int:
+        """Bytes of raw data of a whole scan."""
+        return self.grid.rows * self.recorded_row_bytes
+
+
+def load_instrument(path: Path) -> Instrument:
+    """Read and check a rig file; its relative paths become absolute.
+
+    Raises
+    ------
+    ConfigError
+        with file, key, value and rule.
+    """
+    rig = decode(read_toml(path), Instrument, str(path))
+    folder = path.parent.resolve()
+    files = {kind: name and str(folder / name) for kind, name in to_builtins(rig.calibration).items()}
+    pi = msgspec.structs.replace(rig.pi, key_dir=str(folder / rig.pi.key_dir))
+    paths = ("firmware", "calibration_dir", "trace_dir")
+    places = {key: (name := getattr(rig.radar, key)) and str(folder / name) for key in paths}
+    radar = msgspec.structs.replace(rig.radar, **places)
+    return msgspec.structs.replace(rig, pi=pi, radar=radar, calibration=CalibrationFiles(**files))

@@ -1,0 +1,62 @@
+"""Codes of errors, so that programs and tests distinguish them without comparing sentences.
+
+The general codes fit most cases; a room adds its own only for an error that callers or tests distinguish.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class ErrorCode(StrEnum):
+    """`PolysightError.code`: stable names, in lower case with hyphens, unlike the sentences beside them."""
+
+    OTHER = "other"
+
+    # Files and folders
+    FILE_MISSING = "file-missing"
+    FILE_UNREADABLE = "file-unreadable"
+    FILE_UNWRITABLE = "file-unwritable"
+    FILE_DAMAGED = "file-damaged"
+    FILE_FOREIGN = "file-foreign"  # of another format, or another program's
+    FILE_TOO_LARGE = "file-too-large"
+    FILE_EXISTS = "file-exists"
+    PATH_OUTSIDE = "path-outside"  # leads out of the folder it belongs to
+    DISK_FULL = "disk-full"
+    VERSION_UNSUPPORTED = "version-unsupported"
+
+    # Values given by a person or a program
+    KEY_UNKNOWN = "key-unknown"
+    KEY_MISSING = "key-missing"
+    TYPE_WRONG = "type-wrong"
+    VALUE_INVALID = "value-invalid"  # breaks a rule of its own: range, form, finite
+    VALUES_CONFLICT = "values-conflict"  # two values that cannot stand together
+    NAME_TAKEN = "name-taken"
+
+    # Peers and devices
+    NO_ANSWER = "no-answer"
+    REFUSED_BY_PEER = "refused-by-peer"
+    MESSAGE_INVALID = "message-invalid"
+    BUSY = "busy"
+    PACKAGE_MISSING = "package-missing"
+
+    # Data
+    NO_DATA = "no-data"
+    NOT_ENOUGH_DATA = "not-enough-data"
+    MISMATCH = "mismatch"  # two pieces of data that do not belong together
+
+    # host/polysight/serve
+    HOST_UNKNOWN = "host-unknown"  # the request's Host is no name of this server
+    ORIGIN_FOREIGN = "origin-foreign"  # the request comes from a page of another site
+    READ_ONLY = "read-only"
+    TOKEN_WRONG = "token-wrong"
+
+    # host/polysight/acquisition
+    ROW_INCOMPLETE = "row-incomplete"  # all retakes of a row are used up
+    STAGE_NOT_READY = "stage-not-ready"  # not homed, in a fault, or another host's
+    STAGE_DIFFERS = "stage-differs"  # the Pi's [stage] places rows elsewhere
+
+    # Radar
+    RADAR_RESTARTED = "radar-restarted"
+    RADAR_NO_FIRMWARE = "radar-no-firmware"
+    RADAR_FAULT = "radar-fault"  # a fatal event, or a failed self-test

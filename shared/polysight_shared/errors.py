@@ -1,0 +1,110 @@
+"""Exceptions with three sentences for people (what happened, the likely cause, what to do) and a code for programs."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterable
+from difflib import get_close_matches
+from pathlib import Path
+
+from polysight_shared.error_codes import ErrorCode
+
+
+class PolysightError(Exception):
+    """Base class of all errors that this project raises.
+
+    Parameters
+    ----------
+    what
+        What happened, with the file, address, line or value.
+    why
+        The likely cause.
+    remedy
+        What to do next.
+    code
+        Kind of error, for programs and tests.
+    """
+
+    exit_status = 1
+
+    def __init__(self, what: str, why: str = "", remedy: str = "", *, code: ErrorCode = ErrorCode.OTHER) -> None:
+        super().__init__(what)
+        self.what, self.why, self.remedy, self.code = what, why, remedy, code
+
+    def __str__(self) -> str:
+        parts = [self.what]
+        if self.why:
+            parts.append(f"why: {self.why}")
+        if self.remedy:
+            parts.append(f"do: {self.remedy}")
+        return "\n  ".join(parts)
+
+
+def advice(*parts: str) -> str:
+    """Join the parts of a remedy that are not empty."""
+    return "; ".join(part for part in parts if part)
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return `did you mean 'step_mm'?` with the most similar known word; "" if none is similar."""
+    near = get_close_matches(word, list(known), n=1, cutoff=0.7)
+    return f"did you mean {near[0]!r}?" if near else ""
+
+
+class ConfigError(PolysightError):
+    """A configuration file has a wrong, missing or unknown key."""
+
+    exit_status = 2
+
+
+class DataError(PolysightError):
+    """A file or folder is missing, damaged, or of another kind than expected."""
+
+    exit_status = 3
+
+
+def no_such(path: Path) -> DataError:
+    """Return the error for a missing file or folder."""
+    try:
+        near = did_you_mean(path.name, [p.name for p in path.parent.iterdir()])
+    except OSError:
+        near = f"{path.parent} does not exist either"
+    return DataError(
+        f"{path}: does not exist",
+        "the path is wrong",
+        near or "give the path of an existing file or folder",
+        code=ErrorCode.FILE_MISSING,
+    )
+
+
+class ProtocolError(PolysightError):
+    """A message that breaks its protocol."""
+
+    exit_status = 4
+
+
+class VersionError(ProtocolError):
+    """The peer uses another major version of the protocol."""
+
+
+class DeviceError(PolysightError):
+    """A device, peer or network hop failed."""
+
+    exit_status = 5
+
+
+def os_error(
+    e: OSError,
+    why: str = "the disk is full, a path is wrong, or you may not write there",
+    remedy: str = "check the path, its permissions and the free space (df -h)",
+) -> DeviceError:
+    """Turn an OSError into a DeviceError with cause and remedy, so that a command ends without a traceback."""
+    where = f"{e.filename}: " if e.filename else ""
+    code = ErrorCode.DISK_FULL if e.errno in (errno.ENOSPC, errno.EDQUOT) else ErrorCode.OTHER
+    return DeviceError(f"{where}{e.strerror or e}", why, advice(remedy, *getattr(e, "__notes__", ())), code=code)
+
+
+class ScanError(PolysightError):
+    """A scan failed, or was refused."""
+
+    exit_status = 6

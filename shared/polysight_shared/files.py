@@ -1,0 +1,98 @@
+"""Read files with limits (no pipe blocks the program, no size fills its memory), and write them safely."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, BinaryIO
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+
+MAX_JSON_BYTES = 256 << 20  # a hundred times the manifest of a scan of ten thousand rows
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file for reading. Does not block on a pipe without a writer.
+
+    Raises
+    ------
+    DataError
+        if it is a folder, a device or a pipe.
+    OSError
+        if it cannot be opened.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise DataError(
+                f"{path}: is not a regular file",
+                "it is a folder, a device or a pipe",
+                "give a file",
+                code=ErrorCode.FILE_FOREIGN,
+            )
+        return os.fdopen(os.dup(descriptor), "rb")
+    finally:
+        os.close(descriptor)
+
+
+def read_bounded(path: Path, max_bytes: int) -> bytes:
+    """Read a regular file of at most `max_bytes` bytes.
+
+    Raises
+    ------
+    DataError
+        if it is larger, or not a regular file.
+    OSError
+        if it cannot be read.
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(max_bytes + 1) if size <= max_bytes else b""
+    if (size := max(size, len(data))) > max_bytes:
+        raise DataError(
+            f"{path}: {size} bytes, the limit is {max_bytes}",
+            "it is another kind of file",
+            "check the path",
+            code=ErrorCode.FILE_TOO_LARGE,
+        )
+    return data
+
+
+def read_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
+    """Read a JSON file.
+
+    Raises
+    ------
+    ValueError
+        if it is not JSON in UTF-8, or nested too deeply.
+    DataError, OSError
+        as `read_bounded`.
+    """
+    try:
+        return json.loads(read_bounded(path, max_bytes).decode("utf-8"))
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Add this path to an OSError of the block that has none, such as a full disk during a write."""
+    try:
+        yield
+    except OSError as e:
+        if e.filename is None:
+            e.filename = str(path)
+        raise
+
+
+def open_to_write(path: Path, mode: str = "wb", buffering: int = -1) -> IO[Any]:
+    """Open a file for writing. Raises OSError, also for a symbolic link, through which nothing is written."""
+    if path.is_symlink():
+        raise OSError(errno.ELOOP, "it is a symbolic link; polysight does not write through links", str(path))
+    return path.open(mode, buffering)

@@ -1,0 +1,399 @@
+"""Messages between Pi and host: typed, packed with msgpack, checked on decoding.
+
+A message is a msgpack map with its `type` and its `version`, "major.minor"; another major version is refused. New
+fields have defaults and come last, so that all minor versions are compatible. Specification: docs/spec/wire.md.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgpack
+import msgspec
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ProtocolError, VersionError
+from polysight_shared.raster import RasterPlan, Row
+
+WIRE_VERSION = "1.0"
+# Limits of `Pulse`; the reply arrives well before the timeout of a command.
+MAX_PULSES_AT_REST = 256
+MAX_PULSES_AT_REST_S = 2.0
+MAX_COMMAND_BYTES = 65_536  # the Pi closes the connection after a longer command
+MAX_HEARTBEAT_MS = 10_000  # of the host; after a missing heartbeat the rig stays locked for four periods
+# Every field has a finite and bounded type; a message outside the limits is refused.
+Natural = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+Seq = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
+Index = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
+Take = Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
+Number = Annotated[int, msgspec.Meta(ge=0, lt=1000)]
+MAX_TEXT = 4000
+Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
+Name = Annotated[str, msgspec.Meta(max_length=120)]
+ScanId = Annotated[str, msgspec.Meta(min_length=1, max_length=120, pattern=r"\A[A-Za-z0-9_-][A-Za-z0-9._-]*\Z")]
+ScanIdOrNone = Annotated[str, msgspec.Meta(max_length=120, pattern=r"\A[A-Za-z0-9._-]*\Z")]
+Owner = Annotated[str, msgspec.Meta(max_length=64, pattern=r"\A[A-Za-z0-9-]*\Z")]
+Micros = Annotated[float, msgspec.Meta(ge=0, le=1e7)]
+Speed = Annotated[float, msgspec.Meta(ge=0, le=1e5)]
+Place = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+RowStatus = Literal["done", "aborted", "fault"]
+ExitStatus = Literal["success", "abort", "fail"]
+State = Literal["idle", "homing", "homed", "ready", "running", "held", "done", "fault"]
+GPIOD, GPIOMEM, SPI, WIRES = "gpiod", "gpiomem", "spi", "wires"
+"""Backends of the Pi's SYNC_IN output (`HelloReply.backend`): kernel, GPIO registers, SPI controller, simulated."""
+_HARDWARE = (GPIOD, GPIOMEM, SPI)
+Timing = Literal["", "spi", "one-shot", "program"]
+"""Timing source of a burst: SPI controller (widths and periods), one-shot (widths, periods by the program), program;
+"" in events of earlier releases."""
+
+
+def is_simulated(backend: str) -> bool:
+    """Return True if the backend drives no hardware. An unknown backend counts as simulated, to be on the safe side."""
+    return backend not in _HARDWARE
+
+
+class _Message(msgspec.Struct, frozen=True, tag_field="type", tag=True, kw_only=True):
+    version: Name = WIRE_VERSION
+
+
+# --- events: Pi -> host, PUB ------------------------------------------------------------------------------------------
+
+
+class Event(_Message, frozen=True, kw_only=True):
+    """Fields of every event.
+
+    `seq` counts the journalled events of one `scan_id` from 1 without gaps. Heartbeats and stage status are not
+    journalled: they have the `seq` of the last journalled event, so that a subscriber detects a lost last event.
+    """
+
+    scan_id: ScanIdOrNone
+    seq: Seq
+    t_mono_ns: Natural
+
+
+class RunStarted(Event, frozen=True, kw_only=True):
+    """A run was started or resumed. `lost`: number of earlier events that only the host still has."""
+
+    plan: RasterPlan
+    resumed: bool = False
+    lost: Seq = 0
+
+
+class RunStopped(Event, frozen=True, kw_only=True):
+    """The host ended a run."""
+
+    exit_status: ExitStatus
+    reason: Text = ""
+
+
+class RowStarted(Event, frozen=True, kw_only=True):
+    """The stage got the command to run a row; `take` counts the attempts at this row from 1."""
+
+    row: Row
+    take: Take
+
+
+class RowFinished(Event, frozen=True, kw_only=True):
+    """A row ended. `points` is the stage's count; `edges`, `bursts` and `pulses` are those of the Pi."""
+
+    row_index: Index
+    take: Take
+    status: RowStatus
+    points: Natural
+    edges: Natural
+    bursts: Natural
+    pulses: Natural
+    fault: Number = 0
+    reason: Text = ""
+    timed_by: Timing = ""
+
+
+class Capture(Event, frozen=True, kw_only=True):
+    """One trigger edge and its burst. Times are the Pi's monotonic clock.
+
+    `width_max_ns` is an upper bound of the pulse widths, `jitter_ns` the largest deviation of a rising edge from its
+    scheduled time.
+    """
+
+    row_index: Index
+    take: Take
+    point: Natural
+    column: Natural
+    edge_ns: Natural
+    first_pulse_ns: Natural
+    last_pulse_ns: Natural
+    pulses: Natural
+    width_max_ns: Natural
+    jitter_ns: Natural
+
+
+class StageStatus(Event, frozen=True, kw_only=True):
+    """Position of the stage, stage coordinates. Not journalled."""
+
+    state: Name
+    x_mm: Place
+    y_mm: Place
+    points: Natural = 0
+    alarm: Number = 0
+
+
+class Heartbeat(Event, frozen=True, kw_only=True):
+    """Sent by the Pi every `period_ms`. Not journalled."""
+
+    state: State
+    period_ms: Natural
+
+
+class Fault(Event, frozen=True, kw_only=True):
+    """A fault with its number in shared/polysight_shared/faults.py. The first fault of a row is kept."""
+
+    number: Number
+    what: Text
+    why: Text = ""
+    remedy: Text = ""
+
+
+AnyEvent = RunStarted | RunStopped | RowStarted | RowFinished | Capture | StageStatus | Heartbeat | Fault
+JOURNALLED = (RunStarted, RunStopped, RowStarted, RowFinished, Capture, Fault)
+
+# --- commands: host -> Pi, REQ/REP ------------------------------------------------------------------------------------
+
+
+class Command(_Message, frozen=True, kw_only=True):
+    """Base class of commands. Every command gets exactly one reply."""
+
+
+class Hello(Command, frozen=True, kw_only=True):
+    """Request identity and state. Answered with HelloReply in any state."""
+
+    host_release: Name = ""
+
+
+class BeginRun(Command, frozen=True, kw_only=True):
+    """Start a run, or resume the run with this id after a restart of either side.
+
+    `last_seq` is the run's last event that the host has; the Pi continues the sequence after it, even if its journal
+    was lost. `heartbeat_ms`: period of the host's `Alive` messages; 0: none. `owner`: a secret chosen by the host,
+    required in all commands of this run.
+    """
+
+    scan_id: ScanId
+    plan: RasterPlan
+    pulses: Annotated[int, msgspec.Meta(ge=1, le=65_536)]
+    period_us: Micros
+    width_us: Micros
+    speed_mm_s: Speed
+    last_seq: Seq = 0
+    heartbeat_ms: Annotated[int, msgspec.Meta(ge=0, le=MAX_HEARTBEAT_MS)] = 0
+    owner: Owner = ""
+
+
+class EndRun(Command, frozen=True, kw_only=True):
+    """End the run. Answered with Accepted after RunStopped is journalled."""
+
+    scan_id: ScanId
+    exit_status: ExitStatus
+    reason: Text = ""
+    owner: Owner = ""
+
+
+class Alive(Command, frozen=True, kw_only=True):
+    """Heartbeat of the host. A row ends with fault 108 if four heartbeats in a row are missing."""
+
+    scan_id: ScanId
+    owner: Owner = ""
+
+
+class Home(Command, frozen=True, kw_only=True):
+    """Home the stage. Accepted at once; the state is `homing`, then `ready`."""
+
+
+class RunRow(Command, frozen=True, kw_only=True):
+    """Run one row of the plan. Accepted at once; RowFinished has the result."""
+
+    scan_id: ScanId
+    row_index: Index
+    take: Take
+    owner: Owner = ""
+
+
+class Hold(Command, frozen=True, kw_only=True):
+    """Decelerate and wait."""
+
+    owner: Owner = ""
+
+
+class Resume(Command, frozen=True, kw_only=True):
+    """Continue after a hold, on the exact grid."""
+
+    owner: Owner = ""
+
+
+class Abort(Command, frozen=True, kw_only=True):
+    """Stop the row at once. RowFinished with status `aborted` follows if a row was running."""
+
+    reason: Text = ""
+    owner: Owner = ""
+
+
+class Pulse(Command, frozen=True, kw_only=True):
+    """Send one burst on SYNC_IN at rest, outside of a run. Answered with Pulsed after the burst."""
+
+    pulses: Annotated[int, msgspec.Meta(ge=1, le=MAX_PULSES_AT_REST)]
+    period_us: Micros
+    width_us: Micros
+
+
+class Status(Command, frozen=True, kw_only=True):
+    """Request the status. Answered with StatusReply in any state."""
+
+
+class Replay(Command, frozen=True, kw_only=True):
+    """Request journalled events of a scan from `from_seq` on, at most `limit`."""
+
+    scan_id: ScanId
+    from_seq: Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
+    limit: Annotated[int, msgspec.Meta(ge=1, le=10000)] = 1000
+
+
+AnyCommand = Hello | BeginRun | EndRun | Alive | Home | RunRow | Hold | Resume | Abort | Status | Replay | Pulse
+
+# --- replies: Pi -> host ----------------------------------------------------------------------------------------------
+
+
+class HelloReply(_Message, frozen=True, kw_only=True):
+    """Identity and state of the Pi. Older releases send 0 for `t_unix_ns` and {} for `stage` (`placement_settings`)."""
+
+    pi_release: Name
+    firmware: Name
+    backend: Name
+    state: State
+    scan_id: ScanIdOrNone
+    last_seq: Seq
+    t_unix_ns: Natural = 0
+    in_run: bool = False
+    stage: dict[Name, Place] = {}
+
+
+class Accepted(_Message, frozen=True, kw_only=True):
+    """The command was accepted; `state` is the state after it."""
+
+    state: State
+
+
+class Refused(_Message, frozen=True, kw_only=True):
+    """The command was refused, and changed nothing."""
+
+    number: Number
+    what: Text
+    why: Text = ""
+    remedy: Text = ""
+
+
+class StatusReply(_Message, frozen=True, kw_only=True):
+    """Status of the Pi. `row_index` is -1 if no row is running.
+
+    `lost_x_mm`, `lost_y_mm`: position error found by the last homing at the switches, since the homing before it.
+    """
+
+    state: State
+    homed: bool
+    x_mm: Place
+    y_mm: Place
+    scan_id: ScanIdOrNone
+    row_index: Annotated[int, msgspec.Meta(ge=-1, lt=100_000)]
+    take: Seq
+    points: Natural
+    pulses: Natural
+    last_seq: Seq
+    fault: Number
+    reason: Text
+    lost_x_mm: Place = 0.0
+    lost_y_mm: Place = 0.0
+
+
+class ReplayReply(_Message, frozen=True, kw_only=True):
+    """Events in order; `last_seq` is the last one in the journal of that scan (0 if there is none)."""
+
+    events: Annotated[list[AnyEvent], msgspec.Meta(max_length=10_000)]
+    last_seq: Seq
+
+
+class Pulsed(_Message, frozen=True, kw_only=True):
+    """Result of `Pulse`: pulses sent, upper bound of their widths, largest delay of an edge, fault number."""
+
+    pulses: Natural
+    width_max_ns: Natural
+    jitter_ns: Natural
+    fault: Number = 0
+    timed_by: Timing = ""
+
+
+AnyReply = HelloReply | Accepted | Refused | StatusReply | ReplayReply | Pulsed
+
+M = TypeVar("M")
+
+
+def pack(message: AnyEvent | AnyCommand | AnyReply) -> bytes:
+    """Pack a message as msgpack."""
+    return msgpack.packb(msgspec.to_builtins(message), use_bin_type=True) or b""
+
+
+def _unpack(raw: bytes, kind: Any, what: str) -> Any:
+    try:
+        node = msgpack.unpackb(raw, raw=False, strict_map_key=True)
+    except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as e:
+        raise ProtocolError(
+            f"{what} of {len(raw)} bytes is not msgpack: {str(e)[:200]}",
+            "another program uses this port",
+            code=ErrorCode.MESSAGE_INVALID,
+        ) from None
+    version = node.get("version") if isinstance(node, dict) else None
+    if isinstance(version, str) and version.partition(".")[0] != WIRE_VERSION.partition(".")[0]:
+        raise VersionError(
+            f"{what} {str(node.get('type'))[:40]!r} has wire version {version[:20]}, this program uses {WIRE_VERSION}",
+            "host and Pi have different releases",
+            "install the same release on both",
+            code=ErrorCode.VERSION_UNSUPPORTED,
+        )
+    try:
+        return msgspec.convert(node, kind)
+    except msgspec.ValidationError as e:
+        raise ProtocolError(
+            f"{what} has invalid fields: {str(e)[:300]}",
+            "host and Pi have different releases",
+            code=ErrorCode.MESSAGE_INVALID,
+        ) from None
+
+
+def unpack_event(raw: bytes) -> AnyEvent:
+    """Decode and check an event. Raises ProtocolError."""
+    return _unpack(raw, AnyEvent, "event")
+
+
+def pack_with_crc(event: AnyEvent) -> bytes:
+    """Pack an event for a file: its map with a last key `crc`, the CRC-32 of the map without it."""
+    raw = pack(event)
+    return msgpack.packb({**msgpack.unpackb(raw), "crc": zlib.crc32(raw)}) or b""
+
+
+def unpack_with_crc(raw: bytes) -> AnyEvent:
+    """Decode and check an event from a file. Raises ProtocolError."""
+    event = unpack_event(raw)
+    node = msgpack.unpackb(raw)
+    if node.pop("crc", None) != zlib.crc32(msgpack.packb(node) or b""):
+        raise ProtocolError(
+            f"the CRC of event {event.seq} is wrong", "the file is damaged", code=ErrorCode.FILE_DAMAGED
+        )
+    return event
+
+
+def unpack_command(raw: bytes) -> AnyCommand:
+    """Decode and check a command. Raises ProtocolError."""
+    return _unpack(raw, AnyCommand, "command")
+
+
+def unpack_reply(raw: bytes) -> AnyReply:
+    """Decode and check a reply. Raises ProtocolError."""
+    return _unpack(raw, AnyReply, "reply")

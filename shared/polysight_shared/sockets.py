@@ -1,0 +1,182 @@
+"""Create the ZeroMQ sockets of host and Pi, with timeouts, limits, and CURVE keys on addresses other than loopback."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+from typing import Any
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.messages import MAX_COMMAND_BYTES
+
+Socket = zmq.Socket[bytes]
+HOST_KEYS = ("pi.key", "host.key_secret")
+"""Key files that the host needs, made on the Pi. `pi.key_secret` never leaves the Pi."""
+PI_KEYS = ("pi.key_secret",)
+EVENT_TOPIC = b"event"
+MAX_SUBSCRIPTION_BYTES = 1024
+SEND_TIMEOUT_MS = 200
+HANDSHAKE_TIMEOUT_MS = 5000  # then a connection without a handshake is closed
+
+
+def host_of(address: str) -> str:
+    """Return the host of `tcp://host:port`. Raises ConfigError for another form."""
+    scheme, _, rest = address.partition("://")
+    host, _, port = rest.rpartition(":")
+    if scheme != "tcp" or not host or not (port == "*" or port.isdigit()):
+        raise ConfigError(
+            f"address {address!r} is not of the form tcp://host:port",
+            "a typing error",
+            "correct it in instrument.toml",
+            code=ErrorCode.VALUE_INVALID,
+        )
+    return host.strip("[]")
+
+
+def is_loopback(address: str) -> bool:
+    """Return True if the address is reachable only from this machine."""
+    host = host_of(address)
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
+    """Enable CURVE on a socket whose address is not loopback. Raises ConfigError without usable keys.
+
+    `key_dir` has PI_KEYS or HOST_KEYS in the format of zmq.auth. The server's `authenticator` decides which clients
+    are accepted.
+    """
+    if is_loopback(address):
+        return
+    needed = PI_KEYS if server else HOST_KEYS
+    secret_file = key_dir / needed[-1]
+    try:
+        from zmq.auth import load_certificate
+
+        public, secret = load_certificate(secret_file)
+        if secret is None:
+            raise OSError(f"{secret_file} holds no secret key")
+        socket.curve_publickey, socket.curve_secretkey = public, secret
+        if server:
+            socket.curve_server = True
+        else:
+            socket.curve_serverkey = load_certificate(key_dir / HOST_KEYS[0])[0]
+    except (OSError, ValueError) as e:
+        raise ConfigError(
+            f"{address} is not loopback, and no CURVE keys are usable: {e}",
+            f"{key_dir} lacks {' or '.join(needed)}, or they belong to another user",
+            "make keys with `polysight-pi keys`, or use a loopback address"
+            if server
+            else f"copy the Pi's {' and '.join(HOST_KEYS)} here (docs/how-to/install.md); pi.key_dir is {key_dir}",
+            code=ErrorCode.FILE_MISSING,
+        ) from None
+
+
+def _make(
+    context: zmq.Context[Any],
+    kind: int,
+    address: str,
+    key_dir: Path,
+    bind: bool,
+    options: dict[int, int | bytes] | None = None,
+) -> Socket:
+    host_of(address)
+    socket: Socket = context.socket(kind)
+    for option, value in {zmq.LINGER: 0, **(options or {})}.items():
+        socket.setsockopt(option, value)
+    try:
+        _secure(socket, address, key_dir, server=bind)
+        if bind:
+            socket.bind(address)
+        else:
+            socket.connect(address)
+    except zmq.ZMQError as e:
+        socket.close()
+        raise DeviceError(
+            f"{address}: {e.strerror}" if hasattr(e, "strerror") else f"{address}: {e}",
+            "another program uses this port"
+            if e.errno == zmq.EADDRINUSE
+            else "the address does not exist on this machine",
+            "stop the other program (ss -ltnp shows it), or change the address in instrument.toml",
+            code=ErrorCode.BUSY if e.errno == zmq.EADDRINUSE else ErrorCode.OTHER,
+        ) from None
+    except ConfigError:
+        socket.close()
+        raise
+    return socket
+
+
+def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """Create the Pi's PUB socket, bound."""
+    options: dict[int, int | bytes] = {zmq.SNDHWM: 100_000, zmq.MAXMSGSIZE: MAX_SUBSCRIPTION_BYTES}
+    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_TIMEOUT_MS}
+    return _make(context, zmq.PUB, address, key_dir, bind=True, options=options)
+
+
+def subscriber(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """Create the host's SUB socket, connected, subscribed to all events, with a long queue."""
+    return _make(
+        context, zmq.SUB, address, key_dir, bind=False, options={zmq.RCVHWM: 100_000, zmq.SUBSCRIBE: EVENT_TOPIC}
+    )
+
+
+def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """Create the SUB socket of a program that only displays events: a short queue, and a heartbeat of ZeroMQ.
+
+    The Pi has a queue for each subscriber; without the heartbeat it would keep the queue of one that hangs.
+    """
+    heartbeat: dict[int, int | bytes] = {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TTL: 5000}
+    options = {zmq.RCVHWM: 1000, zmq.SUBSCRIBE: EVENT_TOPIC, **heartbeat}
+    return _make(context, zmq.SUB, address, key_dir, bind=False, options=options)
+
+
+def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """Create the Pi's ROUTER socket, bound, for REQ sockets; a message over the limit closes its connection."""
+    options: dict[int, int | bytes] = {zmq.MAXMSGSIZE: MAX_COMMAND_BYTES, zmq.ROUTER_MANDATORY: 1}
+    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_TIMEOUT_MS}
+    return _make(context, zmq.ROUTER, address, key_dir, bind=True, options=options)
+
+
+def authenticator(context: zmq.Context[Any]) -> Socket:
+    """Create the REP socket to which ZeroMQ sends each CURVE client of this context for approval (ZAP, RFC 27)."""
+    socket: Socket = context.socket(zmq.REP)
+    socket.bind("inproc://zeromq.zap.01")
+    return socket
+
+
+class HandshakeMonitor:
+    """Detect that a server refused this client's key, as opposed to not answering. `socket`: the client's."""
+
+    def __init__(self, socket: Socket) -> None:
+        self._socket = socket
+        self._monitor = socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
+        self._refused = False
+
+    def refused(self) -> bool:
+        """Return True if so far the server refused this client's key, or this client the server's."""
+        while self._monitor.poll(0):
+            recv_monitor_message(self._monitor)
+            self._refused = True
+        return self._refused
+
+    def close(self) -> None:
+        """Close the monitor; call it before closing the socket."""
+        self._socket.disable_monitor()
+        self._monitor.close()
+
+
+def requester(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """Create the host's REQ socket, connected; relaxed, so that it can send again after a lost reply.
+
+    If the server refused the handshake, `send` raises zmq.Again after `SEND_TIMEOUT_MS`.
+    """
+    options: dict[int, int | bytes] = {zmq.REQ_RELAXED: 1, zmq.REQ_CORRELATE: 1, zmq.SNDTIMEO: SEND_TIMEOUT_MS}
+    return _make(context, zmq.REQ, address, key_dir, bind=False, options=options)

@@ -1,0 +1,180 @@
+"""Protocol of the stage line: ASCII lines with sequence number and CRC, and single bytes that act during motion.
+
+Specification: docs/spec/stage-line.md. The firmware's counterpart is arduino_stage/protocol.cpp.
+"""
+
+from __future__ import annotations
+
+import binascii
+import re
+from enum import IntEnum
+
+import msgspec
+
+from polysight_shared.errors import ProtocolError
+
+PROTOCOL_VERSION = 2
+MAX_LINE_BYTES = 96
+MAX_SEQUENCE = 65535
+HOMING_TIMEOUT_S = 300.0  # of the Pi; programs that wait for the Pi need a longer one
+_VALUE = re.compile(r"-?[0-9]{1,10}")
+_COMMAND = re.compile(r"N([0-9]{1,5}) ([A-Z]+)((?: -?[0-9]{1,10})*)")
+_FIELD = re.compile(r"([a-z]+)=([-+.:A-Za-z0-9]+)")
+
+
+class Immediate(IntEnum):
+    """Bytes that the stage handles in its receive interrupt, even during motion.
+
+    Each differs in at least two bits from every byte of a line. RESUME, which starts motion, differs in three bits
+    from every other byte and must be sent twice.
+    """
+
+    HOLD = 0x81
+    RESUME = 0x9D
+    STATUS = 0x84
+    STOP = 0x88
+
+    @property
+    def sent(self) -> bytes:
+        """Bytes to send."""
+        return bytes([self]) * (2 if self is Immediate.RESUME else 1)
+
+
+class Parameter(IntEnum):
+    """First argument of `SET`: the setting of the stage; the comment has the unit of the second argument."""
+
+    ACCEL = 0  # steps/s^2
+    HEARTBEAT = 1  # ms of silence after which a moving stage stops
+    TRIGGER = 2  # us, width of the trigger pulse
+    TRAVEL_X = 3  # steps, soft limit 0..TRAVEL_X
+    TRAVEL_Y = 4  # steps
+    TRAVEL_SPEED = 5  # steps/s, between rows
+    BACKLASH = 6  # steps; rows are approached from below, with at least this run-up; 0 = off
+
+
+def crc16(body: bytes) -> int:
+    """Compute CRC-16/XMODEM (polynomial 0x1021, start 0), as avr-libc's _crc_xmodem_update."""
+    return binascii.crc_hqx(body, 0)
+
+
+def seal(body: str) -> bytes:
+    """Append `*CRC` and the line end. Raises ProtocolError if the line is too long or not plain ASCII."""
+    try:
+        raw = body.encode("ascii")
+    except UnicodeEncodeError:
+        raise ProtocolError(f"stage line {body!r} is not ASCII") from None
+    if b"*" in raw or b"\n" in raw or b"\r" in raw:
+        raise ProtocolError(f"stage line {body!r} contains a reserved character")
+    line = raw + b"*%04X\n" % crc16(raw)
+    if len(line) > MAX_LINE_BYTES:
+        raise ProtocolError(f"stage line of {len(line)} bytes is longer than {MAX_LINE_BYTES}: {body!r}")
+    return line
+
+
+def unseal(line: bytes) -> str:
+    """Check length, line end and CRC, and return the body. Raises ProtocolError for a line not made by `seal`."""
+    if len(line) > MAX_LINE_BYTES:
+        raise ProtocolError(f"stage line of {len(line)} bytes is longer than {MAX_LINE_BYTES}")
+    if len(line) < 6 or line[-1:] != b"\n" or line[-6:-5] != b"*":
+        raise ProtocolError(f"not a stage line: {line!r}")
+    body, tail = line[:-6], line[-5:-1]
+    if tail != b"%04X" % crc16(body):
+        raise ProtocolError(f"checksum {tail!r} of stage line {body!r} is wrong, expected {crc16(body):04X}")
+    if any(not 0x20 <= c < 0x7F or c == 0x2A for c in body):
+        raise ProtocolError(f"stage line {body!r} contains a reserved character")
+    return body.decode("ascii")
+
+
+class Command(msgspec.Struct, frozen=True):
+    """Command to the stage: `N<sequence> <VERB> [integers]`."""
+
+    sequence: int
+    verb: str
+    args: tuple[int, ...] = ()
+
+    def encode(self) -> bytes:
+        """Return the sealed line. Raises ProtocolError if a value is out of the protocol's range."""
+        if not 0 <= self.sequence <= MAX_SEQUENCE:
+            raise ProtocolError(f"sequence {self.sequence} is outside 0..{MAX_SEQUENCE}")
+        if not re.fullmatch(r"[A-Z]+", self.verb):
+            raise ProtocolError(f"stage verb {self.verb!r} must be capital letters")
+        if any(not -(2**31) <= a < 2**31 for a in self.args):
+            raise ProtocolError(f"stage arguments {self.args} must be 32-bit integers")
+        return seal(" ".join([f"N{self.sequence}", self.verb, *map(str, self.args)]))
+
+    @staticmethod
+    def decode(line: bytes) -> Command:
+        """Parse a sealed command line. Raises ProtocolError."""
+        body = unseal(line)
+        m = _COMMAND.fullmatch(body)
+        if m is None or int(m[1]) > MAX_SEQUENCE:
+            raise ProtocolError(f"not a stage command: {body!r}")
+        args = tuple(int(a) for a in m[3].split())
+        if any(not -(2**31) <= a < 2**31 for a in args):
+            raise ProtocolError(f"stage arguments {args} must be 32-bit integers")
+        return Command(int(m[1]), m[2], args)
+
+
+class Reply(msgspec.Struct, frozen=True):
+    """Reply of the stage.
+
+    `kind` is one of
+
+    * `banner`: boot; fields fw, proto
+    * `ok`: command `sequence` accepted (motion) or executed (others); fields depend on the command
+    * `error`: command refused with `number`; `sequence` is None if the line could not be read
+    * `done`: motion command `sequence` ended; a row has fields points, pulses, x, y
+    * `alarm`: latched fault `number`
+    * `status`: answer to the STATUS byte; fields state, x, y, points, pulses, alarm, limits
+    """
+
+    kind: str
+    sequence: int | None = None
+    number: int = 0
+    fields: dict[str, str] = {}
+
+    def encode(self) -> bytes:
+        """Return the sealed line."""
+        tag = "-" if self.sequence is None else str(self.sequence)
+        head = {
+            "banner": "polysight-stage",
+            "ok": f"ok N{tag}",
+            "error": f"error:{self.number} N{tag}",
+            "done": f"done N{tag}",
+            "alarm": f"alarm:{self.number}",
+            "status": "status",
+        }[self.kind]
+        return seal(" ".join([head, *(f"{k}={v}" for k, v in self.fields.items())]))
+
+    @staticmethod
+    def decode(line: bytes) -> Reply:
+        """Parse a sealed reply line. Raises ProtocolError."""
+        body = unseal(line)
+        words = body.split(" ")
+        head, rest = words[0], words[1:]
+        kind, _, number = head.partition(":")
+        kind = "banner" if kind == "polysight-stage" else kind
+        if kind not in ("banner", "ok", "error", "done", "alarm", "status"):
+            raise ProtocolError(f"not a stage reply: {body!r}")
+        if (kind in ("error", "alarm")) != bool(re.fullmatch(r"[0-9]{1,3}", number)):
+            raise ProtocolError(f"stage reply without a valid number: {body!r}")
+        sequence: int | None = None
+        if kind in ("ok", "error", "done"):
+            if not rest or not re.fullmatch(r"N([0-9]{1,5}|-)", rest[0]):
+                raise ProtocolError(f"stage reply without a sequence number: {body!r}")
+            sequence = None if rest[0] == "N-" else int(rest[0][1:])
+            rest = rest[1:]
+        fields: dict[str, str] = {}
+        for word in rest:
+            m = _FIELD.fullmatch(word)
+            if m is None or m[1] in fields:
+                raise ProtocolError(f"stage reply with an invalid field {word!r}: {body!r}")
+            fields[m[1]] = m[2]
+        return Reply(kind, sequence, int(number) if number else 0, fields)
+
+    def integer(self, key: str) -> int:
+        """Return an integer field. Raises ProtocolError if it is missing or not an integer."""
+        value = self.fields.get(key)
+        if value is None or not _VALUE.fullmatch(value):
+            raise ProtocolError(f"stage reply {self.kind!r} needs an integer field {key!r}, got {value!r}")
+        return int(value)

@@ -1,0 +1,152 @@
+"""Read TOML and JSON tables into typed declarations, and write them back.
+
+An unknown key, a wrong type or a broken rule raises ConfigError with the file, the key, the value and the rule.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DataError, did_you_mean
+from polysight_shared.files import read_bounded
+
+_MAX_BYTES = 64 << 20
+_RIG_KEYS = "instrument.toml in the repository explains every key"
+T = TypeVar("T")
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base class of a table of the rig file; unknown keys are refused."""
+
+
+def require(ok: bool, rule: str) -> None:
+    """Check a rule of a table. Raises ValueError, which `decode` turns into a ConfigError."""
+    if not ok:
+        raise ValueError(rule)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Parse a TOML file. Raises ConfigError if it is missing, unreadable or not TOML."""
+    try:
+        return tomllib.loads(read_bounded(path, _MAX_BYTES).decode("utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{path}: no such file",
+            "the path is wrong",
+            "give the path of a TOML file",
+            code=ErrorCode.FILE_MISSING,
+        ) from None
+    except (OSError, UnicodeDecodeError, DataError) as e:
+        raise ConfigError(
+            f"{path}: cannot be read: {e}",
+            "it is not a readable text file",
+            "check the path",
+            code=ErrorCode.FILE_UNREADABLE,
+        ) from None
+    except (tomllib.TOMLDecodeError, RecursionError) as e:
+        raise ConfigError(
+            f"{path}: not valid TOML: {e}", "a typing error", "correct that line", code=ErrorCode.FILE_DAMAGED
+        ) from None
+
+
+def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T:
+    """Convert a parsed TOML or JSON table to a typed declaration.
+
+    `source` is the file's name for messages; `keys` says where its keys are explained, "" for the rig file.
+
+    Raises
+    ------
+    ConfigError
+        with `source`, the key, its value and the broken rule.
+    """
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as e:
+        rule, _, path = str(e).partition(" - at `")
+        path = path.rstrip("`") or "$"
+        value = _lookup(raw, path)
+        key = path.removeprefix("$").lstrip(".")
+        rule, code = _plain_rule(rule, kind)
+        raise ConfigError(
+            f"{source}: {key}{' = ' + value if value else ''}{': ' if key else ''}{rule}",
+            "the file breaks a rule of its format",
+            f"correct {key or 'that'} in {source}; {keys or _RIG_KEYS}",
+            code=code,
+        ) from None
+
+
+_TYPES = {  # names of the types of JSON and TOML for messages
+    "int": "a whole number", "float": "a number", "str": "text", "bool": "true or false",
+    "array": "a list", "object": "a table", "null": "nothing",
+}  # fmt: skip
+
+
+def _plain_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
+    """Rewrite a message of msgspec in plain words, with its code; keep a rule of `require` as it is."""
+    if found := re.search(r"unknown field `(.*)`", rule):
+        return f"no key {found[1]!r}: {_suggest_key(found[1], kind)}", ErrorCode.KEY_UNKNOWN
+    if found := re.search(r"missing required field `(.*)`", rule):
+        return f"the key {found[1]!r} is missing", ErrorCode.KEY_MISSING
+    if found := re.fullmatch(r"Invalid enum value (.*)", rule):
+        return f"{found[1]} is not an allowed value", ErrorCode.VALUE_INVALID
+    found = re.fullmatch(r"Expected `(.+?)`( .+?)?(?:, got `?(.+?)`?)?", rule)
+    if found is None:
+        return rule, ErrorCode.VALUE_INVALID
+    wanted = " or ".join(_TYPES.get(name, name) for name in found[1].split(" | ") if name != "null")
+    limit = (found[2] or "").replace("matching regex", "of the form")
+    given = f", not {_TYPES.get(found[3], found[3])}" if found[3] else ""
+    code = ErrorCode.TYPE_WRONG if given and not limit else ErrorCode.VALUE_INVALID
+    return f"must be {wanted}{limit}{given}", code
+
+
+def _suggest_key(key: str, kind: Any) -> str:
+    """Suggest a correction of an unknown key: the table to which it belongs, or a similar key."""
+    known: dict[str, set[str]] = {}
+    _collect(msgspec.inspect.type_info(kind), "", known)
+    if key in known:
+        return f"it belongs to {' or '.join(f'[{table}]' if table else 'the top' for table in sorted(known[key]))}"
+    return did_you_mean(key, known) or "no key is similar"
+
+
+def _collect(kind: Any, table: str, known: dict[str, set[str]]) -> None:
+    """Collect every key of a declaration with the tables that contain it into `known`."""
+    for field in getattr(kind, "fields", ()):
+        known.setdefault(field.name, set()).add(table)
+        parts = [field.type, *getattr(field.type, "types", ()), *getattr(field.type, "item_types", ())]
+        for part in (*parts, getattr(field.type, "item_type", None), getattr(field.type, "value_type", None)):
+            _collect(part, f"{table}.{field.name}".lstrip("."), known)
+
+
+def to_builtins(config: Any) -> dict[str, Any]:
+    """Convert a configuration to plain dicts and lists, without None, for JSON, TOML or msgpack."""
+    return _without_none(msgspec.to_builtins(config))
+
+
+def _lookup(data: Any, path: str) -> str:
+    """Return the value at a msgspec error path such as `$.boards[0].name`, for the message; '' if missing."""
+    node = data
+    for part in path.removeprefix("$").replace("[", ".[").split("."):
+        if not part:
+            continue
+        try:
+            node = node[int(part[1:-1])] if part.startswith("[") else node[part]
+        except (KeyError, IndexError, TypeError, ValueError):
+            return ""
+    return "" if isinstance(node, dict | list) else repr(node)
+
+
+def _without_none(node: Any) -> Any:
+    if isinstance(node, dict):
+        return {k: _without_none(v) for k, v in node.items() if v is not None}
+    if isinstance(node, list | tuple):
+        return [_without_none(v) for v in node]
+    return node

@@ -1,0 +1,142 @@
+"""Simulated wires: GPIO edges with timestamps between processes, over a local socket.
+
+A hub (`simulators.wires`) relays between its clients: the stage raises the trigger, the Pi sends SYNC_IN pulses, the
+radars listen. The protocol has ASCII lines:
+
+    `S <t_ns> <line> <0|1>`                 a line changed at wire time t_ns
+    `M <t_ns> <x_um> <y_um> <vx_um_s>`      the stage is at (x, y) and moves at vx from now on (stage coordinates)
+    `L <line> [<line> ...]`                 client to hub: subscribe to changes of these lines
+    `W`                                     client to hub: subscribe to M lines
+    `K`                                     hub to client: confirms L or W
+
+Wire time is the simulated stage's clock, which may be faster than the wall clock. Reactions to an edge are scheduled
+relative to the edge's time, so that the intervals of a simulated scan are exact on a busy machine.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError, ProtocolError
+
+
+class WireEdge(NamedTuple):
+    """A line changed."""
+
+    t_ns: int
+    line: int
+    value: int
+
+
+class WireMotion(NamedTuple):
+    """Position (um, stage coordinates) and x speed (um/s) of the stage from `t_ns` on."""
+
+    t_ns: int
+    x_um: int
+    y_um: int
+    vx_um_s: int
+
+
+WireMessage = WireEdge | WireMotion
+
+
+def encode(message: WireMessage) -> bytes:
+    """Encode a message as a line of the wire protocol."""
+    tag = "S" if isinstance(message, WireEdge) else "M"
+    return (" ".join([tag, *map(str, message)]) + "\n").encode("ascii")
+
+
+def parse(line: str) -> WireMessage:
+    """Parse an S or M line. Raises ProtocolError."""
+    tag, *rest = line.split() or [""]
+    try:
+        values = [int(w) for w in rest]
+        if tag == "S" and len(values) == 3 and values[2] in (0, 1):
+            return WireEdge(*values)
+        if tag == "M" and len(values) == 4:
+            return WireMotion(*values)
+    except ValueError:
+        pass
+    raise ProtocolError(f"not a wire line: {line!r}")
+
+
+class WireClient:
+    """Client of the hub at the Unix socket `path`, subscribed to the lines `listen` and, with `motion`, to M lines.
+
+    Raises DeviceError if there is no hub within `timeout_s`.
+    """
+
+    def __init__(self, path: Path, listen: tuple[int, ...] = (), motion: bool = False, timeout_s: float = 10.0) -> None:
+        self._path = path
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            try:
+                self._socket.connect(str(path))
+                break
+            except OSError as e:
+                self._socket.close()
+                if time.monotonic() > deadline:
+                    raise DeviceError(
+                        f"simulated wires: no connection to {path}: {e}",
+                        "the simulated rig is not running",
+                        "start it first",
+                        code=ErrorCode.NO_ANSWER,
+                    ) from None
+                time.sleep(0.02)
+        self._buffer = b""
+        self._pending: list[str] = []
+        hello = b""
+        if listen:
+            hello += ("L " + " ".join(map(str, listen)) + "\n").encode("ascii")
+        if motion:
+            hello += b"W\n"
+        if hello:
+            self._socket.sendall(hello)
+            deadline = time.monotonic() + timeout_s
+            for _ in range(hello.count(b"\n")):
+                if self._next_line(max(0.0, deadline - time.monotonic())) != "K":
+                    raise ProtocolError(f"simulated wires at {path}: no confirmation", code=ErrorCode.NO_ANSWER)
+
+    def fileno(self) -> int:
+        """Return the file descriptor, for select and poll; `receive` may have buffered messages besides."""
+        return self._socket.fileno()
+
+    def send(self, *messages: WireMessage) -> None:
+        """Send messages in one write. Raises DeviceError if the hub is gone."""
+        try:
+            self._socket.sendall(b"".join(map(encode, messages)))
+        except OSError as e:
+            raise DeviceError(f"simulated wires at {self._path} broke: {e}", "the simulated rig ended") from None
+
+    def receive(self, timeout_s: float | None) -> WireMessage | None:
+        """Return the next message, or None after `timeout_s`. Raises DeviceError if the hub is gone."""
+        line = self._next_line(timeout_s)
+        return None if line is None else parse(line)
+
+    def _next_line(self, timeout_s: float | None) -> str | None:
+        while not self._pending:
+            self._socket.settimeout(timeout_s if timeout_s is None else max(timeout_s, 1e-6))
+            try:
+                data = self._socket.recv(1 << 16)
+            except (TimeoutError, BlockingIOError):
+                return None
+            except OSError as e:
+                raise DeviceError(f"simulated wires at {self._path} broke: {e}", "the simulated rig ended") from None
+            finally:
+                if self._socket.fileno() >= 0:
+                    self._socket.settimeout(None)
+            if not data:
+                raise DeviceError(f"simulated wires at {self._path} were closed", "the simulated rig ended")
+            lines = (self._buffer + data).split(b"\n")
+            self._buffer = lines.pop()
+            self._pending = [line.decode("ascii", "replace") for line in reversed(lines)]
+        return self._pending.pop()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()

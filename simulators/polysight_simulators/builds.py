@@ -1,0 +1,108 @@
+"""Compile programs on demand and cache them by their sources and command, such as the sketch for this machine."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from polysight_shared.errors import DeviceError
+
+SKETCH_DIR = Path(__file__).resolve().parents[2] / "arduino_stage"
+FOLDER = SKETCH_DIR / "build"  # ignored by git, removed by `make clean`
+_FLAGS = ("-std=gnu++11", "-O2", "-Wall", "-Wextra", "-fno-exceptions", "-fno-rtti")
+
+
+def compiled(product: str, sources: Iterable[Path], command: Sequence[str], on_failure: tuple[str, str]) -> Path:
+    """Run `command` to make a file of `sources`, unless these sources were already compiled.
+
+    Parameters
+    ----------
+    product
+        Name of the file that the command makes, such as "stage" or "arduino_stage.hex".
+    sources
+        All files on which the result depends, with headers and build files.
+    command
+        Arguments; "{folder}" is replaced by the folder where it must write `product`.
+    on_failure
+        Cause and remedy for the error.
+
+    Returns
+    -------
+    Path
+        A file named after the product and the hash of sources and command, in arduino_stage/build,
+        ~/.cache/polysight/build, or a temporary folder of this user: the first that is writable. Safe with several
+        processes.
+
+    Raises
+    ------
+    DeviceError
+        if the command fails; the error has its message.
+    """
+    digest = hashlib.sha256("\0".join(command).encode())
+    for path in sorted(sources):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    name = f"{Path(product).stem}-{digest.hexdigest()[:16]}{Path(product).suffix}"
+    if (FOLDER / name).is_file():  # also in a read-only folder
+        return FOLDER / name
+    result = _folder() / name
+    if result.is_file():
+        return result
+    with tempfile.TemporaryDirectory(prefix=".making-", dir=result.parent) as folder:
+        _run([word.replace("{folder}", folder) for word in command], product, on_failure)
+        (Path(folder) / product).replace(result)  # atomically
+    return result
+
+
+def _run(command: list[str], product: str, on_failure: tuple[str, str]) -> None:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        message, failed = done.stderr.strip(), done.returncode != 0
+    except OSError as e:
+        message, failed = str(e), True
+    if failed:
+        raise DeviceError(f"{product} does not compile on this machine:\n{message}", *on_failure)
+
+
+def _folder() -> Path:
+    """Return a writable folder for compiled programs. Raises DeviceError if the last one belongs to another user."""
+    places = [FOLDER]
+    with suppress(RuntimeError):  # a user without a home
+        places.append(Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "polysight" / "build")
+    for folder in places:
+        try:
+            folder.mkdir(exist_ok=True, parents=folder != FOLDER)  # without the repository there is no arduino_stage
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    fallback = Path(tempfile.gettempdir()) / f"polysight-build-{os.getuid()}"
+    fallback.mkdir(mode=0o700, exist_ok=True)
+    if fallback.stat().st_uid != os.getuid():
+        raise DeviceError(f"{fallback} belongs to another user", "another user created it", "set TMPDIR")
+    return fallback
+
+
+def sketch_compiler() -> str | None:
+    """Return the C++ compiler's path; None if it or the sketch's sources are missing."""
+    return shutil.which("g++") if (SKETCH_DIR / "pc" / "main.cpp").is_file() else None
+
+
+def build_sketch(gxx: str, flags: tuple[str, ...] = _FLAGS) -> Path:
+    """Compile the sketch for this machine. Raises DeviceError if the compiler fails."""
+    sources = [*SKETCH_DIR.glob("*.cpp"), *(SKETCH_DIR / "pc").glob("*.cpp")]
+    headers = [*SKETCH_DIR.glob("*.h"), *(SKETCH_DIR / "pc").glob("*.h")]
+    return compiled(
+        "stage",
+        [*sources, *headers],
+        [gxx, *flags, "-o", "{folder}/stage", *map(str, sorted(sources))],
+        (
+            "the sources were changed, or the compiler is too old",
+            "correct them, or use the Python simulator: --python",
+        ),
+    )

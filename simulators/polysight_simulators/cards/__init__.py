@@ -1,0 +1,32 @@
+"""Simulated DCA1000 capture cards: SYNC_IN edges in, UDP data packets out.
+
+`sync_in` decides which pulses start a frame, and where the stage is then; `dca1000` is the card's state machine without
+sockets; `card` adds sockets and a radar; `sender` sends many packets per call; `fault_draws` draws faults from a seed;
+`adversary` is a stand-alone card and network with every kind of trouble. `server` runs the cards of one process
+(`python -m polysight_simulators.cards`). Specification: docs/spec/simulated-rig.md.
+"""
+
+from polysight_simulators.cards.adversary import KINDS, Adversary, Arrival, Sent
+from polysight_simulators.cards.card import MAC, CardEndpoint, Clock, SimulatedCard
+from polysight_simulators.cards.dca1000 import SOURCE_PORT, Network
+from polysight_simulators.cards.fault_draws import EventKind
+from polysight_simulators.cards.sender import CardSender, Pace, bound_udp
+from polysight_simulators.cards.sync_in import StageTrack
+
+__all__ = [
+    "KINDS",
+    "MAC",
+    "SOURCE_PORT",
+    "Adversary",
+    "Arrival",
+    "CardEndpoint",
+    "CardSender",
+    "Clock",
+    "EventKind",
+    "Network",
+    "Pace",
+    "Sent",
+    "SimulatedCard",
+    "StageTrack",
+    "bound_udp",
+]

@@ -1,0 +1,161 @@
+"""The radars and capture cards of a simulated rig as one process: SYNC_IN edges in, frames out as UDP.
+
+Each rising edge on a board's SYNC_IN line starts one frame; while its card records, the frame's samples leave as data
+packets from the card's address on loopback. Specification: docs/spec/simulated-rig.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import time
+from contextlib import ExitStack, closing
+from pathlib import Path
+from threading import Event
+
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, PolysightError
+from polysight_shared.wires import WireClient
+from polysight_simulators.cards.card import SimulatedCard
+from polysight_simulators.cards.sender import Pace
+from polysight_simulators.cards.server import CardServer
+from polysight_simulators.cards.sync_in import StageTrack
+from polysight_simulators.faults import read_faults
+from polysight_simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight_simulators.radars import LineServer, RadarSocket
+from polysight_simulators.scene import (
+    Disturbances,
+    PatternSource,
+    Scene,
+    SignalSource,
+    SimulatedRig,
+    load_scene,
+    without_offset,
+)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = command_line(
+        "polysight_simulators.cards",
+        "Radars and capture cards of a simulated rig; `python -m polysight_simulators.rig` starts them.",
+        "--config rig/instrument.toml --wires rig/wires.sock --pattern",
+    )
+    parser.add_argument("--config", type=Path, required=True, help="rig file of the simulated rig")
+    parser.add_argument("--wires", type=Path, required=True, help="Unix socket of the wires hub")
+    parser.add_argument("--scene", type=Path, help="scene file; not needed with --pattern")
+    parser.add_argument(
+        "--offset-in-rig",
+        action="store_true",
+        help="the rig file's start frequencies include the scene's offset",
+    )
+    parser.add_argument("--pattern", action="store_true", help="send a counting pattern instead of the scene")
+    parser.add_argument("--time-scale", type=float, default=1.0, help="wire time over wall time")
+    parser.add_argument("--seed", type=int, default=None, help="default: the scene's")
+    parser.add_argument("--boards", default="", help="names, with commas; default: every board")
+    parser.add_argument("--faults", type=Path, help="TOML file with a [faults] table")
+    parser.add_argument("--fault", action="append", default=[], metavar="[BOARD.]KEY=VALUE", help="a single fault")
+    parser.add_argument("--no-wait", action="store_true", help="send even if the receiver does not keep up")
+    parser.add_argument(
+        "--real-pacing",
+        action="store_true",
+        help="send each packet individually when it is due; occupies a core; implies --no-wait",
+    )
+    parser.add_argument("--report", type=Path, help="JSON file for the counts, written at the end")
+    parser.add_argument("--cache", type=Path, help="folder where the scene's object fields are kept between runs")
+    return parser
+
+
+def _check_arguments(args: argparse.Namespace, known: tuple[str, ...]) -> tuple[str, ...]:
+    if args.time_scale <= 0:
+        what = f"--time-scale {args.time_scale}"
+        raise ConfigError(what, "it must be positive", "give a number above 0", code=ErrorCode.VALUE_INVALID)
+    if args.scene is None and not args.pattern:
+        why = "the cards need something to send"
+        raise ConfigError("neither --scene nor --pattern", why, "give one of them", code=ErrorCode.KEY_MISSING)
+    names = tuple(args.boards.split(",")) if args.boards else known
+    if unknown := sorted(set(names) - set(known)):
+        what = f"--boards {','.join(unknown)}: no such board"
+        raise ConfigError(what, f"the boards are {known}", "correct it", code=ErrorCode.KEY_UNKNOWN)
+    return names
+
+
+def _source(args: argparse.Namespace, rig: Instrument, scene: Scene | None, names: tuple[str, ...]) -> SignalSource:
+    if scene is None or args.pattern:
+        return PatternSource(rig)
+    radars = SimulatedRig(rig, scene, args.seed, args.cache)
+    recorded = [b.name for b in rig.recorded if b.name in names]
+    if recorded:
+        radars.prepare(*recorded)  # before the first burst of a scan
+    return radars
+
+
+def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
+    rig = load_instrument(args.config)
+    known = tuple(b.name for b in rig.boards)
+    names = _check_arguments(args, known)
+    scene = None if args.scene is None else load_scene(args.scene)
+    if scene is not None and args.offset_in_rig:
+        scene = without_offset(scene)
+    base = {} if scene is None else {"loss": scene.disturbances.packet_loss}
+    faults = read_faults(args.faults, args.fault, known, base, rig.radar.control)
+    seed = args.seed if args.seed is not None else 0 if scene is None else scene.seed
+    source = _source(args, rig, scene, names)
+    power_cycle = Event()
+    signal.signal(signal.SIGUSR1, lambda _signal, _frame: power_cycle.set())
+    pace = Pace(not (args.no_wait or args.real_pacing), args.real_pacing)
+    cards: list[SimulatedCard] = []
+    open_things.callback(lambda: _report(cards, args.report))
+    for name in names:
+        board = rig.by_name(name)
+        cards.append(SimulatedCard(rig, board, source, faults[name], seed, args.time_scale, time.monotonic, pace))
+    lines = tuple(sorted({card.line for card in cards} | {rig.pi.trigger_in}))
+    wires = open_things.enter_context(closing(WireClient(args.wires, lines, motion=True)))
+    disturbed = Disturbances() if scene is None else scene.disturbances
+    track = StageTrack(rig, disturbed.burst_motion, disturbed.backlash_mm)
+    control: list[LineServer] = []
+    chips: list[RadarSocket] = []
+    for card in cards:
+        if card.radar is not None:
+            chips.append(RadarSocket(rig.radar.native[card.board.name].usb_serial, card.radar))
+            open_things.callback(chips[-1].close)
+    if rig.radar.control == "line_server":
+        for card in cards:
+            name = card.board.name
+            control.append(LineServer(rig.radar.servers[name], card.rearm, faults[name]))
+            open_things.callback(control[-1].close)
+    server = CardServer(rig, cards, wires, args.time_scale, time.monotonic, track, power_cycle, control, chips)
+    open_things.callback(server.close)
+    announce_ready(", ".join(f"{c.board.name} at {c.board.card_address}" for c in cards))
+    server.serve(stop)
+
+
+def _report(cards: list[SimulatedCard], path: Path | None) -> None:
+    """Write each card's counts: a line on stderr, all into the file; then close the sockets."""
+    reports = {card.board.name: card.report() for card in cards}
+    for name, report in reports.items():
+        sys.stderr.write(f"{name}: " + ", ".join(f"{k} {v}" for k, v in report.items() if v != 0) + "\n")
+    if path is not None:
+        path.write_text(json.dumps({"simulated": True, "boards": reports}, indent=2) + "\n", encoding="utf-8")
+    for card in cards:
+        card.close()
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the cards until SIGTERM or SIGINT."""
+    args = _parser().parse_args(argv)
+    stop = stop_requested()
+    die_with_parent()
+    try:
+        with ExitStack() as open_things:
+            _run(args, stop, open_things)
+    except PolysightError as e:
+        sys.stderr.write(f"error: {e}\n")
+        return e.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

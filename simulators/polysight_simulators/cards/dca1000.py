@@ -1,0 +1,318 @@
+"""State machine of one DCA1000EVM capture card: commands in, replies and data packets out, without sockets or clocks.
+
+docs/spec/simulated-rig.md lists the modelled behaviour; "inferred" there marks behaviour that no document or capture
+shows. Times are in seconds of any one clock of the caller.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum, IntFlag
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight_shared.errors import ProtocolError
+
+REQUEST_HEADER = 0xA55A
+REQUEST_FOOTER = 0xEEAA
+SOURCE_PORT = 1024  # of replies and data (seen)
+DATA_HEADER_BYTES = 10  # u32 sequence, u48 byte count
+PACKET_OVERHEAD_BYTES = 14  # "packet size 1470" carries 1456 bytes of payload
+TAIL_S = 2.0  # from the last LVDS data to the short last packet (seen)
+FPGA_VERSION = 2 | 8 << 7  # 2.8: bytes 02 04 (seen)
+DELAY_TICK_S = 8e-9
+TIMER_S = 30
+_MIN_PACKET, _MAX_PACKET = 48, 1470
+_CHOICES = (2, 2, 2, 2, 3)  # of each byte of command 0x03 but the last, counted from 1
+_LANES = {1: 4, 2: 2}
+
+Bytes2D = NDArray[np.uint8]
+
+
+class Code(IntEnum):
+    """Command codes."""
+
+    RESET_FPGA = 0x01
+    RESET_RADAR = 0x02
+    CONFIGURE_FPGA = 0x03
+    EEPROM = 0x04
+    RECORD_START = 0x05
+    RECORD_STOP = 0x06
+    ALIVE = 0x09
+    STATUS = 0x0A
+    CONFIGURE_PACKET = 0x0B
+    FPGA_VERSION = 0x0E
+
+
+class Status(IntFlag):
+    """Bits of the asynchronous status 0x0A."""
+
+    NO_LVDS_DATA = 1 << 0
+    NO_HEADER = 1 << 1
+    EEPROM_FAILURE = 1 << 2
+    SD_CARD_DETECTED = 1 << 3
+    SD_CARD_REMOVED = 1 << 4
+    SD_CARD_FULL = 1 << 5
+    MODE_CONFIGURATION_FAILED = 1 << 6
+    DDR_FULL = 1 << 7
+    RECORD_COMPLETED = 1 << 8
+    LVDS_BUFFER_FULL = 1 << 9
+    PLAYBACK_COMPLETED = 1 << 10
+    PLAYBACK_OUT_OF_SEQUENCE = 1 << 11
+
+
+class Network(NamedTuple):
+    """Addresses in the card's EEPROM, active from the next power-up."""
+
+    host_address: str
+    card_address: str
+    mac: bytes
+    command_port: int
+    data_port: int
+
+    @staticmethod
+    def decode(body: bytes) -> Network:
+        """Parse the 18 bytes of command 0x04. Raises ProtocolError if there are not 18."""
+        if len(body) != 18:
+            raise ProtocolError(f"EEPROM body of {len(body)} bytes, expected 18")
+        host, card, mac = body[3::-1], body[7:3:-1], body[13:7:-1]
+        command_port, data_port = struct.unpack("<HH", body[14:])
+        return Network(".".join(map(str, host)), ".".join(map(str, card)), mac, command_port, data_port)
+
+
+class Message(NamedTuple):
+    """Eight bytes from the card to the host's command port."""
+
+    payload: bytes
+
+
+class Packets(NamedTuple):
+    """Data packets, uint8 [packet, header and payload], from the card to the host's data port."""
+
+    rows: Bytes2D
+
+    @property
+    def payload_bytes(self) -> int:
+        """Number of bytes of LVDS data."""
+        return self.rows.size - DATA_HEADER_BYTES * len(self.rows)
+
+
+Output = Message | Packets
+
+
+def message(code: int, status: int) -> Message:
+    """Return a reply, or with code 0x0A an asynchronous status."""
+    return Message(struct.pack("<HHHH", REQUEST_HEADER, code, status, REQUEST_FOOTER))
+
+
+def parse_request(datagram: bytes) -> tuple[int, bytes, bool] | None:
+    """Return code, body, and True if size and footer are right; None if the header is not a request's."""
+    if len(datagram) < 8:
+        return None
+    header, code, size = struct.unpack_from("<HHH", datagram)
+    if header != REQUEST_HEADER:
+        return None
+    body = datagram[6:-2]
+    return code, body, size == len(body) and datagram[-2:] == REQUEST_FOOTER.to_bytes(2, "little")
+
+
+class Packetiser:
+    """Cuts the LVDS byte stream into data packets with sequence number and byte count.
+
+    Parameters
+    ----------
+    payload_bytes
+        Payload of a full packet.
+    sequence
+        Sequence number of the first packet (a card fresh from reset starts at 1).
+    byte_count
+        Byte count of the first packet: payload bytes sent before it.
+    """
+
+    def __init__(
+        self, payload_bytes: int = _MAX_PACKET - PACKET_OVERHEAD_BYTES, sequence: int = 1, byte_count: int = 0
+    ):
+        self.payload_bytes = payload_bytes
+        self.sequence = sequence
+        self.byte_count = byte_count
+        self._rest = np.empty(0, np.uint8)
+
+    def feed(self, lvds: NDArray[np.generic]) -> Bytes2D:
+        """Return the packets that the stream now fills, uint8 [n, 10 + payload]; keep the rest."""
+        fresh = np.ascontiguousarray(lvds).view(np.uint8).reshape(-1)
+        stream = np.concatenate([self._rest, fresh])
+        n = len(stream) // self.payload_bytes
+        used = n * self.payload_bytes
+        self._rest = stream[used:].copy()
+        return self._pack(stream[:used].reshape(n, self.payload_bytes))
+
+    def flush(self) -> Bytes2D:
+        """Return the short last packet, [1, 10 + rest]; [0, 10] if nothing is left."""
+        rest, self._rest = self._rest, np.empty(0, np.uint8)
+        return self._pack(rest.reshape(1 if len(rest) else 0, len(rest)))
+
+    def discard(self) -> int:
+        """Discard bytes that are not sent yet; return their number."""
+        lost, self._rest = len(self._rest), np.empty(0, np.uint8)
+        return lost
+
+    def _pack(self, payload: Bytes2D) -> Bytes2D:
+        n, size = payload.shape
+        k = np.arange(n, dtype=np.uint64)
+        rows = np.empty((n, DATA_HEADER_BYTES + size), np.uint8)
+        sequence = (np.uint64(self.sequence) + k) & np.uint64(0xFFFF_FFFF)
+        count = (np.uint64(self.byte_count) + k * np.uint64(size)) & np.uint64((1 << 48) - 1)
+        rows[:, :4] = sequence.astype("<u4").view(np.uint8).reshape(n, 4)
+        rows[:, 4:DATA_HEADER_BYTES] = count.astype("<u8").view(np.uint8).reshape(n, 8)[:, :6]
+        rows[:, DATA_HEADER_BYTES:] = payload
+        self.sequence = (self.sequence + n) % (1 << 32)
+        self.byte_count = (self.byte_count + n * size) % (1 << 48)
+        return rows
+
+
+class Card:
+    """One card, from power-up on.
+
+    Parameters
+    ----------
+    network
+        Content of its EEPROM.
+    sequence, byte_count
+        Counters at power-up.
+    no_data_floor_s
+        Shortest timeout after record start without LVDS data; the timer of command 0x03 applies if it is longer.
+    stop_discards
+        On record stop, lose bytes that do not fill a packet instead of sending them as the short last packet.
+    lanes
+        LVDS lanes of the radar: a card configured for another number records nothing. None fits either.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        sequence: int = 1,
+        byte_count: int = 0,
+        no_data_floor_s: float = 0.0,
+        stop_discards: bool = False,
+        lanes: int | None = 4,
+    ) -> None:
+        self.network = network
+        self.records = 0
+        self._lanes = lanes
+        self._eeprom = network
+        self._no_data_floor_s = no_data_floor_s
+        self._stop_discards = stop_discards
+        self._power_up(sequence, byte_count)
+
+    def _power_up(self, sequence: int, byte_count: int) -> None:
+        self._packetiser = Packetiser(sequence=sequence, byte_count=byte_count)
+        self._suits_radar = True
+        self._timer_s = TIMER_S
+        self._recording = False
+        self._last_data_s: float | None = None
+        self._started_s = 0.0
+        self.packet_delay_s = 0.0
+
+    def power_cycle(self) -> None:
+        """Switch off and on: activate the EEPROM's addresses, reset everything else."""
+        self.network = self._eeprom
+        self._power_up(1, 0)
+
+    def reset_fpga(self) -> None:
+        """Reset everything but the addresses. A record ends without its last packet and without a status."""
+        self._power_up(1, 0)
+
+    @property
+    def recording(self) -> bool:
+        """True between record start and the end of the record."""
+        return self._recording
+
+    @property
+    def packet_bytes(self) -> int:
+        """Bytes of a full data packet as UDP payload, header included."""
+        return DATA_HEADER_BYTES + self._packetiser.payload_bytes
+
+    @property
+    def deadline_s(self) -> float | None:
+        """Time at which :meth:`tick` ends the record if no LVDS data comes; None without a record."""
+        if not self._recording:
+            return None
+        if self._last_data_s is None:
+            return self._started_s + max(float(self._timer_s), self._no_data_floor_s)
+        return self._last_data_s + TAIL_S
+
+    def command(self, datagram: bytes, now_s: float) -> list[Output]:
+        """Execute one request and return the card's answers, in order; [] if it is not a request."""
+        request = parse_request(datagram)
+        if request is None:
+            return []
+        code, body, well_formed = request
+        if code == Code.RECORD_START:
+            if not self._recording:
+                self._recording, self._last_data_s, self._started_s = True, None, now_s
+                self.records += 1
+            return [message(code, 0)]
+        if code == Code.RECORD_STOP:
+            if not self._recording:
+                return [message(code, 0)]
+            if self._stop_discards:
+                self._packetiser.discard()
+            return [message(code, 0), *self._end(Status.RECORD_COMPLETED)]
+        return [message(code, self._configure(code, body, well_formed))]
+
+    def _configure(self, code: int, body: bytes, well_formed: bool) -> int:
+        if code == Code.RESET_FPGA:
+            self.reset_fpga()
+        elif code == Code.CONFIGURE_FPGA:
+            # The card also answers bodies of wrong length or content (seen).
+            if well_formed and len(body) == 6 and all(1 <= b <= n for b, n in zip(body, _CHOICES, strict=False)):
+                raw_ethernet = (body[0], *body[2:5]) == (1, 1, 2, 3)  # raw, capture, ethernet, 16 bit
+                self._suits_radar = raw_ethernet and self._lanes in (None, _LANES[body[1]])
+                self._timer_s = body[5]
+        elif code == Code.CONFIGURE_PACKET:
+            if well_formed and len(body) == 6:
+                size, ticks, _ = struct.unpack("<HHH", body)
+                if size < _MIN_PACKET:
+                    return 1
+                # mmWave Studio and most clients request 1472, get "done", and 1456 as with 1470 (read).
+                self._packetiser.payload_bytes = min(size, _MAX_PACKET) - PACKET_OVERHEAD_BYTES
+                self.packet_delay_s = ticks * DELAY_TICK_S
+        elif code == Code.EEPROM:
+            if not well_formed or len(body) != 18:
+                return 1
+            self._eeprom = Network.decode(body)
+        elif code == Code.FPGA_VERSION:
+            return FPGA_VERSION
+        elif code not in (Code.RESET_RADAR, Code.ALIVE, Code.STATUS):
+            return 1
+        return 0
+
+    def lvds(self, data: NDArray[np.generic], now_s: float) -> list[Output]:
+        """Process LVDS data of the radar; return the packets it fills, [] without a record or if wrongly configured."""
+        if not self._recording or not self._suits_radar:
+            return []
+        self._last_data_s = now_s
+        rows = self._packetiser.feed(data)
+        return [Packets(rows)] if len(rows) else []
+
+    def overflow(self, status: Status = Status.LVDS_BUFFER_FULL) -> list[Output]:
+        """Report LVDS data lost before packetising, which leaves no gap in the sequence numbers."""
+        return [message(Code.STATUS, status)] if self._recording else []
+
+    def end_record(self) -> list[Output]:
+        """End the record now, as if the LVDS data had ended 2 s ago."""
+        return self._end(Status.RECORD_COMPLETED) if self._recording else []
+
+    def tick(self, now_s: float) -> list[Output]:
+        """End the record if :attr:`deadline_s` has passed: the short last packet, then the status."""
+        deadline = self.deadline_s
+        if deadline is None or now_s < deadline:
+            return []
+        return self._end(Status.NO_LVDS_DATA if self._last_data_s is None else Status.RECORD_COMPLETED)
+
+    def _end(self, status: Status) -> list[Output]:
+        self._recording = False
+        tail = self._packetiser.flush()
+        return [*([Packets(tail)] if len(tail) else []), message(Code.STATUS, status)]

@@ -1,0 +1,150 @@
+"""Run all cards and radars of one process on one set of wires: SYNC_IN edges in, frames out as UDP."""
+
+from __future__ import annotations
+
+import selectors
+from collections.abc import Sequence
+from threading import Event
+
+from polysight_shared.config import Instrument
+from polysight_shared.wires import WireClient, WireEdge, WireMotion
+from polysight_simulators.cards.card import Clock, SimulatedCard
+from polysight_simulators.cards.dca1000 import TAIL_S
+from polysight_simulators.cards.sync_in import StageTrack
+from polysight_simulators.radars import LineServer, RadarSocket
+
+EDGES_PER_TURN = 2048
+GATHER_S = 0.01  # between reads of the wires with pulses: many frames per call cost less than a few
+IDLE_S = 0.1
+
+
+class CardServer:
+    """All cards of one process, on one set of wires."""
+
+    def __init__(
+        self,
+        rig: Instrument,
+        cards: list[SimulatedCard],
+        wires: WireClient,
+        time_scale: float,
+        clock_s: Clock,
+        track: StageTrack,
+        power_cycle: Event | None = None,
+        control: Sequence[LineServer] = (),
+        chips: Sequence[RadarSocket] = (),
+    ) -> None:
+        self._cards = cards
+        self._control, self._chips = control, chips
+        self._power_cycle = power_cycle or Event()
+        self._wires = wires
+        self._trigger = rig.pi.trigger_in
+        self._time_scale = time_scale
+        self._clock_s = clock_s
+        self._track = track
+        self._trigger_ns = self._pulse_ns = 0
+        self._selector = selectors.DefaultSelector()
+        self._bound: dict[SimulatedCard, tuple[int, int]] = {}  # number of the card's binding, its descriptor then
+        self._select_cards()
+        self._selector.register(wires, selectors.EVENT_READ)
+        for server in (*control, *chips):
+            self._selector.register(server, selectors.EVENT_READ)
+        self._listening = True
+        self._unread = False
+        self._next_read_s = 0.0
+
+    @property
+    def more_expected(self) -> bool:
+        """True if the stage is in a row, or pulses of its last trigger are pending."""
+        return self._track.moving or self._trigger_ns > self._pulse_ns
+
+    def serve(self, stop: Event) -> None:
+        """Run until `stop` is set; switch every card off and on if `power_cycle` is set.
+
+        Raises DeviceError if the wires break, or a card's new address cannot be bound.
+        """
+        timeout: float = 0.0
+        while not stop.is_set():
+            ready = self._selector.select(0.0 if self._unread and self._listening else timeout)
+            # Radars are armed before the row's first pulse is sent, so control comes before the wires.
+            for server in self._control:
+                server.serve()
+            # Wires before commands: keep the order of a pulse and a later command.
+            commands = any(key.fileobj is not self._wires for key, _ in ready)
+            if commands or (self._listening and (self._unread or ready)):
+                self._take_edges()
+            for chip in self._chips:
+                chip.serve()
+            if self._power_cycle.is_set():
+                self._power_cycle.clear()
+                for card in self._cards:
+                    card.endpoint.power_cycle()
+            for card in self._cards:
+                card.endpoint.serve_commands()
+            self._select_cards()
+            timeout = min(self._work(card) for card in self._cards)
+            gather_s = self._next_read_s - self._clock_s()
+            self._listen(gather_s <= 0 and not any(card.endpoint.sender.full for card in self._cards))
+            if gather_s > 0:
+                timeout = min(timeout, gather_s)
+
+    def _select_cards(self) -> None:
+        """Register the cards' sockets, which change at a power cycle."""
+        changed = [card for card in self._cards if self._bound.get(card, (0,))[0] != card.endpoint.bindings]
+        for card in changed:
+            if card in self._bound:
+                self._selector.unregister(self._bound[card][1])
+        for card in changed:
+            descriptor = card.endpoint.fileno()
+            self._selector.register(descriptor, selectors.EVENT_READ)
+            self._bound[card] = (card.endpoint.bindings, descriptor)
+
+    def _take_edges(self) -> bool:
+        """Read the wires; return True if there were pulses."""
+        rising: dict[int, list[int]] = {card.line: [] for card in self._cards}
+        self._unread = True  # the client may have buffered lines
+        for _ in range(EDGES_PER_TURN):
+            message = self._wires.receive(0.0)
+            if message is None:
+                self._unread = False
+                break
+            if isinstance(message, WireMotion):
+                self._track.add(message)
+            elif message.value:
+                self._edge(message, rising)
+        for card in self._cards:
+            if rising[card.line]:
+                card.pulses(rising[card.line], self._track)
+                self._next_read_s = self._clock_s() + GATHER_S
+        return any(rising.values())
+
+    def _edge(self, edge: WireEdge, rising: dict[int, list[int]]) -> None:
+        if edge.line == self._trigger:
+            self._trigger_ns = edge.t_ns
+            self._track.trigger(edge.t_ns)
+        elif edge.line in rising:
+            self._pulse_ns = edge.t_ns
+            rising[edge.line].append(edge.t_ns)
+
+    def _work(self, card: SimulatedCard) -> float:
+        """Send data and end the record in time; return the seconds until this card has more to do."""
+        endpoint = card.endpoint
+        wait = endpoint.flush()
+        if wait is None and endpoint.due and not self._take_edges():  # pending data delays the end
+            card.tick(self.more_expected)
+            wait = endpoint.flush()
+        if wait is not None:
+            return min(wait, IDLE_S)
+        return IDLE_S if card.card.deadline_s is None else min(IDLE_S, max(0.001, 0.1 * TAIL_S / self._time_scale))
+
+    def _listen(self, wanted: bool) -> None:
+        """Start or stop reading the wires; unread edges stay in the socket and the hub."""
+        if wanted is not self._listening:
+            self._listening = wanted
+            if wanted:
+                self._selector.register(self._wires, selectors.EVENT_READ)
+            else:
+                self._selector.unregister(self._wires)
+
+    def close(self) -> None:
+        """Close the selector, not the sockets."""
+        self._selector.close()

@@ -1,0 +1,78 @@
+"""Addresses of a simulated rig: its own loopback subnet 127.x.y.0, so that several rigs run at once with equal ports.
+
+The last byte of every card and host address is kept (.180, .181, .182, .30), as in the real rig.
+"""
+
+from __future__ import annotations
+
+import random
+import socket
+from contextlib import ExitStack
+from typing import Any
+
+from polysight_shared.config import Instrument
+from polysight_shared.errors import DeviceError
+from polysight_shared.tables import decode, to_builtins
+from polysight_simulators.cards import SOURCE_PORT, bound_udp
+
+_TRIES = 50
+_COMMAND_PORT, _EVENT_PORT = 5601, 5602
+_PI_HOST_PART = "10"
+_RADAR_PORT = 5700
+
+
+def on_subnet(rig: Instrument, subnet: str) -> Instrument:
+    """Return the rig with its cards, host and Pi on `subnet` ("127.x.y"), with the last bytes of their addresses kept.
+
+    A board's control server, or its native connection, gets its card's address.
+    """
+    table: dict[str, Any] = to_builtins(rig)
+    for board in table["boards"]:
+        for key in ("card_address", "host_address"):
+            board[key] = f"{subnet}.{board[key].rpartition('.')[2]}"
+    cards = {board["name"]: board["card_address"] for board in table["boards"]}
+    servers = {name: f"{cards[name]}:{port.rpartition(':')[2]}" for name, port in rig.radar.servers.items()}
+    native = table["radar"].get("native", {})
+    for name, board in native.items():
+        board["usb_serial"] = f"tcp://{cards[name]}:{_RADAR_PORT}"
+    table["radar"] = {**table["radar"], "servers": servers, "native": native}
+    pi = f"tcp://{subnet}.{_PI_HOST_PART}"
+    table["pi"] |= {"command_address": f"{pi}:{_COMMAND_PORT}", "event_address": f"{pi}:{_EVENT_PORT}"}
+    return decode(table, Instrument, f"{rig.name} on {subnet}.0")
+
+
+def is_free(rig: Instrument) -> bool:
+    """Return True if every address of the rig is free."""
+    udp = {(b.card_address, port) for b in rig.boards for port in (SOURCE_PORT, b.command_port)}
+    udp |= {(b.host_address, port) for b in rig.boards for port in (b.command_port, b.data_port)}
+    radars = (*rig.radar.servers.values(), *(b.usb_serial for b in rig.radar.native.values()))
+    addresses = (rig.pi.command_address, rig.pi.event_address, *radars)
+    tcp = [address.removeprefix("tcp://").split(":") for address in addresses]
+    with ExitStack() as held:
+        try:
+            for address, port in udp:
+                held.enter_context(bound_udp(address, port))
+            for address, port in tcp:
+                s = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
+                s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # addresses of a rig that just ended are free
+                s.bind((address, int(port)))
+        except (OSError, DeviceError):
+            return False
+    return True
+
+
+def on_free_subnet(rig: Instrument, chance: random.Random | None = None) -> Instrument:
+    """Return the rig on a random loopback subnet with free addresses.
+
+    Raises DeviceError if there is none in 50 attempts, because this machine's loopback is not 127.0.0.0/8.
+    """
+    chance = chance or random.Random()
+    for _ in range(_TRIES):
+        moved = on_subnet(rig, f"127.{chance.randint(1, 254)}.{chance.randint(0, 255)}")
+        if is_free(moved):
+            return moved
+    raise DeviceError(
+        f"no free loopback subnet in {_TRIES} tries",
+        "only 127.0.0.1 exists on this machine (not Linux?), or too many simulated rigs run",
+        "end other simulated rigs; on macOS add addresses with `ifconfig lo0 alias`",
+    )

@@ -1,0 +1,89 @@
+"""`python -m polysight_simulators.radars TRACE`: replay the host's side of a trace to a simulated board.
+
+Prints where the simulated board answers differently from the traced one: a limit of the simulator, or a fault of the
+traced board. Format of the trace: docs/spec/mmwavelink.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from polysight_simulators.radars.board import FUNCTIONAL, RadarBoard
+from polysight_simulators.radars.image import make_image
+
+_STEP_S, _TIMEOUT_S = 1e-4, 15.0
+
+
+class _Time:
+    def __init__(self) -> None:
+        self.s = 0.0
+
+    def now(self) -> float:
+        return self.s
+
+
+def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> list[str]:
+    """Return a line for each different answer of the board. Raises OSError, ValueError."""
+    time = _Time()
+    board, differences = make(time.now), []
+    if not trace.is_file():
+        raise ValueError("not a regular file")
+    lines = trace.read_text(encoding="utf-8").splitlines()
+    first = json.loads(lines[0]) if lines else None
+    if len(lines) < 2 or not isinstance(first, dict) or first.get("trace") != 1:
+        raise ValueError("not a trace of version 1, or an empty one")
+    for number, line in enumerate(lines, 1):
+        record = json.loads(line)
+        time.s = max(time.s, record.get("t", 0.0))
+        if record.get("line") == "NRST":
+            board.sense(FUNCTIONAL)
+            board.reset(held=not record["level"])
+        elif record.get("line") == "HOST_INTR" and record["level"]:
+            until = time.s + _TIMEOUT_S
+            while not board.interrupt and time.s < until:
+                time.s += _STEP_S
+            if not board.interrupt:
+                differences.append(f"line {number}: the simulated board sends nothing here")
+        elif "out" in record:
+            for word in _words(record["out"]):
+                board.write_word(word)
+        elif "in" in record:
+            sent = [board.read_word() for _ in _words(record["in"])]
+            if sent != _words(record["in"]):
+                here = b"".join(w.to_bytes(2, "little") for w in sent).hex()
+                differences.append(f"line {number}: the traced board sent {record['in']}, the simulated one {here}")
+    return differences
+
+
+def _words(text: str) -> list[int]:
+    raw = bytes.fromhex(text)
+    return [int.from_bytes(raw[at : at + 2], "little") for at in range(0, len(raw), 2)]
+
+
+def main() -> int:
+    """Return 0 if the simulated board answers the same."""
+    parser = argparse.ArgumentParser(
+        prog="python -m polysight_simulators.radars",
+        description=__doc__,
+        epilog="example:\n  python -m polysight_simulators.radars first-day.jsonl",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("trace", type=Path, metavar="TRACE", help="a file of `polysight radar --trace FILE`")
+    parser.add_argument("--empty-flash", action="store_true", help="simulate a new board")
+    args = parser.parse_args()
+    flash = b"" if args.empty_flash else make_image()
+    try:
+        differences = replay(args.trace, lambda now: RadarBoard(now, flash=flash))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as e:
+        sys.stderr.write(f"{args.trace}: {e}\n")
+        return 2
+    sys.stdout.write("\n".join(differences or ["the simulated board answers the same"]) + "\n")
+    return 1 if differences else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,300 @@
+"""A simulated AWR2243 board at its SPI lines: words, host interrupt, reset and sense lines, SYNC_IN pulses.
+
+It has its own mmWaveLink codec, after TI's interface control document and the observed behaviour of devices: answers
+with a 16-bit CRC, refusals with message id 0, a harmless main core fault at power-up, an empty flash at first, data 1
+ms after the interrupt. The clock is a parameter; `RadarBoard.inject` sets faults. Real timing is not known.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import deque
+from collections.abc import Callable
+from enum import Enum
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError
+from polysight_simulators.radars.cores import ERASE_S, FRAME_END, RF_FAULT, Cores
+from polysight_simulators.radars.wire import EVENT, NACK, READY, RESPONSE, TO_DEVICE, frame, ones_sum
+
+FUNCTIONAL = 4  # sense-on-power mode
+ANSWER_S, DATA_S = 1e-4, 1e-3
+
+
+class Fault(Enum):
+    """Fault of the next answer; `EVENT_BETWEEN` sends an event before it."""
+
+    NACK = "reports a damaged command"
+    REFUSE = "refuses the command"
+    REFUSE_BARE = "refuses the command without a body"
+    BAD_CRC = "one bit of the answer's body flips"
+    BAD_CHECKSUM = "one bit of the answer's header flips"
+    BAD_SYNC = "words before the answer"
+    LOST_INTERRUPT = "the interrupt does not come"
+    NO_ANSWER = "does not answer"
+    EVENT_BETWEEN = "an event comes first"
+
+
+class RadarBoard:
+    """A board.
+
+    Parameters
+    ----------
+    now
+        Clock, seconds.
+    flash
+        Content of the serial flash; empty in a new board. It boots from `make_image()`.
+    dead_s
+        Minimum time from a frame's pulse to the next; default: the frame period.
+    fault_pulses
+        Pulses since the start, from 0, at which the RF core faults.
+    die
+        Part of the die id, which identifies the board.
+    supply_v
+        Voltage of the RF supplies; LDO bypass at 1.3 V destroys the board.
+    erase_s
+        Duration of erasing the flash.
+    fault_at
+        Time of the main core's harmless fault: "power-up", "download" or "never".
+    functional_jumpers
+        SOP0 set, SOP1 and SOP2 open, which functional mode requires.
+    first_generation
+        Boots and refuses like an AWR1243.
+    answers_32_bit
+        Answers with a CRC of 32 bits; events have one if the host requested it.
+
+    Attributes
+    ----------
+    cores
+        Settings, flash and executed commands.
+    """
+
+    def __init__(
+        self,
+        now: Callable[[], float],
+        *,
+        flash: bytes = b"",
+        dead_s: float | None = None,
+        fault_pulses: tuple[int, ...] = (),
+        die: int = 1,
+        supply_v: float = 1.3,
+        erase_s: float = ERASE_S,
+        fault_at: str = "power-up",
+        functional_jumpers: bool = True,
+        first_generation: bool = False,
+        answers_32_bit: bool = False,
+    ) -> None:
+        self.now, self._dead_s, self._fault_pulses = now, dead_s, fault_pulses
+        self.functional_jumpers, self._answers_32_bit = functional_jumpers, answers_32_bit
+        self.cores = Cores(
+            now, self._event, flash, die=die, supply_v=supply_v, erase_s=erase_s, fault_at=fault_at,
+            first_generation=first_generation,
+        )  # fmt: skip
+        self.plugged = True
+        self.powered = True
+        self._faults: deque[Fault] = deque()
+        self._pulses_seen = 0
+        self._held, self._mode = True, 0
+        self._forget()
+
+    @property
+    def executed(self) -> list[int]:
+        """Numbers of the executed sub-blocks, in order."""
+        return self.cores.executed
+
+    @property
+    def settings(self) -> dict[int, bytes]:
+        """Data of the last sub-block of each number."""
+        return self.cores.settings
+
+    @property
+    def armings(self) -> int:
+        """Number of frame starts."""
+        return self.cores.armings
+
+    @property
+    def destroyed(self) -> bool:
+        """True if LDO bypass has destroyed it."""
+        return self.cores.destroyed
+
+    def _forget(self) -> None:
+        self._in, self._out = bytearray(), bytearray()
+        self._waiting: deque[bytes] = deque()  # messages not read by the host yet
+        self._later: list[tuple[float, bytes]] = []
+        self._offered, self._ready_at = False, 0.0
+        self._last: tuple[int, bytes] = (-1, b"")
+        self._pulse_s, self._busy_until = float("-inf"), -1.0
+        self.cores.forget()
+
+    def inject(self, *faults: Fault) -> None:
+        """Set the faults of the next answers, one each; earlier ones are discarded."""
+        self._faults = deque(faults)
+
+    # lines
+
+    def power(self, on: bool) -> None:
+        """Switch the board's supply, not that of its USB chip; the flash keeps its content."""
+        self._forget()
+        self.powered = on
+        if on and not self._held:
+            self._boot()
+
+    def sense(self, mode: int) -> None:
+        """Set the sense-on-power lines, which are read at the release of the reset."""
+        self._mode = mode
+
+    def reset(self, held: bool) -> None:
+        """Drive the reset line."""
+        if held:
+            self._forget()
+        elif self._held:
+            self._boot()
+        self._held = held
+
+    def _boot(self) -> None:
+        if self._mode == FUNCTIONAL and self.functional_jumpers and self.powered and not self.destroyed:
+            self.cores.boot()
+
+    @property
+    def interrupt(self) -> bool:
+        """Level of the host interrupt line. Raises DeviceError if unplugged."""
+        self._check()
+        self._deliver()
+        return self._offered
+
+    @property
+    def ready_for_triggers(self) -> bool:
+        """True if a pulse would start a frame now."""
+        self._deliver()
+        return self.cores.armed and self.cores.frames_left != 0
+
+    def trigger(self, pulse_s: float | None = None) -> bool:
+        """Give a rising edge on SYNC_IN, now or at a time of the pulses' clock; return True if it starts a frame.
+
+        An edge that comes too early causes a fault, after which pulses are ignored. A time that jumps back further is
+        taken for another clock.
+        """
+        self._pulses_seen += 1
+        if not self.ready_for_triggers:
+            return False
+        cores, at = self.cores, self.now() if pulse_s is None else pulse_s
+        period = cores.period_s()
+        too_soon = abs(at - self._pulse_s) < (period if self._dead_s is None else self._dead_s) - 1e-9
+        if too_soon or self._pulses_seen - 1 in self._fault_pulses:
+            cores.armed = False
+            self._event(RF_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), 0.0)
+            return False
+        self._pulse_s, cores.frame_ends = at, self.now() + period
+        cores.frames_left -= 1
+        if cores.frames_left == 0:
+            cores.armed = False
+            self._event(FRAME_END, b"", period)
+        return True
+
+    def say(self, number: int, data: bytes = b"") -> None:
+        """Send an event now."""
+        self._event(number, data, 0.0)
+
+    # words
+
+    def write_word(self, word: int) -> None:
+        """Receive a word from the host. Raises DeviceError if unplugged."""
+        self._check()
+        self._deliver()
+        self._in += word.to_bytes(2, "little")
+        while len(self._in) >= 4 and self._in[:4] not in (TO_DEVICE, READY):
+            del self._in[:2]
+        if self._in[:4] == READY and len(self._in) >= 16:
+            del self._in[:16]
+            self._offered = False
+            if self._waiting:
+                self._out, self._ready_at = bytearray(self._waiting.popleft()), self.now() + DATA_S
+        elif self._in[:4] == TO_DEVICE and len(self._in) >= 16:
+            length = int.from_bytes(self._in[6:8], "little")
+            if ones_sum(bytes(self._in[4:16])) != 0xFFFF:
+                self._in.clear()  # no response: the host has a timeout
+            elif len(self._in) >= 4 + length:
+                raw = bytes(self._in[4 : 4 + length])
+                del self._in[: 4 + length]
+                self._message(raw)
+
+    def read_word(self) -> int:
+        """Send a word to the host; all ones if there is none yet. Raises DeviceError if unplugged."""
+        self._check()
+        self._deliver()
+        if not self._out or self.now() < self._ready_at - 1e-9:
+            return 0xFFFF
+        word = int.from_bytes(self._out[:2], "little")
+        del self._out[:2]
+        return word
+
+    # inside
+
+    def _check(self) -> None:
+        if not self.plugged:
+            raise DeviceError(
+                "the simulated radar is unplugged", "a test unplugged it", "plug it in", code=ErrorCode.NO_ANSWER
+            )
+
+    def _deliver(self) -> None:
+        for at, raw in sorted(self._later, key=lambda p: p[0]):
+            if at <= self.now():
+                self._later.remove((at, raw))
+                self._waiting.append(raw)
+        if self._waiting and not self._out:
+            self._offered = True
+
+    def _send(self, raw: bytes, delay_s: float) -> None:
+        self._later.append((self.now() + delay_s, raw))
+
+    def _event(self, number: int, data: bytes, delay_s: float) -> None:
+        main = number >= 0x4000
+        wide = self.cores.crc32_events if main else not self.cores.first_generation
+        block = struct.pack("<HH", number, len(data) + 4) + data
+        self._send(frame(6 if main else 2, EVENT, number // 32, block, 1, 0, wide), delay_s)
+
+    def _message(self, raw: bytes) -> None:
+        opcode, length, flags, remaining, count = struct.unpack_from("<5H", raw)
+        fault = self._faults.popleft() if self._faults else None
+        if fault is Fault.NO_ANSWER or self.destroyed or not self.powered or self.now() < self._busy_until:
+            return
+        direction, number, sequence, wide = (opcode & 15) + 1, opcode >> 6, flags >> 12, self._answers_32_bit
+        if fault is Fault.NACK or zlib.crc32(raw[: length - 4]) != int.from_bytes(raw[length - 4 :], "little"):
+            self._send(frame(direction, NACK, number, b"", 0, sequence, wide), 0.0)
+            return
+        if flags & 3 == 3 and self._last[0] == sequence and self._last[1]:
+            self._send(self._last[1], 0.0)  # a retry: repeat the answer, without executing the command again
+            return
+        delay, error = ANSWER_S, 0
+        body, blocks, block = raw[12 : length - 4], b"", 0
+        for _ in range(count):
+            block, size = struct.unpack_from("<HH", body)
+            refused = fault in (Fault.REFUSE, Fault.REFUSE_BARE)
+            error, data, extra = (6, b"", 0.0) if refused else self.cores.execute(block, body[4:size], remaining)
+            if error:
+                break
+            delay += extra
+            blocks += struct.pack("<HH", block, len(data) + 4) + data if data else b""
+            body = body[size:]
+        self._busy_until = self.now() + delay
+        if error and (self.cores.first_generation or fault is Fault.REFUSE_BARE):
+            answer = frame(direction, RESPONSE, 0, b"", 1, sequence, wide)  # like an AWR1243
+        elif error:
+            answer = frame(direction, RESPONSE, 0, struct.pack("<4H", 0, 8, error, block), 1, sequence, wide)  # ICD 4.4
+        else:
+            answer = frame(direction, RESPONSE, number, blocks, 1 if blocks else 0, sequence, wide)
+        self._last = (sequence, answer)
+        self._answer(answer, fault, delay)
+
+    def _answer(self, answer: bytes, fault: Fault | None, delay_s: float) -> None:
+        if fault is Fault.EVENT_BETWEEN:
+            self._event(0x1012, bytes(20), 0.0)
+        elif fault is Fault.BAD_CRC:
+            answer = answer[:-1] + bytes((answer[-1] ^ 1,))
+        elif fault is Fault.BAD_CHECKSUM:
+            answer = answer[:14] + bytes((answer[14] ^ 1,)) + answer[15:]
+        elif fault is Fault.BAD_SYNC:
+            answer = b"\xff\xff\x00\x00" + answer
+        if fault is not Fault.LOST_INTERRUPT:
+            self._send(answer, delay_s)

@@ -1,0 +1,291 @@
+r"""Control connections of the simulated radars: a board's USB chip, the same over TCP, or a control server.
+
+`UsbChip` is the FT4232H between host and board: it decodes the byte streams of its four channels to lines and words.
+Channels A and B have the MPSSE commands of FTDI's application note AN_108 that SPI needs, and answer an unknown one
+with 0xFA and the command, as the chip does; C and D are bit-bang ports. `errors` collects protocol errors of the host.
+The timing of USB is not simulated.
+
+`RadarSocket` connects the chip to a TCP address, `usb_serial = "tcp://address:port"` in a rig file. Requests: channel
+(A..D), `W` or `R`, size (u16, little-endian), and the bytes of a write. The answer to a read is a u16 count and the
+available bytes.
+
+`LineServer` simulates the published rig's MATLAB servers beside mmWave Studio: over TCP it receives the line
+`Retrigger\n`, arms the radar, and never replies. Faults of the `[faults]` table: a line without effect
+(`retrigger_fails`), a connection reset at a line (`retrigger_resets`). Specification: docs/spec/simulated-rig.md.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import struct
+from collections.abc import Callable
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError
+from polysight_simulators.faults import Faults
+from polysight_simulators.radars.board import RadarBoard
+
+_CLOCK, _OUT, _SELECT = 1 << 0, 1 << 1, 1 << 3
+_BARE = (0x85, 0x87, 0x8A, 0x8C, 0x8D, 0x97)
+_CHANNELS = "ABCD"
+_PIN_S = 0.2e-6  # duration of a pin command (FTDI AN_114)
+_CLOCKS_S = 0.2e-6  # two clocks, the minimum before and between chip selects (ICD 3.2.4); required here: twice that
+_HEAD = struct.Struct("<ccH")
+LINE = b"Retrigger"
+_NO_LINGER = struct.pack("ii", 1, 0)  # closing sends a reset
+
+
+class UsbChip:
+    """The USB chip of a board; `channel("A")` to `channel("D")` return its ports."""
+
+    def __init__(self, board: RadarBoard) -> None:
+        self._board = board
+        self.errors: list[str] = []
+        self.words_written: list[int] = []
+        self.spi_hz = 0.0
+        self._fast, self._pins, self._latched = False, 0, 0
+        self._high_s, self._low_s = float("inf"), 0.0  # time since the last change of chip select
+        self._answers = {name: bytearray() for name in _CHANNELS}
+        self._pending = {name: bytearray() for name in _CHANNELS}
+        self._sense = 0
+
+    def channel(self, name: str) -> UsbChannel:
+        """Return one of the four channels."""
+        return UsbChannel(self, name)
+
+    def take(self, name: str, data: bytes) -> None:
+        """Receive bytes from the host for a channel. Raises DeviceError if unplugged."""
+        self._check()
+        if name == "D":
+            pins = data[-1]
+            self._sense = {0b100: 4}.get(pins >> 2 & 0b111, 0)
+            self._board.sense(self._sense)
+        elif name == "C":
+            for pins in data:
+                self._board.reset(held=not (pins >> 6 & 1 and pins >> 7 & 1))
+        else:
+            self._high_s = float("inf") if name == "A" and self._pins & _SELECT else self._high_s  # USB is slow
+            self._pending[name] += data
+            commands: dict[str, Callable[[bytearray], int]] = {"A": self._spi, "B": self._gpio}
+            while self._pending[name]:
+                used = commands[name](self._pending[name])
+                if used == 0:
+                    return  # incomplete command
+                del self._pending[name][:used]
+
+    def give(self, name: str, size: int) -> bytes:
+        """Return up to `size` bytes of a channel for the host. Raises DeviceError if unplugged."""
+        self._check()
+        found = bytes(self._answers[name][:size])
+        del self._answers[name][:size]
+        return found
+
+    def _check(self) -> None:
+        if not self._board.plugged:
+            raise DeviceError("no such USB device", "it was unplugged", "plug it in", code=ErrorCode.NO_ANSWER)
+
+    def _spi(self, data: bytearray) -> int:
+        code = data[0]
+        if code in _BARE:
+            self._fast = self._fast or code == 0x8A
+            return 1
+        if code == 0x86:
+            if len(data) < 3:
+                return 0
+            self.spi_hz = (60e6 if self._fast else 12e6) / (2 * (1 + int.from_bytes(data[1:3], "little")))
+            return 3
+        if code == 0x80:
+            return self._set_pins(data)
+        if code not in (0x11, 0x20):
+            return self._unknown("A", code)
+        if len(data) < 3:
+            return 0
+        count = 1 + int.from_bytes(data[1:3], "little")
+        if code == 0x11 and len(data) < 3 + count:
+            return 0
+        if count != 2 or self._pins & _SELECT:
+            self.errors.append(f"{count} bytes at once, chip select {'high' if self._pins & _SELECT else 'low'}")
+        if self._latched:
+            self.errors.append("two words under one chip select")
+        elif self._low_s < 2 * _CLOCKS_S - 1e-9:
+            self.errors.append(f"the clock starts {self._low_s * 1e9:.0f} ns after chip select")
+        self._latched = 1
+        if code == 0x20:
+            self._answers["A"] += self._board.read_word().to_bytes(2, "big")
+            return 3
+        word = int.from_bytes(data[3:5], "big")
+        self.words_written.append(word)
+        self._board.write_word(word)
+        return 3 + count
+
+    def _set_pins(self, data: bytearray) -> int:
+        if len(data) < 3:
+            return 0
+        pins, direction = data[1], data[2]
+        if direction & (_CLOCK | _OUT | _SELECT) != _CLOCK | _OUT | _SELECT:
+            self.errors.append(f"clock, data or chip select is not driven (direction {direction:08b})")
+        if pins & _CLOCK:
+            self.errors.append("the clock rests high: not SPI mode 0")
+        was_high = self._pins & _SELECT
+        if pins & _SELECT:
+            self._latched = 0
+            self._high_s = self._high_s + _PIN_S if was_high else _PIN_S
+        else:
+            if was_high and self._high_s < 2 * _CLOCKS_S - 1e-9:
+                self.errors.append(f"chip select is high for {self._high_s * 1e9:.0f} ns between words")
+            self._low_s = _PIN_S if was_high else self._low_s + _PIN_S
+        self._pins = pins
+        return 3
+
+    def _gpio(self, data: bytearray) -> int:
+        code = data[0]
+        if code in _BARE:
+            return 1
+        if code == 0x80:
+            if len(data) < 3:
+                return 0
+            if data[2] >> 5 & 1:
+                self.errors.append("the host drives the interrupt line")
+            return 3
+        if code == 0x81:
+            self._answers["B"].append(self._board.interrupt << 5)
+            return 1
+        return self._unknown("B", code)
+
+    def _unknown(self, name: str, code: int) -> int:
+        self.errors.append(f"unknown command 0x{code:02X} on channel {name}")
+        self._answers[name] += bytes((0xFA, code))
+        return 1
+
+
+class UsbChannel:
+    """Port of one channel."""
+
+    def __init__(self, chip: UsbChip, name: str) -> None:
+        self._chip, self._name = chip, name
+        self.closed = False
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        self._chip.take(self._name, data)
+
+    def read(self, size: int) -> bytes:
+        """Receive up to `size` bytes."""
+        return self._chip.give(self._name, size)
+
+    def close(self) -> None:
+        """Close the port."""
+        self.closed = True
+
+
+class _Server:
+    """A TCP server for an event loop that polls `fileno` and calls `serve`. Raises DeviceError if it cannot listen."""
+
+    def __init__(self, address: str, what: str) -> None:
+        host, _, port = address.removeprefix("tcp://").rpartition(":")
+        try:
+            self._listener = socket.create_server((host, int(port)))
+        except OSError as e:
+            raise DeviceError(
+                f"{what}: cannot listen at {address}: {e.strerror}",
+                "another program uses this address",
+                code=ErrorCode.BUSY,
+            ) from None
+        self._listener.setblocking(False)
+        self.address = f"tcp://{host}:{self._listener.getsockname()[1]}"
+        self._clients: dict[int, tuple[socket.socket, bytes]] = {}  # by descriptor, with incomplete requests
+        self._ready = select.epoll()
+        self._ready.register(self._listener, select.EPOLLIN)
+
+    def fileno(self) -> int:
+        """Return an epoll descriptor for the listener and its clients."""
+        return self._ready.fileno()
+
+    def serve(self) -> None:
+        """Process pending connections and requests."""
+        for descriptor, _ in self._ready.poll(0):
+            if descriptor == self._listener.fileno():
+                self._accept()
+            elif descriptor in self._clients:
+                client, rest = self._clients[descriptor]
+                try:
+                    data = client.recv(65536)
+                    if data:
+                        self._clients[descriptor] = client, self._execute(client, rest + data)
+                        continue
+                except (OSError, DeviceError):
+                    pass  # disconnected or unplugged: close the connection
+                self._drop(descriptor)
+
+    def _accept(self) -> None:
+        client, _ = self._listener.accept()
+        self._clients[client.fileno()] = client, b""
+        self._ready.register(client, select.EPOLLIN)
+
+    def _execute(self, client: socket.socket, data: bytes) -> bytes:
+        """Process the requests in `data` and return the incomplete rest. Raises OSError to close the connection."""
+        raise NotImplementedError
+
+    def _drop(self, descriptor: int) -> None:
+        self._ready.unregister(descriptor)
+        self._clients.pop(descriptor)[0].close()
+
+    def close(self) -> None:
+        """Close all sockets."""
+        for descriptor in list(self._clients):
+            self._drop(descriptor)
+        self._listener.close()
+        self._ready.close()
+
+
+class RadarSocket(_Server):
+    """A USB chip at a TCP address, for one client at a time."""
+
+    def __init__(self, address: str, board: RadarBoard) -> None:
+        super().__init__(address, "simulated radar")
+        self.chip = UsbChip(board)
+
+    def _accept(self) -> None:
+        for descriptor in list(self._clients):  # the new client replaces the old one
+            self._drop(descriptor)
+        super()._accept()
+
+    def _execute(self, client: socket.socket, data: bytes) -> bytes:
+        while len(data) >= _HEAD.size:
+            channel, what, size = _HEAD.unpack_from(data)
+            port = channel.decode("ascii")
+            if what == b"R":
+                found = self.chip.give(port, size)
+                client.sendall(struct.pack("<H", len(found)) + found)
+                data = data[_HEAD.size :]
+                continue
+            if len(data) < _HEAD.size + size:
+                break
+            self.chip.take(port, data[_HEAD.size : _HEAD.size + size])
+            data = data[_HEAD.size + size :]
+        return data
+
+
+class LineServer(_Server):
+    """Control server of a board at `address:port`; it calls `rearm` for each line that arms the radar."""
+
+    def __init__(self, address: str, rearm: Callable[[], None], faults: Faults) -> None:
+        super().__init__(address, "simulated control server")
+        self._rearm, self._faults = rearm, faults
+        self.lines = 0
+        self.unknown_lines = 0
+
+    def _execute(self, client: socket.socket, data: bytes) -> bytes:
+        *lines, rest = data.split(b"\n")
+        for line in lines:
+            if line.strip() != LINE:
+                self.unknown_lines += 1
+                continue
+            number, self.lines = self.lines, self.lines + 1
+            if number in self._faults.retrigger_resets:
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
+                raise ConnectionResetError
+            if number not in self._faults.retrigger_fails:
+                self._rearm()
+        return rest

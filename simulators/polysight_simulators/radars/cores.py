@@ -1,0 +1,253 @@
+"""The two cores of a simulated AWR2243: their states, and the effect of each command.
+
+The table in docs/spec/mmwavelink.md ("The stand-in") has the answers in each state, with the sections of TI's document.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from polysight_simulators.radars.image import boot_errors, patch_of
+from polysight_simulators.radars.wire import FAULT_DATA, OLD_UP_EMPTY, OLD_UP_WRITTEN
+
+BOOT_S, RF_UP_S, RF_INIT_S, ERASE_S, READY_S = 0.05, 0.02, 0.3, 4.0, 1e-3
+UP_MAIN, UP_RF, MAIN_FAULT, BOOTED = 0x5000, 0x5001, 0x5002, 0x5005
+CALIBRATED, TRIGGER_READY, FRAME_END, RF_FAULT = 0x1004, 0x100B, 0x100F, 0x1002
+PROFILE, CHIRP, FRAME, STREAM_SET, STREAM = 0x0100, 0x0101, 0x0102, 0x0103, 0x0104
+SAVE, RESTORE, CHUNK_BYTES, CHUNKS = 0x00AB, 0x008B, 224, 3
+SIZES = {  # data bytes of each sub-block
+    0x0080: 8, 0x0082: 8, 0x0083: 4, 0x0085: 4, 0x0086: 12, 0x0089: 12, RESTORE: 228, 0x008D: 16, SAVE: 4, 0x00C0: 0,
+    PROFILE: 44, CHIRP: 20, FRAME: 24, STREAM_SET: 20, STREAM: 4, 0x0120: 4, 0x0121: 4, 0x0122: 0, 0x0140: 4,
+    0x0220: 0, 0x0223: 0, 0x02CC: 4, 0x02EA: 0, 0x4000: 0, 0x4041: 12, 0x4042: 8, 0x4043: 4,
+    0x4044: 4, 0x4045: 4, 0x4046: 4, 0x404C: 12, 0x40C0: 8, 0x40E0: 0,
+}  # fmt: skip
+_BEFORE_FRAMES = (0x0080, 0x0082, 0x0086, 0x00C0, PROFILE, CHIRP, 0x4041, 0x4042, 0x4043, 0x4044, 0x4045)
+_WITHOUT_RF = (0x4080, 0x404C, 0x4000, 0x40E0)  # commands before the RF power-up
+
+
+@dataclass
+class Cores:
+    """Both cores and the serial flash. `event` sends an event after a delay; see `RadarBoard` for the other fields."""
+
+    now: Callable[[], float]
+    event: Callable[[int, bytes, float], None]
+    flash: bytes = b""
+    ram: bytes = b""
+    die: int = 1
+    supply_v: float = 1.3
+    erase_s: float = ERASE_S
+    fault_at: str = "power-up"
+    first_generation: bool = False
+    hardware_bits: int = 0
+    rf_tests: int = 0x07FFFFFF  # self-tests of the RF core that passed
+    passes: int = 0x1FFE  # calibrations of the RF init
+    main_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
+    rf_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
+    destroyed: bool = False
+    executed: list[int] = field(default_factory=list)
+    settings: dict[int, bytes] = field(default_factory=dict)
+    profiles: dict[int, bytes] = field(default_factory=dict)
+    chirps: dict[int, bytes] = field(default_factory=dict)
+    armings: int = 0
+
+    def __post_init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Reset: clear RAM and settings, keep the flash."""
+        self.ram = self._booted = b""
+        self.main_up = self.rf_up = self.calibrated = self.crc32_events = False
+        self.frames_left, self.armed, self.frame_ends = 0, False, -1.0
+        self._file: tuple[int, int] | None = None  # file type, missing bytes
+        self._restored: dict[int, bytes] = {}
+        self._part = b""
+        for kept in (self.settings, self.profiles, self.chirps):
+            kept.clear()
+
+    def boot(self) -> None:
+        """Boot in functional mode: ROM, then the flash's image if it is complete (ICD 5.21.1)."""
+        self.main_up = True
+        broken = boot_errors(self.flash)
+        self._booted = b"" if broken else self.flash
+        if self.first_generation:
+            self.event(UP_MAIN, OLD_UP_EMPTY if broken else OLD_UP_WRITTEN, BOOT_S)
+        else:
+            self.event(UP_MAIN, struct.pack("<IQQ", 371_216, broken | self.hardware_bits, 0), BOOT_S)
+        if self.fault_at == "power-up":
+            self.event(MAIN_FAULT, FAULT_DATA, BOOT_S + 1e-3)
+
+    def execute(self, number: int, data: bytes, remaining: int) -> tuple[int, bytes, float]:
+        """Execute a command; return error number (0: none; ICD table 5.1, 7.1, 7.2), answer, and extra delay in s."""
+        if number == 0x4080:
+            return self._download(data, remaining)
+        if number not in SIZES or (self.first_generation and number == 0x008D):
+            return 3, b"", 0.0
+        if len(data) != SIZES[number]:
+            return 4, b"", 0.0
+        if not self.main_up or (number not in _WITHOUT_RF and not self.rf_up):
+            return 6, b"", 0.0
+        error, answer = self._do(number, data)
+        if not error:
+            self.executed.append(number)
+            self.settings[number] = data
+        return error, answer, 0.0
+
+    def _do(self, number: int, data: bytes) -> tuple[int, bytes]:
+        if number == 0x0140:
+            return self._start_or_stop(struct.unpack_from("<H", data)[0]), b""
+        if number == FRAME and self.armed:
+            return 83, b""
+        if number in (0x0120, 0x0121, 0x0122):
+            return self._read_back(number, data)
+        if number in (PROFILE, CHIRP):
+            return self._keep(number, data), b""
+        if number in (SAVE, RESTORE):
+            return self._calibration(number, data)
+        return 0, self._effect(number, data)
+
+    def _effect(self, number: int, data: bytes) -> bytes:
+        if number == 0x404C:
+            self.crc32_events = data[0] == 1
+        elif number == 0x4000 and (
+            self._patched() or not self.first_generation
+        ):  # otherwise it never reports, as observed
+            self.rf_up = True
+            self.event(UP_RF, struct.pack("<4I", self.rf_tests, 2000, 0, 0), RF_UP_S)
+        elif number == 0x00C0:
+            self.calibrated = True
+            self._report_calibration(self.passes)
+        elif number == 0x02CC and data[0] & 1 and self.supply_v > 1.1:
+            self.destroyed = True
+        elif number in (0x0220, 0x40E0):
+            rom = self.main_rom if number == 0x40E0 else self.rf_rom
+            return bytes((1, 2, 0, *rom, 20, 3, 17)) + self._patch(main=number == 0x40E0)
+        elif number == 0x0223:
+            if not self.die:
+                return bytes(32)
+            return struct.pack("<8I", 0x5EED0000 + self.die, 0xD1E, 2243, self.die, 0, 0, 0, 0)
+        elif number == 0x02EA:
+            return struct.pack("<I10h", int(self.now() * 1e3) & 0xFFFFFFFF, 41, 41, 42, 42, 45, 46, 45, 40, 43, 0)
+        return b""
+
+    def _patched(self) -> bytes:
+        return self.ram if self.ram and not boot_errors(self.ram) else self._booted
+
+    def _patch(self, main: bool) -> bytes:
+        image = self._patched()
+        return patch_of(image, main) if image else bytes(6)
+
+    def _report_calibration(self, passed: int) -> None:
+        self.event(CALIBRATED, struct.pack("<IIhHII", passed, passed, 41, 0, 500, 0), RF_INIT_S)
+
+    def _keep(self, number: int, data: bytes) -> int:
+        """Store a profile (0..3), or chirps (0..511) of one (ICD tables 5.24, 5.26); return an error number."""
+        first, last, profile = struct.unpack_from("<3H", data)
+        if number == PROFILE:
+            if first > 3:
+                return 35
+            self.profiles[first] = data
+            return 0
+        if last > 511 or first > last:
+            return 60 if last > 511 else 61
+        if profile not in self.profiles:
+            return 62 if profile > 3 else 63
+        for chirp in range(first, last + 1):
+            self.chirps[chirp] = data
+        return 0
+
+    def _read_back(self, number: int, data: bytes) -> tuple[int, bytes]:
+        """Read back a setting in the form in which it was sent (ICD 5.6.1..5.6.6)."""
+        kept = {
+            0x0120: lambda: self.profiles.get(struct.unpack_from("<H", data)[0]),
+            0x0121: lambda: self.chirps.get(struct.unpack_from("<H", data)[0]),
+            0x0122: lambda: self.settings.get(FRAME),
+        }[number]()
+        return (5, b"") if kept is None else (0, kept)
+
+    def _calibration(self, number: int, data: bytes) -> tuple[int, bytes]:
+        """Save or restore 672 bytes of calibration in three parts (ICD 5.2.11, 5.3.2)."""
+        _, part = struct.unpack_from("<2H", data)
+        if part >= CHUNKS:
+            return 5, b""
+        if number == SAVE:
+            if not self.calibrated:
+                return 6, b""
+            whole = (
+                struct.pack("<2I8xh", self.passes, self.passes, 41)
+                + bytes((self.die * 31 + n) & 0xFF for n in range(654))
+            )[:672]
+            return 0, struct.pack("<2H", CHUNKS, part) + whole[CHUNK_BYTES * part : CHUNK_BYTES * (part + 1)]
+        self._restored[part] = data[4:]
+        if len(self._restored) == CHUNKS:
+            status, copy = struct.unpack_from("<2I", self._restored[0])
+            self._restored.clear()
+            self._report_calibration(status if status == copy else 0)
+        return 0, b""
+
+    def _start_or_stop(self, what: int) -> int:
+        if what == 1:
+            return self._start()
+        if what not in (0, 4):
+            return 23
+        if not self.armed:
+            return 21
+        if what == 4 and self.now() < self.frame_ends:
+            self.event(RF_FAULT, struct.pack("<BBH", 3, 2, 815) + bytes(28), 0.0)
+        self.armed = False
+        self.event(FRAME_END, b"", READY_S)
+        return 0
+
+    def _start(self) -> int:
+        if self.armed:
+            return 20
+        if not self.calibrated or any(n not in self.settings for n in (*_BEFORE_FRAMES, FRAME, 0x40C0)):
+            return 22
+        _, _, _, _, frames, _, period, trigger = struct.unpack_from("<6HIH", self.settings[FRAME])
+        self.frames_left, self.armed, self.frame_ends = frames or -1, True, -1.0
+        self.armings += 1
+        if trigger == 1:  # software trigger: they run at once (ICD table 5.27)
+            self.armed, self.frames_left = False, 0
+            self.event(FRAME_END, b"", frames * period * 5e-9)
+        else:
+            self.event(TRIGGER_READY, b"", READY_S)
+        return 0
+
+    def period_s(self) -> float:
+        """Return the frame period, seconds."""
+        return struct.unpack_from("<I", self.settings[FRAME], 12)[0] * 5e-9
+
+    def _download(self, data: bytes, remaining: int) -> tuple[int, bytes, float]:
+        """Store a part of a file (ICD 5.18.1). The first part erases the flash; its content is checked only at boot."""
+        if not self.main_up:
+            return 6, b"", 0.0
+        first = self._file is None
+        if self._file is None:
+            kind, length = struct.unpack_from("<II", data)
+            if kind not in (0, 4, 5, 6, 7):
+                return 8, b"", 0.0
+            self._file, self._part, data = (kind, length), b"", data[8:]
+            if kind:
+                self.flash = b""
+            if self.fault_at == "download":
+                self.event(MAIN_FAULT, FAULT_DATA, 0.0)
+        kind, missing = self._file
+        self._part += data
+        if kind:
+            self.flash = self._part
+        missing -= len(data)
+        self._file = (kind, missing)
+        if (missing <= 0) != (remaining == 0) or missing < 0:
+            self._file = None
+            return 7, b"", 0.0
+        if missing == 0:
+            self._file = None
+            if kind == 0:
+                self._boot_from_ram()
+        self.executed.append(0x4080)
+        return 0, b"", self.erase_s if first and kind else 0.0
+
+    def _boot_from_ram(self) -> None:
+        self.ram = self._part
+        self.event(BOOTED, struct.pack("<IQQ", 371_216, boot_errors(self.ram), 0), BOOT_S)

@@ -1,0 +1,352 @@
+"""Start a whole simulated rig: wires, stage, radars with capture cards, and optionally the Pi's program.
+
+    python -m polysight_simulators.rig --config instrument.toml --scene SCENE.toml --dir DIR --time-scale 30 --with-pi
+
+Writes DIR/instrument.toml, the rig file with the addresses of these processes, DIR/truth.json, the truth of the scene,
+and DIR/logs. Prints `ready DIR/instrument.toml` when all processes are ready. SIGTERM, SIGINT or the end of a process
+ends all of them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from threading import Event
+from typing import Any, NamedTuple
+
+import tomli_w
+
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.errors import ConfigError, DeviceError, PolysightError, os_error
+from polysight_shared.tables import decode, to_builtins
+from polysight_simulators.faults import read_faults
+from polysight_simulators.loopback import on_free_subnet
+from polysight_simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight_simulators.radars import make_image
+from polysight_simulators.scene import Scene, apply_scene, load_scene, truth
+from polysight_simulators.wires import MAX_SOCKET_PATH
+
+MIN_HEARTBEAT_MS = 2000  # the processes share the cores of a busy machine
+IMAGE_FILE = "firmware.bin"
+READY_TIMEOUT_S = 60.0
+STOP_TIMEOUT_S = 5.0
+UNO_TIME_SCALE = 2.0
+_POLL_S = 0.02
+_NATIVE_OFFSET_HZ = 790e3  # puts the published rig's direct path in the middle of its IF window
+_LOG_LINES = 15
+# One thread for linear algebra: several processes with more threads on few cores are ten times slower.
+_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+
+
+def _under_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
+    """Set native radar control: each board at its card's address, the receivers with a start offset."""
+    names = [board["name"] for board in table["boards"]]
+    table["radar"] |= {"control": "native", "native": {name: {"usb_serial": name} for name in names}}
+    for board in table["boards"]:
+        if board["role"] != "transmit" and not board["start_offset_hz"]:
+            board["start_offset_hz"] = if_offset_hz or _NATIVE_OFFSET_HZ
+
+
+def _as_programmed(table: dict[str, Any], if_offset_hz: float) -> None:
+    """Add the scene's IF offset to the start offsets of the receivers, as if they were programmed so."""
+    for board in table["boards"]:
+        if board["role"] != "transmit":
+            board["start_offset_hz"] += if_offset_hz
+
+
+def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = False) -> Instrument:
+    """Derive the rig file of a simulated rig in `folder`: the scene's overrides, free addresses, paths.
+
+    `native` overrides the radar control of the rig file. Raises ConfigError if an override breaks a rule, DeviceError
+    if no loopback subnet is free.
+    """
+    table: dict[str, Any] = to_builtins(rig if scene is None else apply_scene(rig, scene))
+    if native:
+        _under_native_control(table, _NATIVE_OFFSET_HZ if scene is None else scene.disturbances.if_offset_hz)
+    elif table["radar"]["control"] != "native" and scene is not None:
+        _as_programmed(table, scene.disturbances.if_offset_hz)
+    if table["radar"]["control"] == "native" and not table["radar"]["firmware"]:
+        table["radar"]["firmware"] = str(folder / IMAGE_FILE)  # the boards start with an empty flash
+    table["stage"]["port"] = str(folder / "ttySTAGE")
+    table["pi"] |= {"journal_dir": str(folder / "journal"), "key_dir": str(folder / "keys")}
+    table["stage"]["heartbeat_ms"] = max(MIN_HEARTBEAT_MS, table["stage"]["heartbeat_ms"])
+    table["pi"]["host_heartbeat_ms"] = table["stage"]["heartbeat_ms"] // 4
+    return on_free_subnet(decode(table, Instrument, f"{rig.name}, simulated"))
+
+
+class Child:
+    """One process of the rig, with its log."""
+
+    def __init__(self, name: str, command: list[str], logs: Path) -> None:
+        self.name = name
+        self.log = logs / f"{name}.log"
+        with self.log.open("wb") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**_ENVIRONMENT, **os.environ},
+                start_new_session=True,  # Ctrl-C goes only to the rig, which ends its processes in order
+                preexec_fn=die_with_parent,
+            )
+
+    @property
+    def ready(self) -> bool:
+        """True if it has printed `ready`."""
+        return any(line.startswith("ready") for line in self._lines())
+
+    def check(self) -> None:
+        """Raise DeviceError with the last lines of its log if the process has ended."""
+        status = self._process.poll()
+        if status is not None:
+            raise DeviceError(
+                f"simulated rig: the {self.name} process ended with status {status}:\n" + self.last_lines(),
+                "see its last lines above",
+                f"the whole log is {self.log}",
+            )
+
+    def last_lines(self) -> str:
+        """Return the end of its log."""
+        return "\n".join(f"    {line}" for line in self._lines()[-_LOG_LINES:])
+
+    def _lines(self) -> list[str]:
+        return self.log.read_text(encoding="utf-8", errors="replace").splitlines()
+
+    def send_signal(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        self._process.send_signal(number)
+
+    def end(self) -> None:
+        """Send SIGTERM, and SIGKILL after a timeout."""
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+
+
+class RigOptions(NamedTuple):
+    """Options of the simulated rig."""
+
+    time_scale: float = 1.0
+    with_pi: bool = False
+    seed: int | None = None
+    pattern: bool = False
+    faults: Path | None = None
+    single_faults: tuple[str, ...] = ()
+    cache: Path | None = None
+    real_pacing: bool = False
+    uno: bool = False
+    native: bool = False
+
+
+class RigProcesses:
+    """The processes of a simulated rig in `folder`, which contains its rig file.
+
+    Raises DeviceError if one of them ends, or is not ready before the timeout.
+    """
+
+    def __init__(self, rig: Instrument, scene: Path | None, folder: Path, options: RigOptions, stop: Event) -> None:
+        self._folder, self._logs = folder, folder / "logs"
+        self._logs.mkdir(parents=True, exist_ok=True)
+        self._stop = stop
+        self.children: list[Child] = []
+        try:
+            self._start(rig, scene, options)
+        except PolysightError:
+            self.end()
+            raise
+
+    def _start(self, rig: Instrument, scene: Path | None, options: RigOptions) -> None:
+        wires = str(self._folder / "wires.sock")
+        config, scale = str(self._folder / "instrument.toml"), repr(options.time_scale)
+        self._wait([self._module("wires", "wires", "--socket", wires)])
+        common = ["--config", config, "--wires", wires, "--time-scale", scale]
+        started = [self._module("stage", "uno" if options.uno else "stage", *common, "--link", rig.stage.port)]
+        started += [
+            self._module(
+                f"cards-{group.partition(',')[0]}",
+                "cards",
+                *common,
+                "--boards",
+                group,
+                *_card_options(scene, options),
+                *self._report(group),
+            )
+            for group in card_groups(rig)
+        ]
+        self._wait(started)
+        if options.with_pi:
+            self._wait([self._launch("pi", [_pi_program(), "run", "--config", config, "--wires", wires])])
+
+    def _report(self, group: str) -> tuple[str, str]:
+        return "--report", str(self._folder / f"cards-{group.partition(',')[0]}.json")
+
+    def _module(self, name: str, module: str, *arguments: str) -> Child:
+        return self._launch(name, [sys.executable, "-m", f"polysight_simulators.{module}", *arguments])
+
+    def _launch(self, name: str, command: list[str]) -> Child:
+        self.children.append(Child(name, command, self._logs))
+        return self.children[-1]
+
+    def _wait(self, started: list[Child]) -> None:
+        deadline = time.monotonic() + READY_TIMEOUT_S
+        while not self._stop.is_set():
+            self.check()
+            waiting = [child for child in started if not child.ready]
+            if not waiting:
+                return
+            if time.monotonic() > deadline:
+                raise DeviceError(
+                    f"simulated rig: {', '.join(c.name for c in waiting)} not ready after {READY_TIMEOUT_S:.0f} s:\n"
+                    + waiting[0].last_lines(),
+                    "an overloaded machine, or a fault shown above",
+                    f"the logs are in {self._logs}",
+                )
+            self._stop.wait(_POLL_S)
+
+    def check(self) -> None:
+        """Raise DeviceError if a process has ended."""
+        for child in self.children:
+            child.check()
+
+    def power_cycle(self) -> None:
+        """Switch every capture card off and on."""
+        for child in self.children:
+            if child.name.startswith("cards-"):
+                child.send_signal(signal.SIGUSR1)
+
+    def end(self) -> None:
+        """End all processes, the last one first."""
+        for child in reversed(self.children):
+            child.end()
+
+
+def card_groups(rig: Instrument) -> list[str]:
+    """Group the boards into processes: one for each recorded board; the others join the first."""
+    groups = [[b.name] for b in rig.recorded] or [[]]
+    groups[0] += [b.name for b in rig.boards if not b.record]
+    return [",".join(g) for g in groups]
+
+
+def _card_options(scene: Path | None, options: RigOptions) -> list[str]:
+    given = ["--scene", str(scene), "--offset-in-rig"] if scene is not None else []
+    given += ["--pattern"] if options.pattern else []
+    given += ["--seed", str(options.seed)] if options.seed is not None else []
+    given += ["--faults", str(options.faults)] if options.faults is not None else []
+    given += ["--cache", str(options.cache)] if options.cache is not None else []
+    given += ["--real-pacing"] if options.real_pacing else []
+    return given + [word for fault in options.single_faults for word in ("--fault", fault)]
+
+
+def _pi_program() -> str:
+    program = Path(sys.executable).parent / "polysight-pi"
+    if not program.exists():
+        raise ConfigError(
+            f"{program}: not there", "the Pi half is not installed in this environment", "pip install ./pi_controller"
+        )
+    return str(program)
+
+
+def _write_files(rig: Instrument, scene: Scene | None, folder: Path, options: RigOptions) -> None:
+    table = to_builtins(rig)
+    table["name"] = rig.name if rig.name.endswith("(simulated)") else f"{rig.name} (simulated)"
+    (folder / "instrument.toml").write_bytes(tomli_w.dumps(table).encode())
+    if rig.radar.firmware == str(folder / IMAGE_FILE):
+        (folder / IMAGE_FILE).write_bytes(make_image())
+    if scene is not None and not options.pattern:
+        facts = truth(rig, scene, scene.seed if options.seed is None else options.seed)
+        (folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+
+
+def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions, stop: Event) -> None:
+    """Start a simulated rig, announce that it is ready, and keep it until `stop` is set.
+
+    Raises PolysightError if a file is invalid, or a process does not start or ends.
+    """
+    folder = folder.resolve()
+    if len(str(folder / "wires.sock").encode()) > MAX_SOCKET_PATH:
+        raise ConfigError(f"--dir {folder}: too long a path", "it holds a Unix socket", "choose a shorter one")
+    if options.uno and options.time_scale > UNO_TIME_SCALE:
+        raise ConfigError(
+            f"--uno with --time-scale {options.time_scale:g}",
+            "the emulated board's heartbeat clock is scaled, the Pi's is not",
+            f"give at most {UNO_TIME_SCALE:g}, or leave out --uno",
+        )
+    scene = None if scene_path is None else load_scene(scene_path)
+    if options.time_scale <= 0:
+        raise ConfigError(f"--time-scale {options.time_scale:g}", "it must be positive", "give a number above 0")
+    if scene is None and not options.pattern:
+        raise ConfigError("neither --scene nor --pattern", "the radars need a signal", "give one of them")
+    rig = derive(load_instrument(config), scene, folder, options.native)
+    boards = tuple(b.name for b in rig.boards)
+    read_faults(
+        options.faults, list(options.single_faults), boards, control=rig.radar.control
+    )  # raises before anything starts
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_files(rig, scene, folder, options)
+    power_cycle = Event()
+    signal.signal(signal.SIGUSR1, lambda _signal, _frame: power_cycle.set())
+    processes = RigProcesses(rig, scene_path, folder, options, stop)
+    try:
+        if not stop.is_set():
+            announce_ready(str(folder / "instrument.toml"))
+        while not stop.wait(0.2):
+            processes.check()
+            if power_cycle.is_set():
+                power_cycle.clear()
+                processes.power_cycle()
+    finally:
+        processes.end()
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a simulated rig until SIGTERM or SIGINT."""
+    parser = command_line(
+        "polysight_simulators.rig",
+        "Start a simulated rig; print `ready FILE` with its rig file, and run until Ctrl-C.",
+        "--config instrument.toml --scene examples/metal-plate.toml --dir out/rig --time-scale 30 --with-pi",
+    )
+    parser.add_argument("--config", type=Path, required=True, help="rig file")
+    parser.add_argument("--scene", type=Path, help="scene file; not needed with --pattern")
+    parser.add_argument("--dir", type=Path, required=True, help="folder of this rig: its rig file, logs, serial port")
+    parser.add_argument("--time-scale", type=float, default=1.0, help="speed: wire time relative to wall time")
+    parser.add_argument("--with-pi", action="store_true", help="run the Pi's program too")
+    parser.add_argument("--seed", type=int, help="default: the scene's")
+    parser.add_argument("--pattern", action="store_true", help="send a counting pattern instead of the scene's signals")
+    parser.add_argument("--faults", type=Path, help="TOML file with a [faults] table for the cards")
+    parser.add_argument("--fault", action="append", default=[], metavar="[BOARD.]KEY=VALUE", help="a single fault")
+    parser.add_argument("--cache", type=Path, help="cache folder for the scene's object fields")
+    parser.add_argument("--real-pacing", action="store_true", help="send each packet at its own time, as a card does")
+    parser.add_argument(
+        "--uno",
+        action="store_true",
+        help=f"run the sketch's machine code on an emulated board; --time-scale at most {UNO_TIME_SCALE:g}",
+    )
+    parser.add_argument("--native", action="store_true", help="the host configures and arms the radars (simulated USB)")
+    args = parser.parse_args(argv)
+    stop = stop_requested()
+    die_with_parent()
+    options = RigOptions(
+        args.time_scale, args.with_pi, args.seed, args.pattern, args.faults, tuple(args.fault), args.cache,
+        args.real_pacing, args.uno, args.native,
+    )  # fmt: skip
+    try:
+        run(args.config, args.scene, args.dir, options, stop)
+    except (PolysightError, OSError) as e:
+        e = os_error(e) if isinstance(e, OSError) else e
+        sys.stderr.write(f"error: {e}\n")
+        return e.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,147 @@
+"""Simulate samples after ideal synchronisation, without raw data.
+
+:func:`reference_cube` is the object's echo for an ideal rig. :func:`synced_cube` adds the disturbances that
+synchronisation does not remove (leakage, gains, noise, the direct path, backlash) to the averaged samples: hundreds of
+scenes take the time of one raw scan.
+
+Compared with a raw scan that the host synchronised (tests/simulators/test_cubes.py), a synced cube differs by one
+complex factor, common to all rows, channels and samples, and by less than 1 % RMS without noise, due to residuals of
+motion within a burst, of the filter, and of the object in the host's direct path. The noise power agrees within 5 %.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight_shared.config import Board, Instrument
+from polysight_shared.raster import mean_burst_travel_mm, plan_raster
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_simulators.scene.draws import stream_key
+from polysight_simulators.scene.field import ObjectField, build_field, node_matrix
+from polysight_simulators.scene.optics import Real, antennas, direct_factor
+from polysight_simulators.scene.radar import sample_frequencies_hz
+from polysight_simulators.scene.receiver import high_pass, power_on
+from polysight_simulators.scene.scene_file import Scene, apply_scene
+
+
+def reference_cube(rig: Instrument, scene: Scene, remove_direct: bool = True) -> dict[str, NDArray[np.complex64]]:
+    """Return the object's echo after ideal synchronisation, at the true positions.
+
+    All disturbances of the scene are ignored: no leakage, gains, noise or direct path. Each position is the mean of its
+    burst (x + direction x mean travel).
+
+    Parameters
+    ----------
+    rig, scene
+        Rig file and scene; the scene's overrides are applied.
+    remove_direct
+        Reference each RX to its own direct path: phase 2 pi f (tau - tau_direct), otherwise 2 pi f tau.
+
+    Returns
+    -------
+    complex64 [rx, row, column, sample] for each receiving board's name; column 0 is the smallest x. A full published
+    grid is 573 MB a board.
+    """
+    ideal = scene.with_disturbances(ideal=True)
+    rig = apply_scene(rig, ideal)
+    f = sample_frequencies_hz(rig)
+    cubes = {}
+    for board in rig.receivers:
+        field = build_field(rig, ideal, board, f)
+        direct_m = antennas(rig, board).direct_m
+        away = field.centre_path_m - (direct_m if remove_direct else 0.0 * direct_m)
+        cubes[board.name] = _read(field, rig, f, away, np.ones(len(away), np.complex64), 0.0)
+    return cubes
+
+
+def synced_cube(
+    rig: Instrument,
+    scene: Scene,
+    board_name: str,
+    frequencies_hz: Real | None = None,
+    rx: Sequence[int] | None = None,
+    noise: float | None = None,
+    direct: bool = True,
+    seed: int | None = None,
+    cache_dir: Path | None = None,
+) -> NDArray[np.complex64]:
+    """Return the samples of a scan after ideal synchronisation: referenced to the direct path, bursts averaged.
+
+    Simulated disturbances: leakage, gains and phases of the channels, H over V, noise, loss of the direct path,
+    backlash. Not simulated: timing, crystals, phases, chirp shape, filter, motion within a burst, ADC, lost packets. An
+    echo of excess path d is a exp(+j 2 pi f d / c), the direct path is constant.
+
+    Parameters
+    ----------
+    rig, scene, board_name
+        Rig file and scene; the scene's overrides are applied. One of the receiving boards.
+    frequencies_hz
+        Transmit frequencies, ascending; None: those of all ADC samples. Few are fast.
+    rx
+        Channels; None for all.
+    noise
+        RMS noise of an averaged sample of a channel of gain 1, relative to the direct path; None: from `direct_snr_db`,
+        averaging and filter compensation.
+    direct
+        Include the direct path.
+    seed
+        Seed of the power cycle (gains and noise); None: the scene's. Specimens always use the scene's seed.
+    cache_dir
+        Folder that caches fields between runs; None: no cache.
+
+    Returns
+    -------
+    complex64 [rx, row, column, frequency]; column 0 is the smallest x. Amplitudes are relative to the free direct path.
+    """
+    rig, seed = apply_scene(rig, scene), scene.seed if seed is None else seed
+    board, d = rig.by_name(board_name), scene.disturbances
+    f = sample_frequencies_hz(rig) if frequencies_hz is None else np.asarray(frequencies_hz, np.float64)
+    channels = list(range(len(rig.antennas.rx_mm))) if rx is None else list(rx)
+    field = build_field(rig, scene, board, f, cache_dir, channels)
+    all_m = antennas(rig, board).direct_m
+    direct_m, gains = all_m[channels], power_on(rig, scene, board, seed).gains[channels]
+    cube = _read(field, rig, f, field.centre_path_m - direct_m, gains, d.backlash_mm)
+    if direct:
+        level = direct_factor(board, scene) * d.direct_gain * all_m[0] / direct_m
+        cube += (gains * level).astype(np.complex64)[:, None, None, None]
+    sigma = _burst_noise(rig, scene, board, seed, field.centre_path_m) if noise is None else noise
+    if sigma > 0:
+        rng = np.random.default_rng(stream_key(seed, "synced noise", board.name))
+        flat = rng.standard_normal((*cube.shape[:-1], 2 * len(f)), dtype=np.float32).view(np.complex64)
+        flat *= (sigma * np.sqrt(0.5) * np.abs(gains)).astype(np.float32)[:, None, None, None]
+        cube += flat
+    return cube
+
+
+def _burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int, echo_m: float) -> float:
+    """Return the RMS noise of an averaged sample; compensating the high-pass filter divides by its gain at the IF."""
+    d, chirp = scene.disturbances, rig.chirp
+    if d.direct_snr_db is None:
+        return 0.0
+    averaged = 10.0 ** (-d.direct_snr_db / 20) / np.sqrt(rig.burst.chirps_a_position)
+    if not d.hpf:
+        return float(averaged)
+    delay_s = (antennas(rig, board).direct_m[0] + echo_m) / 2 / SPEED_OF_LIGHT_M_S
+    if_hz = chirp.slope_hz_per_s * delay_s + power_on(rig, scene, board, seed).if_error_hz.mean()
+    return float(averaged / np.abs(high_pass(np.array(if_hz), chirp)[0]))
+
+
+def _read(
+    field: ObjectField, rig: Instrument, f: Real, away_m: Real, gains: NDArray[np.complexfloating], backlash_mm: float
+) -> NDArray[np.complex64]:
+    """Return the field at the true positions, [rx, row, column, frequency], with the phase of path `away_m` [rx]."""
+    base = np.eye(len(f)) if np.array_equal(field.nodes_hz, f) else node_matrix(field, f)[0]
+    turn = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(away_m, f)) * gains[:, None]
+    expand = (base * turn[:, None]).astype(np.complex64)
+    plan, travel = plan_raster(rig.grid), mean_burst_travel_mm(rig.burst, rig.stage)
+    cube = np.empty((len(away_m), plan.rows, plan.columns, len(f)), dtype=np.complex64)
+    for row in plan:
+        x = np.array(row.x_mm) + row.direction * travel + (backlash_mm if row.direction < 0 else 0.0)
+        nodes = field.at(x / 1e3, np.full(len(x), row.y_mm / 1e3))
+        order = [row.column(i) for i in range(row.points)]
+        cube[:, row.index, order] = np.einsum("prq,rqk->rpk", nodes, expand, optimize=True)
+    return cube

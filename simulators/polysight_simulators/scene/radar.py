@@ -1,0 +1,294 @@
+"""Simulated radars: frames of the three boards for given stage offsets.
+
+A chirp is the sum of direct path and object, times a factor per chirp, through the high-pass filter:
+
+    s[n, k] = factor[n, k] (H(f_n,k) F[n, k] + H'(f_n,k) F1[n, k]) gain + noise
+
+F is the undisturbed signal, f_n,k the middle of its band shifted by that chirp's offset, and
+F1 = (dF/dt) / (2 pi j) - middle F. This is the filter's response to first order around the middle of a signal of about
+50 kHz bandwidth; the error is H'' df^2 / 2, below 1e-3 for the published offset of about 1 MHz.
+
+:class:`PatternSource` gives frames with a counting pattern, for bit-exact tests.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight_shared.config import Board, Instrument
+from polysight_shared.raster import FIRST_PULSE_DELAY_S, mean_burst_travel_mm
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_simulators.scene.draws import pulse_normal, pulse_uniform, stream_key
+from polysight_simulators.scene.field import ObjectField, build_field, node_matrix
+from polysight_simulators.scene.optics import antennas, direct_factor
+from polysight_simulators.scene.receiver import high_pass, per_chirp, power_on, sync_delay_s
+from polysight_simulators.scene.scene_file import Scene, apply_scene
+
+_BATCH = 64  # chirps per batch: their arrays fit in the cache
+_FULL_SCALE = 32767
+_LEAKAGE_DELAY_S = 0.2e-9  # from TX to RX on the transmit board: some centimetres
+_LEAKAGE_AMPLITUDE = 2.0
+
+
+class _ReceivingBoard:
+    """Properties of a receiving board that are constant for all chirps."""
+
+    def __init__(self, rig: Instrument, scene: Scene, board: Board, seed: int, cache_dir: Path | None) -> None:
+        chirp = rig.chirp
+        self.receiver = power_on(rig, scene, board, seed)
+        t = np.arange(chirp.samples) / chirp.sample_rate_hz
+        f = sample_frequencies_hz(rig)
+        self.field: ObjectField = build_field(rig, scene, board, f, cache_dir)
+        ant = antennas(rig, board)
+        tau, centre = ant.direct_m / SPEED_OF_LIGHT_M_S, self.field.centre_path_m / SPEED_OF_LIGHT_M_S
+        self.middle_hz = float(chirp.slope_hz_per_s * (tau.mean() + centre) / 2)
+        amplitude = direct_factor(board, scene) * ant.direct_m[0] / ant.direct_m
+        amplitude = amplitude * scene.disturbances.direct_gain
+        direct = amplitude[:, None] * np.exp(
+            2j * np.pi * (f[0] * tau[:, None] + chirp.slope_hz_per_s * np.outer(tau, t))
+        )
+        gains = self.receiver.gains[:, None]
+        # [2, rx, sample]: F and F1 of the direct path, with the channel's gain.
+        shift = chirp.slope_hz_per_s * tau[:, None] - self.middle_hz
+        self.direct = (gains * direct * np.stack([np.ones_like(shift), shift])).astype(np.complex64)
+        values, slopes = node_matrix(self.field, f)
+        carrier = np.exp(2j * np.pi * f * centre)
+        first = (chirp.slope_hz_per_s * centre - self.middle_hz) * values
+        first = first + slopes * chirp.slope_hz_per_s / 2j / np.pi
+        # [2, node, sample]: the object's F and F1 from its node values.
+        self.expand = np.stack([values * carrier, first * carrier]).astype(np.complex64)
+
+
+class SimulatedRig:
+    """The radars of a rig with a scene, for one power cycle.
+
+    Parameters
+    ----------
+    rig
+        The rig; the scene's overrides are applied here.
+    scene
+        Plates, points and disturbances.
+    seed
+        Seed of gains, timing, phases and noise; None: the scene's. The same seed gives the same data for the same pulse
+        numbers in any batches.
+    cache_dir
+        Folder that caches object fields between runs; None: no cache.
+
+    Attributes
+    ----------
+    clipped
+        Number of clipped samples, by board.
+    outside
+        Number of chirps outside the simulated aperture, by board; they contain only the direct path.
+    """
+
+    def __init__(self, rig: Instrument, scene: Scene, seed: int | None = None, cache_dir: Path | None = None) -> None:
+        self.rig = apply_scene(rig, scene)
+        self.scene = scene
+        self.seed = scene.seed if seed is None else seed
+        self._cache_dir = cache_dir
+        self._boards: dict[str, _ReceivingBoard] = {}
+        self._next_pulse = {b.name: 0 for b in rig.boards}
+        self.clipped = {b.name: 0 for b in rig.boards}
+        self.outside = {b.name: 0 for b in rig.boards}
+
+    def prepare(self, *board_names: str) -> None:
+        """Compute the object fields of these boards (default: both receivers) now instead of at the first chirp."""
+        for name in board_names or [b.name for b in self.rig.receivers]:
+            if self.rig.by_name(name).role != "transmit":
+                self._receiving(name)
+
+    def chirps(
+        self,
+        board_name: str,
+        x_mm: NDArray[np.floating],
+        y_mm: NDArray[np.floating],
+        first_pulse: int | None = None,
+    ) -> NDArray[np.int16]:
+        """Return frames of one chirp each, as the board sends them to its card.
+
+        Parameters
+        ----------
+        board_name
+            Name of the board.
+        x_mm, y_mm
+            True stage offset during each chirp, millimetres from the middle of the grid, [n].
+        first_pulse
+            Number of the first chirp's SYNC_IN pulse since power-up, which determines timing, phase and noise. None:
+            continue after this board's last call.
+
+        Returns
+        -------
+        int16 [n, samples, 8]: I of RX1..RX4, then Q of RX1..RX4.
+
+        Raises
+        ------
+        KeyError
+            if the rig has no such board.
+        """
+        d = self.scene.disturbances
+        signal = self.signals(board_name, x_mm, y_mm, first_pulse)
+        n, rx, samples = signal.shape
+        out = np.empty((n, samples, 2 * rx), dtype=np.int16)
+        scale = np.float32(_FULL_SCALE / d.adc_full_scale)
+        for at in range(0, n, _BATCH):
+            part = signal[at : at + _BATCH]
+            parts = part.view(np.float32).reshape(*part.shape, 2).transpose(0, 2, 3, 1)
+            counts = np.rint(parts * scale)
+            extreme = np.abs(counts).max(initial=0.0)
+            if extreme > _FULL_SCALE:
+                self.clipped[board_name] += int(np.sum(np.abs(counts) > _FULL_SCALE))
+                np.clip(counts, -_FULL_SCALE - 1, _FULL_SCALE, out=counts)
+            out[at : at + _BATCH] = counts.reshape(len(part), samples, 2 * rx)
+        return out
+
+    def signals(
+        self,
+        board_name: str,
+        x_mm: NDArray[np.floating],
+        y_mm: NDArray[np.floating],
+        first_pulse: int | None = None,
+    ) -> NDArray[np.complex64]:
+        """Return :meth:`chirps` before the ADC: complex64 [n, rx, sample], direct path of RX1 about 1, with noise."""
+        board = self.rig.by_name(board_name)
+        x_mm, y_mm = np.broadcast_arrays(np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64))
+        first = self._next_pulse[board_name] if first_pulse is None else first_pulse
+        self._next_pulse[board_name] = first + len(x_mm)
+        out = np.empty((len(x_mm), len(self.rig.antennas.rx_mm), self.rig.chirp.samples), dtype=np.complex64)
+        for at in range(0, len(x_mm), _BATCH):
+            batch = slice(at, min(at + _BATCH, len(x_mm)))
+            pulses = np.arange(first + batch.start, first + batch.stop, dtype=np.int64)
+            self._noise(board, pulses, out[batch])
+            if board.role == "transmit":
+                out[batch] += self._own_leakage()
+            else:
+                self._add_received(board, x_mm[batch] / 1e3, y_mm[batch] / 1e3, pulses, out[batch])
+        return out
+
+    def burst_mm(self, direction: int) -> NDArray[np.floating]:
+        """Return the stage travel from a trigger point to each of its pulses, millimetres [pulse], signed.
+
+        Without burst motion every pulse is at the mean position of the burst. With backlash, rows towards -x are
+        shifted along +x.
+        """
+        burst, stage, d = self.rig.burst, self.rig.stage, self.scene.disturbances
+        lost = d.backlash_mm if direction < 0 else 0.0
+        if not d.burst_motion:
+            return np.full(burst.chirps_a_position, direction * mean_burst_travel_mm(burst, stage) + lost)
+        after_s = FIRST_PULSE_DELAY_S + np.array(burst.chirp_times_s)
+        return direction * stage.speed_mm_s * after_s + lost
+
+    def _receiving(self, name: str) -> _ReceivingBoard:
+        if name not in self._boards:
+            board = self.rig.by_name(name)
+            self._boards[name] = _ReceivingBoard(self.rig, self.scene, board, self.seed, self._cache_dir)
+        return self._boards[name]
+
+    def _add_received(
+        self,
+        board: Board,
+        x_m: NDArray[np.floating],
+        y_m: NDArray[np.floating],
+        pulses: NDArray[np.int64],
+        out: NDArray[np.complex64],
+    ) -> None:
+        d, own, chirp = self.scene.disturbances, self._receiving(board.name), self.rig.chirp
+        frames = pulses // self.rig.burst.chirps  # all chirps of a frame start with one pulse
+        delay = sync_delay_s(d, self.seed, board, frames) - sync_delay_s(d, self.seed, self.rig.transmitter, frames)
+        turns = pulse_uniform(stream_key(self.seed, "phase", board.name), pulses) if d.random_phase else 0.0 * delay
+        factor, shift = per_chirp(own.receiver, delay, 2 * np.pi * turns, d.hpf)
+        inside = own.field.covers(x_m, y_m)
+        self.outside[board.name] += int(np.sum(~inside))
+        nodes = np.zeros((len(x_m), *own.direct.shape[1:2], own.expand.shape[1]), dtype=np.complex64)
+        if inside.any():
+            nodes[inside] = own.field.at(x_m[inside], y_m[inside]) * own.receiver.gains[:, None]
+        # One small product per chirp: BLAS runs larger ones in threads, which is slow beside other processes.
+        ideal = np.matmul(nodes[:, None], own.expand)  # [chirp, 2, rx, sample]
+        ideal += own.direct
+        if not d.hpf:
+            out += factor[:, None] * ideal[:, 0]
+            return
+        h, slope = high_pass(own.middle_hz + shift, chirp)
+        ideal[:, 0] *= (factor * h).astype(np.complex64)[:, None]
+        ideal[:, 1] *= (factor * slope).astype(np.complex64)[:, None]
+        out += ideal[:, 0]
+        out += ideal[:, 1]
+
+    def _noise(self, board: Board, pulses: NDArray[np.int64], out: NDArray[np.complex64]) -> None:
+        """Fill `out` with receiver noise: each channel has the same signal-to-noise ratio for any gain."""
+        snr_db = self.scene.disturbances.direct_snr_db
+        if snr_db is None:
+            out[...] = 0
+            return
+        pulse_normal(stream_key(self.seed, "noise", board.name), int(pulses[0]), out.view(np.float32))
+        sigma = np.sqrt(0.5 * 10 ** (-snr_db / 10))
+        if board.role == "transmit":
+            out *= np.float32(sigma)
+        else:
+            gains = self._receiving(board.name).receiver.gains
+            out *= (sigma * np.abs(gains)).astype(np.float32)[:, None]
+
+    def _own_leakage(self) -> NDArray[np.complex64]:
+        """Return the signal of the transmitting board: its own leakage, a tone near zero IF through the filter."""
+        chirp = self.rig.chirp
+        t = np.arange(chirp.samples) / chirp.sample_rate_hz
+        tone_hz = chirp.slope_hz_per_s * _LEAKAGE_DELAY_S
+        tone = _LEAKAGE_AMPLITUDE * np.exp(2j * np.pi * (tone_hz * t + chirp.first_sample_hz * _LEAKAGE_DELAY_S))
+        if self.scene.disturbances.hpf:
+            tone *= high_pass(np.array(tone_hz), chirp)[0]
+        return tone.astype(np.complex64)
+
+
+def sample_frequencies_hz(rig: Instrument) -> NDArray[np.floating]:
+    """Return the transmit frequency at each ADC sample, Hz [sample]."""
+    return rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(rig.chirp.samples)
+
+
+class SignalSource(Protocol):
+    """Source of frames."""
+
+    def chirps(
+        self, board_name: str, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], first_pulse: int | None = None
+    ) -> NDArray[np.int16]:
+        """Return frames of one chirp each, int16 [n, samples, 8], for stage offsets x_mm [n], y_mm [n].
+
+        `first_pulse` is the number of the first SYNC_IN pulse since power-up. The eight values of a sample are I of
+        RX1..RX4, then Q of RX1..RX4.
+        """
+        ...
+
+
+def pattern_frames(board: int, first: int, n: int, samples: int) -> NDArray[np.int16]:
+    """Return frames `first` .. `first + n - 1` of the counting pattern, int16 [n, samples, 8].
+
+    Every 32-bit word is `board << 28 | word count since the first frame`, little-endian, which detects any byte that is
+    lost, doubled or misplaced, in 1 GiB per board.
+    """
+    words = samples * 4
+    count = np.arange(n * words, dtype="<u4")
+    count += np.uint32(first * words % (1 << 28))  # may wrap at 32 bits without effect on 28 bits
+    count &= np.uint32((1 << 28) - 1)
+    count |= np.uint32(board << 28)
+    return count.view("<i2").reshape(n, samples, 8)
+
+
+class PatternSource:
+    """Source of :func:`pattern_frames` at any stage position: frame k comes from SYNC_IN pulse k."""
+
+    def __init__(self, rig: Instrument) -> None:
+        self._samples = rig.chirp.samples
+        self._board = {b.name: i for i, b in enumerate(rig.boards)}
+        self._next = dict.fromkeys(self._board, 0)
+
+    def chirps(
+        self, board_name: str, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], first_pulse: int | None = None
+    ) -> NDArray[np.int16]:
+        """Return the frames of len(x_mm) pulses from `first_pulse` on; None: continue after the last call."""
+        del y_mm
+        first = self._next[board_name] if first_pulse is None else first_pulse
+        self._next[board_name] = first + len(x_mm)
+        return pattern_frames(self._board[board_name], first, len(x_mm), self._samples)

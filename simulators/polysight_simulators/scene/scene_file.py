@@ -1,0 +1,316 @@
+"""Scene files: plates and points on the object plane, and disturbances of the rig (docs/spec/scene-file.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+
+from polysight_shared.config import Burst, Grid, Image, Instrument, Stage
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+from polysight_shared.tables import decode, read_toml, to_builtins
+from polysight_simulators.scene.draws import stream_key
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Fraction = Annotated[float, msgspec.Meta(ge=0, le=0.5)]
+Pair = tuple[float, float]
+Degrees = Annotated[float, msgspec.Meta(ge=-10, le=10)]  # of tilt: the fast field is checked up to 2
+Tilt = tuple[Degrees, Degrees]
+Height = Annotated[float, msgspec.Meta(ge=-50, le=50)]
+Decibels = Annotated[float, msgspec.Meta(ge=-40, le=200)]
+Spread = Annotated[float, msgspec.Meta(ge=0, le=2)]
+_OVERRIDES: dict[str, type] = {"grid": Grid, "burst": Burst, "image": Image, "stage": Stage}
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of the scene file: frozen, without unknown keys."""
+
+
+def _require(ok: bool, rule: str) -> None:
+    if not ok:
+        raise ValueError(rule)
+
+
+def _check_permittivity(pair: Pair) -> None:
+    _require(pair[0] >= 1.0, "permittivity's real part must be at least 1")
+    _require(pair[1] >= 0.0, "permittivity's second number is the loss eps'' >= 0 of eps' - j eps''")
+
+
+class Layer(_Table, frozen=True):
+    """A layer of a plate; without `thickness_mm` a half space (only the last layer)."""
+
+    permittivity: Pair
+    thickness_mm: Positive | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _check_permittivity(self.permittivity)
+
+    @property
+    def epsilon(self) -> complex:
+        """Relative permittivity eps' - j eps''."""
+        return complex(self.permittivity[0], -self.permittivity[1])
+
+
+class Plate(_Table, frozen=True):
+    """A flat rectangular plate on the object plane, sides along x and y.
+
+    `centre_mm` is relative to the image centre (specular midpoint of TX and H at stage offset zero). `permittivity` is
+    [eps', eps''] of eps' - j eps''; without `thickness_mm` the plate is a half space (one interface). `layers` is a
+    stack from front to back instead, for example a liquid behind a wall; air follows the last layer unless that is a
+    half space. Metal with `strips_deg` is ideal thin strips, rotated by this angle from the vertical towards +x.
+
+    `height_mm` moves the plate away from the radars (+z). `tilt_deg` [ax, ay] rotates it about its centre: height grows
+    along +x by tan(ax) and along +y by tan(ay). `rough_mm` is the standard deviation of the surface's height, in facets
+    of `rough_length_mm`.
+    """
+
+    name: str
+    centre_mm: Pair
+    size_mm: tuple[Positive, Positive]
+    permittivity: Pair | None = None
+    metal: bool = False
+    thickness_mm: Positive | None = None
+    layers: tuple[Layer, ...] = ()
+    strips_deg: float | None = None
+    tilt_deg: Tilt = (0.0, 0.0)
+    height_mm: Height = 0.0
+    rough_mm: Annotated[float, msgspec.Meta(ge=0, le=5)] = 0.0
+    rough_length_mm: Positive = 6.0
+
+    def __post_init__(self) -> None:
+        _require(self.strips_deg is None or self.metal, "strips_deg goes with metal = true")
+        kinds = (self.metal, self.permittivity is not None, bool(self.layers))
+        _require(sum(kinds) == 1, "a plate has one of permittivity = [..], metal = true or [[plates.layers]]")
+        _require(
+            self.thickness_mm is None or self.permittivity is not None,
+            "thickness_mm goes with permittivity, not with metal or layers",
+        )
+        _require(
+            all(layer.thickness_mm is not None for layer in self.layers[:-1]),
+            "only the last of [[plates.layers]] may be without thickness_mm",
+        )
+        if self.permittivity is not None:
+            _check_permittivity(self.permittivity)
+
+    @property
+    def stack(self) -> tuple[Layer, ...]:
+        """Layers from front to back; none for metal."""
+        if self.permittivity is not None:
+            return (Layer(self.permittivity, self.thickness_mm, self.name),)
+        return self.layers
+
+
+class Point(_Table, frozen=True):
+    """An isotropic point scatterer, equal in both polarisations.
+
+    `amplitude` [re, im] is relative to the direct path, for a point at the specular midpoint. `height_mm` moves it away
+    from the radars.
+    """
+
+    position_mm: Pair
+    amplitude: Pair = (1.0, 0.0)
+    name: str = ""
+    height_mm: Height = 0.0
+
+
+class PerRole(_Table, frozen=True):
+    """One number per role of the boards."""
+
+    transmit: float = 0.0
+    receive_h: float = 0.0
+    receive_v: float = 0.0
+
+
+class Disturbances(_Table, frozen=True):
+    """Disturbances of the rig. Defaults are those of the published rig; OFF switches all off."""
+
+    sync_uncertainty_ns: NonNegative = 5.0
+    sync_latency_ns: NonNegative = 160.0
+    crystal_ppm: PerRole = PerRole(0.0, 0.8, -1.1)
+    if_offset_hz: float = 870e3
+    random_phase: bool = True
+    bend_hz: float = 300e3
+    bend_us: Positive = 20.0
+    ripple_hz: float = 3e3
+    ripple_us: Positive = 5.0
+    hpf: bool = True
+    rx_gain_spread_db: NonNegative = 1.0
+    rx_phase_spread_deg: NonNegative = 20.0
+    hv_gain_db: float = 1.5
+    leakage_h: Pair = (0.05, 0.0)
+    leakage_v: Pair = (0.05, 0.0)
+    burst_motion: bool = True
+    direct_snr_db: float | None = 5.5
+    adc_full_scale: Positive = 64.0
+    packet_loss: Fraction = 0.0
+    backlash_mm: float = 0.0
+    sync_skew_ns: PerRole = PerRole()
+    direct_loss_db: Decibels | Literal["absent"] = 0.0
+    leakage_measured: NonNegative | None = None
+
+    @property
+    def direct_gain(self) -> float:
+        """Amplitude of the direct path relative to a free path; 0 without direct path."""
+        return 0.0 if isinstance(self.direct_loss_db, str) else 10 ** (-self.direct_loss_db / 20)
+
+
+OFF: dict[str, Any] = {
+    "sync_uncertainty_ns": 0.0,
+    "sync_latency_ns": 0.0,
+    "crystal_ppm": {},
+    "if_offset_hz": 0.0,
+    "random_phase": False,
+    "bend_hz": 0.0,
+    "ripple_hz": 0.0,
+    "hpf": False,
+    "rx_gain_spread_db": 0.0,
+    "rx_phase_spread_deg": 0.0,
+    "hv_gain_db": 0.0,
+    "leakage_h": [0.0, 0.0],
+    "leakage_v": [0.0, 0.0],
+    "burst_motion": False,
+    "direct_snr_db": None,
+    "adc_full_scale": 4.0,  # finer steps: 8192 counts for the direct path
+    "packet_loss": 0.0,
+    "backlash_mm": 0.0,
+    "sync_skew_ns": {},
+    "direct_loss_db": 0.0,
+    "leakage_measured": None,
+}
+
+
+class Scene(_Table, frozen=True):
+    """The whole scene file.
+
+    `object_gain` models the antenna patterns: gain of object paths relative to the direct path, which lies at the edge
+    of the patterns. By default the echo of a 45 mm metal plate at the midpoint has 0.75 of the direct path's amplitude.
+
+    `plane_shift_mm` and `plane_tilt_deg` shift and tilt the plane of all plates and points about the image centre, with
+    the signs of a plate. `object_distance_mm` in the rig file does not change, as if the true plane was not measured.
+    `specimen_spread` [real, loss] are relative standard deviations of the plates' permittivities from the given ones.
+    """
+
+    name: str
+    seed: int = 1
+    object_distance_mm: Positive | None = None
+    object_gain: Positive = 1.35
+    plane_shift_mm: Height = 0.0
+    plane_tilt_deg: Tilt = (0.0, 0.0)
+    specimen_spread: tuple[Spread, Spread] = (0.0, 0.0)
+    grid: dict[str, Any] = {}
+    burst: dict[str, Any] = {}
+    image: dict[str, Any] = {}
+    stage: dict[str, Any] = {}
+    plates: tuple[Plate, ...] = ()
+    points: tuple[Point, ...] = ()
+    disturbances: Disturbances = Disturbances()
+
+    def __post_init__(self) -> None:
+        for table, kind in _OVERRIDES.items():
+            unknown = sorted(set(getattr(self, table)) - set(kind.__struct_fields__))  # type: ignore[attr-defined]
+            _require(not unknown, f"[{table}] holds unknown keys {unknown}; known: {list(kind.__struct_fields__)}")  # type: ignore[attr-defined]
+
+    def with_disturbances(self, **changes: Any) -> Scene:
+        """Return the scene with some disturbances changed; `ideal=True` switches all off first."""
+        base = msgspec.to_builtins(self.disturbances)
+        if changes.pop("ideal", False):
+            base = dict(OFF, bend_us=base["bend_us"], ripple_us=base["ripple_us"])
+        table = decode(_switched({**base, **changes}, "with_disturbances"), Disturbances, "with_disturbances")
+        return msgspec.structs.replace(self, disturbances=table)
+
+
+def _switched(table: Any, source: str) -> Any:
+    """Replace `ideal = true` and "off"/"on" (or false/true) in a [disturbances] table by plain values."""
+    if not isinstance(table, dict):
+        return table
+    given = dict(table)
+    ideal = given.pop("ideal", False)
+    if not isinstance(ideal, bool):
+        raise ConfigError(
+            f"{source}: disturbances.ideal = {ideal!r}",
+            "it is a switch",
+            "write true or false",
+            code=ErrorCode.TYPE_WRONG,
+        )
+    result: dict[str, Any] = dict(OFF) if ideal else {}
+    for key, value in given.items():
+        if value == "off" or value is False:
+            if key not in OFF and key in Disturbances.__struct_fields__:
+                raise ConfigError(
+                    f"{source}: disturbances.{key} cannot be switched off",
+                    "it only shapes another disturbance",
+                    f"switch off disturbances.{key.partition('_')[0]}_hz instead",
+                    code=ErrorCode.VALUE_INVALID,
+                )
+            result[key] = OFF.get(key, value)
+        elif value == "on" or value is True:
+            result.pop(key, None)
+            if key not in Disturbances.__struct_fields__:
+                result[key] = value
+        else:
+            result[key] = value
+    return result
+
+
+def decode_scene(raw: dict[str, Any], source: str) -> Scene:
+    """Convert and check a parsed scene file.
+
+    Raises
+    ------
+    ConfigError
+        with `source`, the key, its value and the violated rule.
+    """
+    if "disturbances" in raw:
+        raw = {**raw, "disturbances": _switched(raw["disturbances"], source)}
+    return decode(raw, Scene, source, "docs/spec/scene-file.md lists all keys of a scene")
+
+
+def load_scene(path: Path) -> Scene:
+    """Read and check a scene file. Raises ConfigError."""
+    return decode_scene(read_toml(path), str(path))
+
+
+def without_offset(scene: Scene) -> Scene:
+    """Return the scene without its own IF offset, for a rig file that contains the start frequencies."""
+    return msgspec.structs.replace(scene, disturbances=msgspec.structs.replace(scene.disturbances, if_offset_hz=0.0))
+
+
+def apply_scene(rig: Instrument, scene: Scene) -> Instrument:
+    """Return the rig with the scene's grid, burst, image, stage and object distance.
+
+    A filter or leakage that the scene switches off is also switched off in the rig, so that processing does not correct
+    it. With `leakage_measured` the rig contains leakage as from a calibration: the true value with an error drawn from
+    the scene's seed. Applying the same scene again changes nothing.
+
+    Raises
+    ------
+    ConfigError
+        if an override has a wrong type or violates a rule of the rig file.
+    """
+    table = to_builtins(rig)
+    for name in _OVERRIDES:
+        table[name] = {**table[name], **getattr(scene, name)}
+    if scene.object_distance_mm is not None:
+        table["geometry"] = {**table["geometry"], "object_distance_mm": scene.object_distance_mm}
+    if not scene.disturbances.hpf:
+        table["chirp"] = {**table["chirp"], "hpf1_khz": 0.0, "hpf2_khz": 0.0}
+    table["polarimetry"] = {**table["polarimetry"], **_known_leakage(scene)}
+    remedy = f"its {', '.join(_OVERRIDES)} override the rig file's; docs/spec/scene-file.md lists all keys"
+    return decode(table, Instrument, f"scene {scene.name}", remedy)
+
+
+def _known_leakage(scene: Scene) -> dict[str, Any]:
+    """Return the keys of the rig file's [polarimetry] that a scene sets: measured leakage, or zero."""
+    d, parts = scene.disturbances, ("leakage_h", "leakage_v")
+    if d.leakage_measured is not None:
+        rng = np.random.default_rng(stream_key(scene.seed, "leakage"))
+        error = rng.standard_normal((2, 2)) * d.leakage_measured
+        found = (np.array([d.leakage_h, d.leakage_v]) + error).tolist()
+        return {**dict(zip(parts, found, strict=True)), "leakage_std": d.leakage_measured}
+    none = {key: [0.0, 0.0] for key in parts if not any(getattr(d, key))}
+    return {**none, "leakage_std": 0.0} if len(none) == len(parts) else none

@@ -1,0 +1,212 @@
+"""Simulate a whole scan without sockets: raw data in either layout, with truth.json."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from polysight_shared.config import Board, Grid, Instrument
+from polysight_shared.geometry import Vector, incidence_deg, specular_midpoint_m
+from polysight_shared.raster import RasterPlan, Row, check_burst_fits, mean_burst_travel_mm, plan_raster
+from polysight_shared.tables import to_builtins
+from polysight_simulators.scene.draws import stream_key
+from polysight_simulators.scene.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
+from polysight_simulators.scene.published_layout import AuthorsLayout, Skipped
+from polysight_simulators.scene.radar import SimulatedRig
+from polysight_simulators.scene.scene_file import Pair, Plate, Scene, apply_scene
+from polysight_simulators.scene.specimens import draw_specimens
+
+Progress = Callable[[int, int], None]
+
+
+def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
+    """Return the content of truth.json: true plates and points, disturbances, scene, seed, versions.
+
+    `rig` has the scene applied. `centre_m` is in the rig frame, at the plate's true height; permittivity is the drawn
+    [eps', eps''], or null (metal, layers), with the nominal one of the scene file. Tilt and height are relative to the
+    plane of the rig file and include those of the true plane.
+    """
+    centre, actual = specular_midpoint_m(rig, rig.by_role("receive_h")), draw_specimens(scene)
+    plates = [_plate_truth(p, n, centre) for p, n in zip(actual.plates, scene.plates, strict=True)]
+    points = [
+        {
+            "name": p.name,
+            "position_mm": list(p.position_mm),
+            "position_m": _in_rig(p.position_mm, p.height_mm, centre),
+            "height_mm": p.height_mm,
+            "amplitude": list(p.amplitude),
+        }
+        for p in actual.points
+    ]
+    return {
+        "simulated": True,
+        "seed": seed,
+        "versions": versions(),
+        "image_centre_m": list(centre),
+        "incidence_deg": {b.name: incidence_deg(rig, b) for b in rig.receivers},
+        "mean_burst_travel_mm": mean_burst_travel_mm(rig.burst, rig.stage),
+        "plates": plates,
+        "points": points,
+        "direct_path": scene.disturbances.direct_gain > 0,
+        "scene": {**to_builtins(scene), "disturbances": msgspec.to_builtins(scene.disturbances)},
+    }
+
+
+def _plate_truth(plate: Plate, nominal: Plate, centre_m: Vector) -> dict[str, Any]:
+    """Return the entry of a drawn plate, with the nominal values of the scene file."""
+    return {
+        "name": plate.name,
+        "centre_mm": list(plate.centre_mm),
+        "centre_m": _in_rig(plate.centre_mm, plate.height_mm, centre_m),
+        "size_mm": list(plate.size_mm),
+        "permittivity": None if plate.permittivity is None else list(plate.permittivity),
+        "nominal_permittivity": None if nominal.permittivity is None else list(nominal.permittivity),
+        "metal": plate.metal and plate.strips_deg is None,
+        "strips_deg": plate.strips_deg,
+        "thickness_mm": plate.thickness_mm,
+        "layers": [msgspec.to_builtins(layer) for layer in plate.layers],
+        "nominal_layers": [msgspec.to_builtins(layer) for layer in nominal.layers],
+        "tilt_deg": list(plate.tilt_deg),
+        "height_mm": plate.height_mm,
+        "rough_mm": plate.rough_mm,
+        "rough_length_mm": plate.rough_length_mm,
+    }
+
+
+def _in_rig(at_mm: Pair, height_mm: float, centre_m: Vector) -> list[float]:
+    """Return a position on the plane with a height, in the rig frame, metres."""
+    return [centre_m[0] + at_mm[0] / 1e3, centre_m[1] + at_mm[1] / 1e3, centre_m[2] + height_mm / 1e3]
+
+
+def row_offsets_mm(radar: SimulatedRig, row: Row) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Return the true stage offsets of every chirp of a row in order of time: x_mm, y_mm, [points * pulses]."""
+    x = (np.array(row.x_mm)[:, None] + radar.burst_mm(row.direction)).ravel()
+    return x, np.full(len(x), row.y_mm)
+
+
+def lost_bytes(radar: SimulatedRig, board_name: str, row: Row) -> Gaps:
+    """Return the byte ranges of a row in lost packets, sorted and merged."""
+    loss = radar.scene.disturbances.packet_loss
+    size = row.points * radar.rig.burst.pulses * radar.rig.frame_bytes
+    full = packet_payload_bytes(radar.rig)
+    if loss == 0.0:
+        return []
+    rng = np.random.default_rng([stream_key(radar.seed, "loss", board_name), row.index])
+    gaps: Gaps = []
+    for k in np.flatnonzero(rng.random(-(-size // full)) < loss):
+        start, stop = int(k) * full, min((int(k) + 1) * full, size)
+        if gaps and gaps[-1][1] == start:
+            gaps[-1] = (gaps[-1][0], stop)
+        else:
+            gaps.append((start, stop))
+    return gaps
+
+
+def simulate(
+    rig: Instrument,
+    scene: Scene,
+    out: Path,
+    layout: str = "own",
+    seed: int | None = None,
+    started_s: float | None = None,
+    zero_filling: bool = True,
+    cache_dir: Path | None = None,
+    progress: Progress | None = None,
+    by_columns: bool = False,
+    skipped: Skipped | None = None,
+) -> Path:
+    """Write a scan of a scene.
+
+    Parameters
+    ----------
+    rig, scene
+        Rig file and scene; the scene's overrides are applied.
+    out, layout
+        Output folder, created if missing. "own": a scan folder at `out`. "authors": `out`/unsynced/<scan>, with the
+        transmitting board's data.
+    seed
+        None: the scene's. The same seed gives the same raw bytes.
+    started_s
+        Unix time of the scan's start; None: now.
+    cache_dir, progress
+        Folder that caches object fields (None: no cache); callback with rows done and total rows.
+    zero_filling, by_columns, skipped
+        Authors' layout only: see :class:`polysight_simulators.scene.published_layout.AuthorsLayout`.
+
+    Returns
+    -------
+    Folder to process: the scan folder, or unsynced/<scan>.
+
+    Raises
+    ------
+    ConfigError
+        if the scene does not fit the rig, or a burst does not end before the next point.
+    DataError
+        if the folder is not empty.
+    """
+    radar = SimulatedRig(rig, _wider(scene, rig) if by_columns else scene, seed, cache_dir)
+    rig = apply_scene(rig, scene)
+    plan = _plan(rig, by_columns)
+    started_s = time.time() if started_s is None else started_s
+    scan_id = "".join(c if c.isalnum() else "-" for c in scene.name).strip("-") or "scene"
+    if layout == "own":
+        stamp = datetime.fromtimestamp(started_s, UTC).isoformat(timespec="seconds")
+        _write_rows(OwnLayout(out, rig, plan, scan_id, stamp), radar, plan, rig.recorded, by_columns, progress)
+        folder = out
+    else:
+        writer = AuthorsLayout(out, rig, scan_id, started_s, zero_filling, by_columns, skipped)
+        _write_rows(writer, radar, plan, rig.boards, by_columns, progress)
+        folder = writer.folder
+        # The authors' files contain neither geometry nor filter nor leakage.
+        (folder / "instrument.toml").write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
+    facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id, "samples_clipped": radar.clipped}
+    (folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    return folder
+
+
+def _plan(rig: Instrument, by_columns: bool) -> RasterPlan:
+    """Return the plan of the rig's grid. Raises ConfigError if a burst does not end before the next point."""
+    grid = _by_columns(rig.grid) if by_columns else rig.grid
+    check_burst_fits(grid, rig.burst, rig.stage)
+    return plan_raster(grid)
+
+
+def _write_rows(
+    writer: Layout,
+    radar: SimulatedRig,
+    plan: RasterPlan,
+    boards: Sequence[Board],
+    by_columns: bool,
+    progress: Progress | None,
+) -> None:
+    """Write every row of the plan for these boards; `by_columns`: the stage runs along y."""
+    writer.start()
+    for row in plan:
+        x, y = row_offsets_mm(radar, row)
+        x, y = (y, x) if by_columns else (x, y)
+        first = row.index * len(x)
+        payloads = {b.name: radar.chirps(b.name, x, y, first) for b in boards}
+        writer.write_row(row, payloads, {b.name: lost_bytes(radar, b.name, row) for b in boards})
+        if progress is not None:
+            progress(row.index + 1, plan.rows)
+    writer.end()
+
+
+def _by_columns(grid: Grid) -> Grid:
+    """Return the grid with rows and columns swapped."""
+    return Grid(columns=grid.rows, rows=grid.columns, step_x_mm=grid.step_y_mm, step_y_mm=grid.step_x_mm)
+
+
+def _wider(scene: Scene, rig: Instrument) -> Scene:
+    """Return the scene with one more row above and below, for bursts that travel along y."""
+    grid = to_builtins(apply_scene(rig, scene).grid)
+    return msgspec.structs.replace(scene, grid={**grid, "rows": grid["rows"] + 2})

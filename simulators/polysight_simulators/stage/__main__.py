@@ -1,0 +1,213 @@
+"""The stage of a simulated rig: a serial port that behaves like the board, trigger and motion on the simulated wires.
+
+It is the sketch's own code, compiled for this machine (arduino_stage/pc); without a C++ compiler, or with `--python`,
+a stand-in with the same dialogue and the same step times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import os
+import select
+import struct
+import sys
+import termios
+import time
+import tty
+from pathlib import Path
+from threading import Event as Signal
+
+from polysight_shared.config import load_instrument
+from polysight_shared.errors import DeviceError, PolysightError
+from polysight_shared.units import NS_PER_MS
+from polysight_shared.wires import WireClient
+from polysight_simulators.builds import build_sketch, sketch_compiler
+from polysight_simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight_simulators.stage.motion import TICK_HZ
+from polysight_simulators.stage.python_stage import PythonStage, Rig
+
+BOOT_MS = 200
+STEP_POLL_MS, REST_POLL_MS = 2, 20
+_IN_CLOSE, _IN_OPEN = 0x08 | 0x10, 0x20  # inotify(7)
+_EVENT = struct.Struct("iIII")
+# A process without CPU time slows the simulated world down: the longest advance at once, wall time.
+LONGEST_LEAP_NS = 20 * NS_PER_MS
+
+
+class SerialPort:
+    """The far end of the USB cable for the Python stand-in: a pseudo terminal behind the symbolic link `link`.
+
+    Raises DeviceError when it cannot be made.
+    """
+
+    def __init__(self, link: Path) -> None:
+        self._link = link
+        try:
+            self._master, slave = os.openpty()
+            tty.setraw(slave, termios.TCSANOW)
+            settings = termios.tcgetattr(slave)
+            settings[2] |= termios.HUPCL  # as a serial port has, and a pseudo terminal not
+            termios.tcsetattr(slave, termios.TCSANOW, settings)
+            os.set_blocking(self._master, False)
+            name = os.ttyname(slave)
+            os.close(slave)
+            libc = ctypes.CDLL(None, use_errno=True)
+            self._watch = libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
+            if libc.inotify_add_watch(self._watch, os.fsencode(name), _IN_OPEN | _IN_CLOSE) < 0:
+                raise OSError(ctypes.get_errno(), f"no watch on {name}")
+            self._clients, self._dtr = 0, False
+            fresh = link.with_name(link.name + ".new")
+            fresh.unlink(missing_ok=True)
+            fresh.symlink_to(name)
+            fresh.replace(link)
+        except OSError as e:
+            raise DeviceError(f"simulated stage port {link}: {e}", "the folder is missing or not writable") from None
+
+    @property
+    def is_open(self) -> bool:
+        """True if a client held the port open at the last call of :meth:`opened`."""
+        return self._clients > 0
+
+    def wait(self, timeout_ms: int) -> None:
+        """Wait until bytes arrive, or a client opens or closes the port; at most `timeout_ms`."""
+        poll = select.poll()
+        poll.register(self._watch, select.POLLIN)
+        if self.is_open:
+            poll.register(self._master, select.POLLIN)
+        poll.poll(timeout_ms)
+
+    def opened(self) -> bool:
+        """Take note of opening and closing. True when DTR rose, which resets an UNO, however shortly it had been low.
+
+        The kernel raises DTR when a serial port is opened, and lowers it at the last close unless HUPCL was taken away.
+        """
+        try:
+            events = os.read(self._watch, 4096)
+        except BlockingIOError:
+            return False
+        rose = False
+        for _, mask, _, _ in _EVENT.iter_unpack(events):  # a watch on one file: no names follow
+            if mask & _IN_OPEN:
+                rose |= not self._dtr
+                self._dtr = True
+                self._clients += 1
+            if mask & _IN_CLOSE:
+                self._clients -= 1
+                self._dtr = self._clients > 0 or not termios.tcgetattr(self._master)[2] & termios.HUPCL
+        return rose
+
+    def read(self) -> bytes:
+        """Received bytes; empty when there are none."""
+        try:
+            return os.read(self._master, 512)
+        except OSError:  # EAGAIN, or EIO while no client is there
+            return b""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; those that a client does not read in time are lost, as on a serial line."""
+        try:
+            os.write(self._master, data)
+        except OSError:  # EAGAIN: full
+            return
+
+    def flush(self) -> None:
+        """Drop received bytes and set the terminal to raw mode."""
+        tty.setraw(self._master, termios.TCSANOW)
+        while self.read():
+            pass
+
+    def close(self) -> None:
+        """Remove the link and the terminal."""
+        self._link.unlink(missing_ok=True)
+        os.close(self._watch)
+        os.close(self._master)
+
+
+def serve(
+    stage: PythonStage, port: SerialPort, wires: WireClient | None, time_scale: float, boot_ms: int, stop: Signal
+) -> None:
+    """Run the stage behind its port until `stop` is set. Raises DeviceError when the wires break."""
+    started = wall = time.monotonic_ns()
+    ticks = 0.0
+    boots_at = 0
+    running = False
+    while not stop.is_set():
+        port.wait(STEP_POLL_MS if stage.stepping else REST_POLL_MS)
+        now = time.monotonic_ns()
+        leap = min(now - wall, LONGEST_LEAP_NS) if stage.stepping else now - wall
+        wall = now
+        ticks += leap * time_scale * TICK_HZ * 1e-9
+        now_ms = (now - started) // NS_PER_MS
+        if port.opened():  # opening the port resets the board; its boot loader ignores bytes until it ends
+            boots_at, running = now + boot_ms * NS_PER_MS, False
+        is_open = port.is_open
+
+        # Read bytes first, so that a late process does not detect a silent host.
+        if not stage.stepping:
+            stage.advance(int(ticks), now_ms)
+        if is_open and not running and now >= boots_at:
+            port.flush()
+            stage.reset(now_ms)
+            running = True
+        elif is_open and running:
+            stage.receive(port.read())
+        if stage.stepping:
+            stage.advance(int(ticks), now_ms)
+
+        if wires is not None and stage.wires:
+            wires.send(*stage.wires)
+        stage.wires.clear()
+        if is_open and stage.replies:
+            port.write(bytes(stage.replies))
+        stage.replies.clear()
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = command_line("polysight_simulators.stage", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
+    p.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
+    p.add_argument("--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires; without it no edges")
+    p.add_argument("--link", type=Path, required=True, metavar="PATH", help="name of the serial port to make")
+    p.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="motion runs X times the wall clock")
+    p.add_argument("--boot-ms", type=int, default=BOOT_MS, metavar="N", help="reset to banner, wall time")
+    p.add_argument("--python", action="store_true", help="the Python stand-in, even where a C++ compiler exists")
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run until SIGTERM or SIGINT."""
+    p = parser()
+    args = p.parse_args(argv)
+    if not args.time_scale > 0:
+        p.error("--time-scale must be positive")
+    die_with_parent()
+    try:
+        rig = load_instrument(args.config)
+        gxx = None if args.python else sketch_compiler()
+        if gxx is not None:
+            program = str(build_sketch(gxx))
+            command = [program, "--link", str(args.link), "--time-scale", repr(args.time_scale)]
+            command += ["--boot-ms", str(args.boot_ms), "--trigger-line", str(rig.pi.trigger_in)]
+            command += ["--steps-per-mm", repr(rig.stage.steps_per_mm)]
+            command += ["--wires", str(args.wires)] if args.wires else []
+            os.execv(program, command)
+        if not args.python:
+            sys.stderr.write("stage: no C++ compiler or no sketch here: the Python stand-in runs instead\n")
+        stop = stop_requested()
+        wires = WireClient(args.wires) if args.wires else None
+        port = SerialPort(args.link)
+        try:
+            announce_ready(str(args.link))
+            stage = PythonStage(Rig(rig.stage.steps_per_mm, rig.pi.trigger_in))
+            serve(stage, port, wires, args.time_scale, args.boot_ms, stop)
+        finally:
+            port.close()
+    except PolysightError as e:
+        sys.stderr.write(f"stage: {e}\n")
+        return e.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,313 @@
+"""Commands of the Python stand-in of the stage: legs, homing, hold, stop, alarms (as arduino_stage/stage.cpp)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum
+
+from polysight_shared.faults import StageError
+from polysight_shared.stage_line import Immediate, Parameter
+from polysight_simulators.stage.motion import EMERGENCY, LOOKS, MAX_RATE, MIN_RATE, SWITCH_X, SWITCH_Y, Leg, StepEngine
+
+MAX_TRAVEL = 999_999
+MAX_POINTS = 9_999
+MAX_BACKLASH = 20_000
+HOME_RATE, CREEP_RATE, PULL_OFF, MAX_RELEASE = 4000, 400, 400, 4000  # steps/s and steps
+HOME_ACCEL = 40_000  # steps/s^2
+QUIET_MS = 4
+_RANGES = {
+    Parameter.ACCEL: (100, 1_000_000),
+    Parameter.HEARTBEAT: (50, 60_000),
+    Parameter.TRIGGER: (1, 10_000),
+    Parameter.TRAVEL_X: (1, MAX_TRAVEL),
+    Parameter.TRAVEL_Y: (1, MAX_TRAVEL),
+    Parameter.TRAVEL_SPEED: (MIN_RATE, 2**31),
+    Parameter.BACKLASH: (0, MAX_BACKLASH),
+}
+ARGUMENTS = {"HELLO": 0, "SET": 2, "ENABLE": 1, "HOME": 0, "MOVE": 3, "ROW": 5, "CLEAR": 0}
+MOTION_VERBS = ("HOME", "MOVE", "ROW")
+
+
+class Refused(Exception):  # noqa: N818 - the answer to a command, not a failure of this program
+    """A command is refused with this number."""
+
+    def __init__(self, number: StageError) -> None:
+        super().__init__(number.name)
+        self.number = number
+
+
+class Event(Enum):
+    """Result of :meth:`StageLogic.service`."""
+
+    NONE = 0
+    DONE = 1
+    ALARM = 2
+
+
+def homing_zero() -> int:
+    """Return the steps from the closing point of a switch to the zero of homing.
+
+    The creep sees the switch open after its looks, takes the steps of its ramp to stop, and pulls off. Homing has to
+    begin at least the ramp of the search away from the switch.
+    """
+    engine = StepEngine()
+    engine.set_accel(HOME_ACCEL)
+    return LOOKS + engine.ramp_steps(CREEP_RATE) + PULL_OFF
+
+
+def _require(ok: bool, number: StageError) -> None:
+    if not ok:
+        raise Refused(number)
+
+
+class StageLogic:
+    """The sequences of legs behind the commands.
+
+    Parameters
+    ----------
+    engine
+        Moves the stage.
+    arm
+        Told the ticks to the next step when the engine starts stepping; 0 when it does not.
+    inputs
+        The switches that are pressed now.
+    """
+
+    def __init__(self, engine: StepEngine, arm: Callable[[int], None], inputs: Callable[[], int]) -> None:
+        self._engine, self._arm, self._inputs = engine, arm, inputs
+        self.parameters = {
+            Parameter.ACCEL: 40_000,
+            Parameter.HEARTBEAT: 500,
+            Parameter.TRIGGER: 20,
+            Parameter.TRAVEL_X: 160_000,
+            Parameter.TRAVEL_Y: 100_000,
+            Parameter.TRAVEL_SPEED: 8_000,
+            Parameter.BACKLASH: 0,
+        }
+        self.activity = "idle"  # idle, move, travel, row, home
+        self.alarm: StageError | None = None
+        self.homed = self.held = self.row_command = self.heard = self.status_requested = False
+        self._stopping: StageError | None = None
+        self._enabled = self._stop = self._resume = self._homing_leg_made = False
+        self._byte_seen = self._resume_begun = self._knew = self.homing_command = False
+        self._quiet = True
+        self._phase = self._heard_ms = self._byte_ms = self._looked_ms = 0
+        self.lost_x = self.lost_y = 0
+        self._row_leg = Leg(0, 0, MIN_RATE)
+        self._row_y = 0
+
+    @property
+    def busy(self) -> bool:
+        """True while a motion command is active."""
+        return self.activity != "idle"
+
+    @property
+    def state(self) -> str:
+        """The state as in a status reply."""
+        if self.busy and self._engine.hold and not self._engine.stepping:
+            return "hold"
+        if self.busy:
+            return "row" if self.activity == "travel" else self.activity
+        return "alarm" if self.alarm else "idle"
+
+    def execute(self, verb: str, args: tuple[int, ...]) -> None:
+        """Execute a command. Raises Refused."""
+        _require(verb in ARGUMENTS, StageError.UNKNOWN_COMMAND)
+        _require(len(args) == ARGUMENTS[verb], StageError.ARGUMENT_COUNT)
+        if verb == "HELLO":
+            return
+        _require(not self.busy, StageError.BUSY)
+        if verb in MOTION_VERBS:
+            _require(self.alarm is None and not self._stop, StageError.IN_ALARM)
+            _require(self._enabled, StageError.DISABLED)
+            _require(self.homed or verb == "HOME", StageError.NOT_HOMED)
+        handlers: dict[str, Callable[..., None]] = {
+            "SET": self._set,
+            "ENABLE": self._enable,
+            "CLEAR": self._clear,
+            "HOME": self._home,
+            "MOVE": self._move,
+            "ROW": self._row,
+        }
+        handlers[verb](*args)
+
+    def _set(self, index: int, value: int) -> None:
+        _require(index in _RANGES, StageError.OUT_OF_RANGE)
+        parameter = Parameter(index)
+        low, high = _RANGES[parameter]
+        _require(low <= value <= high, StageError.OUT_OF_RANGE)
+        _require(parameter != Parameter.TRAVEL_SPEED or value <= MAX_RATE, StageError.TOO_FAST)
+        self.parameters[parameter] = value
+        if parameter == Parameter.ACCEL:
+            self._engine.set_accel(value)
+
+    def _enable(self, on: int) -> None:
+        _require(on in (0, 1), StageError.OUT_OF_RANGE)
+        self._enabled = on == 1
+        self.homed = self.homed and self._enabled
+
+    def _clear(self) -> None:
+        _require(not (self._inputs() | self._engine.stable) & EMERGENCY, StageError.EMERGENCY_STOP)
+        self.alarm = None
+
+    def _home(self) -> None:
+        self._begin("home")
+        self._engine.set_accel(HOME_ACCEL)
+        self._knew, self.homed = self.homed, False
+        self._phase = 0
+
+    def _move(self, x: int, y: int, rate: int) -> None:
+        _require(rate >= MIN_RATE, StageError.OUT_OF_RANGE)
+        _require(rate <= MAX_RATE, StageError.TOO_FAST)
+        _require(self._within(x, y), StageError.SOFT_LIMIT)
+        self._begin("move")
+        self._go(x, y, rate)
+
+    def _row(self, x0: int, pitch: int, points: int, y: int, rate: int) -> None:
+        _require(1 <= points <= MAX_POINTS and pitch != 0 and rate >= MIN_RATE, StageError.OUT_OF_RANGE)
+        _require(rate <= MAX_RATE, StageError.TOO_FAST)
+        last, spacing = x0 + pitch * (points - 1), abs(pitch)
+        _require(self._within(x0, y) and self._within(last, y) and spacing <= MAX_TRAVEL, StageError.SOFT_LIMIT)
+        width_us = self.parameters[Parameter.TRIGGER]
+        _require(width_us * rate < min(spacing, 4000) * 1_000_000, StageError.OUT_OF_RANGE)
+        backlash = self.parameters[Parameter.BACKLASH]
+        lead = self._engine.ramp_steps(rate) + max(spacing, backlash)
+        run_up = lead if pitch > 0 else -lead
+        _require(self._within(x0 - run_up, y) and self._within(last + run_up, y), StageError.NO_RUN_UP)
+        _require(y >= backlash, StageError.NO_RUN_UP)
+        self._row_leg = Leg(last - x0 + 2 * run_up, 0, rate, lead, spacing, points)
+        self._begin("travel")
+        self._row_y = y
+        from_below = y - backlash if self._engine.y > y - backlash else y
+        self._go(x0 - run_up, from_below, self.parameters[Parameter.TRAVEL_SPEED])
+
+    def _within(self, x: int, y: int) -> bool:
+        return 0 <= x <= self.parameters[Parameter.TRAVEL_X] and 0 <= y <= self.parameters[Parameter.TRAVEL_Y]
+
+    def _begin(self, activity: str) -> None:
+        self.activity = activity
+        self.held = self._homing_leg_made = False
+        self.row_command = activity == "travel"
+        self.homing_command = activity == "home"
+        self._engine.abandon()
+        self._engine.points = self._engine.pulses = 0
+        self.heard = True
+
+    def _go(self, x: int, y: int, rate: int) -> None:
+        self._arm(self._engine.start(Leg(x - self._engine.x, y - self._engine.y, rate)))
+
+    def immediate(self, byte: int) -> bool:
+        """Process a byte; return False if it is not an immediate one."""
+        alone, confirmed = self._quiet, self._resume_begun
+        self._quiet, self._byte_seen, self._resume_begun = False, True, byte == Immediate.RESUME
+        if byte == Immediate.HOLD:
+            self._engine.hold, self._resume = True, False
+        elif byte == Immediate.RESUME:
+            self._resume |= confirmed
+            self._resume_begun = not confirmed
+        elif byte == Immediate.STATUS:
+            self.status_requested = True
+        elif byte == Immediate.STOP:
+            self._engine.hold = self._stop = True
+        else:
+            return False
+        self.heard |= alone
+        return True
+
+    def _listen(self, now_ms: int) -> None:
+        if self._byte_seen:
+            self._byte_seen, self._byte_ms = False, now_ms
+        elif now_ms - self._byte_ms >= QUIET_MS:
+            self._quiet = True
+        if self.heard:
+            self.heard, self._heard_ms = False, now_ms
+        if now_ms != self._looked_ms and not self._engine.stepping:
+            self._looked_ms = now_ms
+            self._engine.look(self._inputs())
+
+    def _raise(self, alarm: StageError, position_lost: bool) -> Event:
+        self._engine.abandon()
+        self._engine.set_accel(self.parameters[Parameter.ACCEL])
+        self.activity = "idle"
+        self._stopping = None
+        self._stop = self._resume = False
+        self.alarm = alarm
+        self.homed = self.homed and not position_lost
+        return Event.ALARM
+
+    def service(self, now_ms: int) -> Event:
+        """Start the next leg, check heartbeat and switches. Call often."""
+        engine = self._engine
+        self._listen(now_ms)
+        if engine.fault is not None:
+            return self._raise(engine.fault, True)
+        if engine.stable & EMERGENCY and self.alarm != StageError.EMERGENCY_STOP:
+            return self._raise(StageError.EMERGENCY_STOP, True)
+        if not self.busy:
+            if self._stop and self.alarm is None:
+                return self._raise(StageError.STOPPED, False)
+            self._stop = self._resume = False
+            engine.abandon()
+            return Event.NONE
+        if self._stop and self._stopping is None:
+            self._stopping = StageError.STOPPED
+        silent_ms = now_ms - self._heard_ms
+        if engine.stepping and self._stopping is None and silent_ms > self.parameters[Parameter.HEARTBEAT]:
+            self._stopping = StageError.HEARTBEAT_LOST
+        if self._stopping is not None:
+            engine.hold = True
+            return (
+                Event.NONE
+                if engine.stepping
+                else self._raise(self._stopping, self._stopping == StageError.HEARTBEAT_LOST)
+            )
+        if self._resume:
+            self._resume = False
+            self._arm(engine.resume())
+        if engine.hold and self.activity == "row":
+            self.held = True
+        return self._next_leg() if engine.finished else Event.NONE
+
+    def _next_leg(self) -> Event:
+        if self.activity == "travel" and self._engine.y != self._row_y:
+            self._go(self._engine.x, self._row_y, self.parameters[Parameter.TRAVEL_SPEED])
+            return Event.NONE
+        if self.activity == "travel":
+            self.activity = "row"
+            self._arm(self._engine.start(self._row_leg))
+            return Event.NONE
+        if self.activity == "home":
+            return self._next_homing_leg()
+        return self._end()
+
+    def _end(self) -> Event:
+        self.activity = "idle"
+        self._engine.abandon()
+        return Event.DONE
+
+    def _next_homing_leg(self) -> Event:
+        if self._homing_leg_made:
+            if self._engine.reached != (self._phase % 3 != 2):
+                return self._raise(StageError.HOMING_FAILED, True)
+            if self._phase == 2:
+                self.lost_x, self._engine.x = -self._engine.x if self._knew else 0, 0
+            if self._phase == 5:
+                self.lost_y, self._engine.y = -self._engine.y if self._knew else 0, 0
+            self._phase += 1
+        if self._phase == 6:
+            self._engine.set_accel(self.parameters[Parameter.ACCEL])
+            self.homed = True
+            return self._end()
+        along_x, step = self._phase < 3, self._phase % 3
+        travel = self.parameters[Parameter.TRAVEL_X if along_x else Parameter.TRAVEL_Y]
+        distance = (-(travel + travel // 10 + PULL_OFF), MAX_RELEASE, PULL_OFF)[step]
+        leg = Leg(
+            distance if along_x else 0,
+            0 if along_x else distance,
+            CREEP_RATE if step == 1 else HOME_RATE,
+            until=SWITCH_X if along_x else SWITCH_Y,
+            until_open=step == 1,
+        )
+        self._homing_leg_made = True
+        self._arm(self._engine.start(leg))
+        return Event.NONE

@@ -1,0 +1,49 @@
+"""The emulated UNO at real time: `python -m polysight_simulators.stage` with the flashed machine code itself.
+
+`--time-scale` is the speed of the whole board, its heartbeat clock included: a host that asks for the status four
+times per heartbeat allows 2, and a machine that cannot keep up slows the simulated world down.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from polysight_shared.config import load_instrument
+from polysight_shared.errors import PolysightError
+from polysight_simulators.process import command_line, die_with_parent
+from polysight_simulators.stage import homing_zero
+from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run until SIGTERM or SIGINT."""
+    p = command_line("polysight_simulators.uno", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
+    p.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
+    p.add_argument("--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires: gets trigger and motion")
+    p.add_argument("--link", type=Path, required=True, metavar="PATH", help="name of the serial port to make")
+    p.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="times real time; see above")
+    p.add_argument("--boot-ms", type=int, default=200, metavar="N", help="after opening, in the board's own time")
+    args = p.parse_args(argv)
+    if not args.time_scale > 0:
+        p.error("--time-scale must be positive")
+    die_with_parent()
+    if lacking := missing():
+        sys.stderr.write(f"uno: not installed: {' '.join(lacking)}. Do: {ENABLING_COMMAND}\n")
+        return 1
+    try:
+        rig = load_instrument(args.config)
+        zero = homing_zero()
+        program = str(emulator())
+        command = [program, "--pty", str(args.link), "--speed", repr(args.time_scale), "--boot-ms", str(args.boot_ms)]
+        command += ["--zero", f"{zero},{zero}", "--um-per-step", repr(1000.0 / rig.stage.steps_per_mm)]
+        command += ["--line", str(rig.pi.trigger_in), *(["--wires", str(args.wires)] if args.wires else [])]
+        os.execv(program, [*command, str(firmware())])
+    except PolysightError as e:
+        sys.stderr.write(f"uno: {e}\n")
+        return e.exit_status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,212 @@
+"""The emulated board in lockstep with a Python program: time advances only by command.
+
+Emulator and firmware are compiled on demand, once for the same sources; :func:`missing` lists the packages needed.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import NamedTuple
+
+from polysight_shared.errors import DeviceError
+from polysight_simulators.builds import SKETCH_DIR, compiled
+
+CORE_DIR = Path("/usr/share/arduino/hardware/arduino/avr/cores/arduino")
+ENABLING_COMMAND = (
+    "sudo apt-get install gcc make gcc-avr avr-libc binutils-avr arduino-core-avr libsimavr-dev libelf-dev"
+)
+_SOURCES = sorted(p for p in Path(__file__).parent.iterdir() if p.suffix in (".c", ".h"))
+_CC = ("gcc", "-O2", "-Wall", "-Wextra")
+_LIBRARIES = ("-lsimavr", "-lelf", "-lutil", "-lm")
+_ON_FAILURE = ("a package is missing, or the sources were changed", ENABLING_COMMAND)
+HZ = 16_000_000
+STEP_VECTOR, TRIGGER_END_VECTOR, MILLIS_VECTOR, RECEIVE_VECTOR, SEND_VECTOR = 11, 12, 16, 18, 19
+
+
+class PinEdge(NamedTuple):
+    """An edge of a watched pin, at an exact cycle of the 16 MHz clock."""
+
+    cycle: int
+    pin: int  # Arduino number; A0 is 14
+    value: int
+    x: int  # motor steps, counted at the pins from where the stage stood when it was switched on
+    left: int
+    right: int
+    step_cycle: int  # of the last rising PUL edge
+
+
+class Cost(NamedTuple):
+    """Worst cases since the last call of :meth:`EmulatedUno.cost`, in cycles."""
+
+    interrupts: dict[int, int]  # by vector number: from entry to the end of reti
+    step_pulse: int  # shortest
+    direction_setup: int  # shortest time from DIR to PUL
+    direction_hold: int  # ... and from PUL to DIR
+
+
+class EmulatedUno:
+    """A board with its motors and switches, just switched on.
+
+    Parameters
+    ----------
+    program, image
+        From :func:`polysight_simulators.uno.emulator` and :func:`polysight_simulators.uno.firmware`.
+    start
+        Position at power-on: steps from the switches.
+    watch
+        Pins whose edges are stored in `edges`.
+    pty
+        Path of a pseudo terminal to make for the serial line; None: use :meth:`feed` and `received`.
+    """
+
+    def __init__(
+        self,
+        program: Path,
+        image: Path,
+        start: tuple[int, int] = (2000, 1500),
+        watch: tuple[int, ...] = (2,),
+        pty: Path | None = None,
+    ) -> None:
+        self.edges: list[PinEdge] = []
+        self.received = bytearray()
+        self.troubles: list[str] = []  # resets, lost bytes, crashes
+        self.cycle = 0
+        self.motors = (start[0], start[1], start[1])  # x, left, right
+        self.sent = 0  # bytes to the pseudo terminal
+        self._counted: dict[int, int] = {}
+        self._cost_pins = (0, 0, 0)
+        command = [str(program), "--parent", str(os.getpid()), "--start", f"{start[0]},{start[1]}"]
+        command += ["--watch", ",".join(map(str, watch)), *(["--pty", str(pty)] if pty else []), str(image)]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._collect()
+
+    def _collect(self) -> None:
+        output = self._process.stdout
+        if output is None:
+            raise DeviceError("the UNO emulator has no output", "a bug", "report it")
+        for line in output:
+            tag, *rest = line.split()
+            if tag == "E":
+                self.edges.append(PinEdge(*map(int, rest)))
+            elif tag == "T":
+                self.received.append(int(rest[1], 16))
+            elif tag == "R":
+                self.cycle, *motors, self.sent = map(int, rest)
+                self.motors = (motors[0], motors[1], motors[2])
+                return
+            elif tag == "C":
+                self._counted[int(rest[0])] = int(rest[2])
+            elif tag == "W":
+                pulse, setup, hold = map(int, rest)
+                self._cost_pins = (pulse, setup, hold)
+            else:
+                self.troubles.append(" ".join(rest[1:]))
+        raise DeviceError("the UNO emulator ended", "it crashed; its last words are on standard error", "report it")
+
+    def _do(self, line: str) -> None:
+        if self._process.stdin is None:
+            raise DeviceError("the UNO emulator has no input", "a bug", "report it")
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+        self._collect()
+
+    def feed(self, data: bytes) -> None:
+        """Put bytes on the serial line; they arrive as time advances."""
+        self._do(f"feed {data.hex()}")
+
+    def run(self, cycles: int) -> None:
+        """Advance the time by CPU cycles."""
+        self._do(f"run {max(1, cycles)}")
+
+    def run_ms(self, ms: float) -> None:
+        """Advance the time by milliseconds."""
+        self.run(round(ms * HZ / 1000))
+
+    def settle(self, pty_bytes: int = 0) -> None:
+        """Run until the serial line is idle; `pty_bytes`: total number written to the pseudo terminal."""
+        self._do(f"settle {pty_bytes}")
+
+    def rest(self, limit_s: float = 600.0) -> None:
+        """Run until no motor has stepped for 50 ms."""
+        self._do(f"rest {round(limit_s * HZ)}")
+
+    def press(self, mask: int) -> None:
+        """Press switches: 1 x, 2 y, 4 emergency stop."""
+        self._do(f"inputs {mask}")
+
+    def slip(self, dx: int, dy: int) -> None:
+        """Let the motors lose steps."""
+        self._do(f"slip {dx} {dy}")
+
+    def reset(self) -> None:
+        """Press the reset button."""
+        self._do("reset")
+
+    def hang(self) -> None:
+        """Stop the main program until the next reset; interrupts go on."""
+        self._do("hang")
+
+    def watch(self, *pins: int) -> None:
+        """Store the edges of these pins from now on."""
+        self._do("watch " + ",".join(map(str, pins)))
+
+    def cost(self) -> Cost:
+        """Return the worst cases since the last call."""
+        self._counted = {}
+        self._do("cost")
+        return Cost(self._counted, *self._cost_pins)
+
+    def close(self) -> None:
+        """End the emulator."""
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                stream.close()
+        self._process.wait(10)
+
+
+def missing() -> list[str]:
+    """Return the missing Debian packages that compiling firmware and emulator needs."""
+    lacking = {
+        "gcc": shutil.which("gcc") is None,
+        "make": shutil.which("make") is None,
+        "gcc-avr": shutil.which("avr-g++") is None,
+        "avr-libc": not any(Path(p).is_file() for p in ("/usr/lib/avr/include/avr/io.h", "/usr/avr/include/avr/io.h")),
+        "arduino-core-avr": not CORE_DIR.is_dir(),
+        "libsimavr-dev": not Path("/usr/include/simavr/sim_avr.h").is_file(),
+        "libelf-dev": not Path("/usr/include/libelf.h").is_file(),
+    }
+    return [package for package, lacks in lacking.items() if lacks]
+
+
+def emulator() -> Path:
+    """Compile the emulator; return its path. Raises DeviceError if it does not compile."""
+    code = [str(p) for p in _SOURCES if p.suffix == ".c"]
+    return compiled("unosim", _SOURCES, [*_CC, "-o", "{folder}/unosim", *code, *_LIBRARIES], _ON_FAILURE)
+
+
+def firmware(compiler: Path | None = None) -> Path:
+    """Compile the image that `make flash` puts on a board; return the .hex file.
+
+    Parameters
+    ----------
+    compiler
+        Folder of another avr-gcc and its tools; None: those on the path.
+
+    Raises
+    ------
+    DeviceError
+        if it does not compile, or its sources are missing.
+    """
+    if not SKETCH_DIR.is_dir():
+        raise DeviceError(
+            f"{SKETCH_DIR}: no such folder",
+            "polysight is installed without its repository, which holds the sketch",
+            "run from a clone of the repository, or use the stage without the emulated board",
+        )
+    sources = [p for p in SKETCH_DIR.iterdir() if p.suffix in (".cpp", ".h", ".ino", ".mk")]
+    command = ["make", "-s", "-C", str(SKETCH_DIR), "firmware", "AVR_B={folder}"]
+    command += [f"AVR={compiler}/avr-"] if compiler else []
+    return compiled("arduino_stage.hex", sources, command, _ON_FAILURE)

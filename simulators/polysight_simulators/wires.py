@@ -1,0 +1,237 @@
+"""Hub of the simulated wires: relay GPIO edges and stage motion between the processes of a simulated rig.
+
+Protocol: shared/polysight_shared/wires.py and docs/spec/simulated-rig.md. Lines of a client reach every subscriber in order, and none is
+dropped: unread lines are queued up to a limit; a client that exceeds it is disconnected with a message.
+"""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DeviceError, PolysightError, ProtocolError
+from polysight_shared.wires import WireMotion, parse
+from polysight_simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+
+MAX_LINE_BYTES = 200
+MAX_PENDING_BYTES = 64 << 20
+MAX_SOCKET_PATH = 107  # sun_path of Linux holds 108 bytes with its terminator
+_READ_BYTES = 1 << 18
+
+
+class _Client:
+    """A connected process with its subscriptions and its unread lines."""
+
+    def __init__(self, connection: socket.socket, number: int) -> None:
+        self.connection = connection
+        self.name = f"client {number}"
+        self.partial = b""
+        self.lines: set[bytes] = set()
+        self.motion = False
+        self.pending = bytearray()
+
+
+class WireHub:
+    """Relay S lines to the clients that subscribed with L, M lines to those that sent W, never to the sender.
+
+    Parameters
+    ----------
+    path
+        Unix socket; an unused socket file is replaced.
+    report
+        Called with the reason when a client is disconnected: an invalid line, or too many unread bytes.
+    max_pending_bytes
+        Limit of unread bytes of a client.
+
+    Raises
+    ------
+    ConfigError
+        if the path is too long for a Unix socket.
+    DeviceError
+        if the socket cannot be created, or another hub uses it.
+    """
+
+    def __init__(self, path: Path, report: Callable[[str], object], max_pending_bytes: int = MAX_PENDING_BYTES) -> None:
+        if len(str(path).encode()) > MAX_SOCKET_PATH:
+            raise ConfigError(
+                f"{path}: too long for a Unix socket (at most {MAX_SOCKET_PATH} bytes)",
+                "the folder of the run is too deep",
+                "choose a shorter folder, for example in /tmp",
+                code=ErrorCode.VALUE_INVALID,
+            )
+        self._path = path
+        self._report = report
+        self._max_pending = max_pending_bytes
+        self._listener = _listen(path)
+        self._listener.setblocking(False)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, selectors.EVENT_READ, None)
+        self._clients: dict[socket.socket, _Client] = {}
+        self._accepted = 0
+        self._last_motion = b""
+        self._cut: set[bytes] = set()
+        self.relayed = 0
+
+    def serve(self, stop: Event, poll_s: float = 0.1) -> None:
+        """Relay until `stop` is set."""
+        while not stop.is_set():
+            self.step(poll_s)
+
+    def step(self, timeout_s: float) -> None:
+        """Read lines from the clients, relay them, and write queued lines."""
+        for key, events in self._selector.select(timeout_s):
+            if key.data is None:
+                self._accept()
+            elif events & selectors.EVENT_READ and key.data.connection in self._clients:
+                self._read(key.data)
+        for client in list(self._clients.values()):
+            if client.pending:
+                self._write(client)
+
+    def close(self) -> None:
+        """Close all connections and remove the socket file."""
+        for client in list(self._clients.values()):
+            self._drop(client)
+        self._selector.close()
+        self._listener.close()
+        self._path.unlink(missing_ok=True)
+
+    def _accept(self) -> None:
+        connection, _ = self._listener.accept()
+        connection.setblocking(False)
+        self._accepted += 1
+        client = _Client(connection, self._accepted)
+        self._clients[connection] = client
+        self._selector.register(connection, selectors.EVENT_READ, client)
+
+    def _read(self, client: _Client) -> None:
+        try:
+            data = client.connection.recv(_READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(client)
+            return
+        *lines, client.partial = (client.partial + data).split(b"\n")
+        try:
+            self._relay(client, lines)
+            if len(client.partial) > MAX_LINE_BYTES:
+                raise ProtocolError(f"a line of more than {MAX_LINE_BYTES} bytes: {client.partial[:40]!r}...")
+        except ProtocolError as e:
+            self._disconnect(client, str(e))
+
+    def _relay(self, sender: _Client, lines: list[bytes]) -> None:
+        others = [p for p in self._clients.values() if p is not sender]
+        for line in lines:
+            tag = line[:2]
+            if tag == b"S ":
+                fields = line.split(b" ")
+                wanted = len(fields) == 4 and fields[2]
+                if not wanted:
+                    raise ProtocolError(f"not a wire line: {line!r}")
+                for p in others:
+                    if wanted in p.lines and wanted not in self._cut:
+                        p.pending += line + b"\n"
+                        self.relayed += 1
+            elif tag == b"M ":
+                if not isinstance(parse(line.decode("ascii", "replace")), WireMotion):
+                    raise ProtocolError(f"not a wire line: {line!r}")
+                self._last_motion = line + b"\n"
+                for p in others:
+                    if p.motion:
+                        p.pending += self._last_motion
+                        self.relayed += 1
+            elif tag == b"L " and all(word.isdigit() for word in line[2:].split()):
+                sender.lines.update(line[2:].split())
+                sender.pending += b"K\n"
+            elif tag == b"X " and len(fields := line.split(b" ")) == 3 and fields[2] in (b"0", b"1"):
+                (self._cut.add if fields[2] == b"1" else self._cut.discard)(fields[1])
+                sender.pending += b"K\n"
+            elif line == b"W":
+                sender.motion = True
+                sender.pending += b"K\n" + self._last_motion  # a late client needs the stage's position
+            else:
+                raise ProtocolError(f"not a wire line: {line!r}")
+
+    def _write(self, client: _Client) -> None:
+        try:
+            sent = client.connection.send(client.pending)
+        except BlockingIOError:
+            sent = 0
+        except OSError:
+            self._drop(client)
+            return
+        del client.pending[:sent]
+        if len(client.pending) > self._max_pending:
+            self._disconnect(client, f"{len(client.pending)} unread bytes")
+            return
+        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.pending else 0)
+        if self._selector.get_key(client.connection).events != wanted:
+            self._selector.modify(client.connection, wanted, client)
+
+    def _disconnect(self, client: _Client, why: str) -> None:
+        lines = ", ".join(sorted(word.decode() for word in client.lines)) or "none"
+        self._drop(client)
+        self._report(f"{client.name} (lines: {lines}) disconnected: {why}")
+
+    def _drop(self, client: _Client) -> None:
+        self._selector.unregister(client.connection)
+        del self._clients[client.connection]
+        client.connection.close()
+
+
+def _listen(path: Path) -> socket.socket:
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        if path.is_socket():
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+                if probe.connect_ex(str(path)) == 0:
+                    raise DeviceError(
+                        f"{path}: another hub uses this socket",
+                        "a simulated rig is still running",
+                        "end it first",
+                        code=ErrorCode.BUSY,
+                    )
+            path.unlink()
+        listener.bind(str(path))
+        listener.listen(16)
+    except OSError as e:
+        listener.close()
+        raise DeviceError(
+            f"{path}: cannot listen: {e}", "the folder is missing or not writable", "create the folder"
+        ) from None
+    except DeviceError:
+        listener.close()
+        raise
+    return listener
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the hub until SIGTERM or SIGINT."""
+    parser = command_line("polysight_simulators.wires", "Hub of the simulated wires.", "--socket out/wires.sock")
+    parser.add_argument("--socket", type=Path, required=True, help="Unix socket to serve")
+    args = parser.parse_args(argv)
+    stop = stop_requested()
+    die_with_parent()
+    try:
+        hub = WireHub(args.socket, lambda message: sys.stderr.write(f"wires: {message}\n"))
+    except PolysightError as e:
+        sys.stderr.write(f"error: {e}\n")
+        return e.exit_status
+    announce_ready(str(args.socket))
+    try:
+        hub.serve(stop)
+    finally:
+        hub.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,83 @@
+"""Laws of the roof: five projects, each a folder with its package inside; no links, one import name for each class."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from email.parser import Parser
+from importlib.metadata import PackagePath, distribution
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+
+from polysight_shared import __version__
+
+ROOT = Path(__file__).parents[2]
+PROJECTS = {
+    "shared": "polysight_shared",
+    "pi_controller": "polysight_pi",
+    "simulators": "polysight_simulators",
+    "host": "polysight",
+    "papers": "polysight_papers",
+}
+
+
+def test_the_repository_has_no_links():
+    listed = subprocess.run(["git", "ls-files", "-s"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a git checkout: the files of the project are not known")
+    assert [line for line in listed.stdout.splitlines() if line.startswith("120000")] == []
+
+
+@pytest.mark.parametrize(("folder", "package"), PROJECTS.items())
+def test_a_project_holds_its_one_package(folder, package):
+    packages = {p.parent.name for p in (ROOT / folder).glob("*/__init__.py")}
+    assert packages == {package}
+    assert not list((ROOT / folder).glob("*.py")) or folder == "host"  # setup.py
+
+
+@pytest.mark.parametrize("folder", PROJECTS)
+def test_all_projects_have_one_version(folder):
+    project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["version"] == __version__
+    ours = [d for d in project["dependencies"] if d.startswith("polysight")]
+    assert all(d.endswith(f"=={__version__}") for d in ours)
+
+
+def test_an_editable_installation_is_a_path_that_editors_follow():
+    """No import hook: type checkers do not run hooks."""
+    for folder in PROJECTS:
+        name = tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]["name"]
+        files: list[PackagePath] = distribution(name).files or []
+        pth = [f for f in files if f.suffix == ".pth"]
+        if not pth:
+            pytest.skip("the projects are not installed in place: `make test` does that")
+        assert Path(pth[0].read_text(encoding="utf-8").strip()).resolve() == ROOT / folder
+
+
+def test_wheels_share_no_file(tmp_path):
+    """Otherwise uninstalling one half breaks the other."""
+    projects = [ROOT / folder for folder in ("shared", "pi_controller", "simulators", "papers")]
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir"]
+    subprocess.run([*command, tmp_path, *projects], check=True)
+    owners: dict[str, str] = {}
+    for wheel in sorted(tmp_path.glob("*.whl")):
+        with ZipFile(wheel) as archive:
+            metadata = next(n for n in archive.namelist() if n.endswith("METADATA"))
+            name = Parser().parsestr(archive.read(metadata).decode())["Name"]
+            for file in archive.namelist():
+                assert owners.setdefault(file, name) == name, file
+    tops = {file.partition("/")[0] for file in owners if ".dist-info" not in file}
+    assert tops == {"polysight_shared", "polysight_pi", "polysight_simulators", "polysight_papers"}
+
+
+def test_an_error_is_one_class_wherever_it_is_imported_from():
+    import polysight
+    from polysight.store import ScanFolder
+    from polysight_shared.errors import PolysightError
+
+    with pytest.raises(PolysightError):
+        ScanFolder.load(Path("/no/such/scan"))
+    assert polysight.__version__ == __version__

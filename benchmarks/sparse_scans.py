@@ -2,7 +2,7 @@
 
 Every example scene is simulated once with all positions, without noise or disturbances, so that only the
 missing positions matter. Then rows or columns are masked, and the image is made by matched filter and by reconstruction
-(host/polysight/imaging/sparse.py). The error is that of the whole image against the matched filter of all positions, both
+(polysight/imaging/sparse.py). The error is that of the whole image against the matched filter of all positions, both
 channels' mean; a reconstruction is compared through the samples it predicts.
 """
 

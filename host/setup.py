@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: installing compiles `polysight/sync/*.c`, and a wheel is for one platform, any Python.
+"""What pyproject.toml cannot say: how the loops are compiled; a wheel is for one platform and any Python.
 
 With POLYSIGHT_WHEEL set to a platform of `polysight/sync/build.py`, wheels are made for that one.
 """
@@ -21,7 +21,7 @@ TARGET = os.environ.get("POLYSIGHT_WHEEL", "")
 
 
 def copy_data(folder):
-    """Copy the rig file and the scenes into the package that is built; sources used in place read them where they lie."""
+    """Copy the rig file and the scenes into the package that is built."""
     files = [Path("instrument.toml"), *(p.relative_to(TOP) for p in (TOP / "examples").rglob("*.toml"))]
     for file in files:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
@@ -37,7 +37,7 @@ class PlatformDistribution(Distribution):
 
 
 class BuildWithKernels(build_py):
-    """Copies the package and its data files, and compiles the kernels into it; into the sources where these are used in place."""
+    """Copies the package and its data, and compiles the kernels into it, or into sources used in place."""
 
     def run(self):
         """Without a compiler that works the same runs in NumPy, more slowly: say so, and go on."""

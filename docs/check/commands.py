@@ -17,15 +17,7 @@ from unittest import mock
 from docs.check.pages import ROOT
 
 PROGRAMS = {"polysight": "polysight.cli.main", "polysight-pi": "polysight_pi.cli"}
-OWN = (
-    "benchmarks",
-    "docs",
-    "polysight",
-    "polysight_papers",
-    "polysight_pi",
-    "polysight_shared",
-    "polysight_simulators",
-)
+OWN = ("benchmarks", "docs", "polysight", *(f"polysight_{name}" for name in ("papers", "pi", "shared", "simulators")))
 _BEFORE = ("sudo", "env", "exec", "time", "nohup", "ssh", "timeout", "nice")
 _ENDS = re.compile(r"[|&;()\n]+")
 _REDIRECTS = re.compile(r"[<>&]+")

@@ -3,10 +3,9 @@
 The names below are the public Python interface. They are imported when first used, so that `import polysight` is quick
 and needs no other package. Start with :func:`open_scan`.
 
-`pipeline.py` is the whole flow on one screen: capture -> store -> sync -> imaging -> polarimetry -> materials -> report.
-Every folder is a room: its `__init__` says what it takes and gives, and neighbours import from there only
-(docs/decisions/0008-rooms.md). Beside this package: `polysight_shared` (configuration, messages, errors), `polysight_pi`
-(the Raspberry Pi), `polysight_simulators`, `polysight_papers`.
+`pipeline.py` is the whole flow on one screen. Every folder is a room: its `__init__` says what it takes and gives, and
+neighbours import from there only (docs/decisions/0008-rooms.md). Beside this package: `polysight_shared`
+(configuration, messages, errors), `polysight_pi` (the Raspberry Pi), `polysight_simulators`, `polysight_papers`.
 """
 
 from importlib import import_module

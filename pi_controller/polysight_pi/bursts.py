@@ -11,11 +11,10 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from polysight_shared.config import Burst
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 from polysight_shared.faults import PiFault
-from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS
+from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, Burst
 from polysight_shared.units import us_to_ns
 
 MAX_HZ, MIN_HZ = 2_000_000, 500_000  # SPI clock for pulses of 0.5 .. 2 us

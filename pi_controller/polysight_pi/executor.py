@@ -23,10 +23,9 @@ from polysight_pi.stage_link import StageLost, StageNews
 from polysight_pi.trigger import BurstSent, LoopFault, TriggerLoop
 from polysight_shared import __version__
 from polysight_shared import messages as m
-from polysight_shared.config import Stage
 from polysight_shared.errors import PolysightError, os_error
 from polysight_shared.faults import PiFault, explain
-from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, MIN_WIDTH_NS, WIDTH_TEXT
+from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, MIN_WIDTH_NS, WIDTH_TEXT, Stage
 from polysight_shared.stage_line import Reply
 from polysight_shared.units import us_to_ns
 

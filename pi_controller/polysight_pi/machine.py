@@ -18,7 +18,7 @@ from polysight_shared.stage_line import HOMING_TIMEOUT_S
 
 
 class RefusedError(PolysightError):
-    """A command is refused with a PiFault number; shared/polysight_shared/faults.py has the default texts of each number."""
+    """A command is refused with a PiFault number; polysight_shared/faults.py has the default texts of each number."""
 
     def __init__(self, number: int, what: str, why: str = "", remedy: str = "") -> None:
         super().__init__(what, why, remedy, code=ErrorCode.REFUSED_BY_PEER)

@@ -17,10 +17,9 @@ from polysight_pi.stage import MAX_MM, StageDriver
 from polysight_pi.stage_link import StageLostError, StageRefusedError
 from polysight_pi.trigger import BurstSent, Counts, Job, LoopFault, TriggerLoop, TriggerWatch
 from polysight_shared import messages as m
-from polysight_shared.config import Stage
 from polysight_shared.errors import ProtocolError
 from polysight_shared.faults import PiFault, StageError, explain
-from polysight_shared.raster import Row
+from polysight_shared.raster import Row, Stage
 from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 
 STATUS_EVENT_S = 0.24

@@ -1,4 +1,4 @@
-"""Lines of a simulated rig: edges are sent and received over a local socket, with their wire time (shared/polysight_shared/wires.py).
+"""Lines of a simulated rig: edges are sent and received over a local socket, with their wire time (`wires` of shared).
 
 Wire time is the simulated stage's clock. Here it is the latest of the received edges and of the deadlines slept until,
 so a burst takes no wall time and its pulses are exactly on their deadlines, however busy the machine is.

@@ -15,11 +15,10 @@ from polysight_pi.stage_link import (
     StageNews,
     StageRefusedError,
 )
-from polysight_shared.config import Stage
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, ProtocolError
 from polysight_shared.faults import StageError, explain
-from polysight_shared.raster import Row
+from polysight_shared.raster import Row, Stage
 from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Parameter, Reply
 
 IDLE_STATUS_S = 1.0

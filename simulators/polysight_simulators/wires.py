@@ -1,6 +1,6 @@
 """Hub of the simulated wires: relay GPIO edges and stage motion between the processes of a simulated rig.
 
-Protocol: shared/polysight_shared/wires.py and docs/spec/simulated-rig.md. Lines of a client reach every subscriber in order, and none is
+Protocol: docs/spec/simulated-rig.md. Lines of a client reach every subscriber in order, and none is
 dropped: unread lines are queued up to a limit; a client that exceeds it is disconnected with a message.
 """
 

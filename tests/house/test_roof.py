@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 import tomllib
-from email.parser import Parser
 from importlib.metadata import PackagePath, distribution
 from pathlib import Path
-from zipfile import ZipFile
 
 import pytest
 
@@ -55,22 +52,6 @@ def test_an_editable_installation_is_a_path_that_editors_follow():
         if not pth:
             pytest.skip("the projects are not installed in place: `make test` does that")
         assert Path(pth[0].read_text(encoding="utf-8").strip()).resolve() == ROOT / folder
-
-
-def test_wheels_share_no_file(tmp_path):
-    """Otherwise uninstalling one half breaks the other."""
-    projects = [ROOT / folder for folder in ("shared", "pi_controller", "simulators", "papers")]
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir"]
-    subprocess.run([*command, tmp_path, *projects], check=True)
-    owners: dict[str, str] = {}
-    for wheel in sorted(tmp_path.glob("*.whl")):
-        with ZipFile(wheel) as archive:
-            metadata = next(n for n in archive.namelist() if n.endswith("METADATA"))
-            name = Parser().parsestr(archive.read(metadata).decode())["Name"]
-            for file in archive.namelist():
-                assert owners.setdefault(file, name) == name, file
-    tops = {file.partition("/")[0] for file in owners if ".dist-info" not in file}
-    assert tops == {"polysight_shared", "polysight_pi", "polysight_simulators", "polysight_papers"}
 
 
 def test_an_error_is_one_class_wherever_it_is_imported_from():

@@ -46,7 +46,7 @@ def instrument(tmp_path: Path) -> Instrument:
 
 @pytest.fixture
 def gpio_rig(instrument: Instrument, tmp_path: Path) -> Instrument:
-    """With SYNC_IN on a GPIO line of the stand-in chip (simulators/polysight_simulators/gpio) at `tmp_path / "chip"`."""
+    """With SYNC_IN on a GPIO line of the stand-in chip (polysight_simulators/gpio) at `tmp_path / "chip"`."""
     rig = timed_by_the_program(instrument)
     return msgspec.structs.replace(rig, pi=msgspec.structs.replace(rig.pi, gpio_chip=str(tmp_path / "chip")))
 

@@ -15,11 +15,12 @@ from polysight.acquisition.control import StopRequest
 from polysight.acquisition.pi_client import MOVING, PiClient
 from polysight.acquisition.take import ON_REQUEST
 from polysight.store import Fact
-from polysight_shared.config import Instrument, Stage
+from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError
 from polysight_shared.faults import PiFault, explain
 from polysight_shared.messages import HelloReply, StatusReply
+from polysight_shared.raster import Stage
 from polysight_shared.stage_line import HOMING_TIMEOUT_S
 
 _HOMING_TIMEOUT_S = HOMING_TIMEOUT_S + 30.0  # longer than the Pi's own, which reports the exact reason

@@ -7,7 +7,7 @@ from pathlib import Path
 _PACKAGE = Path(__file__).parent
 _REPOSITORY = _PACKAGE.parents[2]
 
-# `host/setup.py` copies the files into a wheel. Where the sources are used in place they lie at the top of the repository.
+# `host/setup.py` copies the files into a wheel. Sources used in place find them at the top of the repository.
 FOLDER = _PACKAGE if (_PACKAGE / "instrument.toml").exists() else _REPOSITORY
 
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from polysight.imaging import scan_offsets_m
-from polysight.jobs.process import all_rows, open_source
+from polysight.jobs.process import all_rows
 from polysight.pipeline import Pipeline
 from polysight.products import scan_folder_of
-from polysight.store import ScanFolder
+from polysight.store import ScanFolder, open_source
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.raster import plan_raster

@@ -68,7 +68,7 @@ def scene_m(rig: Instrument) -> tuple[float, float]:
 def range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean power over RX and positions against excess path, relative to the direct path at 0.
 
-    An echo of excess path d is `exp(+j 2 pi f d / c)` (host/polysight/sync/chain.py), so a Fourier transform along the linear
+    An echo of excess path d is `exp(+j 2 pi f d / c)` (sync/chain.py), so a Fourier transform along the linear
     samples, Hann-windowed, has it at bin `d N df / c`. Returns dB, float64 [n] as `excess_m`; all at the floor when no
     position is valid.
     """

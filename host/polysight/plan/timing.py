@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from polysight_shared.config import CARD_TAIL_S, Grid, Instrument, Stage
-from polysight_shared.raster import burst_duration_s
+from polysight_shared.config import CARD_TAIL_S, Instrument
+from polysight_shared.raster import Grid, Stage, burst_duration_s
 
 ROW_OVERHEAD_S = 0.3
 """Default standstill between rows, for storing the row, arming cards and radars, and commands.

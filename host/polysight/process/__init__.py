@@ -3,7 +3,7 @@
 A `ProcessRequest` is the command line as plain data; `Options` are the same settings with their files loaded.
 `map_rows` processes rows on several threads. For each row, `Quality` collects quality figures and `KeptSamples` stores
 the reduced samples in the scan folder, so that images can be formed again without raw data. `judge` gives the verdict
-on the result; `save_images` and `save_materials` write the products. `host/polysight/pipeline.py` calls them in this order.
+on the result; `save_images` and `save_materials` write the products. `polysight/pipeline.py` calls them in this order.
 """
 
 from polysight.process.judge import judge

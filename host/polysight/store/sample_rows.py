@@ -1,6 +1,6 @@
 """Rows of kept samples on disk (docs/spec/samples.md): the lines of rows.jsonl, and a check of every record.
 
-`host/polysight/process/samples.py` makes and restores the samples. This file needs nothing of the processing, so that `validate`
+`process/samples.py` makes and restores the samples. This file needs nothing of the processing, so that `validate`
 and `drop-raw` check them.
 """
 

@@ -1,7 +1,7 @@
 """A stand-in GPIO chip for one program at a time, used through the unmodified libgpiod bindings.
 
 A preloaded library (`gpioshim.c`: system calls, `lines.c`: lines, `spidev.c`: SPI controller) replaces the system calls
-on the GPIO character device and on spidev; the lines are connected to the simulated wires (shared/polysight_shared/wires.py). It is
+on the GPIO character device and on spidev; the lines are connected to the simulated wires (`wires` of shared). It is
 compiled on demand; :func:`missing` lists the packages needed.
 """
 

@@ -8,9 +8,10 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from polysight_shared.config import Burst, Grid, Image, Instrument, Stage
+from polysight_shared.config import Image, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
+from polysight_shared.raster import Burst, Grid, Stage
 from polysight_shared.tables import decode, read_toml, to_builtins
 from polysight_simulators.scene.draws import stream_key
 

@@ -14,9 +14,9 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from polysight_shared.config import Board, Grid, Instrument
+from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import Vector, incidence_deg, specular_midpoint_m
-from polysight_shared.raster import RasterPlan, Row, check_burst_fits, mean_burst_travel_mm, plan_raster
+from polysight_shared.raster import Grid, RasterPlan, Row, check_burst_fits, mean_burst_travel_mm, plan_raster
 from polysight_shared.tables import to_builtins
 from polysight_simulators.scene.draws import stream_key
 from polysight_simulators.scene.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions

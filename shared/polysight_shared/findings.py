@@ -1,0 +1,58 @@
+"""One type for everything that is reported to people: results of checks, reasons of a verdict, warnings of a plan."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import PolysightError
+
+Level = Literal["ok", "note", "warning", "error"]
+"""`ok`: checked and right. `note`: worth knowing. `warning`: usable with care. `error`: does not work, or no result."""
+LEVELS: tuple[Level, ...] = ("ok", "note", "warning", "error")
+"""From harmless to grave."""
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """What was found, why it matters and what to do: one plain sentence each, without a full stop.
+
+    Attributes
+    ----------
+    level
+        How grave it is.
+    what, why, do
+        What was found, with the value and its unit; the likely cause; the remedy. `why` and `do` may be empty.
+    where
+        What it is about: a check, hop, board, file, row or patch; "" for the whole.
+    code
+        Kind of fault, for programs.
+    weight
+        Findings of one level are listed by falling weight.
+    facts
+        Numbers behind it, for programs.
+    """
+
+    level: Level
+    what: str
+    why: str = ""
+    do: str = ""
+    where: str = ""
+    code: ErrorCode = ErrorCode.OTHER
+    weight: float = 1.0
+    facts: dict[str, Any] = {}
+
+    @classmethod
+    def of_error(cls, error: PolysightError, level: Level = "error", where: str = "") -> Finding:
+        """Return the finding that tells an error."""
+        return cls(level, error.what, error.why, error.remedy, where, error.code)
+
+    def __str__(self) -> str:
+        place = f"{self.where}: " if self.where else ""
+        lines = [f"{self.level}: {place}{self.what}"]
+        if self.why:
+            lines.append(f"why: {self.why}")
+        if self.do:
+            lines.append(f"do: {self.do}")
+        return "\n  ".join(lines)

@@ -360,7 +360,7 @@ def test_importing_polysight_imports_nothing_else():
         "import sys\nfor name in ('numpy', 'xarray', 'msgspec', 'scipy', 'matplotlib'): sys.modules[name] = None\n"
         "import polysight\nassert polysight.__version__\n"
         "assert {'open_scan', 'fresnel', 'backproject'} <= set(dir(polysight))\n"
-        "assert not [m for m in sys.modules if m.startswith('polysight')]\n"
+        "assert not [m for m in sys.modules if m.startswith('polysight.')]\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

@@ -1,6 +1,7 @@
 """Many scans at once: each on its own, finished ones passed over, a failing one alone, a table at the end."""
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -10,6 +11,7 @@ import pytest
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 from tests.support.scenes import scene_of
+from tests.support.store.plain_scan import write_scan
 
 from polysight.cli.main import main
 from polysight.jobs import batch as many
@@ -17,6 +19,7 @@ from polysight.jobs.batch import Outcome, at_once, finished, jobs_of, memory_byt
 from polysight.process import cores
 from polysight.process.request import ProcessRequest
 from polysight.products.files import FINISHED
+from polysight.store import ScanFolder, drop
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.scene import decode_scene, simulate
 
@@ -125,18 +128,60 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
     assert finished(job())
     for change in ({"metal_box_mm": (0.0, 0.0, 1.0, 1.0)}, {"library": None}, {"config": None}):
         assert not finished(job(**change)), change
-    for path in (library, rig, folder / "0_0.bin"):
+    (folder / "RH").mkdir()
+    for path in (library, rig, folder / "RH" / "0_0.bin"):
         before = path.read_bytes() if path.exists() else b""
         path.write_bytes(b"2")
         assert not finished(job()), path
         path.write_bytes(before)
-    (folder / "0_0.bin").unlink()
+    (folder / "RH" / "0_0.bin").unlink()
     assert finished(job())
     (tmp_path / "out" / "a" / "image.npz").unlink()
     assert not finished(job())
     process_many([job()], tmp_path / "out", 1, again=True)
     (tmp_path / "out" / "a" / FINISHED).write_text("[1]")
     assert not finished(job())
+
+
+@pytest.mark.usefixtures("worker")
+def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothing_else(tmp_path):
+    """Notes, programs of the page, exports and labels are no data; manifest, rows, calibration and truth are."""
+    folder = write_scan(tmp_path / "in" / "scan")
+    kept = folder / "samples" / "RH.npy"
+    process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
+
+    def is_finished():
+        return finished(jobs(tmp_path / "in", "scan")[0])
+
+    no_data = ("operator.json", "program/process.log", "export/image.nc", "labels.json", "control/request.json")
+    for name in (*no_data, "products/report.html", "samples/RH.npy", "raw/RH/0004.part"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("new")
+        assert is_finished(), name
+    for name in ("manifest.jsonl", "raw/RH/0000.bin", "raw/RV/0001.idx", "truth.json"):
+        file = folder / name
+        file.parent.mkdir(exist_ok=True)
+        before = file.read_bytes() if file.exists() else None
+        times = file.stat().st_mtime_ns if file.exists() else 0
+        with file.open("a") as appended:
+            appended.write("\n")
+        assert not is_finished(), name
+        if before is None:
+            file.unlink()
+        else:
+            file.write_bytes(before)
+            os.utime(file, ns=(times, times))
+        assert is_finished(), name
+    drop(ScanFolder.load(folder), raw_digests(folder), tmp_path / "out" / "scan")
+    process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
+    assert is_finished()
+    kept.write_text("other samples")
+    assert not is_finished()  # they are all that is left
+
+
+def raw_digests(folder):
+    committed = ScanFolder.load(folder).committed()
+    return {name: {row: at.boards[name].crc32 for row, at in committed.items()} for name in ("RH", "RV")}
 
 
 @pytest.mark.usefixtures("worker")

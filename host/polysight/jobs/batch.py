@@ -22,9 +22,11 @@ from typing import Any, Literal
 
 import msgspec
 
+from polysight.calibration import calibration_of_scan
+from polysight.materials import TRUTH
 from polysight.process import ProcessRequest, cores
 from polysight.products import FINISHED, SavedProducts, write_json
-from polysight.store import COLLECTION, MANIFEST, ScanFolder, is_source, versions
+from polysight.store import COLLECTION, MANIFEST, SAMPLES, ScanFolder, dropped_rows, is_source, open_source, versions
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, PolysightError
 from polysight_shared.files import read_json
@@ -103,26 +105,46 @@ def jobs_of(requests: Sequence[ProcessRequest]) -> list[Job]:
 
 
 PRODUCTS_VERSION = 4  # counts changes of what products of the same data hold
-NOT_DATA = ("samples", "products", ".products.new", ".products.old", "products-export", "control")  # folders of a scan
+_OWN_FILES = (MANIFEST, TRUTH, "raw/*/*.bin", "raw/*/*.idx")
+_PUBLISHED_FILES = ("*_cfg.json", TRUTH, "*/*.bin", "*/*_log.csv", "*_synced.npy")
 
 
 def made_with(request: ProcessRequest) -> dict[str, Any]:
     """Return the dependencies of products: releases, options (files by digest), data files by size and time."""
-    data = Path(request.data)
-    choices = {**request.choices(), **{name: _digest(path) for name, path in request.paths().items()}}
-    files = sorted(p for p in data.rglob("*") if p.is_file() and p.relative_to(data).parts[0] not in NOT_DATA)
-    listing = [f"{p.relative_to(data)} {s.st_size} {s.st_mtime_ns}" for p in files for s in (p.stat(),)]
-    digest = hashlib.sha256("\n".join(listing).encode()).hexdigest()
-    return {"versions": versions(), "products": PRODUCTS_VERSION, "options": choices, "data": digest}
+    config = None if request.config is None else Path(request.config)
+    options = request.choices()
+    for name, path in request.paths().items():
+        is_file = path.is_file()
+        options[name] = hashlib.sha256(path.read_bytes()).hexdigest() if is_file else _digest_scan(path, config)
+    data = _digest_scan(Path(request.data), config)
+    return {"versions": versions(), "products": PRODUCTS_VERSION, "options": options, "data": data}
 
 
-def _digest(path: Path) -> Any:
-    """Digest of a file's content, or of the names, sizes and times of a folder's files."""
-    if path.is_file():
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    if path.is_dir():
-        return [f"{p.name} {p.stat().st_size} {p.stat().st_mtime_ns}" for p in sorted(path.iterdir()) if p.is_file()]
-    return str(path)
+def _digest_scan(folder: Path, config: Path | None) -> str:
+    """Digest of the sizes and times of a scan's :func:`data_files`."""
+    listing = []
+    for path in data_files(folder, config):
+        status = path.stat()
+        listing.append(f"{os.path.relpath(path, folder)} {status.st_size} {status.st_mtime_ns}")
+    return hashlib.sha256("\n".join(listing).encode()).hexdigest()
+
+
+def data_files(folder: Path, config: Path | None = None) -> list[Path]:
+    """Return the files that products of a scan are made from: manifest, rows, calibration and truth.
+
+    `config` is the rig file of scans without one. Kept samples count where raw data was dropped: elsewhere they are
+    made again from it. Notes, labels, exports, programs and products in the folder are no data.
+    """
+    patterns = _OWN_FILES if (folder / MANIFEST).exists() else _PUBLISHED_FILES
+    files: list[Path] = []
+    with suppress(PolysightError):  # the scan's own program will say what is wrong with it
+        source = open_source(folder, config, dropped=True)
+        if isinstance(source, ScanFolder) and dropped_rows(source):
+            patterns = (*patterns, f"{SAMPLES}/*")
+        files += (calibration_of_scan(source).paths or {}).values()
+    for pattern in patterns:
+        files += folder.glob(pattern)
+    return sorted({file for file in files if file.is_file()})
 
 
 def finished(job: Job) -> bool:

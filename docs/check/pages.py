@@ -20,7 +20,8 @@ MARKS = {
     "minutes": "takes long",
     "asks": "asks before it changes something",
 }
-"""Second word of a block's info string, which no renderer shows: how its commands are run, or why they are not."""
+"""Words of a comment above a block, `<!-- check: minutes -->`: how its commands are run, or why they are not."""
+_MARK = re.compile(r"<!-- check: ([a-z ]+) -->")
 SHELLS = ("sh", "bash", "console")
 _HTML_TARGET = re.compile(r'(?:src|href)="([^"]+)"')
 _HTML_ANCHOR = re.compile(r'(?:id|name)="([^"]+)"')
@@ -141,7 +142,10 @@ def read_page(path: Path) -> Page:
     for number, token in enumerate(tokens):
         line = token.map[0] + 1 if token.map else 0
         if token.type == "fence":
-            blocks.append(Block(line + 1, tuple(token.info.split()), token.content))
+            before = tokens[number - 1] if number else None
+            mark = _MARK.fullmatch(before.content.strip()) if before and before.type == "html_block" else None
+            words = [*token.info.split(), *(mark[1].split() if mark else ())]
+            blocks.append(Block(line + 1, tuple(words), token.content))
         elif token.type == "code_block":
             blocks.append(Block(line, (), token.content))
         for part in (token, *_inline(token)):

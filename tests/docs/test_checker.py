@@ -21,7 +21,8 @@ SOUND = """# Page
 
 Say `polysight scan`, `polysight-pi home --json`, `make demo` or `polysight` and `ls -l`.
 
-```sh rig
+<!-- check: rig -->
+```sh
 polysight scan --config instrument.toml --out scans/one   # a comment
 cat > truth.json <<'END'
 {"a": "it's"} # polysight nonsense
@@ -37,7 +38,8 @@ cd x && polysight process scans/one \\
 $ polysight validate scans/one
 scans/one: polysight nonsense is only output here
 ```
-```sh hardware
+<!-- check: hardware -->
+```sh
 ssh -t pi@host sudo -u polysight /opt/polysight/venv/bin/polysight-pi check --config /etc/polysight/instrument.toml
 make -C arduino_stage firmware; make flash PORT=/dev/ttyACM0
 systemctl status polysight-pi
@@ -72,15 +74,15 @@ def test_a_sound_page_has_no_faults(tmp_path):
         ("```\npolysight scan --fast\n```", "no option --fast"),
         ("```sh\npolysight skan\n```", "invalid choice: 'skan'"),
         ("```sh\npolysight scan --out a --fast\n```", "unrecognized arguments: --fast"),
-        ("```sh hardware\npolysight scan\n```", "--out"),
-        ("```sh minutes\ncd x && sudo -u y polysight-pi jog --dz 1\n```", "--dz"),
+        ("<!-- check: hardware -->\n```sh\npolysight scan\n```", "--out"),
+        ("<!-- check: minutes -->\n```sh\ncd x && sudo -u y polysight-pi jog --dz 1\n```", "--dz"),
         ("```console\n$ polysight validate\n```", "SCAN"),
         ("```sh\npython -m polysight_simulators.gone\n```", "no module"),
         ("```sh\npython -m polysight_simulators.stage --config a --link b --gone\n```", "--gone"),
         ("```sh\nmake reproduce WAY=1\n```", "no variable WAY"),
         ("```sh\npython -m pytest tests/gone\n```", "no path tests/gone"),
         ("```sh\npython -m pytest tests/stage --stage-portt x\n```", "no option --stage-portt"),
-        ("```sh sometimes\nls\n```", "unknown mark 'sometimes'"),
+        ("<!-- check: sometimes -->\n```sh\nls\n```", "unknown mark 'sometimes'"),
         ("```python\nfrom polysight.imaging import Gone\n```", "has no Gone"),
         ("```python\nfrom polysight.gone import a\n```", "No module named"),
         ("```python\nx = (\n```", "python block"),
@@ -91,8 +93,9 @@ def test_each_fault_is_found_with_its_line(tmp_path, text, fault):
     faults = page_faults(page(tmp_path, f"# Page\n\n{text}\n"))
     assert len(faults) == 1
     assert fault in faults[0]
-    line = 4 if text.startswith("```") and "unknown mark" not in fault else 3
-    assert faults[0].split(":")[1] in (str(line), "4")
+    line = int(faults[0].split(":")[1])
+    fence = 3 + text.startswith("<!--")
+    assert line in (fence, fence + 1)
 
 
 RUN = """# Page
@@ -107,10 +110,12 @@ echo first > made
    first
    $ touch second
    ```
-```sh hardware
+<!-- check: hardware -->
+```sh
 touch never
 ```
-```sh asks
+<!-- check: asks -->
+```sh
 touch never
 ```
 """

@@ -50,7 +50,7 @@ def _check_extra() -> None:
         raise ConfigError(
             "starlette and uvicorn are not installed",
             "the page is an extra of the host half",
-            "pip install '.[serve]', from the repository",
+            "pip install starlette uvicorn",
         )
 
 

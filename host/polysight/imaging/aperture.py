@@ -125,7 +125,7 @@ def namespace(array: Any) -> Any:
         raise ConfigError(
             f"arrays of type {type(array).__module__}.{type(array).__name__} need the package array-api-compat",
             "it is an optional dependency, for GPUs",
-            "pip install polysight[gpu], or give numpy arrays",
+            "pip install array-api-compat, or give numpy arrays",
             code=ErrorCode.PACKAGE_MISSING,
         ) from None
     return array_api_compat.array_namespace(array)

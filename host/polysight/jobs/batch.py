@@ -244,7 +244,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
         raise ConfigError(
             "Dask is not installed here",
             "it is needed for --dask alone, and not installed with the rest",
-            "pip install 'polysight[dask]' here and on the workers (in the repository: '.[dask]')",
+            "pip install distributed, here and on the workers",
             code=ErrorCode.PACKAGE_MISSING,
         ) from None
     try:

@@ -327,7 +327,7 @@ def _library() -> _Library:
         raise ConfigError(
             'radar.control = "native" needs pyftdi, which is not installed',
             "it comes with the host's extra `radar`",
-            "pip install 'polysight[radar]' (in this repository: .venv/bin/pip install -e '.[radar]')",
+            "pip install pyftdi",
             code=ErrorCode.PACKAGE_MISSING,
         ) from None
     # FtdiError and USBError are OSErrors

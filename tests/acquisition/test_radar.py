@@ -14,8 +14,7 @@ from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
 from polysight.acquisition.scan import run_scan
-from polysight.radar.backends import LINE, Endless, LineServers, radar_control
-from polysight.radar.interface import BoardState, RadarControl, RadarState
+from polysight.radar.control import LINE, BoardState, Endless, LineServers, RadarControl, RadarState, radar_control
 from polysight.store.scan_folder import ScanFolder
 from polysight_shared.config import Instrument, Radar
 from polysight_shared.error_codes import ErrorCode
@@ -115,7 +114,7 @@ def test_unknown_host_is_named():
 
 HALF_OPEN = """
 import socket, subprocess
-from polysight.radar.backends import LineServers
+from polysight.radar.control import LineServers
 from polysight_shared.errors import DeviceError
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
 listener = socket.create_server(("127.0.0.1", 5000))

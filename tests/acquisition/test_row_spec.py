@@ -11,7 +11,7 @@ from tests.support.refusals import refused
 from polysight.acquisition.row import TRANSITIONS, RowState, RowTransaction
 from polysight.capture import receiver as receiver_words
 from polysight.capture.dca1000 import Code
-from polysight.radar.interface import RadarControl, RadarState
+from polysight.radar.control import RadarControl, RadarState
 from polysight_shared import messages
 from polysight_shared.config import Radar
 from polysight_shared.error_codes import ErrorCode

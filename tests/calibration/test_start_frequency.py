@@ -9,7 +9,7 @@ from polysight.calibration.direct_signal import by_geometry, fit_start, start_of
 from polysight.calibration.files import StartFile, read_calibration
 from polysight.calibration.scans import open_raw
 from polysight.cli.main import main
-from polysight.radar.constraints import direct_if_hz
+from polysight.radar.commands import direct_if_hz
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.tables import to_builtins
 

@@ -15,9 +15,8 @@ from docs.check.pages import ROOT, read_page
 from polysight.capture import dca1000
 from polysight.capture.card import EepromSettings
 from polysight.radar import commands, events
-from polysight.radar.commands import DEVICE_CONFIGURATION, Command
+from polysight.radar.commands import DEVICE_CONFIGURATION, Command, program
 from polysight.radar.messages import Direction, Kind, SubBlock, decode
-from polysight.radar.program import program
 from polysight_shared import messages, stage_line
 from polysight_shared.config import NativeRadar, Radar, load_instrument
 

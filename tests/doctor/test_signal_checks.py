@@ -14,7 +14,7 @@ from polysight.doctor.check_capture import (
     judge_skew,
 )
 from polysight.doctor.context import CapturedFrames
-from polysight.radar.constraints import direct_if_hz
+from polysight.radar.commands import direct_if_hz
 
 
 def judged(board="RH", rig=RIG, **disturbances):

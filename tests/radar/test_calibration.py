@@ -16,7 +16,7 @@ from polysight.radar.calibration_data import (
     InitCalibrations,
     RestoreCalibration,
 )
-from polysight.radar.program import program
+from polysight.radar.commands import program
 from polysight_shared.error_codes import ErrorCode
 
 FRAMES = 4

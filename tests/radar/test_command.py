@@ -13,8 +13,8 @@ import pytest
 import tomli_w
 
 from polysight.cli.main import main
+from polysight.radar.commands import program
 from polysight.radar.messages import decode
-from polysight.radar.program import program
 from polysight_shared.tables import to_builtins
 from polysight_simulators.radars import RadarBoard, make_image
 from polysight_simulators.radars.__main__ import replay

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
 
 from polysight.radar.board import RadarBoard, State
-from polysight.radar.commands import LOW_POWER_OFF, Chirp, LdoBypass
-from polysight.radar.program import program
-from polysight.radar.spi import Link
+from polysight.radar.commands import LOW_POWER_OFF, Chirp, LdoBypass, program
+from polysight.radar.link import Link
 from polysight_shared.errors import DeviceError
 from polysight_simulators.radars import Fault, make_image
 from polysight_simulators.radars import RadarBoard as Simulated
@@ -54,7 +53,7 @@ def test_commands_are_executed_once_in_order_although_messages_are_lost(faults_o
     radar = RadarBoard("RH", BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")))
     radar.configure()
     board.executed.clear()
-    link: Link = radar._link
+    link: Link = radar.link
     result = []
     for n, faults in enumerate(faults_of_each):
         sent = (LOW_POWER_OFF, LdoBypass(), Chirp(0))[n % 3]

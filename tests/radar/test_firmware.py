@@ -11,8 +11,8 @@ from tests.support.radar.boards import BoardWords, Restarts, VirtualClock, nativ
 from tests.support.refusals import refused
 
 from polysight.radar.board import RadarBoard, State
+from polysight.radar.commands import program
 from polysight.radar.firmware import CHUNK_TIMEOUT_S, TO_RAM, check_image, file_chunks, read_image
-from polysight.radar.program import program
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_simulators.radars import Fault, make_image
@@ -320,6 +320,6 @@ def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, 
 @pytest.mark.parametrize("fault", [Fault.BAD_CRC, Fault.LOST_INTERRUPT, Fault.NACK, Fault.BAD_CHECKSUM])
 def test_a_disturbed_download_is_complete(new, clock, fault):
     radar = made(new, clock)
-    radar._words.board.inject(fault, fault)
+    radar.words.board.inject(fault, fault)
     radar.write_flash(IMAGE, ignored)
     assert new.cores.flash == DATA

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tests.support.refusals import refused
 
 from polysight.radar.board import RadarBoard, State
-from polysight.radar.program import program
+from polysight.radar.commands import program
 from polysight.radar.usb import UsbWords, read_words, set_up_spi, write_words
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.radars import UsbChip

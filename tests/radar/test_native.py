@@ -11,9 +11,8 @@ from tests.support.radar.boards import BoardWords
 from tests.support.refusals import refused
 
 from polysight.radar import board as boards
-from polysight.radar.interface import RadarState
-from polysight.radar.native import NativeRadars, radar_board
-from polysight.radar.trace import ReplayedWords, read_trace
+from polysight.radar.control import NativeRadars, RadarState, radar_board
+from polysight.radar.diagnosis import ReplayedWords, read_trace
 from polysight.store.manifest import decode_line, encode_line
 from polysight_shared.config import Instrument, NativeRadar, Radar
 from polysight_shared.error_codes import ErrorCode
@@ -254,7 +253,8 @@ def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
     files = sorted((tmp_path / "traces").iterdir())
     assert sorted(t["file"] for t in result) == [str(f) for f in files]
     assert [read_trace(f)[0]["board"] for f in files] == ["LS", "RH", "RH", "RV"]
-    assert any("error" in record for record in read_trace(files[1])[1] + read_trace(files[2])[1])
+    lines = read_trace(files[1])[1] + read_trace(files[2])[1]
+    assert any(line.error is not None for line in lines)
     # The first link's trace replays the bring-up without the board.
     replayed = ReplayedWords(files[0])
     made = radar_board(rig, "LS", replayed, replayed, None)
@@ -263,7 +263,7 @@ def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
 
 
 def test_a_full_disk_ends_a_trace_but_no_row(rig, usb, clock, tmp_path, monkeypatch):
-    monkeypatch.setattr("polysight.radar.native.new_trace", lambda *_: Path("/dev/full"))
+    monkeypatch.setattr("polysight.radar.control.new_trace", lambda *_: Path("/dev/full"))
     kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, trace_dir=str(tmp_path)))
     with NativeRadars(kept, usb.open, clock) as radars:
         assert run_row(radars, usb) == ALL_DONE

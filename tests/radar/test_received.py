@@ -13,8 +13,8 @@ from tests.support.refusals import refused
 
 from polysight.radar.commands import DEVICE_CONFIGURATION, GET_MAIN_VERSION, LOW_POWER_OFF, RF_POWER_UP
 from polysight.radar.events import BOOT_STATUS, MAIN_CPU_FAULT, MAIN_POWER_UP, decode_event
+from polysight.radar.link import Link
 from polysight.radar.messages import Direction, Kind, SubBlock, decode, decode_header
-from polysight.radar.spi import Link
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.radars.wire import frame, ones_sum
 

@@ -15,10 +15,9 @@ from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 from polysight.radar.board import RadarBoard, State
-from polysight.radar.constraints import constraints
-from polysight.radar.native import open_board
-from polysight.radar.program import program
-from polysight.radar.spi import SystemClock
+from polysight.radar.commands import constraints, program
+from polysight.radar.control import open_board
+from polysight.radar.usb import SystemClock
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.radars import RadarBoard as Simulated
 from polysight_simulators.radars import RadarSocket, make_image

@@ -11,8 +11,7 @@ from pyftdi.usbtools import UsbTools
 from tests.support.radar import usb_bus
 from tests.support.refusals import refused
 
-from polysight.radar.interface import RadarState
-from polysight.radar.native import NativeRadars
+from polysight.radar.control import NativeRadars, RadarState
 from polysight.radar.usb import open_usb
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError

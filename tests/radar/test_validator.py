@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from tests.support.radar.boards import native_rig
 from tests.support.refusals import refused
 
-from polysight.radar.constraints import constraints, direct_if_hz, require
-from polysight.radar.program import program
+from polysight.radar.commands import constraints, direct_if_hz, program, require
 from polysight_shared.config import Instrument, NativeRadar
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
@@ -144,7 +143,7 @@ def test_frame_counts(rig, frames, holds):
 
 
 def test_pulse_gap(rig, monkeypatch):
-    monkeypatch.setattr("polysight.radar.program.TRIGGER_MARGIN_US", 149.0)
+    monkeypatch.setattr("polysight.radar.commands.TRIGGER_MARGIN_US", 149.0)
     assert broken(rig) == {"pulse gap"}
 
 

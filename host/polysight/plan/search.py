@@ -34,7 +34,7 @@ _PI_KEYS = ("speed_mm_s", "accel_mm_s2")
 _STEP_MULTIPLES = (1, 2, 3, 4, 5)  # of the rig file's steps
 _MAX_DUTY = 0.95  # of a burst in the time between two points
 _MAX_TRAVEL_WAVELENGTHS = 0.5
-_MAX_FRAMES = 65535  # of a row (host/polysight/radar/constraints.py)
+_MAX_FRAMES = 65535  # of a row (host/polysight/radar/commands.py)
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def rig_lines(plan: Instrument, original: Instrument) -> str:
 
 
 def shortest_period_us(rig: Instrument) -> float:
-    """Return the shortest pulse period of the radars (host/polysight/radar/constraints.py), rounded up to 10 us."""
+    """Return the shortest pulse period of the radars (host/polysight/radar/commands.py), rounded up to 10 us."""
     return 10 * float(np.ceil((chirp_us(rig) + INTER_FRAME_US + TRIGGER_MARGIN_US) / 10))
 
 

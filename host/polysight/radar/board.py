@@ -1,30 +1,47 @@
-"""State machine of one radar board, from off to frames ended.
+"""One radar board: its steps from reset to configured (`BringUp`), then arming and frames (`RadarBoard`).
 
 A board is `ARMED` only after the radar reported that it waits for triggers, and `DONE` only after it reported the end
-of its frames. A fatal event leads to `FAULT`, which only a reset leaves. Not run on hardware yet.
+of its frames. A fatal event leads to `FAULT`, which only a reset leaves. docs/spec/mmwavelink.md ("Power-up") lists the
+errors that healthy boards report at power-up and that are ignored. Not run on hardware yet.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import Enum
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 from polysight.radar import commands as c
 from polysight.radar import events as e
-from polysight.radar.bring_up import BringUp, Step, data_of
-from polysight.radar.calibration_data import CalibrationFiles
-from polysight.radar.firmware import Image
-from polysight.radar.program import Program
-from polysight.radar.spi import Clock, Link, WordLink
+from polysight.radar.calibration_data import (
+    ALL,
+    NO_DIE,
+    RESTORED,
+    CalibrationFiles,
+    read_calibration,
+    restore_calibration,
+)
+from polysight.radar.commands import Program
+from polysight.radar.firmware import TO_FLASH, TO_RAM, Image, describe_patch, require_family, require_rom, send_image
+from polysight.radar.link import Link, NotReportedError, UnexpectedRestartError
+from polysight.radar.usb import Clock, WordLink
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, PolysightError
 
+POWER_UP_TIMEOUT_S = 5.0
+_CALIBRATION_TIMEOUT_S = 5.0
+_BOOT_TIMEOUT_S = 5.0
+_RESET_S = 0.1
 _READY_TIMEOUT_S = 1.0
 _MAX_EVENTS = 1000
 _SENSORS = ("rx1", "rx2", "rx3", "rx4", "tx1", "tx2", "tx3", "pm", "digital")
+_FIRMWARE = (
+    "set radar.firmware to TI's image, or write it once: `polysight radar firmware` (docs/how-to/radar-bring-up.md)"
+)
+_JUMPERS = "SOP0 set, SOP1 and SOP2 open; see docs/how-to/radar-bring-up.md"
 
 
 class State(Enum):
@@ -38,6 +55,323 @@ class State(Enum):
     RUNNING = "pulses have begun"
     DONE = "frames ended"
     FAULT = "has failed, needs a reset"
+
+
+class Step(NamedTuple):
+    """One step. `run` executes it and returns its outcome; it raises DeviceError or ConfigError."""
+
+    name: str
+    expected: str
+    remedy: str
+    run: Callable[[], str]
+    state_after: State
+
+
+class BringUp:
+    """One bring-up of a board: its steps, and what they report. Results go to the board's `facts`."""
+
+    def __init__(self, board: RadarBoard) -> None:
+        self._board = board
+        self._link = board.link
+        # Errors that healthy boards report, too.
+        self._ignored: list[str] = []
+        self._cure = ""
+        self._flash_patch = ""
+        self._damage = ""
+        self._from_flash = False
+
+    def steps(self) -> list[Step]:
+        """Return the steps in order: both cores run, the RF core is calibrated, chirp and data path are configured."""
+        program = self._board.program
+        waits = "the main core's power-up event within a second"
+        in_place = "the image is in RAM, or already in the flash"
+        basic = f"{len(program.basic)} acknowledgements"
+        calibrated = "every calibration that the board needs passed"
+        waveform = f"{len(program.waveform)} acknowledgements"
+        exchange = "exchange the boards, or correct die_id"
+        return [
+            Step("reset", waits, f"power, reset, {_JUMPERS}", self._reset, State.OFF),
+            Step("firmware", in_place, _FIRMWARE, self._load_firmware, State.OFF),
+            Step(
+                "RF power-up",
+                "the RF core's power-up event",
+                "reset; power-cycle the board",
+                self._rf_up,
+                State.POWERED,
+            ),
+            Step("versions", "both cores with a patch", _FIRMWARE, self._check_versions, State.POWERED),
+            Step("settings", basic, "compare with `plan`", partial(self._send, program.basic), State.POWERED),
+            Step("RF init", calibrated, "clock, RF supplies; power-cycle it", self._rf_init, State.RF_READY),
+            Step("chirp", waveform, "compare with `plan`", partial(self._send, program.waveform), State.RF_READY),
+            Step("die id", "the board of the rig file", exchange, self._check_die, State.CONFIGURED),
+        ]
+
+    def with_ignored(self, error: DeviceError) -> DeviceError:
+        """Return the error with the ignored errors of this bring-up added to its cause."""
+        if not self._ignored:
+            return error
+        ignored = "; ".join(dict.fromkeys(self._ignored))
+        return DeviceError(error.what, f"{error.why}; earlier reports: {ignored}", error.remedy, code=error.code)
+
+    def write_flash(self, image: Image, progress: Callable[[int, int], None]) -> str:
+        """Write an image to the flash, start the board from it, and verify it, from any state of the board.
+
+        Raises DeviceError or ConfigError if a part is refused, or the board does not start from its flash afterwards.
+        """
+        self._reset()
+        before = self._same_rom(image)
+        send_image(self._link, self._board.name, image, TO_FLASH, progress)
+        self._ignored.clear()
+        self._reset()
+        if self._cure == "firmware":
+            raise DeviceError(
+                f"{self._board.name}: starts, but not from its flash: {'; '.join(self._ignored)}",
+                "the flash does not contain the image: a power failure during the download, or a worn flash",
+                "download it again; until then radar.firmware starts the board from RAM",
+                code=ErrorCode.RADAR_NO_FIRMWARE,
+            )
+        after = self._main_patch()
+        self._verify(after, before, image)
+        self._refuse_damaged()
+        if self._board.die_id:  # only readable after the RF power-up
+            self._rf_up()
+            self._read_die()
+        return f"main core's patch {after} from flash (before: {before})"
+
+    def _reset(self) -> str:
+        self._board.words.reset(held=True)
+        self._board.clock.sleep(_RESET_S)
+        self._link.restart()
+        self._board.words.reset(held=False)
+        try:
+            up = self._link.wait_for((e.MAIN_POWER_UP,), POWER_UP_TIMEOUT_S, self.note)
+        except NotReportedError as error:
+            raise NotReportedError(
+                error.what,
+                f"no power on the radar board, jumpers not in functional mode ({_JUMPERS}), or {error.why}",
+                f"check the 5 V supply of the radar board, the jumpers, then the reset; {error.remedy}",
+                code=error.code,
+            ) from None
+        self._boot_status(up)
+        return str(up)
+
+    def _boot_status(self, event: e.Event) -> None:
+        self._board.facts["boot"] = dict(event.values)
+        self._cure = str(event.values.get("cure", ""))
+        if event.detail:
+            self._ignored.append(str(event))
+        if self._cure == "hardware":
+            self._damage = str(event)
+
+    def _refuse_damaged(self) -> None:
+        """Raise DeviceError if the board reported a hardware fault at any start of this bring-up."""
+        if self._damage:
+            raise fault_error(
+                self._board.name, self._damage, "the start-up self-test of the device failed", "replace the board"
+            )
+
+    def _load_firmware(self) -> str:
+        if self._board.firmware is not None:
+            outcome = self._load_into_ram(self._board.firmware)
+        elif self._cure == "firmware":
+            outcome = "the flash is empty or damaged, and radar.firmware is not set"
+        else:
+            outcome = "none configured"
+        self._refuse_damaged()
+        return outcome
+
+    def _load_into_ram(self, image: Image) -> str:
+        self._flash_patch = patch = self._same_rom(image)
+        if patch == image.patches[0] and self._cure != "firmware":
+            self._from_flash = True
+            return f"the flash already contains the main core's patch {patch}; nothing is sent"
+        send_image(self._link, self._board.name, image, TO_RAM)
+        self._boot_from_ram(image)
+        return f"{image.name} in RAM"
+
+    def _boot_from_ram(self, image: Image) -> None:
+        try:
+            booted = self._booted()
+        except NotReportedError as error:
+            self._ignored.append(f"no event 0x{e.BOOT_STATUS:04X} after the download")
+            self._board.log_event(error.what)
+            return
+        self._ignored.clear()
+        self._boot_status(booted)
+        if self._cure == "firmware":
+            raise DeviceError(
+                f"{self._board.name}: refuses {image.name}: {booted}",
+                "an image for another device",
+                "use TI's image for AWR2243",
+                code=ErrorCode.REFUSED_BY_PEER,
+            )
+
+    def _booted(self) -> e.Event:
+        """Wait for the event at the end of a download to RAM (ICD 6.1); a power-up event alone is another start."""
+        self._link.may_start = True
+        event = self._link.wait_for((e.BOOT_STATUS, e.MAIN_POWER_UP), _BOOT_TIMEOUT_S, self.note)
+        if event.id == e.BOOT_STATUS:
+            self._link.may_start = False
+            return event
+        try:
+            return self._link.wait_for((e.BOOT_STATUS,), _BOOT_TIMEOUT_S, self.note)
+        except NotReportedError:
+            raise UnexpectedRestartError(self._board.name) from None
+
+    def _same_rom(self, image: Image) -> str:
+        """Return the main core's patch. Raises ConfigError if the image is for another ROM."""
+        answer = self._board.ask(c.GET_MAIN_VERSION, 16)
+        require_rom(self._board.name, answer, image)
+        return _patch(answer)
+
+    def _main_patch(self) -> str:
+        return _patch(self._board.ask(c.GET_MAIN_VERSION, 16))
+
+    def _verify(self, patch: str, before: str, image: Image) -> None:
+        """Raise DeviceError if the patch is still the old one; warn if it is not the file's.
+
+        Its place in the file is not documented by TI, so the latter is no error.
+        """
+        what = f"{self._board.name}: reports patch {patch} after the download, {image.name} contains {image.patches[0]}"
+        if patch == image.patches[0]:
+            return
+        if patch in (before, _NO_PATCH):
+            raise DeviceError(
+                what,
+                "it did not start from the download",
+                "power-cycle the board, then `polysight radar check`",
+                code=ErrorCode.MISMATCH,
+            )
+        self._link.warnings.append(what)
+
+    def _verify_rf(self, patch: str, image: Image) -> None:
+        """Warn if the RF core's patch, which is known only when that core runs, is not the file's."""
+        if patch != image.patches[1]:
+            update = f"`polysight radar firmware {self._board.name} {image.name} --flash` writes both cores"
+            self._link.warnings.append(
+                f"{self._board.name}: its RF core reports patch {patch}, {image.name} contains {image.patches[1]}"
+                + (f": it runs from the flash; {update}" if self._from_flash else "")
+            )
+
+    def _rf_up(self) -> str:
+        self._link.call(c.DEVICE_CONFIGURATION)
+        self._link.call(c.RF_POWER_UP)
+        up = self._link.wait_for((e.RF_POWER_UP_DONE,), POWER_UP_TIMEOUT_S, self.note)
+        self._board.facts["rf_tests_passed"] = up.values.get("tests_passed", 0)
+        if up.detail:
+            self._ignored.append(str(up))
+        return str(up)
+
+    def _check_versions(self) -> str:
+        for core, key, question in (
+            ("RF", "rf_firmware", c.GET_RF_VERSION),
+            ("main", "main_firmware", c.GET_MAIN_VERSION),
+        ):
+            v = self._board.ask(question, 16)
+            hardware, release, patch = v[:3], v[3:7], (*v[10:12], v[15] >> 4, v[15] & 15)
+            self._board.facts[key] = ".".join(map(str, release)) + " patch " + ".".join(map(str, patch))
+            self._board.facts["hardware"] = ".".join(map(str, hardware))
+            require_family(self._board.name, core, v)
+            if not any(patch):
+                raise DeviceError(
+                    f"{self._board.name}: its {key.replace('_', ' ')} has no patch (version {self._board.facts[key]})",
+                    "the flash of this board contains no firmware, and none was downloaded",
+                    _FIRMWARE,
+                    code=ErrorCode.RADAR_NO_FIRMWARE,
+                )
+            if self._board.firmware is not None and core == "RF":
+                self._verify_rf(_patch(v), self._board.firmware)
+            elif self._board.firmware is not None:
+                self._verify(_patch(v), self._flash_patch, self._board.firmware)
+        if self._board.die_id:
+            self._read_die()  # before the RF part of a wrong board is powered
+        return f"RF {self._board.facts['rf_firmware']}, main {self._board.facts['main_firmware']}"
+
+    def _send(self, commands: Sequence[c.Command]) -> str:
+        for command in commands:
+            self._link.call(command)
+        return "acknowledged"
+
+    def _rf_init(self) -> str:
+        die = ""
+        saved = None
+        restored = ""
+        if self._board.calibration is not None:
+            die = self._read_die()
+            if die == NO_DIE:
+                self._link.warnings.append(f"{self._board.name}: its die id is 0, so its calibration is not saved")
+            else:
+                saved = self._board.calibration.load(die)
+        if saved is not None:
+            restored = "; " + restore_calibration(
+                self._link, self._board.name, saved, _CALIBRATION_TIMEOUT_S, self.note
+            )
+        self._link.call(c.RF_INIT)
+        event = self._link.wait_for((e.RF_INIT_DONE,), _CALIBRATION_TIMEOUT_S, self.note)
+        self._board.facts["calibration"] = dict(event.values)
+        asked = ALL & ~RESTORED if restored else ALL
+        if failed := e.failed_calibrations(event, self._board.program.transmits, asked):
+            raise DeviceError(
+                f"{self._board.name}: RF init failed: {', '.join(failed)} ({event})",
+                "no reference clock, an RF supply out of range, or a damaged RF part",
+                "measure the RF supplies; power-cycle the board; replace it if the fault remains",
+                code=ErrorCode.RADAR_FAULT,
+            )
+        if self._board.calibration is not None and saved is None and die != NO_DIE:
+            self._board.calibration.save(die, read_calibration(self._link, self._board.name))
+        self._board.facts["calibration_restored"] = bool(restored)
+        return str(event) + restored
+
+    def _check_die(self) -> str:
+        die = self._read_die()
+        for event in self._link.poll():
+            self.note(event)
+        return die
+
+    def _read_die(self) -> str:
+        try:
+            data = self._board.ask(c.GET_DIE_ID, 16)
+        except DeviceError as error:
+            if self._board.die_id or error.code is not ErrorCode.REFUSED_BY_PEER:
+                raise
+            self._board.log_event(error.what)  # a firmware without this command
+            return "unknown"
+        die = "-".join(f"{word:08x}" for word in struct.unpack_from("<4I", data))
+        self._board.facts["die_id"] = die
+        if self._board.die_id and die != self._board.die_id:
+            raise DeviceError(
+                f"{self._board.name}: this board has die id {die}, the rig file {self._board.die_id}",
+                "two boards or their USB cables were exchanged",
+                f"exchange them again, or correct radar.native.{self._board.name}.die_id",
+                code=ErrorCode.MISMATCH,
+            )
+        return die
+
+    def note(self, event: e.Event) -> None:
+        """Log an event. Raises DeviceError for a fatal one, except the main core fault that healthy boards report."""
+        self._board.log_event(str(event))
+        if event.id == e.MAIN_CPU_FAULT:
+            if event.fatal:
+                self._ignored.append(str(event))
+        elif event.fatal:
+            raise fault_error(self._board.name, str(event))
+
+
+def fault_error(
+    name: str,
+    what: str,
+    why: str = "the radar stopped with a fault",
+    remedy: str = "the retake of the row resets it",
+) -> DeviceError:
+    """Return the error of a board that reported a fault."""
+    return DeviceError(f"{name}: {what}", why, remedy, code=ErrorCode.RADAR_FAULT)
+
+
+_NO_PATCH = describe_patch(0, 0, 0, 0)
+
+
+def _patch(version: bytes) -> str:
+    return describe_patch(version[10], version[11], version[15] >> 4, version[15] & 15)
 
 
 class RadarBoard:
@@ -72,11 +406,17 @@ class RadarBoard:
         die_id: str = "",
         calibration: CalibrationFiles | None = None,
     ) -> None:
-        self.name, self._words, self._clock, self._program = name, words, clock, program
-        self._firmware, self._die_id, self._calibration = firmware, die_id, calibration
+        self.name = name
+        self.words = words
+        self.clock = clock
+        self.program = program
+        self.firmware = firmware
+        self.die_id = die_id
+        self.calibration = calibration
         self._sent: list[bytes] = []
-        self._link = Link(name, words, clock, self._sent.append)
-        self._state, self._frames = State.OFF, 0
+        self.link = Link(name, words, clock, self._sent.append)
+        self._state = State.OFF
+        self._frames = 0
         self.reason = ""
         self.facts: dict[str, object] = {}
         self.steps: list[Step] = []
@@ -91,7 +431,7 @@ class RadarBoard:
     @property
     def warnings(self) -> list[str]:
         """Errors of the link that a retry corrected, since the last report."""
-        return self._link.warnings[:]
+        return self.link.warnings[:]
 
     def configure(self, on_step: Callable[[Step, str], None] | None = None) -> None:
         """Reset and configure the board, from any state; call `on_step` with each step and its outcome.
@@ -100,21 +440,15 @@ class RadarBoard:
         """
         with self._fault_on_error():
             up = self._begin()
-            stages = (
-                (up.power_steps(), State.POWERED),
-                (up.rf_steps(), State.RF_READY),
-                (up.waveform_steps(), State.CONFIGURED),
-            )
-            self.steps = [step for steps, _ in stages for step in steps]
-            for steps, state in stages:
-                for step in steps:
-                    try:
-                        outcome = step.run()
-                    except DeviceError as error:
-                        raise up.with_ignored(error) from None
-                    if on_step is not None:
-                        on_step(step, outcome)
-                self._state = state
+            self.steps = up.steps()
+            for step in self.steps:
+                try:
+                    outcome = step.run()
+                except DeviceError as error:
+                    raise up.with_ignored(error) from None
+                if on_step is not None:
+                    on_step(step, outcome)
+                self._state = step.state_after
 
     def write_flash(self, image: Image, progress: Callable[[int, int], None]) -> str:
         """Write firmware to the board's flash, start from it and verify; return a description of the flash.
@@ -130,12 +464,11 @@ class RadarBoard:
                 raise up.with_ignored(error) from None
 
     def _begin(self) -> BringUp:
-        self._state, self.reason, self._frames = State.OFF, "", 0
+        self._state = State.OFF
+        self.reason = ""
+        self._frames = 0
         self.facts.clear()
-        return BringUp(
-            self.name, self._link, self._words, self._clock, self._program, self._firmware, self._die_id,
-            self._calibration, self.facts, self._keep,
-        )  # fmt: skip
+        return BringUp(self)
 
     def arm(self, frames: int) -> None:
         """Start `frames` frames and wait until the radar reports that it waits for their triggers.
@@ -150,18 +483,13 @@ class RadarBoard:
             if self._state in (State.ARMED, State.RUNNING):
                 self._stop()
             if self._state is State.FAULT:
-                raise DeviceError(
-                    f"{self.name}: {self.reason}",
-                    "a fatal event while it was stopped",
-                    "resume the scan",
-                    code=ErrorCode.RADAR_FAULT,
-                )
+                raise fault_error(self.name, self.reason, "a fatal event while it was stopped", "resume the scan")
             self.read_temperatures()
             if frames != self._frames:
                 self._frames = 0
                 self._set_frames(frames, c.HARDWARE_TRIGGER)
                 self._frames = frames
-            self._link.call(c.FrameControl(c.START))
+            self.link.call(c.FrameControl(c.START))
             self._wait(e.TRIGGER_READY, _READY_TIMEOUT_S)
             if self._state is State.DONE:
                 raise DeviceError(
@@ -170,42 +498,39 @@ class RadarBoard:
                     "measure SYNC_IN while no pulse is sent (docs/how-to/wiring.md); the row is retaken",
                 )
             if self._state is not State.ARMED:
-                raise DeviceError(
-                    f"{self.name}: {self.reason}",
-                    "a fatal event while it was armed",
-                    "resume the scan",
-                    code=ErrorCode.RADAR_FAULT,
-                )
+                raise fault_error(self.name, self.reason, "a fatal event while it was armed", "resume the scan")
 
     def run_one_frame(self) -> str:
         """Run one frame of a configured board with a software trigger; return its end event. Raises DeviceError."""
         with self._fault_on_error():
             self._frames = 0
             self._set_frames(1, c.SOFTWARE_TRIGGER)
-            self._link.call(c.FrameControl(c.START))
-            return str(self._wait(e.FRAME_END, _READY_TIMEOUT_S + self._program.frame_period_us * 1e-6))
+            self.link.call(c.FrameControl(c.START))
+            return str(self._wait(e.FRAME_END, _READY_TIMEOUT_S + self.program.frame_period_us * 1e-6))
 
     def _set_frames(self, frames: int, trigger: int) -> None:
-        self._sent_frames = self._program.frames(frames, trigger)
+        self._sent_frames = self.program.frames(frames, trigger)
         for command in self._sent_frames:
-            self._link.call(command)
+            self.link.call(command)
 
     def read_back(self) -> list[str]:
         """Read back profile, chirp and frame of a board that was armed; return the differences. Raises DeviceError."""
-        sent = {one.ID: one.block().data for one in (*self._program.waveform, *self._sent_frames)}
+        commands = (*self.program.waveform, *self._sent_frames)
+        sent = {command.ID: command.block().data for command in commands}
         differences = []
         for question, of in ((c.READ_PROFILE, 0x0100), (c.READ_CHIRP, 0x0101), (c.READ_FRAME, 0x0102)):
-            blocks = self._link.call(question).blocks
-            found = blocks[0].data if blocks else b""
-            if found != sent[of]:
-                differences.append(f"0x{of:04X}: sent {sent[of].hex()}, read back {found.hex()}")
+            blocks = self.link.call(question).blocks
+            read = blocks[0].data if blocks else b""
+            if read != sent[of]:
+                differences.append(f"0x{of:04X}: sent {sent[of].hex()}, read back {read.hex()}")
         return differences
 
     def reconnect(self, words: WordLink) -> None:
         """Replace a lost link; the next `arm` resets and configures the board."""
-        warnings = self._link.warnings
-        self._words, self._link = words, Link(self.name, words, self._clock, self._sent.append)
-        self._link.warnings += warnings
+        warnings = self.link.warnings
+        self.words = words
+        self.link = Link(self.name, words, self.clock, self._sent.append)
+        self.link.warnings += warnings
         self.fail("its link was reopened")
 
     def pulses_begin(self) -> None:
@@ -217,17 +542,27 @@ class RadarBoard:
         """Read the board's events and return its state; a lost link is a fault."""
         if self._state not in (State.OFF, State.FAULT):
             try:
-                for event in self._link.poll():
+                for event in self.link.poll():
                     self._on_event(event)
             except DeviceError as error:
                 self.fail(error.what)
         return self._state
 
+    def ask(self, question: c.Command, min_bytes: int) -> bytes:
+        """Return the sub-block of the answer to a question. Raises DeviceError, also if it is missing or shorter."""
+        for block in self.link.call(question).blocks:
+            if block.id == question.ID and len(block.data) >= min_bytes:
+                return block.data
+        raise DeviceError(
+            f"{self.name}: the answer to 0x{question.ID:04X} has no such data",
+            "unknown device or firmware",
+            "check the firmware",
+            code=ErrorCode.MESSAGE_INVALID,
+        )
+
     def read_temperatures(self) -> None:
         """Read the temperatures into `facts`. Raises DeviceError."""
-        answer = self._link.call(c.GET_TEMPERATURES)
-        data = data_of(self.name, answer, c.GET_TEMPERATURES, 24)
-        stamp, *degrees = struct.unpack_from("<I9h", data)
+        stamp, *degrees = struct.unpack_from("<I9h", self.ask(c.GET_TEMPERATURES, 24))
         self.facts["temperatures_c"] = dict(zip(_SENSORS, degrees, strict=True))
         self.facts["device_ms"] = stamp
 
@@ -238,13 +573,13 @@ class RadarBoard:
             **self.facts,
             "sent": [raw.hex() for raw in self._sent],
             "events": self._log[:],
-            "warnings": self._link.warnings[:],
+            "warnings": self.link.warnings[:],
         }
         if self.reason:
             report["reason"] = self.reason
         self._sent.clear()
         self._log.clear()
-        self._link.warnings.clear()
+        self.link.warnings.clear()
         return report
 
     def close(self) -> None:
@@ -255,7 +590,7 @@ class RadarBoard:
         except DeviceError:
             pass  # the link is closed in any case
         finally:
-            self._words.close()
+            self.words.close()
 
     def fail(self, reason: str) -> None:
         """Enter `FAULT`; the first reason is kept."""
@@ -265,35 +600,30 @@ class RadarBoard:
 
     def _stop(self) -> None:
         """Stop frames that wait for triggers, after one frame period, because a stop is forbidden during a frame."""
-        self._clock.sleep(self._program.frame_period_us * 1e-6)
+        self.clock.sleep(self.program.frame_period_us * 1e-6)
         self.poll()
         if self._state in (State.ARMED, State.RUNNING):
-            self._link.call(c.FrameControl(c.STOP_WHILE_WAITING))
-            self._link.wait_for((e.FRAME_END,), _READY_TIMEOUT_S, self._note)
+            self.link.call(c.FrameControl(c.STOP_WHILE_WAITING))
+            self.link.wait_for((e.FRAME_END,), _READY_TIMEOUT_S, self._note)
             self._state = State.CONFIGURED
 
     def _wait(self, event_id: int, timeout_s: float) -> e.Event:
-        return self._link.wait_for((event_id,), timeout_s, self._on_event)
+        return self.link.wait_for((event_id,), timeout_s, self._on_event)
 
     def _note(self, event: e.Event) -> None:
         """Log an event. Raises DeviceError for a fatal one."""
-        self._keep(str(event))
+        self.log_event(str(event))
         if event.fatal:
             self.fail(str(event))
-            raise DeviceError(
-                f"{self.name}: {event}",
-                "the radar stopped with a fault",
-                "the retake of the row resets it",
-                code=ErrorCode.RADAR_FAULT,
-            )
+            raise fault_error(self.name, str(event))
 
-    def _keep(self, line: str) -> None:
+    def log_event(self, line: str) -> None:
         """Log an event for the report, up to `_MAX_EVENTS`."""
         if len(self._log) < _MAX_EVENTS:
             self._log.append(line)
 
     def _on_event(self, event: e.Event) -> None:
-        self._keep(str(event))
+        self.log_event(str(event))
         if event.fatal:
             self.fail(str(event))
         elif event.id == e.FRAME_END and self._state in (State.ARMED, State.RUNNING):

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from polysight.radar import events as e
 from polysight.radar.commands import Command
-from polysight.radar.spi import Link
+from polysight.radar.link import Link
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.files import read_bounded

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polysight.radar.commands import FileChunk
+from polysight.radar.link import Link
 from polysight.radar.messages import BODY_LIMIT
-from polysight.radar.spi import Link
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.files import read_bounded
@@ -58,10 +58,6 @@ class Image:
     data: bytes
     rom: tuple[int, ...]
     patches: tuple[str, ...]
-
-    def chunks(self, to: int) -> list[tuple[FileChunk, int]]:
-        """Return the download commands, each with the number of commands after it."""
-        return file_chunks(self.data, to)
 
 
 def describe_patch(major: int, minor: int, build: int, debug: int) -> str:
@@ -161,7 +157,7 @@ def send_image(
 
     Raises DeviceError for the part that failed. The flash is then incomplete; the board still accepts a download.
     """
-    parts = image.chunks(to)
+    parts = file_chunks(image.data, to)
     progress(0, len(parts))
     for n, (part, remaining) in enumerate(parts):
         try:

@@ -1,4 +1,4 @@
-"""Word links to a board: the FT4232H of a DCA1000 over USB, or its four channels over TCP.
+"""Words between host and board: the FT4232H of a DCA1000 over USB, or its four channels over TCP.
 
 `UsbWords` translates words, interrupt, reset and sense lines to MPSSE commands on the chip's four channels. `open_usb`
 opens them by serial number or USB path with pyftdi (the extra `radar`), `open_tcp` those of a TCP server. Not run on
@@ -38,6 +38,8 @@ INTERRUPT_IDLE = 0b0001_0011
 INTERRUPT_BIT = 5
 RESET_DIRECTION, RESET_PIN, WARM_RESET_PIN = 0b1111_1001, 6, 7
 SENSE_DIRECTION, FUNCTIONAL_MODE = 0b1111_1111, 0b0001_0000  # D4 = 1, D3 = D2 = 0
+# Directions of channels A to D, and True for bit-bang mode.
+_CHANNELS = ((SPI_DIRECTION, False), (INTERRUPT_DIRECTION, False), (RESET_DIRECTION, True), (SENSE_DIRECTION, True))
 _PINS, _READ_PINS, _WRITE_BYTES, _READ_BYTES, _NOW = 0x80, 0x81, 0x11, 0x20, 0x87
 _FULL_SPEED, _NO_ADAPTIVE, _NO_THREE_PHASE, _THREE_PHASE, _DIVISOR = 0x8A, 0x97, 0x8D, 0x8C, 0x86
 _NO_LOOPBACK = 0x85
@@ -47,6 +49,54 @@ _SELECT_COMMANDS, _IDLE_COMMANDS = 2, 3
 _SLOW_GAP_S = 100e-6
 _DESELECT = bytes((_PINS, IDLE, SPI_DIRECTION)) * _IDLE_COMMANDS
 _RESET_S = 0.01
+
+
+class WordLink(Protocol):
+    """Connection to one board: 16-bit words, its host interrupt, its reset and sense lines."""
+
+    def write(self, words: Sequence[int]) -> None:
+        """Shift words out, each with its own chip select. Raises DeviceError if the link is lost."""
+        ...
+
+    def read(self, count: int) -> list[int]:
+        """Shift words in. Raises DeviceError if the link is lost."""
+        ...
+
+    def interrupt(self) -> bool:
+        """Return True if the host interrupt is high. Raises DeviceError if the link is lost."""
+        ...
+
+    def reset(self, held: bool) -> None:
+        """Hold the board in reset, or release it in functional mode (sense-on-power mode 4)."""
+        ...
+
+    def close(self) -> None:
+        """Close the connection; may be called twice."""
+        ...
+
+
+class Clock(Protocol):
+    """Clock of a link; tests use a virtual one."""
+
+    def now(self) -> float:
+        """Return the time, seconds."""
+        ...
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        ...
+
+
+class SystemClock:
+    """Monotonic clock of this machine."""
+
+    def now(self) -> float:
+        """Return the time, seconds."""
+        return time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        time.sleep(seconds)
 
 
 class Port(Protocol):
@@ -92,7 +142,7 @@ def read_words(count: int) -> bytes:
 
 
 class UsbWords:
-    """Word link (`spi.WordLink`) through the four channels of a chip.
+    """Word link through the four channels of a chip.
 
     `slow`: one word in each USB transfer, every 0.1 ms, at 1 MHz.
     """
@@ -106,7 +156,11 @@ class UsbWords:
         sleep: Callable[[float], None] = time.sleep,
         slow: bool = False,
     ) -> None:
-        self._spi, self._interrupt, self._reset, self._sense, self._sleep = spi, interrupt, reset, sense, sleep
+        self._spi = spi
+        self._interrupt = interrupt
+        self._reset = reset
+        self._sense = sense
+        self._sleep = sleep
         self._slow = slow
         self._spi.write(set_up_spi(SLOW_DIVISOR if slow else SPI_DIVISOR))
         self._interrupt.write(set_up_interrupt())
@@ -191,13 +245,14 @@ class FtdiPort:
 
     def read(self, size: int) -> bytes:
         """Receive up to `size` bytes, with a timeout of half a second. Raises DeviceError."""
-        found, deadline = bytearray(), time.monotonic() + _READ_TIMEOUT_S
+        received = bytearray()
+        deadline = time.monotonic() + _READ_TIMEOUT_S
         try:
-            while len(found) < size and time.monotonic() < deadline:
-                found += self._ftdi.read_data_bytes(size - len(found), attempt=4)
+            while len(received) < size and time.monotonic() < deadline:
+                received += self._ftdi.read_data_bytes(size - len(received), attempt=4)
         except self._library.errors as e:
             raise _usb_error(f"{self._place}: {e}", e, _PULLED) from None
-        return bytes(found)
+        return bytes(received)
 
     def close(self) -> None:
         """Close the channel, also of a lost chip; the pins keep their levels."""
@@ -243,15 +298,7 @@ def open_usb(place: str, slow: bool = False) -> UsbWords:
     chip = library.chip_at(place)
     ports: list[FtdiPort] = []
     try:
-        for interface, (direction, bit_bang) in enumerate(
-            (
-                (SPI_DIRECTION, False),
-                (INTERRUPT_DIRECTION, False),
-                (RESET_DIRECTION, True),
-                (SENSE_DIRECTION, True),
-            ),
-            start=1,
-        ):
+        for interface, (direction, bit_bang) in enumerate(_CHANNELS, start=1):
             ports.append(FtdiPort(place, chip, interface, direction, bit_bang))
         spi, interrupt, reset, sense = ports
         return UsbWords(spi, interrupt, reset, sense, slow=slow)
@@ -281,11 +328,11 @@ class _Library(NamedTuple):
             matching = [p for p, d in paths.items() if (p if by_path else self._serial(d)) == name]
         except self.errors as e:
             raise _usb_error(f"{place}: {e}", e, "libusb is missing, or the chip was unplugged") from None
-        found = f"chips at {', '.join(sorted(paths))}" if paths else "no chip on the bus"
+        on_the_bus = f"chips at {', '.join(sorted(paths))}" if paths else "no chip on the bus"
         if not matching:
             what = "at this path" if by_path else "with this serial number"
             raise DeviceError(
-                f"radar USB {place}: cannot be opened: no chip 0451:fd03 {what}; {found}",
+                f"radar USB {place}: cannot be opened: no chip 0451:fd03 {what}; {on_the_bus}",
                 "unplugged, another serial number or path, or no permission (a udev rule for 0451:fd03)",
                 _CHECK,
                 code=ErrorCode.NO_ANSWER,

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from polysight.radar.board import RadarBoard
+from polysight.radar.commands import program
 from polysight.radar.firmware import Image, check_image
-from polysight.radar.program import program
 from polysight_shared.errors import DeviceError
 from polysight_simulators.radars import Fault, make_image
 from polysight_simulators.radars import RadarBoard as Simulated

@@ -1,30 +1,101 @@
-"""The backend `native`: this host configures and arms the radars over USB.
+"""Control of radars that start a frame at each SYNC_IN pulse: the interface `RadarControl` and its three backends.
 
-After a fault a board is reset and configured again when the next row, or the retake of a row, is armed; a lost link is
-reopened. Not run on hardware yet.
+Each row calls `arm` before its cards record, and `states` during the row and at its end (docs/spec/row.md). A backend
+reports only what it knows: a board behind a control line without replies stays `UNKNOWN`, and only its data shows that
+it was armed, because an armed radar sends nothing before its first pulse.
+
+* `NativeRadars`: this host configures and arms the radars over USB. After a fault a board is reset and configured again
+  when the next row, or the retake of a row, is armed; a lost link is reopened. Not run on hardware yet.
+* `LineServers` re-arms the radars for each row over TCP: a server for each board receives the line `Retrigger` and
+  never replies. The published rig works so: a MATLAB server beside mmWave Studio configures a radar for the frames of
+  one row, and restarts it at each line. The kernel of the server's machine acknowledges the line; only the data of the
+  row shows that the server read it and that the radar started.
+* `Endless`: another program started the radars.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import fcntl
+import select
+import socket
+import struct
+import termios
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
+from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, NamedTuple
 
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.calibration_data import NO_DIE, CalibrationFiles
-from polysight.radar.constraints import constraints, direct_if_hz, require
+from polysight.radar.commands import constraints, direct_if_hz, program, require
+from polysight.radar.diagnosis import TracedWords, new_trace, traced
 from polysight.radar.firmware import Image, read_image
-from polysight.radar.interface import BoardState, RadarControl, RadarState
 from polysight.radar.messages import command, encode
-from polysight.radar.program import program
-from polysight.radar.spi import Clock, SystemClock, WordLink
-from polysight.radar.trace import TracedWords, new_trace, traced
-from polysight.radar.usb import SCHEME, open_tcp, open_usb
+from polysight.radar.usb import SCHEME, Clock, SystemClock, WordLink, open_tcp, open_usb
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
+
+
+class RadarState(Enum):
+    """Known state of one radar."""
+
+    UNKNOWN = "not reported"
+    ARMED = "waits for pulses, or sends frames"
+    DONE = "all its frames have ended"
+    FAULT = "has stopped with a fault"
+
+
+class BoardState(NamedTuple):
+    """A radar's state with a description."""
+
+    state: RadarState
+    detail: str = ""
+
+
+class RadarControl(ABC):
+    """The radars of a rig; a context manager that closes the connections."""
+
+    @abstractmethod
+    def arm(self, frames: int) -> None:
+        """Arm every board for a frame at each of the next `frames` pulses.
+
+        Afterwards `states` returns `ARMED` for boards that confirmed it. Raises DeviceError if a board or its control
+        server fails.
+        """
+
+    @abstractmethod
+    def states(self) -> dict[str, BoardState]:
+        """Return the states by board name, without waiting; boards without any information may be missing."""
+
+    def row_begins(self) -> None:  # noqa: B027 - optional
+        """Note that pulses may come from now on."""
+
+    def wait_done(self, timeout_s: float) -> list[str]:
+        """Wait after the row's last pulse; return the boards whose frames did not end within the timeout, seconds."""
+        del timeout_s
+        return []
+
+    def report(self) -> dict[str, object]:
+        """Return the radars' report for the manifest since the last call; empty if there is none."""
+        return {}
+
+    def close(self) -> None:  # noqa: B027 - optional
+        """Close the connections; may be called twice."""
+
+    def __enter__(self) -> RadarControl:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
 
 _POLL_S = 0.005
 _REOPEN_TIMEOUT_S = 5.0  # USB needs some time to find a chip again
@@ -258,3 +329,155 @@ class NativeRadars(RadarControl):
         for board in self._boards.values():
             board.close()
         self._boards = {}
+
+
+LINE = b"Retrigger\n"
+_POLL_MS = 5
+_START_SERVER = (
+    "start the control server of this board (beside mmWave Studio), or correct radar.servers in instrument.toml"
+    " (then continue the scan: `polysight resume SCAN --config instrument.toml`)"
+)
+
+
+class LineServers(RadarControl):
+    """A connection to each board's control server, kept open between rows, and reopened if its server closed it.
+
+    `servers` has the `address:port` of each board's server; `timeout_s` limits connecting, and the acknowledgement of a
+    line. Raises DeviceError if a server cannot be reached.
+    """
+
+    def __init__(self, servers: Mapping[str, str], timeout_s: float) -> None:
+        self._servers = dict(servers)
+        self._timeout_s = timeout_s
+        self._sockets: dict[str, socket.socket] = {}
+        self._reset: set[str] = set()  # boards whose server broke the connection since the last line
+        try:
+            for board in self._servers:
+                self._connect(board)
+        except DeviceError:
+            self.close()
+            raise
+
+    def arm(self, frames: int) -> None:
+        """Send the line to every server and wait for the acknowledgement of its machine. Raises DeviceError.
+
+        The number of frames is set in the server's own configuration. `states` reports connections that were reset.
+        """
+        del frames
+        self._reset.clear()
+        for board in self._servers:
+            if self._is_closed(board):
+                self._connect(board)
+            self._reset.discard(board)
+            try:
+                self._sockets[board].sendall(LINE)
+            except BlockingIOError:
+                raise DeviceError(
+                    f"{board}: its control server at {self._servers[board]} does not read its lines",
+                    "the program there hangs: the lines of many rows fill its connection",
+                    "restart it, then `polysight resume SCAN`",
+                    code=ErrorCode.NO_ANSWER,
+                ) from None
+            except ConnectionError:
+                self._reset.add(board)
+        deadline = time.monotonic() + self._timeout_s
+        for board in self._servers:
+            self._wait_taken(board, deadline)
+
+    def states(self) -> dict[str, BoardState]:
+        """Return `FAULT` for boards whose server reset the connection, otherwise `UNKNOWN` with its address."""
+        found = {}
+        for board, address in self._servers.items():
+            self._is_closed(board)
+            found[board] = (
+                BoardState(RadarState.FAULT, f"its control server at {address} reset the connection")
+                if board in self._reset
+                else BoardState(RadarState.UNKNOWN, f"re-armed through {address}, which never replies")
+            )
+        return found
+
+    def close(self) -> None:
+        """Close the connections."""
+        for connection in self._sockets.values():
+            connection.close()
+        self._sockets.clear()
+
+    def _connect(self, board: str) -> None:
+        old = self._sockets.pop(board, None)
+        if old is not None:
+            old.close()
+        address, _, port = self._servers[board].rpartition(":")
+        try:
+            connection = socket.create_connection((address, int(port)), self._timeout_s)
+        except OSError as e:
+            raise self._unreachable(board, e) from None
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        connection.setblocking(False)
+        self._sockets[board] = connection
+
+    def _is_closed(self, board: str) -> bool:
+        """Return True if the server closed or reset the connection; data that it sent is discarded."""
+        try:
+            while self._sockets[board].recv(4096):
+                pass
+        except BlockingIOError:
+            return False
+        except OSError:
+            self._reset.add(board)
+        return True
+
+    def _wait_taken(self, board: str, deadline: float) -> None:
+        """Wait until the other machine acknowledged the line, or the connection ended."""
+        connection = self._sockets[board]
+        ended = select.poll()
+        ended.register(connection, 0)  # a reset, or the end of both directions
+        while _unacknowledged(connection):
+            if ended.poll(_POLL_MS):
+                return
+            if time.monotonic() > deadline:
+                raise DeviceError(
+                    f"{board}: its control server at {self._servers[board]} did not acknowledge the line within"
+                    f" {self._timeout_s:g} s",
+                    "the connection is half-open: that machine was switched off, or the network is cut",
+                    "check that machine and the cable, then `polysight resume SCAN`",
+                    code=ErrorCode.NO_ANSWER,
+                )
+
+    def _unreachable(self, board: str, e: OSError) -> DeviceError:
+        if isinstance(e, ConnectionRefusedError):
+            reason = ": connection refused"
+            why = "that machine is running, but no server listens"
+        elif isinstance(e, TimeoutError):
+            reason = f" within {self._timeout_s:g} s"
+            why = "that machine is off, or a firewall drops the connection"
+        else:
+            reason = f": {e.strerror or e}"
+            why = "the address is wrong, or there is no route to it"
+        what = f"{board}: cannot reach its control server at {self._servers[board]}{reason}"
+        return DeviceError(what, why, _START_SERVER, code=ErrorCode.NO_ANSWER)
+
+
+def _unacknowledged(connection: socket.socket) -> int:
+    """Return the sent bytes that the other kernel has not acknowledged (SIOCOUTQ, tcp(7))."""
+    return struct.unpack("=i", fcntl.ioctl(connection, termios.TIOCOUTQ, b"\0\0\0\0"))[0]
+
+
+class Endless(RadarControl):
+    """Radars that another program started with an infinite number of frames; nothing is done for a row."""
+
+    def arm(self, frames: int) -> None:
+        """Do nothing."""
+
+    def states(self) -> dict[str, BoardState]:
+        """Return no states; they are not known."""
+        return {}
+
+
+def radar_control(instrument: Instrument) -> RadarControl:
+    """Connect to the radars of a rig with the backend of its file. Raises ConfigError, DeviceError."""
+    if instrument.radar.control == "line_server":
+        return LineServers(instrument.radar.servers, instrument.limits.command_timeout_s)
+    if instrument.radar.control == "native":
+        return NativeRadars(instrument)
+    return Endless()

@@ -8,11 +8,9 @@ device that sends events without end. Not run on hardware yet.
 from __future__ import annotations
 
 import struct
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple, Protocol
 
 from polysight.radar.commands import RF_POWER_UP, Command
 from polysight.radar.events import RESTARTED, Event, decode_event, describe_refusal
@@ -29,8 +27,10 @@ from polysight.radar.messages import (
     decode_header,
     encode,
 )
+from polysight.radar.usb import Clock, WordLink
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, ProtocolError
+from polysight_shared.findings import Finding
 
 RESPONSE_TIMEOUT_S = 1.0
 ATTEMPTS = 3
@@ -45,13 +45,6 @@ _MAX_WARNINGS = 100
 _SYNC_SEARCH_BYTES = 252
 _FLUSH_BYTES = 244  # read after an invalid header, to resynchronise with the device
 _REMEDY = "check the board's power, the 60-pin connector and the USB cable, then `polysight resume SCAN`"
-
-
-class Problem(NamedTuple):
-    """Reason for a lost message, and its likely cause."""
-
-    what: str
-    why: str
 
 
 _SILENT = "the board has no power, hangs, or its interrupt line is not connected"
@@ -74,54 +67,6 @@ class UnexpectedRestartError(DeviceError):
             "measure the 5 V of the radar board while it starts; the operation is repeated after a reset",
             code=ErrorCode.RADAR_RESTARTED,
         )
-
-
-class WordLink(Protocol):
-    """Connection to one board: 16-bit words, its host interrupt, its reset and sense lines."""
-
-    def write(self, words: Sequence[int]) -> None:
-        """Shift words out, each with its own chip select. Raises DeviceError if the link is lost."""
-        ...
-
-    def read(self, count: int) -> list[int]:
-        """Shift words in. Raises DeviceError if the link is lost."""
-        ...
-
-    def interrupt(self) -> bool:
-        """Return True if the host interrupt is high. Raises DeviceError if the link is lost."""
-        ...
-
-    def reset(self, held: bool) -> None:
-        """Hold the board in reset, or release it in functional mode (sense-on-power mode 4)."""
-        ...
-
-    def close(self) -> None:
-        """Close the connection; may be called twice."""
-        ...
-
-
-class Clock(Protocol):
-    """Clock of a link; tests use a virtual one."""
-
-    def now(self) -> float:
-        """Return the time, seconds."""
-        ...
-
-    def sleep(self, seconds: float) -> None:
-        """Wait."""
-        ...
-
-
-class SystemClock:
-    """Monotonic clock of this machine."""
-
-    def now(self) -> float:
-        """Return the time, seconds."""
-        return time.monotonic()
-
-    def sleep(self, seconds: float) -> None:
-        """Wait."""
-        time.sleep(seconds)
 
 
 class Link:
@@ -147,7 +92,10 @@ class Link:
     """
 
     def __init__(self, name: str, words: WordLink, clock: Clock, on_sent: Callable[[bytes], None]) -> None:
-        self._name, self._words, self._clock, self._on_sent = name, words, clock, on_sent
+        self._name = name
+        self._words = words
+        self._clock = clock
+        self._on_sent = on_sent
         self.sequence = 0
         self._events: deque[Event] = deque()
         self.may_start = True
@@ -164,7 +112,7 @@ class Link:
 
         Raises DeviceError if the device does not answer or refuses the command.
         """
-        problems: list[Problem] = []
+        problems: list[Finding] = []
         retry = False
         for _ in range(1 if sent is RF_POWER_UP else ATTEMPTS):
             request = command((sent.block(),), sequence=self.sequence, retry=retry, remaining=remaining)
@@ -176,7 +124,7 @@ class Link:
                 continue
             self.sequence = (self.sequence + 1) % 16
             if answer.kind is Kind.NACK:
-                problems.append(Problem("the device received a damaged message", _DISTURBED))
+                problems.append(_lost_message("the device received a damaged message", _DISTURBED))
                 retry = False
                 continue
             if problems:
@@ -218,7 +166,7 @@ class Link:
         Raises NotReportedError after the timeout, DeviceError if the link is lost.
         """
         deadline = self._clock.now() + timeout_s
-        lost: Problem | None = None
+        lost: Finding | None = None
         while True:
             lost = self._read_messages() or lost
             events = list(self._events)
@@ -239,7 +187,7 @@ class Link:
                 )
             self._clock.sleep(_INTERVAL_S)
 
-    def _read_messages(self) -> Problem | None:
+    def _read_messages(self) -> Finding | None:
         """Read pending messages, within limits, and keep their events; return the reason if one was lost."""
         deadline = self._clock.now() + MAX_POLL_S
         for _ in range(MAX_MESSAGES):
@@ -255,45 +203,45 @@ class Link:
         self._warn("it sends messages without a pause; the rest is read later")
         return None
 
-    def _await_answer(self, request: Message, timeout_s: float) -> tuple[Message | None, Problem]:
+    def _await_answer(self, request: Message, timeout_s: float) -> tuple[Message | None, Finding]:
         """Return the answer to the last message, or None and the reason; keep events that arrive before it."""
         deadline = self._clock.now() + timeout_s
-        problem = Problem(f"no answer within {timeout_s:g} s", _SILENT)
+        problem = _lost_message(f"no answer within {timeout_s:g} s", _SILENT)
         parts: list[Message] = []
         while self._clock.now() <= deadline:
             if not self._words.interrupt():
                 self._clock.sleep(_INTERVAL_S)
                 continue
-            message, found = self._receive()
+            message, reason = self._receive()
             if message is None:
-                problem = found
+                problem = reason
             elif message.kind is Kind.EVENT:
                 self._keep(message)
             elif not _answers(message, request):
                 self._warn(f"late answer to an earlier message (sequence {message.sequence})")
             elif parts and message.remaining_chunks != parts[-1].remaining_chunks - 1:
-                return None, Problem("parts of the answer are missing", _DISTURBED)
+                return None, _lost_message("parts of the answer are missing", _DISTURBED)
             else:
                 parts.append(message)
                 if message.remaining_chunks == 0:
                     return _joined(parts), problem
-        return None, Problem("parts of the answer are missing", _DISTURBED) if parts else problem
+        return None, _lost_message("parts of the answer are missing", _DISTURBED) if parts else problem
 
-    def _receive(self) -> tuple[Message | None, Problem]:
+    def _receive(self) -> tuple[Message | None, Finding]:
         """Read one message while the interrupt is high; return None and the reason if it cannot be read."""
         self._clock.sleep(SETTLE_S)
         self._write(READY_TO_READ)
         if not self._wait_for_low():
             self._write(READY_TO_READ)
             if not self._wait_for_low():
-                return None, Problem("the host interrupt stays high", _NOT_CLOCKED)
+                return None, _lost_message("the host interrupt stays high", _NOT_CLOCKED)
         self._clock.sleep(DATA_DELAY_S)
         head = self._read(SYNC_BYTES)
         searched = 0
         while head[-SYNC_BYTES:] != DEVICE_SYNC:
             if searched >= _SYNC_SEARCH_BYTES:
                 same = len(set(head)) == 1
-                return None, Problem(f"no sync word in {searched} bytes", _NO_MISO if same else _DISTURBED)
+                return None, _lost_message(f"no sync word in {searched} bytes", _NO_MISO if same else _DISTURBED)
             head += self._read(2)
             searched += 2
         head = head[-SYNC_BYTES:] + self._read(HEADER_BYTES)
@@ -301,12 +249,12 @@ class Link:
             header = decode_header(head)
         except ProtocolError as e:
             self._read(_FLUSH_BYTES)
-            return None, Problem(e.what, _DISTURBED)
+            return None, _lost_message(e.what, _DISTURBED)
         body = self._read(header.body_bytes)
         try:
-            return decode(head + body), Problem("", "")
+            return decode(head + body), _lost_message("", "")
         except ProtocolError as e:
-            return None, Problem(e.what, _DISTURBED)
+            return None, _lost_message(e.what, _DISTURBED)
 
     def _wait_for_low(self) -> bool:
         deadline = self._clock.now() + _INTERRUPT_TIMEOUT_S
@@ -342,6 +290,10 @@ class Link:
             self.warnings.append(f"{self._name}: {what}")
 
 
+def _lost_message(what: str, why: str) -> Finding:
+    return Finding("warning", what, why)
+
+
 def _answers(message: Message, request: Message) -> bool:
     """Return True if a response or NACK belongs to a command, by its message id and sequence number.
 
@@ -356,8 +308,8 @@ def _answers(message: Message, request: Message) -> bool:
         return True
     if message.kind is not Kind.RESPONSE or message.direction is not back:
         return False
-    known = message.message_id == request.message_id or message.error is not None
-    return known and message.sequence == request.sequence
+    same_command = message.message_id == request.message_id or message.error is not None
+    return same_command and message.sequence == request.sequence
 
 
 def _joined(parts: Sequence[Message]) -> Message:

@@ -1,0 +1,396 @@
+"""Examine a board: check its bring-up step by step, log its traffic to a file (`TracedWords`), and replay such a file.
+
+A trace has one JSON object a line; docs/spec/mmwavelink.md ("Traces") has the format. A replay (`ReplayedWords`) stands
+for the board, so that a failure can be examined without it. Not run on hardware yet.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import struct
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import msgspec
+
+from polysight.radar.board import RadarBoard, Step
+from polysight.radar.usb import Clock, WordLink
+from polysight_shared import __version__
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DeviceError, PolysightError
+from polysight_shared.files import read_bounded
+
+JUMPERS = """\
+    SOP2      SOP1      SOP0          of the AWR2243BOOST, for control over SPI
+   [ o o ]   [ o o ]   [ o=o ]        o=o  jumper set      o o  open
+    open      open      set           (mmWave Studio needs SOP1 set too: remove it here)"""
+
+
+class Row(NamedTuple):
+    """Result of one step: success (`holds`), expected and actual outcome (`came`), remedy after a failure (`do`)."""
+
+    step: str
+    holds: bool
+    expected: str
+    came: str
+    do: str = ""
+
+
+def check_board(
+    open_words: Callable[[], WordLink],
+    make_board: Callable[[WordLink], RadarBoard],
+    transmits: bool,
+    on_row: Callable[[Row], None],
+) -> RadarBoard | None:
+    """Bring up a board from USB to one frame; stop at the first step that fails.
+
+    Parameters
+    ----------
+    open_words, make_board
+        Open the board's USB chip, and create the board with it.
+    transmits
+        True if the board transmits.
+    on_row
+        Called with the result of each step.
+
+    Returns
+    -------
+    RadarBoard or None
+        The board in its current state, for its report; None if its chip could not be opened.
+    """
+    opening = "four channels of the FT4232H on the capture card"
+    try:
+        words = open_words()
+    except PolysightError as error:
+        on_row(Row("USB", False, opening, error.what, f"{error.why}; {error.remedy}"))
+        return None
+    on_row(Row("USB", True, opening, "opened"))
+    board = make_board(words)
+    done: list[Step] = []
+
+    def on_step(step: Step, found: str) -> None:
+        done.append(step)
+        on_row(Row(step.name, True, step.expected, found))
+        if step.name == "reset":
+            on_row(_power(board))
+
+    try:
+        board.configure(on_step)
+    except PolysightError as error:
+        on_row(_failed(board.steps[len(done)] if len(done) < len(board.steps) else None, error))
+        return board
+    _frame_and_read_back(board, transmits, on_row)
+    return board
+
+
+def _frame_and_read_back(board: RadarBoard, transmits: bool, on_row: Callable[[Row], None]) -> None:
+    expected = "frame end, 1 frame" + (" (this board transmits)" if transmits else "")
+    try:
+        on_row(Row("one frame", True, expected, board.run_one_frame()))
+    except PolysightError as error:
+        on_row(Row("one frame", False, expected, error.what, f"{error.why}; {error.remedy}"))
+        return
+    expected = "profile, chirp and frame as sent"
+    try:
+        found = board.read_back()
+        remedy = (
+            "compare the fields with docs/spec/mmwavelink.md; a reserved field that differs is harmless"
+            if found
+            else ""
+        )
+        on_row(Row("read back", not found, expected, "; ".join(found) or "as sent", remedy))
+    except PolysightError as error:
+        on_row(Row("read back", False, expected, error.what, f"{error.why}; {error.remedy}"))
+
+
+def _failed(step: Step | None, error: PolysightError) -> Row:
+    name, expected, remedy = (step.name, step.expected, step.remedy) if step else ("bring-up", "", "")
+    picture = f"\n{JUMPERS}" if name == "reset" else ""
+    return Row(name, False, expected, error.what, f"{error.why}; {error.remedy or remedy}{picture}")
+
+
+def _power(board: RadarBoard) -> Row:
+    """Judge the supplies by the main core's power-up and the report of its voltage monitor."""
+    boot = board.facts.get("boot")
+    errors = boot.get("boot_errors", 0) if isinstance(boot, dict) else 0
+    monitor = bool(isinstance(errors, int) and errors >> 57 & 1)
+    found = "the main core runs; " + ("its voltage monitor reports an error" if monitor else "no error reported")
+    remedy = "measure the RF supplies (1.3 V or 1.0 V), 1.8 V and 3.3 V" if monitor else ""
+    return Row("power rails", not monitor, "the core runs, no error of the voltage monitor", found, remedy)
+
+
+FORM = 1
+INTERRUPT, RESET = "HOST_INTR", "NRST"
+MAX_BYTES = 2**26  # a scan of some thousand rows
+_MAX_S = 1e7
+
+
+class TracedWords:
+    """A word link (`spi.WordLink`) that logs its traffic.
+
+    Parameters
+    ----------
+    words, clock
+        The link, and the clock for the log.
+    file
+        Overwritten; each line is flushed at once. A full disk ends only the log, and `ended` has the reason.
+    facts
+        Content of the first line: board, place, rig, version, time.
+
+    Raises
+    ------
+    OSError
+        if the file cannot be written.
+    """
+
+    def __init__(self, words: WordLink, clock: Clock, file: Path, facts: dict[str, object]) -> None:
+        self._words, self._clock, self._began = words, clock, clock.now()
+        self._file = file.open("w", encoding="utf-8")
+        self._level: bool | None = None
+        self._looks = 0  # queries of the interrupt without a change since the last line
+        self.file, self.ended = file, ""
+        self._write({"trace": FORM, **facts})
+
+    def write(self, words: Sequence[int]) -> None:
+        """Shift words out. Raises DeviceError."""
+        self._put(out=_hex(words))
+        with self._log_errors():
+            self._words.write(words)
+
+    def read(self, count: int) -> list[int]:
+        """Shift words in. Raises DeviceError."""
+        with self._log_errors():
+            words = self._words.read(count)
+        self._put(**{"in": _hex(words)})
+        return words
+
+    def interrupt(self) -> bool:
+        """Return the host interrupt and log its changes. Raises DeviceError."""
+        with self._log_errors():
+            level = self._words.interrupt()
+        if level is self._level:
+            self._looks += 1
+        else:
+            self._level = level
+            self._put(line=INTERRUPT, level=int(level), looks=self._looks)
+        return level
+
+    def reset(self, held: bool) -> None:
+        """Set the reset line. Raises DeviceError."""
+        self._put(line=RESET, level=int(not held))
+        with self._log_errors():
+            self._words.reset(held)
+
+    def close(self) -> None:
+        """Close link and file; may be called twice."""
+        self._words.close()
+        with suppress(OSError):  # closing tries to write the rest
+            self._file.close()
+
+    @contextmanager
+    def _log_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except DeviceError as e:
+            self._put(error=e.what)
+            raise
+
+    def _put(self, **what: object) -> None:
+        self._looks = 0
+        self._write({"t": round(self._clock.now() - self._began, 6), **what})
+
+    def _write(self, line: dict[str, object]) -> None:
+        if self.ended:
+            return
+        try:
+            self._file.write(json.dumps(line) + "\n")
+            self._file.flush()
+        except OSError as e:
+            self.ended = f"ended early: {e.strerror}"
+
+
+def traced(words: WordLink, clock: Clock, file: Path, rig: Instrument, board: str) -> TracedWords:
+    """Log a board's link to `file`, whose first line has board, place, rig, version and time."""
+    place, now = rig.radar.native[board].place, round(time.time(), 3)
+    facts = {"board": board, "place": place, "rig": rig.name, "polysight": __version__, "unix_s": now}
+    return TracedWords(words, clock, file, facts)
+
+
+def new_trace(folder: Path, board: str) -> Path:
+    """Return an unused path for a new trace: BOARD-TIME.jsonl (UTC), with a number if it exists."""
+    name = f"{board}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+    ends = itertools.chain([""], (f"-{n}" for n in itertools.count(2)))
+    names = (folder / f"{name}{end}.jsonl" for end in ends)
+    return next(path for path in names if not path.exists())
+
+
+Words = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{4})*$")]
+
+
+class TraceLine(msgspec.Struct, omit_defaults=True):
+    """One line of a trace: a line's level, words written, words read, or an error, at `t` seconds."""
+
+    t: Annotated[float, msgspec.Meta(ge=0, le=_MAX_S)]
+    line: Literal["HOST_INTR", "NRST"] | None = None
+    level: Literal[0, 1] | None = None
+    looks: Annotated[int, msgspec.Meta(ge=0)] | None = None
+    out: Words | None = None
+    read: Words | None = msgspec.field(default=None, name="in")
+    error: str | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless the line has exactly one content."""
+        contents = [value for value in (self.line, self.out, self.read, self.error) if value is not None]
+        if len(contents) != 1 or (self.line is None) != (self.level is None):
+            raise ValueError("a line of a trace has one content")
+
+
+class ReplayedWords:
+    """Replay of a trace: a word link and a clock in virtual time. `facts` has the trace's first line.
+
+    The host must repeat its actions of the trace; the first difference raises a DeviceError with both.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.facts, self._lines = read_trace(file)
+        self._at = 0
+        self._time = 0.0
+        self._level = False
+        # Queries of the interrupt since the last replayed line.
+        self._looks = 0
+
+    def now(self) -> float:
+        """Return the trace's time, seconds."""
+        self._time += 1e-6
+        return self._time
+
+    def sleep(self, seconds: float) -> None:
+        """Advance the time."""
+        self._time += seconds
+
+    @property
+    def done(self) -> bool:
+        """True if the whole trace was replayed."""
+        return self._at >= len(self._lines)
+
+    def write(self, words: Sequence[int]) -> None:
+        """Compare the words with those of the trace. Raises DeviceError."""
+        written = _hex(words)
+        self._take(f"out {written}", lambda line: line.out == written)
+
+    def read(self, count: int) -> list[int]:
+        """Return the board's words in the trace. Raises DeviceError."""
+        action = f"reads {count} words"
+        words = self._take(action, lambda line: line.read is not None).read or ""
+        if len(words) != 4 * count:
+            raise self._differs(action, f"{len(words) // 4} words")
+        return list(struct.unpack(f"<{count}H", bytes.fromhex(words)))
+
+    def interrupt(self) -> bool:
+        """Return the level at this query or, if the trace does not count them, at this time. Raises DeviceError."""
+        self._looks += 1
+        while self._is_interrupt():
+            line = self._lines[self._at]
+            later = line.t > self.now() if line.looks is None else line.looks >= self._looks
+            if later:
+                break
+            self._play_level()
+            if line.looks is not None:
+                break
+        self._raise_error()
+        return self._level
+
+    def reset(self, held: bool) -> None:
+        """Compare the reset with that of the trace. Raises DeviceError."""
+        level = int(not held)
+        self._take(f"level {level}", lambda line: line.level == level)
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def _is_interrupt(self) -> bool:
+        return not self.done and self._lines[self._at].line == INTERRUPT
+
+    def _play_level(self) -> None:
+        self._level = bool(self._lines[self._at].level)
+        self._step()
+
+    def _step(self) -> TraceLine:
+        line = self._lines[self._at]
+        self._time = max(self._time, line.t)
+        self._at += 1
+        self._looks = 0
+        return line
+
+    def _raise_error(self) -> None:
+        if not self.done and self._lines[self._at].error is not None:
+            line = self._step()
+            raise DeviceError(line.error or "", "as in the trace", "see the error of the traced run")
+
+    def _take(self, action: str, agrees: Callable[[TraceLine], bool]) -> TraceLine:
+        """Return the next line without changes of the interrupt. Raises DeviceError if it is not this action."""
+        while self._is_interrupt():
+            self._play_level()
+        self._raise_error()
+        if self.done:
+            raise DeviceError("the trace ends here", "the traced run ended or was killed", "")
+        if not agrees(self._lines[self._at]):
+            raise self._differs(action, msgspec.json.encode(self._lines[self._at]).decode())
+        line = self._step()
+        self._raise_error()
+        return line
+
+    def _differs(self, now: str, then: str) -> DeviceError:
+        return DeviceError(
+            f"line {self._at + 2} of the trace: the host does {now}, the trace has {then}",
+            "another version of this program, another rig file or board, or another trace",
+            "replay it with the rig file and the version of the traced run",
+        )
+
+
+def read_trace(file: Path) -> tuple[dict[str, Any], list[TraceLine]]:
+    """Read a trace: its first line, and the others without an incomplete last one. Raises ConfigError, OSError."""
+    lines = read_bounded(file, MAX_BYTES).split(b"\n")
+    facts: dict[str, Any] | None = None
+    records: list[TraceLine] = []
+    for number, line in enumerate(lines, 1):
+        try:
+            value = msgspec.json.decode(line) if line else None
+        except (ValueError, RecursionError):
+            # The last line of a killed program is incomplete.
+            if number < len(lines):
+                raise _invalid(file, f"line {number} is not JSON") from None
+            continue
+        if facts is None:
+            if not isinstance(value, dict) or value.get("trace") != FORM:
+                raise _invalid(file, f"its first line is not that of a trace, version {FORM}")
+            facts = value
+        elif value is not None:
+            records.append(_trace_line(file, number, value))
+            if len(records) > 1 and records[-1].t < records[-2].t:
+                raise _invalid(file, f"line {number} has an earlier time than the one before")
+    if facts is None:
+        raise _invalid(file, f"its first line is not that of a trace, version {FORM}")
+    return facts, records
+
+
+def _trace_line(file: Path, number: int, value: object) -> TraceLine:
+    try:
+        return msgspec.convert(value, TraceLine)
+    except ValueError:
+        raise _invalid(file, f"line {number} is not a line of a trace") from None
+
+
+def _invalid(file: Path, what: str) -> ConfigError:
+    return ConfigError(
+        f"{file}: {what}", "another file", "give a file of `polysight radar --trace FILE`", code=ErrorCode.FILE_FOREIGN
+    )
+
+
+def _hex(words: Sequence[int]) -> str:
+    return struct.pack(f"<{len(words)}H", *words).hex()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import http.client
 import json
 import os
 import shutil
@@ -11,12 +12,12 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
 from tests.support.page.asking import TOKEN, ask, get, post
-from tests.support.page.live_view import Served, served_folder
+from tests.support.page.live_view import Served, open_control, served_folder
 from tests.support.paths import RIG_FILE
 from tests.support.products import judged_products
 
@@ -133,6 +134,25 @@ def test_of_two_starts_at_once_one_is_refused(view, scans, monkeypatch):
         thread.join()
     assert sorted(found) == [200, 409]
     assert sum((scans / name).exists() for name in ("first", "second")) == 1
+
+
+def test_open_live_views_keep_nobody_from_pausing_and_stopping(view, scans):
+    """Not those of the scan that is asked, nor of as many others as may be open."""
+    for k in range(site.MAX_WATCHES):
+        (scans / f"view{k}" / "program").mkdir(parents=True)
+    with ExitStack() as pages, open_control(scans / "one") as stop:
+        for k in range(site.MAX_WATCHES):
+            page = http.client.HTTPConnection("127.0.0.1", view.port)
+            pages.callback(page.close)
+            page.request("GET", f"/api/events?scan=view{k}")
+            assert page.getresponse().readline().startswith(b"event: ")
+        assert ask(view, "/api/state?scan=one")[0] == 409
+        assert post(view, "/api/control/pause?scan=one")[0] == 200
+        assert stop.paused
+        assert post(view, "/api/control/stop?scan=one")[0] == 200
+        assert stop.after_row
+        assert post(view, "/api/control/abort?scan=one")[0] == 200
+        assert stop.now
 
 
 def test_exports_stay_in_the_scan(view, scans, tmp_path):

@@ -15,7 +15,7 @@ from tests.support.processes import wait_for
 from tests.support.products import judged_products
 
 from polysight.catalogue import Scans, scans
-from polysight.serve import reading, site, watches
+from polysight.serve import reading, site
 from polysight_shared.error_codes import ErrorCode
 
 LIMIT_S = 0.4
@@ -108,7 +108,7 @@ def test_a_list_keeps_what_it_knew_of_a_folder_that_does_not_answer(dead, root):
 
 
 def test_a_dead_folder_stops_no_other_live_view(dead, view):
-    dead.stop(watches, "Watch")
+    dead.stop(site, "Watch")
     assert ask(view, "/api/state?scan=dead")[0] == 503
     assert get(view, "/api/state?scan=alive")["scan"] is None
 

@@ -141,14 +141,14 @@ def picture_of(
     return _picture(_numbers(values, seen, limits, colours))
 
 
-def thumbnail(pixels: Pixels) -> bytes:
-    """A small PNG of the amplitude of H."""
+def thumbnail(pixels: Pixels) -> Picture:
+    """A small picture of the amplitude of H."""
     step = max(1, -(-max(pixels.h.shape) // _THUMBNAIL))
     seen = pixels.valid & np.isfinite(pixels.h)
     level = _db(pixels.h)
     top = float(np.percentile(level[seen], 99.8)) if seen.any() else 0.0
     part = slice(None, None, step)
-    return _picture(_Values(level[part, part], seen[part, part].astype(float), (top - _RANGE_DB, top))).png
+    return _picture(_Values(level[part, part], seen[part, part].astype(float), (top - _RANGE_DB, top)))
 
 
 def _phase(channel: NDArray[np.complex64], opacity: NDArray[Any]) -> _Values:

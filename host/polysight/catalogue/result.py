@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from polysight.catalogue.pictures import MAPS
 from polysight.catalogue.pixels import Pixels
 from polysight.materials import PATCHES
@@ -24,7 +26,7 @@ from polysight_shared.errors import PolysightError
 EXPORT = "export"
 """Folder of a scan that a page has exports written into."""
 FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES)
-EXPORTS = (".h5", ".mat", ".csv", ".nc", ".cphd")
+EXPORTS = (".mat", ".csv", ".nc")
 _KEYS = (
     "label", "name", "confidence", "probabilities", "why", "metal_reference", "metal_like", "box_mm", "outline_mm",
     "pixels", "incidence_deg", "ratio", "permittivity", "refused", "box", "truth", "bands", "tilt_across_deg",
@@ -84,15 +86,23 @@ def labels_of(folder: Path, products: SavedProducts) -> dict[str, Any] | None:
     }
 
 
-def files_of(folder: Path) -> list[dict[str, Any]]:
-    """Downloadable files of a scan's products and exports: `of` (which folder), `name`, `bytes`."""
+class File(msgspec.Struct, frozen=True):
+    """A file that may be downloaded: its folder (`products` or `export`), name and size."""
+
+    of: str
+    name: str
+    bytes: int
+
+
+def files_of(folder: Path) -> list[File]:
+    """Downloadable files of a scan's products and exports."""
     products = read_products(folder).folder
-    found = []
-    for of, where in (("products", products), (EXPORT, folder / EXPORT)):
-        if where.is_symlink() or not where.is_dir():
+    files = []
+    for of, place in (("products", products), (EXPORT, folder / EXPORT)):
+        if place.is_symlink() or not place.is_dir():
             continue
-        for path in sorted(where.iterdir()):
-            wanted = path.name in FILES or path.suffix in EXPORTS
-            if wanted and path.is_file() and not path.is_symlink():
-                found.append({"of": of, "name": path.name, "bytes": path.stat().st_size})
-    return found
+        for path in sorted(place.iterdir()):
+            is_listed = path.name in FILES or path.suffix in EXPORTS
+            if is_listed and path.is_file() and not path.is_symlink():
+                files.append(File(of, path.name, path.stat().st_size))
+    return files

@@ -1,9 +1,9 @@
 """The operator's page: one web server for the catalogue, the live view and the results of scans.
 
 `serve` shows all scans under a folder; whoever holds the token starts, controls and labels them. `preview` shows one.
-Each connection has timeouts (`connections`), and each request passes the access checks of `guard`. `reading` answers
-GET requests, `control` POST requests; `site` holds their shared state. Scans and processing run as processes of their
-own (`programs`), which outlive this server. Threat model: docs/decisions/0014-operators-page.md.
+Each request passes the access checks of `guard`. `reading` answers GET requests, `control` POST requests; `site` holds
+their shared state, the live views among it. Scans and processing run as processes of their own (`programs`), which
+outlive this server. Threat model: docs/decisions/0014-operators-page.md.
 """
 
 from polysight.serve.server import Place, preview, serve

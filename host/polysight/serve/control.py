@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import tomli_w
@@ -21,22 +21,24 @@ from polysight.jobs.label import remove_labels, save_labels
 from polysight.materials import Labels
 from polysight.plan import Changes, forecast, forecast_values
 from polysight.products import find_labels, label_folder, read_products
-from polysight.serve.guard import cookie_name
-from polysight.serve.programs import Programs, program_of
+from polysight.serve.guard import BODY_BYTES, cookie_name, refused_body
+from polysight.serve.programs import program_of
 from polysight.serve.site import LIBRARIES, Site
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError, ScanError
+from polysight_shared.errors import ConfigError, DataError, ScanError
 from polysight_shared.tables import decode, to_builtins
 
 RIG = "instrument.toml"
-FORMATS = ("csv", "mat", "hdf5", "netcdf", "cphd")
-"""Formats of exports, which are written into `<scan>/export`: files; a Zarr store is a folder, for no download."""
-_LARGEST = 2000  # positions of a row, rows
+Format = Literal["csv", "mat", "netcdf"]
+"""Formats of exports, which are written into `<scan>/export`."""
+# Positions of a row, and rows.
+MAX_POSITIONS = 2000
 Text = Annotated[str, msgspec.Meta(max_length=200)]
+LongText = Annotated[str, msgspec.Meta(max_length=1000)]
 Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 Box = tuple[Number, Number, Number, Number]
-Few = Annotated[int, msgspec.Meta(ge=1, le=_LARGEST)]
+Count = Annotated[int, msgspec.Meta(ge=1, le=MAX_POSITIONS)]
 Size = Annotated[float, msgspec.Meta(gt=0, le=1e5)]
 
 
@@ -47,23 +49,30 @@ class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class PlanRequest(Body, frozen=True):
     """Numbers of the plan that differ from the rig file."""
 
-    columns: Few | None = None
-    rows: Few | None = None
+    columns: Count | None = None
+    rows: Count | None = None
     step_x_mm: Size | None = None
     step_y_mm: Size | None = None
     speed_mm_s: Size | None = None
     pulses: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None
 
-    def changes(self) -> dict[str, Any]:
-        """The numbers that are given."""
-        return {n: v for n in PlanRequest.__struct_fields__ if (v := getattr(self, n)) is not None}
+    def changes(self) -> Changes:
+        """The same as changes of a plan."""
+        return Changes(
+            columns=self.columns,
+            rows=self.rows,
+            step_x_mm=self.step_x_mm,
+            step_y_mm=self.step_y_mm,
+            speed_mm_s=self.speed_mm_s,
+            pulses=self.pulses,
+        )
 
     def apply(self, config: Path) -> Instrument:
         """The rig file with these numbers. Raises ConfigError."""
-        rig = Changes(**self.changes()).apply(load_instrument(config))
-        if max(rig.grid.columns, rig.grid.rows) > _LARGEST:
+        rig = self.changes().apply(load_instrument(config))
+        if max(rig.grid.columns, rig.grid.rows) > MAX_POSITIONS:
             raise ConfigError(
-                f"{rig.grid.columns} x {rig.grid.rows} positions", f"{_LARGEST} in a row are the most here",
+                f"{rig.grid.columns} x {rig.grid.rows} positions", f"{MAX_POSITIONS} in a row are the most here",
                 "larger steps, or a smaller area", code=ErrorCode.VALUE_INVALID,
             )  # fmt: skip
         return rig
@@ -107,7 +116,7 @@ class NotesRequest(Body, frozen=True):
     """The operator's notes and tags; they are refused if the present ones are not `base`."""
 
     notes: Annotated[str, msgspec.Meta(max_length=20_000)] = ""
-    tags: Annotated[tuple[Annotated[str, msgspec.Meta(max_length=1000)], ...], msgspec.Meta(max_length=100)] = ()
+    tags: Annotated[tuple[LongText, ...], msgspec.Meta(max_length=100)] = ()
     base: Notes | None = None
 
 
@@ -115,43 +124,52 @@ class TrainRequest(Body, frozen=True):
     """A library to make from labelled scans."""
 
     name: Annotated[str, msgspec.Meta(pattern=r"^[\w][\w .-]{0,60}$")]
-    scans: Annotated[
-        tuple[Annotated[str, msgspec.Meta(max_length=1000)], ...], msgspec.Meta(min_length=1, max_length=500)
-    ]
+    scans: Annotated[tuple[LongText, ...], msgspec.Meta(min_length=1, max_length=500)]
 
 
 class ExportRequest(Body, frozen=True):
     """Formats to write."""
 
-    formats: Annotated[tuple[str, ...], msgspec.Meta(min_length=1, max_length=len(FORMATS))]
+    formats: Annotated[tuple[Format, ...], msgspec.Meta(min_length=1)]
 
 
 Answer = Callable[[Site, Request, Any], Awaitable[dict[str, Any]]]
 Words = list[str | Path]
+STARTED = {"what": "started"}
 
 
 def control_routes(site: Site) -> list[Route]:
     """Routes of everything that POST asks for; the guard has checked the token."""
 
-    def route(path: str, kind: type[Body], answer: Answer) -> Route:
+    def make_route(path: str, kind: type[Body], answer: Answer) -> Route:
         async def endpoint(request: Request) -> Response:
-            body = _decode_body(await request.body(), kind)
-            return JSONResponse(await answer(site, request, body))
+            content = bytearray()
+            async for chunk in request.stream():
+                content += chunk
+                if len(content) > BODY_BYTES:
+                    return refused_body()
+            return JSONResponse(await answer(site, request, _decode_body(bytes(content), kind)))
 
         return Route(f"/api/{path}", endpoint, methods=["POST"])
 
+    async def open_session(request: Request) -> Response:
+        answer = JSONResponse({"what": "opened"})
+        name = cookie_name(request.scope)
+        answer.set_cookie(name, site.access.session, httponly=True, samesite="strict", secure=site.access.secure)
+        return answer
+
     return [
-        Route("/api/session", _session(site), methods=["POST"]),
-        route("control/{command}", Body, _control),
-        route("plan", PlanRequest, _plan),
-        route("doctor", Body, _doctor),
-        route("start", StartRequest, _start),
-        route("resume", ResumeRequest, _resume),
-        route("process", ProcessRequest, _process),
-        route("labels", LabelRequest, _labels),
-        route("notes", NotesRequest, _notes),
-        route("train", TrainRequest, _train),
-        route("export", ExportRequest, _export),
+        Route("/api/session", open_session, methods=["POST"]),
+        make_route("control/{command}", Body, _control),
+        make_route("plan", PlanRequest, _plan),
+        make_route("doctor", Body, _doctor),
+        make_route("start", StartRequest, _start),
+        make_route("resume", ResumeRequest, _resume),
+        make_route("process", ProcessRequest, _process),
+        make_route("labels", LabelRequest, _labels),
+        make_route("notes", NotesRequest, _notes),
+        make_route("train", TrainRequest, _train),
+        make_route("export", ExportRequest, _export),
     ]
 
 
@@ -167,32 +185,23 @@ def _decode_body(body: bytes, kind: type[Body]) -> Body:
     return decode(table, kind, "the request", "send what the page sends")
 
 
-def _session(site: Site) -> Callable[[Request], Awaitable[Response]]:
-    async def session(request: Request) -> Response:
-        answer = JSONResponse({"what": "opened"})
-        name, access = cookie_name(request.scope), site.access
-        answer.set_cookie(name, access.session, httponly=True, samesite="strict", secure=access.secure)
-        return answer
-
-    return session
-
-
 async def _control(site: Site, request: Request, body: Body) -> dict[str, Any]:
+    """Pause, continue, stop or abort: behind no read, and whatever else is open."""
     del body
-    name, given = site.name(request), request.path_params["command"]
-    if given not in list(ScanCommand):
+    name = site.name(request)
+    command = request.path_params["command"]
+    if command not in list(ScanCommand):
         raise DataError(
-            f"a scan cannot be asked to {given[:40]!r}", "the name is wrong", f"one of {', '.join(ScanCommand)}",
+            f"a scan cannot be asked to {command[:40]!r}", "the name is wrong", f"one of {', '.join(ScanCommand)}",
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
-    watch = await site.read_scan(request, lambda folder: site.watches.of(name, folder))
-    await site.act(watch.ask, ScanCommand(given))
+    await site.act(lambda: site.watches.ask(name, site.scans.folder(name), ScanCommand(command)))
     return {"what": "asked"}
 
 
 async def _plan(site: Site, request: Request, body: PlanRequest) -> dict[str, Any]:
     del request
-    config = _config(site)
+    config = site.config
     plan = await site.read("plan", lambda: forecast_values(forecast(body.apply(config))))
     rig = load_instrument(config)
     return plan | {"rig": rig.name, "config": str(config), "begun_with": to_builtins(rig)["grid"]}
@@ -200,21 +209,22 @@ async def _plan(site: Site, request: Request, body: PlanRequest) -> dict[str, An
 
 async def _doctor(site: Site, request: Request, body: Body) -> dict[str, Any]:
     del request, body
-    words: Words = ["doctor", "--config", _config(site), "--out", site.scans.root]
+    words: Words = ["doctor", "--config", site.config, "--out", site.scans.root]
 
     def start() -> None:
         with site.rig:
             _check_free(site)
             site.logs.mkdir(exist_ok=True)
-            _programs(site).start(site.logs, "doctor", words)
+            site.programs.start(site.logs, "doctor", words)
 
     await site.act(start)
-    return {"what": "started"}
+    return STARTED
 
 
 async def _start(site: Site, request: Request, body: StartRequest) -> dict[str, Any]:
     del request
-    config, programs = _config(site), _programs(site)
+    config = site.config
+    programs = site.programs
     if not body.name:
         raise ConfigError("the scan has no name", "`name` is empty", "give it one", code=ErrorCode.KEY_MISSING)
     rig = body.apply(config)
@@ -226,31 +236,35 @@ async def _start(site: Site, request: Request, body: StartRequest) -> dict[str, 
                 f"{body.name} is there already", "scans are never overwritten", "give another name",
                 code=ErrorCode.NAME_TAKEN,
             )  # fmt: skip
-        words: Words = ["scan", "--out", folder, *_material_words(site, body.library, body.metal)]
-        words += ["--keep-incomplete"] if body.keep_incomplete else []
+        words: Words = ["scan", "--out", folder, *_processing_words(site, body.library, body.metal)]
+        if body.keep_incomplete:
+            words.append("--keep-incomplete")
         with site.rig:
             _check_free(site)
-            words += ["--config", _write_rig(folder, rig) if body.changes() else config.absolute()]
+            words += ["--config", config.absolute() if body.changes() == Changes() else _write_rig(folder, rig)]
             if body.notes or body.tags:
                 folder.mkdir(parents=True, exist_ok=True)
                 write_notes(folder, Notes(body.notes, body.tags))
             programs.start(folder, "scan", words)
 
     await site.act(start)
-    return {"what": "started", "scan": body.name}
+    return STARTED | {"scan": body.name}
 
 
 def _check_free(site: Site) -> None:
-    """Refuse what needs the rig while a known program has it. Raises ScanError."""
-    running = [s.name for s in site.scans.list() if s.state in ("running", "paused") or _starting(site, s)]
+    """Refuse what needs the rig while a program that the list shows has it. Raises ScanError."""
+    running = [s.name for s in site.scans.list() if s.state in ("running", "paused") or _is_starting(site, s)]
     doctor = program_of(site.logs, "doctor")
-    if not running and (doctor is None or not doctor.running):
+    if running:
+        what = f"{running[0]} is being scanned"
+    elif doctor is not None and doctor.running:
+        what = "the doctor checks the rig"
+    else:
         return
-    what = f"{running[0]} is being scanned" if running else "the doctor checks the rig"
     raise ScanError(what, "a rig does one thing at a time", "wait until it has ended, or stop it", code=ErrorCode.BUSY)
 
 
-def _starting(site: Site, s: Summary) -> bool:
+def _is_starting(site: Site, s: Summary) -> bool:
     """True if the scan's program runs without a sign of life yet, or is processing."""
     program = program_of(site.scans.root / s.name, "scan") if s.state in ("begun", "lost") else None
     return program is not None and program.running
@@ -262,39 +276,41 @@ def _write_rig(folder: Path, rig: Instrument) -> Path:
     if path.parent.is_symlink():
         raise ConfigError(f"{path.parent} is a link", "the folder was made by another program", "give another name")
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.unlink(missing_ok=True)  # a link there would have another file written
+    # Through a link there, another file would be written.
+    path.unlink(missing_ok=True)
     path.write_text(tomli_w.dumps(to_builtins(rig)), encoding="utf-8")
     return path
 
 
 async def _resume(site: Site, request: Request, body: ResumeRequest) -> dict[str, Any]:
     def start(folder: Path) -> None:
-        words: Words = ["resume", folder.absolute(), *_material_words(site, body.library, None)]
-        words += ["--keep-incomplete"] if body.keep_incomplete else []
+        words: Words = ["resume", folder.absolute(), *_processing_words(site, body.library, None)]
+        if body.keep_incomplete:
+            words.append("--keep-incomplete")
         with site.rig:
             _check_free(site)
-            _programs(site).start(folder, "scan", words)
+            site.programs.start(folder, "scan", words)
 
     await site.read_scan(request, start)
-    return {"what": "started"}
+    return STARTED
 
 
 async def _process(site: Site, request: Request, body: ProcessRequest) -> dict[str, Any]:
     def start(folder: Path) -> None:
         words: Words = ["process", folder.absolute(), "--out", folder.absolute() / "products"]
-        words += _material_words(site, body.library, body.metal)
+        words += _processing_words(site, body.library, body.metal)
         if body.labels:
-            found = find_labels(folder)
-            if found is None:
+            labels = find_labels(folder)
+            if labels is None:
                 raise ConfigError(
                     "no boxes are drawn on this scan", "they were not saved", "draw and save them first",
                     code=ErrorCode.FILE_MISSING,
                 )  # fmt: skip
-            words.extend(["--labels", found[0].absolute()])
-        _programs(site).start(folder, "process", words)
+            words += ["--labels", labels[0].absolute()]
+        site.programs.start(folder, "process", words)
 
     await site.read_scan(request, start)
-    return {"what": "started"}
+    return STARTED
 
 
 async def _labels(site: Site, request: Request, body: LabelRequest) -> dict[str, Any]:
@@ -312,7 +328,8 @@ async def _labels(site: Site, request: Request, body: LabelRequest) -> dict[str,
 
 
 async def _notes(site: Site, request: Request, body: NotesRequest) -> dict[str, Any]:
-    written = await site.read_scan(request, write_notes, Notes(body.notes, body.tags), body.base)
+    notes = Notes(body.notes, body.tags)
+    written = await site.read_scan(request, lambda folder: write_notes(folder, notes, body.base))
     return {"what": "saved", "notes": written.notes, "tags": list(written.tags)}
 
 
@@ -322,22 +339,15 @@ async def _train(site: Site, request: Request, body: TrainRequest) -> dict[str, 
     def start() -> None:
         folders = [site.scans.folder(name).absolute() for name in body.scans]
         out = site.scans.root.absolute() / LIBRARIES
-        for folder in (out, site.logs):
-            folder.mkdir(exist_ok=True)
-        _programs(site).start(site.logs, "train", ["train", *folders, "--out", out / f"{body.name}.npz"])
+        out.mkdir(exist_ok=True)
+        site.logs.mkdir(exist_ok=True)
+        site.programs.start(site.logs, "train", ["train", *folders, "--out", out / f"{body.name}.npz"])
 
     await site.act(start)
-    return {"what": "started"}
+    return STARTED
 
 
 async def _export(site: Site, request: Request, body: ExportRequest) -> dict[str, Any]:
-    unknown = [name for name in body.formats if name not in FORMATS]
-    if unknown:
-        raise ConfigError(
-            f"no format is called {unknown[0][:20]!r}", "the name is wrong", f"one of {', '.join(FORMATS)}",
-            code=ErrorCode.VALUE_INVALID,
-        )  # fmt: skip
-
     def start(folder: Path) -> None:
         out = folder.absolute() / "export"
         if not out.resolve().is_relative_to(folder.resolve()):
@@ -345,37 +355,25 @@ async def _export(site: Site, request: Request, body: ExportRequest) -> dict[str
                 f"{out}: leads out of the scan", "it is a link", "remove the link, or use `polysight export --out`",
                 code=ErrorCode.PATH_OUTSIDE,
             )  # fmt: skip
-        words = ["export", folder.absolute(), *(f"--{name}" for name in body.formats)]
-        _programs(site).start(folder, "export", [*words, "--out", out])
+        options = [f"--{name}" for name in body.formats]
+        site.programs.start(folder, "export", ["export", folder.absolute(), *options, "--out", out])
 
     await site.read_scan(request, start)
-    return {"what": "started"}
+    return STARTED
 
 
-def _material_words(site: Site, library: str, metal: Box | None) -> Words:
+def _processing_words(site: Site, library: str, metal: Box | None) -> Words:
     """Options of the library and the metal reference. Raises ConfigError."""
     words: Words = []
     if library:
-        known = site.libraries()
-        if library not in known:
+        libraries = site.libraries()
+        if library not in libraries:
             raise ConfigError(
                 f"no library is called {library[:60]!r}", "it was not trained here", "train it first",
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
-        words += ["--library", known[library].absolute()]
+        words += ["--library", libraries[library].absolute()]
     if metal is not None:
         x0, y0, x1, y1 = metal
         words.append(f"--metal={(x0 + x1) / 2:g},{(y0 + y1) / 2:g},{x1 - x0:g},{y1 - y0:g}")
     return words
-
-
-def _config(site: Site) -> Path:
-    if site.config is None:
-        raise ConfigError("this server has no rig file", "it was started without", "polysight serve --config FILE")
-    return site.config
-
-
-def _programs(site: Site) -> Programs:
-    if site.programs is None:
-        raise DeviceError("nothing can be started here", "it shows one scan", "polysight serve starts scans")
-    return site.programs

@@ -13,12 +13,22 @@ import os
 import selectors
 import subprocess
 import sys
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
-_SHELL = '"$@" >> "$0.log" 2>&1 < /dev/null; echo $? > "$0.status"'
-_LOOK_S = 2.0
+SHELL = '"$@" >> "$0.log" 2>&1 < /dev/null; echo $? > "$0.status"'
+POLL_S = 2.0
+
+
+@dataclass(frozen=True)
+class Record:
+    """Content of `base`.json: a program's process number and start time (:func:`started_ticks`), and its command."""
+
+    pid: int
+    ticks: int
+    words: list[str]
+    started_utc: str
 
 
 def started_ticks(pid: int) -> int | None:
@@ -40,15 +50,10 @@ def launch(words: list[str], cwd: str, base: str) -> subprocess.Popen[bytes]:
     now = datetime.now(UTC).isoformat(timespec="seconds")
     with Path(base + ".log").open("a", encoding="utf-8") as log:
         log.write(f"--- {now} {' '.join(words)}\n")
-    program = subprocess.Popen(["/bin/sh", "-c", _SHELL, base, *words], cwd=cwd, start_new_session=True)
-    record: dict[str, Any] = {
-        "pid": program.pid,
-        "ticks": started_ticks(program.pid),
-        "words": words,
-        "started_utc": now,
-    }
+    program = subprocess.Popen(["/bin/sh", "-c", SHELL, base, *words], cwd=cwd, start_new_session=True)
+    record = Record(program.pid, started_ticks(program.pid) or 0, words, now)
     part = Path(base + ".part")
-    part.write_text(json.dumps(record) + "\n", encoding="utf-8")
+    part.write_text(json.dumps(asdict(record)) + "\n", encoding="utf-8")
     part.replace(base + ".json")
     return program
 
@@ -60,8 +65,9 @@ def main() -> int:
     with selectors.DefaultSelector() as selector:
         selector.register(0, selectors.EVENT_READ)
         while True:
-            running = [program for program in running if program.poll() is None]  # reaps those that have ended
-            if not selector.select(_LOOK_S):
+            # `poll` reaps those that have ended.
+            running = [program for program in running if program.poll() is None]
+            if not selector.select(POLL_S):
                 continue
             line = sys.stdin.readline()
             if not line:
@@ -69,7 +75,8 @@ def main() -> int:
             try:
                 running.append(launch(**json.loads(line)))
                 answer = ""
-            except OSError as e:  # a full disk has no file name
+            except OSError as e:
+                # The error of a full disk has no file name.
                 answer = f"{e.filename or json.loads(line)['base']}: {e.strerror or e}"
             except (ValueError, TypeError) as e:
                 answer = str(e)

@@ -11,9 +11,9 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from polysight.catalogue import PROGRAM, is_plain, log_tail
 from polysight.serve import launcher
@@ -24,8 +24,7 @@ from polysight_shared.errors import DeviceError, ScanError
 KINDS = ("scan", "process", "export", "doctor", "train")
 
 
-@dataclass(frozen=True)
-class Program:
+class Program(msgspec.Struct, frozen=True):
     """A program that was started: its exit status is None while it runs, and if it was killed."""
 
     kind: str
@@ -35,16 +34,13 @@ class Program:
     started_utc: str
     log: str
 
-    def to_dict(self) -> dict[str, Any]:
-        """As plain data for JSON."""
-        return self.__dict__ | {"words": list(self.words)}
-
 
 class Programs:
     """Starts programs; create it before the server lowers its priority (see `launcher`)."""
 
     def __init__(self) -> None:
-        command = [sys.executable, "-I", str(Path(launcher.__file__))]  # as a module it would load all of this server
+        # As a module it would load all of this server.
+        command = [sys.executable, "-I", str(Path(launcher.__file__))]
         self._launcher = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
@@ -61,31 +57,30 @@ class Programs:
             if none can be started.
         """
         with self._lock:
-            if (found := program_of(folder, kind)) is not None and found.running:
+            earlier = program_of(folder, kind)
+            if earlier is not None and earlier.running:
                 raise ScanError(
-                    f"{folder}: {kind} runs already",
-                    "it was started before",
-                    "wait for it, or stop it",
+                    f"{folder}: {kind} runs already", "it was started before", "wait for it, or stop it",
                     code=ErrorCode.BUSY,
-                )
+                )  # fmt: skip
             _check_place(folder / PROGRAM, kind)
             base = str((folder / PROGRAM).absolute() / kind)
-            words = [sys.executable, "-m", "polysight", *map(str, words)]
-            answer = self._ask({"words": words, "cwd": str(Path.cwd()), "base": base})
+            command = [sys.executable, "-m", "polysight", *map(str, words)]
+            answer = self._ask(json.dumps({"words": command, "cwd": str(Path.cwd()), "base": base}))
         if answer:
             raise DeviceError(
                 f"{folder}: {kind} cannot be started: {answer}", "no room, no permission, or no memory",
                 "see what it says; the same command works in a terminal",
             )  # fmt: skip
 
-    def _ask(self, request: dict[str, Any]) -> str:
-        stdin, stdout = self._launcher.stdin, self._launcher.stdout
-        if stdin is None or stdout is None:
+    def _ask(self, request: str) -> str:
+        """Send a request to the launcher; return its complaint, "" for none."""
+        if self._launcher.stdin is None or self._launcher.stdout is None:
             return "the launcher has no pipes"
         try:
-            stdin.write(json.dumps(request) + "\n")
-            stdin.flush()
-            line = stdout.readline()
+            self._launcher.stdin.write(f"{request}\n")
+            self._launcher.stdin.flush()
+            line = self._launcher.stdout.readline()
         except OSError as e:
             return str(e)
         return str(json.loads(line)) if line else "the launcher has ended"
@@ -104,37 +99,36 @@ def _check_place(place: Path, kind: str) -> None:
     for path in (place, *files):
         if path.is_symlink() or (path != place and path.exists() and not is_plain(path)):
             raise DeviceError(
-                f"{path} is no file of its own",
-                "the folder was made by another program",
-                "remove it, and find out who made it",
-                code=ErrorCode.PATH_OUTSIDE,
-            )
+                f"{path} is no file of its own", "the folder was made by another program",
+                "remove it, and find out who made it", code=ErrorCode.PATH_OUTSIDE,
+            )  # fmt: skip
 
 
 def programs_of(folder: Path) -> list[Program]:
     """All programs started for a folder, the newest first."""
-    found = [program for kind in KINDS if (program := program_of(folder, kind)) is not None]
-    return sorted(found, key=lambda p: p.started_utc, reverse=True)
+    programs = [program_of(folder, kind) for kind in KINDS]
+    return sorted((p for p in programs if p is not None), key=lambda p: p.started_utc, reverse=True)
 
 
 def program_of(folder: Path, kind: str) -> Program | None:
     """The program of a kind that was started last for a folder; None if there is none."""
     base = folder / PROGRAM / kind
-    if (folder / PROGRAM).is_symlink() or not is_plain(base.with_suffix(".json")):
+    path = base.with_suffix(".json")
+    if (folder / PROGRAM).is_symlink() or not is_plain(path):
         return None
     try:
-        record = json.loads(base.with_suffix(".json").read_text(encoding="utf-8")[:100_000])
-        pid, ticks = int(record["pid"]), int(record["ticks"])
-        words, began = [str(w) for w in record["words"]], str(record["started_utc"])
-    except (OSError, ValueError, KeyError, TypeError):
+        record = msgspec.json.decode(path.read_bytes()[:100_000], type=launcher.Record)
+    except (OSError, ValueError):
         return None
-    running = started_ticks(pid) == ticks
-    status = None if running else _status(base.with_suffix(".status"))
-    shown = ["polysight", *words[3:]] if words[1:3] == ["-m", "polysight"] else words
-    return Program(kind, running, status, tuple(shown), began, log_tail(base.with_suffix(".log")))
+    words = record.words
+    if words[1:3] == ["-m", "polysight"]:
+        words = ["polysight", *words[3:]]
+    running = started_ticks(record.pid) == record.ticks
+    status = None if running else _read_status(base.with_suffix(".status"))
+    return Program(kind, running, status, tuple(words), record.started_utc, log_tail(base.with_suffix(".log")))
 
 
-def _status(path: Path) -> int | None:
+def _read_status(path: Path) -> int | None:
     try:
         return int(path.read_text(encoding="ascii")[:8])
     except (OSError, ValueError):

@@ -5,15 +5,19 @@ Whatever touches a scan folder goes through `Site.read`: in a thread and with a 
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Awaitable, Callable
-from dataclasses import asdict
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import quote
 
+import anyio
+import msgspec
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
+from starlette.types import Receive, Scope, Send
 
 from polysight.catalogue import (
     AMPLITUDE,
@@ -24,24 +28,23 @@ from polysight.catalogue import (
     Picture,
     colour_bar,
     draw_comparison,
-    draw_products,
     files_of,
     probe,
     read_notes,
     result_of,
-    thumbnail,
 )
 from polysight.page import Watch
 from polysight.products import REPORT, read_products
 from polysight.serve.guard import refused
 from polysight.serve.programs import program_of, programs_of
-from polysight.serve.site import Site
+from polysight.serve.site import THUMBNAIL, Site, compare_products, draw_map
 from polysight_shared import __version__
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
-_REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
-"""For a report, which may come from anywhere: no script runs in it, and nothing is loaded."""
+# A report may come from anywhere: no script runs in it, and nothing is loaded.
+REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
+CHUNK_BYTES = 1 << 18
 T = TypeVar("T")
 Endpoint = Callable[[Site, Request], Awaitable[Response]]
 
@@ -66,13 +69,18 @@ def reading_routes(site: Site) -> list[Route]:
         "compare/{name}": _compare_map,
     }
 
-    def route(path: str, answer: Endpoint) -> Route:
+    def make_route(path: str, answer: Endpoint) -> Route:
         async def endpoint(request: Request) -> Response:
             return await answer(site, request)
 
         return Route(f"/api/{path}", endpoint)
 
-    return [route(path, answer) for path, answer in endpoints.items()]
+    return [make_route(path, answer) for path, answer in endpoints.items()]
+
+
+def json_answer(content: Any) -> Response:
+    """Structs, dataclasses or plain data as JSON; numbers that are not finite become null."""
+    return Response(msgspec.json.encode(content), media_type="application/json")
 
 
 # --- lists ---
@@ -80,94 +88,93 @@ def reading_routes(site: Site) -> list[Route]:
 
 async def _page(site: Site, request: Request) -> Response:
     access = site.access
-    inside = not access.token or access.loopback or access.holds_session(request.scope)
+    may_read = not access.token or access.loopback or access.has_session(request.scope)
     facts = {
         "version": __version__,
         "control": access.control,
-        "starts": site.programs is not None and site.config is not None and access.control,
-        "known": inside or access.holds_token(request.headers),
+        "starts": site.starts,
+        "known": may_read or access.has_token(request.headers),
         "only": site.scans.only,
-        "folder": str(site.scans.root) if inside else "",
+        "folder": str(site.scans.root) if may_read else "",
     }
-    return JSONResponse(facts)
+    return json_answer(facts)
 
 
 async def _scans(site: Site, request: Request) -> Response:
     del request
+    root = site.scans.root
 
-    def listed() -> dict[str, Any]:
-        root = site.scans.root
-        rows = [asdict(s) | {"bytes": site.size(s.name)} for s in site.scans.list()]
-        free = shutil.disk_usage(root).free if root.is_dir() else None
-        left_out = site.scans.left_out()
-        return {"scans": rows, "free_bytes": free, "libraries": list(site.libraries()), "left_out": left_out}
+    def list_scans() -> dict[str, Any]:
+        return {
+            "scans": [msgspec.to_builtins(s) | {"bytes": site.size(s.name)} for s in site.scans.list()],
+            "free_bytes": shutil.disk_usage(root).free if root.is_dir() else None,
+            "libraries": list(site.libraries()),
+            "left_out": site.scans.left_out(),
+        }
 
-    return JSONResponse(await site.read("", listed))
+    return json_answer(await site.read("", list_scans))
 
 
 async def _scan(site: Site, request: Request) -> Response:
     name = site.name(request)
 
-    def summary(folder: Path) -> dict[str, Any]:
-        notes = read_notes(folder)
-        facts = asdict(site.scans.summary(name)) | {"bytes": site.size(name), "folder": str(folder.absolute())}
-        programs = [program.to_dict() for program in programs_of(folder)]
-        return facts | {"notes": notes.notes, "tags": list(notes.tags), "programs": programs}
+    def read_summary(folder: Path) -> dict[str, Any]:
+        facts = msgspec.to_builtins(site.scans.summary(name)) | msgspec.to_builtins(read_notes(folder))
+        programs = programs_of(folder)
+        return facts | {"bytes": site.size(name), "folder": str(folder.absolute()), "programs": programs}
 
-    return JSONResponse(await site.read_scan(request, summary))
+    return json_answer(await site.read_scan(request, read_summary))
 
 
 async def _thumbnail(site: Site, request: Request) -> Response:
-    def png(folder: Path) -> bytes:
+    def draw(folder: Path) -> bytes:
         try:
-            return site.draw(folder, ("thumbnail",), thumbnail)
-        except DataError:  # no image, or a damaged one: the scan's own page says so
+            return draw_map(folder, THUMBNAIL).png
+        except DataError:
+            # No image, or a damaged one: the scan's own page says so.
             return b""
 
-    found = await site.read_scan(request, png)
-    if not found:
+    png = await site.read_scan(request, draw)
+    if not png:
         return Response(status_code=204)
-    return Response(found, media_type="image/png", headers={"Cache-Control": "private, max-age=5"})
+    return Response(png, media_type="image/png", headers={"Cache-Control": "private, max-age=5"})
 
 
 async def _program(site: Site, request: Request) -> Response:
     kind = request.path_params["kind"]
-    found = program_of(site.logs, kind) if kind in ("doctor", "train") else None
-    return JSONResponse(None if found is None else found.to_dict())
+    return json_answer(program_of(site.logs, kind) if kind in ("doctor", "train") else None)
 
 
 # --- the live view ---
 
 
-async def _watch(site: Site, request: Request) -> Watch:
+async def _open_watch(site: Site, request: Request) -> Watch:
     name = site.name(request)
-    return await site.read_scan(request, lambda folder: site.watches.of(name, folder))
+    return await site.read_scan(request, lambda folder: site.watches.open(name, folder))
 
 
 async def _state(site: Site, request: Request) -> Response:
-    return Response((await _watch(site, request)).state.data, media_type="application/json")
+    return Response((await _open_watch(site, request)).state.data, media_type="application/json")
 
 
 async def _events(site: Site, request: Request) -> Response:
-    if site.watches.full:
-        return refused(503, ErrorCode.BUSY, "Too many pages are open", "each holds a connection", "close some of them")
-    watch = await _watch(site, request)
-    stream = site.watches.events(site.name(request), watch, site.ending)
-    return StreamingResponse(stream, media_type="text/event-stream")
+    watch = await _open_watch(site, request)
+    events = site.watches.events(site.name(request), watch, site.is_ending)
+    return StreamingResponse(events, media_type="text/event-stream")
 
 
 async def _live_picture(site: Site, request: Request) -> Response:
-    found = (await _watch(site, request)).shown.pictures.get(request.path_params["name"])
-    if found is None:
+    picture = (await _open_watch(site, request)).shown.pictures.get(request.path_params["name"])
+    if picture is None:
         what = "This picture is not there yet"
         return refused(404, ErrorCode.FILE_MISSING, what, "no row is processed", "it comes with the first row")
-    return Response(found.png, media_type="image/png")
+    return Response(picture.png, media_type="image/png")
 
 
 async def _bar(site: Site, request: Request) -> Response:
     del site
     kind = request.path_params["kind"]
-    colours = {"phase": PHASE, "amplitude": AMPLITUDE}.get(kind, kind)
+    colours = {"phase": PHASE, "amplitude": AMPLITUDE}.get(kind, str(kind))
     if colours not in (AMPLITUDE, PHASE, DIFFERENCE):
         return refused(404, ErrorCode.VALUE_INVALID, "There are no such colours", "", "use the page")
     return Response(colour_bar(colours), media_type="image/png")
@@ -177,49 +184,70 @@ async def _bar(site: Site, request: Request) -> Response:
 
 
 async def _result(site: Site, request: Request) -> Response:
-    return JSONResponse(await site.read_scan(request, result_of))
+    return json_answer(await site.read_scan(request, result_of))
 
 
 async def _map(site: Site, request: Request) -> Response:
     name = request.path_params["name"]
-    given = [_number(request, key) for key in ("low", "high") if key in request.query_params]
-    limits = (given[0], given[1]) if len(given) == 2 and given[0] < given[1] else None
-
-    def drawn(folder: Path) -> Picture:
-        return site.draw(folder, ("map", name, limits), lambda pixels: draw_products(pixels, name, limits))
-
-    return _picture(await site.read_scan(request, drawn))
+    limits = None
+    if "low" in request.query_params and "high" in request.query_params:
+        low = _number(request, "low")
+        high = _number(request, "high")
+        limits = (low, high) if low < high else None
+    return _picture_answer(await site.read_scan(request, lambda folder: draw_map(folder, name, limits)))
 
 
 async def _probe(site: Site, request: Request) -> Response:
-    x, y = (_number(request, key) for key in ("x", "y"))
-    library = request.query_params.get("library", "")
-    return JSONResponse(await site.read_scan(request, lambda f: probe(f, x, y, site.libraries().get(library))))
+    x_mm = _number(request, "x")
+    y_mm = _number(request, "y")
+    name = request.query_params.get("library", "")
+    return json_answer(await site.read_scan(request, lambda f: probe(f, x_mm, y_mm, site.libraries().get(name))))
 
 
 async def _file(site: Site, request: Request) -> Response:
     """One of the files that the result lists; nothing in it may act as a page of this server."""
-    name, of = request.path_params["name"], request.query_params.get("of", "products")
+    name = request.path_params["name"]
+    of = request.query_params.get("of", "products")
 
-    def find(folder: Path) -> tuple[Path, Path]:
-        if not any(f["name"] == name and f["of"] == of for f in files_of(folder)):
+    def find_file(folder: Path) -> tuple[str, Path]:
+        if not any(file.name == name and file.of == of for file in files_of(folder)):
             raise DataError(
                 f"no file is called {name[:80]!r}", "it was not made, or the name is wrong", "see the scan's page",
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
-        return folder, (folder / EXPORT if of == EXPORT else read_products(folder).folder) / name
+        place = folder / EXPORT if of == EXPORT else read_products(folder).folder
+        return folder.name, place / name
 
-    folder, path = await site.read_scan(request, find)
+    scan, path = await site.read_scan(request, find_file)
     if name == REPORT:
-        return FileResponse(path, media_type="text/html", headers={"Content-Security-Policy": _REPORT_POLICY})
-    return FileResponse(path, media_type="application/octet-stream", filename=f"{folder.name}-{name}")
+        return Download(path, "text/html", {"Content-Security-Policy": REPORT_POLICY})
+    disposition = f"attachment; filename*=utf-8''{quote(f'{scan}-{name}')}"
+    return Download(path, "application/octet-stream", {"Content-Disposition": disposition})
 
 
-def _picture(drawn: Picture) -> Response:
+class Download(StreamingResponse):
+    """A file as an answer, closed also when the answer is aborted: starlette's FileResponse leaves it open then."""
+
+    def __init__(self, path: Path, media_type: str, headers: dict[str, str]) -> None:
+        super().__init__(self._chunks(), media_type=media_type, headers=headers)
+        self._path = path
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the file."""
+        with self._path.open("rb") as self._file:
+            self.headers["Content-Length"] = str(os.fstat(self._file.fileno()).st_size)
+            await super().__call__(scope, receive, send)
+
+    async def _chunks(self) -> AsyncIterator[bytes]:
+        while chunk := await anyio.to_thread.run_sync(self._file.read, CHUNK_BYTES):
+            yield chunk
+
+
+def _picture_answer(picture: Picture) -> Response:
     """A map, with the values at the ends of its colours as headers."""
-    unit = "deg" if drawn.unit == "°" else drawn.unit
-    ends = {"X-Low": f"{drawn.low:g}", "X-High": f"{drawn.high:g}", "X-Unit": unit}
-    return Response(drawn.png, media_type="image/png", headers=ends)
+    unit = "deg" if picture.unit == "°" else picture.unit
+    headers = {"X-Low": f"{picture.low:g}", "X-High": f"{picture.high:g}", "X-Unit": unit}
+    return Response(picture.png, media_type="image/png", headers=headers)
 
 
 def _number(request: Request, key: str) -> float:
@@ -239,17 +267,20 @@ def _number(request: Request, key: str) -> float:
 # --- comparisons ---
 
 
-async def _compared(site: Site, request: Request, use: Callable[[Comparison], T]) -> T:
+async def _use_comparison(site: Site, request: Request, use: Callable[[Comparison], T]) -> T:
     """`use` of the comparison of the two scans that a request names, in a thread."""
-    names = [site.name(request, key) for key in ("a", "b")]
-    both = " and ".join(name.partition("/")[0] for name in names)  # if one hangs, the other alone is still read
-    return await site.read(both, lambda: use(site.compare(*map(site.scans.folder, names))))
+    first = site.name(request, "a")
+    second = site.name(request, "b")
+    # If one of them hangs, the other is still read alone.
+    both = f"{first.partition('/')[0]} and {second.partition('/')[0]}"
+    folder = site.scans.folder
+    return await site.read(both, lambda: use(compare_products(folder(first), folder(second))))
 
 
 async def _compare(site: Site, request: Request) -> Response:
-    return JSONResponse(await _compared(site, request, Comparison.to_dict))
+    return json_answer(await _use_comparison(site, request, Comparison.to_dict))
 
 
 async def _compare_map(site: Site, request: Request) -> Response:
     name = request.path_params["name"]
-    return _picture(await _compared(site, request, lambda found: draw_comparison(found, name)))
+    return _picture_answer(await _use_comparison(site, request, lambda both: draw_comparison(both, name)))

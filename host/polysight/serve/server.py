@@ -1,4 +1,7 @@
-"""`polysight serve` and `polysight preview`: bind, lower the priority, print the address, serve until Ctrl-C."""
+"""`polysight serve` and `polysight preview`: the web application, its address, and the server until Ctrl-C.
+
+uvicorn limits the number of connections and closes idle ones; each request passes the access checks of `guard`.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +15,43 @@ import socket
 import ssl
 import sys
 import threading
+import traceback
 from dataclasses import dataclass
 from pathlib import Path
 
 import uvicorn
 from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import RedirectResponse, Response
+from starlette.routing import Route
 
 from polysight.catalogue import Scans
 from polysight.page import Watch
-from polysight.serve.app import make_app
-from polysight.serve.connections import HEAD_BYTES, KEEP_ALIVE_S, MAX_CONNECTIONS, TimeoutProtocol
-from polysight.serve.guard import Access
+from polysight.serve.control import control_routes
+from polysight.serve.guard import HEAD_BYTES, Access, Guard, refused
 from polysight.serve.programs import Programs
-from polysight.serve.site import Site
-from polysight.serve.watches import Watches
+from polysight.serve.reading import reading_routes
+from polysight.serve.site import Site, Watches
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError, os_error
 
-NICE = 10  # priority of the server, below capture and scan
-_END_S = 1  # to close connections
+STATIC = Path(__file__).parent / "static"
+PAGES = {
+    "/": "catalogue.html",
+    "/scan": "scan.html",
+    "/watch": "watch.html",
+    "/new": "new.html",
+    "/compare": "compare.html",
+}
+MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+# Priority of the server, below capture and scan.
+NICE = 10
+# Connections that are answered at a time; a page holds up to six. Above it uvicorn answers 503.
+MAX_CONNECTIONS = 2048
+# Longer than the pages' intervals: a server that closes at the moment of the next request breaks it.
+KEEP_ALIVE_S = 75
+CLOSE_S = 1
 
 
 @dataclass(frozen=True)
@@ -89,10 +110,11 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
     listener = _bind(place)
     programs = Programs() if control else None
     lower_priority()
-    access = _access(place, listener, control)
-    config = None if config is None else config.absolute()
-    site = Site(Scans(root.absolute()), access, Watches(control), programs, config)
-    threading.Thread(target=site.scans.list, name="first list", daemon=True).start()  # cached before the page asks
+    if config is not None:
+        config = config.absolute()
+    site = Site(Scans(root.absolute()), _access(place, listener, control), Watches(control), programs, config)
+    # The list is cached before the page asks for it.
+    threading.Thread(target=site.scans.list, name="first list", daemon=True).start()
     return _run(site, place, listener, f"scans in {root}")
 
 
@@ -104,51 +126,17 @@ def preview(folder: Path, place: Place, control: bool) -> int:
     folder = folder.absolute()
     watch = Watch(folder, control)
     watch.start()
-    access = _access(place, listener, control)
-    site = Site(Scans(folder.parent, folder.name), access, Watches(control, {folder.name: watch}))
+    watches = Watches(control, {folder.name: watch})
+    site = Site(Scans(folder.parent, folder.name), _access(place, listener, control), watches)
     return _run(site, place, listener, f"live view of {folder}")
 
 
 def _access(place: Place, listener: socket.socket, control: bool) -> Access:
     token = secrets.token_urlsafe(18) if control or not place.loopback else ""
-    here = {place.host, socket.gethostname(), str(listener.getsockname()[0])}
-    hosts = () if place.loopback else tuple(here - {"0.0.0.0", "::"})
-    return Access(token, place.loopback, (*hosts, *place.hosts), control, place.certificate is not None)
-
-
-def _run(site: Site, place: Place, listener: socket.socket, what: str) -> int:
-    try:
-        sys.stderr.write(_welcome(site, place, listener, what))
-        sys.stderr.flush()
-        server(make_app(site), site, place).run(sockets=[listener])
-    finally:
-        site.close()
-        listener.close()
-    return 0
-
-
-def server(app: Starlette, site: Site, place: Place | None = None) -> uvicorn.Server:
-    """Build a server with timeouts and without logging, which stops within a second."""
-    logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
-    place = place or Place()
-    config = uvicorn.Config(
-        app,
-        http=TimeoutProtocol,
-        ws="none",
-        lifespan="off",
-        log_config=None,
-        access_log=False,
-        proxy_headers=False,  # an address that a client claims to have is not its address
-        server_header=False,
-        h11_max_incomplete_event_size=HEAD_BYTES,
-        timeout_keep_alive=KEEP_ALIVE_S,
-        timeout_graceful_shutdown=_END_S,
-        ssl_certfile=None if place.certificate is None else str(place.certificate),
-        ssl_keyfile=None if place.key is None else str(place.key),
-    )
-    made = uvicorn.Server(config)
-    site.ending = lambda: made.should_exit
-    return made
+    hosts = set(place.hosts)
+    if not place.loopback:
+        hosts |= {place.host, socket.gethostname(), str(listener.getsockname()[0])} - {"0.0.0.0", "::"}
+    return Access(token, place.loopback, tuple(hosts), control, secure=place.certificate is not None)
 
 
 def _bind(place: Place) -> socket.socket:
@@ -171,25 +159,143 @@ def _bind(place: Place) -> socket.socket:
 def lower_priority() -> None:
     """Give capture and scan the processor first, and have the kernel end this process first when memory runs out."""
     with contextlib.suppress(OSError, ValueError):
+        # Connections are files.
         _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, 1 << 16), most))  # connections are files
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, 1 << 16), most))
     with contextlib.suppress(OSError):
         os.nice(NICE)
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
 
+def _run(site: Site, place: Place, listener: socket.socket, what: str) -> int:
+    try:
+        sys.stderr.write(_welcome(site, place, listener, what))
+        sys.stderr.flush()
+        make_server(site, place).run(sockets=[listener])
+    finally:
+        site.close()
+        listener.close()
+    return 0
+
+
 def _welcome(site: Site, place: Place, listener: socket.socket, what: str) -> str:
-    host, port = str(listener.getsockname()[0]), listener.getsockname()[1]
-    shown = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname(), "::1": "localhost"}.get(host, host)
-    token, scheme = site.access.token, "http" if place.certificate is None else "https"
-    address = f"{scheme}://[{shown}]:{port}/" if ":" in shown else f"{scheme}://{shown}:{port}/"
-    lines = [f"{what}: {address}{f'#token={token}' if token else ''}"]
+    host, port = listener.getsockname()[:2]
+    name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname(), "::1": "localhost"}.get(host, str(host))
+    if ":" in name:
+        name = f"[{name}]"
+    scheme = "https" if site.access.secure else "http"
+    token = f"#token={site.access.token}" if site.access.token else ""
+    lines = [f"{what}: {scheme}://{name}:{port}/{token}"]
     if site.access.control:
         lines.append("anyone with this address and its token can start, pause and stop scans")
     else:
         lines.append("read-only; --control adds buttons to pause and stop the scan")
     if not place.loopback:
-        plain = "; nothing is encrypted: --certificate and --key do that" if place.certificate is None else ""
+        plain = "" if site.access.secure else "; nothing is encrypted: --certificate and --key do that"
         lines.append(f"anyone who reaches this machine and has the token can read all scans{plain}")
     return "\n".join(lines) + "\nCtrl-C ends the page; started programs go on\n"
+
+
+def make_server(site: Site, place: Place) -> uvicorn.Server:
+    """Build the server of a site: limited, without logging, and stopping within a second."""
+    logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
+    config = uvicorn.Config(
+        make_app(site),
+        http="h11",
+        ws="none",
+        lifespan="off",
+        log_config=None,
+        access_log=False,
+        # An address that a client claims to have is not its address.
+        proxy_headers=False,
+        server_header=False,
+        h11_max_incomplete_event_size=HEAD_BYTES,
+        limit_concurrency=MAX_CONNECTIONS,
+        timeout_keep_alive=KEEP_ALIVE_S,
+        timeout_graceful_shutdown=CLOSE_S,
+        ssl_certfile=place.certificate,
+        ssl_keyfile=place.key,
+    )
+    server = uvicorn.Server(config)
+    site.is_ending = lambda: server.should_exit
+    return server
+
+
+# --- the application ---
+
+
+def make_app(site: Site) -> Starlette:
+    """Build the application of a site: static pages, GET and POST routes, error answers, behind the guard."""
+    # They are small, and stay in memory.
+    files = {
+        path.name: Response(path.read_bytes(), media_type=MEDIA_TYPES[path.suffix])
+        for path in STATIC.iterdir()
+        if path.suffix in MEDIA_TYPES
+    }
+    files["favicon.ico"] = files["icon.svg"]
+
+    async def show_page(request: Request) -> Response:
+        path = request.url.path
+        only = site.scans.only
+        if path == "/" and only is not None:
+            # A browser keeps the fragment, and the token in it.
+            return RedirectResponse("/watch")
+        if path in ("/scan", "/watch") and only is None and not request.query_params.get("scan"):
+            return RedirectResponse("/")
+        return files[PAGES[path]]
+
+    async def send_file(request: Request) -> Response:
+        answer = files.get(request.path_params["name"])
+        return answer if answer is not None else await _tell_no_page(request, DataError("no such file"))
+
+    routes = [Route(path, show_page) for path in PAGES]
+    routes.append(Route("/{name}", send_file))
+    routes += reading_routes(site) + control_routes(site)
+    return Starlette(
+        routes=routes,
+        middleware=[Middleware(Guard, access=site.access)],
+        exception_handlers={
+            PolysightError: _tell_error,
+            OSError: _tell_error,
+            ClientDisconnect: _tell_nobody,
+            404: _tell_no_page,
+            Exception: _tell_defect,
+        },
+    )
+
+
+async def _tell_error(request: Request, e: Exception) -> Response:
+    # A file that cannot be written or read is no defect of this program.
+    error = os_error(e) if isinstance(e, OSError) else e
+    if not isinstance(error, PolysightError):
+        raise e
+    wrong_values = (ErrorCode.VALUE_INVALID, ErrorCode.VALUES_CONFLICT, ErrorCode.TYPE_WRONG, ErrorCode.KEY_MISSING)
+    if isinstance(error, ConfigError) or (request.method == "POST" and error.code in wrong_values):
+        status = 400
+    elif isinstance(error, DataError):
+        status = 404
+    elif isinstance(error, DeviceError) and error.code is ErrorCode.NO_ANSWER:
+        status = 503
+    else:
+        status = 409
+    return refused(status, error.code, error.what, error.why, error.remedy)
+
+
+async def _tell_nobody(request: Request, e: Exception) -> Response:
+    """The client disconnected in the middle of its request."""
+    del request, e
+    return Response(status_code=400)
+
+
+async def _tell_no_page(request: Request, e: Exception) -> Response:
+    del request, e
+    return refused(404, ErrorCode.OTHER, "There is no such page", "the address is wrong", "begin at the list of scans")
+
+
+async def _tell_defect(request: Request, e: Exception) -> Response:
+    sys.stderr.write(f"{request.method} {request.url.path}\n{''.join(traceback.format_exception(e))}")
+    sys.stderr.flush()
+    what = f"An internal error of the server: {type(e).__name__}"
+    do = "report it, with the server's terminal output"
+    return refused(500, ErrorCode.OTHER, what, "a defect of this program", do)

@@ -1,22 +1,26 @@
-"""State shared by all requests: scans, access, live views, threads for reads, caches, sizes on the disk."""
+"""State shared by all requests: scans, access, open live views, threads for reads, caches, sizes on the disk."""
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import anyio
 from starlette.requests import Request
 
-from polysight.catalogue import Comparison, Pixels, Scans, compare, folder_bytes
-from polysight.products import read_products
+from polysight.acquisition import ScanCommand, send_command
+from polysight.catalogue import Comparison, Picture, Pixels, Scans, compare, draw_products, folder_bytes, thumbnail
+from polysight.page import Watch
+from polysight.products import IMAGE, MATERIALS, QUALITY, read_products
 from polysight.serve.guard import Access
 from polysight.serve.programs import Programs
-from polysight.serve.watches import Watches
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 
@@ -27,9 +31,19 @@ SIZE_S = 30.0
 HIDDEN = ".polysight"
 """Folder beside the scans that holds the logs of programs that belong to no scan."""
 LIBRARIES = "libraries"
-_PICTURES, _COMPARISONS = 400, 4  # that are kept
-_THREADS, _THREADS_A_FOLDER = 4, 2  # of reads at a time
-_SIZES_S = 20.0  # a folder's size is asked for again after so long, at most
+THUMBNAIL = "thumbnail"
+MAX_PICTURES = 400
+MAX_COMPARISONS = 4
+# Each live view forms images with an own pipeline.
+MAX_WATCHES = 4
+LINGER_S = 30.0
+READERS = 4
+READERS_OF_ONE_FOLDER = 2
+# A folder's size is counted again after so long, at most.
+SIZE_AGE_S = 20.0
+STREAM_INTERVAL_S = 0.1
+# A page that receives nothing for some of these reconnects.
+ALIVE_INTERVAL_S = 2.0
 T = TypeVar("T")
 
 
@@ -47,13 +61,35 @@ class Site:
         programs: Programs | None = None,
         config: Path | None = None,
     ) -> None:
-        self.scans, self.access, self.watches = scans, access, watches
-        self.programs, self.config = programs, config
-        self.ending: Callable[[], bool] = lambda: False
-        self.rig = threading.Lock()  # held from the check that the rig is free until a program has it
-        self._pictures, self._comparisons = Recent(_PICTURES), Recent(_COMPARISONS)
+        self.scans = scans
+        self.access = access
+        self.watches = watches
+        self.is_ending: Callable[[], bool] = lambda: False
+        # Held from the check that the rig is free until a program has it.
+        self.rig = threading.Lock()
+        self._programs = programs
+        self._config = config
         self._readers = Readers()
         self._sizes = Sizes()
+
+    @property
+    def starts(self) -> bool:
+        """True if programs and scans can be started from the page."""
+        return self._programs is not None and self._config is not None and self.access.control
+
+    @property
+    def programs(self) -> Programs:
+        """Started programs. Raises DeviceError if none can be started here."""
+        if self._programs is None:
+            raise DeviceError("nothing can be started here", "it shows one scan", "polysight serve starts scans")
+        return self._programs
+
+    @property
+    def config(self) -> Path:
+        """The rig file of new scans. Raises ConfigError without one."""
+        if self._config is None:
+            raise ConfigError("this server has no rig file", "it was started without", "polysight serve --config FILE")
+        return self._config
 
     def name(self, request: Request, key: str = "scan") -> str:
         """Name of the scan that a request asks for: as given, or the only one. Raises ConfigError without one."""
@@ -65,28 +101,18 @@ class Site:
             )  # fmt: skip
         return name
 
-    async def read(self, name: str, work: Callable[..., T], *arguments: Any) -> T:
+    async def read(self, name: str, work: Callable[[], T]) -> T:
         """Read something of a scan, "" for the whole folder, in a thread. Raises DeviceError, see :class:`Readers`."""
-        return await self._readers.run(name.partition("/")[0], work, *arguments)
+        return await self._readers.run(name.partition("/")[0], work)
 
-    async def read_scan(self, request: Request, work: Callable[..., T], *arguments: Any) -> T:
-        """Run `work(folder, *arguments)` in a thread, for the scan that a request names. Raises PolysightError."""
+    async def read_scan(self, request: Request, work: Callable[[Path], T]) -> T:
+        """Run `work(folder)` in a thread, for the scan that a request names. Raises PolysightError."""
         name = self.name(request)
-        return await self.read(name, lambda: work(self.scans.folder(name), *arguments))
+        return await self.read(name, lambda: work(self.scans.folder(name)))
 
-    async def act(self, work: Callable[..., T], *arguments: Any) -> T:
-        """Run a command that waits, in a thread of its own, never behind reads."""
-        return await anyio.to_thread.run_sync(work, *arguments)
-
-    def draw(self, folder: Path, what: tuple[Any, ...], draw: Callable[[Pixels], T]) -> T:
-        """A picture of a scan's products, drawn again only when these have changed."""
-        products, key = _stamped(folder)
-        return self._pictures.get((key, *what), lambda: draw(Pixels(products)))
-
-    def compare(self, first: Path, second: Path) -> Comparison:
-        """Two processed scans compared, computed again only when their products have changed. Raises DataError."""
-        key = (_stamped(first)[1], _stamped(second)[1])
-        return self._comparisons.get(key, lambda: compare(first, second))
+    async def act(self, work: Callable[[], T]) -> T:
+        """Run a command in a thread of its own, never behind reads."""
+        return await anyio.to_thread.run_sync(work)
 
     def size(self, name: str) -> int | None:
         """Bytes of a scan on the disk; None while they are being counted."""
@@ -100,41 +126,49 @@ class Site:
     def libraries(self) -> dict[str, Path]:
         """Libraries trained here, by name."""
         folder = self.scans.root / LIBRARIES
-        found = sorted(folder.glob("*.npz")) if folder.is_dir() and not folder.is_symlink() else []
-        return {path.stem: path for path in found if path.is_file() and not path.is_symlink()}
+        if not folder.is_dir() or folder.is_symlink():
+            return {}
+        files = [path for path in sorted(folder.glob("*.npz")) if path.is_file() and not path.is_symlink()]
+        return {path.stem: path for path in files}
 
     def close(self) -> None:
         """Close the live views; started programs go on."""
         self.watches.close()
-        if self.programs is not None:
-            self.programs.close()
+        if self._programs is not None:
+            self._programs.close()
 
 
-def _stamped(folder: Path) -> tuple[Path, tuple[Any, ...]]:
+def draw_map(folder: Path, name: str, limits: tuple[float, float] | None = None) -> Picture:
+    """A map of a scan's products, or its `thumbnail`; drawn again only when these have changed. Raises DataError."""
+    return _draw(*_stamp_products(folder), name, limits)
+
+
+def compare_products(first: Path, second: Path) -> Comparison:
+    """Two processed scans compared, computed again only when their products have changed. Raises DataError."""
+    return _compare(first, second, _stamp_products(first), _stamp_products(second))
+
+
+Stamp = tuple[int, ...]
+
+
+def _stamp_products(folder: Path) -> tuple[Path, Stamp]:
     """The folder of a scan's products, and what changes when these do."""
     products = read_products(folder).folder
-    files = [products / name for name in ("image.npz", "materials.json", "quality.json")]
-    return products, (str(products), *(path.stat().st_mtime_ns for path in files if path.exists()))
+    files = [products / name for name in (IMAGE, MATERIALS, QUALITY)]
+    return products, tuple(path.stat().st_mtime_ns for path in files if path.exists())
 
 
-class Recent:
-    """Results by key; the oldest go when there are more than `most`."""
+@lru_cache(maxsize=MAX_PICTURES)
+def _draw(products: Path, stamp: Stamp, name: str, limits: tuple[float, float] | None) -> Picture:
+    del stamp
+    pixels = Pixels(products)
+    return thumbnail(pixels) if name == THUMBNAIL else draw_products(pixels, name, limits)
 
-    def __init__(self, most: int) -> None:
-        self._most, self._kept = most, OrderedDict[Any, Any]()
-        self._lock = threading.Lock()
 
-    def get(self, key: Any, make: Callable[[], T]) -> T:
-        """The result of a key, made if it is not kept."""
-        with self._lock:
-            if key in self._kept:
-                return self._kept[key]
-        made = make()
-        with self._lock:
-            self._kept[key] = made
-            while len(self._kept) > self._most:
-                self._kept.popitem(last=False)
-        return made
+@lru_cache(maxsize=MAX_COMPARISONS)
+def _compare(first: Path, second: Path, *stamps: tuple[Path, Stamp]) -> Comparison:
+    del stamps
+    return compare(first, second)
 
 
 class Readers:
@@ -145,11 +179,11 @@ class Readers:
     """
 
     def __init__(self) -> None:
-        self._threads = anyio.CapacityLimiter(_THREADS)
+        self._threads = anyio.CapacityLimiter(READERS)
         self._turns: dict[str, anyio.CapacityLimiter] = {}
-        self._hanging: dict[str, list[threading.Event]] = {}  # set when they have returned
+        self._hanging: dict[str, list[threading.Event]] = {}
 
-    async def run(self, folder: str, work: Callable[..., T], *arguments: Any) -> T:
+    async def run(self, folder: str, work: Callable[[], T]) -> T:
         """Run a read of a folder.
 
         Raises
@@ -157,11 +191,11 @@ class Readers:
         DeviceError
             with `NO_ANSWER` when it takes longer than `READ_S`, or another read of this folder still hangs.
         """
-        turn = self._turns.setdefault(folder, anyio.CapacityLimiter(_THREADS_A_FOLDER))
+        turn = self._turns.setdefault(folder, anyio.CapacityLimiter(READERS_OF_ONE_FOLDER))
         try:
             async with turn, self._threads:
                 self._check(folder)
-                return await self._run(folder, lambda: work(*arguments))
+                return await self._run(folder, work)
         finally:
             if not turn.statistics().borrowed_tokens and not turn.statistics().tasks_waiting:
                 self._turns.pop(folder, None)
@@ -169,15 +203,15 @@ class Readers:
     async def _run(self, folder: str, work: Callable[[], T]) -> T:
         returned = threading.Event()
 
-        def tracked() -> T:
+        def work_and_return() -> T:
             try:
                 return work()
             finally:
                 returned.set()
 
-        own = anyio.CapacityLimiter(1)
         with anyio.move_on_after(READ_S):
-            return await anyio.to_thread.run_sync(tracked, abandon_on_cancel=True, limiter=own)
+            one_thread = anyio.CapacityLimiter(1)
+            return await anyio.to_thread.run_sync(work_and_return, abandon_on_cancel=True, limiter=one_thread)
         self._hanging.setdefault(folder, []).append(returned)
         raise _no_answer(folder)
 
@@ -200,32 +234,141 @@ class Sizes:
     """Sizes of folders, counted in the background one after another; one that hangs holds up no other for long."""
 
     def __init__(self) -> None:
-        self._known: dict[Path, tuple[int, float]] = {}
-        self._wanted: OrderedDict[Path, None] = OrderedDict()
-        self._counting: dict[Path, float] = {}  # since when
+        self._counted: dict[Path, tuple[int, float]] = {}
+        self._waiting: OrderedDict[Path, None] = OrderedDict()
+        self._counting_since: dict[Path, float] = {}
         self._lock = threading.Lock()
 
     def of(self, folder: Path) -> int | None:
         """Size in bytes at the last count; None before the first."""
-        size, at = self._known.get(folder, (None, float("-inf")))
+        size, counted_at = self._counted.get(folder, (None, float("-inf")))
         now = time.monotonic()
-        if now - at > _SIZES_S:
+        if now - counted_at > SIZE_AGE_S:
             with self._lock:
-                if folder not in self._counting:
-                    self._wanted[folder] = None
-                if all(now - since > SIZE_S for since in self._counting.values()):
+                if folder not in self._counting_since:
+                    self._waiting[folder] = None
+                if all(now - since > SIZE_S for since in self._counting_since.values()):
                     self._next()
         return size
 
     def _next(self) -> None:
         """Begin with the next folder, with the lock held."""
-        if self._wanted:
-            folder, _ = self._wanted.popitem(last=False)
-            self._counting[folder] = time.monotonic()
+        if self._waiting:
+            folder, _ = self._waiting.popitem(last=False)
+            self._counting_since[folder] = time.monotonic()
             threading.Thread(target=self._count, args=(folder,), name="sizes", daemon=True).start()
 
     def _count(self, folder: Path) -> None:
-        self._known[folder] = (folder_bytes(folder), time.monotonic())
+        self._counted[folder] = (folder_bytes(folder), time.monotonic())
         with self._lock:
-            del self._counting[folder]
+            del self._counting_since[folder]
             self._next()
+
+
+class OpenWatch:
+    """A live view that was opened for a page: how many event streams show it, and when it was last used."""
+
+    def __init__(self, watch: Watch) -> None:
+        self.watch = watch
+        self.streams = 0
+        self.used_at = time.monotonic()
+
+
+class Watches:
+    """Open live views: one for each scan that a page shows; those without pages are closed when others are opened.
+
+    `control`: scans may be controlled; `lasting`: watches that stay open, by name.
+    """
+
+    def __init__(self, control: bool, lasting: dict[str, Watch] | None = None) -> None:
+        self._control = control
+        self._lasting = lasting or {}
+        self._open: dict[str, OpenWatch] = {}
+        self._lock = threading.Lock()
+
+    def open(self, name: str, folder: Path) -> Watch:
+        """The live view of a scan, opened if it is not. Raises DeviceError when too many are open."""
+        watch = self._find(name)
+        if watch is not None:
+            return watch
+        with self._lock:
+            self._make_room()
+        # It reads the folder, which may hang: without the lock.
+        watch = Watch(folder, self._control)
+        with self._lock:
+            opened = self._open.setdefault(name, OpenWatch(watch))
+        if opened.watch is watch:
+            watch.start()
+        else:
+            watch.close()
+        return opened.watch
+
+    def ask(self, name: str, folder: Path, command: ScanCommand) -> None:
+        """Pause, continue, stop or abort a scan, whether it is shown or not. Raises ScanError."""
+        watch = self._find(name)
+        if watch is None:
+            send_command(folder, command)
+        else:
+            watch.ask(command)
+
+    def _find(self, name: str) -> Watch | None:
+        with self._lock:
+            if name in self._open:
+                self._open[name].used_at = time.monotonic()
+                return self._open[name].watch
+            return self._lasting.get(name)
+
+    def _make_room(self) -> None:
+        """Close live views without pages: after a while, or at once when there are too many. Raises DeviceError."""
+        too_many = len(self._open) >= MAX_WATCHES
+        for name, opened in list(self._open.items()):
+            if not opened.streams and (too_many or time.monotonic() - opened.used_at > LINGER_S):
+                # Its folder may hang.
+                threading.Thread(target=opened.watch.close, name="close", daemon=True).start()
+                del self._open[name]
+        if len(self._open) >= MAX_WATCHES:
+            raise DeviceError(
+                f"{MAX_WATCHES} live views are open", "each takes a part of a processor", "close one",
+                code=ErrorCode.BUSY,
+            )  # fmt: skip
+
+    @contextmanager
+    def _count_stream(self, name: str):
+        opened = self._open.get(name)
+        if opened is None:
+            yield
+            return
+        opened.streams += 1
+        try:
+            yield
+        finally:
+            opened.streams -= 1
+            opened.used_at = time.monotonic()
+
+    async def events(self, name: str, watch: Watch, is_ending: Callable[[], bool]) -> AsyncIterator[bytes]:
+        """Server-sent events of one page: always the newest state and motion.
+
+        Nothing is queued: a slow page gets fewer events, since `yield` waits for its socket.
+        """
+        sent = {"state": -1, "motion": -1}
+        silent_s = 0.0
+        with self._count_stream(name):
+            while not is_ending():
+                for kind, newest in (("state", watch.state), ("motion", watch.motion)):
+                    if newest.version != sent[kind]:
+                        sent[kind] = newest.version
+                        silent_s = 0.0
+                        yield b"event: %s\nid: %d\ndata: %s\n\n" % (kind.encode(), newest.version, newest.data)
+                if silent_s >= ALIVE_INTERVAL_S:
+                    silent_s = 0.0
+                    yield b"event: alive\ndata: 0\n\n"
+                await asyncio.sleep(STREAM_INTERVAL_S)
+                silent_s += STREAM_INTERVAL_S
+
+    def close(self) -> None:
+        """Close all."""
+        with self._lock:
+            for watch in [*self._lasting.values(), *(opened.watch for opened in self._open.values())]:
+                watch.close()
+            self._open = {}
+            self._lasting = {}

@@ -11,12 +11,10 @@ from pathlib import Path
 from polysight.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
 from polysight.catalogue import Scans
 from polysight.page.watch import Watch
-from polysight.serve.app import make_app
 from polysight.serve.guard import Access
 from polysight.serve.programs import Programs
-from polysight.serve.server import Place, server
-from polysight.serve.site import Site
-from polysight.serve.watches import Watches
+from polysight.serve.server import Place, make_server
+from polysight.serve.site import Site, Watches
 from polysight.store import manifest
 from polysight.store.scan_folder import EVENTS, MANIFEST, utc_now
 from tests.support.processes import LIMIT_S, wait_for
@@ -75,7 +73,7 @@ class Served:
 
     def __init__(self, site: Site, host: str = "127.0.0.1", port: int = 0, place: Place | None = None) -> None:
         self.site = site
-        self._server = server(make_app(site), site, place)
+        self._server = make_server(site, place or Place())
         self._server.config.host, self._server.config.port = host, port
         self._thread = threading.Thread(target=self._server.run)
         self._thread.start()

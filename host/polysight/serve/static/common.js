@@ -37,10 +37,6 @@ async function answer(path, given, options) {
   } catch {
     throw new Refused({ what: "The server is not responding", why: "`polysight serve` was ended, or the network is gone", do: "start it again; scans go on regardless" }, 0);
   }
-  if (reply.status === 429) {
-    await new Promise((go) => setTimeout(go, 1100));
-    return answer(path, given, options);
-  }
   if (!reply.ok) {
     const told = await reply.json().catch(() => ({ what: `The server answered ${reply.status}` }));
     if (told.code === "token-wrong") askForToken();

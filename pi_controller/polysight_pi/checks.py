@@ -5,12 +5,11 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any
 
 import zmq
 
 from polysight_pi import AS_THE_SERVICE, system
-from polysight_pi.bursts import MIN_PART, BurstSpec, spi_burst
 from polysight_pi.journal import Journal
 from polysight_pi.lines import (
     GpiodLines,
@@ -22,38 +21,40 @@ from polysight_pi.lines import (
     request_output,
 )
 from polysight_pi.stage import BenchStage
+from polysight_pi.trigger import MIN_PART, BurstSpec, spi_burst
 from polysight_shared.config import Instrument, Pi
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, PolysightError, os_error
+from polysight_shared.findings import Finding
 from polysight_shared.raster import MAX_WIDTH_NS, WIDTH_TEXT, check_burst_fits
 from polysight_shared.sockets import is_loopback, publisher, replier
 
 JOURNAL_BYTES = 100 << 20  # a scan of 70,000 positions journals about 20 MB
 TRANSFERS = 5
 MAX_PART = 1.05  # of the nominal duration: the system call adds some 100 us to 22 ms
-PAIRS, PAUSE_NS = 500, 300_000  # pairs of system calls to time, and the pause between them
-MODEL, MODULES = Path("/proc/device-tree/model"), Path("/sys/module")
+PAIRS = 500  # pairs of system calls to time
+PAUSE_NS = 300_000  # between them
+MODEL = Path("/proc/device-tree/model")
+MODULES = Path("/sys/module")
 STRICT = "put `dtparam=strict_gpiod` into /boot/firmware/config.txt and reboot the Pi"
+VERDICTS = {"ok": "ok", "note": "ok", "warning": "warn", "error": "fail"}  # words of the command's output, by level
 
 
-class Finding(NamedTuple):
-    """Result of one check; `remedy` says what to do if the verdict is not ok."""
-
-    name: str
-    verdict: Literal["ok", "warn", "fail"]
-    found: str
-    remedy: str = ""
+def to_json(finding: Finding) -> dict[str, Any]:
+    """Return a finding in the form that `check --json` prints."""
+    found = finding.what + (f" ({finding.why})" if finding.why else "")
+    return {"name": finding.where, "verdict": VERDICTS[finding.level], "found": found, "remedy": finding.do}
 
 
 def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Finding:
     """Run a check. Text it returns becomes an ok finding, an error it raises a failed one."""
     try:
-        found = check(*args)
+        result = check(*args)
     except PolysightError as e:
-        return Finding(name, "fail", e.what + (f" ({e.why})" if e.why else ""), e.remedy)
+        return Finding.of_error(e, where=name)
     except OSError as e:
-        return Finding(name, "fail", os_error(e).what, AS_THE_SERVICE)
-    return found if isinstance(found, Finding) else Finding(name, "ok", found)
+        return Finding("error", os_error(e).what, do=AS_THE_SERVICE, where=name)
+    return result if isinstance(result, Finding) else Finding("ok", result, where=name)
 
 
 def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
@@ -87,9 +88,9 @@ def _real_time() -> Finding:
     """Request the same real-time rights as the service, so that pulse widths are measured with them."""
     refused = dict.fromkeys(system.prepare_process() + system.prepare_thread())
     if refused:
-        remedy = "the systemd unit grants both (LimitRTPRIO, LimitMEMLOCK); a shell does not"
-        return Finding("real time", "warn", "; ".join(refused), remedy)
-    return Finding("real time", "ok", "SCHED_FIFO and locked memory are permitted")
+        do = "the systemd unit grants both (LimitRTPRIO, LimitMEMLOCK); a shell does not"
+        return Finding("warning", "; ".join(refused), do=do, where="real time")
+    return Finding("ok", "SCHED_FIFO and locked memory are permitted", where="real time")
 
 
 def _stage(instrument: Instrument) -> str:
@@ -102,8 +103,8 @@ def _journal(path: Path, needed: int) -> str:
     Journal(path).close()
     free = shutil.disk_usage(path).free
     if free < needed:
-        wanted = f"{path}: {free >> 20} MiB free, {needed >> 20} MiB wanted"
-        raise DeviceError(wanted, "the disk fills", "remove old journals there", code=ErrorCode.DISK_FULL)
+        what = f"{path}: {free >> 20} MiB free, {needed >> 20} MiB wanted"
+        raise DeviceError(what, "the disk fills", "remove old journals there", code=ErrorCode.DISK_FULL)
     return f"{path} can be written, {free >> 20} MiB are free"
 
 
@@ -114,8 +115,9 @@ def _keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
     if not secret.is_file():
         raise DeviceError(f"{secret} is missing", "keys were not made yet", "polysight-pi keys")
     if secret.stat().st_mode & 0o077:
-        found = f"{secret} can be read by others than its owner"
-        return Finding("keys", "warn", found, f"chmod 600 {secret}; new ones with `polysight-pi keys --replace`")
+        what = f"{secret} can be read by others than its owner"
+        do = f"chmod 600 {secret}; new ones with `polysight-pi keys --replace`"
+        return Finding("warning", what, do=do, where="keys")
     return f"{secret}"
 
 
@@ -139,7 +141,7 @@ def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MOD
     pi = instrument.pi
     chip = attempt("GPIO chip", _chip, pi)
     yield chip
-    if chip.verdict == "ok":
+    if chip.level == "ok":
         yield attempt(f"trigger line {pi.trigger_in}", _trigger, pi)
         yield attempt(f"SYNC_IN line {pi.sync_out[0]}", _spi if pi.wiring == "spi" else _output, pi)
         yield attempt("pulse width", measure_clock if pi.wiring == "spi" else measure_width, instrument)
@@ -191,37 +193,38 @@ def measure_clock(instrument: Instrument) -> str | Finding:
     try:
         burst = spi_burst(BurstSpec.of(instrument.burst), device.bufsiz)
         zeros = bytes(len(burst.data))
-        took = [after - before for before, after in (device.transfer(zeros, burst.clock_hz) for _ in range(TRANSFERS))]
+        times_ns = [device.transfer(zeros, burst.clock_hz) for _ in range(TRANSFERS)]
     finally:
         device.close()
-    bit_ns = min(took) / (8 * len(zeros))
-    found = f"a bit lasts {bit_ns / 1e3:.3f} us, nominal {burst.bit_ns / 1e3:.3f} us; the same clock sets the period"
+    bit_ns = min(after - before for before, after in times_ns) / (8 * len(zeros))
+    what = f"a bit lasts {bit_ns / 1e3:.3f} us, nominal {burst.bit_ns / 1e3:.3f} us; the same clock sets the period"
     if MIN_PART <= bit_ns / burst.bit_ns <= MAX_PART:
-        return found + " (SPI controller, measured now with the line low)"
-    remedy = "fix the Pi's core clock in /boot/firmware/config.txt: `core_freq=250` on a 3, `core_freq_min=500` on a 4"
-    return Finding("pulse width", "fail", found, remedy)
+        return what + " (SPI controller, measured now with the line low)"
+    do = "fix the Pi's core clock in /boot/firmware/config.txt: `core_freq=250` on a 3, `core_freq_min=500` on a 4"
+    return Finding("error", what, do=do, where="pulse width")
 
 
 def judge_widths(widths_ns: list[int], one_shot: bool) -> str | Finding:
     """Judge measured widths: a row needs thousands of pulses below 4 us, so 1 % above it is too much."""
     widths_ns = sorted(widths_ns)
-    middle, high = widths_ns[len(widths_ns) // 2], widths_ns[len(widths_ns) * 99 // 100]
-    found = f"two system calls take {middle / 1e3:.1f} us (median), {high / 1e3:.1f} us (99th percentile)"
+    median_us = widths_ns[len(widths_ns) // 2] / 1e3
+    high_ns = widths_ns[len(widths_ns) * 99 // 100]
+    what = f"two system calls take {median_us:.1f} us (median), {high_ns / 1e3:.1f} us (99th percentile)"
     if one_shot:
-        return f"{found}; a one-shot sets the width"
-    if high <= MAX_WIDTH_NS:
-        return f"{found} (measured now with the line low)"
-    found += f": the radar accepts {WIDTH_TEXT}; rows would end with fault 105"
-    remedy = 'wire SYNC_IN to MOSI and set wiring = "spi", or fit a one-shot and set one_shot = true'
-    return Finding("pulse width", "fail", found, f"{remedy} (docs/how-to/wiring.md)")
+        return f"{what}; a one-shot sets the width"
+    if high_ns <= MAX_WIDTH_NS:
+        return f"{what} (measured now with the line low)"
+    what += f": the radar accepts {WIDTH_TEXT}; rows would end with fault 105"
+    do = 'wire SYNC_IN to MOSI and set wiring = "spi", or fit a one-shot and set one_shot = true'
+    return Finding("error", what, do=f"{do} (docs/how-to/wiring.md)", where="pulse width")
 
 
 def _release(modules: Path) -> Finding:
-    found = "this kernel does not say if outputs are released when their program dies"
+    what = "this kernel does not say if outputs are released when their program dies"
     for module in ("pinctrl_bcm2835", "pinctrl_rp1"):
         parameter = modules / module / "parameters" / "persist_gpio_outputs"
         if parameter.exists():
             if parameter.read_text().strip() != "Y":
-                return Finding("line release", "ok", "lines become inputs again when their program ends")
-            found = f"{module} keeps outputs as they were: a program killed during a pulse leaves them high"
-    return Finding("line release", "warn", found, STRICT)
+                return Finding("ok", "lines become inputs again when their program ends", where="line release")
+            what = f"{module} keeps outputs as they were: a program killed during a pulse leaves them high"
+    return Finding("warning", what, do=STRICT, where="line release")

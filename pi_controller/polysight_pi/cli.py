@@ -38,26 +38,29 @@ def _run(args: argparse.Namespace, instrument: Instrument) -> int:
 
 
 def _check(args: argparse.Namespace, instrument: Instrument) -> int:
-    from polysight_pi.checks import check_all
+    from polysight_pi.checks import check_all, to_json
     from polysight_pi.client import refuse_beside_service
 
     refuse_beside_service(instrument)
     findings = []
-    for f in check_all(instrument, args.wires):
+    for finding in check_all(instrument, args.wires):
+        f = to_json(finding)
         findings.append(f)
         if not args.json:
-            _write(f"{f.verdict:5} {f.name}: {f.found}" + (f"\n        do: {f.remedy}" if f.remedy else ""))
+            _write(f"{f['verdict']:5} {f['name']}: {f['found']}")
+        if not args.json and finding.do:
+            _write(f"        do: {finding.do}")
     if args.json:
-        _write(json.dumps([f._asdict() for f in findings]))
-    return int(any(f.verdict == "fail" for f in findings))
+        _write(json.dumps(findings))
+    return int(any(f["verdict"] == "fail" for f in findings))
 
 
 def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight_pi import system
-    from polysight_pi.bursts import BurstSpec, send_burst
     from polysight_pi.client import refuse_beside_service
     from polysight_pi.lines import open_lines
     from polysight_pi.service import log
+    from polysight_pi.trigger import BurstSpec, send_burst
 
     refuse_beside_service(instrument)
     lines = open_lines(instrument, args.wires)
@@ -66,19 +69,23 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
             for sentence in dict.fromkeys(system.prepare_process() + system.prepare_thread()):  # each once
                 log(sentence)
         lines.check_width = False  # the width is printed below
-        spec, end_ns, records = BurstSpec.of(instrument.burst), lines.now_ns(), []
+        spec = BurstSpec.of(instrument.burst)
+        end_ns = lines.now_ns()
+        records = []
         for _ in range(args.count):
-            records.append(send_burst(lines, spec, end_ns + PAUSE_NS))
-            end_ns = records[-1].end_ns
+            record = send_burst(lines, spec, end_ns + PAUSE_NS)
+            records.append(record)
+            end_ns = record.end_ns
     finally:
         lines.close()
-    width, jitter = max(r.width_max_ns for r in records), max(r.jitter_ns for r in records)
     if args.json:
         _write(json.dumps([r._asdict() for r in records]))
     else:
         _write(f"{sum(r.pulses for r in records)} pulses in {len(records)} bursts on SYNC_IN {instrument.pi.sync_out}")
-        _write(f"longest pulse at most {width / 1e3:.2f} us (the radar accepts {WIDTH_TEXT})")
-        _write(f"latest rising edge {jitter / 1e3:.2f} us after its deadline")
+        width_us = max(r.width_max_ns for r in records) / 1e3
+        jitter_us = max(r.jitter_ns for r in records) / 1e3
+        _write(f"longest pulse at most {width_us:.2f} us (the radar accepts {WIDTH_TEXT})")
+        _write(f"latest rising edge {jitter_us:.2f} us after its deadline")
     faults = [r.fault for r in records if r.fault]
     for number in sorted(set(faults)):
         e = explain(number)

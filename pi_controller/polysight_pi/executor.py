@@ -1,6 +1,6 @@
 """The executor: one thread that processes commands, replies of the stage and bursts from one queue, in order.
 
-It executes the host's commands and manages the run; machine.py and row_machine.py control stage and row.
+It executes the host's commands and manages the run; machine.py controls stage and row.
 docs/spec/wire.md describes each command.
 """
 
@@ -14,13 +14,12 @@ import traceback
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from polysight_pi.bursts import BurstSpec
+import msgspec
+
 from polysight_pi.journal import Journal, JournalFullError
-from polysight_pi.machine import RefusedError
-from polysight_pi.row_machine import RowMachine
-from polysight_pi.stage import StageDriver
-from polysight_pi.stage_link import StageLost, StageNews
-from polysight_pi.trigger import BurstSent, LoopFault, TriggerLoop
+from polysight_pi.machine import Machine, RefusedError
+from polysight_pi.stage import StageDriver, StageLost, StageNews
+from polysight_pi.trigger import BurstSent, BurstSpec, LoopFault, TriggerLoop
 from polysight_shared import __version__
 from polysight_shared import messages as m
 from polysight_shared.errors import PolysightError, os_error
@@ -32,7 +31,8 @@ from polysight_shared.units import us_to_ns
 TURN_TIMEOUT_S = 0.2  # the rest of the queue waits for the next turn, so that a queue that never empties is not a hang
 TURN_S = 1.0  # longest turn without work
 HUNG_S = 10.0  # time without a turn after which the executor counts as hung
-COMMANDS_WAITING, REPLAYS_WAITING = 64, 4
+COMMANDS_WAITING = 64
+REPLAYS_WAITING = 4
 LINES_WAITING = 64  # of the stage: further lines are dropped, so that an endless flood cannot fill the memory
 REPLAYED_AT_REST = 1000  # events per reply: half a second on a Pi
 REPLAYED_IN_A_ROW = 20  # events per reply during a row: packing more would delay the trigger thread
@@ -64,12 +64,15 @@ class Executor:
     def __init__(
         self, stage: StageDriver, loop: TriggerLoop, journal: Journal, turned: Callable[[], None] = lambda: None
     ) -> None:
-        self._loop, self._journal, self._turned = loop, journal, turned
+        self._loop = loop
+        self._journal = journal
+        self._turned = turned
         self.take_over_key = secrets.token_hex(16)  # accepted as the owner of every run: a person at the Pi
         self._turned_s = time.monotonic()
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._room, self._replay_room = map(threading.Semaphore, (COMMANDS_WAITING, REPLAYS_WAITING))
-        self._machine = RowMachine(stage, loop, journal, self._inbox.put)
+        self._command_slots = threading.Semaphore(COMMANDS_WAITING)
+        self._replay_slots = threading.Semaphore(REPLAYS_WAITING)
+        self._machine = Machine(stage, loop, journal, self._inbox.put)
         self._run: m.BeginRun | None = None
         self._last_row: tuple[int, int] | None = None
         self._after_row: Request | None = None
@@ -90,12 +93,12 @@ class Executor:
 
     def submit(self, command: m.AnyCommand, answer: Callable[[m.AnyReply], None]) -> bool:
         """Queue a command whose reply is passed to `answer`. Return False, without queueing, if too many wait."""
-        room = self._replay_room if isinstance(command, m.Replay) else self._room
-        if not room.acquire(blocking=False):
+        slots = self._replay_slots if isinstance(command, m.Replay) else self._command_slots
+        if not slots.acquire(blocking=False):
             return False
 
         def execute() -> None:
-            room.release()
+            slots.release()
             self._execute(Request(command, answer))
 
         self._inbox.put(execute)
@@ -138,8 +141,7 @@ class Executor:
 
     def _turn(self) -> None:
         try:
-            left_s = self._machine.seconds_left()
-            self._handle(self._inbox.get(timeout=TURN_S if left_s is None else min(left_s, TURN_S)))
+            self._handle(self._inbox.get(timeout=min(self._machine.seconds_left(), TURN_S)))
             until_s = time.monotonic() + TURN_TIMEOUT_S
             while time.monotonic() < until_s:
                 self._handle(self._inbox.get_nowait())
@@ -152,10 +154,10 @@ class Executor:
             self._machine.happen("lasting fault", e.number, str(e))
             self._journal.commit()
         self._refresh()
-        replies, self._replies = self._replies, []
-        for request, reply in replies:
+        for request, reply in self._replies:
             self._count_as_heartbeat(request.command)
             request.answer(reply)
+        self._replies.clear()
         self._turned_s = time.monotonic()
         self._turned()
 
@@ -166,7 +168,8 @@ class Executor:
             self._machine.note_host_alive()
 
     def _handle(self, item: Any) -> None:
-        machine, row = self._machine, self._machine.row
+        machine = self._machine
+        row = machine.row
         if isinstance(item, BurstSent):
             machine.on_burst(item)
         elif isinstance(item, m.Pulsed):
@@ -196,9 +199,8 @@ class Executor:
         except PolysightError as e:
             reply = refused(getattr(e, "number", PiFault.BAD_REQUEST), e.what, e.why, e.remedy)
         except OSError as e:
-            reply = refused(
-                PiFault.BAD_REQUEST, os_error(e).what, "the operating system refused it", "check the Pi's disk"
-            )
+            why = "the operating system refused it"
+            reply = refused(PiFault.BAD_REQUEST, os_error(e).what, why, "check the Pi's disk")
         except Exception as e:  # noqa: BLE001 - reported to the client and in the log
             traceback.print_exc()
             reply = refused(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
@@ -208,7 +210,8 @@ class Executor:
 
     def _on_command(self, request: Request) -> m.AnyReply | None:
         """Return the reply, or None if it follows later."""
-        command, run = request.command, self._run
+        command = request.command
+        run = self._run
         if isinstance(command, m.Replay):
             return self._replay(command)
         if self._ending:
@@ -240,8 +243,8 @@ class Executor:
                     "retry when the row has ended",
                 )
             limit = min(limit, REPLAYED_IN_A_ROW)
-        found, last = self._journal.read(command.scan_id, command.from_seq, limit)
-        return m.ReplayReply(events=[m.unpack_event(raw) for raw in found], last_seq=last)
+        packed, last_seq = self._journal.read(command.scan_id, command.from_seq, limit)
+        return m.ReplayReply(events=[m.unpack_event(raw) for raw in packed], last_seq=last_seq)
 
     def _accept(self, event: str = "", *args: Any) -> m.Accepted:
         """Execute a command of the state machine. Raises RefusedError."""
@@ -252,15 +255,15 @@ class Executor:
     def _pulse(self, request: Request, command: m.Pulse) -> None:
         """Pass a burst to the trigger loop; the reply follows when it has been sent."""
         if self._run is not None:
-            begun = f"run {self._run.scan_id} is begun"
-            raise RefusedError(PiFault.NOT_READY, begun, "pulses would belong to no point", "wait for the scan's end")
+            what = f"run {self._run.scan_id} is begun"
+            raise RefusedError(PiFault.NOT_READY, what, "pulses would belong to no point", "wait for the scan's end")
         self._machine.require("Pulse")
         if not self._loop.alive:
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
         spec = burst_of(command)
         if spec.pulses * spec.period_ns > m.MAX_PULSES_AT_REST_S * 1e9:
-            lasts = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MAX_PULSES_AT_REST_S:g} s"
-            raise RefusedError(PiFault.NOT_READY, lasts, "the lines are busy meanwhile", "ask for fewer pulses")
+            what = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MAX_PULSES_AT_REST_S:g} s"
+            raise RefusedError(PiFault.NOT_READY, what, "the lines are busy meanwhile", "ask for fewer pulses")
         self._pulsing.append(request)
         self._loop.send(spec)
 
@@ -268,12 +271,12 @@ class Executor:
         """Check a run; return True if a row has to be aborted before it can begin. Raises RefusedError."""
         check_run(run, self._machine.stage.config)
         self._loop.check(burst_of(run))
-        begun = self._run
-        other = begun is not None and (run.scan_id, run.owner) != (begun.scan_id, begun.owner)
-        if begun is not None and other and self._machine.host_lives:
+        active = self._run
+        replaces = active is not None and (run.scan_id, run.owner) != (active.scan_id, active.owner)
+        if active is not None and replaces and self._machine.host_lives:
             raise RefusedError(
                 PiFault.NOT_READY,
-                f"run {begun.scan_id} is active, and its host is alive",
+                f"run {active.scan_id} is active, and its host is alive",
                 "another program, perhaps on another machine, scans with this Pi",
                 "wait for that scan's end, or stop it there",
             )
@@ -285,7 +288,7 @@ class Executor:
 
     def _begin(self, run: m.BeginRun) -> m.Accepted:
         resumed, lost = self._journal.open(run.scan_id, run.plan, run.last_seq)
-        self._run, self._last_row = None, None
+        self._run = self._last_row = None
         self._machine.happen("EndRun")
         self._add_synced(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
         self._run = run
@@ -312,24 +315,28 @@ class Executor:
 
     def _need_run(self, scan_id: str) -> m.BeginRun:
         if self._run is None or self._run.scan_id != scan_id:
-            now = f"run {self._run.scan_id} is" if self._run else "no run is"
-            raise RefusedError(PiFault.NOT_READY, f"{now} active, not {scan_id}", "the Pi was restarted", "BeginRun")
+            active = f"run {self._run.scan_id}" if self._run else "no run"
+            what = f"{active} is active, not {scan_id}"
+            raise RefusedError(PiFault.NOT_READY, what, "the Pi was restarted", "BeginRun")
         return self._run
 
     def _run_row(self, command: m.RunRow) -> m.Accepted:
-        run, current = self._need_run(command.scan_id), self._machine.row
-        wanted = (command.row_index, command.take)
-        if wanted in (current and (current.row.index, current.take), self._last_row):
-            return self._accept()  # a repeated request
+        run = self._need_run(command.scan_id)
+        running = self._machine.row
+        requested = (command.row_index, command.take)
+        repeated = running is not None and requested == (running.row.index, running.take)
+        if repeated or requested == self._last_row:
+            return self._accept()
         self._machine.require("RunRow")
         _require(command.row_index < run.plan.rows, f"row {command.row_index} is not in the plan of {run.plan.rows}")
         return self._accept("RunRow", run.plan.row(command.row_index), command.take, burst_of(run), run.speed_mm_s)
 
     def _row_ended(self, row: tuple[int, int]) -> None:
         self._last_row = row
-        begins, self._after_row = self._after_row, None
-        if begins is not None:
-            self._execute(begins)
+        if self._after_row is not None:
+            request = self._after_row
+            self._after_row = None
+            self._execute(request)
         self._ended = self._ending
 
     def _end(self) -> None:
@@ -338,18 +345,40 @@ class Executor:
 
     def _refresh(self) -> None:
         """Update the replies to Hello and Status; they are replaced as a whole, so other threads may read them."""
-        machine, stage, row, counts = self._machine, self._machine.stage, self._machine.row, self._loop.counts
-        scan_id, last_seq = self._journal.scan_id, self._journal.last_seq
-        self.status = m.StatusReply(
-            state=machine.wire_state, homed=machine.homed, x_mm=stage.x_mm, y_mm=stage.y_mm,
-            scan_id=scan_id, row_index=row.row.index if row else -1, take=row.take if row else 0,
-            points=counts.bursts if row else 0, pulses=counts.pulses if row else 0, last_seq=last_seq,
-            fault=machine.fault, reason=machine.reason, lost_x_mm=machine.lost_mm[0], lost_y_mm=machine.lost_mm[1],
-        )  # fmt: skip
+        machine = self._machine
+        stage = machine.stage
+        status = m.StatusReply(
+            state=machine.wire_state,
+            homed=machine.homed,
+            x_mm=stage.x_mm,
+            y_mm=stage.y_mm,
+            scan_id=self._journal.scan_id,
+            row_index=-1,
+            take=0,
+            points=0,
+            pulses=0,
+            last_seq=self._journal.last_seq,
+            fault=machine.fault,
+            reason=machine.reason,
+            lost_x_mm=machine.lost_mm[0],
+            lost_y_mm=machine.lost_mm[1],
+        )
+        if (row := machine.row) is not None:
+            counts = self._loop.counts
+            status = msgspec.structs.replace(
+                status, row_index=row.row.index, take=row.take, points=counts.bursts, pulses=counts.pulses
+            )
+        self.status = status
         self.hello = m.HelloReply(
-            pi_release=__version__, firmware=stage.firmware, backend=self._loop.backend, state=machine.wire_state,
-            scan_id=scan_id, last_seq=last_seq, in_run=self._run is not None, stage=stage.config.placement_settings,
-        )  # fmt: skip
+            pi_release=__version__,
+            firmware=stage.firmware,
+            backend=self._loop.backend,
+            state=machine.wire_state,
+            scan_id=status.scan_id,
+            last_seq=status.last_seq,
+            in_run=self._run is not None,
+            stage=stage.config.placement_settings,
+        )
 
 
 # --- limits of this rig and the radars --------------------------------------------------------------------------------
@@ -367,7 +396,8 @@ def burst_of(asked: m.BeginRun | m.Pulse) -> BurstSpec:
 
 def check_run(run: m.BeginRun, stage: Stage) -> None:
     """Check that this rig can execute a run. Raises RefusedError with the conflicting values."""
-    plan, spec = run.plan, burst_of(run)
+    plan = run.plan
+    spec = burst_of(run)
     _require(plan.columns >= 1 and plan.rows >= 1, f"plan of {plan.columns} x {plan.rows} points is empty")
     _require(plan.step_x_mm > 0 and plan.step_y_mm > 0, "steps of the plan must be positive")
     fastest = max(stage.speed_mm_s, stage.travel_speed_mm_s)
@@ -380,7 +410,8 @@ def check_run(run: m.BeginRun, stage: Stage) -> None:
         abs(steps - round(steps)) < 1e-6 and round(steps) >= 1,
         f"step of {plan.step_x_mm} mm is {steps:g} motor steps: it must be a whole number",
     )
-    between_ms, burst_ms = 1e3 * plan.step_x_mm / run.speed_mm_s, run.pulses * spec.period_ns * 1e-6
+    between_ms = 1e3 * plan.step_x_mm / run.speed_mm_s
+    burst_ms = run.pulses * spec.period_ns * 1e-6
     _require(
         burst_ms <= between_ms,
         f"burst of {run.pulses} x {run.period_us} us lasts {burst_ms:.2f} ms, a point passes every "

@@ -9,7 +9,6 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-import zmq.utils.z85
 from zmq.auth import create_certificates, load_certificate
 
 from polysight_shared.error_codes import ErrorCode
@@ -29,17 +28,21 @@ class AllowedKeys:
         self._folder = folder
         self._names: dict[str, str] = {}
         self._seen = (-1, -1)
-        with suppress(OSError):
+        with suppress(OSError, ValueError):
             self._names = read_allowed(folder)
 
-    def name_of(self, key: bytes) -> str:
-        """Return the name of the client with this public key (32 bytes), or "" if it is not allowed."""
-        with suppress(OSError):  # missing or unreadable: keep the last list
+    def callback(self, domain: str, key: bytes) -> bool:  # noqa: ARG002 - the interface of zmq.auth
+        """Return True if the client with this public key (Z85) may connect. In the thread of zmq.auth."""
+        return bool(self.name_of(key.decode("ascii")))
+
+    def name_of(self, key: str) -> str:
+        """Return the name of the client with this public key (Z85), or "" if it is not allowed."""
+        with suppress(OSError, ValueError):  # missing or unreadable: keep the last list
             stat = (self._folder / ALLOWED).stat()
             if self._seen != (stat.st_mtime_ns, stat.st_size):
                 self._names = read_allowed(self._folder)
                 self._seen = (stat.st_mtime_ns, stat.st_size)
-        return self._names.get(zmq.utils.z85.encode(key).decode("ascii"), "") if len(key) == 32 else ""
+        return self._names.get(key, "")
 
 
 def read_allowed(folder: Path) -> dict[str, str]:
@@ -62,18 +65,18 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
 
     Returns the files. Raises ConfigError if there are keys already, unless `replace`.
     """
-    there = [p for name in PARTIES if (p := folder / f"{name}.key_secret").exists()]
-    if there and not replace:
+    existing = [p for name in PARTIES if (p := folder / f"{name}.key_secret").exists()]
+    if existing and not replace:
         raise ConfigError(
-            f"{there[0]} exists",
+            f"{existing[0]} exists",
             "keys were made before; new ones lock out every host that has the old ones",
             f"keep them, or give --replace, then {COPY}",
             code=ErrorCode.FILE_EXISTS,
         )
     folder.mkdir(parents=True, exist_ok=True)
-    made = [path for name in PARTIES for path in _create(folder, name)]
+    files = [path for name in PARTIES for path in _create(folder, name)]
     _write_allowed(folder, {_public(folder, "host"): "host"})
-    return made
+    return files
 
 
 def allow(folder: Path, name: str) -> list[Path]:
@@ -85,19 +88,19 @@ def allow(folder: Path, name: str) -> list[Path]:
             "choose another name, or revoke that client first",
             code=ErrorCode.NAME_TAKEN,
         )
-    made = _create(folder, name)
+    files = _create(folder, name)
     _write_allowed(folder, read_allowed(folder) | {_public(folder, name): name})
-    return made
+    return files
 
 
 def revoke(folder: Path, name: str) -> None:
     """Remove a client from the list: its next command is refused, and it cannot connect again."""
     names = read_allowed(folder)
-    left = {key: other for key, other in names.items() if other != name}
-    if left == names:
-        known = f"allowed: {', '.join(names.values())}"
-        raise ConfigError(f"no client {name!r} is allowed", "a typing error", known, code=ErrorCode.KEY_UNKNOWN)
-    _write_allowed(folder, left)
+    remaining = {key: other for key, other in names.items() if other != name}
+    if remaining == names:
+        remedy = f"allowed: {', '.join(names.values())}"
+        raise ConfigError(f"no client {name!r} is allowed", "a typing error", remedy, code=ErrorCode.KEY_UNKNOWN)
+    _write_allowed(folder, remaining)
 
 
 def _public(folder: Path, name: str) -> str:

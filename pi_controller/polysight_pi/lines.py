@@ -1,7 +1,7 @@
-"""Lines of the Raspberry Pi: trigger input and SYNC_IN through libgpiod v2, or SYNC_IN on MOSI through spidev.
+"""Trigger input and SYNC_IN output: libgpiod v2, SYNC_IN on MOSI through spidev, or simulated wires.
 
-Works on any Linux GPIO chip; not run on a Pi yet. Sources of the ioctls: Linux, include/uapi/linux/gpio.h and
-include/uapi/linux/spi/spidev.h.
+The hardware classes work on any Linux GPIO chip; not run on a Pi yet. Sources of the ioctls: Linux,
+include/uapi/linux/gpio.h and include/uapi/linux/spi/spidev.h.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from polysight_pi.bursts import DEFAULT_BUFSIZ, Edge, Lines, SpiBurst
-from polysight_pi.sim_lines import SpiWireLines, WireLines
+from polysight_pi.trigger import DEFAULT_BUFSIZ, Edge, Lines, SpiBurst
 from polysight_shared.config import Instrument, Pi
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.faults import PiFault
-from polysight_shared.messages import GPIOD, SPI
+from polysight_shared.messages import GPIOD, SPI, WIRES
+from polysight_shared.wires import WireClient, WireEdge
 
 EVENT_BUFFER = 1024  # edges kept by the kernel; its default of 16 would lose edges of a program without CPU time
 SPIN_NS = 100_000  # a sleep may end this much late, so the rest of a wait polls the clock
@@ -61,8 +61,6 @@ def open_lines(instrument: Instrument, wires: Path | None = None) -> Lines:
     Raises ConfigError or DeviceError if they cannot be opened.
     """
     pi = instrument.pi
-    if wires is not None:
-        return (SpiWireLines if pi.wiring == "spi" else WireLines)(wires, pi)
     if pi.wiring == "gpiomem" or len(pi.sync_out) > 1:
         raise ConfigError(
             f'wiring = "{pi.wiring}" with sync_out = {list(pi.sync_out)} is no longer supported',
@@ -70,7 +68,10 @@ def open_lines(instrument: Instrument, wires: Path | None = None) -> Lines:
             'use wiring = "spi", or "fanout", with a clock buffer behind one line (docs/how-to/wiring.md)',
             code=ErrorCode.VALUE_INVALID,
         )
-    return (SpiLines if pi.wiring == "spi" else GpiodLines)(pi)
+    by_spi = pi.wiring == "spi"
+    if wires is not None:
+        return SpiWireLines(wires, pi) if by_spi else WireLines(wires, pi)
+    return SpiLines(pi) if by_spi else GpiodLines(pi)
 
 
 def load_gpiod() -> Any:
@@ -96,19 +97,20 @@ def find_chip(name: str, devices: Path = Path("/dev")) -> str:
     """
     if name.startswith("/"):
         return name
-    gpiod, found = load_gpiod(), []
+    gpiod = load_gpiod()
+    chips: list[str] = []
     for path in sorted(devices.glob("gpiochip*")):
         try:
             with gpiod.Chip(str(path)) as chip:
                 label = chip.get_info().label
         except OSError as e:
-            found.append(f"{path} ({e.strerror})")
+            chips.append(f"{path} ({e.strerror})")
             continue
         if label == name:
             return str(path)
-        found.append(f"{path} is {label!r}")
+        chips.append(f"{path} is {label!r}")
     raise DeviceError(
-        f"no GPIO chip has the label {name!r}: found {', '.join(found) or 'none'}",
+        f"no GPIO chip has the label {name!r}: found {', '.join(chips) or 'none'}",
         "another Pi model, no GPIO on this machine, or no permission (group gpio)",
         "set pi.gpio_chip in instrument.toml to one of these labels or to a path",
         code=ErrorCode.FILE_MISSING,
@@ -117,7 +119,8 @@ def find_chip(name: str, devices: Path = Path("/dev")) -> str:
 
 def _request(pi: Pi, line: int, buffer: int | None = None, **settings: Any) -> Any:
     """Request a line of the rig's chip. Raises DeviceError with the reason."""
-    gpiod, path = load_gpiod(), find_chip(pi.gpio_chip)
+    gpiod = load_gpiod()
+    path = find_chip(pi.gpio_chip)
     config = {(line,): gpiod.LineSettings(**settings)}
     try:
         return gpiod.request_lines(path, config, consumer="polysight", event_buffer_size=buffer)
@@ -154,11 +157,15 @@ class TriggerInput:
         self._events: deque[Any] = deque()
         line = load_gpiod().line
         self._input = _request(
-            pi, pi.trigger_in, EVENT_BUFFER,
-            direction=line.Direction.INPUT, edge_detection=line.Edge.RISING, event_clock=line.Clock.MONOTONIC,
+            pi,
+            pi.trigger_in,
+            EVENT_BUFFER,
+            direction=line.Direction.INPUT,
+            edge_detection=line.Edge.RISING,
+            event_clock=line.Clock.MONOTONIC,
             bias=line.Bias[pi.trigger_bias.upper().replace("-", "_")],
             debounce_period=timedelta(microseconds=pi.trigger_debounce_us),
-        )  # fmt: skip
+        )
 
     def now_ns(self) -> int:
         """Return the time of CLOCK_MONOTONIC, nanoseconds."""
@@ -166,9 +173,9 @@ class TriggerInput:
 
     def sleep_until(self, t_ns: int) -> None:
         """Return at `t_ns`, never before it: sleep most of the time, then poll the clock."""
-        left = t_ns - time.monotonic_ns() - SPIN_NS
-        if left > 0:
-            time.sleep(left * 1e-9)
+        sleep_ns = t_ns - time.monotonic_ns() - SPIN_NS
+        if sleep_ns > 0:
+            time.sleep(sleep_ns * 1e-9)
         while time.monotonic_ns() < t_ns:
             pass
 
@@ -200,7 +207,8 @@ class GpiodLines(TriggerInput):
 
     def __init__(self, pi: Pi) -> None:
         self._output = request_output(pi)
-        self._set, self._clear = (partial(fcntl.ioctl, self._output.fd, SET_VALUES, _VALUES.pack(v, 1)) for v in (1, 0))
+        self._set = partial(fcntl.ioctl, self._output.fd, SET_VALUES, _VALUES.pack(1, 1))
+        self._clear = partial(fcntl.ioctl, self._output.fd, SET_VALUES, _VALUES.pack(0, 1))
         try:
             super().__init__(pi)
         except DeviceError:
@@ -228,7 +236,9 @@ class GpiodLines(TriggerInput):
         return after - before
 
     def _make_pulse(self, set_line: Callable[[], object], width_ns: int = 0) -> tuple[int, int]:
-        now, clear = time.monotonic_ns, self._clear
+        # Looked up before the line is set: nothing but the two calls is inside a pulse.
+        now = time.monotonic_ns
+        clear = self._clear
         try:
             before = now()
             set_line()
@@ -266,9 +276,12 @@ class SpiDevice:
             except OSError:
                 fcntl.ioctl(self._fd, WRITE_MODE, bytes([MODE_0]))
             self.transfer(bytes(1), 1_000_000)
-        except (OSError, DeviceError) as e:
+        except OSError as e:
             os.close(self._fd)
-            raise (e if isinstance(e, DeviceError) else self._error(e)) from None
+            raise self._error(e) from None
+        except DeviceError:
+            os.close(self._fd)
+            raise
 
     @property
     def bufsiz(self) -> int:
@@ -323,3 +336,91 @@ class SpiLines(TriggerInput):
             self._device.close()
         finally:
             super().close()
+
+
+# --- simulated wires --------------------------------------------------------------------------------------------------
+
+
+class WireLines:
+    """Lines on simulated wires; `path` is the hub's socket. Raises DeviceError if no hub listens there.
+
+    Wire time is the simulated stage's clock. Here it is the latest of the received edges and of the deadlines slept
+    until, so a burst takes no wall time and its pulses are exactly on their deadlines, however busy the machine is.
+    """
+
+    name: str = WIRES
+
+    def __init__(self, path: Path, pi: Pi) -> None:
+        self.check_width = not pi.one_shot
+        self._trigger = pi.trigger_in
+        self._output = pi.sync_out[0]
+        self._client = WireClient(path, listen=(pi.trigger_in,))
+        self._now_ns = self._seqno = 0
+        self._active = False
+        self._unsent: list[WireEdge] = []
+
+    def now_ns(self) -> int:
+        """Return the wire time."""
+        return self._now_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Advance the wire time; return at once."""
+        self._now_ns = max(self._now_ns, t_ns)
+
+    def wait_edge(self, timeout_s: float) -> Edge | None:
+        """Send the edges of the last burst and wait for the next rising edge of the trigger line.
+
+        Raises DeviceError when the hub is lost.
+        """
+        self._flush()
+        deadline = time.monotonic() + timeout_s
+        while (left_s := deadline - time.monotonic()) > 0:
+            message = self._client.receive(left_s)
+            if isinstance(message, WireEdge) and message.line == self._trigger and message.value:
+                self.sleep_until(message.t_ns)
+                self._seqno += 1
+                return Edge(message.t_ns, self._seqno)
+        return None
+
+    def pulse(self, width_ns: int) -> tuple[int, int]:
+        """Send a pulse, starting now; return its times."""
+        begin_ns = self._now_ns
+        self._set_output(True)
+        self.sleep_until(begin_ns + width_ns)
+        self._set_output(False)
+        return begin_ns, self._now_ns
+
+    def _set_output(self, active: bool) -> None:
+        if active != self._active:
+            self._active = active
+            self._unsent.append(WireEdge(self._now_ns, self._output, int(active)))
+
+    def _flush(self) -> None:
+        if self._unsent:
+            self._client.send(*self._unsent)
+            self._unsent.clear()
+
+    def close(self) -> None:
+        """Set the output low and disconnect from the hub."""
+        try:
+            self._set_output(False)
+            self._flush()
+        finally:
+            self._client.close()
+
+
+class SpiWireLines(WireLines):
+    """Simulated wires whose SYNC_IN is MOSI: the bits of a transfer become edges at the wire time of their bit."""
+
+    bufsiz = DEFAULT_BUFSIZ
+
+    def transfer(self, burst: SpiBurst) -> tuple[int, int]:
+        """Send the edges of a transfer, most significant bit first; the line keeps the level of the last bit."""
+        begin_ns = self._now_ns
+        for i, byte in enumerate(burst.data):
+            if byte or self._active:
+                for k in range(8):
+                    self._now_ns = begin_ns + round((8 * i + k) * burst.bit_ns)
+                    self._set_output(bool(byte << k & 0x80))
+        self._now_ns = begin_ns + round(burst.duration_ns)
+        return begin_ns, self._now_ns

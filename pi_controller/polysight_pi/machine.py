@@ -1,20 +1,38 @@
 """The state machine of stage, run and row: RULES lists the events of each state, their actions and the next states.
 
-The actions are methods of `RowMachine` (row_machine.py). docs/spec/wire.md, "State machine", has the same tables.
+The actions are methods of `Machine`, which control stage, trigger loop and the running row. The first fault is kept
+until the next `Home` or row. docs/spec/wire.md, "State machine", has the same tables.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
+from polysight_pi.journal import Journal
+from polysight_pi.stage import MAX_MM, StageDriver, StageLostError, StageRefusedError
+from polysight_pi.trigger import BurstSent, BurstSpec, Counts, Job, LoopFault, TriggerLoop, TriggerWatch
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import PolysightError
-from polysight_shared.faults import PiFault
-from polysight_shared.stage_line import HOMING_TIMEOUT_S
+from polysight_shared.errors import PolysightError, ProtocolError
+from polysight_shared.faults import PiFault, StageError, explain
+from polysight_shared.raster import Row, Stage
+from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
+
+STATUS_EVENT_S = 0.24
+RESTS = 3  # consecutive statuses at rest after which the reply to the end of a motion counts as lost
+MOVING = ("homing", "running", "held", "stopping")
+POSITION_LOST = (
+    StageError.NOT_HOMED,
+    StageError.IN_ALARM,
+    StageError.LIMIT_SWITCH,
+    StageError.EMERGENCY_STOP,
+    StageError.DISABLED,
+)
 
 
 class RefusedError(PolysightError):
@@ -92,18 +110,69 @@ HOST_MISSES = 4  # missing heartbeats after which the host is lost
 WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}  # the others have the same name
 
 
+@dataclass
+class RunningRow:
+    """A row that the stage has started. `status` is set once the row's result is decided."""
+
+    row: Row
+    take: int
+    job: Job
+    sequence: int  # of the stage's ROW and its `done`
+    status: m.RowStatus | None = None
+    fault: int = 0
+    reason: str = ""
+    lasting: bool = False  # the next state is fault
+    points: int = 0  # passed, counted by the stage
+    bursts: int = 0  # reported to the host
+
+    def judge(self, counts: Counts) -> None:
+        """Set the result of a row that was not stopped: `done` if all counts agree, else `fault`."""
+        points = self.row.points
+        pulses = points * self.job.spec.pulses
+        if self.points == points and counts == Counts(points, points, pulses):
+            self.status = "done"
+            return
+        self.status = "fault"
+        self.fault = int(PiFault.POINTS_MISMATCH)
+        self.reason = (
+            f"{points} points requested, {self.points} passed by the stage, {counts.edges} edges received, "
+            f"{counts.bursts} bursts and {counts.pulses} of {pulses} pulses sent"
+        )
+
+
 class Machine:
     """Applies RULES, checks the time limit of the state and, during a row, the host's heartbeat.
 
-    Used by the executor's thread only, except `note_host_alive`.
+    `post` appends a call to the executor's queue. Used by the executor's thread only, except `note_host_alive`.
     """
 
-    def __init__(self, post: Callable[[Callable[[], object]], None], clock: Callable[[], float]) -> None:
-        self._post, self._clock = post, clock
+    def __init__(
+        self,
+        stage: StageDriver,
+        loop: TriggerLoop,
+        journal: Journal,
+        post: Callable[[Callable[[], object]], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.stage = stage
+        self._loop = loop
+        self._journal = journal
+        self._post = post
+        self._clock = clock
         self.state: State = "idle"
-        self.reason = ""  # of the first fault
+        self.row: RunningRow | None = None
+        self.homed = self.in_run = False
+        self.fault = 0  # the first one
+        self.reason = ""  # of that fault
+        self.lost_mm = (0.0, 0.0)  # steps lost before the last homing, which found them
         self.row_timeout_s = math.inf
         self._deadline_s = math.inf
+        self._homing = -1  # sequence of HOME
+        self._homing_underway = False  # True once the stage has accepted it
+        self._lines_dead = self._terminating = False
+        self._rests = 0
+        self._watch = TriggerWatch()
+        self._status_sent_s = 0.0
         self.watch_host(0)
         self._rules: dict[tuple[str, str], tuple[list[Any], Callable[..., str | None]]] = {
             (state, rule.event): (rule.leads_to.split(), getattr(self, f"_{rule.action}"))
@@ -115,10 +184,10 @@ class Machine:
         """Apply the rule of this event in the current state; return False if there is none."""
         if (self.state, event) not in self._rules:
             return False
-        possible, action = self._rules[self.state, event]
         before = self.state
-        state: Any = action(*args) or possible[0]
-        if state not in possible:
+        next_states, action = self._rules[before, event]
+        state: Any = action(*args) or next_states[0]
+        if state not in next_states:
             raise RuntimeError(f"{event} in state {before} does not lead to {state}")
         if state != "same":
             self._enter(state)
@@ -126,20 +195,19 @@ class Machine:
 
     def _enter(self, state: State) -> None:
         timeout_s = self.row_timeout_s if state == "running" else TIMEOUTS_S.get(state, math.inf)
-        self.state, self._deadline_s = state, self._clock() + timeout_s
+        self.state = state
+        self._deadline_s = self._clock() + timeout_s
         if state == "ending":  # after the bursts that are still in the queue
             self._post(partial(self.happen, "settled"))
 
     def require(self, event: str) -> None:
         """Raise RefusedError if this command has no rule in the current state."""
         if (self.state, event) not in self._rules:
-            row = self.state in ("running", "held", "stopping", "done", "ending")
-            raise RefusedError(
-                PiFault.NOT_READY,
-                f"no {event} in state {self.wire_state}" + (f": {self.reason}" if self.reason else ""),
-                f"the state is {self.wire_state}",
-                "wait for the row's end, or abort it" if row else "begin a run, home the stage, start a row",
-            )
+            what = f"no {event} in state {self.wire_state}" + (f": {self.reason}" if self.reason else "")
+            remedy = "begin a run, home the stage, start a row"
+            if self.row is not None:
+                remedy = "wait for the row's end, or abort it"
+            raise RefusedError(PiFault.NOT_READY, what, f"the state is {self.wire_state}", remedy)
 
     def command(self, event: str, *args: Any) -> None:
         """Execute a command. Raises RefusedError."""
@@ -174,10 +242,9 @@ class Machine:
     def _host_lost_s(self) -> float:
         return self._host_alive_s + self._host_timeout_s if self.state in ("running", "held") else math.inf
 
-    def seconds_left(self) -> float | None:
-        """Return the time until the next deadline, or None."""
-        at_s = min(self._deadline_s, self._host_lost_s)
-        return None if at_s == math.inf else max(0.0, at_s - self._clock())
+    def seconds_left(self) -> float:
+        """Return the time until the next deadline; infinity if there is none."""
+        return max(0.0, min(self._deadline_s, self._host_lost_s) - self._clock())
 
     def check_deadlines(self) -> None:
         """Handle deadlines that have passed."""
@@ -186,3 +253,300 @@ class Machine:
         if self._clock() >= self._host_lost_s:
             reason = f"no heartbeat of the host for {self._host_timeout_s * 1e3:.0f} ms"
             self.happen("row fault", PiFault.HOST_LOST, reason)
+
+    # --- events of trigger loop and stage ---------------------------------------------------------------------------
+
+    def on_burst(self, sent: BurstSent) -> None:
+        """Journal a burst of the row."""
+        row = self.row
+        record = sent.record
+        if row is None or sent.job is not row.job or not record.pulses:
+            return
+        self._journal.add(
+            m.Capture,
+            row_index=row.row.index,
+            take=row.take,
+            point=sent.point,
+            column=row.row.column(sent.point),
+            edge_ns=sent.edge_ns,
+            first_pulse_ns=record.first_ns,
+            last_pulse_ns=record.last_ns,
+            pulses=record.pulses,
+            width_max_ns=record.width_max_ns,
+            jitter_ns=record.jitter_ns,
+        )
+        row.bursts += 1
+        if row.bursts >= row.row.points:
+            self.happen("all sent")
+
+    def on_loop_fault(self, fault: LoopFault) -> None:
+        """Handle a fault of the trigger loop, which ends the row, or the loop itself."""
+        if fault.job is None:
+            self._lines_dead = True
+            self.happen("lasting fault", fault.number, fault.detail)
+        elif self.row is not None and fault.job is self.row.job:
+            self.happen("row fault", fault.number, fault.detail)
+
+    def on_stage(self, reply: Reply) -> None:
+        """Handle an unsolicited reply of the stage."""
+        homing = self.state == "homing"
+        answers_home = reply.sequence == self._homing
+        if reply.kind == "status":
+            self._on_status(reply)
+        elif reply.kind == "ok":
+            self._homing_underway |= homing and answers_home
+        elif homing and not self._homing_underway:
+            pass  # sent before HOME was accepted
+        elif reply.kind == "banner":
+            self.happen("stage lost", PiFault.STAGE_LOST, "the stage was reset: it sent its banner")
+        elif reply.kind == "alarm" and reply.number == StageError.STOPPED:
+            self.happen("stopped")
+        elif reply.kind == "alarm":
+            e = explain(reply.number)
+            what = f"stage alarm {reply.number}: {e.what} ({e.why}); {e.remedy}"
+            self.happen("stage lost", PiFault.STAGE_ALARM, what)
+        elif reply.kind == "done" and homing and answers_home:
+            self.stage.note_position(reply)
+            self.happen("homed", reply)
+        elif reply.kind == "done" and not homing and self.row and reply.sequence == self.row.sequence:
+            self.stage.note_position(reply)
+            self.happen("passed", reply)
+
+    def _on_status(self, reply: Reply) -> None:
+        self.stage.note_position(reply)
+        self._publish_status(reply)
+        row = self.row
+        edges = self._loop.counts.edges
+        if row is not None and self.state in MOVING:
+            row.points = max(0, _number(reply, "points"))
+            if self.state != "stopping" and self._watch.is_silent(row.points, edges):
+                reason = f"the stage has passed {row.points} points, {edges} edges were received: wire off?"
+                self.happen("lasting fault", PiFault.TRIGGER_LINE_LOST, reason)
+        waits_for_end = self.state in MOVING and (row is not None or self._homing_underway)
+        if waits_for_end and reply.fields.get("state") in ("idle", "alarm"):
+            self._rests += 1
+        else:
+            self._rests = 0
+        if self._rests >= RESTS:
+            self._rests = 0
+            try:
+                self.stage.link.repeat()  # the stage repeats the end of its motion
+            except StageLostError as e:
+                self.happen("stage lost", e.number, str(e))
+
+    def _publish_status(self, reply: Reply) -> None:
+        now_s = self._clock()
+        interval_s = STATUS_EVENT_S if self.state in MOVING else 1.0
+        if now_s - self._status_sent_s < interval_s:
+            return
+        self._status_sent_s = now_s
+        self._journal.add(
+            m.StageStatus,
+            state=reply.fields.get("state", ""),
+            x_mm=self.stage.x_mm,
+            y_mm=self.stage.y_mm,
+            points=max(0, _number(reply, "points")),
+            alarm=max(0, min(_number(reply, "alarm"), 999)),
+        )
+
+    # --- actions: homing and rows -----------------------------------------------------------------------------------
+
+    def _home(self) -> None:
+        if self._lines_dead:
+            remedy = "find out why, then start polysight-pi again"
+            raise RefusedError(PiFault.TRIGGER_LINE_LOST, self.reason, remedy=remedy)
+        self.homed = self._homing_underway = self._journal.broken = False
+        self._forget_fault()
+        self._post(self._home_now)
+
+    def _home_now(self) -> None:
+        if self.state != "homing":
+            return
+        try:
+            self.stage.connect()
+            self._homing = self.stage.home()
+        except StageRefusedError as e:
+            self.happen("stage lost", PiFault.STAGE_ALARM, str(e))
+        except StageLostError as e:
+            self.happen("stage lost", e.number, str(e))
+
+    def _note_homed(self, reply: Reply) -> str:
+        self.stage.at_rest()
+        limit = MAX_MM * self.stage.config.steps_per_mm
+        lost_x, lost_y = (max(-limit, min(_number(reply, key), limit)) for key in ("lostx", "losty"))
+        self.lost_mm = (lost_x / self.stage.config.steps_per_mm, lost_y / self.stage.config.steps_per_mm)
+        self.homed = True
+        return "ready" if self.in_run else "homed"
+
+    def _begin_run(self, heartbeat_ms: int) -> None:
+        self.in_run = True
+        self.watch_host(heartbeat_ms)
+
+    def _end_run(self) -> None:
+        self.in_run = False
+
+    def _start_row(self, row: Row, take: int, spec: BurstSpec, speed_mm_s: float) -> None:
+        job = self._loop.arm(row.points, spec)
+        try:
+            sequence = self.stage.row(row, speed_mm_s)
+        except (StageRefusedError, StageLostError) as e:
+            self._loop.disarm()
+            if isinstance(e, StageLostError):
+                self.happen("stage lost", e.number, str(e))
+            elif e.number in POSITION_LOST:
+                self.happen("not homed")
+            raise
+        self.row = RunningRow(row, take, job, sequence)
+        self.row_timeout_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
+        self._rests = 0
+        self._watch = TriggerWatch()
+        self._forget_fault()
+        self._journal.add(m.RowStarted, row=row, take=take)
+
+    def _hold(self) -> None:
+        self.stage.link.send_byte(Immediate.HOLD)
+
+    def _resume(self) -> None:
+        self.stage.link.send_byte(Immediate.RESUME)
+
+    # --- actions: how a row ends ------------------------------------------------------------------------------------
+
+    def _decide(self, status: m.RowStatus, number: int, reason: str, lasting: bool = False) -> None:
+        """Set the row's result, unless it is set already, and disarm the trigger loop."""
+        if self.row is not None:
+            self.row.lasting |= lasting
+            if self.row.status is None:
+                self.row.status = status
+                self.row.fault = int(number)
+                self.row.reason = reason
+                self._loop.disarm()
+
+    def _stop(self, *_: object) -> str | None:
+        """Stop the stage if it moves. Returns `ending` for a row that cannot be stopped."""
+        if self.state in ("homing", "running", "held"):
+            try:
+                self.stage.link.send_byte(Immediate.STOP)
+            except StageLostError:
+                return "ending" if self.row else None
+        return None
+
+    def _disarm(self) -> None:
+        self._loop.disarm()
+
+    def _abort(self, reason: str) -> str | None:
+        self._decide("aborted", PiFault.ABORTED, reason)
+        return self._stop()
+
+    def terminate(self) -> bool:
+        """Stop the stage because the program is being ended. Returns True if a row has to end first."""
+        self._terminating = True
+        self.happen("Abort", "polysight-pi was ended")
+        if self.state == "stopping":
+            self._deadline_s = self._clock() + END_TIMEOUT_S
+        return self.row is not None
+
+    def _fail_row(self, number: int, reason: str, lasting: bool = False) -> str | None:
+        self._report_fault(number, reason)
+        self._decide("fault", number, reason, lasting)
+        return self._stop()
+
+    def _fail(self, number: int, reason: str) -> str | None:
+        return self._fail_row(number, reason, lasting=True)
+
+    def _lose_stage(self, number: int, reason: str) -> None:
+        """Handle a stage that is lost, in alarm, or reset: it cannot be stopped any more."""
+        self.homed = False
+        self.stage.at_rest()
+        if self.state != "fault":
+            self._report_fault(number, reason)
+        self._decide("fault", number, reason, lasting=True)
+
+    def _lose_position(self) -> None:
+        self.homed = False
+
+    def _time_out(self) -> None:
+        if not self._terminating:
+            reasons = {
+                "homing": f"not homed after {HOMING_TIMEOUT_S} s",
+                "running": f"the row has not ended after {self.row_timeout_s:.0f} s",
+                "stopping": "the stage did not stop",
+            }
+            self._lose_stage(PiFault.STAGE_LOST, reasons[self.state])
+
+    def _note_passed(self, reply: Reply) -> str | None:
+        row = self._current
+        self.stage.at_rest()
+        row.points = max(0, _number(reply, "points", row.row.points))
+        if _number(reply, "held"):
+            row.reason = "held during the row: some positions were passed below full speed"
+        return "ending" if row.bursts >= row.row.points else None
+
+    def _note_stopped(self, reply: Reply | None = None) -> None:
+        """Handle the stage at rest after STOP; it may have reached the row's end before."""
+        if reply is not None:
+            self._current.points = max(0, _number(reply, "points", self._current.row.points))
+        self._decide("aborted", PiFault.ABORTED, "the stage was stopped")
+        self._clear_alarm()
+
+    def _clear_alarm(self) -> None:
+        """Clear the alarm that STOP latches; the stage keeps its position."""
+        self.stage.at_rest()
+        try:
+            self.stage.clear()
+        except StageRefusedError as e:
+            self.homed = self.homed and e.number not in POSITION_LOST
+        except StageLostError as e:
+            self._post(partial(self.happen, "stage lost", e.number, str(e)))
+
+    def _finish_row(self) -> str:
+        row = self._current
+        counts = self._loop.disarm()
+        if row.status is None:
+            row.judge(counts)
+            if row.fault:
+                self._report_fault(row.fault, row.reason)
+        self._journal.add(
+            m.RowFinished,
+            row_index=row.row.index,
+            take=row.take,
+            status=row.status,
+            points=row.points,
+            **counts._asdict(),
+            fault=row.fault,
+            reason=row.reason,
+            timed_by=self._loop.timed_by,
+        )
+        self.row = None
+        if row.lasting:
+            return "fault"
+        return "ready" if self.homed else "idle"
+
+    @property
+    def _current(self) -> RunningRow:
+        if self.row is None:
+            raise RuntimeError(f"state {self.state} without a row")
+        return self.row
+
+    def _forget_fault(self) -> None:
+        self.fault = 0
+        self.reason = ""
+
+    def _report_fault(self, number: int, reason: str) -> None:
+        e = explain(number)
+        if not self.fault:
+            self.fault = int(number)
+            self.reason = reason
+        self._journal.add(m.Fault, number=int(number), what=f"{e.what}: {reason}", why=e.why, remedy=e.remedy)
+
+
+def row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:
+    """Estimate the duration of a row, including the longest travel to its first point."""
+    travel_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s
+    return travel_s + abs(row.step_mm) * row.points / speed_mm_s + 4 * speed_mm_s / stage.accel_mm_s2
+
+
+def _number(reply: Reply, key: str, absent: int = 0) -> int:
+    try:
+        return reply.integer(key)
+    except ProtocolError:
+        return absent

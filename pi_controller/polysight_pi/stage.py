@@ -1,26 +1,45 @@
-"""The stage in millimetres: connect, set up, home, run rows, stop. `BenchStage` is the blocking form for bring-up."""
+"""The motion stage: its serial link, the driver in millimetres, and the blocking form for bring-up.
+
+`StageLink` sends numbered lines, repeated until answered, and immediate bytes. Its reader thread separates answers to
+lines from unsolicited replies (done, alarm, status, banner) and asks for the stage's status at an interval: this is
+the heartbeat without which a moving stage stops. Protocol: docs/spec/stage-line.md.
+"""
 
 from __future__ import annotations
 
+import os
 import queue
+import termios
+import threading
 import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from polysight_pi.stage_link import (
-    STATUS_PER_HEARTBEAT,
-    StageLink,
-    StageLost,
-    StageLostError,
-    StageNews,
-    StageRefusedError,
-)
+import serial
+
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, ProtocolError
-from polysight_shared.faults import StageError, explain
+from polysight_shared.faults import PiFault, StageError, explain
 from polysight_shared.raster import Row, Stage
-from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Parameter, Reply
+from polysight_shared.stage_line import (
+    HOMING_TIMEOUT_S,
+    MAX_LINE_BYTES,
+    MAX_SEQUENCE,
+    PROTOCOL_VERSION,
+    Command,
+    Immediate,
+    Parameter,
+    Reply,
+)
 
+BANNER_TIMEOUT_S = 3.0  # the first opening of the port resets an UNO, whose boot loader takes up to 2 s
+ANSWER_TIMEOUT_S = 0.5  # the longest line and its answer take 14 ms at 115200 baud; the rest is for a busy machine
+TRIES = 4
+RETRIED = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
+STATUS_PER_HEARTBEAT = 4  # while moving
+# Timeout of a status request, in heartbeats. With the time until the next request and the read timeout, a silent stage
+# is noticed before its own heartbeat stops it.
+SILENT_HEARTBEATS = 0.5
 IDLE_STATUS_S = 1.0
 STOP_TIMEOUT_S = 3.0  # from STOP to standstill
 CLEAR_RETRY_S = 0.05
@@ -28,11 +47,268 @@ MAX_MM = 1e6  # limit of a position in the messages
 MOTION_TIMEOUT_S = HOMING_TIMEOUT_S  # no motion takes longer than homing
 
 
+class StageLostError(DeviceError):
+    """The stage does not answer, or its port is lost."""
+
+    number = PiFault.STAGE_LOST
+
+
+class StageRefusedError(DeviceError):
+    """The stage answered a line with `error:<number>`."""
+
+    def __init__(self, verb: str, number: int) -> None:
+        what, why, remedy = explain(number)
+        what = f"stage refused {verb}: error {number}, {what}"
+        super().__init__(what, why, remedy, code=ErrorCode.REFUSED_BY_PEER)
+        self.number = number
+
+
+class StageLost(NamedTuple):
+    """The link is lost."""
+
+    reason: str
+
+
+StageNews = Reply | StageLost
+
+
+class StatusWatch:
+    """Schedules status requests and detects a silent stage. All times are those of one clock, in seconds."""
+
+    def __init__(self, heartbeat_s: float, now_s: float) -> None:
+        self._silence_s = SILENT_HEARTBEATS * heartbeat_s
+        self._asked_s = now_s
+        self._unanswered_since_s: float | None = None
+        self.look_s = min(0.05, heartbeat_s / STATUS_PER_HEARTBEAT / 2)  # interval for calling `is_due` and `silent_s`
+        self.interval_s = 0.0  # between status requests; 0: none
+
+    def is_due(self, now_s: float) -> bool:
+        """Return True, once per interval, if the status is to be requested now."""
+        if not self.interval_s or now_s - self._asked_s < self.interval_s:
+            return False
+        self._asked_s = now_s
+        if self._unanswered_since_s is None:
+            self._unanswered_since_s = now_s
+        return True
+
+    def heard(self) -> None:
+        """Note that the stage has sent something."""
+        self._unanswered_since_s = None
+
+    def silent_s(self, now_s: float) -> float:
+        """Return how long the stage has been silent; 0 while that is within the timeout."""
+        if self._unanswered_since_s is None or now_s - self._unanswered_since_s <= self._silence_s:
+            return 0.0
+        return now_s - self._unanswered_since_s
+
+
+class StageLink:
+    """An open serial link to the stage at `port`. Every method raises StageLostError if the stage does not answer.
+
+    Parameters
+    ----------
+    news
+        Called by the reader thread with every unsolicited reply, every `ok` (it separates replies before a command from
+        those after it), and one :class:`StageLost` when the link is lost. Must return at once.
+    heartbeat_s
+        The stage's heartbeat; the stage is lost if a status request is not answered within half of it.
+    banner_timeout_s
+        Timeout for the banner of a stage that was reset by opening the port; a stage without one is greeted anyway.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        baud: int,
+        news: Callable[[StageNews], None],
+        heartbeat_s: float = 2.0,
+        banner_timeout_s: float = BANNER_TIMEOUT_S,
+    ) -> None:
+        self.port = port
+        self._news = news
+        self._watch = StatusWatch(heartbeat_s, time.monotonic())
+        try:
+            self._serial = serial.Serial(port, baud, timeout=self._watch.look_s, write_timeout=1.0, exclusive=True)
+            # Keep DTR up when the port is closed: its next rise would reset an UNO, which would lose its position.
+            settings = termios.tcgetattr(self._serial.fileno())
+            settings[2] &= ~termios.HUPCL
+            termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, settings)
+        except (OSError, ValueError, termios.error) as e:  # SerialException is an OSError
+            reason = os.strerror(e.errno) if isinstance(e, OSError) and e.errno else str(e)
+            raise StageLostError(
+                f"stage port {port} cannot be opened: {reason}",
+                "cable unplugged, wrong port, no permission (group dialout), or another program uses it",
+                "check stage.port in instrument.toml and `ls -l /dev/ttyACM* /dev/ttyUSB*`",
+                code=ErrorCode.FILE_UNREADABLE,
+            ) from None
+        self._write_lock = threading.Lock()
+        self._answers: queue.SimpleQueue[Reply | None] = queue.SimpleQueue()
+        self._banner: Reply | None = None
+        self._banner_seen = threading.Event()
+        self._greeted = self._closing = False
+        self._sequence = self.bad_lines = 0
+        self._last_line = b""
+        self.lost = ""  # the reason, once the link is lost
+        self._reader = threading.Thread(target=self._read, name="stage", daemon=True)
+        self._reader.start()
+        try:
+            self._greet(banner_timeout_s)
+        except DeviceError:
+            self.close()
+            raise
+
+    def _greet(self, banner_timeout_s: float) -> None:
+        self._banner_seen.wait(banner_timeout_s)
+        self._write(b"\n")  # ends a partial line sent earlier
+        hello = self.request("HELLO")
+        fields = {**(self._banner.fields if self._banner else {}), **hello.fields}
+        self.firmware = fields.get("fw", "")
+        self.steps_per_mm = fields.get("steps", "")
+        if fields.get("proto", str(PROTOCOL_VERSION)) != str(PROTOCOL_VERSION):
+            raise StageLostError(
+                f"stage at {self.port} speaks protocol {fields['proto']}, this program speaks {PROTOCOL_VERSION}",
+                "firmware and Pi program are of different releases",
+                "flash the sketch of this release",
+                code=ErrorCode.VERSION_UNSUPPORTED,
+            )
+        self._greeted = True
+
+    def request(self, verb: str, *args: int) -> Reply:
+        """Send a line and return the answer; retry with the same number if it is lost or damaged.
+
+        Raises StageRefusedError if the stage refuses the line, StageLostError if it does not answer.
+        """
+        answer = self._exchange(verb, args)
+        if answer.number == StageError.SEQUENCE and verb != "HELLO":
+            self._exchange("HELLO", ())
+            answer = self._exchange(verb, args)
+        if answer.kind == "error":
+            raise StageRefusedError(verb, answer.number)
+        return answer
+
+    def _exchange(self, verb: str, args: tuple[int, ...]) -> Reply:
+        sequence = self._sequence
+        self._sequence = (sequence + 1) % (MAX_SEQUENCE + 1)
+        self._last_line = Command(sequence, verb, args).encode()
+        while not self._answers.empty():
+            self._answers.get()
+        for _ in range(TRIES):
+            self._write(self._last_line)
+            answer = self._answer(sequence)
+            if answer is not None and answer.number not in RETRIED:
+                return answer
+        raise StageLostError(
+            f"stage at {self.port} does not answer {verb}" + (f": {self.lost}" if self.lost else ""),
+            "cable unplugged, board without the sketch, or wrong port",
+            "check the USB cable, stage.port and stage.baud; `make flash` puts the sketch on the board",
+            code=ErrorCode.NO_ANSWER,
+        )
+
+    def _answer(self, sequence: int) -> Reply | None:
+        deadline = time.monotonic() + ANSWER_TIMEOUT_S
+        while (left_s := deadline - time.monotonic()) > 0:
+            try:
+                answer = self._answers.get(timeout=left_s)
+            except queue.Empty:
+                return None
+            if answer is None or answer.sequence == sequence or (answer.kind == "error" and answer.sequence is None):
+                return answer
+        return None
+
+    def send_byte(self, byte: Immediate) -> None:
+        """Send an immediate byte."""
+        self._write(byte.sent)
+
+    def repeat(self) -> None:
+        """Send the last line again: the stage repeats its answer and the end of its motion, without moving."""
+        self._write(self._last_line)
+
+    def ask_status_every(self, interval_s: float) -> None:
+        """Request the status at this interval: the heartbeat of a moving stage. 0 stops the requests."""
+        self._watch.interval_s = interval_s
+
+    def close(self) -> None:
+        """Close the port and end the reader."""
+        self._closing = True
+        if self._serial.is_open:
+            self._serial.cancel_read()
+        if threading.current_thread() is not self._reader:
+            self._reader.join(1.0)
+        self._serial.close()
+
+    def _write(self, data: bytes) -> None:
+        if self.lost:
+            raise StageLostError(f"stage at {self.port} is lost: {self.lost}", "see above", "polysight-pi home")
+        try:
+            with self._write_lock:
+                self._serial.write(data)
+        except OSError as e:
+            self._lose(f"writing failed: {e}")
+            unplugged = "cable unplugged, or the board lost power"
+            raise StageLostError(f"stage at {self.port} is lost: {e}", unplugged, "check the USB cable") from None
+
+    def _lose(self, reason: str) -> None:
+        if self.lost or self._closing:
+            return
+        self.lost = reason
+        self._answers.put(None)
+        if self._greeted:
+            self._news(StageLost(f"stage at {self.port}: {reason}"))
+
+    def _read(self) -> None:
+        buffer = b""
+        while not self._closing and not self.lost:
+            try:
+                data = self._serial.read(1)
+                data += self._serial.read(self._serial.in_waiting)
+            except (OSError, TypeError) as e:  # pyserial raises TypeError when the port is closed under a read
+                self._lose(f"reading failed: {e}")
+                return
+            now = time.monotonic()
+            if data:
+                self._watch.heard()
+                *lines, buffer = (buffer + data).split(b"\n")
+                for line in lines:
+                    self._take(line + b"\n")
+                buffer = buffer[-MAX_LINE_BYTES:]
+            elif (silent_s := self._watch.silent_s(now)) and not self._unread():
+                self._lose(f"silent for {silent_s:.1f} s")
+                return
+            if self._watch.is_due(now):
+                try:
+                    self._write(bytes([Immediate.STATUS]))
+                except StageLostError:
+                    return
+
+    def _unread(self) -> bool:
+        """True if bytes arrived since the last read: this thread, not the stage, may have been late."""
+        try:
+            return self._serial.in_waiting > 0
+        except (OSError, TypeError):
+            return False
+
+    def _take(self, line: bytes) -> None:
+        try:
+            reply = Reply.decode(line.replace(b"\r\n", b"\n"))
+        except ProtocolError:
+            self.bad_lines += 1  # if it was an answer, its line is retried
+            return
+        if reply.kind in ("ok", "error"):
+            self._answers.put(reply)
+        elif reply.kind == "banner" and not self._greeted:
+            self._banner = reply
+            self._banner_seen.set()
+        if self._greeted and reply.kind != "error":
+            self._news(reply)
+
+
 class StageDriver:
     """The stage of the [stage] table, used by one thread; `news` as in :class:`StageLink`."""
 
     def __init__(self, config: Stage, news: Callable[[StageNews], None]) -> None:
-        self.config, self.port, self._news = config, config.port, news
+        self.config = config
+        self.port = config.port
+        self._news = news
         self._open: StageLink | None = None
         self.x_mm = self.y_mm = 0.0
         self.firmware = ""
@@ -92,16 +368,17 @@ class StageDriver:
         except StageRefusedError as e:
             if e.number != StageError.NOT_HOMED:  # homing is the remedy
                 raise
-        c, k = self.config, self.config.steps_per_mm
-        for parameter, value in (
-            (Parameter.ACCEL, c.accel_mm_s2 * k),
-            (Parameter.HEARTBEAT, c.heartbeat_ms),
-            (Parameter.TRIGGER, c.trigger_width_us),
-            (Parameter.TRAVEL_X, c.travel_x_mm * k),
-            (Parameter.TRAVEL_Y, c.travel_y_mm * k),
-            (Parameter.TRAVEL_SPEED, c.travel_speed_mm_s * k),
-            (Parameter.BACKLASH, c.backlash_mm * k),
-        ):
+        config = self.config
+        settings = {
+            Parameter.ACCEL: config.accel_mm_s2 * config.steps_per_mm,
+            Parameter.HEARTBEAT: config.heartbeat_ms,
+            Parameter.TRIGGER: config.trigger_width_us,
+            Parameter.TRAVEL_X: config.travel_x_mm * config.steps_per_mm,
+            Parameter.TRAVEL_Y: config.travel_y_mm * config.steps_per_mm,
+            Parameter.TRAVEL_SPEED: config.travel_speed_mm_s * config.steps_per_mm,
+            Parameter.BACKLASH: config.backlash_mm * config.steps_per_mm,
+        }
+        for parameter, value in settings.items():
             self.link.request("SET", int(parameter), round(value))
         self.link.request("ENABLE", 1)
         return self._start("HOME")
@@ -127,30 +404,33 @@ class StageDriver:
         except ProtocolError:
             return
         if max(abs(x_mm), abs(y_mm)) <= MAX_MM:
-            self.x_mm, self.y_mm = x_mm, y_mm
+            self.x_mm = x_mm
+            self.y_mm = y_mm
 
     def close(self) -> None:
         """Close the port."""
-        if self._open is not None:
-            link, self._open = self._open, None
+        link = self._open
+        self._open = None
+        if link is not None:
             link.close()
 
     def _start(self, verb: str, *args: int) -> int:
         # The heartbeat has to begin before the motion does.
         self.link.ask_status_every(self.config.heartbeat_ms / 1e3 / STATUS_PER_HEARTBEAT)
         try:
-            sequence = self.link.request(verb, *args).sequence
+            answer = self.link.request(verb, *args)
         except StageRefusedError:
             self.at_rest()
             raise
-        return -1 if sequence is None else sequence
+        return -1 if answer.sequence is None else answer.sequence
 
 
 def row_in_steps(row: Row, stage: Stage, speed_mm_s: float) -> tuple[int, int, int, int, int]:
     """Return the arguments of ROW: first point, signed step, points, y (all in steps), speed in steps/s."""
     k = stage.steps_per_mm
-    x0, y = (stage.centre_x_mm + row.x_start_mm) * k, (stage.centre_y_mm + row.y_mm) * k
-    return round(x0), round(row.step_mm * k), row.points, round(y), round(speed_mm_s * k)
+    x_start = round((stage.centre_x_mm + row.x_start_mm) * k)
+    y = round((stage.centre_y_mm + row.y_mm) * k)
+    return x_start, round(row.step_mm * k), row.points, y, round(speed_mm_s * k)
 
 
 class Position(NamedTuple):
@@ -205,11 +485,11 @@ class BenchStage:
             self._driver.link.send_byte(Immediate.STOP)
             raise
 
-    def _wait(self, wanted: Callable[[Reply], bool], timeout_s: float, timeout: StageLostError) -> Position:
+    def _wait(self, matches: Callable[[Reply], bool], timeout_s: float, timeout: StageLostError) -> Position:
         deadline = time.monotonic() + timeout_s
-        while (left := deadline - time.monotonic()) > 0:
+        while (left_s := deadline - time.monotonic()) > 0:
             try:
-                news = self._news.get(timeout=left)
+                news = self._news.get(timeout=left_s)
             except queue.Empty:
                 break
             if isinstance(news, StageLost):
@@ -218,6 +498,6 @@ class BenchStage:
                 e = explain(news.number)
                 raise DeviceError(f"stage alarm {news.number}: {e.what}", e.why, e.remedy)
             self._driver.note_position(news)
-            if wanted(news):
+            if matches(news):
                 return Position(self._driver.x_mm, self._driver.y_mm)
         raise timeout

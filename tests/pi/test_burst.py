@@ -8,13 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.support.pi.fakes import FakeLines, gone
 
-from polysight_pi.bursts import BurstSpec, Edge, send_burst
 from polysight_pi.trigger import (
     FIRST_PULSE_DELAY_NS,
     BurstSent,
+    BurstSpec,
     Counts,
+    Edge,
     LoopFault,
     TriggerLoop,
+    send_burst,
 )
 from polysight_shared.faults import PiFault
 from polysight_shared.raster import MIN_PERIOD_NS

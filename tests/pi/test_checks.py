@@ -79,22 +79,22 @@ def test_line_release(rig_with, tmp_path):
     def of(model, **settings):
         (tmp_path / "model").write_bytes(model.encode() + b"\0")
         found = check_lines(rig_with(**settings), tmp_path / "model", tmp_path)
-        return [f.verdict for f in found if f.name == "line release"]
+        return [f.level for f in found if f.where == "line release"]
 
     pi_4 = "Raspberry Pi 4 Model B Rev 1.4"
     assert of("QEMU Virtual Machine") == []
     assert of(pi_4, wiring="spi", sync_out=(10,)) == [], "the kernel ends a transfer, and its last bits are low"
-    assert of(pi_4) == ["warn"]  # an older kernel
+    assert of(pi_4) == ["warning"]  # an older kernel
     parameters = tmp_path / "pinctrl_bcm2835" / "parameters"
     parameters.mkdir(parents=True)
-    for value, verdict in (("Y", "warn"), ("N", "ok")):
+    for value, level in (("Y", "warning"), ("N", "ok")):
         (parameters / "persist_gpio_outputs").write_text(value + "\n")
-        assert of(pi_4) == [verdict]
+        assert of(pi_4) == [level]
 
 
 def test_a_hundredth_of_the_widths_may_be_too_long():
     assert "measured now" in str(judge_widths([3_000] * 991 + [9_000] * 9, one_shot=False))
-    assert judge_widths([3_000] * 989 + [9_000] * 11, one_shot=False).verdict == "fail"
+    assert judge_widths([3_000] * 989 + [9_000] * 11, one_shot=False).level == "error"
 
 
 class Spidev:
@@ -113,16 +113,16 @@ class Spidev:
         return 0
 
 
-@pytest.mark.parametrize(("rate", "verdict"), [(1.0, "ok"), (1.6, "fail"), (0.6, "fail")])
-def test_the_spi_clock_is_measured_with_the_line_low(rig_with, tmp_path, monkeypatch, rate, verdict):
+@pytest.mark.parametrize(("rate", "level"), [(1.0, "ok"), (1.6, "error"), (0.6, "error")])
+def test_the_spi_clock_is_measured_with_the_line_low(rig_with, tmp_path, monkeypatch, rate, level):
     device = tmp_path / "spidev0.0"
     rig = rig_with(wiring="spi", sync_out=(10,), spi_device=str(device))
     found = attempt("pulse width", measure_clock, rig)
-    assert (found.verdict, "dtparam=spi=on" in found.remedy) == ("fail", True), "SPI is off"
+    assert (found.level, "dtparam=spi=on" in found.do) == ("error", True), "SPI is off"
     device.touch()
     controller = Spidev(rate, monkeypatch)
     found = attempt("pulse width", measure_clock, rig)
-    assert (found.verdict, "core_freq" in found.remedy) == (verdict, verdict == "fail")
+    assert (found.level, "core_freq" in found.do) == (level, level == "error")
     assert not any(any(data) for data in controller.data), "no pulse"
     pi_lines.SpiDevice(str(device)).transfer(b"\x01\x80", 1_000_000)
     assert controller.data[-1] == b"\x01\x80"
@@ -132,37 +132,37 @@ def test_rights_that_are_missing(monkeypatch):
     monkeypatch.setattr(checks.system, "prepare_process", lambda: ["no real-time scheduling", "memory is not locked"])
     monkeypatch.setattr(checks.system, "prepare_thread", lambda: ["no real-time scheduling"])
     found = checks._real_time()
-    assert (found.verdict, found.found) == ("warn", "no real-time scheduling; memory is not locked")
-    assert "LimitRTPRIO" in found.remedy
+    assert (found.level, found.what) == ("warning", "no real-time scheduling; memory is not locked")
+    assert "LimitRTPRIO" in found.do
 
 
 def test_journal_and_disk(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    assert attempt("journal", checks._journal, tmp_path / "file" / "journal", 0).verdict == "fail"
+    assert attempt("journal", checks._journal, tmp_path / "file" / "journal", 0).level == "error"
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(100, 99, 1 << 20))
     found = attempt("journal", checks._journal, tmp_path, checks.JOURNAL_BYTES)
-    assert (found.verdict, "1 MiB" in found.found, "100 MiB" in found.found) == ("fail", True, True)
+    assert (found.level, "1 MiB" in found.what, "100 MiB" in found.what) == ("error", True, True)
 
 
 def test_keys(tmp_path):
     folder, addresses = tmp_path / "keys", ("tcp://127.0.0.1:1", "tcp://0.0.0.0:2")
-    assert attempt("keys", checks._keys, folder, addresses[:1]).verdict == "ok"
+    assert attempt("keys", checks._keys, folder, addresses[:1]).level == "ok"
     found = attempt("keys", checks._keys, folder, addresses)
-    assert (found.verdict, found.remedy) == ("fail", "polysight-pi keys")
+    assert (found.level, found.do) == ("error", "polysight-pi keys")
     make_keys(folder)
-    assert attempt("keys", checks._keys, folder, addresses).verdict == "ok"
+    assert attempt("keys", checks._keys, folder, addresses).level == "ok"
     (folder / "pi.key_secret").chmod(0o644)
     found = attempt("keys", checks._keys, folder, addresses)
-    assert (found.verdict, "chmod 600" in found.remedy) == ("warn", True)
+    assert (found.level, "chmod 600" in found.do) == ("warning", True)
 
 
 def test_addresses_and_bursts(tmp_path, gpio_rig):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
-        assert attempt("command address", checks._address, replier, address, tmp_path).verdict == "fail"
+        assert attempt("command address", checks._address, replier, address, tmp_path).level == "error"
     found = attempt("event address", checks._address, publisher, "tcp://0.0.0.0:*", tmp_path)
-    assert (found.verdict, "polysight-pi keys" in found.remedy) == ("fail", True)
-    assert attempt("event address", checks._address, publisher, "tcp//x", tmp_path).verdict == "fail"
+    assert (found.level, "polysight-pi keys" in found.do) == ("error", True)
+    assert attempt("event address", checks._address, publisher, "tcp//x", tmp_path).level == "error"
     slow = replace(gpio_rig, burst=replace(gpio_rig.burst, pulses=100))
-    assert attempt("plan", checks._plan, slow).verdict == "fail", "the burst does not end before the next point"
+    assert attempt("plan", checks._plan, slow).level == "error", "the burst does not end before the next point"

@@ -9,8 +9,8 @@ from tests.support.pi.program import Process
 from tests.support.rigs import at_stage_port
 
 from polysight_pi import cli
-from polysight_pi.bursts import BurstRecord
 from polysight_pi.cli import main
+from polysight_pi.trigger import BurstRecord
 from polysight_shared import messages as m
 from polysight_shared.faults import PiFault
 from polysight_simulators.loopback import on_free_subnet
@@ -113,7 +113,7 @@ def test_pulse_reports_faults(command, config, monkeypatch):
     late = BurstRecord(2, 0, 1, 2, 1000, 900, PiFault.PERIOD_TOO_SHORT)
     records = iter([late, late._replace(fault=0), late])
     monkeypatch.setattr("polysight_pi.lines.open_lines", lambda *_: FakeLines())
-    monkeypatch.setattr("polysight_pi.bursts.send_burst", lambda *_: next(records))
+    monkeypatch.setattr("polysight_pi.trigger.send_burst", lambda *_: next(records))
     monkeypatch.setattr("polysight_pi.system.prepare_process", list)
     monkeypatch.setattr("polysight_pi.system.prepare_thread", list)
     status, _, err = command("pulse", "--config", config, "--count", 3)

@@ -20,7 +20,7 @@ from polysight_pi import checks
 from polysight_pi.checks import attempt
 from polysight_pi.cli import main
 from polysight_pi.keys import allow, make_keys, read_allowed, revoke
-from polysight_pi.server import Server
+from polysight_pi.service import Server
 from polysight_shared import messages as m
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
@@ -222,5 +222,5 @@ def test_keys_of_another_user_are_an_error_with_its_remedy(config, monkeypatch, 
     assert "Permission denied" in said
     assert "sudo -u polysight" in said
     found = attempt("keys", checks._keys, config.parent / "keys", (ELSEWHERE,))
-    assert (found.verdict, "sudo -u polysight" in found.remedy) == ("fail", True)
-    assert "pi.key_secret: Permission denied" in found.found
+    assert (found.level, "sudo -u polysight" in found.do) == ("error", True)
+    assert "pi.key_secret: Permission denied" in found.what

@@ -10,8 +10,8 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight_pi import lines as pi_lines
-from polysight_pi.bursts import BurstSpec, send_burst
 from polysight_pi.lines import GpiodLines, find_chip, open_lines
+from polysight_pi.trigger import BurstSpec, send_burst
 from polysight_shared.config import Pi
 from polysight_shared.error_codes import ErrorCode
 

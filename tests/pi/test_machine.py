@@ -13,11 +13,9 @@ from hypothesis import strategies as st
 from tests.support.paths import REPO
 from tests.support.pi.fakes import FakeDriver, FakeLines
 
-from polysight_pi.bursts import BurstSpec, Edge
-from polysight_pi.machine import RULES, TIMEOUTS_S, WIRE_STATE, RefusedError, State
-from polysight_pi.row_machine import RowMachine
-from polysight_pi.stage_link import STATUS_PER_HEARTBEAT, StatusWatch
-from polysight_pi.trigger import LOOK_UP_S, BurstSent, LoopFault, TriggerLoop, TriggerWatch
+from polysight_pi.machine import RULES, TIMEOUTS_S, WIRE_STATE, Machine, RefusedError, State
+from polysight_pi.stage import STATUS_PER_HEARTBEAT, StatusWatch
+from polysight_pi.trigger import LOOK_UP_S, BurstSent, BurstSpec, Edge, LoopFault, TriggerLoop, TriggerWatch
 from polysight_shared import messages as m
 from polysight_shared.faults import PiFault, StageError
 from polysight_shared.raster import Row
@@ -48,7 +46,7 @@ class Bench:
         self.posted: list[Any] = []
         self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)  # not started: edges are given to it
         parts: Any = (self.stage, self.loop, self.journal, self.posted.append, lambda: self.t)
-        self.machine = RowMachine(*parts)
+        self.machine = Machine(*parts)
         self.seqno = 0
 
     def run_posted(self) -> None:

@@ -84,7 +84,7 @@ def test_a_run_without_a_heartbeat_can_be_replaced(pi):
 def test_a_hanging_executor_does_not_look_alive(pi, hang, monkeypatch):
     """Commands are refused and no heartbeat is sent, until it runs again."""
     host = pi.host
-    monkeypatch.setattr("polysight_pi.server.HUNG_S", 0.5)
+    monkeypatch.setattr("polysight_pi.service.HUNG_S", 0.5)
     monkeypatch.setattr(executors, "TURN_S", 0.05)
 
     def until(kind):

@@ -4,8 +4,7 @@ import msgspec
 import pytest
 
 from polysight.acquisition.pi_client import HostHeartbeat
-from polysight_pi.lines import GpiodLines, SpiLines
-from polysight_pi.sim_lines import WireLines
+from polysight_pi.lines import GpiodLines, SpiLines, WireLines
 from polysight_shared import messages as m
 from polysight_shared.errors import DeviceError
 from polysight_shared.faults import PiFault, StageError
@@ -235,7 +234,7 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(pi, 
 
     raised = []
     monkeypatch.setattr("threading.excepthook", lambda args: raised.append(args.exc_type))
-    monkeypatch.setattr("polysight_pi.row_machine.RowMachine.on_burst", fail)
+    monkeypatch.setattr("polysight_pi.machine.Machine.on_burst", fail)
     stage.pace_s = 0.2  # the reply to the row goes out before its first edge comes
     host.start_row()
     pi.thread.join(60)

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
-from polysight_pi.bursts import (
+from polysight_pi.lines import SpiWireLines
+from polysight_pi.trigger import (
     DEFAULT_BUFSIZ,
     MAX_HZ,
     MIN_BYTES,
@@ -22,7 +23,6 @@ from polysight_pi.bursts import (
     send_burst,
     spi_burst,
 )
-from polysight_pi.sim_lines import SpiWireLines
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.faults import PiFault
 from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_WIDTH_NS

@@ -7,8 +7,7 @@ from tests.support.pi.fake_stage import FakeStage
 from tests.support.refusals import refused
 from tests.support.rigs import at_stage_port
 
-from polysight_pi.stage import BenchStage
-from polysight_pi.stage_link import StageLink, StageLost, StageLostError, StageRefusedError
+from polysight_pi.stage import BenchStage, StageLink, StageLost, StageLostError, StageRefusedError
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.faults import StageError, explain
 from polysight_shared.stage_line import Command, Immediate, Reply
@@ -107,7 +106,7 @@ def test_a_pulled_cable_is_a_lost_stage(dry_stage, connect):
 def test_no_port_and_another_protocol(tmp_path, monkeypatch, connect):
     with refused(ErrorCode.FILE_UNREADABLE, tmp_path / "none"):
         StageLink(str(tmp_path / "none"), 115200, lambda _: None)
-    monkeypatch.setattr("polysight_pi.stage_link.PROTOCOL_VERSION", 9)
+    monkeypatch.setattr("polysight_pi.stage.PROTOCOL_VERSION", 9)
     with refused(ErrorCode.VERSION_UNSUPPORTED, "protocol 2", 9):
         connect()
 

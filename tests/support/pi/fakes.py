@@ -6,7 +6,7 @@ import queue
 from collections.abc import Callable
 from typing import Any
 
-from polysight_pi.bursts import Edge
+from polysight_pi.trigger import Edge
 from polysight_shared.config import Stage
 from polysight_shared.errors import DeviceError
 from polysight_shared.stage_line import Immediate, Reply

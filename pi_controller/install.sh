@@ -11,6 +11,13 @@ root=${ROOT:-} # another place than /, to try it out
 opt="$root/opt/polysight"
 export PIP_DISABLE_PIP_VERSION_CHECK=1
 
+if [ "${1:-}" = --any-machine ]; then # a board that is not a Raspberry Pi
+  shift
+elif [ -z "$root" ] && ! grep -qsa '^Raspberry Pi' /proc/device-tree/model; then
+  echo "This is not a Raspberry Pi, nothing was changed. For another board: sudo $0 --any-machine" >&2
+  exit 2
+fi
+
 use() { # make a release the one in use, in one step
   ln -sfn "releases/$1" "$opt/venv.new"
   mv -T "$opt/venv.new" "$opt/venv"

@@ -93,8 +93,8 @@ def test_commands_beside_the_service(command, instrument, write_config, start, h
     start(rig, "--wires", hub)
     config = write_config(rig)
     assert command("home", "--config", config)[1] == "stage at x 0.000 mm, y 0.000 mm\n"
-    _, out, _ = command("events", "--config", config, "--count", 2)
-    assert [json.loads(line)["type"] for line in out.splitlines()] == ["Heartbeat", "Heartbeat"]
+    _, out, _ = command("events", "--config", config, "--count", 10)  # statuses of the stage are among them
+    assert "Heartbeat" in [json.loads(line)["type"] for line in out.splitlines()]
     for name in ("check", "pulse", "jog"):
         status, _, err = command(name, "--config", config, *(("--wires", hub) if name != "jog" else ()))
         assert (status, rig.pi.command_address in err) == (5, True)

@@ -151,6 +151,8 @@ def install(bench, tmp_path):
 @pytest.fixture
 def bench(tmp_path):
     """Commands that change nothing outside the test's folder, and the environment in which they are found."""
+    # With another name of this variable the script would change the machine that runs the tests.
+    assert "root=${ROOT:-}" in (PI / "install.sh").read_text()
     for name in ("bin", "home/polysight", "root"):
         (tmp_path / name).mkdir(parents=True)
     for name, text in STUBS.items():
@@ -196,6 +198,16 @@ def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_h
     assert back == [0, 5], "to the first release, and no further"
     assert (opt / "venv").readlink() == Path("releases/1")
     assert (opt / "venv/bin/python").is_file()
+
+
+def test_a_machine_that_is_no_pi_is_not_changed(install, bench, tmp_path):
+    if Path("/proc/device-tree/model").exists():
+        pytest.skip("this machine has a device tree: it may be a Pi")
+    del bench["ROOT"]
+    for arguments in ((), ("--roll-back",)):
+        done = install(*arguments)
+        assert (done.returncode, "not a Raspberry Pi" in done.stderr) == (2, True)
+    assert not (tmp_path / "log").exists(), "no command was run"
 
 
 def test_a_release_that_cannot_be_installed_changes_nothing(install, tmp_path):

@@ -12,8 +12,9 @@ from tests.support.refusals import refused
 from polysight_pi import lines as pi_lines
 from polysight_pi.lines import GpiodLines, find_chip, open_lines
 from polysight_pi.trigger import BurstSpec, send_burst
-from polysight_shared.config import Pi
+from polysight_shared.config import Instrument, Pi
 from polysight_shared.error_codes import ErrorCode
+from polysight_shared.tables import decode, to_builtins
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 SET_VALUES = 3 << 30 | 16 << 16 | 0xB4 << 8 | 0x0F  # <linux/gpio.h>: _IOWR(0xB4, 0x0F, two 64-bit words)
@@ -43,16 +44,18 @@ def test_a_short_pulse_is_two_calls_with_nothing_between_them(gpio_rig, monkeypa
 
 
 @pytest.mark.parametrize(("wiring", "sync_out"), [("lines", (22, 23, 24)), ("gpiomem", (22,))])
-def test_wirings_of_the_past_are_refused_before_a_line_is_opened(instrument, wiring, sync_out):
-    pi = msgspec.structs.replace(instrument.pi, wiring=wiring, sync_out=sync_out)
-    with refused(ErrorCode.VALUE_INVALID, wiring, "fanout"):
-        open_lines(msgspec.structs.replace(instrument, pi=pi))
+def test_wirings_of_the_past_are_read_and_never_opened(gpio_rig, hub, wiring, sync_out):
+    old = {"wiring": wiring, "sync_out": sync_out, "gpiomem": "/dev/gpiomem"}
+    rig = msgspec.structs.replace(gpio_rig, pi=msgspec.structs.replace(gpio_rig.pi, **old))
+    assert decode(to_builtins(rig), Instrument, "manifest") == rig
+    for wires in (None, hub):
+        with refused(ErrorCode.VALUE_INVALID, wiring, "fanout"):
+            open_lines(rig, wires)
 
 
-def test_a_rig_file_names_lines_that_exist():
-    for wrong in ({"wiring": "gpiomem", "sync_out": (22, 32)}, {"wiring": "spi", "sync_out": (22,)}):
-        with pytest.raises(ValueError, match=r"lines 0\.\.31|GPIO 10"):
-            Pi(**wrong)
+def test_spi_drives_its_mosi():
+    with pytest.raises(ValueError, match="GPIO 10"):
+        Pi(wiring="spi", sync_out=(22,))
     assert Pi(wiring="spi", sync_out=(20,), spi_device="/dev/spidev1.0").sync_out == (20,)
 
 

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
-from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
 from polysight_shared.raster import plan_raster
 from polysight_shared.wires import WireMotion
-from polysight_simulators.cards.sync_in import Pulse, StageTrack, SyncInput, sync_line
+from polysight_simulators.cards.sync_in import Pulse, StageTrack, SyncInput
 from polysight_simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
 
 RIG = published_rig()
@@ -102,19 +98,6 @@ def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, 
             np.testing.assert_allclose(answer, true, atol=1e-3)
         first = index * row.points * RIG.burst.pulses
         assert [p.number for p in track.places(sent)] == list(range(first, first + len(sent)))
-
-
-def test_every_board_hangs_on_the_fan_out_or_on_its_own_line() -> None:
-    assert {sync_line(RIG, b) for b in RIG.boards} == set(RIG.pi.sync_out)
-
-    def with_lines(*lines: int) -> Instrument:
-        return msgspec.structs.replace(RIG, pi=msgspec.structs.replace(RIG.pi, wiring="lines", sync_out=lines))
-
-    rig = with_lines(22, 23, 24)
-    assert [sync_line(rig, b) for b in rig.boards] == [22, 23, 24]
-    short = with_lines(22, 23)
-    with refused(ErrorCode.VALUES_CONFLICT, "2 lines", "3 boards"):
-        sync_line(short, short.boards[0])
 
 
 def at_point(track: StageTrack, row: int, column: int, t_ns: int) -> list[Pulse]:

@@ -34,7 +34,7 @@ from polysight_simulators.cards.fault_draws import (
     PulseFaults,
 )
 from polysight_simulators.cards.sender import CardSender, Pace, bound_udp
-from polysight_simulators.cards.sync_in import RECOVERY_US, Pulse, StageTrack, SyncInput, sync_line
+from polysight_simulators.cards.sync_in import RECOVERY_US, Pulse, StageTrack, SyncInput
 from polysight_simulators.faults import Faults
 from polysight_simulators.radars import RadarBoard
 
@@ -270,7 +270,7 @@ class SimulatedCard:
         pace: Pace = Pace(),  # noqa: B008 - immutable
     ) -> None:
         self.board = board
-        self.line = sync_line(rig, board)
+        self.line = rig.pi.sync_out[0]
         self._source = source
         self._clock_s = clock_s
         network = Network(board.host_address, board.card_address, MAC, board.command_port, board.data_port)

@@ -8,9 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight_shared.config import Board, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.config import Instrument
 from polysight_shared.raster import burst_middle_s, plan_raster
 from polysight_shared.units import us_to_ns
 from polysight_shared.wires import WireMotion
@@ -18,23 +16,6 @@ from polysight_simulators.radars import RadarBoard
 
 RECOVERY_US = 150.0  # between the end of a frame and the next SYNC_IN pulse (AWR2243, hardware trigger)
 _KEEP = 4096
-
-
-def sync_line(rig: Instrument, board: Board) -> int:
-    """Return the GPIO line of this board's SYNC_IN: the common line of a fan-out, otherwise the board's, in file order.
-
-    Raises ConfigError if there are fewer lines than boards.
-    """
-    if rig.pi.wiring in ("fanout", "spi"):
-        return rig.pi.sync_out[0]
-    if len(rig.pi.sync_out) < len(rig.boards):
-        raise ConfigError(
-            f"pi.sync_out names {len(rig.pi.sync_out)} lines for {len(rig.boards)} boards",
-            'wiring = "lines" needs one line for every board, in the order of [[boards]]',
-            'add lines to pi.sync_out, or use wiring = "fanout"',
-            code=ErrorCode.VALUES_CONFLICT,
-        )
-    return rig.pi.sync_out[rig.boards.index(board)]
 
 
 class Pulse(NamedTuple):

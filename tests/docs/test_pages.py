@@ -13,7 +13,7 @@ from polysight.acquisition import ScanCommand
 from polysight.cli.serve import SCAN_COMMANDS
 from polysight.materials import check_labels, read_labels
 from polysight.radar.usb import PRODUCT, VENDOR
-from polysight.verdict import NoResult
+from polysight.results import NoResult
 from polysight_shared.errors import PolysightError
 from polysight_shared.faults import EXPLANATIONS, PiFault
 

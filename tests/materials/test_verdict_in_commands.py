@@ -13,7 +13,7 @@ from tests.support.products import NAMES, PERMITTIVITY, REASON, judged_products
 from polysight.cli.main import main
 from polysight.materials import PATCHES
 from polysight.materials.patch_files import FORMAT
-from polysight.verdict import LEVELS, NoResult
+from polysight.results import LEVELS, NoResult
 
 NUMBERS = ("2.9", "0.2", "3.0")
 

@@ -22,7 +22,7 @@ from polysight.report.figures import channel_figure, phase_limits_deg
 from polysight.report.maps import draw_materials, permittivity_map
 from polysight.report.style import shorten_labels
 from polysight.report.tables import budget_table
-from polysight.verdict import LEVELS
+from polysight.results.verdict import LEVELS
 
 RESULTS = (*NAMES, "2.90", "± 0.20", "ε′ ±")
 

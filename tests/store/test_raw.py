@@ -23,12 +23,12 @@ from polysight.jobs.live_scan import resume
 from polysight.jobs.process import all_rows, load_options, make_products, process
 from polysight.process.request import ProcessRequest
 from polysight.products import REPORT, making_products
+from polysight.results import NoResult
 from polysight.store import locked_samples
 from polysight.store.append_only import AppendFile
 from polysight.store.raw import drop, droppable, dropped_files, require_raw
 from polysight.store.scan_folder import MANIFEST, ScanFolder
 from polysight.store.validation import damaged_rows
-from polysight.verdict import NoResult
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, ScanError
 

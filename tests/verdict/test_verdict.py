@@ -4,10 +4,9 @@ import itertools
 
 import pytest
 
-from polysight.verdict import (
+from polysight.results.verdict import (
     Coverage,
     NoResult,
-    Reason,
     Verdict,
     brightness_reasons,
     direct_path_reasons,
@@ -17,6 +16,7 @@ from polysight.verdict import (
     metal_reasons,
     plane_reasons,
     read_verdict,
+    reason,
     recording_reasons,
     signal_reasons,
     tilt_reasons,
@@ -24,9 +24,9 @@ from polysight.verdict import (
 )
 
 ALL = [
-    Reason("care", "a", "because", "do a", 1.0),
-    Reason("care", "b", "because", "do b", 3.0),
-    Reason("none", "c", "because", "do c", 0.1),
+    reason("care", "a", "because", "do a", 1.0),
+    reason("care", "b", "because", "do b", 3.0),
+    reason("none", "c", "because", "do c", 0.1),
 ]
 
 
@@ -35,7 +35,7 @@ def test_the_worst_reason_decides_and_weight_orders(order):
     verdict = verdict_of(order)
     assert verdict.level == "none"
     assert [r.what for r in verdict.reasons] == ["c", "b", "a"]
-    assert verdict_of(r for r in order if r.level == "care").level == "care"
+    assert verdict_of(r for r in order if r.level == "warning").level == "care"
 
 
 def test_without_reasons_all_is_good():

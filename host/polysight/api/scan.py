@@ -25,8 +25,8 @@ from polysight.products import (
     write_netcdf,
     write_zarr,
 )
+from polysight.results import Verdict
 from polysight.store import MANIFEST, ScanFolder, Source, open_source
-from polysight.verdict import Verdict
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError

@@ -13,7 +13,7 @@ import msgspec
 from polysight.jobs.batch import ALIVE, Job
 from polysight.jobs.process import process
 from polysight.products import FINISHED, write_json
-from polysight.verdict import NoResult
+from polysight.results import NoResult
 from polysight_shared.errors import PolysightError
 
 

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from polysight.verdict import NoResult
+from polysight.results import NoResult
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError
 

@@ -38,8 +38,8 @@ from polysight.products import (
     read_products,
     refused_text,
 )
+from polysight.results import NoResult
 from polysight.store import is_source
-from polysight.verdict import NoResult
 from polysight_shared.config import Chirp, load_instrument
 from polysight_shared.errors import ConfigError, DataError
 

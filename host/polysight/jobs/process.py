@@ -32,7 +32,6 @@ from polysight.process import (
     Options,
     ProcessRequest,
     Products,
-    coverage_lines,
     map_rows,
     quality_content,
     save_images,
@@ -222,10 +221,10 @@ def _check_dropped(pipeline: Pipeline, out: Path) -> None:
     if not dropped_rows(pipeline.source):
         return
     pipeline.quality.note(**{RAW_DROPPED: mark})
-    coverage = pipeline.quality.coverage()
-    if coverage["rows_absent"]:
+    absent = pipeline.quality.coverage().rows_absent
+    if absent:
         raise DataError(
-            f"{out} holds products of more rows: {len(coverage['rows_absent'])} rows have no data any more",
+            f"{out} holds products of more rows: {len(absent)} rows have no data any more",
             "their raw data was dropped, and their samples are damaged or missing",
             "give another --out",
             code=ErrorCode.NOT_ENOUGH_DATA,
@@ -242,7 +241,7 @@ def image(data: Path, out: Path, config: Path | None, view: View = AS_IN_RIG_FIL
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:
         save_images(new, source, pipeline.rig, images, pipeline.quality)
-    lines = (*coverage_lines(pipeline.quality.coverage()), f"image: {out / IMAGE}")
+    lines = (*pipeline.quality.coverage().lines(), f"image: {out / IMAGE}")
     print_lines(lines)
     sys.stdout.flush()
     pipeline.quality.note_imaging(pipeline.images, images)

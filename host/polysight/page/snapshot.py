@@ -12,7 +12,7 @@ from polysight.page.history import Notice, ScanHistory
 from polysight.page.images import Shown
 from polysight.page.listener import PiState
 from polysight.page.status import LifeSigns, judge, no_scan, sync_notices, unreadable
-from polysight.verdict import Verdict
+from polysight.results import Verdict
 from polysight_shared.raster import WIDTH_US
 
 PAPER_PHASE_RAD = 0.022

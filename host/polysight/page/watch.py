@@ -23,8 +23,8 @@ from polysight.page.listener import PiListener, PiState
 from polysight.page.snapshot import Content, make_motion, make_snapshot
 from polysight.page.status import LifeSigns
 from polysight.products import MATERIALS, QUALITY, find_products
+from polysight.results import Verdict
 from polysight.store import EVENTS, MANIFEST, Fact, Manifest, manifest
-from polysight.verdict import Verdict
 from polysight_shared.errors import PolysightError, ProtocolError
 from polysight_shared.messages import AnyEvent, unpack_with_crc
 

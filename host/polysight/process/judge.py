@@ -9,9 +9,7 @@ import numpy as np
 from polysight.imaging import PlaneEstimate
 from polysight.materials import NOT_PASSIVE, Classifier, MaterialsResult
 from polysight.process.quality import Quality
-from polysight.verdict import (
-    Coverage,
-    Reason,
+from polysight.results import (
     Verdict,
     brightness_reasons,
     direct_path_reasons,
@@ -26,14 +24,15 @@ from polysight.verdict import (
     tilt_reasons,
     verdict_of,
 )
+from polysight_shared.findings import Finding
 
 
-def recording_verdict(quality: Quality) -> list[Reason]:
+def recording_verdict(quality: Quality) -> list[Finding]:
     """Return reasons from recording and synchronisation: rows, frames, manifest, and the direct path of each board."""
-    coverage = Coverage.of(quality.coverage())
+    coverage = quality.coverage()
     positions = sum(b.positions for b in quality.boards.values())
     masked = sum(b.positions_masked for b in quality.boards.values())
-    missing: list[Reason] = []
+    missing: list[Finding] = []
     for name, board in quality.boards.items():
         share = 1 - board.positions_masked / board.positions if board.positions else 0.0
         # Positions without a whole frame have no direct path either; do not count that loss twice.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from polysight.imaging import ChannelImages, ImageBuilder, imaging_facts
 from polysight.materials import MaterialsResult, permittivity_change
 from polysight.polarimetry import IncidenceChoice, PlaneReference
+from polysight.results import Coverage, plain
 from polysight.store import CubeRow, RowData, Source
 from polysight.sync import SyncedRow, echo_of_row, estimate_backlash, object_filter
 from polysight_shared.config import Board, Instrument
@@ -161,21 +162,21 @@ class Quality:
         """Boards with rows of which no position has a direct path."""
         return [name for name, b in self.boards.items() if b.positions and b.positions_masked == b.positions]
 
-    def coverage(self) -> dict[str, Any]:
+    def coverage(self) -> Coverage:
         """Compare rows, positions and frames with the plan; missing rows count as not received."""
         plan, boards = self.source.plan, list(self.boards.values())
         absent = [row for row in range(plan.rows) if any(row not in board.rows for board in boards)]
         frames_at = 1 if self.source.synchronised else self.source.instrument.burst.chirps_a_position
-        return {
-            "rows_planned": plan.rows,
-            "rows_recorded": plan.rows - len(absent),
-            "rows_absent": absent,
-            "positions_planned": plan.positions,
-            "positions_absent": len(absent) * plan.columns,
-            "frames_planned": len(boards) * plan.positions * frames_at,
-            "frames_received": sum(row["frames_received"] for board in boards for row in board.rows.values()),
-            "manifest": [str(fault) for fault in self.source.manifest_faults],
-        }
+        return Coverage(
+            rows_planned=plan.rows,
+            rows_recorded=plan.rows - len(absent),
+            frames_planned=len(boards) * plan.positions * frames_at,
+            frames_received=sum(row["frames_received"] for board in boards for row in board.rows.values()),
+            manifest=tuple(str(fault) for fault in self.source.manifest_faults),
+            rows_absent=tuple(absent),
+            positions_planned=plan.positions,
+            positions_absent=len(absent) * plan.columns,
+        )
 
     def note(self, **entries: Any) -> None:
         """Add entries to quality.json."""
@@ -208,7 +209,7 @@ class Quality:
         """Return the content of quality.json, with the entries `more`."""
         return {
             "boards": {name: board.summary(backlash) for name, board in self.boards.items()},
-            "coverage": self.coverage(),
+            "coverage": plain(self.coverage()),
             "seconds_per_stage": {stage: round(s, 4) for stage, s in self.seconds.items()},
             **more,
             **self.notes,

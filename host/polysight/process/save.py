@@ -37,8 +37,8 @@ from polysight.products import (
     write_json,
     write_scan_facts,
 )
+from polysight.results import NoResult, Verdict, verdict_of
 from polysight.store import Scan, versions
-from polysight.verdict import NoResult, Verdict, verdict_of
 from polysight_shared.config import Instrument
 from polysight_shared.geometry import incidence_deg
 from polysight_shared.tables import to_builtins
@@ -142,21 +142,15 @@ def save_materials(
     write_atomically(out / PATCHES, pack_patches(found, images.x_m, images.y_m, scan.simulated))
     content = materials_content(scan, findings, unnamed)
     write_json(out / MATERIALS, content)
-    write_report(out, _report_context(scan, rig, findings, numbers, content["library"], unnamed))
+    write_report(
+        out, _report_context(scan, rig, findings, numbers, content["library"], unnamed, quality.coverage().damage)
+    )
     lines = (
         *findings.verdict.lines(3),
         *_result_lines(scan, found, content["segments"]),
-        *coverage_lines(numbers["coverage"]),
+        *quality.coverage().lines(),
     )
     return Products(out, (*lines, unnamed) if unnamed else lines, findings.verdict)
-
-
-def coverage_lines(coverage: dict[str, Any]) -> tuple[str, ...]:
-    """Return lines for the terminal: the recorded share of the plan, and faults of the manifest."""
-    from polysight.report import manifest_sentence, recorded_sentence
-
-    damaged = manifest_sentence(coverage)
-    return (recorded_sentence(coverage), damaged) if damaged else (recorded_sentence(coverage),)
 
 
 def materials_content(scan: Scan, findings: Findings, unnamed: str = "") -> dict[str, Any]:
@@ -178,9 +172,9 @@ def materials_content(scan: Scan, findings: Findings, unnamed: str = "") -> dict
 
 
 def _report_context(
-    scan: Scan, rig: Instrument, findings: Findings, quality: dict[str, Any], named_by: str, unnamed: str
+    scan: Scan, rig: Instrument, findings: Findings, quality: dict[str, Any], named_by: str, unnamed: str, damage: str
 ) -> ReportContext:
-    from polysight.report import context_of, manifest_sentence
+    from polysight.report import context_of
 
     images = findings.images
     return context_of(
@@ -199,7 +193,7 @@ def _report_context(
             "processed": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
             **versions(),
         },
-        notes=[note for note in (manifest_sentence(quality["coverage"]), NOT_ON_HARDWARE, unnamed) if note],
+        notes=[note for note in (damage, NOT_ON_HARDWARE, unnamed) if note],
         plan=scan.plan,
         rx_gains=rx_gains(images),
         rig_file=tomli_w.dumps(to_builtins(rig)),

@@ -17,7 +17,7 @@ from polysight.materials import image_centre_mm
 from polysight.polarimetry import incidence_choice, specular_incidence_rad
 from polysight.products.material_table import material_columns
 from polysight.products.processed import ProcessedScan
-from polysight.verdict import Verdict
+from polysight.results import Verdict
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 

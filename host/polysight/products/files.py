@@ -24,8 +24,8 @@ import numpy.typing as npt
 
 from polysight.imaging import ChannelImages
 from polysight.materials import PATCHES, ScanPatches, read_patches
+from polysight.results import Verdict, read_verdict
 from polysight.store import Scan, open_npz, versions
-from polysight.verdict import Verdict, read_verdict
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, no_such

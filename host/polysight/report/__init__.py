@@ -13,7 +13,6 @@ from polysight.report.figures import draw_channel, draw_overview, figures, focus
 from polysight.report.report import write_report
 from polysight.report.style import INK, MUTED, PALETTE, STAMP, extent_mm, figure_label, font_families, png
 from polysight.report.sync_report import QUANTITIES, SyncReport, write_sync_report
-from polysight.report.tables import manifest_sentence, recorded_sentence
 
 __all__ = [
     "INK",
@@ -37,9 +36,7 @@ __all__ = [
     "focus_figure",
     "font_families",
     "label_figure",
-    "manifest_sentence",
     "png",
-    "recorded_sentence",
     "write_cphd",
     "write_report",
     "write_sync_report",

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from polysight.materials import Classifier, MaterialsResult, TruthPlate, expected_pixel_accuracy, pixel_accuracy
 from polysight.products import SavedProducts, withhold
-from polysight.verdict import Verdict, read_verdict
+from polysight.results import Verdict, read_verdict
 from polysight_shared.raster import RasterPlan
 
 Image = npt.NDArray[np.complexfloating]

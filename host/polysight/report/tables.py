@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.report.context import ReportContext
+from polysight.results import percent
 from polysight_shared.raster import RasterPlan
 
 _IMAGING_ROWS: tuple[tuple[str, str], ...] = (
@@ -55,29 +56,6 @@ def coverage_sentence(masks: dict[str, npt.NDArray[np.bool_]]) -> str:
         return "Every position of every board has data."
     counts = [f"{name} {int(m.sum())} of {m.size} ({m.mean():.2%})" for name, m in masks.items()]
     return f"Positions without data, left out of the images: {', '.join(counts)}."
-
-
-def recorded_sentence(coverage: Mapping[str, Any]) -> str:
-    """Compare recorded rows and frames with the plan, from `coverage` of quality.json."""
-    planned, absent = coverage["positions_planned"], coverage["positions_absent"]
-    out = f"rows: {coverage['rows_recorded']} of {coverage['rows_planned']} recorded"
-    if absent:
-        out += f" ({100 * absent / planned:.1f} % of positions absent)"
-    received, frames = coverage["frames_received"], coverage["frames_planned"]
-    return f"{out}; frames: {_share(received, frames, 1)} of {frames} planned"
-
-
-def manifest_sentence(coverage: Mapping[str, Any]) -> str:
-    """Describe the faults of the manifest, from `coverage` of quality.json; "" without faults."""
-    faults = coverage["manifest"]
-    return f"The manifest is damaged: {'; '.join(faults)}. `polysight validate` lists the losses." if faults else ""
-
-
-def _share(part: int, whole: int, digits: int) -> str:
-    """Format a share in percent; "100 %" only if nothing is missing."""
-    if part >= whole:
-        return "100 %"
-    return f"{min(100 * part / whole, 100 - 10**-digits):.{digits}f} %"
 
 
 def imaging_table(imaging: Any) -> Table | None:
@@ -169,7 +147,7 @@ def _received(quality: dict[str, Any]) -> list[tuple[str, str]]:
     coverage, boards = quality.get("coverage"), quality.get("boards")
     if coverage:
         rows, planned = coverage["rows_planned"], coverage["frames_planned"]
-        share = _share(coverage["frames_received"], planned, 2)
+        share = percent(coverage["frames_received"], planned, 2)
         out = [(share, f"of {text(planned)} planned frames received")]
         recorded = (f"{coverage['rows_recorded']} of {rows}", "rows recorded")
         return [recorded, *out] if coverage["rows_absent"] else out
@@ -178,7 +156,7 @@ def _received(quality: dict[str, Any]) -> list[tuple[str, str]]:
     expected = sum(int(b.get("frames_expected", 0)) for b in boards.values())
     received = sum(int(b.get("frames_received", 0)) for b in boards.values())
     return (
-        [(_share(received, expected, 2), f"of {text(expected)} frames of recorded rows received")] if expected else []
+        [(percent(received, expected, 2), f"of {text(expected)} frames of recorded rows received")] if expected else []
     )
 
 

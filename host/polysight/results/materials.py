@@ -1,0 +1,562 @@
+"""Content of materials.json: patches with all their figures, the error budget, and what named the patches.
+
+The structs are the file format: a field that is UNSET is absent in the file, and unknown keys are ignored.
+
+A figure of a patch is declared once: a field or property of :class:`PatchFigures` whose type carries a :class:`Column`
+with its name, unit and title. Tables, exports, datasets and pages render all columns, in the order of declaration.
+"""
+
+# Annotations are evaluated in the order in which they stand here: that is the order of the columns.
+
+import math
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import count
+from pathlib import Path
+from types import NoneType
+from typing import Annotated, Any, Self, get_args, get_origin, get_type_hints
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import UNSET, UnsetType
+
+from polysight.results.json_files import convert, one_line, read_object
+from polysight.results.verdict import Verdict, read_verdict
+from polysight_shared.findings import Finding
+
+Pair = tuple[float | None, float | None]
+Number = float | None
+Text = str | None
+_positions = count()
+
+
+@dataclass(frozen=True)
+class Column:
+    """How a figure of a patch is named and shown.
+
+    Attributes
+    ----------
+    name
+        Column of the CSV and MATLAB table; "" leaves it out.
+    about
+        What it is, in a few words.
+    unit
+        Of the value; "1" for a pure number, "" for text.
+    variable
+        Variable of datasets; "" leaves it out. None: `name`, without the ending `_mm`. Millimetres become metres.
+    title, digits
+        Heading in tables for people ("": not shown there), and digits behind the point.
+    optional
+        Left out of datasets where no patch has a value.
+    """
+
+    name: str
+    about: str = ""
+    unit: str = "1"
+    variable: str | None = None
+    title: str = ""
+    digits: int | None = None
+    optional: bool = False
+    position: int = field(default_factory=_positions.__next__, compare=False)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A declared figure: the attribute of the patch, its type without None, and its column."""
+
+    attribute: str
+    kind: type
+    column: Column
+
+    @property
+    def variable(self) -> str:
+        """Name of the variable in datasets; "" if it is not one."""
+        if self.column.variable is None:
+            return self.column.name.removesuffix("_mm")
+        return self.column.variable
+
+    def shown(self, patch: "PatchFigures") -> str:
+        """Return the value for people, with its unit; a dash if it is not known."""
+        value = getattr(patch, self.attribute)
+        if value is None or value is UNSET:
+            return "–"
+        text = str(value)
+        if self.column.digits is not None:
+            # Adding zero after rounding removes the sign of a negative zero.
+            text = f"{round(float(value), self.column.digits) + 0.0:.{self.column.digits}f}"
+        unit = {"1": "", "degree": "°"}.get(self.column.unit, f" {self.column.unit}")
+        return f"{text}{unit}".strip()
+
+
+@lru_cache
+def figures_of(kind: type["PatchFigures"]) -> tuple[Figure, ...]:
+    """Return the figures declared in a class of patches, in the order of their declaration."""
+    hints = get_type_hints(kind, include_extras=True)
+    for ancestor in reversed(kind.__mro__):
+        for name, member in vars(ancestor).items():
+            if isinstance(member, property) and member.fget is not None:
+                hints[name] = get_type_hints(member.fget, include_extras=True).get("return")
+    figures = []
+    for name, hint in hints.items():
+        if get_origin(hint) is Annotated:
+            bare, *extras = get_args(hint)
+            kinds = [part for part in get_args(bare) if part not in (NoneType, UnsetType)]
+            value_kind = kinds[0] if kinds else bare
+            figures += [Figure(name, value_kind, column) for column in extras if isinstance(column, Column)]
+    return tuple(sorted(figures, key=lambda figure: figure.column.position))
+
+
+class ComplexNumber(msgspec.Struct, frozen=True):
+    """A complex number; None for parts that are not finite."""
+
+    real: float | None
+    imag: float | None
+
+    @classmethod
+    def of(cls, value: complex | None) -> "ComplexNumber | None":
+        """Return a finite number; otherwise None."""
+        if value is None or not (math.isfinite(value.real) and math.isfinite(value.imag)):
+            return None
+        return cls(float(value.real), float(value.imag))
+
+    @property
+    def value(self) -> complex:
+        """As a complex number; NaN for unknown parts."""
+        parts = [math.nan if part is None else part for part in (self.real, self.imag)]
+        return complex(*parts)
+
+
+def _known(number: ComplexNumber | None) -> complex | None:
+    return None if number is None else number.value
+
+
+class PermittivityFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """Permittivity of a patch and its errors.
+
+    Attributes
+    ----------
+    real, imag
+        eps' and -eps'' (minus the loss).
+    real_p30_p70, imag_p30_p70
+        30th to 70th percentile of the pixels.
+    real_std, imag_std
+        Standard errors.
+    covariance
+        [2][2] of (`real`, `imag`). With the loss, the mixed term changes its sign.
+    shares, dominated_by
+        Share of each source in the variance, and the largest source.
+    do
+        Measurement that would shrink the error.
+    """
+
+    real: float
+    imag: float
+    real_p30_p70: tuple[float, float] | None = None
+    imag_p30_p70: tuple[float, float] | None = None
+    real_std: float | None = None
+    imag_std: float | None = None
+    covariance: list[list[float | None]] | None = None
+    shares: dict[str, float] = {}
+    dominated_by: str | None = None
+    do: str | None = None
+
+    @property
+    def value(self) -> complex:
+        """Permittivity eps' - j eps''."""
+        return complex(self.real, self.imag)
+
+    @property
+    def loss(self) -> float:
+        """Loss eps''."""
+        return -self.imag
+
+    @property
+    def spread(self) -> "PermittivitySpread | None":
+        """Error of (eps', eps''); None if it is not known."""
+        given = self.covariance
+        if given is not None:
+            real, mixed, imag = given[0][0], given[0][1], given[1][1]
+            if real is not None and mixed is not None and imag is not None:
+                return PermittivitySpread(math.sqrt(real), math.sqrt(imag), -mixed + 0.0)
+        if self.real_std is None or self.imag_std is None:
+            return None
+        return PermittivitySpread(self.real_std, self.imag_std)
+
+
+@dataclass(frozen=True)
+class PermittivitySpread:
+    """Standard deviations of eps' and of the loss eps'', and their covariance (None in products of old releases)."""
+
+    real_std: float
+    loss_std: float
+    covariance: float | None = None
+
+    @property
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """Covariance matrix of (eps', eps''), [2, 2]; diagonal if the covariance is unknown."""
+        mixed = self.covariance or 0.0
+        return np.array([[self.real_std**2, mixed], [mixed, self.loss_std**2]])
+
+
+class BandFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """Ratio of a patch in one sub-band of the sweep; None where the sub-band shows no pixel of it.
+
+    Attributes
+    ----------
+    first_hz, last_hz
+        Transmit frequencies that it spans.
+    ratio, amplitude_h
+        Median of P and of abs(H), relative to metal.
+    inverse_ratio_std, own_std
+        Standard error of 1 / P, and its part not shared with other sub-bands.
+    covariance
+        [2][2 K]: this 1 / P (real, imaginary) with those of all K sub-bands; None if one has no ratio.
+    """
+
+    first_hz: float
+    last_hz: float
+    ratio: ComplexNumber | None = None
+    inverse_ratio_std: float | None = None
+    own_std: float | None = None
+    amplitude_h: float | None = None
+    covariance: list[list[float]] | None = None
+
+
+class TruthFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """The plate of a simulated scene; `in_library`: the library holds its material."""
+
+    name: str
+    metal: bool = False
+    permittivity: ComplexNumber | None = None
+    thickness_mm: float | None = None
+    in_library: bool = True
+
+
+class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """One patch: an entry of `segments` in materials.json. P = H / V; lengths in mm from the image centre.
+
+    Attributes
+    ----------
+    votes, probabilities
+        Share of the pixels, and probability, of materials and `unknown`; likeliest first.
+    why
+        Reason for the name in one sentence.
+    outline_mm, pixels
+        Outline and size before edges are left out.
+    amplitude_h
+        Median of abs(H) relative to metal.
+    refused
+        Why it has neither name nor permittivity.
+    truth
+        Of a simulated scene.
+    tilt_across_deg
+        Rise across the plane of incidence, which was taken out of H and V.
+    bands
+        Ratios in the sub-bands of the sweep.
+    """
+
+    label: Annotated[int, Column("patch", "number of the patch in label", variable="")]
+    name: Annotated[Text, Column("name", "material; empty where it was not named", "")] = None
+    confidence: Annotated[Number, Column("confidence", "confidence in the name, 0 to 1")] = None
+
+    @property
+    def runner_up(self) -> Annotated[Text, Column("", "next likeliest material", "", "runner_up")]:
+        """The material with the second largest probability (in products without probabilities: share of pixels)."""
+        return self._second[0]
+
+    @property
+    def runner_up_share(self) -> Annotated[Number, Column("", "probability of runner_up", "1", "runner_up_share")]:
+        """Its probability."""
+        return self._second[1]
+
+    votes: dict[str, float] = {}
+    probabilities: dict[str, float] = {}
+    why: str = ""
+    distance: Number = None
+    metal_reference: Annotated[bool, Column("metal_reference", "True where the patch is the metal reference")] = False
+    metal_like: Annotated[bool, Column("metal_like", "True where P is too close to metal for a permittivity")] = False
+    box_mm: tuple[float, float, float, float]
+    outline_mm: list[tuple[float, float]] = []
+
+    @property
+    def centre_x_mm(self) -> Annotated[float, Column("centre_x_mm", "middle of the patch, x", "mm", "")]:
+        """Middle of the box, x."""
+        return (self.box_mm[0] + self.box_mm[2]) / 2
+
+    @property
+    def centre_y_mm(self) -> Annotated[float, Column("centre_y_mm", "middle of the patch, y", "mm", "")]:
+        """Middle of the box, y."""
+        return (self.box_mm[1] + self.box_mm[3]) / 2
+
+    @property
+    def width_mm(self) -> Annotated[float, Column("width_mm", "extent along x", "mm")]:
+        """Extent along x."""
+        return self.box_mm[2] - self.box_mm[0]
+
+    @property
+    def height_mm(self) -> Annotated[float, Column("height_mm", "extent along y", "mm")]:
+        """Extent along y."""
+        return self.box_mm[3] - self.box_mm[1]
+
+    pixels: int = 0
+    interior_pixels: Annotated[int | None, Column("pixels", "number of pixels behind the numbers")] = None
+    incidence_deg: Annotated[
+        Number,
+        Column("incidence_deg", "mean incidence angle of the patch", "degree", "patch_incidence_deg"),
+    ] = None
+    permittivity: PermittivityFigures | None = None
+
+    @property
+    def permittivity_value(self) -> Annotated[complex | None, Column("", "relative permittivity", "1", "permittivity")]:
+        """Permittivity eps' - j eps''."""
+        return None if self.permittivity is None else self.permittivity.value
+
+    @property
+    def permittivity_real(self) -> Annotated[Number, Column("permittivity_real", "eps'", variable="")]:
+        """Real part eps'."""
+        return None if self.permittivity is None else self.permittivity.real
+
+    @property
+    def permittivity_real_std(
+        self,
+    ) -> Annotated[Number, Column("permittivity_real_standard_error", "standard error of the permittivity, real part")]:
+        """Standard error of eps'."""
+        return None if self._spread is None else self._spread.real_std
+
+    @property
+    def permittivity_loss(self) -> Annotated[Number, Column("permittivity_loss", "loss eps''", variable="")]:
+        """Loss eps''."""
+        return None if self.permittivity is None else self.permittivity.loss
+
+    @property
+    def permittivity_loss_std(
+        self,
+    ) -> Annotated[Number, Column("permittivity_loss_standard_error", "standard error of the permittivity, loss part")]:
+        """Standard error of the loss."""
+        return None if self._spread is None else self._spread.loss_std
+
+    @property
+    def permittivity_covariance(
+        self,
+    ) -> Annotated[
+        Number,
+        Column("permittivity_real_loss_covariance", "covariance of the permittivity's real part and loss"),
+    ]:
+        """Covariance of (eps', eps'')."""
+        return None if self._spread is None else self._spread.covariance
+
+    @property
+    def dominated_by(
+        self,
+    ) -> Annotated[Text, Column("dominated_by", "what most of the permittivity's error comes from", "")]:
+        """Largest source of the permittivity's error."""
+        return None if self.permittivity is None else self.permittivity.dominated_by
+
+    refused: Finding | None = None
+
+    @property
+    def refused_text(self) -> Annotated[Text, Column("refused", "why the patch was not judged, and what to do", "")]:
+        """Why it has no result, and the remedy, in one line; None if it has one."""
+        return None if self.refused is None else one_line(self.refused)
+
+    ratio: ComplexNumber | None = None
+
+    @property
+    def p(self) -> Annotated[complex | None, Column("", "median of P = H / V relative to metal", "1", "ratio")]:
+        """Median of P."""
+        return None if self.ratio is None else self.ratio.value
+
+    @property
+    def p_real(self) -> Annotated[Number, Column("p_real", "real part of P", variable="")]:
+        """Real part of P."""
+        return None if self.p is None else self.p.real
+
+    @property
+    def p_imag(self) -> Annotated[Number, Column("p_imag", "imaginary part of P", variable="")]:
+        """Imaginary part of P."""
+        return None if self.p is None else self.p.imag
+
+    @property
+    def p_abs_db(self) -> Annotated[Number, Column("p_abs_db", "level of P", "dB", "")]:
+        """Level of P, dB; None for zero."""
+        return 20 * math.log10(abs(self.p)) if self.p else None
+
+    @property
+    def p_abs(self) -> Annotated[Number, Column("", "size of P", variable="", title="|P|", digits=2)]:
+        """Absolute value of P."""
+        return None if self.p is None else abs(self.p)
+
+    @property
+    def p_phase_deg(self) -> Annotated[Number, Column("p_phase_deg", "phase of P", "degree", "", title="∠P", digits=1)]:
+        """Phase of P."""
+        return None if self.p is None else math.degrees(math.atan2(self.p.imag, self.p.real))
+
+    inverse_ratio_std: Annotated[
+        Number,
+        Column(
+            "inverse_p_standard_error",
+            "standard error of V / H, real and imaginary part each",
+            variable="inverse_ratio_standard_error",
+        ),
+    ] = None
+    amplitude_h: Number = None
+    truth: TruthFigures | None = None
+
+    @property
+    def true_name(self) -> Annotated[Text, Column("true_name", "material of the simulated scene", "", optional=True)]:
+        """True material."""
+        return None if self.truth is None else self.truth.name
+
+    @property
+    def true_permittivity(
+        self,
+    ) -> Annotated[
+        complex | None,
+        Column("", "relative permittivity of the simulated scene", "1", "true_permittivity", optional=True),
+    ]:
+        """True permittivity."""
+        return None if self.truth is None else _known(self.truth.permittivity)
+
+    @property
+    def true_permittivity_real(self) -> Annotated[Number, Column("true_permittivity_real", variable="")]:
+        """Its real part."""
+        return None if self.true_permittivity is None else self.true_permittivity.real
+
+    @property
+    def true_permittivity_loss(self) -> Annotated[Number, Column("true_permittivity_loss", variable="")]:
+        """Its loss."""
+        return None if self.true_permittivity is None else -self.true_permittivity.imag
+
+    tilt_across_deg: float | UnsetType = UNSET
+    bands: list[BandFigures] | UnsetType = UNSET
+    box: Annotated[
+        str | UnsetType, Column("drawn_as", "what a person called the box of the patch", "", optional=True)
+    ] = UNSET
+
+    @property
+    def pixels_used(self) -> Annotated[int, Column("", "pixels", "1", "", title="Pixels")]:
+        """Pixels behind the numbers; in old products the pixels of the whole patch."""
+        return self.pixels if self.interior_pixels is None else self.interior_pixels
+
+    @property
+    def _spread(self) -> PermittivitySpread | None:
+        return None if self.permittivity is None else self.permittivity.spread
+
+    @property
+    def _second(self) -> tuple[Text, Number]:
+        shares = self.probabilities or self.votes
+        others = {name: share for name, share in shares.items() if name != self.name}
+        return max(others.items(), key=lambda item: item[1], default=(None, None))
+
+    def withheld(self) -> Self:
+        """Return only place and size: without name, measured values and truth."""
+        return msgspec.structs.replace(
+            self, name=None, confidence=None, votes={}, probabilities={}, why="", distance=None, metal_like=False,
+            permittivity=None, ratio=None, inverse_ratio_std=None, amplitude_h=None, truth=None, bands=UNSET,
+        )  # fmt: skip
+
+
+class LeakageError(msgspec.Struct, frozen=True, kw_only=True):
+    """Leakage of H and V into each other, relative to their own channel, with its standard deviations.
+
+    `source` is "measured", "scene", or "prior and scene" (hardly known).
+    """
+
+    h: Pair | None = None
+    v: Pair | None = None
+    std: Pair | None = None
+    source: str = ""
+
+
+class IncidenceError(msgspec.Struct, frozen=True, kw_only=True):
+    """Incidence angle after the joint inversion, and its standard deviation."""
+
+    deg: float | None = None
+    std_deg: float | None = None
+
+
+class PlaneError(msgspec.Struct, frozen=True, kw_only=True):
+    """Plane of the plates relative to the rig file's; only `known` if it was not found."""
+
+    known: bool = False
+    offset_mm: float | UnsetType = UNSET
+    offset_std_mm: float | UnsetType | None = UNSET
+    tilt_deg: Pair | UnsetType = UNSET
+    tilt_std_deg: Pair | UnsetType = UNSET
+    by: str | UnsetType = UNSET
+    plates: int | UnsetType = UNSET
+
+
+class MetalEvidence(msgspec.Struct, frozen=True, kw_only=True):
+    """Evidence that the reference is metal: score from the other patches, V over H beside the direct path."""
+
+    score: float | None = None
+    others: int = 0
+    channel_ratio_db: float | None = None
+
+
+class ErrorBudget(msgspec.Struct, frozen=True, kw_only=True):
+    """What the errors of the permittivities were computed with."""
+
+    leakage: LeakageError | None = None
+    incidence: IncidenceError | None = None
+    plane: PlaneError | None = None
+    metal: MetalEvidence | None = None
+
+
+class MetalSource(msgspec.Struct, frozen=True, kw_only=True):
+    """How the metal reference was chosen, in one sentence, and whether it is certainly metal."""
+
+    how: str = ""
+    certain: bool = False
+
+
+class ScanMaterials(msgspec.Struct, frozen=True, kw_only=True):
+    """Content of materials.json.
+
+    Attributes
+    ----------
+    verdict
+        None in products of earlier releases. With the level `none` the patches keep only place and size: no reader and
+        no writer of the results can show names or permittivities.
+    library, model
+        What named the patches, in words, and the classifier.
+    pixel_accuracy
+        Share of interior pixels named right, of a simulated scene.
+    """
+
+    scan_id: str | UnsetType = UNSET
+    simulated: bool | UnsetType = UNSET
+    verdict: Verdict | UnsetType | None = UNSET
+    error_budget: ErrorBudget | UnsetType | None = UNSET
+    metal_reference: MetalSource | UnsetType = UNSET
+    library: str = ""
+    model: str | None = None
+    pixel_accuracy: float | None = None
+    segments: list[PatchFigures] = []
+
+    def __post_init__(self) -> None:
+        if self.verdict and not self.verdict.usable:
+            msgspec.structs.force_setattr(self, "pixel_accuracy", None)
+            msgspec.structs.force_setattr(self, "segments", [patch.withheld() for patch in self.segments])
+
+    @classmethod
+    def read(cls, path: Path) -> "ScanMaterials | None":
+        """Read a file; None if there is none, as where only images were made. Raises DataError if it is damaged."""
+        content = read_object(path)
+        if content is None:
+            return None
+        segments = content.get("segments", [])
+        if isinstance(segments, list):
+            segments = [_with_finding(segment) if isinstance(segment, dict) else segment for segment in segments]
+        return convert({**content, "verdict": read_verdict(content), "segments": segments}, cls, path)
+
+
+def _with_finding(segment: dict[str, Any]) -> dict[str, Any]:
+    """Return an entry with its reason for refusal as a finding; files hold what, why and do."""
+    refused = segment.get("refused")
+    if not isinstance(refused, dict):
+        return segment
+    what, why, do = (str(refused.get(key, "")) for key in ("what", "why", "do"))
+    return {**segment, "refused": Finding("error", what, why, do)}

@@ -1,0 +1,199 @@
+"""Content of quality.json and scan.json: what was recorded, how well it was synchronised, and how it was processed.
+
+The structs are the file formats: a field that is UNSET is absent in the file, and unknown keys are ignored.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from polysight.results.json_files import convert, read_object
+from polysight.results.verdict import Coverage, Verdict, read_verdict
+
+Pair = tuple[float | None, float | None]
+
+
+class Backlash(msgspec.Struct, frozen=True):
+    """Shift of odd rows towards +x relative to the plan, and its standard deviation, mm."""
+
+    shift: float
+    std: float
+
+
+class FrequencyRange(msgspec.Struct, frozen=True):
+    """Intermediate frequency of the direct path over all positions, Hz."""
+
+    median: float
+    min: float
+    max: float
+
+
+class Residual(msgspec.Struct, frozen=True):
+    """Standard deviations after a stage of synchronisation; of the amplitude relative to its mean."""
+
+    frequency_std_hz: float | None = None
+    phase_std_rad: float | None = None
+    amplitude_std: float | None = None
+
+
+class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
+    """Figures of one receiver over the recorded rows.
+
+    Attributes
+    ----------
+    masked_columns
+        Row to half-open ranges [start, stop) of masked columns.
+    rows_recorded
+        Numbers of the recorded rows.
+    raw_crc32
+        Row to the CRC of the raw data that it was made from.
+    synchronisation
+        Stage to its residuals.
+    """
+
+    frames_expected: int = 0
+    frames_received: int = 0
+    bytes_missing: int = 0
+    positions: int | UnsetType = UNSET
+    positions_masked: int | UnsetType = UNSET
+    frames_masked: int = 0
+    direct_path_hz: FrequencyRange | UnsetType = UNSET
+    direct_path_snr_db: float | None = None
+    stage_backlash_mm: Backlash | None = None
+    masked_columns: dict[int, list[tuple[int, int]]] | UnsetType = UNSET
+    rows_recorded: list[int] | UnsetType = UNSET
+    raw_crc32: dict[int, str] | UnsetType = UNSET
+    synchronisation: dict[str, Residual] = {}
+
+
+class BoardImaging(msgspec.Struct, frozen=True, kw_only=True):
+    """Aperture of one receiver and its response to a point in the middle of the image, for (x, y).
+
+    `masked` is the share of the tapered aperture without data, `loss_db` the loss of a point's sum due to it.
+    """
+
+    positions: int = 0
+    masked_positions: int = 0
+    rows_without_data: int = 0
+    masked: float = 0.0
+    frequencies: int = 0
+    loss_db: float | UnsetType = UNSET
+    point_width_mm: Pair | UnsetType = UNSET
+    point_limit_mm: Pair | UnsetType = UNSET
+    point_paper_mm: Pair | UnsetType = UNSET
+    point_sidelobe_db: Pair | UnsetType = UNSET
+
+
+class IncidenceAngles(msgspec.Struct, frozen=True, kw_only=True):
+    """The incidence angle used, the other kind, and the effect of the choice on the permittivities.
+
+    `pixel_deg` are the least, median and largest angle of the pixels.
+    """
+
+    used: str = ""
+    one_deg: float | None = None
+    pixel_deg: tuple[float | None, ...] = ()
+    largest_difference_deg: float | None = None
+    largest_permittivity_change: float | UnsetType = UNSET
+    of_patch: int | UnsetType = UNSET
+
+
+class MetalPlate(msgspec.Struct, frozen=True, kw_only=True):
+    """Variation of the gains over a metal plate that was scanned separately."""
+
+    how: str = ""
+    share_of_plane: float | None = None
+    h_variation_db: float | None = None
+    v_variation_db: float | None = None
+    ratio_variation_db: float | None = None
+    ratio_variation_deg: float | None = None
+    spread: float | None = None
+    sub_bands: int | UnsetType = UNSET
+
+
+class CalibrationSource(msgspec.Struct, frozen=True):
+    """A calibration file that was used."""
+
+    file: str
+    made_utc: str
+    simulated: bool
+
+
+class Recording(msgspec.Struct, frozen=True, kw_only=True):
+    """How published data were recorded: direction of the rows, losses by board, form of cubes, notices."""
+
+    direction: str = ""
+    boards: dict[str, dict[str, int]] | UnsetType = UNSET
+    notices: list[str] = []
+    cubes: dict[str, str] | UnsetType = UNSET
+
+
+class RawDropped(msgspec.Struct, frozen=True):
+    """The scan whose raw data was deleted after these products were made."""
+
+    scan_id: str = ""
+    scan: str = ""
+    dropped_utc: str = ""
+
+
+class ScanQuality(msgspec.Struct, frozen=True, kw_only=True):
+    """Content of quality.json. `imaging` holds an entry for each board, and `notices`."""
+
+    boards: dict[str, BoardQuality] = {}
+    coverage: Coverage | UnsetType = UNSET
+    seconds_per_stage: dict[str, float] = {}
+    verdict: Verdict | UnsetType | None = UNSET
+    pixel_accuracy: float | UnsetType | None = UNSET
+    calibration: dict[str, CalibrationSource] | UnsetType = UNSET
+    recording: Recording | UnsetType = UNSET
+    rows_retaken: int | UnsetType = UNSET
+    rows_incomplete: list[int] | UnsetType = UNSET
+    imaging: dict[str, BoardImaging | list[str]] | UnsetType = UNSET
+    incidence: IncidenceAngles | UnsetType = UNSET
+    metal_reference: MetalPlate | UnsetType = UNSET
+    raw_dropped: RawDropped | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        """Leave out what depends on names or permittivities if the verdict allows none."""
+        if self.verdict and not self.verdict.usable:
+            if self.pixel_accuracy is not UNSET:
+                msgspec.structs.force_setattr(self, "pixel_accuracy", None)
+            if self.incidence is not UNSET:
+                bare = msgspec.structs.replace(self.incidence, largest_permittivity_change=UNSET)
+                msgspec.structs.force_setattr(self, "incidence", bare)
+
+    @classmethod
+    def read(cls, path: Path) -> ScanQuality:
+        """Read a file; without it nothing is known. Raises DataError if it is damaged."""
+        content = read_object(path) or {}
+        return convert({**content, "verdict": read_verdict(content)}, cls, path)
+
+
+class RxGain(msgspec.Struct, frozen=True):
+    """Gain and phase of a receiving antenna relative to its board's first."""
+
+    gain_db: float | None
+    phase_deg: float | None
+
+
+class ScanFacts(msgspec.Struct, frozen=True, kw_only=True):
+    """Content of scan.json: identity and origin of the products.
+
+    `instrument` is the rig that the images were formed with, as the tables of its file; `rx_gains` were divided out.
+    """
+
+    scan_id: str | UnsetType = UNSET
+    simulated: bool | UnsetType = UNSET
+    processed_utc: str | UnsetType = UNSET
+    versions: dict[str, str] | UnsetType = UNSET
+    rx_gains: dict[str, list[RxGain]] = {}
+    instrument: dict[str, Any] | UnsetType = UNSET
+
+    @classmethod
+    def read(cls, path: Path) -> ScanFacts:
+        """Read a file; without it nothing is known. Raises DataError if it is damaged."""
+        return convert(read_object(path) or {}, cls, path)

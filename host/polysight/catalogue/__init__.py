@@ -12,12 +12,12 @@ from polysight.catalogue.pictures import (
     MAPS,
     PHASE,
     Picture,
+    Pixels,
     colour_bar,
     draw,
     draw_products,
     thumbnail,
 )
-from polysight.catalogue.pixels import Pixels
 from polysight.catalogue.probe import probe
 from polysight.catalogue.result import EXPORT, files_of, result_of
 from polysight.catalogue.scans import Scans, folder_bytes

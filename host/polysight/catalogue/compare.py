@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.catalogue.pictures import Picture, picture_of
-from polysight.catalogue.pixels import Pixels
+from polysight.catalogue.pictures import Picture, Pixels, draw_values, mask_values
 from polysight.products import read_products
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -184,7 +183,7 @@ def draw_comparison(found: Comparison, name: str) -> Picture:
         values = np.abs(found.p) if name == "p" else found.sigmas
         seen = np.isfinite(values)
         high = max(float(np.percentile(values[seen], 98)), 1e-3) if seen.any() else 1.0
-        return picture_of(values, seen, (0.0, max(high, 2 * SIGNIFICANT) if name == "sigmas" else high))
+        return draw_values(mask_values(values, seen, (0.0, max(high, 2 * SIGNIFICANT) if name == "sigmas" else high)))
     if name not in ("permittivity", "loss"):
         raise DataError(
             f"no map is called {name[:40]!r}", "the name is wrong", "p, sigmas, permittivity or loss",
@@ -193,7 +192,7 @@ def draw_comparison(found: Comparison, name: str) -> Picture:
     values = found.permittivity.real if name == "permittivity" else -found.permittivity.imag
     seen = np.isfinite(values)
     reach = max(float(np.percentile(np.abs(values[seen]), 95)), 1e-3) if seen.any() else 1.0
-    return picture_of(values, seen, (-reach, reach), DIFFERENCE)
+    return draw_values(mask_values(values, seen, (-reach, reach), DIFFERENCE))
 
 
 def _covariance(permittivity: dict[str, Any]) -> Real:

@@ -1,4 +1,4 @@
-"""Draw images as PNG: amplitude and phase of H, V and P, and the maps of a processed scan.
+"""Images of scans as pictures: pixels of a processed scan with permittivity and errors, maps of them as PNG.
 
 Row 0 of an image (the smallest y) is at the bottom of its picture; unknown pixels are transparent.
 """
@@ -6,24 +6,134 @@ Row 0 of an image (the smallest y) is at the bottom of its picture; unknown pixe
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.catalogue.pixels import Pixels
 from polysight.imaging import ChannelImages
+from polysight.materials import axis_mm
+from polysight.polarimetry import permittivity_from_ratio, specular_incidence_rad
+from polysight.products import SavedProducts
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
-Channels = ChannelImages | Pixels
-"""Both channels of an image and the illuminated pixels: `h`, `v`, `valid` [ny, nx]."""
-AMPLITUDE, PHASE = "cividis", "twilight"
-_RANGE_DB = 35.0
-_RATIO_PERCENTILES = (5.0, 95.0)
-_FAINT_DB, _CLEAR_DB = -26.0, -18.0  # relative to the brightest: between them phases fade out
-_THUMBNAIL = 96  # pixels at most
+Real = NDArray[np.float64]
+Limits = tuple[float, float]
+AMPLITUDE = "cividis"
+PHASE = "twilight"
+RANGE_DB = 35.0
+RATIO_PERCENTILES = (5.0, 95.0)
+# Relative to the brightest: fainter pixels are noise; up to the second level phases fade out.
+FAINT_DB = -26.0
+CLEAR_DB = -18.0
+# Difference quotient of the permittivity.
+RATIO_STEP = 1e-5
+THUMBNAIL_PIXELS = 96
+
+
+# --- pixels ---
+
+
+@dataclass(frozen=True)
+class Pixels(SavedProducts):
+    """Saved products with permittivity and errors of each pixel. Arrays are [ny, nx], row 0 the smallest y."""
+
+    @property
+    def referenced(self) -> bool:
+        """True if the images are relative to metal and the verdict allows a result."""
+        return self.metal_referenced and (self.verdict is None or self.verdict.usable)
+
+    @cached_property
+    def clear(self) -> NDArray[np.bool_]:
+        """Pixels bright enough in both channels for a meaningful ratio."""
+        clear = self.valid & np.isfinite(self.h) & np.isfinite(self.v)
+        for channel in (self.h, self.v):
+            amplitude = np.abs(channel)
+            brightest = float(np.percentile(amplitude[clear], 99.5)) if clear.any() else 0.0
+            clear = clear & (amplitude > brightest * 10 ** (FAINT_DB / 20))
+        return clear
+
+    @cached_property
+    def x_mm(self) -> Real:
+        """Pixel centres from the middle of the image, [nx]."""
+        return axis_mm(self.x_m)
+
+    @cached_property
+    def y_mm(self) -> Real:
+        """The same, [ny]."""
+        return axis_mm(self.y_m)
+
+    @property
+    def extent_mm(self) -> tuple[float, float, float, float]:
+        """Left, right, lower and upper edge of the image."""
+        x = self.x_mm
+        y = self.y_mm
+        half_x = (x[1] - x[0]) / 2
+        half_y = (y[1] - y[0]) / 2
+        return float(x[0] - half_x), float(x[-1] + half_x), float(y[0] - half_y), float(y[-1] + half_y)
+
+    @cached_property
+    def p_std(self) -> Real:
+        """Standard deviation of each part of P; nan where unknown."""
+        if self.p_sigma is None:
+            return np.full(self.valid.shape, np.nan)
+        return np.asarray(self.p_sigma, np.float64)
+
+    @cached_property
+    def theta_rad(self) -> float:
+        """Incidence angle, from the error budget or the rig. Raises DataError."""
+        budget = self.materials.get("error_budget") or {}
+        try:
+            return float(np.radians(budget["incidence"]["deg"]))
+        except (KeyError, TypeError):
+            pass
+        if self.rig is None:
+            raise DataError(
+                f"{self.folder}: the incidence angle is not known", "an earlier release made these products",
+                "process the scan again", code=ErrorCode.KEY_MISSING,
+            )  # fmt: skip
+        return specular_incidence_rad(self.rig)
+
+    @cached_property
+    def permittivity(self) -> NDArray[np.complex128]:
+        """Permittivity eps' - j eps'' as a half space; nan where P is too close to metal or too dark."""
+        p = np.where(self.clear & np.isfinite(self.p), self.p, np.nan).astype(np.complex128)
+        eps = permittivity_from_ratio(p, self.theta_rad)
+        return np.where(np.isfinite(eps), eps, complex(np.nan, np.nan))
+
+    @cached_property
+    def permittivity_sigma(self) -> Real:
+        """Standard deviation of each part of the permittivity: that of P times the slope (the map is analytic)."""
+        p = np.asarray(self.p, np.complex128)
+        with np.errstate(invalid="ignore", over="ignore"):
+            shifted = permittivity_from_ratio(p + RATIO_STEP, self.theta_rad)
+            slope = np.abs((shifted - permittivity_from_ratio(p, self.theta_rad)) / RATIO_STEP)
+            return np.where(np.isfinite(slope), slope, np.nan) * self.p_std
+
+    @cached_property
+    def metal_like(self) -> NDArray[np.bool_]:
+        """Pixels so close to metal that their permittivity is only known to be large."""
+        size = np.abs(self.permittivity)
+        with np.errstate(invalid="ignore"):
+            unsure = np.isfinite(self.p_std) & (self.permittivity_sigma > 0.5 * size)
+            return unsure | (np.abs(self.p - 1) < 0.2) | ~np.isfinite(size)
+
+    def nearest(self, x_mm: float, y_mm: float) -> tuple[int, int]:
+        """Row and column of the pixel at a place. Raises DataError outside the image."""
+        left, right, low, high = self.extent_mm
+        if not (left <= x_mm <= right and low <= y_mm <= high):
+            raise DataError(
+                f"x = {x_mm:.1f} mm, y = {y_mm:.1f} mm lies outside the image",
+                f"it reaches from x {left:.1f} to {right:.1f} mm, and from y {low:.1f} to {high:.1f} mm",
+                "give a place in it, in mm from its centre", code=ErrorCode.VALUE_INVALID,
+            )  # fmt: skip
+        return int(np.abs(self.y_mm - y_mm).argmin()), int(np.abs(self.x_mm - x_mm).argmin())
+
+
+# --- pictures ---
 
 
 @dataclass(frozen=True)
@@ -37,69 +147,49 @@ class Picture:
     colours: str = AMPLITUDE
 
 
-def draw(images: Channels) -> dict[str, Picture]:
-    """Draw amplitude and phase of H, V and P = H / V: `h_amplitude`, `h_phase` and so on.
-
-    P is that of the given images: during a scan it is not referenced to metal.
-    """
-    return {name: _picture(values) for name, values in _channels(images).items()}
-
-
-class _Values(NamedTuple):
+@dataclass(frozen=True)
+class Values:
     """Numbers and opacity [ny, nx] of a picture, and the limits of its colours."""
 
     numbers: NDArray[Any]
     opacity: NDArray[Any]
-    limits: tuple[float, float]
-    colours: str = AMPLITUDE
+    limits: Limits
     unit: str = ""
-    digits: int = 1
-
-
-def _channels(images: Channels) -> dict[str, _Values]:
-    seen = images.valid & np.isfinite(images.h) & np.isfinite(images.v)
-    ratio = np.divide(images.h, images.v, out=np.zeros_like(images.h), where=seen & (images.v != 0))
-    strength = np.minimum(_below_top(images.h, seen), _below_top(images.v, seen))
-    out: dict[str, _Values] = {}
-    for name, channel in (("h", images.h), ("v", images.v)):
-        level = _db(channel)
-        top = float(np.percentile(level[seen], 99.8)) if seen.any() else 0.0
-        out[f"{name}_amplitude"] = _Values(level, seen.astype(float), (top - _RANGE_DB, top), AMPLITUDE, "dB")
-        out[f"{name}_phase"] = _phase(channel, _fade(_below_top(channel, seen)) * seen)
-    clear = _fade(strength) * seen
-    level = _db(ratio)
-    shown = level[clear > 0.5]
-    low, high = np.percentile(shown, _RATIO_PERCENTILES) if shown.size else (-10.0, 10.0)
-    middle, half = (low + high) / 2, max((high - low) / 2, 3.0)
-    out["p_amplitude"] = _Values(level, clear, (float(middle - half), float(middle + half)), AMPLITUDE, "dB")
-    out["p_phase"] = _phase(ratio, clear)
-    return out
+    colours: str = AMPLITUDE
 
 
 @dataclass(frozen=True)
 class Map:
-    """Title, unit and colours of a picture of a processed scan."""
+    """Title and colours of a picture of a processed scan."""
 
     title: str
-    unit: str
     colours: str = AMPLITUDE
 
 
 MAPS = {
-    "h_amplitude": Map("|H|, s-polarised", "dB"),
-    "v_amplitude": Map("|V|, p-polarised", "dB"),
-    "p_amplitude": Map("|P| = |H / V|", "dB"),
-    "h_phase": Map("phase of H", "°", PHASE),
-    "v_phase": Map("phase of V", "°", PHASE),
-    "p_phase": Map("phase of P", "°", PHASE),
-    "p_sigma": Map("standard deviation of P", ""),
-    "permittivity": Map("permittivity, real part", ""),
-    "loss": Map("permittivity, loss", ""),
+    "h_amplitude": Map("|H|, s-polarised"),
+    "v_amplitude": Map("|V|, p-polarised"),
+    "p_amplitude": Map("|P| = |H / V|"),
+    "h_phase": Map("phase of H", PHASE),
+    "v_phase": Map("phase of V", PHASE),
+    "p_phase": Map("phase of P", PHASE),
+    "p_sigma": Map("standard deviation of P"),
+    "permittivity": Map("permittivity, real part"),
+    "loss": Map("permittivity, loss"),
 }
-"""Pictures of a processed scan by name."""
+"""Pictures of a processed scan by name; the last three need a reference of metal."""
+NEED_METAL = ("p_sigma", "permittivity", "loss")
 
 
-def draw_products(pixels: Pixels, name: str, limits: tuple[float, float] | None = None) -> Picture:
+def draw(images: ChannelImages) -> dict[str, Picture]:
+    """Draw amplitude and phase of H, V and P = H / V: `h_amplitude`, `h_phase` and so on.
+
+    P is that of the given images: during a scan it is not referenced to metal.
+    """
+    return {name: draw_values(values) for name, values in _channel_values(images).items()}
+
+
+def draw_products(pixels: Pixels, name: str, limits: Limits | None = None) -> Picture:
     """Draw one of `MAPS` of a processed scan; `limits` replaces the limits of its colours.
 
     Raises DataError if there is no such picture, or nothing to draw.
@@ -109,11 +199,38 @@ def draw_products(pixels: Pixels, name: str, limits: tuple[float, float] | None 
             f"no picture is called {name[:40]!r}", "the name is wrong", f"one of {', '.join(MAPS)}",
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
-    values = _channels(pixels)[name] if name.endswith(("_amplitude", "_phase")) else _derived(pixels, name)
-    return _picture(values if limits is None else values._replace(limits=limits))
+    values = _derived_values(pixels, name) if name in NEED_METAL else _channel_values(pixels)[name]
+    return draw_values(values if limits is None else replace(values, limits=limits))
 
 
-def _derived(pixels: Pixels, name: str) -> _Values:
+def thumbnail(pixels: Pixels) -> Picture:
+    """A small picture of the amplitude of H."""
+    step = max(1, -(-max(pixels.h.shape) // THUMBNAIL_PIXELS))
+    values = _amplitude(pixels.h, pixels.valid & np.isfinite(pixels.h))
+    small = (slice(None, None, step), slice(None, None, step))
+    return draw_values(replace(values, numbers=values.numbers[small], opacity=values.opacity[small]))
+
+
+def _channel_values(images: ChannelImages | Pixels) -> dict[str, Values]:
+    visible = images.valid & np.isfinite(images.h) & np.isfinite(images.v)
+    values = {}
+    for name, channel in (("h", images.h), ("v", images.v)):
+        values[f"{name}_amplitude"] = _amplitude(channel, visible)
+        values[f"{name}_phase"] = _phase(channel, _fade(_below_brightest(channel, visible)) * visible)
+    ratio = np.divide(images.h, images.v, out=np.zeros_like(images.h), where=visible & (images.v != 0))
+    fainter = np.minimum(_below_brightest(images.h, visible), _below_brightest(images.v, visible))
+    opacity = _fade(fainter) * visible
+    level = _db(ratio)
+    clear = level[opacity > 0.5]
+    low, high = np.percentile(clear, RATIO_PERCENTILES) if clear.size else (-10.0, 10.0)
+    middle = float(low + high) / 2
+    half = max(float(high - low) / 2, 3.0)
+    values["p_amplitude"] = Values(level, opacity, (middle - half, middle + half), "dB")
+    values["p_phase"] = _phase(ratio, opacity)
+    return values
+
+
+def _derived_values(pixels: Pixels, name: str) -> Values:
     """Maps derived from P: its error, permittivity, loss."""
     if not pixels.referenced:
         raise DataError(
@@ -122,61 +239,64 @@ def _derived(pixels: Pixels, name: str) -> _Values:
         )  # fmt: skip
     eps = pixels.permittivity
     values = {"p_sigma": pixels.p_std, "permittivity": eps.real, "loss": -eps.imag}[name]
-    seen = pixels.clear & np.isfinite(values)
+    visible = pixels.clear & np.isfinite(values)
     if name != "p_sigma":
-        seen &= ~pixels.metal_like
-    high = float(np.percentile(values[seen], 85)) if seen.any() else 1.0  # edges of plates have any value
+        visible &= ~pixels.metal_like
+    # Edges of plates have any value.
+    high = float(np.percentile(values[visible], 85)) if visible.any() else 1.0
     low = 1.0 if name == "permittivity" else 0.0
-    return _numbers(values, seen, (low, max(1.3 * high, low + 1e-3)), AMPLITUDE)
+    return mask_values(values, visible, (low, max(1.3 * high, low + 1e-3)))
 
 
-def _numbers(values: NDArray[Any], seen: NDArray[np.bool_], limits: tuple[float, float], colours: str) -> _Values:
-    return _Values(np.where(seen, values, limits[0]), seen.astype(float), limits, colours, "", 3)
+def mask_values(values: NDArray[Any], visible: NDArray[np.bool_], limits: Limits, colours: str = AMPLITUDE) -> Values:
+    """Numbers without a unit, to be drawn; pixels that are not `visible` are transparent."""
+    return Values(np.where(visible, values, limits[0]), visible.astype(float), limits, colours=colours)
 
 
-def picture_of(
-    values: NDArray[Any], seen: NDArray[np.bool_], limits: tuple[float, float], colours: str = AMPLITUDE
-) -> Picture:
-    """Draw numbers without a unit; pixels that are not `seen` are transparent."""
-    return _picture(_numbers(values, seen, limits, colours))
-
-
-def thumbnail(pixels: Pixels) -> Picture:
-    """A small picture of the amplitude of H."""
-    step = max(1, -(-max(pixels.h.shape) // _THUMBNAIL))
-    seen = pixels.valid & np.isfinite(pixels.h)
-    level = _db(pixels.h)
-    top = float(np.percentile(level[seen], 99.8)) if seen.any() else 0.0
-    part = slice(None, None, step)
-    return _picture(_Values(level[part, part], seen[part, part].astype(float), (top - _RANGE_DB, top)))
-
-
-def _phase(channel: NDArray[np.complex64], opacity: NDArray[Any]) -> _Values:
-    return _Values(np.degrees(np.angle(channel)), opacity, (-180.0, 180.0), PHASE, "°")
-
-
-def _db(channel: NDArray[np.complex64]) -> NDArray[np.float64]:
-    return 20 * np.log10(np.maximum(np.nan_to_num(np.abs(channel).astype(float), nan=0.0, posinf=0.0), 1e-12))
-
-
-def _below_top(channel: NDArray[np.complex64], seen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Level relative to the brightest seen pixels, dB."""
+def _amplitude(channel: NDArray[np.complex64], visible: NDArray[np.bool_]) -> Values:
     level = _db(channel)
-    return level - (float(np.percentile(level[seen], 99.5)) if seen.any() else 0.0)
+    brightest = float(np.percentile(level[visible], 99.8)) if visible.any() else 0.0
+    return Values(level, visible.astype(float), (brightest - RANGE_DB, brightest), "dB")
 
 
-def _fade(level_db: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.clip((level_db - _FAINT_DB) / (_CLEAR_DB - _FAINT_DB), 0.0, 1.0)
+def _phase(channel: NDArray[np.complex64], opacity: NDArray[Any]) -> Values:
+    return Values(np.degrees(np.angle(channel)), opacity, (-180.0, 180.0), "°", PHASE)
 
 
-def _picture(v: _Values) -> Picture:
-    import matplotlib  # here: it loads for half a second, and lists need no picture
+def _db(channel: NDArray[np.complex64]) -> Real:
+    amplitude = np.nan_to_num(np.abs(channel).astype(float), nan=0.0, posinf=0.0)
+    return 20 * np.log10(np.maximum(amplitude, 1e-12))
 
-    scaled = np.clip((v.numbers - v.limits[0]) / (v.limits[1] - v.limits[0]), 0.0, 1.0)
-    rgba = matplotlib.colormaps[v.colours](scaled)
-    rgba[..., 3] = v.opacity
-    low, high = (round(float(limit), v.digits) for limit in v.limits)
-    return Picture(_png(rgba, "lower"), low, high, v.unit, v.colours)
+
+def _below_brightest(channel: NDArray[np.complex64], visible: NDArray[np.bool_]) -> Real:
+    """Level relative to the brightest visible pixels, dB."""
+    level = _db(channel)
+    return level - (float(np.percentile(level[visible], 99.5)) if visible.any() else 0.0)
+
+
+def _fade(level_db: Real) -> Real:
+    return np.clip((level_db - FAINT_DB) / (CLEAR_DB - FAINT_DB), 0.0, 1.0)
+
+
+def draw_values(values: Values) -> Picture:
+    """Draw numbers as a PNG with one pixel each."""
+    # Imported here: it loads for half a second, and lists need no picture.
+    import matplotlib
+
+    low, high = values.limits
+    rgba = matplotlib.colormaps[values.colours](np.clip((values.numbers - low) / (high - low), 0.0, 1.0))
+    rgba[..., 3] = values.opacity
+    digits = 1 if values.unit else 3
+    return Picture(
+        _png(rgba, "lower"), round(float(low), digits), round(float(high), digits), values.unit, values.colours
+    )
+
+
+def colour_bar(colours: str) -> bytes:
+    """Draw a colour map from left to right, as PNG of 256 x 1 pixels."""
+    import matplotlib
+
+    return _png(matplotlib.colormaps[colours](np.linspace(0, 1, 256))[None], "upper")
 
 
 def _png(rgba: NDArray[Any], origin: Literal["lower", "upper"]) -> bytes:
@@ -185,10 +305,3 @@ def _png(rgba: NDArray[Any], origin: Literal["lower", "upper"]) -> bytes:
     file = io.BytesIO()
     imsave(file, rgba, origin=origin, format="png")
     return file.getvalue()
-
-
-def colour_bar(colours: str) -> bytes:
-    """Draw a colour map from left to right, as PNG of 256 x 1 pixels."""
-    import matplotlib
-
-    return _png(matplotlib.colormaps[colours](np.linspace(0, 1, 256))[None], "upper")

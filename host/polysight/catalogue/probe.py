@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import skimage
 
-from polysight.catalogue.pixels import Pixels
+from polysight.catalogue.pictures import Pixels
 from polysight.materials import SIMULATED_LIBRARY, Library, is_metal
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import permittivity_from_ratio

@@ -7,8 +7,7 @@ from typing import Any
 
 import msgspec
 
-from polysight.catalogue.pictures import MAPS
-from polysight.catalogue.pixels import Pixels
+from polysight.catalogue.pictures import MAPS, NEED_METAL, Pixels
 from polysight.materials import PATCHES
 from polysight.products import (
     IMAGE,
@@ -31,7 +30,6 @@ _KEYS = (
     "label", "name", "confidence", "probabilities", "why", "metal_reference", "metal_like", "box_mm", "outline_mm",
     "pixels", "incidence_deg", "ratio", "permittivity", "refused", "box", "truth", "bands", "tilt_across_deg",
 )  # fmt: skip
-_NO_PERMITTIVITY = ("p_sigma", "permittivity", "loss")
 
 
 def result_of(folder: Path) -> dict[str, Any]:
@@ -45,7 +43,7 @@ def result_of(folder: Path) -> dict[str, Any]:
     products = Pixels(read_products(folder).folder)
     verdict = products.verdict
     left, right, low, high = products.extent_mm
-    names = [n for n in MAPS if products.referenced or n not in _NO_PERMITTIVITY]
+    names = [n for n in MAPS if products.referenced or n not in NEED_METAL]
     return {
         "folder": str(products.folder),
         "scan_id": products.scan_id,

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from polysight.imaging.geometry import Antennas, image_grid, row_offsets_m
 from polysight.imaging.reduce import scene_gate_m
-from polysight.store import ManifestFault
 from polysight.store.source import RowData
 from polysight.sync.chain import SyncedRow
 from polysight_shared.config import Board, Instrument, load_instrument
+from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan, Row, plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_simulators.scene import OwnLayout, Scene, SimulatedRig, apply_scene, load_scene, row_offsets_mm
@@ -89,7 +89,7 @@ class RepeatedRows:
     scan_id: str = "benchmark"
     mirrored: bool = False
     synchronised: bool = False
-    manifest_faults: tuple[ManifestFault, ...] = ()
+    manifest_faults: tuple[Finding, ...] = ()
 
     def recording_facts(self) -> dict[str, Any]:
         """None are known."""

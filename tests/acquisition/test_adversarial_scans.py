@@ -78,7 +78,7 @@ def adversarial_rig(number: int) -> FakeRig:
 def check(folder: Path, rig: FakeRig, incomplete: list[int]) -> None:
     """Check that every committed byte is right or masked, and that a row with a mask is listed as incomplete."""
     scan = ScanFolder.load(folder)
-    assert [f for f in validate(folder) if f.severity == "error"] == []
+    assert [f for f in validate(folder) if f.level == "error"] == []
     for row, committed in scan.committed().items():
         for name, board in committed.boards.items():
             data = scan.read_row(name, row)

@@ -10,6 +10,7 @@ import pytest
 from tests.support.page.live_view import open_control
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
+from tests.support.store.facts import facts_of
 from tests.support.store.small_scan import SmallScan
 
 from polysight.acquisition import scan as host_run
@@ -21,8 +22,7 @@ from polysight.acquisition.control import (
     last_alive_s,
     send_command,
 )
-from polysight.store import manifest
-from polysight.store.scan_folder import MANIFEST, ScanFolder
+from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared.error_codes import ErrorCode
 
@@ -101,7 +101,7 @@ def test_a_folder_that_cannot_be_written_costs_the_scan_nothing(tmp_path):
 
 
 def facts(path: Path) -> list[str]:
-    return [f["fact"] for f in manifest.read(path / MANIFEST).facts]
+    return [f["fact"] for f in facts_of(path)]
 
 
 def scan_with(samples, folder: Path, stop: StopRequest, at_row_1) -> SmallScan:

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 from tests.support.acquisition.fake_cards import FULL, FakeCard, payload_of
 from tests.support.acquisition.fake_rig import FakeRig
+from tests.support.store.facts import facts_of
 
 from polysight.acquisition.capture_rig import CaptureRig
 from polysight.acquisition.scan import run_scan
@@ -77,7 +78,7 @@ def test_take_after_a_row_that_ended_early_is_whole(make_instrument, payload, tm
     finally:
         rig.close()
     assert (result.exit_status, result.retakes) == ("success", 1)
-    assert [(f["row"], f["take"]) for f in result.folder.facts("row_rejected")] == [(1, 1)]
+    assert [(f["row"], f["take"]) for f in facts_of(result.folder, "row_rejected")] == [(1, 1)]
     assert result.folder.read_row("RV", 1).payload.tobytes() == payload("RV", 1, rig.instrument.row_bytes)
     assert validate(tmp_path / "s") == []
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from tests.support.store.facts import facts_of
 
 from polysight.acquisition.scan import run_scan
 from polysight.store.validation import validate
@@ -34,7 +35,7 @@ def test_missed_pulses_are_found_and_the_row_is_taken_again(paced, payload, tmp_
     paced.cards["RV"].missed[0, 1] = {0, 47}
     result = run_scan(paced.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 1)
-    reasons = result.folder.facts("row_rejected")[0]["reasons"]
+    reasons = facts_of(result.folder, "row_rejected")[0]["reasons"]
     assert any(r.startswith("RH") and "SYNC_IN" in r for r in reasons)
     assert any(r.startswith("RV") and "SYNC_IN" in r for r in reasons)
     assert result.folder.read_row("RH", 0).payload.tobytes() == payload("RH", 0, paced.instrument.row_bytes)
@@ -58,7 +59,7 @@ def _kept(paced, payload, folder: Path, missed: dict[str, set[int]]) -> set[str]
     paced.pi.rows_run.clear()  # the rows of the scan before
     result, answer = run_scan(paced.instrument, folder, keep_incomplete=True), set()
     assert (result.exit_status, result.incomplete_rows) == ("success", [0])
-    assert [f for f in validate(folder) if f.severity == "error"] == []
+    assert [f for f in validate(folder) if f.level == "error"] == []
     frame = paced.instrument.frame_bytes
     for name, slots in missed.items():
         data = result.folder.read_row(name, 0)
@@ -69,7 +70,7 @@ def _kept(paced, payload, folder: Path, missed: dict[str, set[int]]) -> set[str]
         if not data.mask.all():
             assert not data.payload[data.mask].any()
             answer.add(name)
-        fact = result.folder.facts("row_committed")[0]["boards"][name]
+        fact = facts_of(result.folder, "row_committed")[0]["boards"][name]
         assert fact["pulses_missed"] == len(slots)
     return answer
 
@@ -84,7 +85,7 @@ def test_row_with_a_spurious_edge_is_not_complete(paced, payload, tmp_path):
         assert result.exit_status == "success"
         if result.incomplete_rows != [0]:
             continue
-        fact = result.folder.facts("row_rejected")[0]
+        fact = facts_of(result.folder, "row_rejected")[0]
         assert [(f["kind"], f.get("board")) for f in fact["faults"]] == [("slipped", "RV")]
         data = result.folder.read_row("RV", 0)
         assert data.mask is not None
@@ -95,4 +96,4 @@ def test_row_with_a_spurious_edge_is_not_complete(paced, payload, tmp_path):
             break
     else:
         pytest.fail("not noticed, or not placed, in 20 scans")
-    assert [f for f in validate(tmp_path / str(number)) if f.severity == "error"] == []
+    assert [f for f in validate(tmp_path / str(number)) if f.level == "error"] == []

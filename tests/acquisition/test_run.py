@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import tomli_w
 from tests.support.refusals import refused
+from tests.support.store.facts import facts_of
 from tests.support.store.plain_scan import errors
 
 from polysight.acquisition.control import StopRequest
@@ -74,7 +75,7 @@ def test_lost_events_are_fetched_from_the_journal(rig, tmp_path):
     rig.pi.lose_events = 7
     assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
     assert errors(tmp_path / "s") == []
-    ended = ScanFolder.load(tmp_path / "s").facts("scan_ended")[0]
+    ended = facts_of(tmp_path / "s", "scan_ended")[0]
     assert ended["events_refetched"] >= 7
 
 
@@ -98,7 +99,7 @@ def test_lost_packets_make_the_row_be_taken_again(rig, payload, tmp_path, droppe
     scan = ScanFolder.load(tmp_path / "s")
     assert scan.committed()[1].take == 2
     assert scan.read_row("RV", 1).payload.tobytes() == payload("RV", 1, rig.instrument.row_bytes)
-    rejected = scan.facts("row_rejected")
+    rejected = facts_of(scan, "row_rejected")
     assert [(r["row"], r["take"]) for r in rejected] == [(1, 1)]
     assert "RV" in rejected[0]["reasons"][0]
     assert errors(tmp_path / "s") == []
@@ -111,7 +112,7 @@ def test_retakes_are_bounded_and_the_error_names_the_board(rig, tmp_path):
         run_scan(rig.instrument, tmp_path / "s")
     scan = ScanFolder.load(tmp_path / "s")
     assert list(scan.committed()) == [0]
-    assert scan.facts("scan_ended")[0]["exit_status"] == "fail"
+    assert facts_of(scan, "scan_ended")[0]["exit_status"] == "fail"
     assert rig.pi.journal[scan.scan_id][-1].exit_status == "fail"
     result = resume_scan(tmp_path / "s")
     assert result.exit_status == "success"
@@ -124,7 +125,7 @@ def test_keep_incomplete_masks_exactly_what_was_lost(rig, payload, tmp_path):
         rig.cards["RV"].drop[1, take] = {3, 4, 9}
     result = run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
     assert (result.exit_status, result.incomplete_rows) == ("success", [1])
-    assert result.folder.facts("row_committed")[1]["faults"] == [{"kind": "lost_on_the_way", "board": "RV"}]
+    assert facts_of(result.folder, "row_committed")[1]["faults"] == [{"kind": "lost_on_the_way", "board": "RV"}]
     data = ScanFolder.load(tmp_path / "s").read_row("RV", 1)
     assert data.missing == [(3 * 1456, 5 * 1456), (9 * 1456, 10 * 1456)]
     want = np.frombuffer(payload("RV", 1, rig.instrument.row_bytes), dtype=np.uint8)

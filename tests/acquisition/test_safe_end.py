@@ -18,6 +18,7 @@ import pytest
 import tomli_w
 from tests.support.acquisition.receivers import receiver_of
 from tests.support.refusals import refused
+from tests.support.store.facts import facts_of
 
 from polysight.acquisition import scan_loop as running
 from polysight.acquisition.control import StopRequest, ignore_hangup
@@ -60,7 +61,7 @@ def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig,
     assert f"1 of 4 rows are safe; `polysight resume {tmp_path / 's'}`" in e.value.remedy
     assert commands(rig.pi).count(m.Home) == 1, "the one at the start"
     assert commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
-    ended = ScanFolder.load(tmp_path / "s").facts("scan_ended")[0]
+    ended = facts_of(tmp_path / "s", "scan_ended")[0]
     assert (ended["exit_status"], ended["remedy"]) == ("fail", e.value.remedy)
 
 
@@ -295,4 +296,4 @@ def test_a_complete_scan_succeeds_if_the_pi_run_cannot_be_ended(rig, tmp_path, m
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.folder.complete) == ("success", True)
     assert any("the Pi did not write it down" in w for w in result.warnings)
-    assert [f["exit_status"] for f in result.folder.facts("scan_ended")] == ["success"]
+    assert [f["exit_status"] for f in facts_of(result.folder, "scan_ended")] == ["success"]

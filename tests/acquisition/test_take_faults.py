@@ -6,12 +6,14 @@ import re
 
 import pytest
 from tests.support.paths import REPO
+from tests.support.store.facts import facts_of
 
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.scan import run_scan
 from polysight.acquisition.take import ON_REQUEST, FaultKind, TakeFault
 from polysight.capture.dca1000 import Status
 from polysight.page.history import CAUSES, notice_of_rejection
+from polysight.store import RowFault
 from polysight_shared.faults import PiFault, explain
 
 SPEC = REPO / "docs/spec/scan-folder.md"
@@ -61,7 +63,7 @@ def test_a_rejected_take_has_the_kind_and_board_of_its_fault(rig, tmp_path, spoi
     spoil(rig)
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 1)
-    (fact,) = result.folder.facts("row_rejected")
+    (fact,) = facts_of(result.folder, "row_rejected")
     assert fact["faults"] == [said]
     assert len(fact["reasons"]) == 1
     assert fact["reasons"][0].startswith("RV: ") == ("board" in said)
@@ -80,7 +82,7 @@ def test_data_that_the_card_dropped_rejects_the_row_and_its_status_is_kept(rig, 
     card.send_row = overflowing
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 1)
-    (fact,) = result.folder.facts("row_rejected")
+    (fact,) = facts_of(result.folder, "row_rejected")
     assert fact["faults"] == [{"kind": "card_dropped", "board": "RV"}]
     assert [bool(fact["boards"][name]["card_status"] & bit) for name in ("RH", "RV")] == [False, True]
 
@@ -95,7 +97,7 @@ def test_stopped_now_is_on_request_whatever_else_is_missing(rig, tmp_path):
             stop.request()
 
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
-    (fact,) = result.folder.facts("row_rejected")
+    (fact,) = facts_of(result.folder, "row_rejected")
     assert (fact["reasons"], fact["faults"]) == ([str(ON_REQUEST)], [{"kind": "on_request"}])
     assert (result.exit_status, list(result.folder.committed())) == ("abort", [])
     assert not list((tmp_path / "s" / "raw").rglob("*.part"))
@@ -121,7 +123,7 @@ def test_words_follow_the_kind_alone():
     pulse_too_long = TakeFault(FaultKind.PI_FAULT, "a pulse was too long", number=int(PiFault.PULSE_TOO_LONG))
     notice = notice_of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.fact()], "")
     assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).why.lower()
-    for unknown in ([], [{"kind": "of_a_newer_release", "board": "RV"}]):
+    for unknown in ([], [RowFault("of_a_newer_release", "RV")]):
         notice = notice_of_rejection(0, 1, [answer], unknown, "")
         assert (notice.why, notice.detail) == ("", answer)
         assert notice.do

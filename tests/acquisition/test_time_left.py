@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 
 import pytest
+from tests.support.store.facts import facts_of, typed
 
 from polysight.acquisition import scan_loop as running
 from polysight.acquisition.control import StopRequest
@@ -64,7 +65,7 @@ def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
 
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
     assert result.exit_status == "success"
-    assert [f["fact"] for f in result.folder.facts("scan_paused")] == ["scan_paused"]
+    assert [f["fact"] for f in facts_of(result.folder, "scan_paused")] == ["scan_paused"]
     assert [t for t in answer if isinstance(t[0], int)] == [(n, (4 - n) * ROW_S) for n in (1, 2, 3, 4)]
     assert [left for word, left in answer if isinstance(word, str)] == [2 * ROW_S] * 2, "before the pause and after it"
 
@@ -74,13 +75,13 @@ def test_the_page_has_the_same_time_left(rig, tmp_path):
     run_scan(rig.instrument, tmp_path / "s")
     utc = "2026-05-{:02d}T02:{:02d}:00.000+00:00"
     history: ScanHistory | None = None
-    for fact in running.ScanFolder.load(tmp_path / "s").content.facts:
+    for fact in facts_of(tmp_path / "s"):
         if history is None:
-            history = ScanHistory(fact | {"started_utc": utc.format(1, 0)})
+            history = ScanHistory(typed(fact | {"started_utc": utc.format(1, 0)}))
         elif fact["fact"] == "row_committed" and fact["row"] < 3:
-            history.add_fact(fact | {"committed_utc": utc.format(1, fact["row"] + 1)})
+            history.add_fact(typed(fact | {"committed_utc": utc.format(1, fact["row"] + 1)}))
     assert history is not None
-    history.add_fact({"fact": "scan_paused", "paused_utc": utc.format(1, 3)})
-    history.add_fact({"fact": "scan_continued", "continued_utc": utc.format(2, 3)})
+    history.add_fact(typed({"fact": "scan_paused", "paused_utc": utc.format(1, 3)}))
+    history.add_fact(typed({"fact": "scan_continued", "continued_utc": utc.format(2, 3)}))
     left, _ = remaining(history, seconds(utc.format(2, 3)) + 20)
     assert left == pytest.approx(time_left(1, 60.0, 20.0))

@@ -15,13 +15,13 @@ import pytest
 import zmq
 from tests.support.acquisition.receivers import receivers
 from tests.support.refusals import refused
+from tests.support.store.facts import facts_of
 
 from polysight.acquisition import ready, row
 from polysight.acquisition import scan_loop as running
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.progress import NICE
 from polysight.acquisition.scan import resume_scan, run_scan
-from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
@@ -118,7 +118,7 @@ def test_full_disk_between_rows_ends_the_scan_before_the_next_row(rig, tmp_path,
     with refused(ErrorCode.DISK_FULL):
         run_scan(rig.instrument, tmp_path / "s")
     assert rig.pi.rows_run == [(0, 1), (1, 1)]
-    ended = ScanFolder.load(tmp_path / "s").facts("scan_ended")[0]
+    ended = facts_of(tmp_path / "s", "scan_ended")[0]
     assert ended["exit_status"] == "fail"
     monkeypatch.undo()
     assert resume_scan(tmp_path / "s").exit_status == "success"
@@ -164,7 +164,7 @@ def test_held_row_that_is_whole_counts_with_a_note(rig, tmp_path):
     rig.pi.notes[1, 1] = "held on the way: some positions were passed below full speed"
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 0)
-    facts = {f["row"]: f for f in result.folder.facts("row_committed")}
+    facts = {f["row"]: f for f in facts_of(result.folder, "row_committed")}
     assert facts[1]["take"] == 1
     assert facts[1]["note"].startswith("held")
     assert "note" not in facts[0]
@@ -217,7 +217,7 @@ def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
     assert until - first == 1, "the turn in hand is the last one"
     assert 0 <= max(sleeps[:until]) <= 100, "ms: a request is seen though nothing comes"
     assert isinstance(rig.pi.commands[commands], m.Abort)
-    ended = result.folder.facts("scan_ended")[0]
+    ended = facts_of(result.folder, "scan_ended")[0]
     assert (ended["exit_status"], ended["reason"]) == ("abort", "stopped on request, 4 of 4 rows are missing")
 
 
@@ -251,6 +251,6 @@ def test_every_end_is_written_down(rig, tmp_path, monkeypatch):
     with pytest.raises(BugError):
         run_scan(rig.instrument, tmp_path / "s")
     monkeypatch.undo()
-    ended = ScanFolder.load(tmp_path / "s").facts("scan_ended")
+    ended = facts_of(tmp_path / "s", "scan_ended")
     assert [(f["exit_status"], f["reason"]) for f in ended] == [("fail", "BugError: oops")]
     assert resume_scan(tmp_path / "s").exit_status == "success"

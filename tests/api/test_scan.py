@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import xarray
 from tests.support.refusals import refused
+from tests.support.store.facts import facts_of
 
 import polysight
 from polysight import open_scan, read_netcdf
@@ -34,7 +35,7 @@ def scan(folder):
 def without_rows(folder: Path, out: Path, *rows: int) -> Path:
     """A copy of a scan folder in which these rows were never committed."""
     shutil.copytree(folder, out)
-    kept = [f for f in manifest.read(out / MANIFEST).facts if f["fact"] != "row_committed" or f["row"] not in rows]
+    kept = [f for f in facts_of(out) if f["fact"] != "row_committed" or f["row"] not in rows]
     (out / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in kept))
     return out
 

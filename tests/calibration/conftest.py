@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from tests.support.rigs import Change, rig_with
+from tests.support.store.facts import facts_of
 
 from polysight.store import MANIFEST, manifest
 from polysight_shared.config import Instrument
@@ -30,7 +31,7 @@ def set_rig() -> Callable[[Path, Instrument], None]:
     """`set_rig(folder, rig)`: replace the rig in the manifest of a scan."""
 
     def change(folder: Path, rig: Instrument) -> None:
-        facts = manifest.read(folder / MANIFEST).facts
+        facts = facts_of(folder)
         facts[0]["instrument"] = to_builtins(rig)
         (folder / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
 

@@ -6,6 +6,7 @@ import pytest
 import tomli_w
 from tests.support.calibration import SOURCES, filter_file, metal_reference
 from tests.support.refusals import refused
+from tests.support.store.facts import facts_of
 
 from polysight.calibration.active import (
     calibration_of_rig,
@@ -47,8 +48,8 @@ def rig_naming(make_rig):
 
 
 def create(folder, rig) -> ScanFolder:
-    extra = {"calibration": copy_into_scan(rig, folder, True)}
-    return ScanFolder.create(folder, rig, plan_raster(rig.grid), extra=extra)
+    copies = copy_into_scan(rig, folder, True)
+    return ScanFolder.create(folder, rig, plan_raster(rig.grid), calibration=copies)
 
 
 def test_a_filter_measured_with_other_corners_or_not_on_every_receiver_is_refused(make_rig, tmp_path):
@@ -103,8 +104,8 @@ def test_without_files_nothing_changes(make_rig):
 def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, hpf):
     metal = write_metal(metal_reference(make_rig()), SOURCES, hpf.parent)
     scan = create(tmp_path / "scan", rig_naming(hpf=hpf, metal=metal))
-    assert sorted(scan.facts("scan_started")[0]["calibration"]) == ["hpf", "metal"]
-    assert not [f for f in validate(scan.path) if f.severity == "error"]
+    assert sorted(facts_of(scan, "scan_started")[0]["calibration"]) == ["hpf", "metal"]
+    assert not [f for f in validate(scan.path) if f.level == "error"]
     before = calibration_of_scan(scan)
     for original in hpf.parent.iterdir():
         original.unlink()

@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
+from tests.support.store.facts import facts_of
 
 from polysight.catalogue import NOTES, Notes, Scans, read_notes, scans, write_notes
 from polysight.store import MANIFEST, ScanFolder, manifest
+from polysight_shared import files
 from polysight_shared.errors import ConfigError, DataError
 
 
@@ -21,7 +23,7 @@ def root(processed: Path, tmp_path: Path) -> Path:
     """A folder with a finished scan, one that was stopped, one whose program died, and products alone."""
     for name in ("done", "week/stopped", "week/lost"):
         shutil.copytree(processed / "one", tmp_path / name, ignore=shutil.ignore_patterns("raw", "samples", "figures"))
-    facts = manifest.read(tmp_path / "done" / MANIFEST).facts
+    facts = facts_of(tmp_path / "done")
     ended = {"fact": "scan_ended", "exit_status": "abort", "reason": "asked to", "rows_committed": 3}
     for name, kept in (("week/stopped", [*facts[:4], ended]), ("week/lost", facts[:6])):
         (tmp_path / name / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in kept))
@@ -61,7 +63,7 @@ def test_a_scan_that_has_not_ended_runs_or_pauses_while_its_program_lives(root):
 def test_rows_are_counted_as_the_scan_folder_counts_them(root):
     """Taken again, withdrawn, torn and damaged lines included."""
     path = root / "done" / MANIFEST
-    facts = manifest.read(path).facts
+    facts = facts_of(path)
     again = [facts[5] | {"take": 2}, {"fact": "row_withdrawn", "row": facts[2]["row"], "take": 1, "reasons": ["x"]}]
     lines = [manifest.encode_line(f) for f in [*facts, *again]]
     lines[7] = lines[7].replace(b'"row":', b'"rov":')
@@ -82,8 +84,8 @@ def test_what_has_not_changed_is_not_read_again(root, monkeypatch):
 
 def test_a_list_reads_no_rows(root, monkeypatch):
     opened: list[str] = []
-    real = Path.read_bytes
-    monkeypatch.setattr(Path, "read_bytes", lambda p: opened.append(str(p)) or real(p))
+    real = files.open_regular
+    monkeypatch.setattr(files, "open_regular", lambda p: opened.append(str(p)) or real(p))
     Scans(root).list()
     assert opened
     assert not [p for p in opened if "raw" in p or "samples" in p or p.endswith(".npz")]

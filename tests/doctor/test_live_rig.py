@@ -12,6 +12,7 @@ from tests.support.doctor.case import QUICK
 from tests.support.doctor.live_rig import answering
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
+from tests.support.store.facts import facts_of
 
 from polysight.acquisition.scan import run_scan
 from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
@@ -132,7 +133,7 @@ def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
     live.home()
     scan = run_scan(load_instrument(config), live.folder / "scan").folder
     path.unlink()
-    fact = scan.facts("scan_started")[0]["calibration"]
+    fact = facts_of(scan, "scan_started")[0]["calibration"]
     assert fact == {
         "hpf": {"file": f"calibration/{path.name}", "crc32": fact["hpf"]["crc32"], "copied_from": str(path)}
     }

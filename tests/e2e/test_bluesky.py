@@ -13,6 +13,7 @@ from bluesky import RunEngine
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 from tests.support.processes import wait_for
 from tests.support.simulated_rig import Rig
+from tests.support.store.facts import facts_of
 
 from polysight import RadarScan, radar_scan
 from polysight.cli.main import main
@@ -81,7 +82,7 @@ def test_a_plan_that_is_stopped_leaves_a_scan_to_be_resumed(rig: Rig, engine: Ru
     scan = ScanFolder.load(folder)
     assert scan.committed()
     assert not scan.complete
-    assert scan.facts("scan_ended")
+    assert facts_of(scan, "scan_ended")
     assert main(["resume", str(folder), "--no-process"]) == 0
     assert ScanFolder.load(folder).complete
 

@@ -23,6 +23,7 @@ import pytest
 from tests.support.paths import REPO
 from tests.support.products import unrendered
 from tests.support.scenes import small_scene
+from tests.support.store.facts import facts_of
 
 from polysight.pipeline import Pipeline
 from polysight.store import manifest
@@ -206,7 +207,7 @@ def safe(folder: Path, truth: dict[str, str]) -> dict[str, str]:
     """The committed rows of a scan that was broken off: all good, or there is none."""
     if not begun(folder):
         return {}
-    assert [f for f in validate(folder) if f.severity == "error"] == []
+    assert [f for f in validate(folder) if f.level == "error"] == []
     found = rows(folder)
     assert found.items() <= truth.items()
     return found
@@ -216,7 +217,7 @@ def retaken(folder: Path) -> set[int]:
     """Rows that the last resume has taken again, by the manifest."""
     if not begun(folder):
         return set()
-    facts = ScanFolder.load(folder).content.facts
+    facts = facts_of(folder)
     since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
     return {f["row"] for f in facts[since:] if f["fact"] in ("row_committed", "row_rejected") and f["take"] > 1}
 

@@ -110,6 +110,6 @@ def test_a_scan_is_followed_paused_lost_and_stopped(slow_rig):
     ended = view.wait_headline("Stopped on request")
     assert ended["progress"]["committed"] < ROWS
     assert again.wait().status != 0
-    assert [f for f in validate(rig.folder / "scan") if f.severity == "error"] == []
+    assert [f for f in validate(rig.folder / "scan") if f.level == "error"] == []
     state = view.wait(lambda s: shown(s) == s["progress"]["committed"], "every row's image")
     assert state["boards"][0]["frames_lost"] == 0

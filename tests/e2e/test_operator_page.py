@@ -80,7 +80,7 @@ class Lab:
     def ended(self, folder: Path) -> None:
         """Until the program that the page started has ended; the folder is whole."""
         self.rig.wait_for(lambda: not _program(folder).running, "the end of the program")
-        assert [f for f in validate(folder) if f.severity == "error"] == []
+        assert [f for f in validate(folder) if f.level == "error"] == []
         assert self.browser.errors == []
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import tomli_w
 from tests.support.rigs import rig_table
+from tests.support.store.facts import facts_of
 
 from polysight.acquisition.scan import ScanResult, run_scan
 from polysight.store.validation import validate
@@ -62,7 +63,7 @@ def test_native_radars_make_a_frame_of_many_chirps_at_each_pulse(bench):
     assert data.frames_expected == COLUMNS * CHIRPS
     words = data.payload.view("<u4") & 0x0FFFFFFF
     assert (words == range(words[0], words[0] + words.size)).all()  # the pattern counts on through every chirp
-    first, *rows = result.folder.facts("radars")
+    first, *rows = facts_of(result.folder, "radars")
     for answer in first["boards"].values():
         assert answer["state"] == "configured"
         assert answer["rf_firmware"] != ""

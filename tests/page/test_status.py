@@ -6,20 +6,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from tests.support.store.facts import facts_of, typed
 
 from polysight.acquisition.control import ScanCommand
 from polysight.page.history import ScanHistory, notice_of_fault
 from polysight.page.images import Shown
 from polysight.page.listener import PiState
 from polysight.page.status import LifeSigns, judge, no_scan
-from polysight.store import manifest
-from polysight.store.scan_folder import MANIFEST
 from polysight_shared.faults import EXPLANATIONS, PiFault
 from polysight_shared.messages import Fault
 
 FOLDER = Path("scans/one")
 LIVELY = LifeSigns(alive=True, alive_s=0, pi_silent_s=0.3, pi_limit_s=6.0, now_s=1.8e9)
 RUNNING = PiState(heard_s=1.0, state="running", row=1, take=1)
+ROW = {"fact": "row_committed", "take": 2, "direction": 1, "pulses": 0, "boards": {}}
 REJECTED = {"fact": "row_rejected", "row": 1, "take": 1, "reasons": ["RV: no data"], "boards": {}}
 REJECTED["faults"] = [{"kind": "no_data", "board": "RV"}]
 
@@ -27,9 +27,9 @@ REJECTED["faults"] = [{"kind": "no_data", "board": "RV"}]
 @pytest.fixture
 def history(finished):
     """One of three rows is committed."""
-    facts = manifest.read(finished / MANIFEST).facts
-    history = ScanHistory(facts[0])
-    history.add_fact(next(f for f in facts if f["fact"] == "row_committed"))
+    facts = facts_of(finished)
+    history = ScanHistory(typed(facts[0]))
+    history.add_fact(typed(next(f for f in facts if f["fact"] == "row_committed")))
     return history
 
 
@@ -49,7 +49,7 @@ def test_a_dead_program_outranks_everything_but_the_end(history):
     assert (s.level, s.headline) == ("bad", "The scan program has ended")
     assert f"polysight resume {FOLDER}" in s.do
     assert "1 of 3 rows are safe" in s.detail
-    history.add_fact({"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request"})
+    history.add_fact(typed({"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request"}))
     assert status(history, gone).headline == "Stopped on request"
 
 
@@ -63,9 +63,7 @@ def test_a_dead_program_outranks_everything_but_the_end(history):
     ],
 )
 def test_trouble_says_why_and_what_to_do(history, signs, heard, word):
-    history.add_fact(
-        {"fact": "row_committed", "row": 0, "take": 2, "boards": {}, "committed_utc": "2026-01-01T00:00:00Z"}
-    )
+    history.add_fact(typed(ROW | {"row": 0, "committed_utc": "2026-01-01T00:00:00Z"}))
     history._row_seconds = [20.0]
     s = status(history, signs, heard)
     assert word in s.headline
@@ -87,16 +85,16 @@ def test_every_fault_of_the_pi_has_words(history, number):
 
 
 def test_a_row_taken_again_is_a_warning_for_a_while(history):
-    history.add_fact(REJECTED)
+    history.add_fact(typed(REJECTED))
     s = status(history, heard=replace(RUNNING, take=2))
     assert s.level == "warn"
     assert "Row 1 is retaken" in s.headline
     assert "polysight card" in s.do
-    row = {"fact": "row_committed", "take": 2, "boards": {}}
+    row = ROW
     for n in (1, 2):
-        history.add_fact(row | {"row": n})
+        history.add_fact(typed(row | {"row": n}))
         assert status(history).level == "warn"
-    history.add_fact(row | {"row": 0})
+    history.add_fact(typed(row | {"row": 0}))
     assert status(history).level == "good"
 
 
@@ -110,7 +108,7 @@ def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, le
 
 def test_wishes_are_said_until_they_come_to_pass(history):
     assert status(history, asked=ScanCommand.PAUSE).headline == "Pausing after this row"
-    history.add_fact({"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"})
+    history.add_fact(typed({"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"}))
     assert status(history, asked=ScanCommand.PAUSE).headline == "Paused"
     assert status(history, asked=ScanCommand.STOP).headline == "Stopping after this row"
     assert status(history, asked=ScanCommand.ABORT).headline == "Stopping now"
@@ -118,14 +116,14 @@ def test_wishes_are_said_until_they_come_to_pass(history):
 
 def test_ends_say_how(history):
     ended = {"fact": "scan_ended", "exit_status": "fail", "reason": "the Pi did not answer"}
-    history.add_fact(ended | {"why": "it is off", "remedy": "switch it on"})
+    history.add_fact(typed(ended | {"why": "it is off", "remedy": "switch it on"}))
     s = status(history)
     assert (s.level, s.detail, s.why, s.do) == ("bad", "The Pi did not answer", "It is off", "Switch it on")
-    history.add_fact(ended)
+    history.add_fact(typed(ended))
     assert f"polysight resume {FOLDER}" in status(history).do
     for row in (1, 2):
-        history.add_fact({"fact": "row_committed", "row": row, "take": 1, "boards": {}})
-    history.add_fact(ended | {"exit_status": "success", "reason": "every row is committed"})
+        history.add_fact(typed(ROW | {"row": row}))
+    history.add_fact(typed(ended | {"exit_status": "success", "reason": "every row is committed"}))
     assert (status(history).level, status(history).do) == ("done", "")
 
 

@@ -9,6 +9,7 @@ import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
+from tests.support.store.facts import facts_of
 
 from polysight.cli.main import main
 from polysight.plan import Changes, row_motion_s
@@ -88,7 +89,7 @@ def scan(rig, tmp_path_factory):
 
 def taken_by_a_pi(scan, rig, gap_s: float) -> None:
     """Give the scan events of a Pi with `gap_s` seconds from a row's last trigger to the next one's first."""
-    facts = manifest.read(scan / MANIFEST).facts
+    facts = facts_of(scan)
     facts[0]["pi"] = {"release": "test"}
     (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
     (scan / EVENTS).unlink(missing_ok=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tests.support.processes import output_of
 from tests.support.scenes import EVERYWHERE, scene_of
+from tests.support.store.facts import facts_of
 
 from polysight.calibration.files import SourceScan, write_metal
 from polysight.jobs.calibrate import load_reference
@@ -28,7 +29,7 @@ def products(scan_of, tmp_path_factory):
     gains = np.broadcast_to(np.exp((4 + 10j) * (seen.x_m - seen.x_m.mean())), seen.h.shape)
     made = replace(seen, h=(seen.h * gains).astype(np.complex64), valid=known)
     path = write_metal(made, [SourceScan("plate", str(scan), True, 8)], scan / "calibration")
-    facts = manifest.read(scan / MANIFEST).facts
+    facts = facts_of(scan)
     facts[0]["instrument"]["calibration"] = {"metal": str(path)}
     (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
     output_of("process", scan, "--out", folder / "out", "--model", "none")

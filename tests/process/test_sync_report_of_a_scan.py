@@ -7,6 +7,7 @@ import pytest
 from tests.support.processes import output_of
 from tests.support.rigs import published_rig, rig_with
 from tests.support.scenes import EVERYWHERE, scene_of
+from tests.support.store.facts import facts_of
 
 from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
 from polysight.store import manifest
@@ -36,7 +37,7 @@ def scan(scan_of, tmp_path_factory):
 
 def _believe_programmed(scan):
     """Set the filters in the scan's manifest to those of the published rig."""
-    facts = manifest.read(scan / "manifest.jsonl").facts
+    facts = facts_of(scan)
     facts[0]["instrument"]["chirp"] |= {"hpf1_khz": 175.0, "hpf2_khz": 350.0}
     (scan / "manifest.jsonl").write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
 

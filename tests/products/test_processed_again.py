@@ -11,6 +11,7 @@ import pytest
 import tomli_w
 from tests.support.rigs import published_rig
 from tests.support.scenes import scene_of
+from tests.support.store.facts import facts_of
 
 from polysight.cli.main import main
 from polysight.materials import Library
@@ -153,7 +154,7 @@ def test_a_library_of_another_angle_is_reported_before_the_rig_is_used(made, oth
 def test_retaken_and_incomplete_rows_of_every_run_are_counted(made):
     """They come from the manifest, however often the scan was resumed."""
     scan = ScanFolder.load(made / "scan")
-    rows = {f["row"]: f for f in scan.facts("row_committed")}
+    rows = {f["row"]: f for f in facts_of(scan, "row_committed")}
     with scan.writer() as writer:
         for row, take in ((2, 1), (2, 2), (5, 1)):
             writer.append({"fact": "row_rejected", "row": row, "take": take, "reasons": ["x"], "boards": {}})

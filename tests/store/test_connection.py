@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import tomli_w
 from tests.support.rigs import rig_table
+from tests.support.store.facts import facts_of, typed
 
 from polysight.acquisition.scan import resume_scan
 from polysight.cli.main import main
@@ -97,12 +98,12 @@ def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
         assert resume_scan(small.path).folder.instrument == now
     scan = ScanFolder.load(small.path)
     assert scan.instrument == now
-    started, (first, second) = scan.facts("scan_started")[0], scan.facts("scan_resumed")
+    started, (first, second) = facts_of(scan, "scan_started")[0], facts_of(scan, "scan_resumed")
     assert decode(started["instrument"], Instrument, "begun") == begun
     assert (first["rig"], "rig" in second) == (connection_of(now), False)
-    story = ScanHistory(started)
+    story = ScanHistory(typed(started))
     for fact in (first, second):
-        story.add_fact(fact)
+        story.add_fact(typed(fact))
     assert story.instrument == now
     assert small.rows() == undisturbed.digests
     assert small.image() == undisturbed.final_image

@@ -11,11 +11,12 @@ from pathlib import Path
 import msgpack
 import pytest
 from tests.support.refusals import refused
+from tests.support.store.facts import facts_of
 from tests.support.store.small_scan import SmallScan
 
 from polysight.store.events import read_events
 from polysight.store.scan_folder import ScanFolder
-from polysight.store.validation import validate
+from polysight.store.validation import to_text, validate
 from polysight_pi.journal import records
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.messages import RowStarted
@@ -34,7 +35,7 @@ def journal_of(scan: SmallScan) -> Path:
 
 
 def faults(scan: SmallScan, severity: str = "error") -> list[str]:
-    return [str(f) for f in validate(scan.path) if f.severity == severity]
+    return [to_text(f) for f in validate(scan.path) if f.level == severity]
 
 
 def resumed(scan: SmallScan, undisturbed, image: bool = False, damaged_lines: int = 0) -> set[int]:
@@ -46,7 +47,7 @@ def resumed(scan: SmallScan, undisturbed, image: bool = False, damaged_lines: in
     assert scan.rows() == undisturbed.digests
     if image:
         assert scan.image() == undisturbed.final_image
-    facts = ScanFolder.load(scan.path).content.facts
+    facts = facts_of(scan.path)
     since = max(i for i, f in enumerate(facts) if f["fact"] == "scan_resumed")
     again = [f["row"] for f in facts[since:] if f["fact"] == "row_committed"]
     assert len(again) == len(set(again))
@@ -121,7 +122,7 @@ def test_event_log(undisturbed, tmp_path, sample, record, tail):
 def test_bit_of_the_event_log(undisturbed, tmp_path, sample):
     """What validate cannot tell by the form, it tells by the digest; what is not readable comes from the journal."""
     raw = (undisturbed.path / "events.msgpack").read_bytes()
-    committed = ScanFolder.load(undisturbed.path).facts("row_committed")[-1]["events"]["bytes"]
+    committed = facts_of(undisturbed.path, "row_committed")[-1]["events"]["bytes"]
     for bit in sample(range(8 * committed), 16):
         scan = undisturbed.copy(tmp_path / "s")
         turn(scan.path / "events.msgpack", bit)
@@ -200,7 +201,7 @@ def test_committed_row_cut_short(undisturbed, tmp_path, sample, suffix):
             with refused(ErrorCode.FILE_DAMAGED):
                 _ = ScanFolder.load(scan.path).read_row("RV", 1).payload
         assert resumed(scan, undisturbed, image=not cut) == {1}  # row 1 is taken last now
-        withdrawn = ScanFolder.load(scan.path).facts("row_withdrawn")
+        withdrawn = facts_of(scan.path, "row_withdrawn")
         assert [(f["row"], f["take"]) for f in withdrawn] == [(1, 1)]
         assert name in withdrawn[0]["reasons"][0]
 
@@ -230,7 +231,7 @@ def test_row_that_is_not_committed_may_be_anything(undisturbed, tmp_path, sample
 def test_withdrawn_row_counts_again_once_it_is_taken(undisturbed, tmp_path):
     scan = undisturbed.copy(tmp_path / "s")
     folder = ScanFolder.load(scan.path)
-    fact = folder.facts("row_committed")[1]
+    fact = facts_of(folder, "row_committed")[1]
     with folder.writer() as writer:
         writer.append({"fact": "row_withdrawn", "row": 1, "take": 1, "reasons": ["test"]})
         folder.reload()

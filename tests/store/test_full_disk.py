@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.refusals import refused
+from tests.support.store.facts import facts_of
 from tests.support.store.faulty_disk import GROWS, FaultyDisk
 from tests.support.store.small_scan import Samples, SmallScan
 
@@ -53,7 +54,7 @@ def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed, tmp_path,
         committed = set(ScanFolder.load(scan.path).committed()) if scan.begun else set()
         assert scan.acknowledged <= committed
         if scan.begun:
-            assert [f for f in validate(scan.path) if f.severity == "error"] == []
+            assert [f for f in validate(scan.path) if f.level == "error"] == []
         before = scan.rows() if scan.begun else {}
         assert scan.run().exit_status == "success"  # there is space again
         assert validate(scan.path) == []
@@ -78,5 +79,5 @@ def test_disk_that_has_space_again_while_the_program_still_runs(samples, tmp_pat
         disk.free_space()
         writer.append({"fact": "scan_resumed"})
     folder.reload()
-    assert folder.content.facts[-1] == {"fact": "scan_resumed"}
-    assert len(folder.content.facts) == len(raw.splitlines()) + 1
+    assert facts_of(folder)[-1] == {"fact": "scan_resumed"}
+    assert len(facts_of(folder)) == len(raw.splitlines()) + 1

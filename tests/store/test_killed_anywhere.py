@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from tests.support.store.facts import facts_of
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 from tests.support.store.plain_scan import errors
 from tests.support.store.small_scan import Samples, SmallScan
@@ -25,7 +26,7 @@ pytestmark = [
 
 def retaken(path: Path) -> set[int]:
     """Rows that were taken again since the last resume, by the manifest."""
-    facts = ScanFolder.load(path).content.facts
+    facts = facts_of(path)
     since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
     return {f["row"] for f in facts[since:] if f["fact"] == "row_committed" and f["take"] > 1}
 

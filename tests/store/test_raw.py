@@ -15,6 +15,7 @@ import pytest
 from tests.support.paths import POLYSIGHT, RIG_FILE
 from tests.support.refusals import refused
 from tests.support.scenes import small_scene
+from tests.support.store.facts import facts_of
 from tests.support.store.plain_scan import errors
 
 from polysight.cli.main import main
@@ -81,7 +82,7 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     assert (kept, dropped) == (products, said)
     products = contents(scan / "products")
     assert len(list(scan.glob("raw/*/*.idx"))) in (0, ROWS * BOARDS)  # arrivals and gaps stay, where there were any
-    facts = ScanFolder.load(scan).facts("raw_dropped")
+    facts = facts_of(scan, "raw_dropped")
     assert [f["row"] for f in facts] == list(range(ROWS))
     said = {(name, f["row"]): board["crc32"] for f in facts for name, board in f["boards"].items()}
     assert said == {(name, row): crc for name, rows in digests.items() for row, crc in rows.items()}
@@ -133,7 +134,7 @@ def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what)
         with refused(code, named):
             drop_raw(scan, None, yes=True)
     assert payloads(scan) == before
-    assert not ScanFolder.load(scan).facts("raw_dropped")
+    assert not facts_of(scan, "raw_dropped")
 
 
 def flip(path: Path, row: int) -> None:
@@ -186,7 +187,7 @@ def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypat
     with refused(ErrorCode.FILE_DAMAGED):
         drop_raw(scan, None, yes=True)
     assert payloads(scan) == before
-    assert not ScanFolder.load(scan).facts("raw_dropped")
+    assert not facts_of(scan, "raw_dropped")
 
 
 def test_only_rows_in_the_products_are_dropped(scan):
@@ -250,7 +251,7 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
     drop(ScanFolder.load(scan), digests, scan / "products")
     assert not payloads(scan)
     assert errors(scan) == []
-    assert [f["row"] for f in ScanFolder.load(scan).facts("raw_dropped")] == list(range(ROWS))
+    assert [f["row"] for f in facts_of(scan, "raw_dropped")] == list(range(ROWS))
 
 
 def test_a_line_torn_anywhere_drops_nothing(scan):
@@ -272,7 +273,7 @@ def test_a_line_torn_anywhere_drops_nothing(scan):
 def test_a_row_taken_again_is_there_again(scan):
     drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
     folder = ScanFolder.load(scan)
-    committed = folder.facts("row_committed")[1]
+    committed = facts_of(folder, "row_committed")[1]
     with folder.writer() as writer:
         writer.append({**committed, "take": 2})
     folder.reload()

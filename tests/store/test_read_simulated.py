@@ -28,7 +28,7 @@ def test_a_simulated_scan_folder_is_whole(tmp_path: Path, loss: float) -> None:
     assert scan.simulated
     assert scan.complete
     assert scan.instrument == radar.rig
-    assert not [f for f in validate(tmp_path / "scan") if f.severity == "error"]
+    assert not [f for f in validate(tmp_path / "scan") if f.level == "error"]
     for row in scan.plan:
         for board in ("RH", "RV"):
             data = scan.read_row(board, row.index)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
+from tests.support.store.facts import facts_of
 
 from polysight.calibration import calibration_of_scan
 from polysight.capture import read_index, read_packets
@@ -48,7 +49,7 @@ def scan(undisturbed, tmp_path) -> ScanFolder:
 
 def committed_as(scan: ScanFolder, file: str) -> None:
     """Commit the first row once more, with its first board's payload in this file."""
-    fact = next(f for f in scan.facts("row_committed") if f["row"] == 0)
+    fact = next(f for f in facts_of(scan, "row_committed") if f["row"] == 0)
     name = next(iter(fact["boards"]))
     boards = {**fact["boards"], name: {**fact["boards"][name], "file": file}}
     with scan.writer() as writer:
@@ -64,7 +65,7 @@ def test_a_row_outside_the_scan_is_refused_by_whatever_reads_it(scan, file):
     for use in (scan.committed, lambda: list(scan.rows()), lambda: droppable(scan, {})):
         with refused(ErrorCode.PATH_OUTSIDE):
             use()
-    assert any(f.severity == "error" for f in validate(scan.path))
+    assert any(f.level == "error" for f in validate(scan.path))
     assert victim.read_bytes() == b"mine"
 
 
@@ -221,7 +222,7 @@ def test_calibration_outside_the_scan_is_not_read(scan, file):
 
 
 def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
-    rig = scan.content.facts[0]["instrument"]
+    rig = facts_of(scan)[0]["instrument"]
     with refused(ErrorCode.PATH_OUTSIDE):
         calibration_of_scan(
             ScanFolder.load(

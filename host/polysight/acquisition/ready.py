@@ -14,7 +14,7 @@ from pathlib import Path
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.pi_client import MOVING, PiClient
 from polysight.acquisition.take import ON_REQUEST
-from polysight.store import Fact
+from polysight.store import PiDescription
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError
@@ -130,9 +130,9 @@ def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
         )
 
 
-def pi_fact(hello: HelloReply) -> Fact:
+def describe_pi(hello: HelloReply) -> PiDescription:
     """Return the manifest's description of the Pi."""
-    return {"release": hello.pi_release, "firmware": hello.firmware, "backend": hello.backend, "stage": hello.stage}
+    return PiDescription(hello.pi_release, hello.firmware, hello.backend, hello.stage)
 
 
 def stage_differences(stage: Stage, hello: HelloReply) -> list[str]:

@@ -15,13 +15,15 @@ from polysight.acquisition.capture_rig import CaptureRig
 from polysight.acquisition.control import StopRequest, delay_interrupts
 from polysight.acquisition.pi_client import PiClient
 from polysight.acquisition.progress import OnProgress, OnRow, ScanProgress, ScanResult
-from polysight.acquisition.ready import check_same_stage, pi_fact, stage_differences
+from polysight.acquisition.ready import check_same_stage, describe_pi, stage_differences
 from polysight.acquisition.scan_loop import RunningScan
 from polysight.calibration import copy_into_scan
 from polysight.radar import RadarControl, radar_control
 from polysight.store import (
     ManifestWriter,
+    RowWithdrawn,
     ScanFolder,
+    ScanResumed,
     check_same_scan,
     connection_of,
     damaged_rows,
@@ -81,7 +83,8 @@ def run_scan(
             plan,
             simulated=simulated,
             scan_id=new_scan_id(),
-            extra={"pi": pi_fact(hello), "calibration": copy_into_scan(instrument, folder, simulated)},
+            pi=describe_pi(hello),
+            calibration=copy_into_scan(instrument, folder, simulated),
         )
         writer = stack.enter_context(scan.writer())
         radars = stack.enter_context(radars or radar_control(instrument))
@@ -122,14 +125,19 @@ def resume_scan(
                 "start the Pi with the backend the scan was begun with, or make a new scan",
                 code=ErrorCode.MISMATCH,
             )
-        if not hello.stage or any(fact.get("pi", {}).get("stage") for fact in scan.facts("scan_started")):
+        if not hello.stage or (scan.started.pi is not None and scan.started.pi.stage):
             warnings = check_same_stage(scan.instrument.stage, hello, f"{folder}")
         else:  # the earlier rows were placed by that Pi, not by the host's rig file
             found = stage_differences(scan.instrument.stage, hello)
             warnings = [f"not compared when the scan began: {d}" for d in found]
-        missing = scan.plan.rows - len(scan.committed())
-        fact = {"fact": "scan_resumed", "resumed_utc": utc_now(), "rows_missing": missing, "pi": pi_fact(hello)}
-        writer.append({**fact, **({} if rig_now is None else {"rig": connection_of(rig_now)})})
+        writer.append(
+            ScanResumed(
+                resumed_utc=utc_now(),
+                rows_missing=len(scan.rows_absent),
+                pi=describe_pi(hello),
+                rig=None if rig_now is None else connection_of(rig_now),
+            )
+        )
         scan.reload()
         radars = stack.enter_context(radars or radar_control(scan.instrument))
         stop = stop or StopRequest()
@@ -144,8 +152,7 @@ def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProg
         progress(ScanProgress("check", f"comparing {len(rows)} committed rows with their digests", scan.plan.rows, 0))
     damaged = damaged_rows(scan)
     for row, reasons in damaged.items():
-        fact = {"fact": "row_withdrawn", "row": row, "take": rows[row].take, "reasons": reasons}
-        writer.append({**fact, "withdrawn_utc": utc_now()})
+        writer.append(RowWithdrawn(row=row, take=rows[row].take, reasons=reasons, withdrawn_utc=utc_now()))
     scan.reload()
     return [f"row {row} is taken again: {'; '.join(reasons)}" for row, reasons in damaged.items()]
 

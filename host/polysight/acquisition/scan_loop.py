@@ -22,7 +22,19 @@ from polysight.acquisition.ready import check_between_rows, check_disk, make_rea
 from polysight.acquisition.row import RowState, RowTaker, RowTransaction
 from polysight.acquisition.take import ON_REQUEST, Take, commit_row, reasons, reject_row, retakes_exhausted
 from polysight.radar import RadarControl
-from polysight.store import EVENTS, EventWriter, Fact, ManifestWriter, ScanFolder, read_events, utc_now
+from polysight.store import (
+    EVENTS,
+    EventWriter,
+    ManifestWriter,
+    RowCommitted,
+    RowRejected,
+    ScanContinued,
+    ScanEnded,
+    ScanFolder,
+    ScanPaused,
+    read_events,
+    utc_now,
+)
 from polysight_shared.errors import PolysightError, advice
 from polysight_shared.messages import AnyEvent, BeginRun, RowStarted, RunStarted
 from polysight_shared.raster import Row
@@ -58,8 +70,8 @@ class RunningScan:
         self._state = ""
         self._stop_announced = False
         self._was_ready = False  # the stage, in this run
-        self._remedy: Fact = {}  # of the error that ended the scan
-        self._lost_steps: Fact = {}
+        self._error: PolysightError | None = None  # that ended the scan
+        self._lost_mm: tuple[float, float] | None = None
         self.result = ScanResult(scan, "fail", "ended unexpectedly")
 
     def run(self, warnings: list[str]) -> ScanResult:
@@ -101,7 +113,7 @@ class RunningScan:
         resume = f"`polysight resume {self._scan.path}` continues from there"
         if isinstance(e, PolysightError):
             e.remedy = advice(e.remedy, safe, "" if f"polysight resume {self._scan.path}" in e.remedy else resume)
-            self._remedy = {"why": e.why, "remedy": e.remedy}
+            self._error = e
             self.result.reason = e.what
         else:
             e.add_note(advice(safe, resume))
@@ -178,7 +190,7 @@ class RunningScan:
         except PolysightError as e:
             self._warn(f"every row is committed; lost steps were not measured: {e.what}")
             return
-        self._lost_steps = {"lost_mm": lost_mm} if lost_mm else {}
+        self._lost_mm = lost_mm
         if lost_mm and max(map(abs, lost_mm)) >= _LOST_STEPS_WARNING_MM:
             self._warn(
                 f"the drives lost {lost_mm[0]:.3f} mm in x and {lost_mm[1]:.3f} mm in y since the last homing:"
@@ -227,7 +239,7 @@ class RunningScan:
         finally:
             self._write_radar_report({"row": row.index, "take": number})
 
-    def _write_radar_report(self, of: Fact) -> None:
+    def _write_radar_report(self, of: dict[str, int]) -> None:
         """Add the radars' report since the last one to the manifest, if there is one."""
         if report := self._radars.report():
             self._writer.append({"fact": "radars", **of, **report})
@@ -246,7 +258,7 @@ class RunningScan:
         """Wait for the end of a pause and record it in the manifest; return False if asked to stop."""
         if not self._stop.paused:
             return not self._stop.now
-        self._writer.append({"fact": "scan_paused", "paused_utc": utc_now()})
+        self._writer.append(ScanPaused(paused_utc=utc_now()))
         self._notify("wait", "paused on request; `continue` begins the next row")
         with self._untimed():
             while self._stop.paused:
@@ -254,7 +266,7 @@ class RunningScan:
                     return False
                 time.sleep(_POLL_S)
                 self._pi.events()
-        self._writer.append({"fact": "scan_continued", "continued_utc": utc_now()})
+        self._writer.append(ScanContinued(continued_utc=utc_now()))
         self._notify("wait", "continued")
         return not self._stop.after_row
 
@@ -292,16 +304,16 @@ class RunningScan:
         """Add `scan_ended` to the manifest and end the Pi's run."""
         status, reason = self.result.exit_status, self.result.reason
         self._writer.append(
-            {
-                "fact": "scan_ended",
-                "exit_status": status,
-                "reason": reason,
-                **self._remedy,
-                **self._lost_steps,
-                "rows_committed": len(self._committed),
-                "events_refetched": self._pi.gaps_filled,
-                "ended_utc": utc_now(),
-            }
+            ScanEnded(
+                exit_status=status,
+                reason=reason,
+                why=self._error.why if self._error is not None else "",
+                remedy=self._error.remedy if self._error is not None else "",
+                lost_mm=self._lost_mm,
+                rows_committed=len(self._committed),
+                events_refetched=self._pi.gaps_filled,
+                ended_utc=utc_now(),
+            )
         )
         waiting = f"; {self._queue.left} rows wait to be processed" if self._queue.left else ""
         self._notify("end", reason + waiting)
@@ -350,7 +362,7 @@ class RunningScan:
 
 def takes_so_far(scan: ScanFolder) -> dict[int, int]:
     """Return the highest take number of every row that was begun, so that none is used twice."""
-    begun = [(f["row"], f["take"]) for kind in ("row_committed", "row_rejected") for f in scan.facts(kind)]
+    begun = [(f.row, f.take) for f in (*scan.facts(RowCommitted), *scan.facts(RowRejected))]
     events = read_events(scan.path / EVENTS).events
     begun += [(e.row.index, e.take) for e in events if isinstance(e, RowStarted)]
     return dict(sorted(begun))  # of one row's takes, the highest is the last

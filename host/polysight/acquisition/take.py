@@ -8,41 +8,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any
 
 from polysight.acquisition.missed_pulses import PlacedFrames
 from polysight.acquisition.slipped_row import ReceivedCapture, describe, rewrite_row
 from polysight.capture import PACKETS, RowCapture, silent_radar, valid_frames, write_error
 from polysight.radar import BoardState, RadarState
-from polysight.store import PART, Fact, ManifestWriter, ScanFolder, sync_folder, utc_now
+from polysight.store import (
+    PART,
+    BoardRow,
+    LogDigest,
+    ManifestWriter,
+    Reception,
+    RowCommitted,
+    RowFault,
+    RowRejected,
+    ScanFolder,
+    sync_folder,
+    utc_now,
+)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError, advice
 from polysight_shared.faults import explain
 from polysight_shared.messages import RowFinished
 from polysight_shared.raster import Row
-
-_RECEPTION_COUNTS = (
-    "packets",
-    "duplicates",
-    "late",
-    "late_by_bytes",
-    "outside",
-    "disagreeing",
-    "malformed",
-    "strangers",
-    "stale",
-    "leftover",
-    "conflicting",
-    "restarted",
-    "before_pulses",
-    "clock_jumps",
-    "kernel_drops",
-    "head_bytes",
-    "gaps",
-    "gap_bytes",
-    "tail_bytes",
-    "card_status",
-)
-"""Counts of each board's reception that the manifest keeps (docs/spec/scan-folder.md)."""
 
 
 class FaultKind(StrEnum):
@@ -78,11 +67,9 @@ class TakeFault:
     def __str__(self) -> str:
         return f"{self.board}: {self.text}" if self.board else self.text
 
-    def fact(self) -> Fact:
-        """Return the fault as the manifest stores it (docs/spec/scan-folder.md)."""
-        board: Fact = {"board": self.board} if self.board else {}
-        number: Fact = {"number": self.number} if self.number else {}
-        return {"kind": str(self.kind), **board, **number}
+    def fact(self) -> RowFault:
+        """Return the fault as the manifest stores it."""
+        return RowFault(str(self.kind), self.board, self.number)
 
 
 ON_REQUEST = TakeFault(FaultKind.ON_REQUEST, "stop requested at the host")
@@ -195,14 +182,16 @@ def _unlocated(capture: RowCapture) -> FaultKind:
     return FaultKind.FRAMES_MISSING if capture.slipped else FaultKind.UNLOCATED
 
 
-def commit_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: list[TakeFault], events: Fact) -> None:
+def commit_row(
+    scan: ScanFolder, writer: ManifestWriter, take: Take, faults: list[TakeFault], events: LogDigest
+) -> None:
     """Rename the row's files to their final names, durably, then add `row_committed` to the manifest.
 
     `events` is the digest of the event log, which must be on the disk. `faults` are those of a row kept incomplete;
     empty for a complete row. Raises DeviceError if the disk fails.
     """
     frames = take.row.points * scan.instrument.burst.pulses
-    boards: dict[str, Fact] = {}
+    boards: dict[str, BoardRow] = {}
     for name, capture in take.captures.items():
         final = scan.row_path(name, take.row.index)
         placed = take.placed.get(name)
@@ -214,31 +203,32 @@ def commit_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
         except OSError as e:
             raise write_error(final, "renamed", e) from None
         sync_folder(final.parent)
-        boards[name] = {
-            "file": str(final.relative_to(scan.path)),
-            "bytes": capture.expected,
-            "frames_expected": frames,
-            "frames_received": int(valid_frames(capture.missing, frames, scan.instrument.frame_bytes).sum()),
-            "missing_bytes": capture.missing_bytes,
-            "crc32": f"{capture.crc32:08x}",
-            "index_crc32": f"{capture.index_crc32:08x}",
-            **({"packets_crc32": f"{capture.packets_crc32:08x}"} if capture.packets_crc32 else {}),
-            **_counts(take, name),
-            **({} if placed is None else {"pulses_missed": placed.pulses - placed.slots.size}),
-        }
-    fact: Fact = {
-        "fact": "row_committed",
-        "row": take.row.index,
-        "take": take.number,
-        "direction": take.row.direction,
-        "boards": boards,
-        "pulses": take.finished.pulses if take.finished else 0,
-        "events": events,
-        "committed_utc": utc_now(),
-    }
-    kept: Fact = {"kept_incomplete": [str(f) for f in faults], "faults": [f.fact() for f in faults]} if faults else {}
-    note: Fact = {"note": take.note} if take.note else {}
-    writer.append({**fact, **kept, **note})
+        boards[name] = BoardRow(
+            file=str(final.relative_to(scan.path)),
+            bytes=capture.expected,
+            frames_expected=frames,
+            frames_received=int(valid_frames(capture.missing, frames, scan.instrument.frame_bytes).sum()),
+            missing_bytes=capture.missing_bytes,
+            crc32=f"{capture.crc32:08x}",
+            index_crc32=f"{capture.index_crc32:08x}",
+            packets_crc32=f"{capture.packets_crc32:08x}" if capture.packets_crc32 else "",
+            pulses_missed=None if placed is None else placed.pulses - placed.slots.size,
+            **_reception(capture),
+        )
+    writer.append(
+        RowCommitted(
+            row=take.row.index,
+            take=take.number,
+            direction=take.row.direction,
+            boards=boards,
+            pulses=take.finished.pulses if take.finished else 0,
+            events=events,
+            committed_utc=utc_now(),
+            kept_incomplete=[str(f) for f in faults],
+            faults=[f.fact() for f in faults],
+            note=take.note,
+        )
+    )
 
 
 def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: list[TakeFault]) -> None:
@@ -248,22 +238,21 @@ def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
         for suffix in (PART, ".idx", PACKETS):
             path.with_suffix(suffix).unlink(missing_ok=True)
     writer.append(
-        {
-            "fact": "row_rejected",
-            "row": take.row.index,
-            "take": take.number,
-            "reasons": [str(f) for f in faults],
-            "faults": [f.fact() for f in faults],
-            "boards": {name: _counts(take, name) for name in take.captures},
-            "rejected_utc": utc_now(),
-        }
+        RowRejected(
+            row=take.row.index,
+            take=take.number,
+            reasons=[str(f) for f in faults],
+            faults=[f.fact() for f in faults],
+            boards={name: Reception(**_reception(capture)) for name, capture in take.captures.items()},
+            rejected_utc=utc_now(),
+        )
     )
 
 
-def _counts(take: Take, name: str) -> Fact:
-    c = take.captures[name]
-    counts = {kind: getattr(c, kind) for kind in _RECEPTION_COUNTS}
-    return {**counts, "located": c.located, "received_bytes": c.bytes}
+def _reception(capture: RowCapture) -> dict[str, Any]:
+    """Return the fields of `Reception` that every capture has."""
+    counts = {kind: getattr(capture, kind) for kind in Reception.__struct_fields__ if hasattr(capture, kind)}
+    return {**counts, "received_bytes": capture.bytes}
 
 
 def retakes_exhausted(take: Take, faults: list[TakeFault], scan: ScanFolder, takes: int) -> ScanError:

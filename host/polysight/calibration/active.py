@@ -187,8 +187,7 @@ def calibration_of_scan(scan: Source) -> Calibration:
     """
     if not isinstance(scan, ScanFolder):
         return calibration_of_rig(scan.instrument)
-    facts = scan.facts("scan_started")
-    recorded = facts[0].get(FACT) if facts else None
+    recorded = scan.started.calibration
     if recorded is None:
         named = {kind: name for kind, name in to_builtins(scan.instrument.calibration).items() if name}
         return load_calibration({kind: inside(scan.path, name) for kind, name in named.items()})

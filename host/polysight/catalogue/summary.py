@@ -1,7 +1,4 @@
-"""One line of the list of scans, from a scan folder's manifest, products, notes and program.
-
-Rows are counted by a search in the manifest's bytes; all other facts are read with their CRC.
-"""
+"""One line of the list of scans, from a scan folder's manifest, products, notes and program."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from typing import Any
 from polysight.acquisition import last_alive_s
 from polysight.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes
 from polysight.products import IMAGE, MATERIALS, QUALITY, SavedProducts
-from polysight.store import MANIFEST, Fact, manifest
+from polysight.store import MANIFEST, manifest
 from polysight_shared.errors import DataError, PolysightError
 
 PROGRAM = "program"
@@ -24,7 +21,6 @@ _TAIL_BYTES = 16384
 _CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 _LAPSE_S = 15.0
 _GRACE_S = 20.0  # from a manifest's last line to the first sign of life
-_ROW = re.compile(rb'"row":(\d+)')
 Stamp = tuple[tuple[int, int], ...]
 
 
@@ -91,25 +87,24 @@ def summary_of(folder: Path, name: str) -> Summary:
         notes = Notes(e.what)
     facts: dict[str, Any] = {"name": name, "notes": notes.notes, "tags": notes.tags, **_processed(folder)}
     try:
-        raw = (folder / MANIFEST).read_bytes() if is_plain(folder / MANIFEST) else None
-    except OSError:
-        raw = None
-    if raw is None:
+        content = manifest.read(folder / MANIFEST) if is_plain(folder / MANIFEST) else None
+    except DataError:
+        content = None
+    if content is None:
         products = facts["processed"] or facts.get("images_only", False)
         reason = "" if products else _start_failure(folder)
         state = "products" if products else "failed" if reason else "begun"
         return Summary(state=state, reason=reason, **{"seconds": _age(folder), **facts})
-    first, rows, last = _read(raw)
-    if first is None:
+    started, ended = content.started, content.ended
+    if started is None:
         return Summary(state="damaged", **{"seconds": _age(folder), **facts})
-    plan, rig = first.get("plan", {}), first.get("instrument", {})
-    started = str(first.get("started_utc", ""))
     facts |= {
-        "scan_id": str(first.get("scan_id", "")), "simulated": bool(first.get("simulated")), "started_utc": started,
-        "rig": str(rig.get("name", "")) if isinstance(rig, dict) else "", "committed": len(rows),
-        "rows": int(plan.get("rows", 0)) if isinstance(plan, dict) else 0, "seconds": _seconds(started) or _age(folder),
+        "scan_id": started.scan_id, "simulated": started.simulated, "started_utc": started.started_utc,
+        "rig": str(started.instrument.get("name", "")), "committed": len(content.rows), "rows": started.plan.rows,
+        "seconds": _seconds(started.started_utc) or _age(folder),
     }  # fmt: skip
-    return Summary(state=_state(last, facts), reason=str(last.get("reason", ""))[:300], **facts)
+    state = "lost" if content.state == "open" else content.state  # `as_of_now` asks if its program lives
+    return Summary(state=state, reason="" if ended is None else ended.reason[:300], **facts)
 
 
 def _start_failure(folder: Path) -> str:
@@ -139,39 +134,6 @@ def log_tail(path: Path) -> str:
     starts = [k for k, line in enumerate(lines) if line.startswith("--- ")]
     text = "\n".join(lines[starts[-1] + 1 :] if starts else lines)
     return printable(_CONTROL_SEQUENCE.sub("", text), keep="\n\t").strip()
-
-
-def _read(raw: bytes) -> tuple[Fact | None, set[int], Fact]:
-    """First fact, committed rows, and the last fact about the scan's state."""
-    rows: set[int] = set()
-    first: Fact | None = None
-    last: Fact = {}
-    for line in raw.split(b"\n"):
-        if b'"fact":"row_committed"' in line:  # most lines; their digits suffice for a list
-            found = _ROW.search(line, line.find(b'"pulses"'))
-            if found is not None:
-                rows.add(int(found[1]))
-            continue
-        fact = manifest.decode_line(line) if line else None
-        if fact is None:
-            continue
-        if fact["fact"] == "scan_started":
-            first = first or fact
-        elif fact["fact"] == "row_withdrawn":
-            rows.discard(int(fact.get("row", -1)))
-        elif fact["fact"] in ("scan_ended", "scan_resumed", "scan_paused", "scan_continued"):
-            last = fact
-    return first, rows, last
-
-
-def _state(last: Fact, facts: dict[str, Any]) -> str:
-    if last.get("fact") == "scan_paused":
-        return "paused"  # if its program lives
-    if last.get("fact") != "scan_ended":
-        return "lost"
-    if last.get("exit_status") == "success" and facts["committed"] >= facts["rows"]:
-        return "finished"
-    return "stopped" if last.get("exit_status") == "abort" else "failed"
 
 
 def as_of_now(folder: Path, s: Summary) -> Summary:

@@ -98,8 +98,7 @@ def phase_history(pipeline: Pipeline) -> PhaseHistory:
 
 def _started(source: object) -> str:
     """Start of the scan; empty if unknown."""
-    facts = source.facts("scan_started") if isinstance(source, ScanFolder) else []
-    return str(facts[0].get("started_utc", "")) if facts else ""
+    return source.started.started_utc if isinstance(source, ScanFolder) else ""
 
 
 def _met(rig: Instrument) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -25,6 +25,7 @@ from polysight.store import (
     place_again,
     replace_rows,
     to_json,
+    to_text,
     validate,
 )
 from polysight_shared.config import load_instrument
@@ -88,8 +89,8 @@ def validate_folder(folder: Path, as_json: bool) -> int:
     if as_json:
         sys.stdout.write(to_json(findings) + "\n")
     else:
-        sys.stdout.write("".join(f"{f}\n" for f in findings) or f"{folder}: whole\n")
-    return 1 if any(f.severity == "error" for f in findings) else 0
+        sys.stdout.write("".join(f"{to_text(f)}\n" for f in findings) or f"{folder}: whole\n")
+    return 1 if any(f.level == "error" for f in findings) else 0
 
 
 def _is_pcap(file: Path) -> bool:

@@ -9,11 +9,23 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any, Literal
+from typing import Literal
 
 from polysight.acquisition import FaultKind, typical_row_s
 from polysight.plan import scan_time
-from polysight.store import Fact, with_connection
+from polysight.store import (
+    Fact,
+    RowCommitted,
+    RowFault,
+    RowRejected,
+    RowWithdrawn,
+    ScanContinued,
+    ScanEnded,
+    ScanPaused,
+    ScanResumed,
+    ScanStarted,
+    with_connection,
+)
 from polysight_shared.config import Instrument
 from polysight_shared.errors import PolysightError
 from polysight_shared.faults import PiFault, explain
@@ -112,25 +124,25 @@ def notice_of_fault(event: Fault) -> Notice:
     )
 
 
-def _cause(faults: Sequence[Fact]) -> tuple[str, str]:
+def _cause(faults: Sequence[RowFault]) -> tuple[str, str]:
     """Likely cause and remedy of a row's faults: those of the first known kind."""
     for fault in faults:
-        if fault["kind"] == K.PI_FAULT and fault.get("number"):
-            table = explain(int(fault["number"]))
+        if fault.kind == K.PI_FAULT and fault.number:
+            table = explain(fault.number)
             return sentence(table.why), sentence(table.remedy)
-        if fault["kind"] in CAUSES:
-            return CAUSES[fault["kind"]]
+        if fault.kind in CAUSES:
+            return CAUSES[FaultKind(fault.kind)]
     return "", ""
 
 
-def notice_of_rejection(row: int, take: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) -> Notice:
+def notice_of_rejection(row: int, take: int, reasons: Sequence[str], faults: Sequence[RowFault], utc: str) -> Notice:
     """Notice of a rejected take."""
     why, do = _cause(faults)
     do = do or "Nothing: the row is retaken automatically"
     return Notice("warn", f"Row {row}, take {take}, was rejected", why, do, "; ".join(reasons), row, utc)
 
 
-def notice_of_kept_row(row: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) -> Notice:
+def notice_of_kept_row(row: int, reasons: Sequence[str], faults: Sequence[RowFault], utc: str) -> Notice:
     """Notice of a row that is kept with gaps."""
     why, do = _cause(faults)
     return Notice("warn", f"Row {row} is kept with gaps, which are masked", why, do, "; ".join(reasons), row, utc)
@@ -182,21 +194,21 @@ class ScanHistory:
         True while the scan is paused on request.
     """
 
-    def __init__(self, started: Fact) -> None:
+    def __init__(self, started: ScanStarted) -> None:
         self.started = started
-        self.instrument: Instrument = decode_config(started["instrument"], Instrument, "the manifest's instrument")
+        self.instrument: Instrument = decode_config(started.instrument, Instrument, "the manifest's instrument")
         self.plan: RasterPlan = plan_raster(self.instrument.grid)
-        self.scan_id, self.simulated = str(started["scan_id"]), bool(started["simulated"])
+        self.scan_id, self.simulated = started.scan_id, started.simulated
         self.takes: dict[int, int] = {}
         self.marks: dict[int, RowMark] = {}
         self.notices: list[Notice] = []
-        self.ended: Fact | None = None
+        self.ended: ScanEnded | None = None
         self.paused = False
-        self.run_started_s = seconds(started.get("started_utc") or "1970-01-01T00:00:00+00:00")
+        self.run_started_s = seconds(started.started_utc or "1970-01-01T00:00:00+00:00")
         self.last_commit_s = 0.0
         self.trigger: dict[int, TriggerHealth] = {}
         self.rows_since_trouble = 0  # rows committed whole since one was rejected or kept with gaps
-        self._rows: dict[int, dict[str, Any]] = {}
+        self._rows: dict[int, RowCommitted] = {}
         self._rejected: dict[str, int] = {b.name: 0 for b in self.instrument.recorded}
         self._row_seconds: list[float] = []
         self._paused_at = 0.0
@@ -205,78 +217,75 @@ class ScanHistory:
     # --- the manifest ---
 
     def add_fact(self, fact: Fact) -> None:
-        """Add the next fact; unknown kinds are ignored."""
-        handlers = {
-            "row_committed": self._row_committed,
-            "row_rejected": self._row_rejected,
-            "row_withdrawn": self._row_withdrawn,
-            "scan_resumed": self._scan_resumed,
-            "scan_paused": self._scan_paused,
-            "scan_continued": self._scan_continued,
-            "scan_ended": self._scan_ended,
-        }
-        if fact["fact"] in handlers:
-            handlers[fact["fact"]](fact)
+        """Add the next fact; other kinds are ignored. Raises ValueError for a time of another form."""
+        if isinstance(fact, RowCommitted):
+            self._row_committed(fact)
+        elif isinstance(fact, RowRejected):
+            self._row_rejected(fact)
+        elif isinstance(fact, RowWithdrawn):
+            self._row_withdrawn(fact)
+        elif isinstance(fact, ScanResumed):
+            self._scan_resumed(fact)
+        elif isinstance(fact, ScanPaused):
+            self.paused = True
+            self._paused_at = seconds(fact.paused_utc)
+        elif isinstance(fact, ScanContinued):
+            self.paused = False
+            if self.last_commit_s:
+                self.last_commit_s += seconds(fact.continued_utc) - self._paused_at  # a pause does not count
+        elif isinstance(fact, ScanEnded):
+            self.ended = fact
+            self.paused = False
 
-    def _row_committed(self, fact: Fact) -> None:
-        row, kept = int(fact["row"]), fact.get("kept_incomplete")
-        self.takes.pop(row, None)
-        self.takes[row] = int(fact["take"])
-        self.marks[row] = "kept" if kept else "committed"
-        self._rows[row] = fact["boards"]
+    def _row_committed(self, fact: RowCommitted) -> None:
+        kept = fact.kept_incomplete
+        self.takes.pop(fact.row, None)
+        self.takes[fact.row] = fact.take
+        self.marks[fact.row] = "kept" if kept else "committed"
+        self._rows[fact.row] = fact
         self.rows_since_trouble = 0 if kept else self.rows_since_trouble + 1
         if kept:
-            self.notices.append(notice_of_kept_row(row, kept, fact.get("faults", []), fact.get("committed_utc", "")))
-        if not fact.get("committed_utc"):
+            self.notices.append(notice_of_kept_row(fact.row, kept, fact.faults, fact.committed_utc))
+        if not fact.committed_utc:
             return  # made in one step, by `polysight simulate`
-        at = seconds(fact["committed_utc"])
+        at = seconds(fact.committed_utc)
         if self.last_commit_s > self.run_started_s:
             self._row_seconds.append(at - self.last_commit_s)
         self.last_commit_s = at
 
-    def _row_rejected(self, fact: Fact) -> None:
-        row, reasons, faults = int(fact["row"]), [str(r) for r in fact["reasons"]], fact.get("faults", [])
-        self.marks[row] = "rejected"
+    def _row_rejected(self, fact: RowRejected) -> None:
+        self.marks[fact.row] = "rejected"
         self.rows_since_trouble = 0
         for name in self._rejected:
-            named = any(f.get("board") == name for f in faults)
-            self._rejected[name] += named if faults else any(r.startswith(f"{name}:") for r in reasons)  # older scans
-        self.notices.append(notice_of_rejection(row, int(fact["take"]), reasons, faults, fact.get("rejected_utc", "")))
+            if fact.faults:
+                blamed = any(fault.board == name for fault in fact.faults)
+            else:  # older scans
+                blamed = any(reason.startswith(f"{name}:") for reason in fact.reasons)
+            self._rejected[name] += blamed
+        self.notices.append(notice_of_rejection(fact.row, fact.take, fact.reasons, fact.faults, fact.rejected_utc))
 
-    def _row_withdrawn(self, fact: Fact) -> None:
-        row = int(fact["row"])
-        self.takes.pop(row, None)
-        self._rows.pop(row, None)
-        self.marks.pop(row, None)
-        why = "; ".join(map(str, fact["reasons"]))
+    def _row_withdrawn(self, fact: RowWithdrawn) -> None:
+        self.takes.pop(fact.row, None)
+        self._rows.pop(fact.row, None)
+        self.marks.pop(fact.row, None)
         self.notices.append(
             Notice(
                 "warn",
-                f"Row {row} on the disk differs from what was committed",
+                f"Row {fact.row} on the disk differs from what was committed",
                 "The disk is faulty, or the file was changed",
                 "Nothing: the row is retaken",
-                why,
-                row,
-                fact.get("withdrawn_utc", ""),
+                "; ".join(fact.reasons),
+                fact.row,
+                fact.withdrawn_utc,
             )
         )
 
-    def _scan_resumed(self, fact: Fact) -> None:
-        self.ended, self.paused = None, False
-        self.run_started_s = seconds(fact["resumed_utc"])
-        if fact.get("rig"):  # the Pi has another address from now on
-            self.instrument = with_connection(self.instrument, fact["rig"])
-
-    def _scan_paused(self, fact: Fact) -> None:
-        self.paused, self._paused_at = True, seconds(fact["paused_utc"])
-
-    def _scan_continued(self, fact: Fact) -> None:
+    def _scan_resumed(self, fact: ScanResumed) -> None:
+        self.ended = None
         self.paused = False
-        if self.last_commit_s:
-            self.last_commit_s += seconds(fact["continued_utc"]) - self._paused_at  # a pause does not count
-
-    def _scan_ended(self, fact: Fact) -> None:
-        self.ended, self.paused = fact, False
+        self.run_started_s = seconds(fact.resumed_utc)
+        if fact.rig:  # the Pi has another address from now on
+            self.instrument = with_connection(self.instrument, fact.rig)
 
     # --- the Pi's events ---
 
@@ -294,17 +303,18 @@ class ScanHistory:
     @property
     def boards(self) -> dict[str, BoardCounts]:
         """Counts over the committed rows, by board."""
-        found = {name: BoardCounts(retaken=n) for name, n in self._rejected.items()}
-        for boards in self._rows.values():
-            for name, facts in boards.items():
-                board = found.setdefault(name, BoardCounts())
-                board.frames_expected += int(facts["frames_expected"])
-                board.frames_received += int(facts["frames_received"])
-                board.missing_bytes += int(facts["missing_bytes"])
+        totals = {name: BoardCounts(retaken=n) for name, n in self._rejected.items()}
+        for row in self._rows.values():
+            for name, part in row.boards.items():
+                total = totals.setdefault(name, BoardCounts())
+                total.frames_expected += part.frames_expected
+                total.frames_received += part.frames_received
+                total.missing_bytes += part.missing_bytes
                 for kind in _RECEPTION:
-                    if kind in facts:
-                        board.counts[kind] = board.counts.get(kind, 0) + int(facts[kind])
-        return found
+                    count = getattr(part, kind)
+                    if count is not None:
+                        total.counts[kind] = total.counts.get(kind, 0) + count
+        return totals
 
     @property
     def row_seconds(self) -> tuple[float, str] | None:

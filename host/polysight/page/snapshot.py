@@ -104,7 +104,7 @@ def _scan(c: Content, history: ScanHistory) -> dict[str, Any]:
         "folder": str(c.folder),
         "rig": history.instrument.name,
         "simulated": history.simulated,
-        "started_utc": history.started.get("started_utc", ""),
+        "started_utc": history.started.started_utc,
         "columns": plan.columns,
         "rows": plan.rows,
         "step_x_mm": plan.step_x_mm,

@@ -10,6 +10,7 @@ from polysight.acquisition import ScanCommand
 from polysight.page.history import Notice, ScanHistory, sentence
 from polysight.page.images import Shown
 from polysight.page.listener import PiState
+from polysight.store import ScanEnded
 
 StatusLevel = Literal["good", "done", "wait", "warn", "bad"]
 SINCE = "{since}"  # the page puts the elapsed time here
@@ -127,8 +128,8 @@ def judge(
 
 
 def _ended(history: ScanHistory, rows: int, done: int, resume: str) -> Status:
-    ended = history.ended or {}
-    reason, status = sentence(str(ended.get("reason", ""))), ended.get("exit_status")
+    ended = history.ended or ScanEnded()
+    reason, status = sentence(ended.reason), ended.exit_status
     if status == "success" and done == rows:
         gaps = sum(mark == "kept" for mark in history.marks.values())
         whole = "Every row is safe." if not gaps else f"Every row is safe; {gaps} are kept with gaps, masked."
@@ -136,8 +137,8 @@ def _ended(history: ScanHistory, rows: int, done: int, resume: str) -> Status:
     if status == "abort":
         return Status("wait", "Stopped on request", f"{done} of {rows} rows are safe.", "", resume)
     return Status(
-        "bad", "The scan has failed", reason, sentence(str(ended.get("why", ""))) or "See its terminal",
-        sentence(str(ended.get("remedy", ""))) or resume,
+        "bad", "The scan has failed", reason, sentence(ended.why) or "See its terminal",
+        sentence(ended.remedy) or resume,
     )  # fmt: skip
 
 

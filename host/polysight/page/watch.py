@@ -24,7 +24,18 @@ from polysight.page.snapshot import Content, make_motion, make_snapshot
 from polysight.page.status import LifeSigns
 from polysight.products import MATERIALS, QUALITY, find_products
 from polysight.results import Verdict
-from polysight.store import EVENTS, MANIFEST, Fact, Manifest, manifest
+from polysight.store import (
+    EVENTS,
+    MANIFEST,
+    Fact,
+    Manifest,
+    OtherFact,
+    ScanContinued,
+    ScanEnded,
+    ScanPaused,
+    ScanResumed,
+    ScanStarted,
+)
 from polysight_shared.errors import PolysightError, ProtocolError
 from polysight_shared.messages import AnyEvent, unpack_with_crc
 
@@ -80,16 +91,21 @@ class GrowingFile:
 
 
 class ManifestTail:
-    """Facts appended to a manifest."""
+    """A manifest that grows; `content` has what was read so far."""
 
     def __init__(self, path: Path) -> None:
         self.file = GrowingFile(path)
+        self.content = Manifest()
 
     def look(self) -> list[Fact]:
         """Facts since the last look."""
-        new = manifest.parse(self.file.look())
-        self.file.take(new.length)
-        return new.facts
+        raw = self.file.look()
+        if self.file.replaced:
+            self.content = Manifest()
+        before = self.content.length
+        facts = self.content.feed(raw)
+        self.file.take(self.content.length - before)
+        return facts
 
 
 class EventTail:
@@ -175,7 +191,6 @@ class Watch:
         """Reset all state: another scan may be in the folder now."""
         self._manifest, self._events = ManifestTail(self.folder / MANIFEST), EventTail(self.folder / EVENTS)
         self._result = ProductsTail(self.folder)
-        self._content = Manifest()
         self._history: ScanHistory | None = None
         self._viewer: RowViewer | None = None
         self._listener: PiListener | None = None
@@ -217,15 +232,16 @@ class Watch:
         if facts and self._looked:  # at the first look nothing is known to be new
             self._grown_at = time.monotonic()
         self._looked = True
-        self._content.facts += facts
         for fact in facts:
             try:
-                if self._history is None and fact["fact"] == "scan_started":
+                if self._history is None and isinstance(fact, ScanStarted):
                     self._history = ScanHistory(fact)
+                elif isinstance(fact, OtherFact) and fact.problem:
+                    self._problem = f"{self.folder / MANIFEST}: unreadable {fact.kind}: {fact.problem}"
                 elif self._history is not None:
                     self._history.add_fact(fact)
-            except (PolysightError, KeyError, TypeError, ValueError) as e:
-                self._problem = f"{self.folder / MANIFEST}: unreadable {fact['fact']}: {e}"
+            except (PolysightError, ValueError) as e:
+                self._problem = f"{self.folder / MANIFEST}: unreadable {type(fact).__name__}: {e}"
         if self._history is not None:
             self._history.add_events(self._events.look())
 
@@ -235,7 +251,7 @@ class Watch:
         if history is None:
             return
         if self._viewer is None:
-            self._viewer = RowViewer(self.folder, self._content)
+            self._viewer = RowViewer(self.folder, self._manifest.content)
             self._viewer.start()
         self._viewer.want(history.takes)
         if history.ended is None and self._listener is None:
@@ -263,15 +279,15 @@ class Watch:
         if self._asked is None or self._history is None:
             return None
         command, facts = self._asked
-        since = {f["fact"] for f in self._content.facts[facts:]}
-        if since & {"scan_ended", "scan_resumed", "scan_paused", "scan_continued"}:
+        since = self._manifest.content.facts[facts:]
+        if any(isinstance(fact, ScanEnded | ScanResumed | ScanPaused | ScanContinued) for fact in since):
             self._asked = None
             return None
         return command
 
     def ask(self, command: ScanCommand) -> None:
         """Ask the scan to pause, continue, stop or abort; returns when it has taken the request. Raises ScanError."""
-        before = len(self._content.facts)
+        before = len(self._manifest.content.facts)
         send_command(self.folder, command)
         paused = self._history is not None and self._history.paused
         self._asked = None if command is ScanCommand.CONTINUE and not paused else (command, before)

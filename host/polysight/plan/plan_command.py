@@ -188,7 +188,7 @@ def measure_row_overhead(folder: Path) -> float | None:
     have no two consecutive rows, or the data was simulated without a Pi.
     """
     scan = ScanFolder.load(folder)
-    if not scan.facts("scan_started")[0].get("pi"):
+    if scan.started.pi is None:
         return None
     rig, ends = scan.instrument, {}
     for event in read_events(folder / EVENTS).events:

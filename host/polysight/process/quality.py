@@ -172,7 +172,7 @@ class Quality:
             rows_recorded=plan.rows - len(absent),
             frames_planned=len(boards) * plan.positions * frames_at,
             frames_received=sum(row["frames_received"] for board in boards for row in board.rows.values()),
-            manifest=tuple(str(fault) for fault in self.source.manifest_faults),
+            manifest=tuple(f"{fault.where}: {fault.what}" for fault in self.source.manifest_faults),
             rows_absent=tuple(absent),
             positions_planned=plan.positions,
             positions_absent=len(absent) * plan.columns,

@@ -10,7 +10,26 @@ data, `read_row`, and facts about the recording. `raw_source` requires a source 
 from polysight.store import manifest
 from polysight.store.append_only import crc32, sync_folder
 from polysight.store.events import EventWriter, read_events
-from polysight.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
+from polysight.store.manifest import (
+    MANIFEST,
+    BoardRow,
+    Fact,
+    LogDigest,
+    Manifest,
+    ManifestWriter,
+    OtherFact,
+    PiDescription,
+    Reception,
+    RowCommitted,
+    RowFault,
+    RowRejected,
+    RowWithdrawn,
+    ScanContinued,
+    ScanEnded,
+    ScanPaused,
+    ScanResumed,
+    ScanStarted,
+)
 from polysight.store.raw import Digests, drop, droppable, dropped_rows, require_raw
 from polysight.store.replace import PlacedAgain, Replaced, place_again, replace_rows
 from polysight.store.sample_rows import (
@@ -25,7 +44,6 @@ from polysight.store.sample_rows import (
 )
 from polysight.store.scan_folder import (
     EVENTS,
-    MANIFEST,
     PART,
     ScanFolder,
     check_same_scan,
@@ -39,7 +57,7 @@ from polysight.store.source import CubeRow, RawSource, RowData, Scan, Source, ra
 from polysight.store.sources.open import is_source, open_source
 from polysight.store.sources.published_settings import COLLECTION, mirrored, read_settings, rig_of
 from polysight.store.untrusted import MAX_BYTES, check_links, inside, open_npz
-from polysight.store.validation import damage_of, damaged_rows, to_json, validate
+from polysight.store.validation import damage_of, damaged_rows, to_json, to_text, validate
 
 __all__ = [
     "COLLECTION",
@@ -49,19 +67,32 @@ __all__ = [
     "PART",
     "SAMPLES",
     "SAMPLE_ROWS",
+    "BoardRow",
     "CubeRow",
     "Digests",
     "EventWriter",
     "Fact",
+    "LogDigest",
     "Manifest",
-    "ManifestFault",
     "ManifestWriter",
+    "OtherFact",
+    "PiDescription",
     "PlacedAgain",
     "RawSource",
+    "Reception",
     "Replaced",
+    "RowCommitted",
     "RowData",
+    "RowFault",
+    "RowRejected",
+    "RowWithdrawn",
     "Scan",
+    "ScanContinued",
+    "ScanEnded",
     "ScanFolder",
+    "ScanPaused",
+    "ScanResumed",
+    "ScanStarted",
     "Source",
     "check_links",
     "check_same_scan",
@@ -94,6 +125,7 @@ __all__ = [
     "rig_of",
     "sync_folder",
     "to_json",
+    "to_text",
     "utc_now",
     "validate",
     "versions",

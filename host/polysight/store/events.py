@@ -14,6 +14,7 @@ from pathlib import Path
 import msgpack
 
 from polysight.store.append_only import AppendFile
+from polysight.store.manifest import LogDigest
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError, ProtocolError
 from polysight_shared.messages import AnyEvent, pack_with_crc, unpack_with_crc
@@ -126,9 +127,9 @@ class EventWriter:
             self._crc = zlib.crc32(data, self._crc)
             self._batch.clear()
 
-    def digest(self) -> dict[str, int | str]:
+    def digest(self) -> LogDigest:
         """Length and CRC-32 of the file on disk, for the manifest."""
-        return {"bytes": self._file.length, "crc32": f"{self._crc:08x}"}
+        return LogDigest(self._file.length, f"{self._crc:08x}")
 
     def close(self) -> None:
         """Close the file without writing pending events, which the Pi's journal contains. Safe to repeat."""

@@ -1,4 +1,8 @@
-"""The manifest of a scan: an append-only log with one JSON line per fact, each with its CRC-32.
+"""The manifest of a scan: an append-only log with one JSON line per fact (docs/spec/scan-folder.md).
+
+`Manifest` is the one reader: `read` takes a whole file, `Manifest.feed` what was appended to a growing one. Facts are
+the structs below; unknown keys and kinds are passed over, keys of later releases have defaults. It also says what the
+facts add up to: the committed rows, the state of the scan, and the faults of the file.
 
 A line is valid if it is complete and its CRC is right. A last line torn by a kill or power cut is reported by readers
 and cut off before appending. Lines form a chain: each has its count and a digest of the line before, so that missing
@@ -10,52 +14,246 @@ from __future__ import annotations
 import hashlib
 import json
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
+
+import msgspec
 
 from polysight.store.append_only import AppendFile
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError, PolysightError, no_such
 from polysight_shared.files import MAX_JSON_BYTES, read_bounded
+from polysight_shared.findings import Finding
+from polysight_shared.raster import RasterPlan
 
-Fact = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class ManifestFault:
-    """A damaged line, or a place where lines are missing, replaced or out of order."""
-
-    line: int  # number in the file, from 1
-    what: str
-    lost: int = 0  # number of facts lost
-
-    def __str__(self) -> str:
-        return f"manifest.jsonl line {self.line}: {self.what}"
+MANIFEST = "manifest.jsonl"
+State = Literal["open", "paused", "finished", "stopped", "failed"]
+"""`open`: a program records the scan, or was killed; `control/alive` tells these apart, also for `paused`."""
 
 
-@dataclass
-class Manifest:
-    """Content of a manifest."""
-
-    facts: list[Fact] = field(default_factory=list)  # in order, without CRC and chain
-    numbers: list[int] = field(default_factory=list)  # line number (from 1) of each fact
-    length: int = 0  # bytes up to the end of the last complete line
-    torn: bool = False  # an incomplete line follows
-    faults: list[ManifestFault] = field(default_factory=list)  # damaged lines and breaks in the chain
-    count: int = 0  # of the next line
-    digest: str = ""  # that the next line must have
+# --- facts ---
 
 
-def crc_of(fact: Fact) -> str:
+class Fact(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="fact", tag=str):
+    """One line of the manifest. A default means that the key is absent."""
+
+
+class PiDescription(msgspec.Struct, frozen=True):
+    """The Pi that ran the rows; `stage` has those keys of its `[stage]` that place rows."""
+
+    release: str = ""
+    firmware: str = ""
+    backend: str = ""
+    stage: dict[str, float] = {}
+
+
+class ScanStarted(Fact, frozen=True, kw_only=True, tag="scan_started"):
+    """First fact of a scan. `instrument` is the rig file, `calibration` describes the copied files by kind."""
+
+    format: int = 0
+    scan_id: str
+    simulated: bool
+    started_utc: str = ""
+    instrument: dict[str, Any]
+    plan: RasterPlan
+    versions: dict[str, str] = {}
+    pi: PiDescription | None = None
+    calibration: Any = None
+
+
+class RowFault(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A fault of a take: kind, board ("": the whole row's), and the Pi's number of a `pi_fault`."""
+
+    kind: str
+    board: str = ""
+    number: int = 0
+
+
+class Reception(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Counts of one board's reception of a row; None where an earlier release, or a simulation, did not count."""
+
+    packets: int | None = None
+    duplicates: int | None = None
+    late: int | None = None
+    late_by_bytes: int | None = None
+    outside: int | None = None
+    disagreeing: int | None = None
+    malformed: int | None = None
+    strangers: int | None = None
+    stale: int | None = None
+    leftover: int | None = None
+    conflicting: int | None = None
+    restarted: int | None = None
+    before_pulses: int | None = None
+    clock_jumps: int | None = None
+    kernel_drops: int | None = None
+    head_bytes: int | None = None
+    gaps: int | None = None
+    gap_bytes: int | None = None
+    tail_bytes: int | None = None
+    card_status: int | None = None
+    located: bool | None = None
+    received_bytes: int | None = None
+    pulses_missed: int | None = None
+
+
+class BoardRow(Reception, frozen=True, kw_only=True, omit_defaults=True):
+    """One board's part of a committed row. `file` is relative to the scan folder; the index is beside it."""
+
+    file: str
+    bytes: int
+    frames_expected: int
+    frames_received: int
+    missing_bytes: int
+    crc32: str
+    index_crc32: str = ""
+    packets_crc32: str = ""
+
+
+class LogDigest(msgspec.Struct, frozen=True):
+    """Length and CRC-32 of the event log at a commit."""
+
+    bytes: int
+    crc32: str
+
+
+class RowCommitted(Fact, frozen=True, kw_only=True, tag="row_committed"):
+    """A committed row; `kept_incomplete` has the reasons, and `faults` the faults, of one with gaps."""
+
+    row: int
+    take: int
+    direction: int
+    boards: dict[str, BoardRow]
+    pulses: int
+    events: LogDigest | None = None
+    committed_utc: str = ""
+    replaced_utc: str = ""
+    kept_incomplete: list[str] = []
+    faults: list[RowFault] = []
+    note: str = ""
+
+
+class RowRejected(Fact, frozen=True, kw_only=True, tag="row_rejected"):
+    """A take that was rejected and removed; earlier releases wrote no `faults`."""
+
+    row: int
+    take: int
+    reasons: list[str]
+    faults: list[RowFault] = []
+    boards: dict[str, Reception] = {}
+    rejected_utc: str = ""
+
+
+class RowWithdrawn(Fact, frozen=True, kw_only=True, tag="row_withdrawn"):
+    """A committed row whose files are not what was committed."""
+
+    row: int
+    take: int = 0
+    reasons: list[str] = []
+    withdrawn_utc: str = ""
+
+
+class DroppedFile(msgspec.Struct, frozen=True):
+    """Digest of a payload that was deleted."""
+
+    file: str
+    bytes: int
+    crc32: str
+
+
+class RawDropped(Fact, frozen=True, kw_only=True, tag="raw_dropped"):
+    """A row whose raw data is deleted, because `products` were made from it."""
+
+    row: int
+    take: int
+    boards: dict[str, DroppedFile]
+    products: str
+    dropped_utc: str
+
+
+class ScanResumed(Fact, frozen=True, kw_only=True, tag="scan_resumed"):
+    """Another run began; `rig` has its connection settings if they were given."""
+
+    resumed_utc: str = ""
+    rows_missing: int | None = None
+    pi: PiDescription | None = None
+    rig: dict[str, Any] | None = None
+
+
+class ScanPaused(Fact, frozen=True, kw_only=True, tag="scan_paused"):
+    """The scan waits, on request."""
+
+    paused_utc: str = ""
+
+
+class ScanContinued(Fact, frozen=True, kw_only=True, tag="scan_continued"):
+    """The pause has ended."""
+
+    continued_utc: str = ""
+
+
+class ScanEnded(Fact, frozen=True, kw_only=True, tag="scan_ended"):
+    """A run ended; `lost_mm` are the steps that the drives lost in x and y, None if they were not measured."""
+
+    exit_status: str = ""
+    reason: str = ""
+    why: str = ""
+    remedy: str = ""
+    lost_mm: tuple[float, float] | None = None
+    rows_committed: int | None = None
+    events_refetched: int | None = None
+    ended_utc: str = ""
+
+
+class OtherFact(Fact, frozen=True, kw_only=True, tag="other"):
+    """A fact of a `kind` that nothing here reads, or with a `problem`: its keys are not those of its kind."""
+
+    kind: str
+    problem: str = ""
+
+
+KINDS: dict[str, type[Fact]] = {
+    "scan_started": ScanStarted,
+    "row_committed": RowCommitted,
+    "row_rejected": RowRejected,
+    "row_withdrawn": RowWithdrawn,
+    "raw_dropped": RawDropped,
+    "scan_resumed": ScanResumed,
+    "scan_paused": ScanPaused,
+    "scan_continued": ScanContinued,
+    "scan_ended": ScanEnded,
+}
+F = TypeVar("F", bound=Fact)
+
+
+# --- lines ---
+
+
+class _Head(msgspec.Struct):
+    """The keys of a line that make it valid."""
+
+    fact: str
+    crc: str
+    count: int | None = None
+    previous: str | None = None
+
+
+_heads = msgspec.json.Decoder(_Head)
+_decoders = {name: msgspec.json.Decoder(kind) for name, kind in KINDS.items()}
+
+
+def crc_of(fact: Mapping[str, Any]) -> str:
     """CRC-32 (hex) of a fact without its `crc`: JSON, keys sorted, compact separators."""
     body = json.dumps(fact, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return f"{zlib.crc32(body.encode('ascii')):08x}"
 
 
-def encode_line(fact: Fact) -> bytes:
-    """Encode a fact as a line with CRC and line end."""
-    line = json.dumps({**fact, "crc": crc_of(fact)}, sort_keys=True, separators=(",", ":"), allow_nan=False)
+def encode_line(fact: Fact | Mapping[str, Any], **chain: int | str) -> bytes:
+    """Encode a fact as a line with CRC and line end; `chain` has `count` and `previous`."""
+    content = {**msgspec.to_builtins(fact), **chain}
+    line = json.dumps({**content, "crc": crc_of(content)}, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return line.encode("ascii") + b"\n"
 
 
@@ -64,70 +262,194 @@ def digest_of(line: bytes) -> str:
     return hashlib.sha256(line).hexdigest()[:16]
 
 
-def decode_line(line: bytes) -> Fact | None:
-    """Decode a line to its fact without CRC; None if the line is malformed or its CRC is wrong."""
+def decode_line(line: bytes) -> dict[str, Any] | None:
+    """Decode a line of any file of such lines, without CRC; None if the line is malformed or its CRC is wrong."""
     try:
-        fact = json.loads(line)
+        content = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    if not isinstance(fact, dict) or not isinstance(fact.get("fact"), str):
+    if not isinstance(content, dict) or not isinstance(content.get("fact"), str):
         return None
-    crc = fact.pop("crc", None)
+    crc = content.pop("crc", None)
     try:
-        return fact if crc == crc_of(fact) else None
+        return content if crc == crc_of(content) else None
     except ValueError:
         return None
 
 
+def _check_line(line: bytes) -> _Head | None:
+    """Return the keys that make a line valid; None if it is damaged."""
+    try:
+        head = _heads.decode(line)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        head = None
+    # A line as this program writes it is compared as it stands, without encoding it again.
+    if head is not None:
+        body = line.replace(f'"crc":"{head.crc}",'.encode(), b"", 1)
+        if f"{zlib.crc32(body):08x}" == head.crc:
+            return head
+    content = decode_line(line)
+    if content is None:
+        return None
+    return head or _Head(content["fact"], "")
+
+
+def _decode_fact(kind: str, line: bytes) -> Fact:
+    decoder = _decoders.get(kind)
+    if decoder is None:
+        return OtherFact(kind=kind)
+    try:
+        return decoder.decode(line)
+    except (msgspec.MsgspecError, ValueError) as e:
+        return OtherFact(kind=kind, problem=str(e))
+
+
+# --- the reader ---
+
+
+def manifest_fault(line: int, what: str, lost: int = 0) -> Finding:
+    """Return a fault of the manifest at a line (from 1), by which so many facts are lost."""
+    place = f"{MANIFEST} line {line}"
+    return Finding("error", what, where=place, code=ErrorCode.FILE_DAMAGED, facts={"line": line, "lost": lost})
+
+
+@dataclass
+class Manifest:
+    """The facts of a scan, and what they add up to.
+
+    Attributes
+    ----------
+    facts, numbers
+        The facts in order, and the line number (from 1) of each.
+    started
+        The first fact; None if it is not there or cannot be read.
+    ended
+        The end of the last run; None while it goes on, or if it was killed.
+    paused
+        True while the scan is paused on request.
+    rows
+        The committed rows, each with its last take, in the order of the commits; withdrawn rows are not in it.
+    rejected
+        All rejected takes.
+    faults
+        Damaged lines and breaks in the chain.
+    length
+        Bytes up to the end of the last complete line.
+    torn
+        True if an incomplete line follows.
+    count, digest
+        Of the next line.
+    """
+
+    facts: list[Fact] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)
+    started: ScanStarted | None = None
+    ended: ScanEnded | None = None
+    paused: bool = False
+    rows: dict[int, RowCommitted] = field(default_factory=dict)
+    rejected: list[RowRejected] = field(default_factory=list)
+    faults: list[Finding] = field(default_factory=list)
+    length: int = 0
+    torn: bool = False
+    count: int = 0
+    digest: str = ""
+    _due: int = 0  # one more than the last count that was read
+    _lines: int = 0
+
+    def feed(self, raw: bytes) -> list[Fact]:
+        """Add what follows the first `length` bytes of the file; return the facts that are new."""
+        lines = raw.split(b"\n")
+        tail = lines.pop()  # an incomplete last line
+        self.torn = bool(tail)
+        before = len(self.facts)
+        for number, line in enumerate(lines, 1):
+            head = _check_line(line)
+            if head is None and number == len(lines) and not tail:
+                self.torn = True
+                break
+            self._lines += 1
+            if head is None:
+                self.faults.append(manifest_fault(self._lines, "damaged: its CRC is wrong", 1))
+                self.count += 1
+            else:
+                self._add_line(head, line)
+            self.digest = digest_of(line)
+            self.length += len(line) + 1
+        return self.facts[before:]
+
+    def _add_line(self, head: _Head, line: bytes) -> None:
+        if head.count is not None and head.previous is not None:
+            self._compare(head.count, head.previous)
+            self.count = head.count
+        self.count += 1
+        self._due = self.count
+        fact = _decode_fact(head.fact, line)
+        # Last, because another thread may compare the number of facts to see that rows were added.
+        self._add_up(fact)
+        self.numbers.append(self._lines)
+        self.facts.append(fact)
+
+    def _compare(self, count: int, previous: str) -> None:
+        """Compare a line's count and digest with the lines before it, and add faults."""
+        missing = count - self.count
+        damaged = self._due < self.count  # the line before
+        if missing > 0 and damaged:  # a damaged line end joins two lines
+            last = self.faults.pop()
+            self.faults.append(manifest_fault(last.facts["line"], last.what, last.facts["lost"] + missing))
+        elif missing > 0:
+            what = f"{missing} lines before it are missing" if missing > 1 else "a line before it is missing"
+            self.faults.append(manifest_fault(self._lines, f"{what} (count {count}, {self.count} expected)", missing))
+        elif count < self._due:
+            what = f"repeated or out of order (count {count}, {self._due} expected)"
+            self.faults.append(manifest_fault(self._lines, what))
+        elif not damaged and previous != self.digest:
+            self.faults.append(manifest_fault(self._lines, "the line before it was replaced", 1))
+
+    def _add_up(self, fact: Fact) -> None:
+        if isinstance(fact, RowCommitted):
+            self.rows.pop(fact.row, None)
+            self.rows[fact.row] = fact
+        elif isinstance(fact, RowWithdrawn):
+            self.rows.pop(fact.row, None)
+        elif isinstance(fact, RowRejected):
+            self.rejected.append(fact)
+        elif isinstance(fact, ScanStarted):
+            self.started = self.started or fact
+        elif isinstance(fact, ScanEnded):
+            self.ended = fact
+            self.paused = False
+        elif isinstance(fact, ScanResumed):
+            self.ended = None
+            self.paused = False
+        elif isinstance(fact, ScanPaused | ScanContinued):
+            self.paused = isinstance(fact, ScanPaused)
+
+    @property
+    def state(self) -> State:
+        """State of the scan according to its last run."""
+        if self.ended is None:
+            return "paused" if self.paused else "open"
+        planned = 0 if self.started is None else self.started.plan.rows
+        if self.ended.exit_status == "success" and len(self.rows) >= planned:
+            return "finished"
+        return "stopped" if self.ended.exit_status == "abort" else "failed"
+
+    @property
+    def problems(self) -> list[tuple[int, OtherFact]]:
+        """Facts whose keys are not those of their kind, with their line numbers."""
+        facts = zip(self.numbers, self.facts, strict=True)
+        return [(number, fact) for number, fact in facts if isinstance(fact, OtherFact) and fact.problem]
+
+    def of_kind(self, kind: type[F]) -> list[F]:
+        """Return all facts of one kind, in order."""
+        return [fact for fact in self.facts if isinstance(fact, kind)]
+
+
 def parse(raw: bytes) -> Manifest:
     """Read a manifest's bytes."""
-    lines = raw.split(b"\n")
-    tail = lines.pop()  # an incomplete last line
-    found, due = Manifest(torn=bool(tail)), 0  # due: one more than the last count that was read
-    for number, line in enumerate(lines, 1):
-        fact = decode_line(line)
-        if fact is None and number == len(lines) and not tail:
-            found.torn = True
-            break
-        if fact is None:
-            found.faults.append(ManifestFault(number, "damaged: its CRC is wrong", 1))
-            found.count += 1
-        else:
-            link = _take_link(fact)
-            if link is not None:
-                _compare(link, found, due, number)
-                found.count = link[0]
-            found.count = due = found.count + 1
-            found.facts.append(fact)
-            found.numbers.append(number)
-        found.digest = digest_of(line)
-        found.length += len(line) + 1
-    return found
-
-
-def _take_link(fact: Fact) -> tuple[int, str] | None:
-    """Remove and return a fact's count and its digest of the line before; None for a line without chain."""
-    if not isinstance(fact.get("count"), int) or not isinstance(fact.get("previous"), str):
-        return None
-    return fact.pop("count"), fact.pop("previous")
-
-
-def _compare(link: tuple[int, str], found: Manifest, due: int, number: int) -> None:
-    """Compare a line's link with the lines before it, and add faults."""
-    count, previous = link
-    missing, damaged = count - found.count, due < found.count  # damaged: the line before
-    if missing > 0 and damaged:  # a damaged line end joins two lines
-        last = found.faults.pop()
-        found.faults.append(ManifestFault(last.line, last.what, last.lost + missing))
-    elif missing > 0:
-        what = f"{missing} lines before it are missing" if missing > 1 else "a line before it is missing"
-        found.faults.append(ManifestFault(number, f"{what} (count {count}, {found.count} expected)", missing))
-    elif count < due:
-        what = f"repeated or out of order (count {count}, {due} expected)"
-        found.faults.append(ManifestFault(number, what))
-    elif not damaged and previous != found.digest:
-        what = "the line before it was replaced"
-        found.faults.append(ManifestFault(number, what, 1))
+    content = Manifest()
+    content.feed(raw)
+    return content
 
 
 def read(path: Path) -> Manifest:
@@ -143,6 +465,9 @@ def read(path: Path) -> Manifest:
             "give the folder of a scan",
             code=ErrorCode.FILE_MISSING if isinstance(e, FileNotFoundError) else ErrorCode.FILE_UNREADABLE,
         ) from None
+
+
+# --- the writer ---
 
 
 class ManifestWriter:
@@ -171,18 +496,20 @@ class ManifestWriter:
             what = f"{path}: another program is writing this scan"
             raise DeviceError(what, "a scan runs", "wait for it, or stop it first", code=ErrorCode.BUSY)
         try:
-            found = read(path)
-            self._count, self._digest = found.count, found.digest
-            self._file.cut(found.length)
+            content = read(path)
+            self._count = content.count
+            self._digest = content.digest
+            self._file.cut(content.length)
         except PolysightError:
             self._file.close()
             raise
 
-    def append(self, fact: Fact) -> None:
+    def append(self, fact: Fact | Mapping[str, Any]) -> None:
         """Append one fact durably. After a DeviceError the manifest does not contain it."""
-        line = encode_line({**fact, "count": self._count, "previous": self._digest})
+        line = encode_line(fact, count=self._count, previous=self._digest)
         self._file.append(line)
-        self._count, self._digest = self._count + 1, digest_of(line[:-1])
+        self._count += 1
+        self._digest = digest_of(line[:-1])
 
     def close(self) -> None:
         """Close the file and release the lock. Safe to repeat."""

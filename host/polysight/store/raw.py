@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from polysight.store.append_only import crc32, sync_folder
-from polysight.store.manifest import Fact
-from polysight.store.scan_folder import CommittedRow, ScanFolder, utc_now
+from polysight.store.manifest import DroppedFile, RawDropped, RowCommitted, RowWithdrawn
+from polysight.store.scan_folder import ScanFolder, utc_now
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError, ScanError
 
@@ -28,20 +28,20 @@ class Droppable:
     kept: list[str] = field(default_factory=list)  # files that must be kept, with the reason
 
 
-def dropped_files(scan: ScanFolder) -> dict[str, Fact]:
-    """Return the payload files (relative to the scan folder) that were dropped, each with its `raw_dropped` fact."""
-    files: dict[str, tuple[int, Fact]] = {}
+def dropped_files(scan: ScanFolder) -> dict[str, RawDropped]:
+    """Return the payload files (relative to the scan folder) that were dropped, each with its fact."""
+    files: dict[str, RawDropped] = {}
     for fact in scan.content.facts:
-        if fact["fact"] in ("row_committed", "row_withdrawn"):  # taken again, with new files
-            files = {file: row_fact for file, row_fact in files.items() if row_fact[0] != fact["row"]}
-        elif fact["fact"] == "raw_dropped":
-            files |= {board["file"]: (fact["row"], fact) for board in fact["boards"].values()}
-    return {file: fact for file, (_, fact) in files.items()}
+        if isinstance(fact, RowCommitted | RowWithdrawn):  # taken again, with new files
+            files = {file: dropped for file, dropped in files.items() if dropped.row != fact.row}
+        elif isinstance(fact, RawDropped):
+            files |= {board.file: fact for board in fact.boards.values()}
+    return files
 
 
 def dropped_rows(scan: ScanFolder) -> set[int]:
     """Return the rows of which a dropped file is gone."""
-    return {fact["row"] for file, fact in dropped_files(scan).items() if not (scan.path / file).exists()}
+    return {fact.row for file, fact in dropped_files(scan).items() if not (scan.path / file).exists()}
 
 
 def require_raw(scan: ScanFolder) -> None:
@@ -49,8 +49,8 @@ def require_raw(scan: ScanFolder) -> None:
     facts = list(dropped_files(scan).values())
     if facts:
         raise DataError(
-            f"{scan.path}: the raw data of {len({f['row'] for f in facts})} rows was dropped",
-            f"it was dropped on {facts[-1]['dropped_utc'][:10]}, after it was processed into {facts[-1]['products']}",
+            f"{scan.path}: the raw data of {len({fact.row for fact in facts})} rows was dropped",
+            f"it was dropped on {facts[-1].dropped_utc[:10]}, after it was processed into {facts[-1].products}",
             "use those products; to synchronise again, restore the raw folder from a copy, or scan again",
             code=ErrorCode.NO_DATA,
         )
@@ -132,7 +132,6 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
     scan.reload()
 
 
-def _fact(row: CommittedRow, boards: list[str], products: str) -> Fact:
-    files = {n: {"file": b.file, "bytes": b.bytes, "crc32": b.crc32} for n, b in row.boards.items() if n in boards}
-    fact: Fact = {"fact": "raw_dropped", "row": row.row, "take": row.take, "boards": files}
-    return {**fact, "products": products, "dropped_utc": utc_now()}
+def _fact(row: RowCommitted, boards: list[str], products: str) -> RawDropped:
+    files = {n: DroppedFile(b.file, b.bytes, b.crc32) for n, b in row.boards.items() if n in boards}
+    return RawDropped(row=row.row, take=row.take, boards=files, products=products, dropped_utc=utc_now())

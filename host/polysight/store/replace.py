@@ -25,9 +25,9 @@ from polysight.capture import (
     write_packets,
 )
 from polysight.store.append_only import crc32, sync_folder
-from polysight.store.manifest import Fact, ManifestWriter
-from polysight.store.scan_folder import BoardRow, CommittedRow, ScanFolder, utc_now
-from polysight.store.validation import board_faults
+from polysight.store.manifest import BoardRow, ManifestWriter, RowCommitted
+from polysight.store.scan_folder import ScanFolder, utc_now
+from polysight.store.validation import board_faults, to_text
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -88,19 +88,19 @@ def replace_rows(scan: ScanFolder) -> list[Replaced]:
             found += [report for report, _ in boards.values()]
             changed = {name: again for name, (report, again) in boards.items() if report.changed and again is not None}
             if changed:
-                _commit(scan, writer, row.row, changed)
+                _commit(scan, writer, row, changed)
     scan.reload()
     return found
 
 
-def _place(scan: ScanFolder, row: CommittedRow, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
+def _place(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
     name, path = Path(board.file).parent.name, scan.path / board.file
     unchanged = Replaced(row.row, name, board.missing_bytes, board.missing_bytes)
     if not board.packets_crc32:
         return replace(unchanged, left="its packets were not kept"), None
     try:
         if faults := board_faults(scan, board, row.pulses):
-            return replace(unchanged, left="; ".join(map(str, faults)), damaged=True), None
+            return replace(unchanged, left="; ".join(map(to_text, faults)), damaged=True), None
         again = place_again(path)
     except DataError as e:
         return replace(unchanged, left=str(e), damaged=True), None
@@ -111,29 +111,30 @@ def _place(scan: ScanFolder, row: CommittedRow, board: BoardRow) -> tuple[Replac
     return replace(unchanged, after=after, changed=not same), again
 
 
-def _commit(scan: ScanFolder, writer: ManifestWriter, row: int, changed: dict[str, PlacedAgain]) -> None:
+def _commit(scan: ScanFolder, writer: ManifestWriter, row: RowCommitted, changed: dict[str, PlacedAgain]) -> None:
     """Write the new files, then the line, then delete the old files."""
-    fact = next(f for f in reversed(scan.facts("row_committed")) if f["row"] == row)
-    boards, old = dict(fact["boards"]), []
+    boards = dict(row.boards)
+    old_files: list[Path] = []
     for name, again in changed.items():
-        path = scan.path / boards[name]["file"]
-        old += [path.with_suffix(suffix) for suffix in (".bin", ".idx", PACKETS)]
-        boards[name] = {**boards[name], **_write(scan, path, again)}
-    kept = {k: v for k, v in fact.items() if k not in ("crc", "count", "previous", "boards")}
-    complete = all(b["missing_bytes"] == 0 for b in boards.values())
-    if complete:
-        kept = {k: v for k, v in kept.items() if k not in ("kept_incomplete", "faults")}
-    elif "kept_incomplete" not in kept:
-        kept["kept_incomplete"] = ["placed again: some bytes are not certain"]
-    new: Fact = {**kept, "boards": boards, "replaced_utc": utc_now()}
+        path = scan.path / boards[name].file
+        old_files += [path.with_suffix(suffix) for suffix in (".bin", ".idx", PACKETS)]
+        boards[name] = _write(scan, boards[name], again)
+    kept, faults = row.kept_incomplete, row.faults
+    if all(board.missing_bytes == 0 for board in boards.values()):
+        kept, faults = [], []
+    elif not kept:
+        kept = ["placed again: some bytes are not certain"]
+    new = msgspec.structs.replace(row, boards=boards, kept_incomplete=kept, faults=faults, replaced_utc=utc_now())
     writer.append(new)
-    for path in old:
+    for path in old_files:
         path.unlink(missing_ok=True)
 
 
-def _write(scan: ScanFolder, path: Path, again: PlacedAgain) -> Fact:
+def _write(scan: ScanFolder, board: BoardRow, again: PlacedAgain) -> BoardRow:
     """Write a row's new files durably; return their entry for the manifest."""
-    placed, frame = again.placed, scan.instrument.frame_bytes
+    placed = again.placed
+    frame = scan.instrument.frame_bytes
+    path = scan.path / board.file
     facts, _ = read_index(path.with_suffix(".idx"))
     _, log = read_packets(path.with_suffix(PACKETS), np.fromfile(path, dtype=np.uint8))
     new = _free_name(path)
@@ -142,17 +143,18 @@ def _write(scan: ScanFolder, path: Path, again: PlacedAgain) -> Fact:
     packets_crc = write_packets(new.with_suffix(PACKETS), log, again.evidence, placed)
     sync_folder(new.parent)
     frames = placed.expected // frame
-    return {
-        "file": str(new.relative_to(scan.path)),
-        "frames_received": int(valid_frames(placed.missing, frames, frame).sum()),
-        "missing_bytes": sum(b - a for a, b in placed.missing),
-        "crc32": f"{crc:08x}",
-        "index_crc32": f"{index_crc:08x}",
-        "packets_crc32": f"{packets_crc:08x}",
-        "located": placed.located,
-        "received_bytes": placed.received,
-        **msgspec.to_builtins(placed.losses),
-    }
+    return msgspec.structs.replace(
+        board,
+        file=str(new.relative_to(scan.path)),
+        frames_received=int(valid_frames(placed.missing, frames, frame).sum()),
+        missing_bytes=sum(b - a for a, b in placed.missing),
+        crc32=f"{crc:08x}",
+        index_crc32=f"{index_crc:08x}",
+        packets_crc32=f"{packets_crc:08x}",
+        located=placed.located,
+        received_bytes=placed.received,
+        **vars(placed.losses),
+    )
 
 
 def _free_name(path: Path) -> Path:

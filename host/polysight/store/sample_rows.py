@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from polysight.store import manifest
 from polysight.store.append_only import crc32
-from polysight.store.scan_folder import BoardRow, ScanFolder
+from polysight.store.manifest import BoardRow
+from polysight.store.scan_folder import ScanFolder
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError
 

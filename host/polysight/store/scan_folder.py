@@ -10,30 +10,42 @@ from __future__ import annotations
 import os
 import platform
 import secrets
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from polysight.capture import read_index
 from polysight.store import manifest
 from polysight.store.append_only import crc32, sync_folder
-from polysight.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
+from polysight.store.manifest import (
+    MANIFEST,
+    BoardRow,
+    F,
+    Manifest,
+    ManifestWriter,
+    OtherFact,
+    PiDescription,
+    RowCommitted,
+    ScanEnded,
+    ScanResumed,
+    ScanStarted,
+    manifest_fault,
+)
 from polysight.store.source import RowData
 from polysight.store.untrusted import check_links, inside
 from polysight_shared import __version__
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError
+from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan
 from polysight_shared.tables import decode, to_builtins
-from polysight_shared.tables import decode as decode_config
 
 SECTIONS = ("pi", "limits")
 ADDRESSES = ("card_address", "host_address", "command_port", "data_port")
@@ -41,7 +53,6 @@ ADDRESSES = ("card_address", "host_address", "command_port", "data_port")
 SERIAL = ("port", "baud")
 """Keys of the stage that are not compared: the Pi has its own. Nor is calibration, of which a scan keeps copies."""
 FORMAT = 1
-MANIFEST = "manifest.jsonl"
 EVENTS = "events.msgpack"
 PART = ".part"  # suffix of a row during reception
 
@@ -101,29 +112,6 @@ def _differences(begun: Any, given: Any, key: str) -> Iterator[str]:
         yield f"{key} is {here} in the scan and {there} there"
 
 
-class BoardRow(msgspec.Struct, frozen=True):
-    """One board's part of a committed row. `file` is relative to the scan folder; the index is beside it."""
-
-    file: str
-    bytes: int
-    frames_expected: int
-    frames_received: int
-    missing_bytes: int
-    crc32: str
-    index_crc32: str = ""
-    packets_crc32: str = ""
-
-
-class CommittedRow(msgspec.Struct, frozen=True):
-    """A committed row."""
-
-    row: int
-    take: int
-    direction: int
-    boards: dict[str, BoardRow]
-    pulses: int
-
-
 def new_scan_id(now: datetime | None = None) -> str:
     """Return a scan id: the start time and four random hex digits."""
     now = now or datetime.now(UTC)
@@ -153,9 +141,11 @@ class ScanFolder:
     def __init__(self, path: Path, content: Manifest) -> None:
         self.path = path
         self.content = content
-        self._rows: tuple[Manifest, int, dict[int, CommittedRow]] | None = None
-        started = next((f for f in content.facts if f["fact"] == "scan_started"), None)
-        if started is None:
+        self._rows: tuple[Manifest, int, dict[int, RowCommitted]] | None = None
+        for number, fact in content.problems:
+            if fact.kind == "scan_started":
+                raise self._unreadable(number, fact)
+        if content.started is None:
             raise DataError(
                 f"{path / MANIFEST}: no scan_started",
                 "the scan ended before its first line was written, or that line is damaged",
@@ -163,20 +153,25 @@ class ScanFolder:
                 " was recorded, and `polysight scan` may use the folder again",
                 code=ErrorCode.FILE_DAMAGED,
             )
-        source = f"{path / MANIFEST} (scan_started)"
-        try:
-            self._begun: Instrument = decode_config(started["instrument"], Instrument, f"{source} instrument")
-            self.plan: RasterPlan = decode_config(started["plan"], RasterPlan, f"{source} plan")
-            self.scan_id = str(started["scan_id"])
-            self.simulated = bool(started["simulated"])
-        except KeyError as e:
-            why = "written by another program or release"
-            raise DataError(f"{source}: no {e}", why, code=ErrorCode.KEY_MISSING) from None
+        self.started: ScanStarted = content.started
+        source = f"{path / MANIFEST} (scan_started) instrument"
+        self._begun: Instrument = decode(self.started.instrument, Instrument, source)
+        self.plan: RasterPlan = self.started.plan
+        self.scan_id = self.started.scan_id
+        self.simulated = self.started.simulated
         self.instrument = self._latest()
+
+    def _unreadable(self, number: int, fact: OtherFact) -> ConfigError:
+        return ConfigError(
+            f"{self.path / MANIFEST} line {number} ({fact.kind}): {fact.problem}",
+            "written by another program or release",
+            "restore it from a copy",
+            code=ErrorCode.VALUE_INVALID,
+        )
 
     def _latest(self) -> Instrument:
         """Return the scan's rig with the connection settings of the last resume. Raises ConfigError."""
-        connections = [f["rig"] for f in self.facts("scan_resumed") if f.get("rig")]
+        connections = [fact.rig for fact in self.facts(ScanResumed) if fact.rig]
         return with_connection(self._begun, connections[-1]) if connections else self._begun
 
     @staticmethod
@@ -187,26 +182,27 @@ class ScanFolder:
         *,
         simulated: bool = False,
         scan_id: str = "",
-        extra: dict[str, Any] | None = None,
+        pi: PiDescription | None = None,
+        calibration: Mapping[str, Any] | None = None,
     ) -> ScanFolder:
-        """Create a scan folder with its first fact, durably; `extra` adds keys to it (calibration, operator...).
+        """Create a scan folder with its first fact, durably.
 
         Raises
         ------
         DeviceError
             if the folder contains a scan already or cannot be written.
         """
-        fact: Fact = {
-            **(extra or {}),
-            "fact": "scan_started",
-            "format": FORMAT,
-            "scan_id": scan_id or new_scan_id(),
-            "simulated": simulated,
-            "started_utc": utc_now(),
-            "instrument": to_builtins(instrument),
-            "plan": msgspec.to_builtins(plan),
-            "versions": versions(),
-        }
+        fact = ScanStarted(
+            format=FORMAT,
+            scan_id=scan_id or new_scan_id(),
+            simulated=simulated,
+            started_utc=utc_now(),
+            instrument=to_builtins(instrument),
+            plan=plan,
+            versions=versions(),
+            pi=pi,
+            calibration=calibration,
+        )
         _make_folder(path)
         if (path / MANIFEST).exists() and not manifest.read(path / MANIFEST).length:
             (path / MANIFEST).unlink()  # left by a start that ended before its first line
@@ -237,52 +233,48 @@ class ScanFolder:
             raise
         return writer
 
-    def facts(self, kind: str) -> list[Fact]:
+    def facts(self, kind: type[F]) -> list[F]:
         """Return all facts of one kind, in order."""
-        return [f for f in self.content.facts if f["fact"] == kind]
+        return self.content.of_kind(kind)
 
-    def committed(self) -> dict[int, CommittedRow]:
+    def committed(self) -> dict[int, RowCommitted]:
         """Return committed rows by index: the last committed take of each row, unless it was withdrawn.
 
-        Raises DataError if the manifest names a file outside `raw`.
+        Raises DataError if the manifest names a file outside `raw`, ConfigError for a row of another form.
         """
         return dict(self._committed())
 
-    def _committed(self) -> dict[int, CommittedRow]:
+    def _committed(self) -> dict[int, RowCommitted]:
         """Return the committed rows from a cache, which is valid until facts are added."""
         if self._rows is None or self._rows[0] is not self.content or self._rows[1] != len(self.content.facts):
-            self._rows = (self.content, len(self.content.facts), self._count_rows(self.content.facts))
+            for number, fact in self.content.problems:
+                if fact.kind in ("row_committed", "row_withdrawn"):
+                    raise self._unreadable(number, fact)
+            for fact in self.facts(RowCommitted):
+                for board in fact.boards.values():
+                    inside(self.path, board.file, "raw")
+            self._rows = (self.content, len(self.content.facts), dict(sorted(self.content.rows.copy().items())))
         return self._rows[2]
 
-    def _count_rows(self, facts: Iterable[Fact]) -> dict[int, CommittedRow]:
-        rows: dict[int, CommittedRow] = {}
-        for fact in facts:
-            if fact["fact"] == "row_withdrawn":
-                rows.pop(fact["row"], None)
-            if fact["fact"] != "row_committed":
-                continue
-            row = decode_config(
-                {k: fact.get(k) for k in CommittedRow.__struct_fields__}, CommittedRow, f"{self.path / MANIFEST}"
-            )
-            for board in row.boards.values():
-                inside(self.path, board.file, "raw")
-            rows[row.row] = row
-        return dict(sorted(rows.items()))
-
     @property
-    def manifest_faults(self) -> tuple[ManifestFault, ...]:
+    def manifest_faults(self) -> tuple[Finding, ...]:
         """Damaged and missing lines of the manifest, and a `scan_ended` that counts more rows than are committed."""
         content = self.content
-        end = next((k for k in reversed(range(len(content.facts))) if content.facts[k]["fact"] == "scan_ended"), None)
-        counted = None if end is None else content.facts[end].get("rows_committed")
-        if end is None or not isinstance(counted, int) or counted <= len(self._committed()):
-            return tuple(content.faults)
-        known = {*self._count_rows(content.facts[:end]), *self._committed()}  # later withdrawn, or taken again
-        lost = counted - len(known)
-        if lost <= sum(fault.lost for fault in content.faults):
-            return tuple(content.faults)
-        what = f"scan_ended counts {counted} rows, the lines before it commit {len(known)}"
-        return (*content.faults, ManifestFault(content.numbers[end], what, lost))
+        faults = tuple(content.faults)
+        ends = [k for k, fact in enumerate(content.facts) if isinstance(fact, ScanEnded)]
+        if not ends:
+            return faults
+        last = ends[-1]
+        counted = self.facts(ScanEnded)[-1].rows_committed
+        if counted is None or counted <= len(self._committed()):
+            return faults
+        # Rows that were later withdrawn, or taken again, were committed then.
+        rows = {fact.row for fact in content.facts[:last] if isinstance(fact, RowCommitted)} | {*self._committed()}
+        lost = counted - len(rows)
+        if lost <= sum(fault.facts["lost"] for fault in faults):
+            return faults
+        what = f"scan_ended counts {counted} rows, the lines before it commit {len(rows)}"
+        return (*faults, manifest_fault(content.numbers[last], what, lost))
 
     @property
     def rows_absent(self) -> list[int]:
@@ -291,10 +283,9 @@ class ScanFolder:
 
     def recording_facts(self) -> dict[str, Any]:
         """Return `rows_retaken` (rejected takes of all runs) and `rows_incomplete` for quality.json."""
-        last = {f["row"]: f for f in self.facts("row_committed") if f["row"] in self._committed()}
         return {
-            "rows_retaken": len(self.facts("row_rejected")),
-            "rows_incomplete": sorted(row for row, fact in last.items() if fact.get("kept_incomplete")),
+            "rows_retaken": len(self.content.rejected),
+            "rows_incomplete": [row for row, fact in self._committed().items() if fact.kept_incomplete],
         }
 
     def rows(self) -> Iterator[int]:

@@ -11,10 +11,10 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.store.manifest import ManifestFault
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
+from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan
 
 Pieces = Callable[[int], Iterator[NDArray[np.uint8]]]
@@ -113,7 +113,7 @@ class Source(Scan, Protocol):
         ...
 
     @property
-    def manifest_faults(self) -> tuple[ManifestFault, ...]:
+    def manifest_faults(self) -> tuple[Finding, ...]:
         """Damaged and missing lines of the manifest; empty for a recording without one."""
         ...
 

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+
+import msgspec
 
 from polysight.capture import PACKETS, read_index
 from polysight.store import manifest
 from polysight.store.append_only import crc32
 from polysight.store.events import read_events
-from polysight.store.manifest import ManifestFault
+from polysight.store.manifest import MANIFEST, BoardRow, RowCommitted, ScanEnded
 from polysight.store.raw import dropped_files, dropped_rows
 from polysight.store.sample_rows import SAMPLES, damaged_samples
-from polysight.store.scan_folder import EVENTS, MANIFEST, PART, BoardRow, CommittedRow, ScanFolder
+from polysight.store.scan_folder import EVENTS, PART, ScanFolder
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, PolysightError
+from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
 
 _CHUNK = 1 << 22
@@ -26,18 +27,32 @@ _ALL_THERE = "every row is committed"
 _FETCHED = "resume fetches the rest from the Pi's journal"
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A fault (`error`), or information about an undamaged folder (`note`)."""
+def to_text(finding: Finding) -> str:
+    """Return a finding as one line."""
+    return f"{finding.level}: {finding.where}: {finding.what}" + (f" ({finding.do})" if finding.do else "")
 
-    severity: Literal["error", "note"]
-    where: str
-    what: str
-    remedy: str = ""
-    unreadable: bool = False  # a read error: the file may be undamaged
 
-    def __str__(self) -> str:
-        return f"{self.severity}: {self.where}: {self.what}" + (f" ({self.remedy})" if self.remedy else "")
+def to_json(findings: list[Finding]) -> str:
+    """Return the findings as JSON; `unreadable`: a read error, the file may be undamaged."""
+    entries = [
+        {
+            "severity": f.level,
+            "where": f.where,
+            "what": f.what,
+            "remedy": f.do,
+            "unreadable": f.code is ErrorCode.FILE_UNREADABLE,
+        }
+        for f in findings
+    ]
+    return json.dumps(entries, indent=2)
+
+
+def _error(where: str, what: str, do: str = "", code: ErrorCode = ErrorCode.FILE_DAMAGED) -> Finding:
+    return Finding("error", what, do=do, where=where, code=code)
+
+
+def _note(where: str, what: str, do: str = "") -> Finding:
+    return Finding("note", what, do=do, where=where)
 
 
 def validate(path: Path) -> list[Finding]:
@@ -45,28 +60,28 @@ def validate(path: Path) -> list[Finding]:
     content = manifest.read(path / MANIFEST)
     found = []
     if content.torn:
-        found.append(Finding("note", MANIFEST, "the last line is torn by a kill or power cut", "resume cuts it off"))
+        found.append(_note(MANIFEST, "the last line is torn by a kill or power cut", "resume cuts it off"))
     try:
         scan = ScanFolder(path, content)
         rows = scan.committed()
     except PolysightError as e:
         lost = [_lost_lines(fault, "its facts are lost") for fault in content.faults]
-        return [*found, *lost, Finding("error", MANIFEST, e.what, e.remedy)]
+        return [*found, *lost, _error(MANIFEST, e.what, e.remedy)]
     found += [_lost_lines(fault, _what_is_lost(scan)) for fault in scan.manifest_faults]
     if scan.plan != plan_raster(scan.instrument.grid):
-        found.append(Finding("error", MANIFEST, "the plan is not that of the rig file's grid"))
+        found.append(_error(MANIFEST, "the plan is not that of the rig file's grid"))
     for row in rows.values():
         found += _row(scan, row)
     found += _dropped(scan)
     found += _strays(scan, rows)
     found += _events(scan)
     missing = scan.plan.rows - sum(0 <= r < scan.plan.rows for r in rows)
-    ended = scan.facts("scan_ended")
+    ended = scan.facts(ScanEnded)
     if missing:
         remedy = f"`polysight resume {path}` takes them"
-        found.append(Finding("note", MANIFEST, f"{missing} of {scan.plan.rows} rows are not committed", remedy))
+        found.append(_note(MANIFEST, f"{missing} of {scan.plan.rows} rows are not committed", remedy))
     elif not ended:
-        found.append(Finding("note", MANIFEST, "no scan_ended: the program ended before it was written"))
+        found.append(_note(MANIFEST, "no scan_ended: the program ended before it was written"))
     return found
 
 
@@ -76,14 +91,15 @@ def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
     Raises DeviceError on a read error: the row may be undamaged and must not be taken again.
     """
     found = {row.row: _row(scan, row) for row in scan.committed().values()}
-    if unreadable := [f for faults in found.values() for f in faults if f.unreadable]:
+    unreadable = [f for faults in found.values() for f in faults if f.code is ErrorCode.FILE_UNREADABLE]
+    if unreadable:
         raise DeviceError(
             f"{scan.path / unreadable[0].where}: {unreadable[0].what}",
             f"the disk fails, or its server is away ({len(unreadable)} files); nothing was changed",
             f"check the disk, then `polysight resume {scan.path}`",
             code=ErrorCode.FILE_UNREADABLE,
         )
-    return {row: [str(f) for f in faults] for row, faults in found.items() if faults}
+    return {row: [to_text(f) for f in faults] for row, faults in found.items() if faults}
 
 
 def damage_of(scan: ScanFolder, path: Path) -> str:
@@ -91,13 +107,13 @@ def damage_of(scan: ScanFolder, path: Path) -> str:
     for row in scan.committed().values():
         for board in row.boards.values():
             if (scan.path / board.file).resolve() == path.resolve():
-                return "; ".join(map(str, board_faults(scan, board, row.pulses)))
+                return "; ".join(map(to_text, board_faults(scan, board, row.pulses)))
     return "the manifest has no such committed row"
 
 
-def _lost_lines(fault: ManifestFault, lost: str) -> Finding:
-    """Return a fault of the manifest as a finding; a note if no row is `lost`."""
-    return Finding("error" if lost else "note", f"{MANIFEST} line {fault.line}", fault.what, lost or _ALL_THERE)
+def _lost_lines(fault: Finding, lost: str) -> Finding:
+    """Add to a fault of the manifest what is lost; it is a note if no row is `lost`."""
+    return msgspec.structs.replace(fault, level="error" if lost else "note", do=lost or _ALL_THERE)
 
 
 def _what_is_lost(scan: ScanFolder) -> str:
@@ -109,20 +125,20 @@ def _what_is_lost(scan: ScanFolder) -> str:
     return f"facts are lost: {rows} not committed; `polysight resume {scan.path}` takes them again"
 
 
-def _row(scan: ScanFolder, row: CommittedRow) -> list[Finding]:
+def _row(scan: ScanFolder, row: RowCommitted) -> list[Finding]:
     where = f"row {row.row}"
     if not 0 <= row.row < scan.plan.rows:
-        return [Finding("error", where, f"outside the plan's {scan.plan.rows} rows")]
+        return [_error(where, f"outside the plan's {scan.plan.rows} rows")]
     found = []
     planned = scan.plan.row(row.row)
     pulses = planned.points * scan.instrument.burst.pulses
     if row.direction != planned.direction:
-        found.append(Finding("error", where, f"direction {row.direction}, planned {planned.direction}"))
+        found.append(_error(where, f"direction {row.direction}, planned {planned.direction}"))
     if row.pulses != pulses:
-        found.append(Finding("error", where, f"{row.pulses} pulses, {pulses} planned"))
+        found.append(_error(where, f"{row.pulses} pulses, {pulses} planned"))
     boards = {board.name for board in scan.instrument.recorded}
     if set(row.boards) != boards:
-        found.append(Finding("error", where, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
+        found.append(_error(where, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
     for board in row.boards.values():
         found += board_faults(scan, board, pulses)
     return found
@@ -134,9 +150,7 @@ def board_faults(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding
     found = []
     expected = frames * scan.instrument.frame_bytes
     if (board.bytes, board.frames_expected) != (expected, frames):
-        found.append(
-            Finding("error", where, f"{board.bytes} bytes of {board.frames_expected} frames, planned {expected}")
-        )
+        found.append(_error(where, f"{board.bytes} bytes of {board.frames_expected} frames, planned {expected}"))
     kept = board.file not in dropped_files(scan) or path.exists()
     try:
         # Only the committed digest is left of a dropped payload.
@@ -144,30 +158,30 @@ def board_faults(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding
     except OSError as e:
         return [*found, _not_read(where, e)]
     if size != board.bytes:
-        found.append(Finding("error", where, f"{size} bytes, {board.bytes} were committed", _COPY))
+        found.append(_error(where, f"{size} bytes, {board.bytes} were committed", _COPY))
     elif f"{crc:08x}" != board.crc32:
-        found.append(Finding("error", where, "differs from the committed data (CRC)", _COPY))
+        found.append(_error(where, "differs from the committed data (CRC)", _COPY))
     index = path.with_suffix(".idx")
     found += _packets(scan, board, path.with_suffix(PACKETS))
     where = str(index.relative_to(scan.path))
     if not index.exists():
         needed = board.missing_bytes > 0 or board.index_crc32 != ""
-        return [*found, Finding("error", where, "absent", _COPY)] if needed else found
+        return [*found, _error(where, "absent", _COPY)] if needed else found
     try:
         index_crc = crc32(index.read_bytes())
     except OSError as e:
         return [*found, _not_read(where, e)]
     if board.index_crc32 and f"{index_crc:08x}" != board.index_crc32:
-        return [*found, Finding("error", where, "differs from the committed data (CRC)", _COPY)]
+        return [*found, _error(where, "differs from the committed data (CRC)", _COPY)]
     try:
         facts, _ = read_index(index)
         gaps = [(int(a), int(b)) for a, b in facts.get("missing", [])]
     except (PolysightError, TypeError, ValueError) as e:
-        return [*found, Finding("error", where, str(e))]
+        return [*found, _error(where, str(e))]
     ordered = all(a < b for a, b in gaps) and all(x[1] < y[0] for x, y in pairwise(gaps))
     inside = all(a >= 0 and b <= board.bytes for a, b in gaps)
     if not ordered or not inside or sum(b - a for a, b in gaps) != board.missing_bytes:
-        found.append(Finding("error", where, f"its gaps do not make the {board.missing_bytes} missing bytes"))
+        found.append(_error(where, f"its gaps do not make the {board.missing_bytes} missing bytes"))
     return found
 
 
@@ -179,16 +193,16 @@ def _packets(scan: ScanFolder, board: BoardRow, path: Path) -> list[Finding]:
     try:
         _, crc = _digest(path)
     except FileNotFoundError:
-        return [Finding("error", where, "absent", _COPY)]
+        return [_error(where, "absent", _COPY)]
     except OSError as e:
         return [_not_read(where, e)]
     right = f"{crc:08x}" == board.packets_crc32
-    return [] if right else [Finding("error", where, "differs from the committed data (CRC)", _COPY)]
+    return [] if right else [_error(where, "differs from the committed data (CRC)", _COPY)]
 
 
 def _not_read(where: str, e: OSError) -> Finding:
-    absent = isinstance(e, FileNotFoundError)
-    return Finding("error", where, f"cannot be read: {e.strerror}", _COPY, unreadable=not absent)
+    code = ErrorCode.FILE_MISSING if isinstance(e, FileNotFoundError) else ErrorCode.FILE_UNREADABLE
+    return _error(where, f"cannot be read: {e.strerror}", _COPY, code)
 
 
 def _digest(path: Path) -> tuple[int, int]:
@@ -205,8 +219,8 @@ def _dropped(scan: ScanFolder) -> list[Finding]:
     if not files:
         return []
     last = list(files.values())[-1]
-    what = f"the raw data of {len({f['row'] for f in files.values()})} rows was dropped after processing"
-    found = [Finding("note", "raw", f"{what} into {last['products']} ({last['dropped_utc']}); digests are kept")]
+    what = f"the raw data of {len({f.row for f in files.values()})} rows was dropped after processing"
+    found = [_note("raw", f"{what} into {last.products} ({last.dropped_utc}); digests are kept")]
     if (scan.path / SAMPLES).exists():
         gone, lost = (
             dropped_rows(scan),
@@ -214,21 +228,21 @@ def _dropped(scan: ScanFolder) -> list[Finding]:
         )
         for row, names in damaged_samples(scan).items():
             what = f"row {row} is damaged or missing (CRC)"
-            found += [Finding("error", name, what, lost) for name in names if row in gone]
+            found += [_error(name, what, lost) for name in names if row in gone]
     else:
-        found.append(Finding("note", SAMPLES, "absent: no image can be made again"))
+        found.append(_note(SAMPLES, "absent: no image can be made again"))
     left = [file for file in files if (scan.path / file).exists()]
     if left:
         remedy = f"`polysight drop-raw {scan.path}` removes them"
-        found.append(Finding("note", "raw", f"{len(left)} files to be dropped are still there", remedy))
+        found.append(_note("raw", f"{len(left)} files to be dropped are still there", remedy))
     return found
 
 
-def _strays(scan: ScanFolder, rows: dict[int, CommittedRow]) -> list[Finding]:
+def _strays(scan: ScanFolder, rows: dict[int, RowCommitted]) -> list[Finding]:
     known = {scan.path / b.file for r in rows.values() for b in r.boards.values()}
     known |= {p.with_suffix(suffix) for p in known for suffix in (".idx", PACKETS)}
     return [
-        Finding("note", str(p.relative_to(scan.path)), "belongs to no committed row", "resume replaces it")
+        _note(str(p.relative_to(scan.path)), "belongs to no committed row", "resume replaces it")
         for p in sorted((scan.path / "raw").rglob("*"))
         if p.is_file() and p not in known and p.suffix in (".bin", ".idx", PACKETS, PART)
     ]
@@ -239,31 +253,31 @@ def _events(scan: ScanFolder) -> list[Finding]:
     try:
         log = read_events(path)
     except PolysightError as e:
-        return [Finding("error", EVENTS, e.what, e.remedy)]
+        return [_error(EVENTS, e.what, e.remedy)]
     found = []
     if log.torn:
-        found.append(Finding("note", EVENTS, "the last event is torn by a kill or power cut", _FETCHED))
+        found.append(_note(EVENTS, "the last event is torn by a kill or power cut", _FETCHED))
     if log.damage:
-        found.append(Finding("error", EVENTS, log.damage, _FETCHED))
+        found.append(_error(EVENTS, log.damage, _FETCHED))
     if {e.scan_id for e in log.events} - {scan.scan_id}:
-        found.append(Finding("error", EVENTS, "holds events of another scan"))
+        found.append(_error(EVENTS, "holds events of another scan"))
     if [e.seq for e in log.events] != list(range(1, len(log.events) + 1)):
-        found.append(Finding("error", EVENTS, "the sequence of the events has gaps"))
-    last = next((f for f in reversed(scan.facts("row_committed")) if "events" in f), None)
-    return found if last is None or log.damage else found + _committed_events(path, log.length, last)
+        found.append(_error(EVENTS, "the sequence of the events has gaps"))
+    commits = [fact for fact in scan.facts(RowCommitted) if fact.events is not None]
+    if commits and not log.damage:
+        found += _committed_events(path, log.length, commits[-1])
+    return found
 
 
-def _committed_events(path: Path, length: int, fact: dict[str, Any]) -> list[Finding]:
+def _committed_events(path: Path, length: int, commit: RowCommitted) -> list[Finding]:
     """Compare the event log with its digest at the last commit."""
-    size, crc, when = fact["events"]["bytes"], fact["events"]["crc32"], f"row {fact['row']} was committed"
+    if commit.events is None:
+        return []
+    size = commit.events.bytes
+    when = f"row {commit.row} was committed"
     if length < size:
-        return [Finding("error", EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
+        return [_error(EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
     with path.open("rb") as f:
-        whole = f"{crc32(f.read(size)):08x}" == crc
+        whole = f"{crc32(f.read(size)):08x}" == commit.events.crc32
     what = f"not the events that were there when {when} (CRC)"
-    return [] if whole else [Finding("error", EVENTS, what, "restore it from a copy")]
-
-
-def to_json(findings: list[Finding]) -> str:
-    """Return the findings as JSON."""
-    return json.dumps([vars(f) for f in findings], indent=2)
+    return [] if whole else [_error(EVENTS, what, "restore it from a copy")]

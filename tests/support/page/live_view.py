@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from polysight.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
 from polysight.catalogue import Scans
@@ -18,13 +19,14 @@ from polysight.serve.site import Site, Watches
 from polysight.store import manifest
 from polysight.store.scan_folder import EVENTS, MANIFEST, utc_now
 from tests.support.processes import LIMIT_S, wait_for
+from tests.support.store.facts import facts_of
 
 
 class GrowingScan:
     """A copy of a finished scan whose manifest and events are written line by line; `live` touches its `alive` file."""
 
     def __init__(self, finished: Path, folder: Path) -> None:
-        self._facts = manifest.read(finished / MANIFEST).facts
+        self._facts = facts_of(finished)
         self._events = (finished / EVENTS).read_bytes()
         self.path = folder
         folder.mkdir()
@@ -42,7 +44,7 @@ class GrowingScan:
         self.write(fact)
         return str(fact["fact"])
 
-    def write(self, fact: manifest.Fact) -> None:
+    def write(self, fact: dict[str, Any]) -> None:
         """Write another fact."""
         with (self.path / MANIFEST).open("ab") as f:
             f.write(manifest.encode_line(fact))

@@ -10,7 +10,7 @@ import numpy as np
 from polysight.capture.segment import write_index
 from polysight.store.events import EventWriter
 from polysight.store.scan_folder import ScanFolder
-from polysight.store.validation import validate
+from polysight.store.validation import to_text, validate
 from polysight_shared.messages import Fault, RunStarted
 from polysight_shared.raster import plan_raster
 from tests.support.acquisition.fake_rig import small_instrument
@@ -52,4 +52,4 @@ def write_scan(folder: Path, gaps: Gaps | None = None) -> Path:
 
 def errors(folder: Path) -> list[str]:
     """Errors of a scan folder, without notes."""
-    return [str(f) for f in validate(folder) if f.severity == "error"]
+    return [to_text(f) for f in validate(folder) if f.level == "error"]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from polysight.store.manifest import MANIFEST
 from polysight.store.raw import require_raw
-from polysight.store.scan_folder import MANIFEST, ScanFolder
+from polysight.store.scan_folder import ScanFolder
 from polysight.store.source import Source
 from polysight.store.sources.published import SYNCED, PublishedCubes, PublishedScan
 from polysight.store.sources.published_settings import COLLECTION

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.store.manifest import ManifestFault
 from polysight.store.source import CubeRow, RowData, pieces_of
 from polysight.store.sources.published_packets import (
     Bursts,
@@ -33,6 +32,7 @@ from polysight.store.sources.published_settings import mirrored, read_settings, 
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
+from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan, plan_raster
 
 _ROW_FILE = re.compile(r"(\d+)_(\d+)\.bin")
@@ -53,7 +53,7 @@ class _Published:
     """Common properties of both kinds of the authors' folders."""
 
     synchronised = False
-    manifest_faults: tuple[ManifestFault, ...] = ()
+    manifest_faults: tuple[Finding, ...] = ()
 
     def __init__(self, path: Path, base: Instrument) -> None:
         self.path = path

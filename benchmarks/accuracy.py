@@ -1,16 +1,253 @@
-"""Accuracy against theory and against the published method: alignment, tones, direct path, image."""
+"""Accuracy against theory and against the published method: alignment, tones, direct path, image.
+
+Trials of the estimators on simulated signals of known truth, the Cramer-Rao bounds beside them; the instrument's image
+against a matched filter over all samples in double precision.
+"""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
-from benchmarks.data import published
-from benchmarks.estimators import Alignment, alignment, one_tone, two_tones
-from benchmarks.matched_filter import image_error
-from benchmarks.measure import one_core
-from benchmarks.table import Line, add_arguments, show, write
+import msgspec
+import numpy as np
+import scipy.signal
+from numpy.typing import NDArray
+
+from benchmarks.data import as_synced, point_row, published
+from benchmarks.measure import Line, add_arguments, one_core, show, write
+from benchmarks.published import Synchroniser
+from polysight.capture.decode import raw_words
+from polysight.imaging import ImageBuilder, backproject
+from polysight.imaging.geometry import Antennas, row_offsets_m
+from polysight.imaging.reduce import reduction, scene_gate_m
+from polysight.sync.align import align_row
+from polysight.sync.direct_path import prepare, reference
+from polysight.sync.tone import estimate_tone
+from polysight_shared.config import Board, Instrument
+from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.raster import plan_raster
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+Complex = NDArray[np.complex128]
+SEED = 20260
+
+
+def _noise(rng: np.random.Generator, shape: tuple[int, ...], snr_db: float) -> Complex:
+    """Complex white noise this far below a tone of amplitude one."""
+    sigma = 10 ** (-snr_db / 20) / np.sqrt(2)
+    return sigma * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
+
+
+def _paths(rig: Instrument, board: Board, cycles_away: float = 0.0) -> tuple[Complex, Complex]:
+    """Direct path and echo of the mirror point, each of amplitude one: complex [rx, sample]."""
+    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    point = np.array(specular_midpoint_m(rig, board))
+    f = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(rig.chirp.samples)
+    direct = np.linalg.norm(rx - tx, axis=1)
+    echo = np.linalg.norm(point - tx) + np.linalg.norm(rx - point, axis=1)
+    first, second = (np.exp(2j * np.pi * np.outer(d, f) / SPEED_OF_LIGHT_M_S) for d in (direct, echo))
+    return first, second * np.exp(2j * np.pi * cycles_away)
+
+
+def _words(bursts: NDArray[np.complexfloating]) -> NDArray[np.int16]:
+    """int16 [position, chirp, sample, 2, rx] of bursts [position, chirp, rx, sample]; 1 is a thousand counts."""
+    positions, chirps, rx, samples = bursts.shape
+    flat = 1000 * bursts.transpose(2, 0, 1, 3).reshape(rx, positions * chirps, samples)
+    return raw_words(flat).reshape(positions, chirps, samples, 2, rx)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Frequency errors of single chirps against the others of their burst, Hz: rms without gross ones, gross ones."""
+
+    snr_db: float
+    ours_hz: float
+    ours_gross: int
+    division_hz: float
+    division_gross: int
+    chirps: int
+
+
+def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment:
+    """Direct path and equal echo, random offsets, noise of each channel `snr_db` below either of them.
+
+    A gross error is one of more than half an FFT bin of the linear samples. Division's rms is without its gross errors.
+    """
+    rng = np.random.default_rng([SEED, round(10 * snr_db)])
+    board, chirp, pulses = rig.receivers[0], rig.chirp, rig.burst.pulses
+    a, b = chirp.linear_samples
+    direct, _ = _paths(rig, board)
+    n = np.arange(chirp.samples)
+    bursts = np.empty((positions, pulses, *direct.shape), np.complex64)
+    truth = rng.uniform(-0.1, 0.1, (positions, pulses))
+    for p in range(positions):
+        signal = np.add(*_paths(rig, board, rng.uniform()))
+        turn = np.exp(2j * np.pi * (truth[p][:, None] * n + rng.uniform(size=(pulses, 1))))
+        bursts[p] = signal * turn[:, None] + _noise(rng, bursts.shape[1:], snr_db)
+    aligned = align_row(_words(bursts), np.ones(truth.shape, bool), chirp.linear_samples)
+    method = Synchroniser(rig, board)
+    divided = np.array([method.offsets(np.swapaxes(burst, 0, 1))[0] for burst in bursts])
+    half_bin = 0.5 / (b - a)
+
+    def errors(found: NDArray[np.float64]) -> tuple[float, int]:
+        e = found - truth
+        e -= np.median(e, axis=1, keepdims=True)
+        gross = np.abs(e) > half_bin
+        rest = np.where(gross, np.nan, e)
+        rest -= np.nanmean(rest, axis=1, keepdims=True)
+        return float(np.sqrt(np.nanmean(rest**2)) * chirp.sample_rate_hz), int(gross.sum())
+
+    return Alignment(snr_db, *errors(aligned.frequency), *errors(divided), truth.size)
+
+
+def one_tone(snr_db: float, trials: int = 4000, samples: int = 192) -> tuple[float, float]:
+    """Rms error over Cramer-Rao bound of frequency and of phase (at the record's centre), one tone in noise."""
+    rng = np.random.default_rng([SEED, 1, round(10 * snr_db)])
+    frequency, phase = rng.uniform(-0.4, 0.4, trials), rng.uniform(-np.pi, np.pi, trials)
+    t = np.arange(samples) - (samples - 1) / 2
+    z = np.exp(1j * (2 * np.pi * frequency[:, None] * t + phase[:, None])) + _noise(rng, (trials, samples), snr_db)
+    tone = estimate_tone(z.astype(np.complex64))
+    power = 10 ** (-snr_db / 10)
+    f_bound = np.sqrt(power / 2 / (t**2).sum()) / (2 * np.pi)
+    p_bound = np.sqrt(power / 2 / samples)
+    f_error = tone.frequency - frequency
+    p_error = np.angle(tone.amplitude * np.exp(-1j * phase))
+    return float(np.sqrt((f_error**2).mean()) / f_bound), float(np.sqrt((p_error**2).mean()) / p_bound)
+
+
+def at_bins(rig: Instrument, board: Board, bins: float) -> Instrument:
+    """The rig with its object plane where the mirror point's echo is so many bins of the linear samples away."""
+    samples = rig.chirp.linear_samples[1] - rig.chirp.linear_samples[0]
+
+    def moved(z_mm: float) -> Instrument:
+        geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=z_mm)
+        return msgspec.structs.replace(rig, geometry=geometry)
+
+    def bins_at(z_mm: float) -> float:
+        there = moved(z_mm)
+        tx, rx = np.array(tx_position_m(there)), np.array(rx_positions_m(there, board)[0])
+        point = np.array(specular_midpoint_m(there, board))
+        excess = np.linalg.norm(point - tx) + np.linalg.norm(rx - point) - np.linalg.norm(rx - tx)
+        return float(excess * rig.chirp.hz_per_sample * samples / SPEED_OF_LIGHT_M_S)
+
+    planes = np.linspace(100.0, 1500.0, 1401)
+    return moved(float(np.interp(bins, [bins_at(z) for z in planes], planes)))
+
+
+def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials: int = 3000) -> tuple[float, float]:
+    """Phase error of the direct path beside an equal echo: rms error (rad), and the same over its Cramer-Rao bound.
+
+    The bound is of the joint estimate from all RX: the direct path's amplitude, phase and frequency, and the echo's
+    complex amplitude and frequency, with the directions of both known, from the geometry.
+    """
+    rng = np.random.default_rng([SEED, 2, round(10 * snr_db), round(100 * bins)])
+    rig = at_bins(rig, board, bins)
+    chirp, (a, b) = rig.chirp, rig.chirp.linear_samples
+    direct, echo = _paths(rig, board)
+    n = np.arange(chirp.samples) - (a + b - 1) / 2
+    frequency, phase, between = rng.uniform(0.2, 0.6, trials), *rng.uniform(-np.pi, np.pi, (2, trials))
+    turn = np.exp(1j * (2 * np.pi * frequency[:, None] * n + phase[:, None]))
+    signal = (direct + np.exp(1j * between)[:, None, None] * echo) * turn[:, None]
+    received = (signal + _noise(rng, signal.shape, snr_db)).astype(np.complex64)
+    aligned = align_row(_words(received[:, None]), np.ones((trials, 1), bool), chirp.linear_samples)
+    done = reference(aligned, prepare(rig, board), chirp)
+    error = np.angle(done.amplitude * np.exp(-1j * phase))[done.found]
+    error = np.angle(np.exp(1j * (error - np.angle(np.exp(1j * error).mean()))))  # the direct path's own, constant
+    rms = float(np.sqrt((error**2).mean()))
+    bound = np.sqrt(np.mean([_phase_bound(direct, echo, x, (a, b), snr_db) for x in between[:200]]))
+    return rms, rms / float(bound)
+
+
+def _phase_bound(direct: Complex, echo: Complex, between: float, linear: tuple[int, int], snr_db: float) -> float:
+    """Cramer-Rao bound of the direct path's phase, variance in rad^2; inverse of the Fisher information (Kay 1993)."""
+    inside = slice(*linear)
+    d, e = direct[:, inside], echo[:, inside] * np.exp(1j * between)
+    t = np.arange(d.shape[1]) - (d.shape[1] - 1) / 2
+    slopes = np.stack([s.ravel() for s in (d, 1j * d, 1j * t * d, e, 1j * e, 1j * t * e)], axis=1)
+    fisher = 2 * 10 ** (snr_db / 10) * (slopes.conj().T @ slopes).real
+    return float(np.linalg.inv(fisher)[1, 1])
+
+
+IMAGE_SEED = 7
+POINTS, POSITIONS, PIXELS = 9, 2000, 60
+
+
+def image_error(rig: Instrument, board: Board) -> float:
+    """Largest difference at some pixels, of the image's peak.
+
+    Points lie anywhere in the image, positions anywhere in the grid (2000 of them, the others masked), and each holds
+    its direct path. The matched filter takes all linear samples with the imager's window, after the
+    direct path is taken out of every position as the range gate does (`Reduction.direct`).
+    """
+    rng = np.random.default_rng(IMAGE_SEED)
+    builder = ImageBuilder(rig)
+    grid, plan, chirp = builder.grid, plan_raster(rig.grid), rig.chirp
+    antennas = Antennas.of(rig, board)
+    margin = 0.02
+    points = np.column_stack(
+        [rng.uniform(a[0] + margin, a[-1] - margin, POINTS) for a in (grid.x_m, grid.y_m)]
+        + [np.full(POINTS, float(np.mean(grid.z_m)))]
+    )
+    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples, dtype=float)
+    used = rng.random((plan.rows, plan.columns)) < POSITIONS / plan.positions
+    samples, shifts = [], []
+    for row in plan:
+        valid = used[row.index]
+        received = np.zeros((len(antennas.rx_m), plan.columns, chirp.samples), np.complex64)
+        if valid.any():
+            echoes = point_row(rig, antennas, row, points, sweep, valid)
+            received[:, valid] = echoes + 1 / antennas.direct_m[:, None, None]
+        builder.add_row(board.name, row.index, as_synced(received, valid))
+        samples.append(received[:, valid])
+        shifts.append(np.pad(row_offsets_m(rig, row)[valid], ((0, 0), (0, 1))))
+    image, _, _ = builder.boards[board.name].image()
+    chosen = rng.choice(image.size, PIXELS, replace=False)
+    chosen[0] = np.abs(image).argmax()
+    weights = builder.boards[board.name].weights
+    taper = np.concatenate([weights[r.index, :: r.direction][used[r.index]] for r in plan])
+    true = _matched(
+        rig,
+        board,
+        np.concatenate(samples, axis=1).astype(complex) / builder.rx_calibration(board.name)[:, None, None],
+        np.concatenate(shifts),
+        taper.astype(float),
+        grid.voxels_m[chosen],
+        builder,
+    )
+    return float(np.abs(image.ravel()[chosen] - true).max() / np.abs(image).max())
+
+
+def _matched(
+    rig: Instrument,
+    board: Board,
+    samples: NDArray[np.complex128],
+    shifts_m: NDArray[np.float64],
+    taper: NDArray[np.float64],
+    voxels_m: NDArray[np.float64],
+    builder: ImageBuilder,
+) -> NDArray[np.complex128]:
+    """Sum over RX, positions and all linear samples, normalised as the imager does, complex128 [voxel]."""
+    chirp, (a, b) = rig.chirp, rig.chirp.linear_samples
+    all_antennas = tuple(Antennas.of(rig, receiver) for receiver in rig.receivers)
+    gate = reduction(chirp, scene_gate_m(all_antennas, plan_raster(rig.grid), builder.grid))
+    antennas = Antennas.of(rig, board)
+    window = np.asarray(scipy.signal.get_window("hann", b - a + 2, fftbins=False), float)[1:-1]
+    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(a, b)
+    total = np.zeros(len(voxels_m), complex)
+    for place, direct, received in zip(antennas.rx_m, antennas.direct_m, samples, strict=True):
+        echoes = received[:, a:b] - (received @ gate.direct)[:, None]
+        total += backproject(
+            echoes * (window / window.sum()) * taper[:, None],
+            sweep,
+            antennas.tx_m + shifts_m,
+            place + shifts_m,
+            voxels_m,
+            np.full(len(shifts_m), direct),
+        )
+    return total / (taper.sum() * len(antennas.rx_m))
+
 
 __all__ = ["add_arguments", "run"]
 ALIGN_SNR_DB = (0.0, 2.5, 5.0)
@@ -19,7 +256,6 @@ BINS, TWO_TONE_SNR_DB = 2.5, 16.0
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure and print."""
     rig, _ = published(args.quick)
     few = 20 if args.quick else 1
     with one_core():

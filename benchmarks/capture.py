@@ -4,59 +4,250 @@ from __future__ import annotations
 
 import argparse
 import os
+import random
 import shutil
 import tempfile
 import time
+import zlib
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.cards import Cards
-from benchmarks.child import Child, ask
-from benchmarks.trial import HEAD, PlainLoops, Receivers
-from polysight_shared.config import load_instrument
+import msgspec
 
-RIG = Path(__file__).parents[1] / "instrument.toml"
+from benchmarks.capture_helpers import PACKETS, make_block
+from benchmarks.measure import ROOT, Child, ask, cpu_s
+from polysight.capture.dca1000 import MAX_PAYLOAD_BYTES
+from polysight.capture.receiver import ReceiverProcess
+from polysight.capture.scheduling import receiver_cores
+from polysight_shared.config import Board, Instrument, load_instrument
+
+RIG = ROOT / "instrument.toml"
+ROW_BLOCKS = 48  # of one board: 286 MB, twelve published rows
+KEEPS_PACE = 0.98
+MBIT_A_PACKET = MAX_PAYLOAD_BYTES * 8 / 1e6
 
 
-def highest(sink: Receivers | PlainLoops, beside: Child | None, low: float, high: float, seconds: float) -> float:
-    """The highest rate without loss that was reached, by bisection to 5 %, or `low`; `high` is tried first.
+class Cards:
+    """A sender for each receiving board.
 
-    Where the senders cannot keep the pace, the rate they reached counts, and nothing above is tried.
+    `blocks` is what each sends again and again, `folder` is where row files go.
     """
-    best, rate = 0.0, high
-    while high > 1.05 * low:
-        trial = sink.try_rate(rate, seconds, beside)
-        show(trial.line())
-        if trial.good:
-            best = max(best, trial.rate)
-        if trial.good and rate == high:
-            break
-        if trial.good and trial.paced:
-            low = rate
-        else:
-            high = rate
-        rate = (low * high) ** 0.5
-    return best or low
+
+    def __init__(self, rig: Instrument, config: Path, folder: Path, stack: ExitStack) -> None:
+        subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
+        self.rig, self.folder, self.buffer_bytes = rig, folder, rig.card.receive_buffer_bytes
+        self.boards: list[Board] = [
+            replace_addresses(b, f"{subnet}.{180 + k}", f"{subnet}.30") for k, b in enumerate(rig.receivers)
+        ]
+        self.blocks = [make_block(rig, k) for k in range(len(self.boards))]
+        self.senders: list[Child] = []
+        for k, b in enumerate(self.boards):
+            child = Child("benchmarks.capture_helpers", "send", config, k, b.card_address, b.host_address, b.data_port)
+            stack.callback(child.close)
+            self.senders.append(child)
+        for sender in self.senders:
+            sender.hear()
+
+    def start_sending(self, packets: int, rate: float) -> None:
+        """Every sender sends this many packets at its share of the rate."""
+        for sender in self.senders:
+            sender.say(packets, rate / len(self.senders))
+
+    def sent(self) -> float:
+        """Wait for the senders; returns the longest time one took."""
+        return max(sender.hear()["seconds"] for sender in self.senders)
+
+    def queues(self) -> list[int]:
+        """Bytes of kernel memory that wait at each board's port."""
+        ports = [b.data_port for b in self.boards]
+        found = [0] * len(ports)
+        for line in Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]:
+            words = line.split()
+            port = int(words[1].split(":")[1], 16)
+            if port in ports:
+                found[ports.index(port)] = int(words[4].split(":")[1], 16)
+        return found
+
+
+def replace_addresses(board: Board, card: str, host: str) -> Board:
+    """The board on another subnet."""
+    return msgspec.structs.replace(board, card_address=card, host_address=host)
+
+
+@dataclass
+class Trial:
+    """One rate, tried for a time. Rates and counts are of both cards together."""
+
+    wanted: float
+    rate: float
+    seconds: float
+    packets: int
+    lost: int
+    kernel_drops: int
+    exact: bool
+    cpu: list[float]  # share of a core, each receiver
+    queue: float  # worst fill of a receive buffer
+    turn_s: float  # worst time to make a row durable and begin the next
+    rows_beside: float  # rows processed a second meanwhile
+    load: float
+
+    @property
+    def good(self) -> bool:
+        return self.lost == 0 and self.exact
+
+    @property
+    def paced(self) -> bool:
+        """Whether the senders kept the pace that was asked for."""
+        return self.rate >= KEEPS_PACE * self.wanted
+
+    def line(self) -> str:
+        cpu = "+".join(f"{100 * c:.0f}" for c in self.cpu)
+        verdict = (
+            "LOSS" if self.lost else "WRONG BYTES" if not self.exact else "good" if self.paced else "good (senders)"
+        )
+        return (
+            f"{self.wanted:9.0f} {self.rate:9.0f} {self.rate * MBIT_A_PACKET:7.0f} {self.seconds:6.1f}"
+            f" {self.packets:10d} {self.lost:8d} {self.kernel_drops:8d} {cpu:>9} {100 * self.queue:6.1f}"
+            f" {self.turn_s:6.2f} {self.rows_beside:6.2f} {self.load:5.1f}  {verdict}"
+        )
+
+
+HEAD = (
+    "   asked       got  Mbit/s   sec.    packets     lost  dropped  CPU % ea  que. %  turn s rows/s  load\n"
+    "     1/s       1/s payload               sent            kernel  receiver   worst  worst  beside"
+)
+
+
+class Receivers:
+    """The project's receivers, writing row files."""
+
+    def __init__(self, cards: Cards, stack: ExitStack) -> None:
+        self._cards = cards
+        cores = receiver_cores(len(cards.boards))
+        self._receivers = [
+            stack.enter_context(ReceiverProcess(b, cards.buffer_bytes, c))
+            for b, c in zip(cards.boards, cores, strict=True)
+        ]
+        self.text = "; ".join(f"{r.board.name} {r.scheduling}, buffer {r.granted_bytes}" for r in self._receivers)
+        self._row = 0
+        self._crc: dict[int, list[int]] = {}
+
+    def try_rate(self, rate: float, seconds: float, beside: Child | None) -> Trial:
+        """Rows, one after another, until the time is sent; making them durable in between is not in the time."""
+        cards = self._cards
+        in_all = max(1, round(rate / len(cards.boards) * seconds / PACKETS))
+        rows = -(-in_all // ROW_BLOCKS)
+        blocks = round(in_all / rows)
+        packets = blocks * PACKETS
+        before, cpu = ask(beside), [cpu_s(r.pid) for r in self._receivers]
+        trial = Trial(rate, 0, 0, 0, 0, 0, True, [], 0, 0, 0, 0)
+        began = time.perf_counter()
+        ended = 0.0
+        for _ in range(rows):
+            size = packets * MAX_PAYLOAD_BYTES
+            for r in self._receivers:
+                path = cards.folder / r.board.name / f"{self._row:04d}.part"
+                r.begin_row(self._row, 1, size, cards.rig.frame_bytes, path)
+            if ended:
+                trial.turn_s = max(trial.turn_s, time.perf_counter() - ended)
+            cards.start_sending(packets, rate)
+            self._watch(trial, packets / (rate / len(cards.boards)))
+            trial.seconds += cards.sent()
+            self._drain()
+            ended = time.perf_counter()
+            captures = [r.end_row() for r in self._receivers]
+            for k, capture in enumerate(captures):
+                trial.packets += packets
+                trial.lost += packets - capture.packets
+                trial.kernel_drops += capture.kernel_drops
+                trial.exact &= capture.missing_bytes > 0 or capture.crc32 == self._expected(k, blocks)
+            for r in self._receivers:
+                path = cards.folder / r.board.name / f"{self._row:04d}.part"
+                path.unlink() if self._row else path.rename(cards.folder / f"{r.board.name}.bin")
+            self._row += 1
+        wall = time.perf_counter() - began
+        after = ask(beside)
+        trial.rate = trial.packets / trial.seconds
+        # All CPU, the ends of rows included, over the time of sending: it belongs to these packets.
+        trial.cpu = [(cpu_s(r.pid) - c) / trial.seconds for r, c in zip(self._receivers, cpu, strict=True)]
+        trial.rows_beside = (after["rows"] - before["rows"]) / wall
+        trial.load = os.getloadavg()[0]
+        return trial
+
+    def _watch(self, trial: Trial, seconds: float) -> None:
+        limit = time.perf_counter() + seconds
+        while (left := limit - time.perf_counter()) > 0:
+            time.sleep(min(0.05, left))
+            trial.queue = max(trial.queue, max(self._cards.queues()) / (2 * self._cards.buffer_bytes))
+
+    def _drain(self) -> None:
+        """Until the receivers have taken what waits; what is lost never comes."""
+        limit = time.perf_counter() + 5.0
+        while any(self._cards.queues()) and time.perf_counter() < limit:
+            time.sleep(0.01)
+
+    def _expected(self, board: int, blocks: int) -> int:
+        """CRC-32 of so many blocks."""
+        known = self._crc.setdefault(board, [0])
+        while len(known) <= blocks:
+            known.append(zlib.crc32(self._cards.blocks[board], known[-1]))
+        return known[blocks]
+
+
+class PlainLoops:
+    """A plain `recv_into` loop a card, which only counts."""
+
+    def __init__(self, cards: Cards, stack: ExitStack) -> None:
+        self._cards = cards
+        self._loops = []
+        for b in cards.boards:
+            loop = Child("benchmarks.capture_helpers", "count", b.host_address, b.data_port, cards.buffer_bytes)
+            stack.callback(loop.close)
+            self._loops.append(loop)
+        for loop in self._loops:
+            loop.hear()
+
+    def try_rate(self, rate: float, seconds: float, beside: Child | None) -> Trial:
+        packets = max(1, round(rate / len(self._loops) * seconds / PACKETS)) * PACKETS
+        before, began = ask(beside), time.perf_counter()
+        for loop in self._loops:
+            loop.say(packets)
+        self._cards.start_sending(packets, rate)
+        took = self._cards.sent()
+        answers = [loop.hear() for loop in self._loops]
+        wall = time.perf_counter() - began
+        total = packets * len(self._loops)
+        return Trial(
+            rate,
+            total / took,
+            took,
+            total,
+            total - sum(a["received"] for a in answers),
+            sum(a["drops"] for a in answers),
+            True,
+            [a["cpu_s"] / took for a in answers],
+            0.0,
+            0.0,
+            (ask(beside)["rows"] - before["rows"]) / wall,
+            os.getloadavg()[0],
+        )
 
 
 def show(text: str) -> None:
-    """Print now."""
     print(text, flush=True)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this benchmark."""
-    parser.add_argument("--seconds", type=float, default=60.0, help="of the run at the highest rate (default 60)")
-    parser.add_argument("--search-seconds", type=float, default=3.0, help="of each step of the search (default 3)")
-    parser.add_argument("--rate", type=float, default=0.0, help="packets/s of both cards; no search then")
-    parser.add_argument("--highest", type=float, default=140_000.0, help="the search ends there (default 140000)")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of the run (default 60)")
+    parser.add_argument("--rate", type=float, default=120_000.0, help="packets/s of both cards (default 120000)")
     parser.add_argument("--alone", action="store_true", help="no processing of rows beside the capture")
     parser.add_argument("--no-compare", action="store_true", help="no plain loop for comparison")
     parser.add_argument("--folder", type=Path, default=None, help="where row files go (default: a temporary folder)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Search, hold, compare; 1 when the held rate lost something."""
+    """Hold the rate, compare; 1 when something was lost."""
     rig = load_instrument(RIG)
     with ExitStack() as stack:
         folder = Path(tempfile.mkdtemp(prefix="polysight-bench-", dir=args.folder))
@@ -66,35 +257,30 @@ def run(args: argparse.Namespace) -> int:
             sink = Receivers(cards, ours)
             show(f"{len(cards.boards)} cards, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; {sink.text}")
             show(HEAD)
-            show(sink.try_rate(20_000, 2.0, None).line())  # also makes the row that is processed beside
-            beside = None
-            if not args.alone:
-                beside = Child("benchmarks.processing", RIG, folder / f"{cards.boards[0].name}.bin")
-                stack.callback(beside.close)
-                idle = ask(beside)
-                time.sleep(4.0)
-                now = ask(beside)
-                show(f"processing alone: {(now['rows'] - idle['rows']) / 4.0:.2f} rows/s of {now['frames']} frames")
-            rate = args.rate or highest(sink, beside, 20_000, args.highest, args.search_seconds)
-            held = sink.try_rate(rate, args.seconds, beside)
+            # Also makes the row that is processed beside.
+            show(sink.try_rate(20_000, 2.0, None).line())
+            beside = None if args.alone else processing_beside(cards, stack)
+            held = sink.try_rate(args.rate, args.seconds, beside)
             show(held.line())
-            while not args.rate and not held.good and rate > 20_000:
-                rate *= 0.93
-                held = sink.try_rate(rate, args.seconds, beside)
-                show(held.line())
-        if args.no_compare:
-            return 0 if held.good else 1
-        with ExitStack() as theirs:
-            show("plain recv_into loops that only count:")
-            plain = PlainLoops(cards, theirs)
-            same = plain.try_rate(rate, args.search_seconds, beside)
-            show(same.line())
-            best = highest(plain, beside, 10_000, args.highest, args.search_seconds) if not args.rate else 0.0
-        ours_cpu, plain_cpu = (sum(t.cpu) / t.rate * 1e6 for t in (held, same))
-        show(
-            f"at {rate:.0f} packets/s: {ours_cpu:.1f} us of CPU a packet, plain loop {plain_cpu:.1f} us and"
-            f" {same.lost} of {same.packets} lost: ratio {plain_cpu / ours_cpu:.2f}"
-        )
-        if best:
-            show(f"highest rate without loss: {rate:.0f}, plain loop {best:.0f}: ratio {rate / best:.2f}")
+        if not args.no_compare:
+            with ExitStack() as theirs:
+                show("plain recv_into loops that only count:")
+                plain = PlainLoops(cards, theirs).try_rate(args.rate, min(args.seconds, 3.0), beside)
+                show(plain.line())
+            ours_cpu, plain_cpu = (sum(trial.cpu) / trial.rate * 1e6 for trial in (held, plain))
+            show(
+                f"at {args.rate:.0f} packets/s: {ours_cpu:.1f} us of CPU a packet, plain loop {plain_cpu:.1f} us and"
+                f" {plain.lost} of {plain.packets} lost: ratio {plain_cpu / ours_cpu:.2f}"
+            )
     return 0 if held.good else 1
+
+
+def processing_beside(cards: Cards, stack: ExitStack) -> Child:
+    """Start the processing of rows; print its pace without capture."""
+    beside = Child("benchmarks.capture_helpers", "process", RIG, cards.folder / f"{cards.boards[0].name}.bin")
+    stack.callback(beside.close)
+    idle = ask(beside)
+    time.sleep(4.0)
+    now = ask(beside)
+    show(f"processing alone: {(now['rows'] - idle['rows']) / 4.0:.2f} rows/s of {now['frames']} frames")
+    return beside

@@ -25,11 +25,7 @@ from polysight.data import packaged
 from polysight.imaging import PlaneEstimate
 from polysight.materials import (
     UNKNOWN,
-    PatchEstimate,
-    PatchMeasurement,
-    invert,
     match_truth,
-    measured_ratio,
     truth_plates,
 )
 from polysight.pipeline import Pipeline
@@ -102,7 +98,6 @@ class Cubes:
         return CubeRow(np.ascontiguousarray(cube[:, :: self.plan.row(row).direction]))
 
     def recording_facts(self) -> dict[str, Any]:
-        """Nothing is known of the recording."""
         return {"recording": {}}
 
 
@@ -219,52 +214,6 @@ def _table(rows: list[PatchFigures], title: str) -> dict[str, float]:
     return entry
 
 
-def _std(p: PatchEstimate) -> float:
-    """Standard deviation of a permittivity, root of the mean of both parts' variance; NaN without one."""
-    return float("nan") if p.covariance is None else float(np.sqrt(np.trace(p.covariance) / 2))
-
-
-def nominal_widths(repeats: int = 5) -> tuple[float, float]:
-    """Median relative standard deviation of the permittivities at nominal conditions: as stated, and its bound.
-
-    Flat smooth plates on the rig file's plane, leakage measured to 0.003. The bound is what the same inversion states
-    when a ratio's error is that of noise alone (its scatter over `repeats` noises), with the same priors.
-    """
-    rig = load_instrument(packaged(Path("instrument.toml")))
-    plates = [
-        {"name": n, "centre_mm": [x, y], "size_mm": [46.0, 46.0]}
-        | ({"metal": True} if n == "metal" else {"permittivity": list(MATERIALS[n])})
-        for n, (x, y) in zip(("ceramic", "acrylic", "PET", "rubber", "metal", "glass"), PLACES, strict=True)
-    ]
-    scene = decode_scene(
-        {
-            "name": "nominal", "grid": GRID, "object_distance_mm": 499.0, "image": {"columns": 116, "rows": 90},
-            "plates": plates, "disturbances": {"leakage_measured": 0.003},
-        },
-        "nominal",
-    )  # fmt: skip
-    runs = []
-    for k in range(repeats):
-        pipeline = _imaged(Cubes(rig, scene, seed=100 + k))
-        runs.append(pipeline.examine(pipeline.form_images(), Options(model="none")).found)
-    ratios = np.array([[p.inverse_ratio for p in run.inversion.patches] for run in runs], np.complex128)
-    noise = np.sqrt((np.var(ratios.real, axis=0, ddof=1) + np.var(ratios.imag, axis=0, ddof=1)) / 2)
-    first, size = runs[0], np.abs([p.permittivity or np.nan for p in runs[0].inversion.patches])
-    theta = float(np.mean(first.theta_rad))
-    seen = [
-        PatchMeasurement(complex(measured_ratio(p.inverse_ratio, *first.inversion.leakage)), max(float(s), 1e-5), theta)
-        for p, s in zip(first.inversion.patches, noise, strict=True)
-    ]
-    least = invert(seen, replace(first.prior, reference_std=float(np.median(noise))))
-    stated, bound = (
-        float(
-            np.median([np.sqrt(np.trace(p.covariance) / 2) for p in found.patches if p.covariance is not None] / size)
-        )
-        for found in (first.inversion, least)
-    )
-    return stated, bound
-
-
 def _one(job: tuple[int, str, bool]) -> list[PatchFigures]:
     return figures(*job)
 
@@ -301,7 +250,6 @@ def _without(job: tuple[int, str]) -> tuple[str, int, str, int, str]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of this benchmark."""
     parser.add_argument("--scenes", type=int, default=40, help="full scenes, from samples (default: 40)")
     parser.add_argument("--raw", type=int, default=4, help="full scenes from raw data (default: 4)")
     parser.add_argument("--without", type=int, default=20, help="scenes that hold nothing to name (default: 20)")
@@ -353,12 +301,6 @@ def run(args: argparse.Namespace) -> int:
         print("   ", w)
     print(f"names of the library's materials, {args.named} scenes with every nuisance but other specimens")
     reliability = _reliability(named)
-    stated, bound = nominal_widths()
-    out["nominal"] = {"stated": stated, "bound": bound}
-    print(
-        f"nominal conditions, leakage measured: stated {100 * stated:.2f} % (median), noise alone with the same priors"
-        f" {100 * bound:.2f} %: {stated / bound:.2f} times"
-    )
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         content = {
@@ -369,6 +311,3 @@ def run(args: argparse.Namespace) -> int:
         }
         args.json.write_text(json.dumps(content, indent=1) + "\n")
     return int(any(w[3] for w in said))
-
-
-__all__ = ["add_arguments", "draw_scene", "figures", "judged", "run"]

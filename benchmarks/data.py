@@ -92,20 +92,16 @@ class RepeatedRows:
     manifest_faults: tuple[Finding, ...] = ()
 
     def recording_facts(self) -> dict[str, Any]:
-        """None are known."""
         return {}
 
     @property
     def plan(self) -> RasterPlan:
-        """Where every position is."""
         return plan_raster(self.instrument.grid)
 
     def rows(self) -> Iterator[int]:
-        """All rows."""
         return iter(range(self.plan.rows))
 
     def read_row(self, board_name: str, row: int) -> RowData:
-        """A row's bytes."""
         files = self.files[board_name]
         frames = self.plan.columns * self.instrument.burst.pulses
         return RowData(partial(_repeated, files[row % len(files)], frames * self.instrument.frame_bytes), [], frames)

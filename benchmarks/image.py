@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from benchmarks import peers
 from benchmarks.data import as_synced, published, temporary, write_point_cube
-from benchmarks.measure import Seconds, one_core
-from benchmarks.published.image import SETTINGS, form_image
-from benchmarks.table import Line, add_arguments, show, write
+from benchmarks.measure import Line, Seconds, add_arguments, one_core, show, write
+from benchmarks.published import SETTINGS, form_image
 from polysight.imaging import ImageBuilder
 from polysight.imaging import lattice as kernels
 from polysight.imaging.aperture import Aperture, row_starts_m
@@ -211,7 +210,6 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure and print."""
     rig, _ = published(args.quick)
     lines: list[Line] = []
     more: dict[str, Any] = {}

@@ -1,22 +1,28 @@
-"""How everything here is measured: one core, jobs in turn, medians, and the machine named."""
+"""How everything here is measured: one core, jobs in turn, medians, the machine named; helper processes; the tables."""
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
+import json
 import os
 import platform
 import statistics
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _LOOK_S = 0.02
+ROOT = Path(__file__).parents[1]
+TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
 def one_thread_each() -> None:
@@ -56,12 +62,10 @@ class Seconds:
 
     @property
     def median(self) -> float:
-        """Median CPU seconds."""
         return statistics.median(self.cpu)
 
     @property
     def median_wall(self) -> float:
-        """Median wall seconds."""
         return statistics.median(self.wall)
 
 
@@ -116,3 +120,135 @@ def machine() -> dict[str, Any]:
         "python": platform.python_version(),
         **packages,
     }
+
+
+class Child:
+    """A helper process that answers lines with lines of JSON."""
+
+    def __init__(self, module: str, *words: object) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", module, *map(str, words)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+            env=os.environ | dict.fromkeys(THREADS, "1"),
+        )
+
+    def say(self, *words: object) -> None:
+        if self._process.stdin is not None:
+            self._process.stdin.write(" ".join(map(str, words)) + "\n")
+            self._process.stdin.flush()
+
+    def hear(self) -> Any:
+        line = self._process.stdout.readline() if self._process.stdout is not None else ""
+        if not line:
+            raise RuntimeError(f"helper ended with status {self._process.wait()}")
+        return line.strip() if line == "ready\n" else json.loads(line)
+
+    def close(self) -> None:
+        self._process.communicate()
+
+
+def ask(beside: Child | None) -> dict[str, Any]:
+    """Progress of the processing beside."""
+    if beside is None:
+        return {"rows": 0, "cpu_s": 0.0}
+    beside.say()
+    return beside.hear()
+
+
+def cpu_s(pid: int) -> float:
+    """CPU seconds of a process so far."""
+    words = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()
+    return (int(words[11]) + int(words[12])) * TICK_S
+
+
+@dataclass(frozen=True)
+class Line:
+    """One quantity of the table.
+
+    Attributes
+    ----------
+    quantity
+        The measured quantity.
+    ours, theirs
+        The two figures as text with their units; `theirs` may be empty.
+    value
+        The judged value: a ratio (higher is better) or an amount (lower is better).
+    at_least, aim
+        Required and desired limits.
+    higher_is_better
+        Whether `value` is such a ratio.
+    note
+        How it was measured, when that is not plain.
+    """
+
+    quantity: str
+    ours: str
+    theirs: str
+    value: float
+    at_least: float | None = None
+    aim: float | None = None
+    higher_is_better: bool = True
+    note: str = ""
+
+    @property
+    def verdict(self) -> str:
+        if self.at_least is None or self.aim is None:
+            return ""
+        if self._reaches(self.aim):
+            return "aim"
+        return "holds" if self._reaches(self.at_least) else "DOES NOT HOLD"
+
+    def _reaches(self, limit: float) -> bool:
+        return self.value >= limit if self.higher_is_better else self.value <= limit
+
+    def cells(self) -> list[str]:
+
+        def number(x: float | None) -> str:
+            return "" if x is None else f"{x:.0f}x" if self.higher_is_better else f"{x:.3g}"
+
+        value = f"{self.value:.1f}x" if self.higher_is_better else f"{self.value:.3g}"
+        return [self.quantity, self.ours, self.theirs, value, number(self.at_least), number(self.aim), self.verdict]
+
+
+HEAD = ["quantity (simulated data)", "ours", "beside it", "value", "at least", "aim", ""]
+
+
+def show(title: str, lines: list[Line], quick: bool = False) -> None:
+    """Print a table, its notes below; after a quick trial without verdicts, which would mean nothing."""
+    rows = [HEAD, *(line.cells()[: -1 if quick else None] for line in lines)]
+    width = [max(len(row[i]) for row in rows if i < len(row)) for i in range(len(HEAD))]
+    here = machine()
+    print(f"\n{title}{'; a quick trial, not a measurement' if quick else ''}")
+    print(f"{here['cpu']}, {here['cores']} cores, load {here['load_average'][0]}; seconds are CPU seconds")
+    for row in rows:
+        print("  ".join(cell.ljust(width[i]) if i < 3 else cell.rjust(width[i]) for i, cell in enumerate(row)))
+    for line in lines:
+        if line.note:
+            print(f"  {line.quantity}: {line.note}")
+    print(flush=True)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of every benchmark that prints such a table."""
+    parser.add_argument("--folder", type=Path, default=None, help="where data is made (default: a temporary folder)")
+    parser.add_argument("--quick", action="store_true", help="a tiny grid, once: shows that it runs, nothing else")
+    parser.add_argument("--json", type=Path, default=None, help="also write the figures and the machine to this file")
+
+
+def write(path: Path | None, name: str, lines: list[Line], **more: Any) -> None:
+    """Write the figures, with the machine they were measured on."""
+    if path is None:
+        return
+    content = {
+        "benchmark": name,
+        "simulated": True,
+        "measured_utc": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "machine": machine(),
+        "lines": [{**asdict(line), "verdict": line.verdict} for line in lines],
+        **more,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -17,9 +17,8 @@ import tomli_w
 import zmq
 
 from benchmarks.data import temporary
-from benchmarks.measure import machine
-from benchmarks.table import add_arguments as add_common
-from benchmarks.table import write
+from benchmarks.measure import add_arguments as add_common
+from benchmarks.measure import machine, write
 from polysight.acquisition.pi_client import PiClient
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.messages import BeginRun, Capture, RowFinished
@@ -36,7 +35,6 @@ ROW_POINTS = 35  # short rows: a machine that is busy with other things ends som
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this benchmark."""
     add_common(parser)
     parser.add_argument("--points", type=int, default=350, metavar="N", help="positions to measure (%(default)s)")
 

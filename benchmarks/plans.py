@@ -5,25 +5,21 @@ scanned as published and faster. The error is that of both channels' whole image
 disturbance but leakage, every position standing still), after the best complex factor; plates are named with the
 simulated library, and permittivities compared with the scene's.
 
-Raw data is made row by row and thrown away: nothing is written but table and figure. Half an hour of one core; with
+Raw data is made row by row and thrown away. Half an hour of one core; with
 `--coarser 2 1`, every second column, half of it (and 3 dB more noise).
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
 
 import msgspec
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
+from benchmarks.data import RIG, SCENE
 from benchmarks.sparse_scans import predicted
 from polysight.capture.decode import row_words
 from polysight.imaging import ChannelImages, ImageBuilder
@@ -46,22 +42,11 @@ from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.raster import plan_raster
 from polysight_simulators.scene import Scene, SimulatedRig, load_scene, row_offsets_mm, truth
 
-ROOT = Path(__file__).parents[1]
 ITERATIONS = 40
-
-
-@dataclass(frozen=True)
-class Result:
-    """One plan: its cost and its result."""
-
-    name: str
-    plan: str
-    minutes: float
-    image_error: float
-    plates_right: int
-    plates: int
-    pixels_right: float
-    permittivity_error: float
+HEAD = (
+    "| scan | plan | minutes | image error | plates named right | their pixels | eps' off by (median) |\n"
+    "| --- | --- | --- | --- | --- | --- | --- |"
+)
 
 
 def as_scanned(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilder]:
@@ -135,8 +120,8 @@ def measure(
     ideal: ChannelImages,
     plates: tuple[TruthPlate, ...],
     every: int = 1,
-) -> Result:
-    """Figures of one scan; `every` n-th row was scanned."""
+) -> None:
+    """Print figures of one scan; `every` n-th row was scanned."""
     scanned = Changes(step_y_mm=every * rig.grid.step_y_mm).apply(rig)  # its minutes are those of the rows scanned
     found = named(rig, images, plates)
     pairs = [(r, r.truth) for r in found.patches if r.truth is not None]
@@ -148,31 +133,11 @@ def measure(
     ]
     b, g = rig.burst, scanned.grid
     plan = f"{rig.stage.speed_mm_s:g} mm/s, {b.pulses} x {b.period_us / 1e3:g} ms, {g.step_x_mm:g} x {g.step_y_mm:g} mm"
-    result = Result(
-        name,
-        plan,
-        scan_time(scanned).minutes,
-        image_error(images, ideal),
-        right,
-        len(plates),
-        pixel_accuracy(found) or 0.0,
-        float(np.median(errors)) if errors else float("nan"),
-    )
-    print(line(result), flush=True)
-    return result
-
-
-HEAD = (
-    "| scan | plan | minutes | image error | plates named right | their pixels | eps' off by (median) |\n"
-    "| --- | --- | --- | --- | --- | --- | --- |"
-)
-
-
-def line(r: Result) -> str:
-    """A row of the table."""
-    return (
-        f"| {r.name} | {r.plan} | {r.minutes:.1f} | {100 * r.image_error:.1f} % | {r.plates_right} of {r.plates} |"
-        f" {100 * r.pixels_right:.1f} % | {100 * r.permittivity_error:.1f} % |"
+    off = 100 * float(np.median(errors)) if errors else float("nan")
+    print(
+        f"| {name} | {plan} | {scan_time(scanned).minutes:.1f} | {100 * image_error(images, ideal):.1f} % |"
+        f" {right} of {len(plates)} | {100 * (pixel_accuracy(found) or 0.0):.1f} % | {off:.1f} % |",
+        flush=True,
     )
 
 
@@ -217,98 +182,29 @@ def proposed(rig: Instrument, scene: Scene) -> Iterator[Made]:
 SCANS = (fast, published, wide, short, proposed)
 
 
-def figure(results: list[Result], pictures: list[tuple[str, ChannelImages]], path: Path) -> None:
-    """Image error against time, and images of H."""
-    fig = Figure(figsize=(12.5, 7.6 if pictures else 4.6), dpi=110, layout="constrained", facecolor="white")
-    FigureCanvasAgg(fig)
-    fig.suptitle("SIMULATED: nine plates, aperture 698 x 398 mm", color="#b3261e", fontsize=11, x=0.01, ha="left")
-    upper: Any = fig
-    if pictures:
-        parts: Any = fig.subfigures(2, 1, height_ratios=[1.15, 1])
-        upper = parts[0]
-        _draw_pictures(parts[1], pictures)
-    ax = upper.subplots(1, 1)
-    marks = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "p", "d")
-    colours = ("#332288", "#88CCEE", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255", "#AA4499")
-    for i, r in enumerate(results):
-        label = f"{r.name}: {r.plates_right} of {r.plates} named right"
-        ax.plot(
-            r.minutes, 100 * r.image_error, marks[i % len(marks)], color=colours[i % len(colours)], ms=9,
-            markeredgecolor="#1b2330", markeredgewidth=0.6, label=label, linestyle="none",
-        )  # fmt: skip
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    ax.set_yticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
-    ax.set_xticks([5, 10, 15, 30, 60, 120], ["5", "10", "15", "30", "60", "120"])
-    ax.minorticks_off()
-    ax.set_xlabel("scan time (minutes)")
-    ax.set_ylabel("image error (%)")
-    ax.grid(color="#e6e9ee")
-    ax.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(path, metadata={"Software": None})
-
-
-def _draw_pictures(fig: Any, pictures: list[tuple[str, ChannelImages]]) -> None:
-    """H of some scans side by side."""
-    shown = None
-    axes = fig.subplots(1, len(pictures), squeeze=False)[0]
-    for ax, (name, images) in zip(axes, pictures, strict=True):
-        level = 20 * np.log10(np.maximum(np.abs(images.h_raw) / np.abs(images.h_raw).max(), 1e-6))
-        half = [(a[-1] - a[0]) / 2 * 1e3 for a in (images.x_m, images.y_m)]
-        extent = (-half[0], half[0], -half[1], half[1])
-        shown = ax.imshow(level, origin="lower", extent=extent, cmap="cividis", vmin=-35, vmax=0)
-        ax.set_title(name, fontsize=8.5, loc="left")
-        ax.set_xlabel("x (mm)", fontsize=8)
-        ax.tick_params(labelsize=7)
-    fig.colorbar(shown, ax=axes, fraction=0.02, pad=0.01).set_label("H (dB)", fontsize=8)
-
-
-SHOWN = ("ideal", "fast", "fast, 1 row in 4", "fast, 1 row in 4, reconstructed")
-
-
 def main() -> int:
-    """Simulate and measure the plans; print a Markdown table, draw the figure."""
+    """Simulate and measure the plans; print a Markdown table."""
     parser = argparse.ArgumentParser(description="image error and naming of faster scans, simulated")
     names = [s.__name__ for s in SCANS]
     parser.add_argument("--scans", nargs="*", choices=names, default=names, help="some of them only")
-    parser.add_argument("--figure", type=Path, default=ROOT / "docs" / "images" / "plans.png")
-    parser.add_argument("--json", type=Path, help="write the results here")
-    parser.add_argument(
-        "--add",
-        type=Path,
-        nargs="*",
-        default=[],
-        help="earlier results to show too; with --scans alone, only these",
-    )
     parser.add_argument(
         "--coarser", type=float, nargs=2, metavar=("X", "Y"), default=(1, 1), help="steps so many times the plans'"
     )
     args = parser.parse_args()
-    scene = msgspec.structs.replace(load_scene(ROOT / "examples" / "nine-materials.toml"), grid={})  # the rig file's
-    rig = load_instrument(ROOT / "instrument.toml")
+    # The grid is the rig file's.
+    scene = msgspec.structs.replace(load_scene(SCENE), grid={})
+    rig = load_instrument(RIG)
     x, y = args.coarser
     rig = Changes(step_x_mm=x * rig.grid.step_x_mm, step_y_mm=y * rig.grid.step_y_mm).apply(rig)
-    results = [Result(**r) for path in args.add for r in json.loads(path.read_text(encoding="utf-8"))]
-    if not args.scans:
-        print(HEAD, *map(line, results), sep="\n")
-        figure(results, [], args.figure)
-        return 0
     leakage = scene.disturbances
     still = scene.with_disturbances(ideal=True, leakage_h=leakage.leakage_h, leakage_v=leakage.leakage_v)
     ideal = as_scanned(Changes(pulses=2).apply(rig), still)[0].finish()
     plates = truth_plates(truth(rig, scene, scene.seed))
     print(HEAD, flush=True)
     measure("ideal", rig, ideal, ideal, plates)
-    pictures = [("ideal", ideal)]
     for make in (s for s in SCANS if s.__name__ in args.scans):
         for name, scanned, images, every in make(rig, scene):
-            results.append(measure(name, scanned, images, ideal, plates, every))
-            if name in SHOWN:
-                pictures.append((name, images))
-        if args.json:
-            args.json.write_text(json.dumps([asdict(r) for r in results], indent=1) + "\n", encoding="utf-8")
-        figure(results, pictures, args.figure)
+            measure(name, scanned, images, ideal, plates, every)
     return 0
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import statistics
 
-from benchmarks.chain import Chain
 from benchmarks.data import published, recorded_rows, temporary
-from benchmarks.measure import one_core
-from benchmarks.table import add_arguments as add_common
-from benchmarks.table import write
+from benchmarks.measure import add_arguments as add_common
+from benchmarks.measure import one_core, write
+from benchmarks.whole import Chain
 
 # Columns, rows and steps (mm) in x and y: always the published aperture of 0.7 x 0.4 m, as far as the stage reaches.
 SIZES = {
@@ -22,13 +21,11 @@ SIZES = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of this benchmark."""
     add_common(parser)
     parser.add_argument("--largest", type=float, default=4.0, help="times the published grid (default 4)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure and print."""
     rig, scene = published()
     found = []
     with temporary(args.folder) as folder, one_core():

@@ -14,8 +14,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from polysight.imaging.samples import BoardSamples, choose_imager
 from polysight.imaging.sparse import reconstruct
@@ -89,33 +87,9 @@ def measure(folder: Path, iterations: int) -> list[tuple[str, float, float, floa
     return out
 
 
-def figure(results: dict[str, list[tuple[str, float, float, float]]], path: Path) -> None:
-    """Errors against scan time, one panel a scene."""
-    fig = Figure(figsize=(11.0, 4.7), dpi=120, layout="constrained", facecolor="white")
-    FigureCanvasAgg(fig)
-    for ax, (scene, rows) in zip(fig.subplots(1, len(results), squeeze=False)[0], results.items(), strict=True):
-        for i, (name, minutes, plain, rebuilt) in enumerate(rows):
-            colour = f"C{i}"
-            ax.plot(minutes, 100 * rebuilt, "s", color=colour, markerfacecolor="white", label=name)
-            if plain > 0:
-                ax.plot([minutes] * 2, [100 * plain, 100 * rebuilt], "-", color=colour, linewidth=1)
-                ax.plot(minutes, 100 * plain, "o", color=colour)
-        ax.set_yscale("log")
-        ax.set_xlim(left=0)
-        ax.set_xlabel("scan time (minutes)")
-        ax.set_ylabel("image error (%)")
-        ax.set_title(f"SIMULATED: {scene}\nfilled: matched filter, open: reconstruction", fontsize=9, loc="left")
-    fig.legend(
-        *fig.axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, frameon=False
-    )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(path, metadata={"Software": None})
-
-
 def main() -> int:
     """Simulate, measure, print a Markdown table, draw the figure."""
     parser = argparse.ArgumentParser(description="image error of sparse scans")
-    parser.add_argument("--figure", type=Path, default=ROOT / "docs" / "images" / "sparse.png")
     parser.add_argument("--iterations", type=int, default=40)
     parser.add_argument("--scenes", nargs="*", default=SCENES)
     parser.add_argument("--keep", type=Path, default=None, help="folder where simulated scans stay")
@@ -132,7 +106,6 @@ def main() -> int:
             print("| --- | --- | --- | --- |")
             for name, minutes, plain, rebuilt in results[scene]:
                 print(f"| {name} | {minutes:.1f} | {100 * plain:.1f} % | {100 * rebuilt:.1f} % |", flush=True)
-    figure(results, args.figure)
     return 0
 
 

@@ -45,7 +45,6 @@ def run(out: Path, positions: int, board_name: str, snr_db: float = SNR_DB) -> s
 
 
 def main(argv: list[str]) -> int:
-    """The command."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.static_chirps", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
     parser.add_argument("--positions", type=int, default=40_000, help="of 16 chirps each")

@@ -11,9 +11,8 @@ from typing import Any, cast
 import numpy as np
 
 from benchmarks.data import RepeatedRows, published, recorded_rows, temporary
-from benchmarks.measure import Seconds, one_core
-from benchmarks.published.synchronise import Synchroniser
-from benchmarks.table import Line, add_arguments, show, write
+from benchmarks.measure import Line, Seconds, add_arguments, one_core, show, write
+from benchmarks.published import Synchroniser
 from polysight.imaging import ImageBuilder
 from polysight.pipeline import Pipeline
 from polysight.sync import direct_path
@@ -48,7 +47,7 @@ class _NoImage:
     live = False
 
     def add_row(self, *_: object) -> None:
-        """Drop it."""
+        pass
 
 
 class Ours:
@@ -110,7 +109,6 @@ def measure(rig: Instrument, files: dict[str, Path], repeats: int) -> dict[str, 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure and print."""
     rig, scene = published(args.quick)
     with temporary(args.folder) as folder, one_core():
         files = {}

@@ -12,8 +12,7 @@ import time
 from pathlib import Path
 
 from benchmarks.data import ROOT, SCENE, published, recorded_rows, temporary, write_scan
-from benchmarks.measure import Seconds
-from benchmarks.table import Line, add_arguments, show, write
+from benchmarks.measure import Line, Seconds, add_arguments, show, write
 from benchmarks.whole import rows_that_fit
 from polysight.catalogue import Scans
 from polysight.imaging import View
@@ -92,7 +91,6 @@ def command(words: list[str]) -> tuple[float, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure and print."""
     rig, scene = published(args.quick)
     repeats = 1 if args.quick else REPEATS
     with temporary(args.folder) as folder:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from benchmarks.data import RIG
-from benchmarks.published.image import SETTINGS, form_image
-from benchmarks.published.synchronise import SYNC_RX, Synchroniser
+from benchmarks.published import SETTINGS, SYNC_RX, Synchroniser, form_image
 from numpy.typing import NDArray
 
 from polysight.imaging import ImageGrid, backproject, image_grid

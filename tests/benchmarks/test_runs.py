@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks import accuracy, image, sync, table, waits, whole
+from benchmarks import accuracy, image, measure, sync, waits, whole
 from benchmarks.__main__ import main
 from benchmarks.measure import THREADS
 
@@ -40,4 +40,4 @@ def test_quick_trial(
 )
 def test_verdict(value: float, higher: bool, verdict: str) -> None:
     limits = (10.0, 25.0) if higher else (25.0, 10.0)
-    assert table.Line("x", "", "", value, *limits, higher_is_better=higher).verdict == verdict
+    assert measure.Line("x", "", "", value, *limits, higher_is_better=higher).verdict == verdict

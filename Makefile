@@ -8,7 +8,7 @@ JOBS ?= $(shell expr 2 \* $$(getconf _NPROCESSORS_ONLN))  # tests wait more than
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport PYTHONDONTWRITEBYTECODE  # modules are compiled once, not for each of a hundred programs
 
-.PHONY: help demo test test-long test-uml test-pi quick check bench firmware flash pi-install library reproduce wheels docs clean
+.PHONY: help demo test test-long test-uml test-pi mutants quick check bench firmware flash pi-install library reproduce wheels docs clean
 
 help:  ## this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -42,6 +42,10 @@ test-pi: $(VENV)/installed  ## a Raspberry Pi 3B in a box: Debian's kernel on QE
 
 CHANGED = $(shell git diff --name-only --diff-filter=d HEAD -- host papers pi_controller shared simulators 2>/dev/null | grep '\.py$$')
 LAWS := tests/house/test_rooms.py tests/shared tests/polarimetry tests/sync/test_tone.py tests/imaging/test_direct.py
+
+mutants: $(VENV)/installed  ## change the code at 100 random places: do the tests notice? (hours; COUNT=100 SEED=1)
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --group mutants
+	$(BIN)/python -m tests.mutants --count $(or $(COUNT),100) --seed $(or $(SEED),1)
 
 quick: $(VENV)/installed  ## under a minute: lint, types of what differs from the last commit, the fastest laws
 	$(BIN)/ruff check .

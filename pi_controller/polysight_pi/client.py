@@ -114,7 +114,9 @@ def take_over(instrument: Instrument, what: str) -> str:
             return ask(m.EndRun(scan_id=scan_id, exit_status="abort", reason=reason, owner=owner)).state
         if what == "abort":
             return ask(m.Abort(reason=reason, owner=owner)).state
-        return ask({"hold": m.Hold, "resume": m.Resume}[what](owner=owner)).state
+        if what == "hold":
+            return ask(m.Hold(owner=owner)).state
+        return ask(m.Resume(owner=owner)).state
 
 
 def follow_events(instrument: Instrument, timeout_s: float) -> Iterator[Any]:

@@ -348,21 +348,10 @@ class Executor:
         machine = self._machine
         stage = machine.stage
         status = m.StatusReply(
-            state=machine.wire_state,
-            homed=machine.homed,
-            x_mm=stage.x_mm,
-            y_mm=stage.y_mm,
-            scan_id=self._journal.scan_id,
-            row_index=-1,
-            take=0,
-            points=0,
-            pulses=0,
-            last_seq=self._journal.last_seq,
-            fault=machine.fault,
-            reason=machine.reason,
-            lost_x_mm=machine.lost_mm[0],
-            lost_y_mm=machine.lost_mm[1],
-        )
+            state=machine.wire_state, homed=machine.homed, x_mm=stage.x_mm, y_mm=stage.y_mm,
+            scan_id=self._journal.scan_id, row_index=-1, take=0, points=0, pulses=0, last_seq=self._journal.last_seq,
+            fault=machine.fault, reason=machine.reason, lost_x_mm=machine.lost_mm[0], lost_y_mm=machine.lost_mm[1],
+        )  # fmt: skip
         if (row := machine.row) is not None:
             counts = self._loop.counts
             status = msgspec.structs.replace(
@@ -370,15 +359,10 @@ class Executor:
             )
         self.status = status
         self.hello = m.HelloReply(
-            pi_release=__version__,
-            firmware=stage.firmware,
-            backend=self._loop.backend,
-            state=machine.wire_state,
-            scan_id=status.scan_id,
-            last_seq=status.last_seq,
-            in_run=self._run is not None,
+            pi_release=__version__, firmware=stage.firmware, backend=self._loop.backend, state=machine.wire_state,
+            scan_id=status.scan_id, last_seq=status.last_seq, in_run=self._run is not None,
             stage=stage.config.placement_settings,
-        )
+        )  # fmt: skip
 
 
 # --- limits of this rig and the radars --------------------------------------------------------------------------------

@@ -65,7 +65,8 @@ def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
         what = f"{getattr(file, 'name', 'journal')}: not a journal"
         remedy = "move it out of the journal folder"
         raise DataError(what, "another program wrote it", remedy, code=ErrorCode.FILE_FOREIGN)
-    offset, last = len(MAGIC), 0
+    offset = len(MAGIC)
+    last = 0
     while len(head := file.read(_HEAD.size)) == _HEAD.size:
         length, seq, crc = _HEAD.unpack(head)
         if length > MAX_RECORD_BYTES or seq <= last:
@@ -74,15 +75,17 @@ def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
         if len(payload) < length or _crc(seq, payload) != crc:
             return
         yield offset, seq, payload
-        offset, last = offset + _HEAD.size + length, seq
+        offset += _HEAD.size + length
+        last = seq
 
 
 def _holds_records(tail: bytes) -> bool:
     """True if a good record follows the damage; after a power cut only a torn record or zeros follow."""
     for offset in range(1, min(len(tail) - _HEAD.size, SEARCHED_BYTES)):
         length, seq, crc = _HEAD.unpack_from(tail, offset)
-        payload = tail[offset + _HEAD.size : offset + _HEAD.size + length] if 0 < length <= MAX_RECORD_BYTES else b""
-        if payload and len(payload) == length and _crc(seq, payload) == crc:
+        start = offset + _HEAD.size
+        payload = tail[start : start + length]
+        if 0 < length <= MAX_RECORD_BYTES and len(payload) == length and _crc(seq, payload) == crc:
             return True
     return False
 
@@ -95,7 +98,8 @@ class JournalFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.damage = path, ""
+        self.path = path
+        self.damage = ""
         self.last_seq = 0  # of the newest record, or of the host's newest event if that is later
         self._places: list[tuple[int, int]] = []  # sequence number and offset of each record
         self._synced = True
@@ -105,9 +109,12 @@ class JournalFile:
             raise JournalFullError(path, e) from None
         try:
             self._recover()
-        except (OSError, DataError) as e:
+        except OSError as e:
             os.close(self._fd)
-            raise (JournalFullError(path, e) if isinstance(e, OSError) else e) from None
+            raise JournalFullError(path, e) from None
+        except DataError:
+            os.close(self._fd)
+            raise
 
     def _recover(self) -> None:
         self._end = len(MAGIC)
@@ -146,7 +153,8 @@ class JournalFile:
 
         Raises JournalFullError if the disk is full or broken; the file is then unchanged.
         """
-        places, data = [], bytearray()
+        places = []
+        data = bytearray()
         for seq, payload in enumerate(payloads, self.last_seq + 1):
             places.append((seq, self._end + len(data)))
             data += _HEAD.pack(len(payload), seq, _crc(seq, payload)) + payload
@@ -167,15 +175,16 @@ class JournalFile:
 
     def read(self, from_seq: int, limit: int) -> list[bytes]:
         """Return at most `limit` payloads, starting at `from_seq`. Raises DataError for a damaged record."""
-        first, found = bisect_left(self._places, (from_seq, 0)), []
+        first = bisect_left(self._places, (from_seq, 0))
+        payloads = []
         for seq, offset in self._places[first : first + limit]:
             length, _, crc = _HEAD.unpack(os.pread(self._fd, _HEAD.size, offset))
             payload = os.pread(self._fd, length, offset + _HEAD.size)
             if _crc(seq, payload) != crc:
                 what = f"{self.path}: record {seq} is damaged"
                 raise DataError(what, "the disk or card fails", "replace it", code=ErrorCode.FILE_DAMAGED)
-            found.append(payload)
-        return found
+            payloads.append(payload)
+        return payloads
 
     def close(self) -> None:
         """Close the file once everything is on the disk. Raises JournalFullError."""
@@ -198,7 +207,9 @@ class Journal:
         publish: Callable[[list[bytes]], None] = lambda _: None,
         warn: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self.folder, self._publish, self._warn = folder, publish, warn
+        self.folder = folder
+        self._publish = publish
+        self._warn = warn
         self._file: JournalFile | None = None
         self._batch: list[tuple[m.AnyEvent, bytes]] = []
         self._pending = 0  # events of the batch that are to be written
@@ -218,8 +229,9 @@ class Journal:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(self._lock)
-            busy = f"journal folder {folder} is in use", "another polysight-pi runs"
-            raise DeviceError(*busy, "stop it, or give another --journal", code=ErrorCode.BUSY) from None
+            what = f"journal folder {folder} is in use"
+            remedy = "stop it, or give another --journal"
+            raise DeviceError(what, "another polysight-pi runs", remedy, code=ErrorCode.BUSY) from None
 
     @property
     def last_seq(self) -> int:
@@ -271,18 +283,19 @@ class Journal:
         if file is not self._file:
             if self._file is not None:
                 self._file.close()
-            self._file, self.scan_id = file, scan_id
+            self._file = file
+            self.scan_id = scan_id
         return begun is not None or host_seq > 0, file.number_behind(host_seq)
 
     def check_room(self, scan_id: str, positions: int) -> None:
         """Raise JournalFullError if the disk has no space for the rest of the scan's journal."""
         path = self.path_of(scan_id)
         try:
-            there = path.stat().st_size if path.exists() else 0
+            written = path.stat().st_size if path.exists() else 0
             free = shutil.disk_usage(self.folder).free
         except OSError as e:
             raise JournalFullError(self.folder, e) from None
-        needed = max(0, positions * CAPTURE_BYTES - there) + SPARE_BYTES
+        needed = max(0, positions * CAPTURE_BYTES - written) + SPARE_BYTES
         if free < needed:
             room = f"{free / 1e6:.1f} MB free, {needed / 1e6:.1f} MB needed for {positions} positions"
             raise JournalFullError(self.folder, OSError(errno.ENOSPC, room))
@@ -303,17 +316,20 @@ class Journal:
         Raises JournalFullError if it cannot be written. Until the scan is opened again, events are then published with
         the last good number and not stored; of this batch only statuses, faults and the end of a row are published.
         """
-        batch, self._batch, self._pending = self._batch, [], 0
+        batch = self._batch
+        self._batch = []
+        self._pending = 0
         if self._file is not None:
-            after = self._file.last_seq
-            kept = [(e, raw) for e, raw in batch if isinstance(e, m.JOURNALLED) and e.seq > after]
+            last_seq = self._file.last_seq
+            journalled = [(e, raw) for e, raw in batch if isinstance(e, m.JOURNALLED) and e.seq > last_seq]
+            sync = any(not isinstance(e, m.Capture) for e, _ in journalled)
             try:
-                if kept:
-                    self._file.write([raw for _, raw in kept], any(not isinstance(e, m.Capture) for e, _ in kept))
+                if journalled:
+                    self._file.write([raw for _, raw in journalled], sync)
             except JournalFullError:
                 self.broken = True
                 urgent = [e for e, _ in batch if isinstance(e, m.RowFinished | m.Fault | m.StageStatus)]
-                self._publish([m.pack(msgspec.structs.replace(e, seq=after)) for e in urgent])
+                self._publish([m.pack(msgspec.structs.replace(e, seq=last_seq)) for e in urgent])
                 raise
         if batch:
             self._publish([raw for _, raw in batch])
@@ -322,25 +338,28 @@ class Journal:
         """Return packed events of any scan from `from_seq` on and its newest number; ([], 0) without a journal."""
         if self._file is not None and scan_id == self.scan_id:
             return self._file.read(from_seq, limit), self.last_seq
-        found, last = [], 0
+        payloads = []
+        last = 0
         with suppress(FileNotFoundError), self.path_of(scan_id).open("rb") as file:
             for _, last, payload in records(file):
-                if last >= from_seq and len(found) < limit:
-                    found.append(payload)
-        return found, last
+                if last >= from_seq and len(payloads) < limit:
+                    payloads.append(payload)
+        return payloads, last
 
     def close(self) -> None:
         """Close the current file and unlock the folder. Raises JournalFullError."""
-        file, self._file = self._file, None
         try:
-            if file is not None:
-                file.close()
+            if self._file is not None:
+                self._file.close()
         finally:
+            self._file = None
             os.close(self._lock)
 
 
 def _plan_of(file: JournalFile) -> RasterPlan | None:
     """Return the plan of the first event, or None if there is no event yet."""
-    first = file.read(1, 1)
-    event = m.unpack_event(first[0]) if first else None
-    return event.plan if isinstance(event, m.RunStarted) else None
+    for packed in file.read(1, 1):
+        event = m.unpack_event(packed)
+        if isinstance(event, m.RunStarted):
+            return event.plan
+    return None

@@ -27,12 +27,8 @@ STATUS_EVENT_S = 0.24
 RESTS = 3  # consecutive statuses at rest after which the reply to the end of a motion counts as lost
 MOVING = ("homing", "running", "held", "stopping")
 POSITION_LOST = (
-    StageError.NOT_HOMED,
-    StageError.IN_ALARM,
-    StageError.LIMIT_SWITCH,
-    StageError.EMERGENCY_STOP,
-    StageError.DISABLED,
-)
+    StageError.NOT_HOMED, StageError.IN_ALARM, StageError.LIMIT_SWITCH, StageError.EMERGENCY_STOP, StageError.DISABLED,
+)  # fmt: skip
 
 
 class RefusedError(PolysightError):
@@ -263,18 +259,10 @@ class Machine:
         if row is None or sent.job is not row.job or not record.pulses:
             return
         self._journal.add(
-            m.Capture,
-            row_index=row.row.index,
-            take=row.take,
-            point=sent.point,
-            column=row.row.column(sent.point),
-            edge_ns=sent.edge_ns,
-            first_pulse_ns=record.first_ns,
-            last_pulse_ns=record.last_ns,
-            pulses=record.pulses,
-            width_max_ns=record.width_max_ns,
-            jitter_ns=record.jitter_ns,
-        )
+            m.Capture, row_index=row.row.index, take=row.take, point=sent.point, column=row.row.column(sent.point),
+            edge_ns=sent.edge_ns, first_pulse_ns=record.first_ns, last_pulse_ns=record.last_ns, pulses=record.pulses,
+            width_max_ns=record.width_max_ns, jitter_ns=record.jitter_ns,
+        )  # fmt: skip
         row.bursts += 1
         if row.bursts >= row.row.points:
             self.happen("all sent")
@@ -341,13 +329,9 @@ class Machine:
             return
         self._status_sent_s = now_s
         self._journal.add(
-            m.StageStatus,
-            state=reply.fields.get("state", ""),
-            x_mm=self.stage.x_mm,
-            y_mm=self.stage.y_mm,
-            points=max(0, _number(reply, "points")),
-            alarm=max(0, min(_number(reply, "alarm"), 999)),
-        )
+            m.StageStatus, state=reply.fields.get("state", ""), x_mm=self.stage.x_mm, y_mm=self.stage.y_mm,
+            points=max(0, _number(reply, "points")), alarm=max(0, min(_number(reply, "alarm"), 999)),
+        )  # fmt: skip
 
     # --- actions: homing and rows -----------------------------------------------------------------------------------
 
@@ -506,16 +490,9 @@ class Machine:
             if row.fault:
                 self._report_fault(row.fault, row.reason)
         self._journal.add(
-            m.RowFinished,
-            row_index=row.row.index,
-            take=row.take,
-            status=row.status,
-            points=row.points,
-            **counts._asdict(),
-            fault=row.fault,
-            reason=row.reason,
-            timed_by=self._loop.timed_by,
-        )
+            m.RowFinished, row_index=row.row.index, take=row.take, status=row.status, points=row.points,
+            **counts._asdict(), fault=row.fault, reason=row.reason, timed_by=self._loop.timed_by,
+        )  # fmt: skip
         self.row = None
         if row.lasting:
             return "fault"

@@ -12,11 +12,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-_PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
-_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+# <linux/prctl.h>, <linux/mman.h>
+_PR_SET_PDEATHSIG = 1
+_PR_SET_TIMERSLACK = 29
+_MCL_CURRENT_FUTURE_ONFAULT = 1 | 2 | 4
 # Of the trigger thread and of the others. All share the interpreter's lock, so a thread that holds it must not be
 # preempted by other programs.
-PRIORITY, OTHERS_PRIORITY = 50, 40
+PRIORITY = 50
+OTHERS_PRIORITY = 40
 SWITCH_INTERVAL_S = 100e-6  # the default of 5 ms is three pulse periods
 MAX_BYTES = 160 << 20  # the program needs 30 to 60 MB, a subscriber that does not read up to 50
 SPARE_BYTES = 64 << 20  # minimum above the memory left after a cut: not all freed memory returns to the system
@@ -33,7 +36,7 @@ def prepare_process() -> list[str]:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     refused = _schedule(OTHERS_PRIORITY)
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
+    if libc.mlockall(_MCL_CURRENT_FUTURE_ONFAULT) != 0:
         refused.append(
             f"memory is not locked ({os.strerror(ctypes.get_errno())}): a page fault can delay a pulse; "
             "set LimitMEMLOCK=infinity in the service"
@@ -83,7 +86,8 @@ class MemoryWatch(threading.Thread):
 
     def __init__(self, ports: set[int], warn: Callable[[str], object]) -> None:
         super().__init__(name="memory", daemon=True)
-        self._ports, self._warn = ports, warn
+        self._ports = ports
+        self._warn = warn
         self._ended = threading.Event()
         self._statm = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)  # kept open: descriptors may run out
         self._most_bytes = max(MAX_BYTES, self.resident_bytes() + SPARE_BYTES)

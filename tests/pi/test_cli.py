@@ -8,7 +8,6 @@ from tests.support.pi.fakes import FakeLines
 from tests.support.pi.program import Process
 from tests.support.rigs import at_stage_port
 
-from polysight_pi import cli
 from polysight_pi.cli import main
 from polysight_pi.trigger import BurstRecord
 from polysight_shared import messages as m
@@ -127,10 +126,3 @@ def test_an_error_of_the_system_is_a_message(command, config, monkeypatch):
     monkeypatch.setattr("polysight_pi.client.refuse_beside_service", refuse)
     status, _, err = command("jog", "--config", config)
     assert (status, "/dev/gpiochip0: Permission denied" in err, "do: " in err) == (5, True, True)
-
-
-@pytest.mark.parametrize("name", [c[0] for c in cli.COMMANDS])
-def test_every_help_has_an_example(name, capsys):
-    with pytest.raises(SystemExit) as e:
-        main([name, "--help"])
-    assert (e.value.code, f"example:  polysight-pi {name}" in capsys.readouterr().out) == (0, True)

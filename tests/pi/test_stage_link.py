@@ -1,16 +1,26 @@
-"""The serial link against a pty."""
+"""The serial link against a pty, and a port whose opening resets an UNO (DTR)."""
 
+from __future__ import annotations
+
+import json
 import queue
+import subprocess
+from contextlib import closing
 
+import msgspec
 import pytest
 from tests.support.pi.fake_stage import FakeStage
+from tests.support.processes import wait_for
 from tests.support.refusals import refused
 from tests.support.rigs import at_stage_port
+from tests.support.stage.processes import StageProcess
 
+from polysight_pi.cli import main
 from polysight_pi.stage import BenchStage, StageLink, StageLost, StageLostError, StageRefusedError
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.faults import StageError, explain
 from polysight_shared.stage_line import Command, Immediate, Reply
+from polysight_simulators.builds import sketch_compiler
 
 
 @pytest.fixture
@@ -126,3 +136,23 @@ def test_jog_and_home_by_hand(dry_stage, instrument):
         assert stage.jog(10, 5.5, 20) == (10.0, 5.5)
         assert stage.jog(-1, 0, 20) == (9.0, 5.5)
     assert dry_stage.seen[-1] == Command(dry_stage.seen[-1].sequence, "MOVE", (1800, 1100, 4000))
+
+
+@pytest.mark.slow
+def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys):
+    """Until another program lets DTR fall when it closes the port."""
+    port = tmp_path / "ttySTAGE"
+    pi = msgspec.structs.replace(instrument.pi, command_address="tcp://127.0.0.1:9")  # no service
+    arguments = ["--config", str(write_config(msgspec.structs.replace(instrument, pi=pi))), "--stage-port", str(port)]
+
+    def place(*command):
+        assert main([*command, *arguments, "--json"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    with closing(StageProcess(tmp_path, "pc" if sketch_compiler() else "python", 20.0)):
+        assert place("home") == {"x_mm": 0.0, "y_mm": 0.0}
+        assert place("jog", "--dx", "10") == {"x_mm": 10.0, "y_mm": 0.0}
+        assert place("jog", "--dx", "-4", "--dy", "1.5") == {"x_mm": 6.0, "y_mm": 1.5}
+        subprocess.run(["stty", "-F", port, "hupcl"], check=True)
+        wait_for(lambda: main(["jog", *arguments, "--dx", "1"]) != 0, "the stage's reset")
+        assert "polysight-pi home" in capsys.readouterr().err

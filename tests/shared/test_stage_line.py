@@ -57,10 +57,12 @@ def test_every_single_bit_flip_of_a_reply_is_refused(reply: Reply):
             Reply.decode(bytes(flipped))
 
 
-def test_no_immediate_byte_is_one_bit_away_from_a_line_byte():
-    alphabet = set(b"ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789 -*\n")
-    for immediate in Immediate:
-        assert not {int(immediate) ^ 1 << k for k in range(8)} & alphabet
+def test_immediate_bytes_differ_from_all_others_in_two_bits_and_resume_in_three():
+    used_in_lines = set(b"0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ-* \n")
+    for byte in Immediate:
+        others = used_in_lines if byte == Immediate.RESUME else used_in_lines | set(range(0x20, 0x7F))
+        nearest = min((byte ^ other).bit_count() for other in others | set(Immediate) - {byte})
+        assert nearest >= (3 if byte == Immediate.RESUME else 2)
 
 
 @given(st.binary(max_size=100))

@@ -12,14 +12,19 @@
 
 Lines `->` that follow each other are sent in one go. A real stage does not wait while this machine is busy: so what
 must be sent before something happens there goes in one go, or it has seconds to spare.
+
+Behind them: no flipped bit, lost byte or random bytes make any of these stages move.
 """
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
 
 import pytest
 from tests.support.stage.conversation import play
+
+from polysight_shared.stage_line import Command
 
 DIALOGUES = sorted((Path(__file__).parent / "dialogues").glob("*.txt"))
 
@@ -29,5 +34,67 @@ def test_dialogue(talker, path: Path):
     play(talker, path)
 
 
-def test_there_are_dialogues():
-    assert len(DIALOGUES) >= 9
+# In an order in which each is obeyed after the one before.
+COMMANDS = (
+    ("HELLO", ()), ("CLEAR", ()), ("SET", (0, 30_000)), ("MOVE", (12_000, 340, 4000)),
+    ("ROW", (8000, -400, 5, 1000, 4000)), ("HOME", ()), ("ENABLE", (0,)),
+)  # fmt: skip
+
+
+def test_every_damaged_line_is_refused(talker):
+    talker.ready()
+    for verb, args in COMMANDS:
+        talker.rest()
+        talker.replies()
+        at_rest = talker.status()
+        talker.still()
+        line = Command(talker.sequence + 1, verb, args).encode()
+        flips = [line[: i // 8] + bytes([line[i // 8] ^ 1 << i % 8]) + line[i // 8 + 1 :] for i in range(8 * len(line))]
+        for damaged in flips + [line[:i] + line[i + 1 :] for i in range(len(line) - 1)]:
+            talker.rx(damaged + b"\n")  # the empty line ends a line whose end is damaged
+            replies = talker.replies()
+            assert replies, f"{damaged!r}: no answer"
+            assert all(r.kind == "error" and r.sequence is None for r in replies), f"{damaged!r}: {replies}"
+            assert talker.still()
+        assert talker.status() == at_rest
+        talker.run_ms(20)
+        assert talker.still()
+        assert talker.command(verb, *args).kind == "ok"  # undamaged it is obeyed
+
+
+CHUNK = 4096
+
+
+@pytest.mark.timeout(600)
+def test_random_bytes(talker, request: pytest.FixtureRequest):
+    amount = 1_000_000 if request.config.getoption("--long") else 24_000
+    rng = random.Random(amount)
+    talker.ready()
+    talker.still()
+    for _ in range(-(-amount // CHUNK)):
+        talker.rx(rng.randbytes(CHUNK))
+        assert talker.still()
+        talker.received = b""
+    talker.run_ms(200)
+    assert talker.still()
+    talker.resync()
+    assert talker.command("CLEAR").kind == "ok"  # a STOP may have been among them
+    done, _ = talker.motion("MOVE", 500, 400, 4000)
+    assert (done.kind, done.integer("x"), done.integer("y")) == ("done", 500, 400)
+
+
+@pytest.mark.timeout(600)
+def test_almost_lines(talker, request: pytest.FixtureRequest):
+    """Random lines of the characters of commands."""
+    amount = 10_000 if request.config.getoption("--long") else 300
+    rng = random.Random(amount)
+    talker.ready()
+    talker.still()
+    for _ in range(amount):
+        words = [rng.choice(["N", "N1", "N65536", "MOVE", "ROW", "HOME", "-", "-1", "0", "99999999999", "*", "*0000"])]
+        words += [
+            rng.choice([" ", "", "N2", "MOVE", "1", "-2147483648", "\t", "*FFFF"]) for _ in range(rng.randint(0, 40))
+        ]
+        talker.rx("".join(words).encode() + b"\n")
+        assert all(r.kind == "error" for r in talker.replies())
+    assert talker.still()

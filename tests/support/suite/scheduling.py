@@ -13,7 +13,6 @@ from xdist.scheduler import LoadScopeScheduling
 TOGETHER = {
     "tests/process/test_drawn_boxes.py": "tests/process/test_laws.py",
     "tests/process/test_products.py": "tests/process/test_samples.py",
-    "tests/stage/test_tables.py": "tests/stage/test_flash.py",
 }
 """Files whose tests share an expensive fixture with another file's."""
 

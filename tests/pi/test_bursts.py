@@ -1,0 +1,397 @@
+"""Laws of bursts, by the program and by the SPI controller, and of the trigger loop, on clocks that tests turn."""
+
+from __future__ import annotations
+
+import itertools
+import queue
+import random
+import threading
+from contextlib import closing
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.support.pi.fakes import FakeLines, gone
+from tests.support.refusals import refused
+from tests.support.rigs import published_rig
+
+from polysight_pi.lines import SpiWireLines
+from polysight_pi.trigger import (
+    DEFAULT_BUFSIZ,
+    FIRST_PULSE_DELAY_NS,
+    MAX_HZ,
+    MIN_BYTES,
+    MIN_HZ,
+    BurstSent,
+    BurstSpec,
+    Counts,
+    Edge,
+    LoopFault,
+    SpiBurst,
+    TriggerLoop,
+    send_burst,
+    spi_burst,
+)
+from polysight_shared import messages as m
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.faults import PiFault
+from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_WIDTH_NS
+from polysight_shared.wires import WireClient, WireEdge
+
+PERIOD = 1_500_000
+SPEC = BurstSpec(16, PERIOD, 1000)
+
+
+@given(
+    pulses=st.integers(1, 40),
+    period=st.integers(MIN_PERIOD_NS, 10**7),
+    start=st.integers(0, 10**12),
+    late=st.lists(st.integers(0, 50_000), min_size=1),
+)
+def test_deadlines_do_not_drift(pulses, period, start, late):
+    """Each pulse is late by its own lateness alone, whatever happened to those before it."""
+    lines = FakeLines(late=lambda n: late[n // 2 % len(late)] if n % 2 == 0 else 0)
+    spec = BurstSpec(pulses, period + 50_000, 1000)
+    sent = send_burst(lines, spec, start + 1)
+    assert sent.fault == 0
+    lateness = [late[k % len(late)] for k in range(pulses)]
+    assert lines.rises == [start + 1 + k * spec.period_ns + lateness[k] for k in range(pulses)]
+    assert sent.jitter_ns == max(lateness)
+    assert (sent.first_ns, sent.last_ns, sent.pulses) == (lines.rises[0], lines.rises[-1], pulses)
+    assert not lines.level
+
+
+def test_a_start_that_has_passed_moves_the_whole_burst():
+    lines = FakeLines()
+    lines.t = 5_000
+    send_burst(lines, SPEC, 1_000)
+    assert lines.rises == [5_000 + k * PERIOD for k in range(16)]
+
+
+@given(st.integers(0, 15), st.integers(0, 10_000), st.integers(0, 10_000))
+def test_width_is_an_upper_bound_of_every_pulse(k, set_ns, clear_ns):
+    """The line changes at an unknown time within each call, so the bound covers both calls completely."""
+    lines = FakeLines(long=lambda n: set_ns if n == 2 * k else clear_ns if n == 2 * k + 1 else 0)
+    sent = send_burst(lines, SPEC, 1_000)
+    worst = max(1000, set_ns) + clear_ns
+    assert sent.width_max_ns == worst
+    assert sent.fault == (PiFault.PULSE_TOO_LONG if worst > 4000 else 0)
+    assert sent.pulses == (k + 1 if worst > 4000 else 16)
+    lines = FakeLines(long=lines.long)
+    lines.check_width = False
+    free = send_burst(lines, SPEC, 1_000)
+    assert (free.fault, free.pulses) == (0, 16)
+
+
+@given(st.integers(1, 15), st.integers(0, 3 * PERIOD))
+def test_a_pulse_too_early_for_the_radar_is_never_sent(k, late):
+    """Pulse k is late; the next one may be too close, and is then left out."""
+    lines = FakeLines(late=lambda n: late if n == 2 * (k - 1) else 0)
+    sent = send_burst(lines, SPEC, 1_000)
+    gaps = [b - a for a, b in zip(lines.rises, lines.rises[1:], strict=False)]
+    assert all(g >= MIN_PERIOD_NS for g in gaps)
+    assert sent.fault == (PiFault.PERIOD_TOO_SHORT if late > PERIOD - MIN_PERIOD_NS and k < 16 else 0)
+    assert sent.pulses == len(lines.rises)
+
+
+def test_the_spacing_includes_the_previous_burst():
+    sent = send_burst(FakeLines(), SPEC, 1_000_000, previous_rise_ns=1_000_000 - MIN_PERIOD_NS + 1)
+    assert (sent.pulses, sent.fault) == (0, PiFault.PERIOD_TOO_SHORT)
+
+
+class Loop:
+    def __init__(self, points=3, lines=None):
+        self.lines, self.posted = lines or FakeLines(), queue.SimpleQueue()
+        self.loop = TriggerLoop(self.lines, self.posted.put, lambda: None)
+        self.job = self.loop.arm(points, SPEC)
+        self.loop.start()
+
+    def edge(self, t_ms, seqno):
+        self.lines.edges.put(Edge(t_ms * 1_000_000, seqno))
+
+    def next(self):
+        return self.posted.get(timeout=5)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        assert self.loop.stop(5)
+        assert self.lines.closed
+        assert not self.lines.level
+
+
+def test_each_edge_gets_its_burst_at_a_fixed_delay():
+    with Loop() as x:
+        for i in range(3):
+            x.edge(100 * (i + 1), 7 + i)
+        for i in range(3):
+            sent = x.next()
+            assert (sent.point, sent.edge_ns, sent.record.pulses) == (i, 100_000_000 * (i + 1), 16)
+            assert sent.record.first_ns == sent.edge_ns + FIRST_PULSE_DELAY_NS
+        assert x.loop.disarm() == Counts(3, 3, 48)
+
+
+@pytest.mark.parametrize(
+    ("edges", "number", "bursts"),
+    [
+        ([(100, 1), (200, 3)], PiFault.EDGE_LOST, 1),
+        ([(100, 1), (110, 2)], PiFault.EDGE_DURING_BURST, 1),
+        ([(100, 1), (200, 2), (300, 3), (400, 4)], PiFault.POINTS_MISMATCH, 3),
+    ],
+)
+def test_fault_table_of_the_loop(edges, number, bursts):
+    with Loop() as x:
+        for e in edges:
+            x.edge(*e)
+        for _ in range(bursts):
+            assert isinstance(x.next(), BurstSent)
+        fault = x.next()
+        assert isinstance(fault, LoopFault)
+        assert (fault.number, fault.job) == (number, x.job)
+        x.edge(900, 99)  # nothing is answered after a fault
+        x.edge(901, 100)
+        while x.loop.strays < 2:
+            pass
+        assert x.loop.disarm() == Counts(len(edges), bursts, 16 * bursts)
+
+
+@pytest.mark.parametrize("number", [PiFault.PULSE_TOO_LONG, PiFault.PERIOD_TOO_SHORT])
+def test_a_failed_burst_is_reported_and_then_a_fault(number):
+    long = number == PiFault.PULSE_TOO_LONG
+    lines = FakeLines(
+        long=lambda n: 5_000 if long and n == 4 else 0, late=lambda n: 0 if long or n != 2 else PERIOD - 100_000
+    )
+    with Loop(lines=lines) as x:
+        x.edge(100, 1)
+        assert x.next().record.pulses == (3 if long else 2)
+        assert x.next().number == number
+
+
+def test_edges_from_before_arming_or_while_disarmed_are_no_points():
+    with Loop() as x:
+        x.loop.disarm()
+        x.edge(100, 1)
+        while not x.loop.strays:
+            pass
+        job = x.loop.arm(3, SPEC)
+        assert job.armed_ns == 100_000_000
+        x.edge(100, 2)
+        x.edge(200, 3)
+        assert x.next().point == 0
+        assert x.loop.strays == 2
+
+
+def test_lines_that_vanish_are_a_fault():
+    with Loop() as x:
+        x.lines.edges.put(gone())
+        fault = x.next()
+        assert (fault.number, fault.job) == (PiFault.TRIGGER_LINE_LOST, None)
+
+
+def test_an_exception_inside_a_pulse_leaves_the_outputs_low_and_is_a_fault(monkeypatch):
+    raised = queue.SimpleQueue()
+    monkeypatch.setattr("threading.excepthook", lambda args: raised.put(args.exc_value))
+
+    def fail(n):
+        if n == 1:
+            raise ZeroDivisionError("a bug")
+        return 0
+
+    with Loop(lines=FakeLines(late=fail)) as x:
+        x.edge(100, 1)
+        fault = x.next()
+        assert (fault.number, fault.job) == (PiFault.TRIGGER_LINE_LOST, None)
+        assert "a bug" in fault.detail
+        assert isinstance(raised.get(timeout=60), ZeroDivisionError)
+        assert tuple(active for _, active in x.lines.changes) == (True, False)
+
+
+def test_disarming_ends_a_running_burst_after_its_pulse():
+    def disarm(n):
+        if n == 4:  # the third pulse is awaited
+            threading.Thread(target=lambda: counted.put(x.loop.disarm())).start()
+            while x.loop._job is not None:
+                pass
+        return 0
+
+    counted = queue.SimpleQueue()
+    with Loop(lines=FakeLines(late=disarm)) as x:
+        x.edge(100, 1)
+        assert x.next().record.pulses == 3
+        assert counted.get(timeout=60) == Counts(1, 1, 3)
+
+
+def test_stop_within_a_burst_ends_it_at_a_whole_pulse():
+    stop = iter([False, False, True])
+    lines = FakeLines()
+    assert send_burst(lines, SPEC, 0, stop=lambda: next(stop)).pulses == 2
+    assert not lines.level
+
+
+bursts = st.tuples(st.integers(1, 256), st.integers(MIN_PERIOD_NS, 20_000_000), st.integers(MIN_WIDTH_NS, MAX_WIDTH_NS))
+ROOMY = 1 << 22
+
+
+def ones(data: bytes) -> list[int]:
+    """Indices of the set bits, most significant bit first."""
+    return np.flatnonzero(np.unpackbits(np.frombuffer(data, np.uint8))).tolist()
+
+
+@given(bursts)
+def test_one_set_bit_a_pulse_at_its_place(burst):
+    pulses, period_ns, width_ns = burst
+    made = spi_burst(BurstSpec(pulses, period_ns, width_ns), ROOMY)
+    assert MIN_HZ <= made.clock_hz <= MAX_HZ
+    assert 500 <= made.bit_ns <= 2000
+    assert MIN_WIDTH_NS <= made.bit_ns <= MAX_WIDTH_NS
+    found = ones(made.data)
+    assert tuple(found) == made.bits
+    assert len(found) == pulses
+    for k, bit in enumerate(found):
+        assert abs((bit - found[0]) * made.bit_ns - k * period_ns) <= made.bit_ns / 2 + 1
+    for a, b in itertools.pairwise(found):
+        assert abs((b - a) * made.bit_ns - period_ns) <= made.bit_ns + 1
+    assert made.data[0] == made.data[-1] == 0, "low before and after"
+    assert len(made.data) >= MIN_BYTES
+
+
+@given(bursts, st.integers(MIN_BYTES, 65_536))
+def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
+    needed = len(spi_burst(BurstSpec(*burst), ROOMY).data)
+    slowest = len(spi_burst(BurstSpec(burst[0], burst[1], 2000), ROOMY).data)
+    if slowest > bufsiz:
+        with refused(ErrorCode.VALUES_CONFLICT, bufsiz) as e:
+            spi_burst(BurstSpec(*burst), bufsiz)
+        wanted = int(e.value.remedy.partition("bufsiz=")[2].partition("`")[0])
+        assert slowest <= wanted
+        spi_burst(BurstSpec(*burst), wanted)
+    else:
+        assert len(spi_burst(BurstSpec(*burst), bufsiz).data) <= min(bufsiz, max(needed, slowest))
+
+
+def test_the_published_burst_fits_every_pi_as_it_comes():
+    b = published_rig().burst
+    made = spi_burst(BurstSpec.of(b))
+    assert SpiWireLines.bufsiz == DEFAULT_BUFSIZ == 4096
+    assert (made.clock_hz, len(made.data)) == (1_000_000, 2815)
+    assert [y - x for x, y in itertools.pairwise(made.bits)] == [1500] * 15
+
+
+class Controller:
+    """An SPI controller whose clock is `rate` times the requested one, and that begins `late_ns` late."""
+
+    name = "fake"
+    check_width = True
+
+    def __init__(self, rate: float = 1.0, late_ns: int = 30_000, bufsiz: int = 4096) -> None:
+        self.t, self.rate, self.late_ns, self.bufsiz = 0, rate, late_ns, bufsiz
+        self.sent: list[tuple[int, SpiBurst]] = []
+
+    def now_ns(self) -> int:
+        return self.t
+
+    def sleep_until(self, t_ns: int) -> None:
+        self.t = max(self.t, t_ns)
+
+    def wait_edge(self, timeout_s: float) -> None: ...
+    def close(self) -> None: ...
+
+    def transfer(self, burst: SpiBurst) -> tuple[int, int]:
+        before, self.t = self.t, self.t + self.late_ns + round(burst.duration_ns / self.rate)
+        self.sent.append((before + self.late_ns, burst))
+        return before, self.t
+
+
+@pytest.mark.parametrize("late_ns", [0, 30_000, 200_000])
+def test_a_record_bounds_what_the_controller_did(late_ns):
+    lines = Controller(late_ns=late_ns)
+    record = send_burst(lines, SPEC, 1_000_000)
+    ((began, burst),) = lines.sent
+    first = began + round(burst.bits[0] * burst.bit_ns)
+    assert (record.pulses, record.fault) == (16, 0)
+    assert abs(record.first_ns - first) <= record.jitter_ns
+    assert record.last_ns - record.first_ns == 15 * 1_500_000
+    assert 1000 <= record.width_max_ns <= 1010
+    assert record.jitter_ns <= late_ns
+
+
+def test_no_position_is_lost_to_a_width_fault():
+    """10,000 positions of the shipped rig file; the kernel is up to 5 ms late in every call."""
+    pi, rng = published_rig().pi, random.Random(1)
+    assert pi.wiring == "spi"
+    lines = Controller()
+    faults = 0
+    for _ in range(10_000):
+        lines.late_ns = rng.randrange(5_000_000)
+        faults += send_burst(lines, SPEC, lines.t + 100_000_000).fault != 0
+    assert (faults, len(lines.sent)) == (0, 10_000)
+
+
+def test_a_burst_can_be_stopped_only_before_it_begins():
+    lines = Controller()
+    asked = []
+    record = send_burst(lines, SPEC, 0, None, lambda: bool(asked.append(1)))
+    assert (record.pulses, len(asked)) == (16, 1)
+    assert send_burst(lines, SPEC, 50_000_000, None, lambda: True).pulses == 0
+    assert len(lines.sent) == 1
+
+
+@pytest.mark.parametrize(("rate", "fault"), [(1.0, 0), (1.6, PiFault.PERIOD_TOO_SHORT), (0.2, PiFault.PULSE_TOO_LONG)])
+def test_a_wrong_clock_is_a_fault(rate, fault):
+    """A Pi's core clock changes where `core_freq` is not fixed, and with it the SPI clock."""
+    assert send_burst(Controller(rate), SPEC, 0).fault == fault
+
+
+def test_a_burst_that_would_come_too_soon_is_not_sent():
+    lines = Controller()
+    record = send_burst(lines, SPEC, 1_000_000, previous_rise_ns=1_000_000 - MIN_PERIOD_NS + 50_000)
+    assert (record.pulses, record.fault, lines.sent) == (0, PiFault.PERIOD_TOO_SHORT, [])
+
+
+@pytest.fixture
+def rises(hub, instrument):
+    """Wire times of the next rising edges, each followed by its falling one."""
+    with closing(WireClient(hub, listen=instrument.pi.sync_out)) as radar:
+
+        def rises(pulses, width_ns=1000):
+            edges = [radar.receive(5) for _ in range(2 * pulses)]
+            assert all(isinstance(e, WireEdge) for e in edges)
+            assert [e.value for e in edges] == [1, 0] * pulses
+            assert {b.t_ns - a.t_ns for a, b in zip(edges[::2], edges[1::2], strict=True)} == {width_ns}
+            return [e.t_ns for e in edges[::2]]
+
+        yield rises
+        assert radar.receive(0.2) is None, "no pulse more"
+
+
+def test_every_pulse_is_sent_once_and_bursts_keep_their_distance(pi, rises):
+    sent = [pi.host.ask(m.Pulse(pulses=n, period_us=400.0, width_us=1.0)) for n in (3, 20)]
+    assert [(s.pulses, s.width_max_ns, s.fault, s.timed_by) for s in sent] == [
+        (3, 1000, 0, "spi"),
+        (20, 1000, 0, "spi"),
+    ]
+    steps = [b - a for a, b in pairwise(rises(23))]
+    assert steps[2] >= 400_000  # between two bursts
+    assert steps[:2] + steps[3:] == [400_000] * 21
+
+
+def test_pulses_beyond_one_transfer_are_sent_in_several(pi, rises):
+    """64 pulses do not fit in spidev's buffer: none is lost, none comes too early."""
+    sent = pi.host.ask(m.Pulse(pulses=64, period_us=1500.0, width_us=1.0))
+    assert (sent.pulses, sent.fault, sent.timed_by) == (64, 0, "spi")
+    assert min(b - a for a, b in pairwise(rises(64, width_ns=2000))) >= 1_500_000
+
+
+def test_a_row_afterwards_is_complete_and_during_a_run_no_pulse_is_sent(pi, instrument):
+    pulse = m.Pulse(pulses=5, period_us=1500.0, width_us=1.0)
+    assert not pi.host.ask(m.Hello()).in_run
+    assert pi.host.ask(pulse).pulses == 5
+    pi.host.accepted(pi.host.begin())
+    assert pi.host.ask(m.Hello()).in_run
+    assert pi.host.refused(pulse) == PiFault.NOT_READY
+    pi.host.home()
+    done = pi.host.row(0)
+    assert (done.status, done.pulses) == ("done", instrument.grid.columns * instrument.burst.pulses)

@@ -1,0 +1,377 @@
+"""`polysight-pi` with the unmodified gpiod bindings on a stand-in GPIO chip and SPI controller (simulated).
+
+The stand-ins are built from the kernel's headers and drivers, in C. Every wait is for a condition; nothing here is
+asserted on the wall clock.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import pytest
+from tests.support.paths import REPO
+from tests.support.pi.program import require_stand_in_chip, run
+from tests.support.pi.wires_log import WiresLog
+from tests.support.stage.processes import StageProcess
+
+from polysight_pi.system import OTHERS_PRIORITY, PRIORITY
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
+from polysight_shared.wires import WireEdge
+from polysight_simulators import gpio, uno
+
+require_stand_in_chip()
+
+TRIGGER, SYNC, MOSI = 26, 22, 10
+POINTS = 4
+replace = msgspec.structs.replace
+
+
+@pytest.fixture
+def rig(gpio_rig):
+    """Pulses behind a one-shot: this machine may be too busy for 4 us."""
+    burst = replace(gpio_rig.burst, pulses=4, period_us=2000.0)
+    grid, pi = replace(gpio_rig.grid, columns=POINTS), replace(gpio_rig.pi, one_shot=True)
+    return replace(gpio_rig, pi=pi, burst=burst, grid=grid)
+
+
+@pytest.fixture
+def long_bursts(rig):
+    """Bursts of 0.8 s, so that the test can act during a burst on a busy machine."""
+    burst = replace(rig.burst, pulses=9, period_us=100_000.0)
+    return replace(rig, burst=burst, stage=replace(rig.stage, speed_mm_s=2.0))
+
+
+@pytest.fixture
+def wires(hub):
+    log = WiresLog(hub, TRIGGER, SYNC, MOSI)
+    yield log
+    log.close()
+
+
+@pytest.fixture
+def in_row(start, stage, hub, wires):
+    """Starts the program on a chip with these faults and a row whose edges the test sends; sends the first one."""
+
+    def in_row(rig, *faults):
+        program, host = start(rig, **gpio.environment(rig.pi.gpio_chip, hub, faults=faults))
+        stage.skip = set(range(rig.grid.columns))  # no edges of its own
+        stage.pace_s = 0.05
+        host.accepted(host.begin())
+        host.home()
+        host.start_row()
+        host.wait(m.RowStarted)
+        wires.drive(*edge())
+        return program, host
+
+    return in_row
+
+
+def edge(t_us=1):
+    return WireEdge(t_us * 1000, TRIGGER, 1), WireEdge(t_us * 1000 + 20_000, TRIGGER, 0)
+
+
+def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires):
+    """Every edge of the row gets its burst, and the capture events agree with the wire."""
+    stage.pace_s = 0.1
+    program, host = start(rig, **gpio.environment(rig.pi.gpio_chip, hub))
+    assert host.ask(m.Hello()).backend == "gpiod"
+    host.accepted(host.begin())
+    host.home()
+    for take in range(1, 6):  # a machine that was too busy for a row reports so, and the row is retaken
+        before = len(wires.rises(SYNC))
+        done = host.row(0, take)
+        captures = [e for e in host.of(m.Capture) if e.take == take]
+        wires.until(lambda: len(wires.rises(SYNC)) - before == done.pulses)  # noqa: B023
+        assert sum(c.pulses for c in captures) == done.pulses
+        if done.status == "done":
+            break
+        assert done.fault in (PiFault.EDGE_DURING_BURST, PiFault.PERIOD_TOO_SHORT), done.reason
+    assert (done.points, done.edges, done.bursts, done.pulses) == (POINTS, POINTS, POINTS, 4 * POINTS)
+    memory = Path(f"/proc/{program.popen.pid}/status").read_text().partition("VmHWM:")[2].split()[0]
+    assert int(memory) < 60_000, f"more than 60 MB: {memory} KB"
+    rises = wires.rises(SYNC)[before:]
+    for c, k in zip(captures, range(0, len(rises), 4), strict=True):
+        burst = rises[k : k + 4]
+        # The program's stamps are from before its call, the chip's from within it.
+        assert c.edge_ns < c.first_pulse_ns <= burst[0]
+        assert c.last_pulse_ns <= burst[-1] <= c.last_pulse_ns + c.width_max_ns
+        assert all(b - a >= 300_000 for a, b in pairwise(burst)), "never closer than the radar allows"
+    status, _, err = program.end()
+    assert status == 0, err
+    assert wires.level(SYNC) == 0
+
+
+@pytest.mark.parametrize(
+    ("edges", "fault", "lost"),
+    [
+        ([1000], PiFault.EDGE_DURING_BURST, ""),
+        # While the first burst is sent, more edges come than the kernel keeps, the newest 1024.
+        ([1000 + 100 * k for k in range(1100)], PiFault.EDGE_LOST, "76 edges"),
+    ],
+)
+def test_edges_during_a_burst_end_the_row_alone(long_bursts, in_row, wires, edges, fault, lost):
+    _, host = in_row(long_bursts)
+    wires.until(lambda: bool(wires.rises(SYNC)))
+    wires.drive(*(e for t_us in edges for e in edge(t_us)))
+    done = host.wait(m.RowFinished)
+    assert (done.status, done.fault, done.bursts) == ("fault", fault, 1), done.reason
+    assert lost in done.reason
+    assert host.of(m.Fault)[-1].number == fault
+    host.until_state("ready")
+
+
+def test_a_chip_that_vanishes_is_fault_107(rig, in_row, wires):
+    program, host = in_row(rig)
+    host.wait(m.Capture)
+    program.popen.send_signal(gpio.VANISH)
+    done = host.wait(m.RowFinished)
+    assert (done.status, done.fault) == ("fault", PiFault.TRIGGER_LINE_LOST)
+    assert "No such device" in host.until_state("fault").reason
+    assert host.refused(m.Home()) == PiFault.TRIGGER_LINE_LOST
+    ended, _, err = program.end()
+    assert ended == 0, err
+    wires.until(lambda: wires.level(SYNC) == 0)
+
+
+def test_a_line_in_use_ends_the_program_with_fault_and_remedy(rig, write_config, stage, hub):
+    """The other faults of a chip are those of `polysight-pi check` (test_checks.py): the same code opens the lines."""
+    environment = gpio.environment(rig.pi.gpio_chip, hub, faults=("busy:22",))
+    done = run("run", "--config", write_config(rig), "--stage-port", stage.port, **environment)
+    assert done.returncode == 5
+    assert all(text in done.stderr for text in ("fault 107", "line 22", "'another-program'", "do: ")), done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_outputs_are_low_after_a_signal_inside_a_pulse(rig, in_row, wires, number):
+    """The chip takes half a second to change an output: the signal comes while the line is high."""
+    program, _ = in_row(rig, "slow:500000")
+    wires.until(lambda: wires.level(SYNC) == 1)
+    status, _, err = program.end(number)
+    assert status == (0 if number == signal.SIGTERM else -signal.SIGKILL), err
+    wires.until(lambda: wires.level(SYNC) == 0)
+    assert len(wires.rises(SYNC)) == 1
+
+
+CHIP_PROGRAM = """
+import os, sys
+from datetime import timedelta
+from pathlib import Path
+import gpiod, msgspec
+from polysight_pi.lines import GpiodLines, find_chip
+from polysight_shared.config import load_instrument
+chip = Path(os.environ["GPIOSHIM_CHIP"])
+assert find_chip("pinctrl-bcm2835", chip.parent) == str(chip)
+rig = load_instrument(Path("instrument.toml"))
+pi = msgspec.structs.replace(rig.pi, gpio_chip=str(chip), trigger_bias="pull-up", trigger_debounce_us=2000)
+lines = GpiodLines(pi)
+with gpiod.Chip(str(chip)) as c:
+    i, o = c.get_line_info(pi.trigger_in), c.get_line_info(pi.sync_out[0])
+print(i.used, i.consumer, i.edge_detection.name, i.bias.name, i.event_clock.name, i.debounce_period, flush=True)
+print(o.used, o.consumer, o.direction.name, flush=True)
+edge = lines.wait_edge(60)
+print("edge", edge.seqno, lines.wait_edge(0.2), flush=True)
+lines.close()
+"""
+
+
+def test_settings_reach_the_chip_and_glitches_do_not_reach_us(hub, wires, tmp_path):
+    """Bias, debouncing, clock, consumer: read back from the chip, which is found by its label."""
+    environment = {**os.environ, **gpio.environment(tmp_path / "gpiochip0", hub)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", CHIP_PROGRAM], stdout=subprocess.PIPE, text=True, cwd=REPO, env=environment
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "True polysight RISING PULL_UP MONOTONIC 0:00:00.002000\n"
+        assert process.stdout.readline() == "True polysight OUTPUT\n"
+        wires.drive(WireEdge(0, TRIGGER, 0))
+        wires.drive(WireEdge(10_000_000, TRIGGER, 1), WireEdge(10_500_000, TRIGGER, 0))  # 0.5 ms: a glitch
+        wires.drive(WireEdge(20_000_000, TRIGGER, 1), WireEdge(25_000_000, TRIGGER, 0))  # 5 ms
+        assert process.stdout.readline() == "edge 1 None\n"
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def spi_rig(instrument, tmp_path):
+    """The shipped wiring, on a stand-in chip and a stand-in controller."""
+    assert instrument.pi.wiring == "spi"
+    devices = {"gpio_chip": str(tmp_path / "chip"), "spi_device": str(tmp_path / "spidev0.0")}
+    return msgspec.structs.replace(instrument, pi=msgspec.structs.replace(instrument.pi, **devices))
+
+
+@pytest.fixture
+def homed(spi_rig, start):
+    """Starts the program with these settings of the controller, begins a run and homes; gives both ends."""
+
+    def homed(hub=None, wire_time=True, **settings):
+        environment = gpio.environment(
+            spi_rig.pi.gpio_chip, hub, wire_time=wire_time, spi=spi_rig.pi.spi_device, **settings
+        )
+        program, host = start(spi_rig, **environment)
+        host.accepted(host.begin())
+        host.home()
+        return program, host
+
+    return homed
+
+
+@pytest.mark.slow
+def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, homed, hub, wires):
+    """Bits on MOSI with the widths and spacing of the real clock, here 0.4 % fast: the program believes 250 MHz."""
+    program, host = homed(hub, core_hz="250e6,251e6")
+    rate = 1 / 1.004
+    assert host.ask(m.Hello()).backend == "spi"
+    done = host.row(0)
+    assert (done.status, done.timed_by) == ("done", "spi"), done.reason
+    status, _, err = program.end()
+    assert status == 0, err
+    n, period_ns = spi_rig.burst.pulses, spi_rig.burst.period_us * 1e3
+    wires.until(lambda: len([e for e in wires.edges if e.line == MOSI]) == 2 * n * spi_rig.grid.columns)
+    edges = [e for e in wires.edges if e.line == MOSI]
+    rises, falls = edges[::2], edges[1::2]
+    assert [e.value for e in edges] == [1, 0] * (n * spi_rig.grid.columns)
+    assert all(abs(b.t_ns - a.t_ns - 1000 * rate) <= 1 for a, b in zip(rises, falls, strict=True))
+    for i, c in enumerate(host.of(m.Capture)):
+        burst = rises[i * n : (i + 1) * n]
+        assert all(abs(b.t_ns - a.t_ns - period_ns * rate) <= 1 for a, b in pairwise(burst))
+        assert abs(burst[0].t_ns - c.first_pulse_ns) <= c.jitter_ns + 1
+        assert c.edge_ns < burst[0].t_ns
+        assert c.width_max_ns >= 1000 * rate
+
+
+@pytest.mark.slow
+def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(homed, hub):
+    """A run whose bursts exceed spidev's `bufsiz` is refused at once; the next one runs."""
+    _, host = homed(hub, bufsiz="512")
+    refused = host.ask(msgspec.structs.replace(host.begin(), pulses=2, period_us=20_000.0, speed_mm_s=5.0))
+    assert isinstance(refused, m.Refused)
+    assert (refused.number, "bufsiz=" in refused.remedy) == (PiFault.BAD_REQUEST, True)
+    assert host.row(0).status == "done"
+
+
+@pytest.mark.slow
+def test_a_killed_program_leaves_the_line_low(spi_rig, homed, hub, wires, stage):
+    """The kernel ends the transfer; its last bits are low."""
+    stage.skip = set(range(spi_rig.grid.columns))
+    program, host = homed(hub, wire_time=False)
+    host.start_row()
+    host.wait(m.RowStarted)
+    wires.drive(WireEdge(1000, TRIGGER, 1), WireEdge(21_000, TRIGGER, 0))
+    wires.until(lambda: bool(wires.rises(MOSI)))
+    program.popen.kill()
+    program.popen.wait()
+    wires.until(lambda: len(wires.rises(MOSI)) == spi_rig.burst.pulses)
+    wires.until(lambda: wires.level(MOSI) == 0)
+
+
+@pytest.mark.slow
+def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_rig, write_config):
+    """With the line low all the time; a busy computer may need several attempts."""
+
+    def findings(spi_rig, **settings):
+        environment = gpio.environment(spi_rig.pi.gpio_chip, spi=spi_rig.pi.spi_device, **settings)
+        found = run("check", "--json", "--config", write_config(spi_rig), **environment).stdout
+        return {f["name"]: f for f in json.loads(found)}
+
+    found = next(f for _ in range(20) if (f := findings(spi_rig))["pulse width"]["verdict"] == "ok")
+    assert found["SYNC_IN line 10"]["verdict"] == "ok"
+    longer = msgspec.structs.replace(spi_rig, burst=msgspec.structs.replace(spi_rig.burst, pulses=16))
+    found = findings(longer, bufsiz="512")
+    assert "512 bytes" in found["SYNC_IN line 10"]["found"]
+    assert "options spidev bufsiz=4096" in found["pulse width"]["remedy"]
+
+
+@pytest.mark.slow
+def test_every_point_of_a_row_is_a_burst(gpio_rig, hub, wires, start, write_config, tmp_path):
+    """The whole chain: the sketch's machine code on an emulated UNO, serial line, trigger wire, bindings, chip.
+
+    The published burst and spacing in wire time, so that the machine may be busy; `make test-uml` has 350 points.
+    """
+    if lacking := uno.missing():
+        pytest.skip(f"no emulated UNO without {' '.join(lacking)}: {uno.ENABLING_COMMAND}")
+    points, pulses, period_ns = 100, 16, 1_500_000
+    place = {"centre_x_mm": points + 3.0, "centre_y_mm": 2.0}
+    rig = replace(
+        gpio_rig,
+        grid=replace(gpio_rig.grid, columns=points, rows=1),
+        burst=replace(gpio_rig.burst, pulses=pulses, period_us=period_ns / 1e3),
+        stage=replace(gpio_rig.stage, port=str(tmp_path / "ttySTAGE"), heartbeat_ms=10_000, **place),
+    )
+    with closing(StageProcess(tmp_path, "uno", 3.0, hub, write_config(rig))):
+        program, host = start(rig, **gpio.environment(rig.pi.gpio_chip, hub, wire_time=True))
+        host.accepted(host.begin())
+        host.home()
+        done = host.row(0)
+        wires.until(lambda: len(wires.rises(SYNC)) == done.pulses)
+        assert (done.status, program.end()[0], wires.level(SYNC)) == ("done", 0, 0), done.reason
+    assert (done.points, done.edges, done.bursts, done.pulses) == (points, points, points, points * pulses)
+    assert len(wires.rises(TRIGGER)) == points
+    assert [e.seq for e in host.journalled] == list(range(1, len(host.journalled) + 1))
+    captures = host.of(m.Capture)
+    assert [(c.point, c.column, c.pulses) for c in captures] == [(i, i, pulses) for i in range(points)]
+    edges = [e for e in wires.edges if e.line == SYNC]
+    assert [e.value for e in edges] == [1, 0] * (points * pulses)
+    for c in captures:
+        burst = edges[2 * pulses * c.point : 2 * pulses * (c.point + 1)]
+        widths = [fall.t_ns - rise.t_ns for rise, fall in zip(burst[::2], burst[1::2], strict=True)]
+        assert max(widths) <= c.width_max_ns, "the bound holds for every pulse on the wire"
+        assert c.edge_ns < c.first_pulse_ns <= burst[0].t_ns
+        drift = c.last_pulse_ns - c.first_pulse_ns - (pulses - 1) * period_ns
+        assert abs(drift) <= c.jitter_ns, "deadlines are absolute: only the last pulse's own lateness shows"
+
+
+PR_CAPBSET_DROP, CAP_IPC_LOCK, CAP_SYS_NICE = 24, 14, 23
+
+
+def may_schedule():
+    code = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+def priorities(pid):
+    """Of the threads of a process that are in real time."""
+    tasks = [int(t.name) for t in Path(f"/proc/{pid}/task").iterdir()]
+    return [os.sched_getparam(t).sched_priority for t in tasks if os.sched_getscheduler(t) == os.SCHED_FIFO]
+
+
+def test_all_threads_are_scheduled_and_the_trigger_thread_first(start, gpio_rig):
+    """They share the interpreter's lock: a thread that holds it must not be preempted by other programs."""
+    if not may_schedule():
+        pytest.skip("SCHED_FIFO is not permitted here: run as root, or with RLIMIT_RTPRIO")
+    program, _ = start(gpio_rig, **gpio.environment(gpio_rig.pi.gpio_chip))
+    deadline = time.monotonic() + 60
+    while PRIORITY not in (found := priorities(program.popen.pid)):  # `ready` comes before the threads
+        assert time.monotonic() < deadline, found
+        time.sleep(0.02)
+    assert found.count(PRIORITY) == 1
+    assert found.count(OTHERS_PRIORITY) >= 3  # main, stage, executor
+    assert "real-time" not in program.end()[2]
+
+
+def test_rights_that_are_missing_are_reported_once_and_the_program_runs(start, gpio_rig):
+    def without_rights():
+        libc = ctypes.CDLL(None)
+        for capability in (CAP_SYS_NICE, CAP_IPC_LOCK):
+            libc.prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)  # root's; others have none
+        for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK):
+            resource.setrlimit(limit, (0, 0))
+
+    program, _ = start(gpio_rig, preexec_fn=without_rights, **gpio.environment(gpio_rig.pi.gpio_chip))
+    status, _, err = program.end()
+    assert status == 0
+    for text in ("no real-time scheduling", "LimitRTPRIO=99", "memory is not locked", "LimitMEMLOCK=infinity"):
+        assert err.count(text) == 1, text

@@ -1,0 +1,349 @@
+"""Hostile messages, replies of the stage and connections: answered, within bounded memory, and a row is undisturbed.
+
+The clients that send without end speak ZMTP 3.0 (RFC 23) by hand, byte by byte.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+import random
+import select
+import socket
+import struct
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import msgspec
+import pytest
+import zmq
+from tests.support.pi.host_side import HostSide
+from tests.support.pi.program import resident_bytes
+from tests.support.pi.wires_log import WiresLog
+
+from polysight_pi import executor as executors
+from polysight_pi.executor import REPLAYS_WAITING
+from polysight_pi.system import MAX_BYTES
+from polysight_shared import messages as m
+from polysight_shared.errors import ProtocolError
+from polysight_shared.raster import RasterPlan
+from polysight_shared.stage_line import Reply
+
+NAN, INF = float("nan"), float("inf")
+VALUES: tuple[Any, ...] = (
+    NAN, INF, -INF, -1, 0, 1, 2**31, 2**40, 2**63, 2**64 - 1, -(2**63), 1e308, -1e308, 5e-324, True, None, b"\0", "",
+    "a\0b", "a\n", "..", "/etc/passwd", "../x", "x" * 300, "x" * 5000, "\u202e", [], [1], {}, {"a": 1}, [[[[[[]]]]]],
+)  # fmt: skip
+BOUND_BYTES = 24 << 20  # of resident memory; one message may hold 64 KiB
+BEGIN = m.BeginRun(
+    scan_id="scan", plan=RasterPlan(8, 4, 2.0, 2.0), pulses=4, period_us=1500.0, width_us=1.0, speed_mm_s=20.0
+)
+PULSE = m.Pulse(pulses=1, period_us=1500.0, width_us=1.0)
+REPLAY, ALIVE = m.Replay(scan_id="scan", from_seq=1), m.Alive(scan_id="scan")
+RUN, END = m.RunRow(scan_id="scan", row_index=0, take=1), m.EndRun(scan_id="scan", exit_status="abort")
+
+
+def draw(rng: random.Random, valid: list[Any]) -> bytes:
+    """Draw a message with one or more errors; sometimes a correct one of a client that does not own the run."""
+    kind = rng.randrange(6)
+    if kind == 0:
+        return rng.randbytes(rng.choice([0, 1, 5, 40, 400]))
+    node = msgspec.to_builtins(rng.choice(valid))
+    if kind == 1:
+        return m.pack(rng.choice(valid))
+    if kind == 2:
+        raw = m.pack(rng.choice(valid))
+        return raw[: rng.randrange(len(raw))]
+    if kind == 3:
+        raw = bytearray(m.pack(rng.choice(valid)))
+        for _ in range(rng.randint(1, 3)):
+            raw[rng.randrange(len(raw))] = rng.randrange(256)
+        return bytes(raw)
+    for _ in range(rng.randint(1, 3)):
+        inner = node["plan"] if "plan" in node and isinstance(node["plan"], dict) and rng.random() < 0.5 else node
+        inner[rng.choice(sorted(inner) or ["x"])] = copy.deepcopy(rng.choice(VALUES))
+    return msgpack.packb(node, use_bin_type=True) or b""
+
+
+class Stranger:
+    """A client that may send again without waiting for a reply."""
+
+    def __init__(self, address: str) -> None:
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.socket = self._context.socket(zmq.REQ)
+        for option in (zmq.REQ_RELAXED, zmq.REQ_CORRELATE):
+            self.socket.setsockopt(option, 1)
+        self.socket.connect(address)
+
+    def ask(self, raw: bytes, limit_s: float = 60.0) -> m.AnyReply | None:
+        self.socket.send(raw)
+        return m.unpack_reply(self.socket.recv()) if self.socket.poll(round(limit_s * 1e3)) else None
+
+    def close(self) -> None:
+        self._context.destroy(linger=0)
+
+
+@pytest.fixture
+def stranger(pi):
+    stranger = Stranger(pi.service.server.command_address)
+    yield stranger
+    stranger.close()
+
+
+@pytest.mark.parametrize(
+    ("commands", "field", "wrong"),
+    [
+        ((BEGIN, PULSE), "period_us", (NAN, INF, -INF, 1e300, 1e70)),
+        ((BEGIN, PULSE), "width_us", (NAN, INF, -INF, 1e300, 1e70)),
+        ((BEGIN,), "speed_mm_s", (NAN, INF, -INF, 1e300, 1e70)),
+        ((BEGIN,), "heartbeat_ms", (2**40,)),  # it would keep every other host out for 35 years
+        (
+            (BEGIN, REPLAY, ALIVE, RUN, END), "scan_id", ("a\0b", "x" * 300, "a\n", "..", "../../etc/passwd", "/", ""),
+        ),
+    ],
+    ids=lambda x: x if isinstance(x, str) else "",
+)  # fmt: skip
+def test_an_impossible_value_is_no_command(commands, field, wrong):
+    """What cannot be decoded is refused; the fuzz test below shows that, through the socket."""
+    for command in commands:
+        for value in wrong:
+            raw = msgpack.packb(msgspec.to_builtins(command) | {field: value})
+            assert raw is not None
+            with pytest.raises(ProtocolError):
+                m.unpack_command(raw)
+
+
+def test_nan_of_single_precision_is_refused_too():
+    raw = m.pack(PULSE).replace(b"\xcb" + struct.pack(">d", 1500.0), b"\xca" + struct.pack(">f", NAN))
+    with pytest.raises(ProtocolError):
+        m.unpack_command(raw)
+
+
+def test_a_folder_in_the_journals_place_is_refused(pi, instrument):
+    (Path(instrument.pi.journal_dir) / "folder.journal").mkdir()
+    for command in (m.Replay(scan_id="folder", from_seq=1), pi.host.begin("folder")):
+        assert pi.host.refused(command)
+    assert pi.host.accepted(pi.host.begin()).state == "idle"
+
+
+def test_a_message_of_64_mb_is_not_taken_into_memory(pi, stranger):
+    before = resident_bytes()
+    big = msgpack.packb({"type": "Hello", "version": "1.0", "host_release": "x" * (64 << 20)})
+    mine = resident_bytes() - before
+    assert stranger.ask(big, limit_s=1.0) is None
+    assert resident_bytes() - before < mine + BOUND_BYTES + (64 << 20), "the sender's own copy and no second one"
+    assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
+
+
+def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, request):
+    """Thousands of messages while rows run: each gets a reply, and every pulse is at its time."""
+    amount = 100_000 if request.config.getoption("--long") else 2_000
+    host: HostSide = pi.host
+    rng = random.Random(amount)
+    wires = WiresLog(hub, *instrument.pi.sync_out)
+    host.accepted(host.begin(owner="mine", heartbeat_ms=10_000))
+    host.home()
+    valid = [
+        m.Hello(), m.Status(), ALIVE, m.Home(), RUN, PULSE, REPLAY, m.Hold(), m.Resume(), m.Abort(), END,
+        host.begin("other"), host.begin(),
+    ]  # fmt: skip
+    sent = taken = before = 0
+    stage.pace_s = 0.05
+    host.start_row(owner="mine")
+    while sent < amount or not taken:
+        assert stranger.ask(draw(rng, valid)) is not None
+        sent += 1
+        if sent == 1_000:
+            before = resident_bytes()
+        if host.subscriber.poll(0):
+            event = m.unpack_event(host.subscriber.recv_multipart()[-1])
+            if isinstance(event, m.RowFinished):
+                assert (event.status, event.pulses) == ("done", instrument.grid.columns * instrument.burst.pulses)
+                taken += 1
+                deadline = time.monotonic() + 60
+                while isinstance(
+                    host.ask(m.RunRow(scan_id="scan", row_index=0, take=taken + 1, owner="mine")), m.Refused
+                ):
+                    assert time.monotonic() < deadline
+                    time.sleep(0.01)
+            host.accepted(m.Alive(scan_id="scan", owner="mine"))
+    assert resident_bytes() - before < BOUND_BYTES
+    assert pi.service.executor.crash is None
+    host.accepted(m.Abort(owner="mine"))
+    host.until_state("ready")
+    wires.close()
+    n, period_ns = instrument.burst.pulses, round(instrument.burst.period_us * 1e3)
+    rises = wires.rises(instrument.pi.sync_out[0])
+    whole = [burst for i in range(0, len(rises), n) if len(burst := rises[i : i + n]) == n]
+    assert len(whole) >= taken * instrument.grid.columns
+    assert all(t - b[0] == k * period_ns for b in whole for k, t in enumerate(b))
+
+
+FLOOD = 100_000  # lines
+HUGE = 9_999_999_999  # ten digits, the most that a line may hold
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_impossible_position_is_ignored(pi, stage, sign):
+    """Status and events stay readable; the position is the last possible one."""
+    stage.x = stage.y = sign * HUGE
+    for alarm in (-HUGE, -1, 1000, HUGE):
+        fields = {"state": "idle", "x": stage.x, "y": stage.y, "points": HUGE, "alarm": alarm}
+        stage.say(Reply("status", fields={k: str(v) for k, v in fields.items()}))
+    seen = pi.host.wait(m.StageStatus, lambda e: e.points == HUGE)
+    assert (seen.x_mm, seen.y_mm) == (0.0, 0.0)
+    assert 0 <= seen.alarm < 1000
+    assert pi.host.ask(m.Status()).x_mm == 0.0
+
+
+def test_impossible_lost_steps_and_points_spoil_no_journal(pi, stage):
+    stage.lost = (HUGE, -HUGE)
+    pi.host.accepted(pi.host.begin())
+    pi.host.home()
+    status = pi.host.ask(m.Status())
+    assert (status.lost_x_mm, status.lost_y_mm) == (1e6, -1e6)
+    stage.pace_s = 0.02
+    pi.host.start_row()
+    pi.host.wait(m.Capture)
+    row = stage.seen[-1]
+    stage.say(Reply("done", row.sequence, fields={"points": str(HUGE), "pulses": "0", "x": str(HUGE), "y": "0"}))
+    done = pi.host.wait(m.RowFinished)
+    assert (done.status, done.points) == ("fault", HUGE)
+    assert pi.host.replay()[-1].seq >= done.seq
+
+
+def test_a_flood_of_lines_keeps_commands_answered(pi, stage):
+    """Far more than a serial line carries."""
+    lines = (
+        Reply("status", fields={"state": "row", "x": "1", "y": "2", "points": "3", "alarm": "0"}),
+        Reply("banner", fields={"fw": "x" * 60, "proto": "2"}), Reply("alarm", number=999), Reply("alarm", number=15),
+        Reply("done", 7), Reply("ok", 7), Reply("error", None, 1),
+    )  # fmt: skip
+    raw, ended = b"".join(line.encode() for line in lines) * 14, threading.Event()
+
+    def flood() -> None:
+        for _ in range(FLOOD // 98):
+            stage.say_raw(raw)
+        ended.set()
+
+    before = resident_bytes()
+    thread = threading.Thread(target=flood)
+    thread.start()
+    while not ended.wait(0.05):
+        assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
+    thread.join()
+    assert resident_bytes() - before < BOUND_BYTES
+    assert pi.service.executor.crash is None
+    assert isinstance(pi.host.ask(m.Abort()), m.Accepted)
+
+
+MORE, LONG, COMMAND = 1, 2, 4
+ENOUGH_BYTES = 2 << 30  # a client that could send so much was not stopped
+TURNS_A_SECOND = 400  # of 600 kB: twice what a Pi's network carries; loopback fills a busy machine's memory at once
+HIGHEST_BYTES = 400 << 20  # MemoryMax of the unit is 512 MiB
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
+
+
+def frame(body: bytes, flags: int = 0) -> bytes:
+    if len(body) < 256:
+        return bytes([flags, len(body)]) + body
+    return bytes([flags | LONG]) + len(body).to_bytes(8, "big") + body
+
+
+def connected(address: str, kind: bytes) -> socket.socket:
+    """A connection after its handshake, as a socket of this kind."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    peer = socket.create_connection((host, int(port)), timeout=60)
+    peer.sendall(GREETING)
+    peer.recv(len(GREETING), socket.MSG_WAITALL)
+    peer.sendall(frame(b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind, COMMAND))
+    return peer
+
+
+def is_cut(peer: socket.socket) -> bool:
+    """True if the other end has closed the connection."""
+    while select.select([peer], [], [], 0)[0]:
+        if not peer.recv(1 << 16):
+            return True
+    return False
+
+
+def paced(frames: bytes) -> bytes:
+    time.sleep(1 / TURNS_A_SECOND)
+    return frames
+
+
+ATTACKS = {
+    "a message of many frames": (0, b"DEALER", lambda: paced(frame(b"", MORE) + frame(bytes(60_000), MORE) * 10)),
+    "subscriptions": (1, b"SUB", lambda: b"".join(frame(b"\x01" + os.urandom(1000)) for _ in range(50))),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
+    """And the next one is served, by the same process with the same run."""
+    which, kind, more = ATTACKS[attack]
+    program, host = start(instrument, "--wires", hub)
+    host.accepted(host.begin())
+    host.home()
+    pid, highest, ended = program.popen.pid, [0], threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(0.02):
+            highest[0] = max(highest[0], resident_bytes(pid))
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    sent = 0
+    while highest[0] < MAX_BYTES and sent < ENOUGH_BYTES:  # ZeroMQ itself ends some of these connections
+        with connected((program.ready[1], program.events[1])[which], kind) as peer, suppress(ConnectionError):
+            peer.settimeout(0.1)  # a connection that was cut may stall before it is closed
+            left = b""
+            while sent < ENOUGH_BYTES and not is_cut(peer):
+                with suppress(TimeoutError):
+                    left = left or more()
+                    taken = peer.send(left)
+                    sent, left = sent + taken, left[taken:]
+    cut_ns = time.monotonic_ns()
+    ended.set()
+    watcher.join()
+    assert 0 < sent < ENOUGH_BYTES
+    assert highest[0] < HIGHEST_BYTES
+    host.wait(m.Heartbeat, lambda beat: beat.t_mono_ns > cut_ns)  # events were cut off, too: they come again
+    assert host.row(0).status == "done"
+    deadline = time.monotonic() + 60
+    while resident_bytes(pid) >= HIGHEST_BYTES and time.monotonic() < deadline:
+        time.sleep(0.1)
+    status, _, err = program.end()
+    assert status == 0
+    assert "connections were cut" in err, (sent, highest)
+
+
+def test_a_queue_that_never_empties_is_not_a_hang(pi, monkeypatch):
+    """The executor completes turns, however much waits: the watchdog and `Alive` go by them."""
+    monkeypatch.setattr(executors, "TURN_TIMEOUT_S", 0.05)
+    longest = 0.0
+    done = threading.Event()
+    for _ in range(60):
+        pi.service.executor.post(lambda: time.sleep(0.05))
+    pi.service.executor.post(done.set)
+    while not done.wait(0.02):
+        longest = max(longest, pi.service.executor.unresponsive_s)
+    assert longest < 2.0
+    assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
+
+
+def test_replays_do_not_keep_other_commands_waiting(pi):
+    """Only few of them wait at a time; more are refused."""
+    slow = threading.Event()
+    pi.service.executor.post(lambda: slow.wait(60))
+    replay = m.Replay(scan_id="scan", from_seq=1)
+    taken = [pi.service.executor.submit(replay, lambda _: None) for _ in range(10)]
+    assert taken == [True] * REPLAYS_WAITING + [False] * (10 - REPLAYS_WAITING)
+    assert pi.service.executor.submit(m.Abort(), lambda _: None)
+    slow.set()

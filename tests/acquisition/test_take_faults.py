@@ -125,5 +125,5 @@ def test_words_follow_the_kind_alone():
     assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).why.lower()
     for unknown in ([], [RowFault("of_a_newer_release", "RV")]):
         notice = notice_of_rejection(0, 1, [answer], unknown, "")
-        assert (notice.why, notice.detail) == ("", answer)
+        assert (notice.why, notice.facts["detail"]) == ("", answer)
         assert notice.do

@@ -12,7 +12,7 @@ from polysight.acquisition.control import StopRequest
 from polysight.acquisition.progress import time_left, typical_row_s
 from polysight.acquisition.scan import run_scan
 from polysight.page.history import ScanHistory, seconds
-from polysight.page.snapshot import remaining
+from polysight.page.status import remaining
 
 ROW_S, PAUSE_S, HOMING_S = 12.0, 7200.0, 240.0
 

@@ -6,7 +6,7 @@ import pytest
 from tests.support.store.facts import facts_of, typed
 
 from polysight.page.history import ScanHistory, seconds
-from polysight.page.snapshot import remaining
+from polysight.page.status import remaining
 from polysight.store.events import read_events
 from polysight.store.scan_folder import EVENTS, ScanFolder
 from polysight_shared.messages import Capture, Fault
@@ -58,7 +58,7 @@ def test_a_fault_told_twice_is_one(finished):
     fault = Fault(scan_id="s", seq=9, t_mono_ns=1, number=103, what="a trigger edge was lost")
     history.add_events([fault])
     history.add_events([fault])
-    assert [n.level for n in history.notices] == ["warn"]
+    assert [n.level for n in history.notices] == ["warning"]
     assert "103" in history.notices[0].what
     assert history.notices[0].do
 
@@ -111,7 +111,7 @@ def test_rejected_then_committed_leaves_a_warning(begun):
 def test_rejections_of_earlier_releases_are_told_without_a_cause(begun):
     history, _ = begun
     history.add_fact(typed({"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {}}))
-    assert (history.marks[2], history.notices[-1].detail) == ("rejected", "RV: no data")
+    assert (history.marks[2], history.notices[-1].facts["detail"]) == ("rejected", "RV: no data")
     assert (history.notices[-1].why, history.boards["RV"].retaken) == ("", 1)
 
 

@@ -17,7 +17,7 @@ from tests.support.processes import wait_for
 from tests.support.rigs import published_rig
 from zmq.utils.monitor import recv_monitor_message
 
-from polysight.page.listener import PiListener
+from polysight.page.watch import PiListener
 from polysight_shared import messages as m
 from polysight_shared.raster import plan_raster
 from polysight_shared.sockets import EVENT_TOPIC, publisher
@@ -42,7 +42,7 @@ def pi(tmp_path):
 
     def beat() -> float:
         tell(m.Heartbeat(**OF, seq=0, state="ready", period_ms=100))
-        return listener.heard.heard_s
+        return listener.state.heard_s
 
     wait_for(beat, "the first event")
     yield tell, listener
@@ -64,50 +64,50 @@ def finished(status: m.RowStatus) -> m.RowFinished:
 def test_where_the_stage_is_in_the_rig_frame(pi):
     tell, listener = pi
     tell(m.StageStatus(**OF, seq=1, state="run", x_mm=RIG.stage.centre_x_mm - 3, y_mm=RIG.stage.centre_y_mm + 5))
-    wait_for(lambda: listener.heard.x_mm is not None, "the stage")
-    assert (listener.heard.x_mm, listener.heard.y_mm) == (-3.0, 5.0)
+    wait_for(lambda: listener.state.x_mm is not None, "the stage")
+    assert (listener.state.x_mm, listener.state.y_mm) == (-3.0, 5.0)
 
 
 def test_a_row_as_it_runs_and_nobody_else_s(pi):
     tell, listener = pi
     tell(m.RowStarted(**OF, seq=2, row=plan_raster(RIG.grid).row(7), take=2), capture(0), capture(1, "another"))
-    wait_for(lambda: listener.heard.point, "a point")
+    wait_for(lambda: listener.state.point, "a point")
     tell(capture(4))
-    wait_for(lambda: listener.heard.point == 5, "the newest point")
-    assert (listener.heard.row, listener.heard.take, listener.heard.state) == (7, 2, "running")
+    wait_for(lambda: listener.state.point == 5, "the newest point")
+    assert (listener.state.row, listener.state.take, listener.state.state) == (7, 2, "running")
     tell(finished("done"))
-    wait_for(lambda: listener.heard.row == -1, "the row's end")
+    wait_for(lambda: listener.state.row == -1, "the row's end")
 
 
 def test_faults_stay_until_a_row_ends_well(pi):
     tell, listener = pi
     tell(m.Fault(**OF, seq=4, number=101, what="the stage does not answer"))
-    wait_for(lambda: listener.heard.faults, "the fault")
+    wait_for(lambda: listener.state.faults, "the fault")
     tell(finished("fault"), m.Heartbeat(**OF, seq=9, state="fault", period_ms=100))
-    wait_for(lambda: listener.heard.state == "fault", "the state")
-    assert listener.heard.faults[0].level == "bad"
+    wait_for(lambda: listener.state.state == "fault", "the state")
+    assert listener.state.faults[0].level == "error"
     tell(finished("done"))
-    wait_for(lambda: not listener.heard.faults, "that it is over")
+    wait_for(lambda: not listener.state.faults, "that it is over")
 
 
 def test_words_of_strangers_are_named_and_survived(pi):
     tell, listener = pi
-    before = listener.heard
-    listener._take(b"\xc1 no message")
-    assert listener.heard.deaf is not None
-    assert listener.heard.deaf.do or listener.heard.deaf.why
-    assert (listener.heard.row, listener.heard.state) == (before.row, before.state)
+    before = listener.state
+    listener._receive(b"\xc1 no message")
+    assert listener.state.deaf is not None
+    assert listener.state.deaf.do or listener.state.deaf.why
+    assert (listener.state.row, listener.state.state) == (before.row, before.state)
     tell(m.Heartbeat(**OF, seq=0, state="idle", period_ms=100))
-    wait_for(lambda: listener.heard.state == "idle", "the next event")
-    assert listener.heard.deaf is None
+    wait_for(lambda: listener.state.state == "idle", "the next event")
+    assert listener.state.deaf is None
 
 
 def test_without_keys_the_view_is_deaf_and_says_so(tmp_path):
     elsewhere = {"event_address": "tcp://192.0.2.1:5602", "key_dir": str(tmp_path)}
     instrument = msgspec.structs.replace(RIG, pi=msgspec.structs.replace(RIG.pi, **elsewhere))
     listener = PiListener(instrument, "mine")
-    wait_for(lambda: listener.heard.deaf, "why nothing is heard")
-    assert str(tmp_path) in listener.heard.deaf.do, "where they belong"
+    wait_for(lambda: listener.state.deaf, "why nothing is heard")
+    assert str(tmp_path) in listener.state.deaf.do, "where they belong"
     listener.close()
 
 

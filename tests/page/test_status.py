@@ -9,10 +9,9 @@ import pytest
 from tests.support.store.facts import facts_of, typed
 
 from polysight.acquisition.control import ScanCommand
-from polysight.page.history import ScanHistory, notice_of_fault
-from polysight.page.images import Shown
-from polysight.page.listener import PiState
-from polysight.page.status import LifeSigns, judge, no_scan
+from polysight.page.history import PiState, ScanHistory, notice_of_fault
+from polysight.page.images import RowSync, Shown
+from polysight.page.status import Inputs, LifeSigns, judge, no_scan
 from polysight_shared.faults import EXPLANATIONS, PiFault
 from polysight_shared.messages import Fault
 
@@ -34,7 +33,7 @@ def history(finished):
 
 
 def status(history, signs=LIVELY, heard=RUNNING, shown=Shown(), asked=None):  # noqa: B008
-    return judge(history, FOLDER, signs, heard, shown, asked)
+    return judge(Inputs(FOLDER, history, signs, heard, shown, asked), history)
 
 
 def test_all_is_well_needs_nothing_done(history):
@@ -79,7 +78,7 @@ def test_every_fault_of_the_pi_has_words(history, number):
     assert notice.why
     assert notice.do
     lasting = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM, PiFault.TRIGGER_LINE_LOST, PiFault.JOURNAL_FULL)
-    assert notice.level == "bad" or number not in lasting
+    assert notice.level == "error" or number not in lasting
     s = status(history, heard=replace(RUNNING, state="fault", faults=(notice,)))
     assert (s.level, s.why, s.do) == ("bad", notice.why, notice.do)
 
@@ -100,7 +99,7 @@ def test_a_row_taken_again_is_a_warning_for_a_while(history):
 
 @pytest.mark.parametrize(("direct_rad", "masked", "level"), [(0.004, 0, "good"), (0.3, 0, "warn"), (0.004, 2, "warn")])
 def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, level):
-    shown = Shown(sync={"RH": {0: (0.02, direct_rad, masked)}})
+    shown = Shown(sync={"RH": {0: RowSync(0.02, direct_rad, masked)}})
     s = status(history, shown=shown)
     assert s.level == level
     assert bool(s.do) == (level == "warn")

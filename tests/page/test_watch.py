@@ -38,18 +38,18 @@ def test_a_finished_folder_is_shown_as_it_is(finished, truth, watching):
     watch = watching(finished)
     assert watch.wait_for(shows(scan.plan.rows), LIMIT_S)
     state = answer(watch)
-    assert (state["status"]["level"], state["marks"]) == ("done", "ccc")
-    assert state["progress"] == {"rows": 3, "committed": 3}
+    assert (state["status"]["level"], state["scan"]["marks"]) == ("done", "ccc")
+    assert (state["scan"]["rows"], state["scan"]["committed"]) == (3, 3)
     assert state["scan"]["simulated"] is True
     for board in state["boards"]:
         summary = pipeline.quality.boards[board["name"]].summary()
         assert board["frames_expected"] - board["frames_lost"] == summary["frames_received"]
         assert board["masked"] == summary["positions_masked"]
     assert {name: p.png for name, p in watch.shown.pictures.items()} == {n: p.png for n, p in pictures.items()}
-    assert set(state["pictures"]["items"]) == {f"{c}_{k}" for c in "hvp" for k in ("amplitude", "phase")}
+    assert set(state["pictures"]["scales"]) == {f"{c}_{k}" for c in "hvp" for k in ("amplitude", "phase")}
     assert state["profile"]["row"] == 2
     for board in state["sync"]["boards"].values():
-        assert board["rows"] == [0, 1, 2]
+        assert list(board) == ["0", "1", "2"]
     assert state["notices"] == []
 
 
@@ -59,13 +59,13 @@ def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
     growing.live()
     growing.grow_to("scan_started")
     assert watch.wait_for(lambda s: s["scan"] is not None, LIMIT_S)
-    assert answer(watch)["marks"] == "..."
+    assert answer(watch)["scan"]["marks"] == "..."
     revision = 0
     for row in range(3):
         growing.grow_to("row_committed")
         assert watch.wait_for(shows(row + 1), LIMIT_S)
         state = answer(watch)
-        assert state["marks"] == "c" * (row + 1) + "." * (2 - row)
+        assert state["scan"]["marks"] == "c" * (row + 1) + "." * (2 - row)
         assert state["pictures"]["revision"] > revision
         assert state["profile"]["row"] == row
         revision = state["pictures"]["revision"]

@@ -1,7 +1,7 @@
 """Rows, takes, counts of each board, times and faults of a scan, collected from its manifest and events.
 
-No files and no clocks are read here, so that the same facts always give the same history. A fault becomes a `Notice`:
-a sentence with its likely cause and remedy (`CAUSES`).
+No files and no clocks are read here, so that the same facts always give the same history. A fault becomes a
+finding: a sentence with its likely cause and remedy (`CAUSES`).
 """
 
 from __future__ import annotations
@@ -29,12 +29,10 @@ from polysight.store import (
 from polysight_shared.config import Instrument
 from polysight_shared.errors import PolysightError
 from polysight_shared.faults import PiFault, explain
-from polysight_shared.messages import AnyEvent, Capture, Fault
-from polysight_shared.messages import Fault as FaultEvent
+from polysight_shared.findings import Finding, Level
+from polysight_shared.messages import AnyEvent, Capture, Fault, State
 from polysight_shared.raster import RasterPlan, plan_raster
 from polysight_shared.tables import decode as decode_config
-
-Level = Literal["bad", "warn", "note"]
 
 K = FaultKind
 CAUSES: dict[FaultKind, tuple[str, str]] = {
@@ -83,44 +81,28 @@ RowMark = Literal["committed", "kept", "rejected"]
 _RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
 
 
-@dataclass(frozen=True)
-class Notice:
-    """A message to the operator: what, why, what to do, and `detail` on demand.
-
-    `row` is -1 if no row is concerned, `utc` is empty if the time is not known.
-    """
-
-    level: Level
-    what: str
-    why: str = ""
-    do: str = ""
-    detail: str = ""
-    row: int = -1
-    utc: str = ""
-
-
 def sentence(text: str) -> str:
     """Return the text with a capital letter first; a command stays as it is."""
     return text if text.startswith("polysight") else text[:1].upper() + text[1:]
 
 
-def notice_of_error(error: PolysightError, level: Level = "warn") -> Notice:
+def notice_of_error(error: PolysightError, level: Level = "warning") -> Finding:
     """Notice of an error that was raised."""
-    return Notice(level, sentence(error.what), sentence(error.why), sentence(error.remedy))
+    return Finding(level, sentence(error.what), sentence(error.why), sentence(error.remedy), code=error.code)
 
 
-def notice_of_fault(event: Fault) -> Notice:
+def notice_of_fault(event: Fault) -> Finding:
     """Notice of a fault of the Pi; a warning if the Pi retakes the row by itself."""
     table = explain(event.number)
     passing = PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in (
         PiFault.HOST_LOST, PiFault.POINTS_MISMATCH, PiFault.ABORTED,
     )  # fmt: skip
-    return Notice(
-        "warn" if passing else "bad",
+    return Finding(
+        "warning" if passing else "error",
         f"Fault {event.number} at the Pi: {table.what}",
         sentence(event.why or table.why),
         sentence(event.remedy or table.remedy),
-        event.what if event.what != table.what else "",
+        facts={"detail": event.what} if event.what != table.what else {},
     )
 
 
@@ -135,17 +117,16 @@ def _cause(faults: Sequence[RowFault]) -> tuple[str, str]:
     return "", ""
 
 
-def notice_of_rejection(row: int, take: int, reasons: Sequence[str], faults: Sequence[RowFault], utc: str) -> Notice:
+def notice_of_rejection(row: int, take: int, reasons: Sequence[str], faults: Sequence[RowFault], utc: str) -> Finding:
     """Notice of a rejected take."""
     why, do = _cause(faults)
     do = do or "Nothing: the row is retaken automatically"
-    return Notice("warn", f"Row {row}, take {take}, was rejected", why, do, "; ".join(reasons), row, utc)
+    return _row_notice(row, f"Row {row}, take {take}, was rejected", (why, do), reasons, utc)
 
 
-def notice_of_kept_row(row: int, reasons: Sequence[str], faults: Sequence[RowFault], utc: str) -> Notice:
-    """Notice of a row that is kept with gaps."""
-    why, do = _cause(faults)
-    return Notice("warn", f"Row {row} is kept with gaps, which are masked", why, do, "; ".join(reasons), row, utc)
+def _row_notice(row: int, what: str, why_do: tuple[str, str], reasons: Sequence[str], utc: str) -> Finding:
+    """Notice of a row; the page shows the reasons in full on demand, and the time if it is known."""
+    return Finding("warning", what, *why_do, where=f"row {row}", facts={"detail": "; ".join(reasons), "utc": utc})
 
 
 @dataclass
@@ -170,6 +151,38 @@ class TriggerHealth:
         """Add one burst."""
         self.width_max_ns = max(self.width_max_ns, event.width_max_ns)
         self.jitter_max_ns = max(self.jitter_max_ns, event.jitter_ns)
+
+
+@dataclass(frozen=True)
+class PiState:
+    """State of the Pi by its last events; replaced as a whole, never changed.
+
+    Attributes
+    ----------
+    heard_s, heard_utc_s
+        Time of the last event, on the monotonic clock and in seconds since 1970; 0 before.
+    state
+        The Pi's.
+    x_mm, y_mm
+        Stage offset in the rig frame; None while unknown.
+    row, take, point
+        Of the running row; row -1 between rows.
+    faults
+        Faults since the last row that was done.
+    deaf
+        Why no events can be received.
+    """
+
+    heard_s: float = 0.0
+    heard_utc_s: int = 0
+    state: State | None = None
+    x_mm: float | None = None
+    y_mm: float | None = None
+    row: int = -1
+    take: int = 0
+    point: int = 0
+    faults: tuple[Finding, ...] = ()
+    deaf: Finding | None = None
 
 
 def seconds(utc: str) -> float:
@@ -198,16 +211,18 @@ class ScanHistory:
         self.started = started
         self.instrument: Instrument = decode_config(started.instrument, Instrument, "the manifest's instrument")
         self.plan: RasterPlan = plan_raster(self.instrument.grid)
-        self.scan_id, self.simulated = started.scan_id, started.simulated
+        self.scan_id = started.scan_id
+        self.simulated = started.simulated
         self.takes: dict[int, int] = {}
         self.marks: dict[int, RowMark] = {}
-        self.notices: list[Notice] = []
+        self.notices: list[Finding] = []
         self.ended: ScanEnded | None = None
         self.paused = False
         self.run_started_s = seconds(started.started_utc or "1970-01-01T00:00:00+00:00")
         self.last_commit_s = 0.0
         self.trigger: dict[int, TriggerHealth] = {}
-        self.rows_since_trouble = 0  # rows committed whole since one was rejected or kept with gaps
+        # Rows committed whole since one was rejected or kept with gaps.
+        self.rows_since_trouble = 0
         self._rows: dict[int, RowCommitted] = {}
         self._rejected: dict[str, int] = {b.name: 0 for b in self.instrument.recorded}
         self._row_seconds: list[float] = []
@@ -232,7 +247,8 @@ class ScanHistory:
         elif isinstance(fact, ScanContinued):
             self.paused = False
             if self.last_commit_s:
-                self.last_commit_s += seconds(fact.continued_utc) - self._paused_at  # a pause does not count
+                # A pause does not count.
+                self.last_commit_s += seconds(fact.continued_utc) - self._paused_at
         elif isinstance(fact, ScanEnded):
             self.ended = fact
             self.paused = False
@@ -245,9 +261,11 @@ class ScanHistory:
         self._rows[fact.row] = fact
         self.rows_since_trouble = 0 if kept else self.rows_since_trouble + 1
         if kept:
-            self.notices.append(notice_of_kept_row(fact.row, kept, fact.faults, fact.committed_utc))
+            what = f"Row {fact.row} is kept with gaps, which are masked"
+            self.notices.append(_row_notice(fact.row, what, _cause(fact.faults), kept, fact.committed_utc))
         if not fact.committed_utc:
-            return  # made in one step, by `polysight simulate`
+            # Made in one step, by `polysight simulate`.
+            return
         at = seconds(fact.committed_utc)
         if self.last_commit_s > self.run_started_s:
             self._row_seconds.append(at - self.last_commit_s)
@@ -259,7 +277,8 @@ class ScanHistory:
         for name in self._rejected:
             if fact.faults:
                 blamed = any(fault.board == name for fault in fact.faults)
-            else:  # older scans
+            else:
+                # Older scans.
                 blamed = any(reason.startswith(f"{name}:") for reason in fact.reasons)
             self._rejected[name] += blamed
         self.notices.append(notice_of_rejection(fact.row, fact.take, fact.reasons, fact.faults, fact.rejected_utc))
@@ -268,23 +287,16 @@ class ScanHistory:
         self.takes.pop(fact.row, None)
         self._rows.pop(fact.row, None)
         self.marks.pop(fact.row, None)
-        self.notices.append(
-            Notice(
-                "warn",
-                f"Row {fact.row} on the disk differs from what was committed",
-                "The disk is faulty, or the file was changed",
-                "Nothing: the row is retaken",
-                "; ".join(fact.reasons),
-                fact.row,
-                fact.withdrawn_utc,
-            )
-        )
+        what = f"Row {fact.row} on the disk differs from what was committed"
+        why_do = ("The disk is faulty, or the file was changed", "Nothing: the row is retaken")
+        self.notices.append(_row_notice(fact.row, what, why_do, fact.reasons, fact.withdrawn_utc))
 
     def _scan_resumed(self, fact: ScanResumed) -> None:
         self.ended = None
         self.paused = False
         self.run_started_s = seconds(fact.resumed_utc)
-        if fact.rig:  # the Pi has another address from now on
+        if fact.rig:
+            # The Pi has another address from now on.
             self.instrument = with_connection(self.instrument, fact.rig)
 
     # --- the Pi's events ---
@@ -294,7 +306,7 @@ class ScanHistory:
         for event in events:
             if isinstance(event, Capture):
                 self.trigger.setdefault(event.row_index, TriggerHealth()).add(event)
-            elif isinstance(event, FaultEvent) and event.seq not in self._fault_seqs:
+            elif isinstance(event, Fault) and event.seq not in self._fault_seqs:
                 self._fault_seqs.add(event.seq)
                 self.notices.append(notice_of_fault(event))
 
@@ -324,5 +336,6 @@ class ScanHistory:
         if self.last_commit_s > self.run_started_s:
             return self.last_commit_s - self.run_started_s, "first row"
         if self.simulated:
-            return None  # the speed of simulated time is not known
+            # The speed of simulated time is not known.
+            return None
         return scan_time(self.instrument).total_s / self.instrument.grid.rows, "plan"

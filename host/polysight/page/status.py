@@ -1,39 +1,42 @@
-"""The status of a scan in one sentence, with what to do: pure functions of history, signs of life and images."""
+"""The state of a scan for pages: a status in one sentence with what to do, and all that is shown below it.
+
+Pure functions of history, signs of life and images. A `Snapshot` is the whole state, a `Motion` the part that changes
+while the stage moves; both are sent as JSON.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from polysight.acquisition import ScanCommand
-from polysight.page.history import Notice, ScanHistory, sentence
-from polysight.page.images import Shown
-from polysight.page.listener import PiState
+import msgspec
+
+from polysight.acquisition import ScanCommand, time_left
+from polysight.page.history import PiState, ScanHistory, sentence
+from polysight.page.images import Profile, Shown
+from polysight.results import Verdict
 from polysight.store import ScanEnded
+from polysight_shared.findings import Finding
+from polysight_shared.raster import WIDTH_US
 
 StatusLevel = Literal["good", "done", "wait", "warn", "bad"]
-SINCE = "{since}"  # the page puts the elapsed time here
-_LATELY_ROWS = 3  # a rejected take is shown for so many rows
-_LATE_ROWS = 3.0  # timeout of a row, in usual durations
-_LATE_S = 60.0
-_DIRECT_RAD = 0.1  # residual of the direct path above which images lose contrast; usual is 0.004
-_MASKED = 0.05  # share of positions without a direct path that gives a warning
-
-
-@dataclass(frozen=True)
-class Status:
-    """The headline: `level` sets colour and sign; `do` is empty if there is nothing to do.
-
-    `SINCE` in `detail` stands for the time elapsed since `since_s` (seconds since 1970).
-    """
-
-    level: StatusLevel
-    headline: str
-    detail: str = ""
-    why: str = ""
-    do: str = ""
-    since_s: float = 0.0
+SINCE = "{since}"
+"""The page puts the elapsed time here."""
+PAPER_PHASE_RAD = 0.022
+"""Phase residual after all stages, paper section 9.1."""
+# A rejected take is shown for so many rows.
+RECENT_ROWS = 3
+# Timeout of a row, in usual durations and at least.
+LATE_ROWS = 3.0
+LATE_S = 60.0
+# Residual of the direct path above which images lose contrast; 0.004 is usual.
+DIRECT_RAD = 0.1
+# Share of positions without a direct path that gives a warning.
+MASKED_SHARE = 0.05
+MAX_NOTICES = 30
+MARKS = {"committed": "c", "kept": "k", "rejected": "r"}
 
 
 @dataclass(frozen=True)
@@ -57,123 +60,391 @@ class LifeSigns:
     now_s: float
 
 
+@dataclass(frozen=True)
+class Inputs:
+    """What a snapshot is made from; `asked` is the command that the scan has not yet carried out."""
+
+    folder: Path
+    history: ScanHistory | None
+    signs: LifeSigns
+    pi: PiState = field(default_factory=PiState)
+    shown: Shown = field(default_factory=Shown)
+    asked: ScanCommand | None = None
+    control: bool = False
+    problem: str = ""
+    verdict: Verdict | None = None
+
+
+class Status(msgspec.Struct, frozen=True):
+    """The headline: `level` sets colour and sign; `do` is empty if there is nothing to do.
+
+    `SINCE` in `detail` stands for the time elapsed since `since_s` (seconds since 1970).
+    """
+
+    level: StatusLevel
+    headline: str
+    detail: str = ""
+    why: str = ""
+    do: str = ""
+    since_s: float = 0.0
+
+
+class ScanState(msgspec.Struct, frozen=True, kw_only=True):
+    """The scan, its plan, and its rows so far: their number, and one letter for each (`MARKS`)."""
+
+    folder: str
+    rig: str
+    simulated: bool
+    columns: int
+    rows: int
+    step_x_mm: float
+    step_y_mm: float
+    receivers: list[str]
+    committed: int
+    marks: str
+
+
+class ControlState(msgspec.Struct, frozen=True):
+    """Whether the scan may be controlled, runs, is paused, and what it was asked."""
+
+    enabled: bool
+    running: bool
+    paused: bool
+    asked: ScanCommand | None
+
+
+class BoardState(msgspec.Struct, frozen=True):
+    """Data of one board over the committed rows."""
+
+    name: str
+    frames_expected: int
+    frames_lost: int
+    retaken: int
+    masked: int
+    counts: dict[str, int]
+
+
+class TriggerState(msgspec.Struct, frozen=True):
+    """SYNC_IN pulses: their number, the longest, and the latest after its edge."""
+
+    pulses: int
+    width_max_us: float
+    jitter_max_us: float
+    width_limit_us: float
+
+
+class PicturesState(msgspec.Struct, frozen=True):
+    """Rows in the pictures, rows that are not in them yet, and by name the ends of each picture's colours."""
+
+    revision: int
+    rows: int
+    waiting: int
+    width_mm: float
+    height_mm: float
+    scales: dict[str, tuple[float, float, str]]
+
+
+class SyncState(msgspec.Struct, frozen=True):
+    """Phase left over by board and row, degrees (nan: unknown), beside the paper's."""
+
+    paper_deg: float
+    boards: dict[str, dict[int, float]]
+
+
+class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
+    """The whole state of a scan; `scan` and what follows are None where there is no scan yet."""
+
+    status: Status
+    control: ControlState
+    notices: list[Finding]
+    scan: ScanState | None = None
+    boards: list[BoardState] = []
+    trigger: TriggerState | None = None
+    pictures: PicturesState | None = None
+    profile: Profile | None = None
+    sync: SyncState | None = None
+    verdict: Verdict | None = None
+
+
+class Place(msgspec.Struct, frozen=True):
+    """Stage offset in the rig frame."""
+
+    x_mm: float
+    y_mm: float
+
+
+class Motion(msgspec.Struct, frozen=True, kw_only=True):
+    """Position of the stage, and time left with its origin (`measured`, `first row`, `plan`)."""
+
+    now_s: int
+    left_s: int | None = None
+    left_from: str = ""
+    stage: Place | None = None
+    row: int = -1
+    point: int = 0
+
+
+def make_snapshot(inputs: Inputs) -> Snapshot:
+    """Describe the whole state of a scan."""
+    history = inputs.history
+    shown = inputs.shown
+    if history is None:
+        status = _unreadable(inputs) if inputs.problem else no_scan(inputs.folder)
+        control = ControlState(inputs.control, running=False, paused=False, asked=inputs.asked)
+        return Snapshot(status=status, control=control, notices=_notices(inputs))
+    plan = history.plan
+    running = history.ended is None and inputs.signs.alive
+    return Snapshot(
+        status=judge(inputs, history),
+        control=ControlState(inputs.control, running, history.paused, inputs.asked),
+        notices=_notices(inputs),
+        scan=ScanState(
+            folder=str(inputs.folder),
+            rig=history.instrument.name,
+            simulated=history.simulated,
+            columns=plan.columns,
+            rows=plan.rows,
+            step_x_mm=plan.step_x_mm,
+            step_y_mm=plan.step_y_mm,
+            receivers=[board.name for board in history.instrument.receivers],
+            committed=len(history.takes),
+            marks="".join(MARKS.get(history.marks.get(row, ""), ".") for row in range(plan.rows)),
+        ),
+        boards=_boards(history, shown),
+        trigger=_trigger(history),
+        pictures=_pictures(history, shown),
+        profile=shown.profile,
+        sync=_sync(shown),
+        # Products of an earlier run may lie there while the scan goes on.
+        verdict=inputs.verdict if history.ended is not None else None,
+    )
+
+
+def make_motion(inputs: Inputs) -> Motion:
+    """Describe the fast-changing part."""
+    now_s = int(inputs.signs.now_s)
+    if inputs.history is None:
+        return Motion(now_s=now_s)
+    pi = inputs.pi
+    left_s, basis = remaining(inputs.history, inputs.signs.now_s) if inputs.signs.alive else (None, "")
+    stage = None
+    if pi.x_mm is not None and pi.y_mm is not None:
+        stage = Place(round(pi.x_mm, 1), round(pi.y_mm, 1))
+    return Motion(now_s=now_s, left_s=left_s, left_from=basis, stage=stage, row=pi.row, point=pi.point)
+
+
+def remaining(history: ScanHistory, now_s: float) -> tuple[int | None, str]:
+    """Seconds to the scan's end and their origin (`measured`, `first row`, `plan`); None: not known."""
+    rows_left = history.plan.rows - len(history.takes)
+    if history.ended is not None or history.row_seconds is None:
+        return (0, "measured") if rows_left == 0 else (None, "")
+    row_s, basis = history.row_seconds
+    row_began_s = max(history.last_commit_s, history.run_started_s)
+    in_row_s = 0.0 if history.paused else now_s - row_began_s
+    return round(time_left(rows_left, row_s, in_row_s)), basis
+
+
+def _boards(history: ScanHistory, shown: Shown) -> list[BoardState]:
+    boards = []
+    for name, board in history.boards.items():
+        masked = sum(sync.masked for sync in shown.sync.get(name, {}).values())
+        frames_lost = board.frames_expected - board.frames_received
+        boards.append(BoardState(name, board.frames_expected, frames_lost, board.retaken, masked, board.counts))
+    return boards
+
+
+def _trigger(history: ScanHistory) -> TriggerState | None:
+    if not history.trigger:
+        return None
+    bursts = history.trigger.values()
+    return TriggerState(
+        pulses=len(history.takes) * history.plan.columns * history.instrument.burst.pulses,
+        width_max_us=max(b.width_max_ns for b in bursts) / 1e3,
+        jitter_max_us=max(b.jitter_max_ns for b in bursts) / 1e3,
+        width_limit_us=WIDTH_US[1],
+    )
+
+
+def _pictures(history: ScanHistory, shown: Shown) -> PicturesState:
+    image = history.instrument.image
+    waiting = max(0, len(history.takes) - len(shown.rows))
+    scales = {name: (p.low, p.high, p.unit) for name, p in shown.pictures.items()}
+    width_mm = image.columns * image.pixel_mm
+    height_mm = image.rows * image.pixel_mm
+    return PicturesState(shown.revision, len(shown.rows), waiting, width_mm, height_mm, scales)
+
+
+def _sync(shown: Shown) -> SyncState:
+    boards = {
+        # What is not a number is sent as null.
+        name: {row: round(math.degrees(sync.object_rad), 3) for row, sync in rows.items()}
+        for name, rows in shown.sync.items()
+    }
+    return SyncState(round(math.degrees(PAPER_PHASE_RAD), 2), boards)
+
+
+def _notices(inputs: Inputs) -> list[Finding]:
+    """All notices, the newest first, each once."""
+    notices = []
+    if inputs.problem:
+        why = "It was written by another release, or is damaged"
+        notices.append(Finding("warning", inputs.problem, why, f"`polysight validate {inputs.folder}`"))
+    history = inputs.history
+    if history is not None:
+        if inputs.pi.deaf is not None and history.ended is None:
+            notices.append(inputs.pi.deaf)
+        if inputs.shown.problem is not None:
+            notices.append(inputs.shown.problem)
+        notices += sync_notices(inputs.shown, history.plan.columns)
+        notices += inputs.pi.faults
+        notices += reversed(history.notices[-MAX_NOTICES:])
+    return [notice for k, notice in enumerate(notices) if notice not in notices[:k]]
+
+
+def sync_notices(shown: Shown, columns: int) -> list[Finding]:
+    """Warnings about the synchronisation of the last row."""
+    notices = []
+    for board, rows in shown.sync.items():
+        if not rows:
+            continue
+        row = max(rows)
+        sync = rows[row]
+        if sync.masked > MASKED_SHARE * columns:
+            what = f"{board}: {sync.masked} of {columns} positions of row {row} have no usable direct path"
+            why = "Something stands between the transmitter and this board, or frames are missing"
+            do = "Clear the line of sight; look at the board's frames"
+        elif sync.direct_rad > DIRECT_RAD:
+            what = f"{board}: synchronisation leaves {sync.direct_rad:.2f} rad in row {row}; 0.004 is usual"
+            why = "A weak direct path, or a strong reflector near it"
+            do = "Check the antennas' aim; look at the range profile"
+        else:
+            continue
+        notices.append(Finding("warning", what, why, do, where=f"row {row}"))
+    return notices
+
+
+# --- the headline ---
+
+
 def no_scan(folder: Path) -> Status:
     """Status of a folder without a scan."""
-    return Status(
-        "wait", "No scan here yet", f"{folder} holds no scan. This page starts when one does.", "",
-        f"`polysight scan --out {folder}`",
-    )  # fmt: skip
+    detail = f"{folder} holds no scan. This page starts when one does."
+    return Status("wait", "No scan here yet", detail, "", f"`polysight scan --out {folder}`")
 
 
-def unreadable(folder: Path, problem: str) -> Status:
+def _unreadable(inputs: Inputs) -> Status:
     """Status of a scan whose first fact cannot be read."""
     why = "It was written by another release, or is damaged"
-    return Status("bad", "This scan cannot be shown", problem, why, f"`polysight validate {folder}`")
+    return Status("bad", "This scan cannot be shown", inputs.problem, why, f"`polysight validate {inputs.folder}`")
 
 
-def judge(
-    history: ScanHistory, folder: Path, signs: LifeSigns, heard: PiState, shown: Shown, asked: ScanCommand | None
-) -> Status:
+def judge(inputs: Inputs, history: ScanHistory) -> Status:
     """The status of a scan; the worst condition wins."""
-    rows, done = history.plan.rows, len(history.takes)
-    resume = f"`polysight resume {folder}`"
     if history.ended is not None:
-        return _ended(history, rows, done, resume)
+        return _judge_end(inputs, history, history.ended)
+    status = _judge_trouble(inputs, history) or _judge_command(inputs, history) or _judge_rows(inputs, history)
+    if status is not None:
+        return status
+    now = _safe_rows(history)
+    if inputs.pi.row >= 0:
+        now = f"Row {inputs.pi.row} is being scanned."
+    return Status("good", "All is well", now)
+
+
+def _safe_rows(history: ScanHistory) -> str:
+    return f"{len(history.takes)} of {history.plan.rows} rows are safe."
+
+
+def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status:
+    resume = f"`polysight resume {inputs.folder}`"
+    if ended.exit_status == "success" and len(history.takes) == history.plan.rows:
+        gaps = sum(mark == "kept" for mark in history.marks.values())
+        detail = f"Every row is safe; {gaps} are kept with gaps, masked." if gaps else "Every row is safe."
+        return Status("done", "The scan is finished", detail)
+    if ended.exit_status == "abort":
+        return Status("wait", "Stopped on request", _safe_rows(history), "", resume)
+    why = sentence(ended.why) or "See its terminal"
+    do = sentence(ended.remedy) or resume
+    return Status("bad", "The scan has failed", sentence(ended.reason), why, do)
+
+
+def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
+    """A program or Pi that does not answer, or a rig that has stopped."""
+    signs = inputs.signs
     if not signs.alive:
         return Status(
-            "bad", "The scan program has ended", f"No sign of life for {SINCE}; {done} of {rows} rows are safe.",
-            "It was killed, or the computer was switched off", resume, signs.alive_s,
+            "bad", "The scan program has ended", f"No sign of life for {SINCE}; {_safe_rows(history)}",
+            "It was killed, or the computer was switched off", f"`polysight resume {inputs.folder}`", signs.alive_s,
         )  # fmt: skip
     if signs.pi_silent_s is not None and signs.pi_silent_s > signs.pi_limit_s:
         return Status(
             "bad", "The Pi is silent", f"No heartbeat for {SINCE}. The stage stops by itself.",
             "Network or power of the Pi, or its program ended", "On the Pi: `systemctl status polysight-pi`",
-            heard.heard_utc_s,
+            inputs.pi.heard_utc_s,
         )  # fmt: skip
-    if heard.state == "fault":
-        unknown = Notice(
-            "bad", "It occurred before this view.", "See the Pi's log", "On the Pi: `journalctl -u polysight-pi`"
-        )
-        fault = heard.faults[-1] if heard.faults else unknown
-        return Status("bad", "The rig has stopped with a fault", fault.what, fault.why, fault.do)
-    if asked is ScanCommand.ABORT:
+    if inputs.pi.state != "fault":
+        return None
+    headline = "The rig has stopped with a fault"
+    if not inputs.pi.faults:
+        do = "On the Pi: `journalctl -u polysight-pi`"
+        return Status("bad", headline, "It occurred before this view.", "See the Pi's log", do)
+    fault = inputs.pi.faults[-1]
+    return Status("bad", headline, fault.what, fault.why, fault.do)
+
+
+def _judge_command(inputs: Inputs, history: ScanHistory) -> Status | None:
+    """A scan that was asked to stop or pause, or is held."""
+    folder = inputs.folder
+    if inputs.asked is ScanCommand.ABORT:
         return Status("wait", "Stopping now", "The stage stops; the running row will be retaken.")
-    if asked is ScanCommand.STOP:
-        return Status("wait", "Stopping after this row", f"Resume later: {resume}.")
+    if inputs.asked is ScanCommand.STOP:
+        return Status("wait", "Stopping after this row", f"Resume later: `polysight resume {folder}`.")
     if history.paused:
-        return Status(
-            "wait", "Paused", f"{done} of {rows} rows are safe. Nothing moves.", "",
-            f"Continue with the button, or `touch {folder}/control/continue`",
-        )  # fmt: skip
-    if asked is ScanCommand.PAUSE:
+        do = f"Continue with the button, or `touch {folder}/control/continue`"
+        return Status("wait", "Paused", f"{_safe_rows(history)} Nothing moves.", "", do)
+    if inputs.asked is ScanCommand.PAUSE:
         return Status("wait", "Pausing after this row", "The stage stands still then, until you continue.")
-    if heard.state == "held":
+    if inputs.pi.state == "held":
         return Status(
             "warn", "The stage is held", "Within a row. Held for more than 2 s, the row is retaken.",
             "A program other than polysight sent the Pi `Hold`",
             f"That program sends `Resume`; or end the scan: `touch {folder}/control/abort`",
         )  # fmt: skip
-    if heard.state == "homing":
+    return None
+
+
+def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
+    """Rows that are retaken, late, or poor."""
+    pi = inputs.pi
+    if pi.state == "homing":
         return Status("good", "Homing the stage", "Rows begin when its position is known.")
-    if heard.row >= 0 and history.marks.get(heard.row) == "rejected":
-        return _news(history, f"Row {heard.row} is retaken (take {heard.take})")
-    if late := _late(history, signs):
+    if pi.row >= 0 and history.marks.get(pi.row) == "rejected":
+        return _recent_warning(history, f"Row {pi.row} is retaken (take {pi.take})")
+    if late := _judge_lateness(history, inputs.signs):
         return late
-    if history.rows_since_trouble < _LATELY_ROWS and any(n.level == "warn" for n in history.notices):
-        return _news(history, "Scanning, after a fault in a row")
-    if poor := sync_notices(shown, history.plan.columns):
+    if history.rows_since_trouble < RECENT_ROWS and any(n.level == "warning" for n in history.notices):
+        return _recent_warning(history, "Scanning, after a fault in a row")
+    if poor := sync_notices(inputs.shown, history.plan.columns):
         return Status("warn", "Scanning, but the data is poor", poor[0].what, poor[0].why, poor[0].do)
-    now = f"Row {heard.row} is being scanned." if heard.row >= 0 else f"{done} of {rows} rows are safe."
-    return Status("good", "All is well", now)
+    return None
 
 
-def _ended(history: ScanHistory, rows: int, done: int, resume: str) -> Status:
-    ended = history.ended or ScanEnded()
-    reason, status = sentence(ended.reason), ended.exit_status
-    if status == "success" and done == rows:
-        gaps = sum(mark == "kept" for mark in history.marks.values())
-        whole = "Every row is safe." if not gaps else f"Every row is safe; {gaps} are kept with gaps, masked."
-        return Status("done", "The scan is finished", whole)
-    if status == "abort":
-        return Status("wait", "Stopped on request", f"{done} of {rows} rows are safe.", "", resume)
-    return Status(
-        "bad", "The scan has failed", reason, sentence(ended.why) or "See its terminal",
-        sentence(ended.remedy) or resume,
-    )  # fmt: skip
+def _recent_warning(history: ScanHistory, headline: str) -> Status:
+    for notice in reversed(history.notices):
+        if notice.level == "warning":
+            return Status("warn", headline, f"{notice.what}.", notice.why, notice.do)
+    return Status("warn", headline)
 
 
-def _news(history: ScanHistory, headline: str) -> Status:
-    last = next((n for n in reversed(history.notices) if n.level == "warn"), None)
-    if last is None:
-        return Status("warn", headline)
-    return Status("warn", headline, f"{last.what}.", last.why, last.do)
-
-
-def _late(history: ScanHistory, signs: LifeSigns) -> Status | None:
+def _judge_lateness(history: ScanHistory, signs: LifeSigns) -> Status | None:
     """A warning if no row has ended for much longer than a row takes."""
-    known, since = history.row_seconds, max(history.last_commit_s, history.run_started_s)
-    if known is None or known[1] == "first row" or signs.now_s - since < max(_LATE_ROWS * known[0], _LATE_S):
+    if history.row_seconds is None:
+        return None
+    row_s, basis = history.row_seconds
+    since = max(history.last_commit_s, history.run_started_s)
+    if basis == "first row" or signs.now_s - since < max(LATE_ROWS * row_s, LATE_S):
         return None
     return Status(
         "warn", "No row has ended for a while", f"None for {SINCE}, though the scan program runs.",
         "It waits for the disk, for processing, or for the stage", "See its terminal", since,
     )  # fmt: skip
-
-
-def sync_notices(shown: Shown, columns: int) -> list[Notice]:
-    """Warnings about the synchronisation of the last row."""
-    found = []
-    for board, rows in shown.sync.items():
-        if not rows:
-            continue
-        row = max(rows)
-        _, direct_rad, masked = rows[row]
-        if masked > _MASKED * columns:
-            what = f"{board}: {masked} of {columns} positions of row {row} have no usable direct path"
-            why = "Something stands between the transmitter and this board, or frames are missing"
-            found.append(Notice("warn", what, why, "Clear the line of sight; look at the board's frames", row=row))
-        elif direct_rad > _DIRECT_RAD:
-            what = f"{board}: synchronisation leaves {direct_rad:.2f} rad in row {row}; 0.004 is usual"
-            why = "A weak direct path, or a strong reflector near it"
-            found.append(Notice("warn", what, why, "Check the antennas' aim; look at the range profile", row=row))
-    return found

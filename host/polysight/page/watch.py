@@ -1,27 +1,28 @@
-"""Follow one scan in a thread, and keep the newest snapshot of it for all pages.
+"""Follow one scan in threads, and keep the newest snapshot of it for all pages.
 
-Manifest, event log and products are read as they change (`ManifestTail`, `EventTail`, `ProductsTail`). A snapshot is
-serialised once, so that a page costs only its transmission, and all pages see the same.
+Manifest, event log and products are read as they change (`ManifestTail`, `EventTail`, `ProductsTail`); `PiListener`
+receives the Pi's events. A snapshot is serialised once, so that a page costs only its transmission, and all pages see
+the same.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgpack
+import msgspec
+import zmq
 
 from polysight.acquisition import ScanCommand, last_alive_s, send_command
-from polysight.page.history import ScanHistory
+from polysight.page.history import PiState, ScanHistory, notice_of_error, notice_of_fault
 from polysight.page.images import RowViewer, Shown
-from polysight.page.listener import PiListener, PiState
-from polysight.page.snapshot import Content, make_motion, make_snapshot
-from polysight.page.status import LifeSigns
+from polysight.page.status import Inputs, LifeSigns, Motion, Snapshot, make_motion, make_snapshot
 from polysight.products import MATERIALS, QUALITY, find_products
 from polysight.results import Verdict
 from polysight.store import (
@@ -36,15 +37,33 @@ from polysight.store import (
     ScanResumed,
     ScanStarted,
 )
+from polysight_shared.config import Instrument
 from polysight_shared.errors import PolysightError, ProtocolError
-from polysight_shared.messages import AnyEvent, unpack_with_crc
+from polysight_shared.messages import (
+    AnyEvent,
+    Capture,
+    Fault,
+    Heartbeat,
+    RowFinished,
+    RowStarted,
+    StageStatus,
+    unpack_event,
+    unpack_with_crc,
+)
+from polysight_shared.sockets import observer
 
-_HEAD = 256
-_TURN_S = 0.2
-_LAPSE_S = 15.0  # the scan program touches its file once a second
-_GRACE_S = 6.0  # from a manifest's first line to the first sign of life
-_PI_LIMIT_S = 6.0  # timeout of the Pi's heartbeat
-_UNATTENDED_ROWS = 3.0  # a scan without signs of life lives while rows come, and for so many rows' time
+HEAD_BYTES = 256
+TURN_S = 0.2
+LISTEN_MS = 200
+MAX_FAULTS = 20
+# The scan program touches its file once a second.
+LAPSE_S = 15.0
+# From a manifest's first line to the first sign of life.
+GRACE_S = 6.0
+# Timeout of the Pi's heartbeat.
+PI_LIMIT_S = 6.0
+# A scan without signs of life lives while rows come, and for so many rows' time.
+UNATTENDED_ROWS = 3.0
 
 
 class GrowingFile:
@@ -62,8 +81,9 @@ class GrowingFile:
         self.path = path
         self.replaced = False
         self.modified_s = 0.0
-        self._position, self._head = 0, b""
-        self._seen = (0, -1, -1)
+        self._position = 0
+        self._head = b""
+        self._stamp = (0, -1, -1)
 
     def look(self) -> bytes:
         """Bytes after those taken so far; empty if nothing has changed or the file cannot be read."""
@@ -71,15 +91,17 @@ class GrowingFile:
         try:
             with self.path.open("rb") as f:
                 status = os.fstat(f.fileno())
-                seen = (status.st_ino, status.st_size, status.st_mtime_ns)
-                if seen == self._seen:
+                stamp = (status.st_ino, status.st_size, status.st_mtime_ns)
+                if stamp == self._stamp:
                     return b""
-                self._seen, self.modified_s = seen, status.st_mtime
+                self._stamp = stamp
+                self.modified_s = status.st_mtime
                 # Another file may have the same number: a record's CRC at its beginning tells them apart.
                 if status.st_size < self._position or f.read(len(self._head)) != self._head:
-                    self.replaced, self._position = True, 0
+                    self.replaced = True
+                    self._position = 0
                 f.seek(0)
-                self._head = f.read(_HEAD)
+                self._head = f.read(HEAD_BYTES)
                 f.seek(self._position)
                 return f.read()
         except OSError:
@@ -91,7 +113,7 @@ class GrowingFile:
 
 
 class ManifestTail:
-    """A manifest that grows; `content` has what was read so far."""
+    """Facts appended to a manifest."""
 
     def __init__(self, path: Path) -> None:
         self.file = GrowingFile(path)
@@ -136,26 +158,88 @@ class ProductsTail:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._seen: tuple[tuple[int, int], ...] | None = None
+        self._stamp: list[tuple[int, int]] = []
         self._verdict: Verdict | None = None
 
     def look(self) -> Verdict | None:
         """The verdict; None if not processed yet, by an earlier release, or if the products cannot be read."""
-        found = find_products(self._folder, QUALITY)
-        seen = () if found is None else tuple(_state(found.folder / name) for name in (MATERIALS, QUALITY))
-        if seen != self._seen:
-            self._seen, self._verdict = seen, None
-            with suppress(PolysightError):  # they are being replaced, or damaged
-                self._verdict = None if found is None else found.verdict
+        products = find_products(self._folder, QUALITY)
+        if products is None:
+            return None
+        stamp = []
+        for name in (MATERIALS, QUALITY):
+            with suppress(OSError):
+                status = (products.folder / name).stat()
+                stamp.append((status.st_mtime_ns, status.st_size))
+        if stamp != self._stamp:
+            self._stamp = stamp
+            self._verdict = None
+            # They are being replaced, or damaged.
+            with suppress(PolysightError):
+                self._verdict = products.verdict
         return self._verdict
 
 
-def _state(path: Path) -> tuple[int, int]:
-    try:
-        status = path.stat()
-    except OSError:
-        return 0, 0
-    return status.st_mtime_ns, status.st_size
+class PiListener:
+    """Receives the Pi's events of one scan in a thread of its own.
+
+    There is no command socket here, so the live view cannot command the Pi.
+    """
+
+    def __init__(self, instrument: Instrument, scan_id: str) -> None:
+        self.state = PiState()
+        self._instrument = instrument
+        self._scan_id = scan_id
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="listener", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        try:
+            pi = self._instrument.pi
+            socket = observer(context, pi.event_address, Path(pi.key_dir))
+            while not self._ended.is_set():
+                if socket.poll(LISTEN_MS):
+                    self._receive(socket.recv_multipart()[-1])
+        except PolysightError as e:
+            self.state = replace(self.state, deaf=notice_of_error(e, "note"))
+        finally:
+            context.destroy(linger=0)
+
+    def _receive(self, raw: bytes) -> None:
+        try:
+            event = unpack_event(raw)
+        except ProtocolError as e:
+            self.state = replace(self.state, deaf=notice_of_error(e, "note"))
+            return
+        state = replace(self.state, heard_s=time.monotonic(), heard_utc_s=int(time.time()), deaf=None)
+        if isinstance(event, Heartbeat):
+            state = replace(state, state=event.state)
+        elif isinstance(event, StageStatus):
+            stage = self._instrument.stage
+            state = replace(state, x_mm=event.x_mm - stage.centre_x_mm, y_mm=event.y_mm - stage.centre_y_mm)
+        elif event.scan_id == self._scan_id:
+            state = _follow_row(state, event)
+        self.state = state
+
+    def close(self) -> None:
+        """Stop the thread."""
+        self._ended.set()
+        self._thread.join()
+
+
+def _follow_row(state: PiState, event: AnyEvent) -> PiState:
+    """The state after an event of the scan's rows."""
+    if isinstance(event, RowStarted):
+        return replace(state, row=event.row.index, take=event.take, point=0, state="running")
+    if isinstance(event, Capture):
+        return replace(state, row=event.row_index, take=event.take, point=event.point + 1)
+    if isinstance(event, RowFinished):
+        return replace(state, row=-1, point=0, faults=() if event.status == "done" else state.faults)
+    if isinstance(event, Fault):
+        return replace(state, faults=(*state.faults, notice_of_fault(event))[-MAX_FAULTS:])
+    return state
 
 
 class Versioned(NamedTuple):
@@ -164,6 +248,11 @@ class Versioned(NamedTuple):
     version: int
     data: bytes
 
+    def publish(self, content: Snapshot | Motion) -> Versioned:
+        """The next version, if the content differs."""
+        data = msgspec.json.encode(content)
+        return self if data == self.data else Versioned(self.version + 1, data)
+
 
 class Watch:
     """Follows a scan folder, which may not exist yet, in a thread of its own; only :meth:`ask` writes into it.
@@ -171,14 +260,17 @@ class Watch:
     `lapse_s` is the timeout of the scan program's signs of life.
     """
 
-    def __init__(self, folder: Path, control: bool = False, lapse_s: float = _LAPSE_S) -> None:
-        self.folder, self.control = folder, control
+    def __init__(self, folder: Path, control: bool = False, lapse_s: float = LAPSE_S) -> None:
+        self.folder = folder
+        self.control = control
+        self.state = Versioned(0, b"{}")
+        self.motion = Versioned(0, b"{}")
+        self.shown = Shown()
         self._lapse_s = lapse_s
         self._ended = threading.Event()
-        self._asked: tuple[ScanCommand, int] | None = None  # and how many facts there were
+        # The last command, and how many facts there were then.
+        self._asked: tuple[ScanCommand, int] | None = None
         self._looked = False
-        self.state, self.motion = Versioned(0, b"{}"), Versioned(0, b"{}")
-        self.shown = Shown()
         self._begin()
         self._turn()
         self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
@@ -189,38 +281,46 @@ class Watch:
 
     def _begin(self) -> None:
         """Reset all state: another scan may be in the folder now."""
-        self._manifest, self._events = ManifestTail(self.folder / MANIFEST), EventTail(self.folder / EVENTS)
-        self._result = ProductsTail(self.folder)
+        self._manifest = ManifestTail(self.folder / MANIFEST)
+        self._events = EventTail(self.folder / EVENTS)
+        self._products = ProductsTail(self.folder)
         self._history: ScanHistory | None = None
         self._viewer: RowViewer | None = None
         self._listener: PiListener | None = None
         self._problem = ""
-        self._life_seen: float | None = None
-        self._life_at = self._grown_at = float("-inf")
+        self._life_s: float | None = None
+        self._life_at = float("-inf")
+        self._grown_at = float("-inf")
 
     def _run(self) -> None:
-        while not self._ended.wait(_TURN_S):
+        while not self._ended.wait(TURN_S):
             try:
                 self._turn()
             except Exception as e:  # noqa: BLE001  a view that has failed must not show "All is well"
                 self._problem = f"the live view fails: {type(e).__name__}: {e}"
-                nothing = Content(
-                    self.folder, None, self._signs(PiState()), PiState(), Shown(), None, False, self._problem
-                )
-                self.state = _publish(self.state, make_snapshot(nothing))
+                nothing = Inputs(self.folder, None, self._signs(PiState()), problem=self._problem)
+                self.state = self.state.publish(make_snapshot(nothing))
 
     def _turn(self) -> None:
         """Read everything once, and publish what has changed."""
         self._read()
         self._attend()
-        self.shown = self._viewer.shown if self._viewer is not None else Shown()
-        heard = self._listener.heard if self._listener is not None else PiState()
-        content = Content(
-            self.folder, self._history, self._signs(heard), heard, self.shown, self._pending(), self.control,
-            self._problem, self._result.look(),
-        )  # fmt: skip
-        self.state = _publish(self.state, make_snapshot(content))
-        self.motion = _publish(self.motion, make_motion(content))
+        if self._viewer is not None:
+            self.shown = self._viewer.shown
+        pi = self._listener.state if self._listener is not None else PiState()
+        inputs = Inputs(
+            folder=self.folder,
+            history=self._history,
+            signs=self._signs(pi),
+            pi=pi,
+            shown=self.shown,
+            asked=self._pending(),
+            control=self.control,
+            problem=self._problem,
+            verdict=self._products.look(),
+        )
+        self.state = self.state.publish(make_snapshot(inputs))
+        self.motion = self.motion.publish(make_motion(inputs))
 
     def _read(self) -> None:
         """Read what was appended to the files."""
@@ -228,8 +328,10 @@ class Watch:
         if self._manifest.file.replaced:
             self._close_parts()
             self._begin()
+            self.shown = Shown()
             facts = self._manifest.look()
-        if facts and self._looked:  # at the first look nothing is known to be new
+        # At the first look nothing is known to be new.
+        if facts and self._looked:
             self._grown_at = time.monotonic()
         self._looked = True
         for fact in facts:
@@ -253,26 +355,33 @@ class Watch:
         if self._viewer is None:
             self._viewer = RowViewer(self.folder, self._manifest.content)
             self._viewer.start()
-        self._viewer.want(history.takes)
+        self._viewer.show_rows(history.takes)
         if history.ended is None and self._listener is None:
             self._listener = PiListener(history.instrument, history.scan_id)
         elif history.ended is not None and self._listener is not None:
             self._listener.close()
             self._listener = None
 
-    def _signs(self, heard: PiState) -> LifeSigns:
+    def _signs(self, pi: PiState) -> LifeSigns:
         """Signs of life of the scan program and the Pi."""
-        now, wall = time.monotonic(), time.time()
-        life = last_alive_s(self.folder)
-        if life is not None and life != self._life_seen:
-            age = max(0.0, wall - life) if self._life_seen is None else 0.0  # from then on changes count, not clocks
-            self._life_seen, self._life_at = life, now - age
-        known = None if self._history is None else self._history.row_seconds
-        patience = _GRACE_S if known is None else max(_GRACE_S, _UNATTENDED_ROWS * known[0])
-        alive = now - self._grown_at < patience if life is None else now - self._life_at < self._lapse_s
-        alive_s = 0 if alive else round(life or self._manifest.file.modified_s)
-        silent = now - heard.heard_s if heard.heard_s else None
-        return LifeSigns(alive, alive_s, silent, _PI_LIMIT_S, wall)
+        now = time.monotonic()
+        wall_s = time.time()
+        life_s = last_alive_s(self.folder)
+        if life_s is not None and life_s != self._life_s:
+            # The first sign may be old; from then on changes count, not clocks.
+            age_s = max(0.0, wall_s - life_s) if self._life_s is None else 0.0
+            self._life_s = life_s
+            self._life_at = now - age_s
+        if life_s is None:
+            patience_s = GRACE_S
+            if self._history is not None and self._history.row_seconds is not None:
+                patience_s = max(GRACE_S, UNATTENDED_ROWS * self._history.row_seconds[0])
+            alive = now - self._grown_at < patience_s
+        else:
+            alive = now - self._life_at < self._lapse_s
+        alive_s = 0 if alive else round(life_s or self._manifest.file.modified_s)
+        pi_silent_s = now - pi.heard_s if pi.heard_s else None
+        return LifeSigns(alive, alive_s, pi_silent_s, PI_LIMIT_S, wall_s)
 
     def _pending(self) -> ScanCommand | None:
         """The pending request, until the manifest shows that it was carried out."""
@@ -287,10 +396,12 @@ class Watch:
 
     def ask(self, command: ScanCommand) -> None:
         """Ask the scan to pause, continue, stop or abort; returns when it has taken the request. Raises ScanError."""
-        before = len(self._manifest.content.facts)
+        facts = len(self._manifest.content.facts)
         send_command(self.folder, command)
-        paused = self._history is not None and self._history.paused
-        self._asked = None if command is ScanCommand.CONTINUE and not paused else (command, before)
+        self._asked = (command, facts)
+        if command is ScanCommand.CONTINUE and not (self._history is not None and self._history.paused):
+            # It withdraws a request to pause.
+            self._asked = None
 
     def _close_parts(self) -> None:
         for part in (self._viewer, self._listener):
@@ -303,8 +414,3 @@ class Watch:
         if self._thread.is_alive():
             self._thread.join()
         self._close_parts()
-
-
-def _publish(before: Versioned, content: dict[str, Any]) -> Versioned:
-    data = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
-    return before if data == before.data else Versioned(before.version + 1, data)

@@ -90,7 +90,7 @@ export function raster(canvas, state, motion) {
   const fill = (row, from, width) => pen.fillRect(from, edge(row + 1), width, Math.max(edge(row) - edge(row + 1) - gap, 1 / ratio));
   const colours = { c: colour("--h"), k: colour("--mark-k"), r: colour("--mark-r"), ".": colour("--well") };
   for (let row = 0; row < rows; row++) {
-    pen.fillStyle = colours[state.marks[row]];
+    pen.fillStyle = colours[state.scan.marks[row]];
     fill(row, margin, inner);
   }
   if (motion.row >= 0 && motion.point > 0) {

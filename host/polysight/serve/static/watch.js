@@ -1,5 +1,5 @@
 // The live view's page: hears the newest state from the server, shows it, and asks for what a button says.
-import { address, begin, by, clock, complain, ending, get, grouped, make, pageOf, post, rich, scanName, signed, span, tell } from "./common.js";
+import { address, begin, by, clock, complain, ending, get, grouped, make, pageOf, post, rich, scanName, signed, span, tell, VERDICTS } from "./common.js";
 import { plot, raster } from "./plots.js";
 
 const SILENT_MS = 7000; // the server says something every two seconds
@@ -13,19 +13,19 @@ let server = {}, name = scanName, summary = {};
 // --- what is shown ---
 
 function showStatus() {
-  const { status, progress } = state;
+  const { status, scan } = state;
   by("status").dataset.level = status.level;
   by("sign").textContent = SIGNS[status.level];
   by("headline").textContent = status.headline;
   tell("detail", status.detail.replace("{since}", span(Math.max(0, (motion.now_s ?? status.since_s) - status.since_s))));
   tell("why", status.why && `Likely: ${status.why[0].toLowerCase()}${status.why.slice(1)}.`);
   tell("do", status.do);
-  by("progress").hidden = !progress;
+  by("progress").hidden = !scan;
   let left = "", ends = "";
-  if (progress) {
-    by("done").style.width = `${100 * progress.committed / progress.rows}%`;
-    by("count").textContent = `${progress.committed} of ${progress.rows} rows`;
-    const open = progress.committed < progress.rows;
+  if (scan) {
+    by("done").style.width = `${100 * scan.committed / scan.rows}%`;
+    by("count").textContent = `${scan.committed} of ${scan.rows} rows`;
+    const open = scan.committed < scan.rows;
     if (open && Number.isFinite(motion.left_s)) {
       left = motion.left_s ? `${span(motion.left_s)} left` : "nearly done";
       ends = state.control.paused ? "once it goes on" : `ends about ${clock(motion.now_s + motion.left_s)}`;
@@ -36,7 +36,7 @@ function showStatus() {
   }
   by("left").textContent = left;
   by("ends").textContent = ends;
-  const short = progress ? ` ${progress.committed}/${progress.rows}` : "";
+  const short = scan ? ` ${scan.committed}/${scan.rows}` : "";
   document.title = `${SIGNS[status.level]}${short}${left ? ` · ${left}` : ""} · polysight`;
 }
 
@@ -45,7 +45,7 @@ function showResult() {
   by("result").hidden = !told;
   if (!told) return;
   by("result").dataset.level = told.level;
-  by("result-level").textContent = told.text;
+  by("result-level").textContent = VERDICTS[told.level][0];
   by("reasons").replaceChildren(...told.reasons.map((r) => {
     const item = make("li"), what = make("b"), why = make("span", r.why && ": ", "why");
     what.append(...rich(r.what));
@@ -62,7 +62,7 @@ function showResult() {
 
 function showButtons() {
   const { enabled, running, paused, asked } = state.control;
-  const open = state.progress && state.progress.committed < state.progress.rows;
+  const open = state.scan && state.scan.committed < state.scan.rows;
   const resumes = Boolean(server.starts && open && !running && !asked && !summary.programs?.some((p) => p.kind === "scan" && p.running));
   by("buttons").hidden = !(enabled && running) && !resumes;
   by("resume").hidden = !resumes;
@@ -110,7 +110,7 @@ function showImages() {
     : state.control.running ? "not referenced to metal yet" : "not referenced to metal: not processed";
   if (p.revision === revision) return;
   revision = p.revision;
-  for (const [key, { low, high, unit }] of Object.entries(p.items)) {
+  for (const [key, [low, high, unit]] of Object.entries(p.scales)) {
     const picture = by(key), caption = picture.closest("figure").querySelector("figcaption");
     picture.src = address(`picture/${key}`, { scan: name, revision });
     picture.hidden = false;
@@ -137,8 +137,8 @@ function showNotices() {
   const shown = allNotices ? notices : notices.slice(0, FEW);
   const items = shown.map((n) => {
     const item = make("li");
-    item.dataset.level = n.level;
-    if (n.utc) item.append(make("time", `${clock(Date.parse(n.utc) / 1000)} `));
+    item.dataset.level = { warning: "warn", error: "bad" }[n.level] ?? n.level;
+    if (n.facts.utc) item.append(make("time", `${clock(Date.parse(n.facts.utc) / 1000)} `));
     const what = make("b");
     what.append(...rich(n.what));
     item.append(what);
@@ -148,9 +148,9 @@ function showNotices() {
       todo.append(...rich(n.do));
       item.append(todo);
     }
-    if (n.detail) {
+    if (n.facts.detail) {
       const more = make("details");
-      more.append(make("summary", "in full"), make("span", n.detail));
+      more.append(make("summary", "in full"), make("span", n.facts.detail));
       item.append(more);
     }
     return item;
@@ -204,7 +204,7 @@ function showPlots() {
     });
   } else by("profile").replaceChildren(make("p", "After the first row.", "empty"));
   const lines = names.filter((n) => boards[n]).map((n) => (
-    { x: boards[n].rows, y: boards[n].object_deg, name: n, style: `receiver${names.indexOf(n)}` }));
+    { x: Object.keys(boards[n]).map(Number), y: Object.values(boards[n]), name: n, style: `receiver${names.indexOf(n)}` }));
   const values = lines.flatMap((l) => l.y).filter((v) => v !== null);
   if (values.length) {
     by("sync-note").textContent = "phase left over, by row";

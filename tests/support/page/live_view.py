@@ -16,8 +16,7 @@ from polysight.serve.guard import Access
 from polysight.serve.programs import Programs
 from polysight.serve.server import Place, make_server
 from polysight.serve.site import Site, Watches
-from polysight.store import manifest
-from polysight.store.scan_folder import EVENTS, MANIFEST, utc_now
+from polysight.store import EVENTS, MANIFEST, manifest, utc_now
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.store.facts import facts_of
 

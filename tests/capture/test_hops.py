@@ -106,8 +106,8 @@ from polysight_shared.config import load_instrument
 rig = load_instrument(Path("instrument.toml"))
 limits = msgspec.structs.replace(rig.limits, command_timeout_s=0.15)
 survey = survey_cards(msgspec.structs.replace(rig, limits=limits))[0]
-hop = next(hop for hop in survey.hops if hop.verdict == "error")
-print(sys.argv[1], "|", hop.hop, "|", hop.found, "|", hop.why, flush=True)
+hop = next(hop for hop in survey.hops if hop.level == "error")
+print(sys.argv[1], "|", hop.where, "|", hop.what, "|", hop.why, flush=True)
 END
 }
 ip link set lo up

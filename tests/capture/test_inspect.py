@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 
+import dpkt
 import numpy as np
 import pytest
 from tests.support.capture.recordings import row, write_pcap
@@ -13,8 +14,7 @@ from tests.support.refusals import refused
 
 from polysight.capture import kind_of
 from polysight.capture.dca1000 import Status
-from polysight.capture.inspect import Layout, inspect_bin
-from polysight.capture.pcap import inspect_pcap, read_pcap
+from polysight.capture.inspect import Layout, inspect_bin, inspect_pcap, is_pcap, read_pcap
 from polysight.jobs.recordings import inspect_file, main_text
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -118,8 +118,18 @@ def test_pcap_forms(tmp_path, order, magic, tick):
     write_pcap(tmp_path / "x.pcap", [b"hello", b"x" * 100], order, magic)
     found = list(read_pcap(tmp_path / "x.pcap"))
     assert [d.payload for d in found] == [b"hello", b"x" * 100]
-    assert found[0].t_ns == 100 * 10**9 + 5 * tick
+    assert found[0].t_s == pytest.approx(100 + 5e-9 * tick, abs=1e-10)
     assert found[0].source == ("192.168.33.180", 1024)
+
+
+def test_pcapng_gives_the_same_datagrams(tmp_path):
+    write_pcap(tmp_path / "x.pcap", [b"hello", b"x" * 100])
+    with (tmp_path / "x.pcap").open("rb") as old, (tmp_path / "x.pcapng").open("wb") as new:
+        writer = dpkt.pcapng.Writer(new)
+        for t_s, frame in dpkt.pcap.Reader(old):
+            writer.writepkt(frame, t_s)
+    assert is_pcap((tmp_path / "x.pcapng").read_bytes()[:4])
+    assert list(read_pcap(tmp_path / "x.pcapng")) == list(read_pcap(tmp_path / "x.pcap"))
 
 
 def test_lost_packets_of_a_pcap_are_masked_and_reported(tmp_path):

@@ -11,15 +11,14 @@
 from polysight.capture.card import CardClient, EepromSettings, program_eeprom
 from polysight.capture.dca1000 import CARD_SOURCE_PORT, MAX_PAYLOAD_BYTES, Code, Status, Version
 from polysight.capture.decode import decode_row, raw_words, row_words, valid_frames
-from polysight.capture.inspect import CardReport, Layout, Report, inspect_bin, kind_of
+from polysight.capture.inspect import CardReport, Layout, Report, inspect_bin, inspect_pcap, is_pcap, kind_of
 from polysight.capture.network import check_receive_buffer, route_interface, silent_radar
 from polysight.capture.packet_file import PACKETS, Evidence, read_packets, write_packets
-from polysight.capture.pcap import inspect_pcap, is_pcap
 from polysight.capture.placement import Placed, place_record
 from polysight.capture.receiver import Progress, ReceiverProcess, RowCapture
 from polysight.capture.scheduling import PRIORITY_REMEDY, receiver_cores, take_priority
 from polysight.capture.segment import read_index, write_durably, write_error, write_index
-from polysight.capture.survey import CardSurvey, HopFinding, survey_cards
+from polysight.capture.survey import CardSurvey, survey_cards
 
 __all__ = [
     "CARD_SOURCE_PORT",
@@ -32,7 +31,6 @@ __all__ = [
     "Code",
     "EepromSettings",
     "Evidence",
-    "HopFinding",
     "Layout",
     "Placed",
     "Progress",

@@ -1,32 +1,41 @@
 """Inspect a recording of a DCA1000: range profile, clipping, silent antennas, order of I and Q.
 
-The layout is given, by the rig file or by the user. A file of whole packets, with headers, is recognised and placed by
-byte count first. `pcap.py` reads packet captures; `polysight.jobs.recordings` prints and plots the report.
-`kind_of` recognises other kinds of files.
+`inspect_bin` reads payload, in a layout that is given. A file of whole packets, with headers, is recognised and placed
+by byte count first. `inspect_pcap` reads a packet capture (pcap or pcapng): the replies of the card, and its record,
+placed as live data is. `kind_of` recognises other kinds of files.
 """
 
 from __future__ import annotations
 
+import io
+import socket
+import struct
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polysight.capture import dca1000
-from polysight.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Status
+from polysight.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Code, Status
 from polysight.capture.decode import decode_row, decode_two_lane
 from polysight.capture.earlier_records import counter_differences
 from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Placed, place_record
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ProtocolError
+from polysight_shared.files import read_bounded
 
 MAX_BYTES = 256 << 20
 """Part of a file that is read: eleven rows of the published scan."""
 MAX_CHIRPS = 4096  # enough for the statistics
 _HEADERS_READ = 16  # to recognise a file of whole packets
 _FULL_SCALE = 32767  # ADC counts
+_PCAP_HEADS = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\n\r\r\n")
+_UDP_HEADER_BYTES = 8
+_MAX_PCAP_BYTES = 4 << 30  # half an hour of three boards
 _MUCH_DC = 0.05 * _FULL_SCALE
 MAGIC = {
     b"\x7fELF": "a program", b"\x89PNG": "a picture (PNG)", b"\xff\xd8\xff": "a picture (JPEG)", b"%PDF": "a PDF",
@@ -147,7 +156,7 @@ def inspect_bin(path: Path, layout: Layout = Layout()) -> Report:
         size = path.stat().st_size
         payload = np.fromfile(path, dtype=np.uint8, count=MAX_BYTES)
     except OSError as e:
-        raise unreadable(path, e) from None
+        raise _unreadable(path, e) from None
     kind = kind_of(payload[:4096].tobytes())
     if kind not in ("empty", "unknown bytes"):
         what, remedy = f"{path}: not a capture: it begins as {kind}", "give a row (.bin) or a packet capture (.pcap)"
@@ -161,7 +170,7 @@ def inspect_bin(path: Path, layout: Layout = Layout()) -> Report:
     return report
 
 
-def unreadable(path: Path, e: OSError) -> DataError:
+def _unreadable(path: Path, e: OSError) -> DataError:
     """Return the error for a recording that cannot be read."""
     what = f"{path}: cannot be read: {e.strerror}"
     return DataError(what, "the path is wrong", "give a recording", code=ErrorCode.FILE_UNREADABLE)
@@ -233,3 +242,138 @@ def _remarks(r: Report, mirrored: bool) -> list[str]:
     if r.peak_db < 10:
         found.append("no clear peak in the range profile: noise, or a wrong layout (--lanes, --samples)")
     return found
+
+
+# --- packet captures ---
+
+
+class Datagram(NamedTuple):
+    """One UDP datagram and when it was seen."""
+
+    t_s: float
+    source: tuple[str, int]
+    payload: bytes
+
+
+def is_pcap(head: bytes) -> bool:
+    """True if a file that begins with these four bytes is a pcap or pcapng file."""
+    return head[:4] in _PCAP_HEADS
+
+
+def read_pcap(path: Path) -> Iterator[Datagram]:
+    """Yield the UDP datagrams of a pcap or pcapng file, in order; other packets and fragments are skipped.
+
+    Raises
+    ------
+    DataError
+        if the file is not a packet capture of an Ethernet interface, or ends within a packet.
+    """
+    import dpkt  # here, because it loads a hundred protocols
+
+    try:
+        raw = read_bounded(path, _MAX_PCAP_BYTES)
+    except OSError as e:
+        raise _unreadable(path, e) from None
+    try:
+        reader = dpkt.pcap.UniversalReader(io.BytesIO(raw))
+    except (dpkt.Error, ValueError, struct.error):
+        what = f"{path}: not a packet capture"
+        why, remedy = "another kind of file, or truncated", "record with `tcpdump -w`"
+        raise DataError(what, why, remedy, code=ErrorCode.FILE_FOREIGN) from None
+    if reader.datalink() != dpkt.pcap.DLT_EN10MB:
+        what = f"{path}: link type {reader.datalink()}, expected {dpkt.pcap.DLT_EN10MB} (Ethernet)"
+        raise DataError(what, "recorded on `-i any`?", code=ErrorCode.FILE_FOREIGN)
+    count = 0
+    try:
+        for t_s, frame in reader:
+            datagram = _udp_of(float(t_s), frame)
+            count += 1
+            if datagram is not None:
+                yield datagram
+    except (dpkt.Error, ValueError, struct.error):
+        what = f"{path}: ends within packet {count + 1}"
+        remedy = "record again: end tcpdump with Ctrl-C"
+        raise DataError(what, "truncated file", remedy, code=ErrorCode.FILE_DAMAGED) from None
+
+
+def _udp_of(t_s: float, frame: bytes) -> Datagram | None:
+    """Return the unfragmented UDP datagram in an Ethernet frame, or None. Raises ValueError if it is cut short."""
+    import dpkt
+
+    ethernet: Any = dpkt.ethernet.Ethernet(frame)
+    ip: Any = ethernet.data
+    if ethernet.type != dpkt.ethernet.ETH_TYPE_IP:
+        return None
+    if isinstance(ip, bytes):
+        raise ValueError("cut within the header")
+    if ip.p != dpkt.ip.IP_PROTO_UDP or ip.mf or ip.offset:
+        return None
+    udp: Any = ip.data
+    if isinstance(udp, bytes) or len(udp) < udp.ulen:
+        raise ValueError("cut within the payload")
+    return Datagram(t_s, (socket.inet_ntoa(ip.src), udp.sport), bytes(udp.data[: udp.ulen - _UDP_HEADER_BYTES]))
+
+
+def inspect_pcap(path: Path, layout: Layout = Layout(), card_address: str = "") -> Report:
+    """Inspect a packet capture (of `tcpdump -w`) with one record of a card.
+
+    `card_address` selects one of several cards.
+
+    Raises
+    ------
+    DataError
+        if the file is no packet capture, has nothing from a card, or several cards and none was selected.
+    """
+    card, packets = _from_card(path, card_address)
+    data = [d for d in packets if len(d.payload) > dca1000.PACKET_HEADER_BYTES]
+    if not data:
+        if not card.replies:
+            raise DataError(
+                f"{path}: contains nothing from a DCA1000{f' at {card_address}' if card_address else ''}",
+                "another capture, or another card",
+                "record on the card's interface",
+                code=ErrorCode.NO_DATA,
+            )
+        return _empty(path, layout, card)
+    payload, card.record = place_packets([d.payload for d in data])
+    if len(data) > 1 and len(data[-1].payload) < len(data[0].payload):
+        card.tail_bytes = len(data[-1].payload) - dca1000.PACKET_HEADER_BYTES
+        card.tail_after_s = data[-1].t_s - data[-2].t_s
+    report = inspect_payload(path, payload, layout)
+    report.card = card
+    if card.record.missing:
+        report.remarks.append(f"{sum(b - a for a, b in card.record.missing)} bytes are missing")
+    return report
+
+
+def _from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram]]:
+    """Return a card's replies and its other datagrams. Raises DataError for several cards."""
+    card, packets = CardReport("", [], "", Status(0), None, 0, 0.0), []
+    for datagram in read_pcap(path):
+        if datagram.source[1] != dca1000.CARD_SOURCE_PORT or card_address not in ("", datagram.source[0]):
+            continue
+        if card.address not in ("", datagram.source[0]):
+            raise DataError(
+                f"{path}: holds packets of {card.address} and {datagram.source[0]}",
+                "several cards were recorded at once",
+                f"choose one: --card {card.address}",
+                code=ErrorCode.VALUES_CONFLICT,
+            )
+        card.address = datagram.source[0]
+        try:
+            reply = dca1000.decode_reply(datagram.payload)
+        except ProtocolError:
+            packets.append(datagram)
+            continue
+        if reply.code == Code.STATUS:
+            card.status |= Status(reply.status & 0x0FFF)
+        name = Code(reply.code).name if reply.code in set(Code) else f"0x{reply.code:02x}"
+        card.replies.append((name, reply.status))
+        if reply.code == Code.VERSION:
+            card.version = str(dca1000.decode_version(reply.status))
+    return card, packets
+
+
+def _empty(path: Path, layout: Layout, card: CardReport) -> Report:
+    none = np.zeros(0)
+    return Report(path, 0, layout, 0, 0, 0.0, 0, [], [], 0, none, none, remarks=["no data packets"], card=card)

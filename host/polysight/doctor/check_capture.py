@@ -12,7 +12,7 @@ import numpy as np
 
 from polysight.acquisition import RefusedError
 from polysight.calibration import FULL_SCALE, DirectSignal, band_hz, find_direct, jitter_hz, unwrapped
-from polysight.capture import HopFinding, RowCapture, route_interface, silent_radar
+from polysight.capture import RowCapture, route_interface, silent_radar
 from polysight.doctor.context import (
     CheckContext,
     Finding,
@@ -27,6 +27,7 @@ from polysight.doctor.kernel import NetworkInterface, read_interface
 from polysight.radar import RadarState
 from polysight_shared.config import Board, Instrument
 from polysight_shared.faults import PiFault, explain
+from polysight_shared.findings import Finding as HopFinding
 from polysight_shared.messages import MAX_PULSES_AT_REST, MAX_PULSES_AT_REST_S
 
 _CARD_HOPS = ("host", "route", "link", "card")  # of the network survey
@@ -43,7 +44,7 @@ def check_card(context: CheckContext, board: Board) -> Finding:
     """Check that the card replies; otherwise report the first hop that does not."""
     survey = context.surveys[board.name]
     for hop in survey.hops:
-        if hop.hop in _CARD_HOPS and hop.verdict == "error":
+        if hop.where in _CARD_HOPS and hop.level == "error":
             return _finding(hop)
     return ok(
         f"{board.card_address}:{board.command_port} answers, FPGA {survey.version}; data to"
@@ -96,18 +97,18 @@ def _judge_interface(interface: NetworkInterface) -> Finding:
 
 def check_buffer(context: CheckContext, board: Board) -> Finding:
     """Check that the receiving process starts and that the kernel grants its receive buffer."""
-    hops = {h.hop: h for h in context.surveys[board.name].hops}
+    hops = {h.where: h for h in context.surveys[board.name].hops}
     receiver, buffer = hops["receiver"], hops["buffer"]
     for verdict in ("error", "warning"):
         for hop in (buffer, receiver):
-            if hop.verdict == verdict:
+            if hop.level == verdict:
                 return _finding(hop)
     context.usable_cards.add(board.name)
-    return ok(f"{buffer.found}; {receiver.found}")
+    return ok(f"{buffer.what}; {receiver.what}")
 
 
 def _finding(hop: HopFinding) -> Finding:
-    return Finding(hop.verdict, hop.found, hop.why, hop.remedy)
+    return error(hop.what, hop.why, hop.do) if hop.level == "error" else warning(hop.what, hop.why, hop.do)
 
 
 def check_pulses(context: CheckContext) -> Finding:

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import msgspec
 
-from polysight.capture import CardClient, CardSurvey, EepromSettings, HopFinding, program_eeprom, survey_cards
+from polysight.capture import CardClient, CardSurvey, EepromSettings, program_eeprom, survey_cards
 from polysight.jobs.output import print_json
 from polysight_shared.config import Board, Instrument, load_instrument
 from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.findings import Finding
 
 _ASK_S = 1.5  # limit of one question to a card that is perhaps just starting, all attempts together
 _PAUSE_S = 0.2
@@ -49,7 +50,18 @@ def _facts(survey: CardSurvey) -> dict[str, object]:
         "ok": survey.ok,
         "silent_hop": survey.silent,
         "fpga_version": survey.version,
-        "hops": [vars(hop) for hop in survey.hops],
+        "hops": [_hop(hop) for hop in survey.hops],
+    }
+
+
+def _hop(finding: Finding) -> dict[str, str]:
+    """One hop as plain data; a note says that the hop was not checked."""
+    return {
+        "hop": finding.where,
+        "verdict": "not checked" if finding.level == "note" else finding.level,
+        "found": finding.what,
+        "why": finding.why,
+        "remedy": finding.do,
     }
 
 
@@ -60,14 +72,15 @@ def _text(survey: CardSurvey) -> str:
     head = (
         f"{b.name} ({b.role}{unused}): card {b.card_address}:{b.command_port}, data to {b.host_address}:{b.data_port}\n"
     )
-    unchecked = [hop.hop for hop in survey.hops if hop.verdict == "not checked" and not hop.found]
+    unchecked = [hop.where for hop in survey.hops if hop.level == "note" and not hop.what]
     tail = f"  not checked {', '.join(unchecked)}\n" if unchecked else ""
-    return head + "".join(_line(hop) for hop in survey.hops if hop.hop not in unchecked) + tail
+    return head + "".join(_line(hop) for hop in survey.hops if hop.where not in unchecked) + tail
 
 
-def _line(hop: HopFinding) -> str:
-    more = "".join(f"{'':24}{word}: {text}\n" for word, text in (("why", hop.why), ("do", hop.remedy)) if text)
-    return f"  {hop.verdict:12}{hop.hop:10}{hop.found}".rstrip() + f"\n{more}"
+def _line(finding: Finding) -> str:
+    hop = _hop(finding)
+    more = "".join(f"{'':24}{word}: {text}\n" for word, text in (("why", finding.why), ("do", finding.do)) if text)
+    return f"  {hop['verdict']:12}{finding.where:10}{finding.what}".rstrip() + f"\n{more}"
 
 
 def _board(rig: Instrument, name: str, config: Path) -> Board:

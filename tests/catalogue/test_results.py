@@ -10,8 +10,9 @@ from tests.support.products import judged_products
 from tests.support.refusals import refused
 from tests.support.scenes import COPPER, PET
 
-from polysight.catalogue import MAPS, Pixels, compare, draw_comparison, draw_products, probe, result_of, thumbnail
+from polysight.catalogue import Pixels, compare, draw_comparison, draw_products, probe, result_of, thumbnail
 from polysight.catalogue.compare import SIGNIFICANT, scatter_of
+from polysight.catalogue.pictures import MAPS
 from polysight.polarimetry import permittivity_from_ratio
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError

@@ -77,7 +77,7 @@ def test_what_has_not_changed_is_not_read_again(root, monkeypatch):
     listed = Scans(root)
     first = listed.list()
     opened: list[str] = []
-    monkeypatch.setattr(scans, "summary_of", lambda _, name: opened.append(name))
+    monkeypatch.setattr(scans, "summarise", lambda _, name: opened.append(name))
     assert listed.list() == first
     assert opened == []
 

@@ -6,10 +6,8 @@ tags beside a scan. Of a processed scan, `result_of` gives the results as plain 
 """
 
 from polysight.catalogue.compare import DIFFERENCE, Comparison, compare, draw_comparison
-from polysight.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes, write_notes
 from polysight.catalogue.pictures import (
     AMPLITUDE,
-    MAPS,
     PHASE,
     Picture,
     Pixels,
@@ -20,14 +18,24 @@ from polysight.catalogue.pictures import (
 )
 from polysight.catalogue.probe import probe
 from polysight.catalogue.result import EXPORT, files_of, result_of
-from polysight.catalogue.scans import Scans, folder_bytes
-from polysight.catalogue.summary import PROGRAM, Summary, log_tail
+from polysight.catalogue.scans import (
+    NOTES,
+    PROGRAM,
+    Notes,
+    Scans,
+    Summary,
+    folder_bytes,
+    is_plain,
+    log_tail,
+    printable,
+    read_notes,
+    write_notes,
+)
 
 __all__ = [
     "AMPLITUDE",
     "DIFFERENCE",
     "EXPORT",
-    "MAPS",
     "NOTES",
     "PHASE",
     "PROGRAM",

@@ -1,27 +1,319 @@
-"""The scans under a folder: a list, and the folder of a scan by its name.
+"""The scans under a folder: a list with one line for each, the folder of a scan by its name, the operator's notes.
 
 Nothing is read again that has not changed, so that hundreds of scans are listed at once.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import re
+import stat
 import threading
+import time
+import unicodedata
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
+from datetime import datetime
 from pathlib import Path, PurePosixPath
 
-from polysight.catalogue.summary import PROGRAM, Stamp, Summary, as_of_now, stamp_of, summary_of
-from polysight.products import IMAGE
-from polysight.store import MANIFEST
+import msgspec
+from msgspec.structs import replace
+
+from polysight.acquisition import last_alive_s
+from polysight.products import IMAGE, MATERIALS, QUALITY, SavedProducts, write_atomically
+from polysight.store import MANIFEST, Manifest, manifest
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, no_such
+from polysight_shared.errors import ConfigError, DataError, PolysightError, ScanError, no_such
 
 READ_S = 3.0
 """Time limit for reading one folder of the list; it is then listed as `silent` until the read returns."""
-_DEEP, _MOST = 4, 5000  # folders below the first, and scans, that are looked at
+PROGRAM = "program"
+"""Folder of a scan in which programs that a page started keep their process number and log."""
+NOTES = "operator.json"
+MAX_NOTES = 10_000
+MAX_TAG = 40
+MAX_TAGS = 20
+MAX_NOTES_BYTES = 1 << 17
+# Folders below the first, and scans, that are looked at.
+MAX_DEPTH = 4
+MAX_SCANS = 5000
+LOG_BYTES = 16384
+CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+# Without a sign of life for so long, a scan's program is gone.
+LAPSE_S = 15.0
+# From a manifest's last line to the first sign of life.
+GRACE_S = 20.0
+Stamp = tuple[tuple[int, int], ...]
+
+
+# --- notes ---
+
+
+class Notes(msgspec.Struct, frozen=True):
+    """Free text and short tags of one scan, in `operator.json` beside its rows."""
+
+    notes: str = ""
+    tags: tuple[str, ...] = ()
+
+
+# Held from the comparison with the present notes until they are replaced.
+_notes_lock = threading.Lock()
+
+
+def read_notes(folder: Path) -> Notes:
+    """Read the notes of a scan; empty if there are none.
+
+    Raises
+    ------
+    DataError
+        if the file is damaged.
+    """
+    path = folder / NOTES
+    if not is_plain(path):
+        return Notes()
+    try:
+        with path.open("rb") as f:
+            raw = f.read(MAX_NOTES_BYTES + 1)
+        return Notes() if len(raw) > MAX_NOTES_BYTES else msgspec.json.decode(raw, type=Notes)
+    except FileNotFoundError:
+        return Notes()
+    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as e:
+        raise DataError(
+            f"{path}: cannot be read: {e}", "it was edited or damaged", "correct it, or remove it",
+            code=ErrorCode.FILE_DAMAGED,
+        ) from None  # fmt: skip
+
+
+def write_notes(folder: Path, notes: Notes, base: Notes | None = None) -> Notes:
+    """Check and write the notes of a scan; return them as written.
+
+    Raises
+    ------
+    ConfigError
+        if a text is too long, or there are too many tags.
+    ScanError
+        if the present notes differ from `base`, from which these were edited; None: not checked.
+    """
+    text = printable(notes.notes, keep="\n")
+    tags = dict.fromkeys(printable(tag).strip() for tag in notes.tags)
+    tags.pop("", None)
+    longest = max(tags, key=len, default="")
+    fault = ""
+    if len(text) > MAX_NOTES:
+        fault = f"the notes have {len(text)} characters, {MAX_NOTES} are allowed"
+    elif len(tags) > MAX_TAGS:
+        fault = f"{len(tags)} tags, {MAX_TAGS} are allowed"
+    elif len(longest) > MAX_TAG:
+        fault = f"the tag {longest[:MAX_TAG]!r}... has {len(longest)} characters, {MAX_TAG} are allowed"
+    if fault:
+        raise ConfigError(
+            fault, "lists have to stay readable", "shorten it; longer texts go into a file of their own",
+            code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
+    written = Notes(text, tuple(tags))
+    with _notes_lock:
+        if base is not None and read_notes(folder) != base:
+            raise ScanError(
+                f"the notes of {folder.name} have changed", "somebody saved them after they were read here",
+                "copy your text, load the page again, and add it", code=ErrorCode.MISMATCH,
+            )  # fmt: skip
+        content = json.dumps(msgspec.to_builtins(written), indent=1, ensure_ascii=False)
+        write_atomically(folder / NOTES, f"{content}\n".encode())
+    return written
+
+
+def is_plain(path: Path) -> bool:
+    """True if a path is a regular file: no link, and no pipe, on which a reader would block."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def printable(text: str, keep: str = "") -> str:
+    """Return the text without control, direction and surrogate characters, for lists and terminals."""
+    hidden = ("Cc", "Cf", "Cs", "Zl", "Zp")
+    return "".join(c for c in unicodedata.normalize("NFC", text) if c in keep or unicodedata.category(c) not in hidden)
+
+
+# --- one line of the list ---
+
+
+class Summary(msgspec.Struct, frozen=True):
+    """One line of the list.
+
+    Attributes
+    ----------
+    name
+        Its path below the folder that is listed, with `/`.
+    state
+        `running`, `paused`, `finished`, `stopped`, `failed`, `lost` (no program writes it, and none said why), `begun`
+        (a folder in which a program was started and no scan is yet), `products` (no rows beside), `damaged`, `silent`
+        (its folder does not answer: a network drive that is gone).
+    rows, committed
+        Of the plan, and those that count.
+    verdict
+        Level of its products' verdict, "" where it was not processed or not judged.
+    processed
+        True if there are materials.
+    images_only
+        True if there are images without materials: by `polysight image`, or before processing has ended.
+    seconds
+        When it began, since 1970; 0 where nothing says.
+    """
+
+    name: str
+    state: str
+    scan_id: str = ""
+    rig: str = ""
+    simulated: bool | None = None
+    started_utc: str = ""
+    rows: int = 0
+    committed: int = 0
+    reason: str = ""
+    verdict: str = ""
+    processed: bool = False
+    images_only: bool = False
+    materials: tuple[str, ...] = ()
+    notes: str = ""
+    tags: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+
+def _stamp(folder: Path) -> Stamp:
+    """Times and sizes of the files that a summary is made from."""
+    files = (MANIFEST, NOTES, f"products/{IMAGE}", f"products/{QUALITY}", IMAGE, QUALITY, f"{PROGRAM}/scan.status")
+    stamps = []
+    for name in files:
+        try:
+            status = (folder / name).stat()
+            stamps.append((status.st_mtime_ns, status.st_size))
+        except OSError:
+            stamps.append((0, -1))
+    return tuple(stamps)
+
+
+def summarise(folder: Path, name: str) -> Summary:
+    """Summarise a scan without signs of life: one that has not ended is `lost` here, see :func:`add_signs_of_life`."""
+    try:
+        notes = read_notes(folder)
+    except DataError as e:
+        notes = Notes(e.what)
+    summary = Summary(name, "begun", notes=notes.notes, tags=notes.tags, seconds=_modified_s(folder))
+    summary = _add_products(folder, summary)
+    content = _read_manifest(folder)
+    if content is None:
+        if summary.processed or summary.images_only:
+            return replace(summary, state="products")
+        reason = _start_failure(folder)
+        return replace(summary, state="failed" if reason else "begun", reason=reason)
+    started = content.started
+    if started is None:
+        return replace(summary, state="damaged")
+    return replace(
+        summary,
+        state="lost" if content.state == "open" else content.state,
+        scan_id=started.scan_id,
+        rig=str(started.instrument.get("name", "")),
+        simulated=started.simulated,
+        started_utc=started.started_utc,
+        rows=started.plan.rows,
+        committed=len(content.rows),
+        reason="" if content.ended is None else content.ended.reason[:300],
+        seconds=_parse_utc(started.started_utc) or summary.seconds,
+    )
+
+
+def _read_manifest(folder: Path) -> Manifest | None:
+    if not is_plain(folder / MANIFEST):
+        return None
+    try:
+        return manifest.read(folder / MANIFEST)
+    except DataError:
+        return None
+
+
+def _add_products(folder: Path, summary: Summary) -> Summary:
+    """Add verdict and materials of the products."""
+    places = [place for place in (folder / "products", folder) if (place / IMAGE).exists()]
+    if not places:
+        return summary
+    processed = (places[0] / MATERIALS).exists()
+    summary = replace(summary, processed=processed, images_only=not processed)
+    try:
+        products = SavedProducts(places[0])
+        if processed:
+            level = "" if products.verdict is None else products.verdict.level
+            names = [str(s["name"]) for s in products.segments if s.get("name")]
+            summary = replace(summary, verdict=level, materials=tuple(dict.fromkeys(names))[:12])
+        if places[0] == folder:
+            summary = replace(summary, scan_id=products.scan_id, simulated=products.simulated)
+    except (PolysightError, TypeError, KeyError, AttributeError):
+        # The page of the scan says what is wrong.
+        return replace(summary, verdict="damaged")
+    return summary
+
+
+def _start_failure(folder: Path) -> str:
+    """Why the program of a scan ended before its first row, from its log; "" if it runs, or was killed."""
+    status = folder / PROGRAM / "scan.status"
+    try:
+        if not is_plain(status) or status.read_text(encoding="ascii")[:8].strip() in ("", "0"):
+            return ""
+    except (OSError, ValueError):
+        return ""
+    lines = log_tail(folder / PROGRAM / "scan.log").splitlines()
+    errors = [line.partition(": ")[2] for line in lines if line.startswith(("polysight scan: ", "polysight resume: "))]
+    return (errors or lines or ["its program ended without a message"])[-1][:300]
+
+
+def log_tail(path: Path) -> str:
+    """The end of a program's log since its last start, without control sequences; "" if there is none."""
+    if not is_plain(path):
+        return ""
+    try:
+        with path.open("rb") as f:
+            f.seek(max(0, f.seek(0, os.SEEK_END) - LOG_BYTES))
+            text = f.read().decode("utf-8", errors="replace")
+    except OSError:
+        return ""
+    # Each start writes a line that begins with dashes.
+    *_, text = re.split(r"(?m)^--- .*$", text.replace("\r\n", "\n"))
+    return printable(CONTROL_SEQUENCE.sub("", text), keep="\n\t").strip()
+
+
+def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
+    """The summary with the present state: `running` or `paused` if the scan's program lives."""
+    if summary.state not in ("lost", "paused"):
+        return summary
+    life_s = last_alive_s(folder)
+    patience_s = LAPSE_S
+    if life_s is None:
+        patience_s = GRACE_S
+        with suppress(OSError):
+            life_s = (folder / MANIFEST).stat().st_mtime
+    if life_s is None or time.time() - life_s >= patience_s:
+        return replace(summary, state="lost")
+    return summary if summary.state == "paused" else replace(summary, state="running")
+
+
+def _modified_s(folder: Path) -> float:
+    try:
+        return folder.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+def _parse_utc(utc: str) -> float:
+    try:
+        return datetime.fromisoformat(utc).timestamp()
+    except ValueError:
+        return 0.0
+
+
+# --- the list ---
 
 
 class Scans:
@@ -36,10 +328,12 @@ class Scans:
     """
 
     def __init__(self, root: Path, only: str | None = None) -> None:
-        self.root, self.only = root, only
-        self._kept: dict[str, tuple[Stamp, Summary]] = {}
-        self._found: dict[str, list[Summary]] = {}  # by entry of the root
-        self._reading: set[str] = set()  # entries of the root
+        self.root = root
+        self.only = only
+        self._summaries: dict[str, tuple[Stamp, Summary]] = {}
+        # Scans below each entry of the root, and entries that are being read.
+        self._listed: dict[str, list[Summary]] = {}
+        self._reading: set[str] = set()
         self._lock = threading.Lock()
 
     def list(self) -> list[Summary]:
@@ -51,41 +345,42 @@ class Scans:
         with self._lock:
             entries = [self.only] if self.only is not None else [name for name, _ in _folders(self.root)]
             self._read_all(deque(entry for entry in entries if entry not in self._reading))
-            found: list[Summary] = []
+            scans: list[Summary] = []
             for entry in entries:
-                known = self._found.get(entry, [])
+                listed = self._listed.get(entry, [])
                 if entry in self._reading:
-                    known = [replace(s, state="silent") for s in known] or [Summary(entry, "silent")]
-                found += known
-            names = {s.name for s in found}
-            self._kept = {name: kept for name, kept in list(self._kept.items()) if name in names}
-        return sorted(found, key=lambda s: (-s.seconds, s.name))
+                    listed = [replace(s, state="silent") for s in listed] or [Summary(entry, "silent")]
+                scans += listed
+            names = {s.name for s in scans}
+            self._summaries = {name: stored for name, stored in list(self._summaries.items()) if name in names}
+        return sorted(scans, key=lambda s: (-s.seconds, s.name))
 
-    def _read_all(self, todo: deque[str]) -> None:
+    def _read_all(self, waiting: deque[str]) -> None:
         """Read entries of the root in a thread; when it makes no progress for `READ_S`, another thread goes on."""
-        while todo:
-            worker = threading.Thread(target=self._read_entries, args=(todo,), name="list", daemon=True)
+        while waiting:
+            worker = threading.Thread(target=self._read_entries, args=(waiting,), name="list", daemon=True)
             worker.start()
             left = -1
-            while worker.is_alive() and left != len(todo):
-                left = len(todo)
+            while worker.is_alive() and left != len(waiting):
+                left = len(waiting)
                 worker.join(READ_S)
 
-    def _read_entries(self, todo: deque[str]) -> None:
-        with suppress(IndexError):  # nothing is left
+    def _read_entries(self, waiting: deque[str]) -> None:
+        # Another thread may take the last one.
+        with suppress(IndexError):
             while True:
-                entry = todo.popleft()
+                entry = waiting.popleft()
                 self._reading.add(entry)
                 try:
-                    self._found[entry] = self._summaries(entry)
+                    self._listed[entry] = [self._summary(name) for name in self._names_below(entry)]
                 finally:
                     self._reading.discard(entry)
 
-    def _summaries(self, entry: str) -> list[Summary]:
+    def _names_below(self, entry: str) -> Iterator[str]:
         """The scan that an entry of the root is, or those below it."""
         if self.only is not None or is_scan(self.root / entry):
-            return [self._summary(entry)]
-        return [self._summary(name) for name in _names(self.root / entry, f"{entry}/", 2)]
+            return iter([entry])
+        return _scan_names(self.root / entry, f"{entry}/", 2)
 
     def left_out(self) -> list[str]:
         """Names in the folder that hold a scan and are not listed: links, and names that cannot be shown; in ASCII."""
@@ -117,56 +412,56 @@ class Scans:
             when the name leads out of the folder, also by a link, or there is no such scan.
         """
         parts = name.split("/")
-        good = bool(name) and len(name) <= 1000 and len(parts) <= _DEEP and all(map(_is_name, parts))
+        valid = bool(name) and len(name) <= 1000 and len(parts) <= MAX_DEPTH and all(map(_is_name, parts))
         if self.only is not None:
-            good = good and name == self.only
-        path = self.root / PurePosixPath(name) if good else self.root
+            valid = valid and name == self.only
+        path = self.root / PurePosixPath(name) if valid else self.root
         try:
-            good = good and path.resolve() == self.root.resolve() / name  # no link on the way
-            inside = next((p for p in path.parents if self.root in p.parents and is_scan(p)), None)
-            there = good and (new or name == self.only or is_scan(path))
+            # No link on the way.
+            valid = valid and path.resolve() == self.root.resolve() / name
+            outer = [parent for parent in path.parents if self.root in parent.parents and is_scan(parent)]
+            exists = new or name == self.only or is_scan(path)
         except (OSError, ValueError):
-            there, inside = False, None
-        if not good:
+            outer = []
+            exists = False
+        if not valid:
             raise DataError(
                 f"no scan is called {name[:80]!r} here", "the name leads elsewhere, or is none", "see the list",
                 code=ErrorCode.PATH_OUTSIDE,
             )  # fmt: skip
-        if inside is not None:
+        if outer:
             raise DataError(
-                f"{path}: no scan", f"it lies inside the scan {inside.name}", "give the scan's own name",
+                f"{path}: no scan", f"it lies inside the scan {outer[0].name}", "give the scan's own name",
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
-        if not path.exists() and not there:
-            raise no_such(path)
-        if not there:
-            raise DataError(
-                f"{path}: no scan", "nothing was recorded there", "see the list", code=ErrorCode.FILE_MISSING
-            )
+        if not exists:
+            why = "nothing was recorded there"
+            missing = DataError(f"{path}: no scan", why, "see the list", code=ErrorCode.FILE_MISSING)
+            raise missing if path.exists() else no_such(path)
         return path
 
     def _summary(self, name: str) -> Summary:
         folder = self.root / name
-        stamp = stamp_of(folder)
-        kept = self._kept.get(name)
-        if kept is None or kept[0] != stamp:
-            kept = self._kept[name] = (stamp, summary_of(folder, name))
-        return as_of_now(folder, kept[1])
+        stamp = _stamp(folder)
+        stored = self._summaries.get(name)
+        if stored is None or stored[0] != stamp:
+            stored = (stamp, summarise(folder, name))
+            self._summaries[name] = stored
+        return add_signs_of_life(folder, stored[1])
 
 
 def folder_bytes(folder: Path) -> int:
     """Bytes of all files in a folder; links are not followed."""
     total = 0
-    for where, _, files in os.walk(folder):
+    for place, _, files in os.walk(folder):
         for name in files:
-            try:
-                total += (Path(where) / name).lstat().st_size
-            except OSError:
-                continue  # it has just gone
+            # A file may go meanwhile.
+            with suppress(OSError):
+                total += (Path(place) / name).lstat().st_size
     return total
 
 
-def _names(root: Path, prefix: str = "", deep: int = 1) -> Iterator[str]:
+def _scan_names(root: Path, prefix: str, depth: int) -> Iterator[str]:
     """Names of the scans below a folder. Links, hidden folders and the insides of scans are not looked at."""
     count = 0
     for entry, path in _folders(root):
@@ -174,9 +469,9 @@ def _names(root: Path, prefix: str = "", deep: int = 1) -> Iterator[str]:
         if is_scan(path):
             yield name
             count += 1
-        elif deep < _DEEP:
-            yield from _names(path, f"{name}/", deep + 1)
-        if count >= _MOST:
+        elif depth < MAX_DEPTH:
+            yield from _scan_names(path, f"{name}/", depth + 1)
+        if count >= MAX_SCANS:
             return
 
 

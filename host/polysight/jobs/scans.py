@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from polysight.acquisition import ScanCommand, send_command
 from polysight.catalogue import (
@@ -36,7 +37,7 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
         odd = f"; not listed, because they are links or have unprintable names: {', '.join(left_out)}"
     found = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _searched(s)]
     if as_json:
-        rows = [asdict(s) | {"bytes": _bytes_of(root, s)} for s in found]
+        rows = [msgspec.to_builtins(s) | {"bytes": _bytes_of(root, s)} for s in found]
         print_json({"scans": rows})
         return 0
     width = min(max((len(s.name) for s in found), default=0), _NAME_WIDTH)

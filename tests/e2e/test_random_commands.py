@@ -1,0 +1,112 @@
+"""Random command lines: whatever is given, a command ends with a status and a message, never with a traceback."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import random
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from pathlib import Path
+
+import numpy as np
+import pytest
+from docs.check.commands import parser_of
+from tests.support.paths import RIG_FILE
+from tests.support.scenes import small_scene
+
+from polysight.cli.main import main
+from polysight_simulators.__main__ import main as simulators
+
+# They serve, wait for a rig, or run for minutes; tests of their own give them wrong input.
+NOT_DRAWN = ("serve", "preview", "demo", "simulate", "reproduce", "scan", "resume", "doctor", "card", "radar", "ask")
+NUMBERS = ("nan", "inf", "-inf", "-1", "0", "1e308", "5e-324", "9" * 20, "1_000", "0x10", "half", "1,2", "1,2,3,4,5")
+BOXES = ("0,0,nan,40", "1,2,3,4", "0,0,0,0", "-60,0,1e9,40", "a=1,2,3", "=b", "a=")
+LAYERS = ("glass,5.5,nan,3", "a,metal,3", "glass,1,2", "?", "glass,?,?", "glass,?,3-1")
+WORDS = ("", "-", "--", "../x", "/", "%s", "{}", "e\u202exe", "x" * 300, "1x1@0", "100000x100000@0.001")
+FILES = (
+    "scan", "scan/raw", "scan/products", "scan/manifest.jsonl", "scan/products/image.npz", "text.txt", "random.bin",
+    "empty", "array.npz", "damaged.toml", "instrument.toml", "/dev/null", "no folder/no file",
+)  # fmt: skip
+CASES = 120
+CASES_LONG = 500  # for each command
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A processed scan, and files that are none of ours."""
+    folder = tmp_path_factory.mktemp("random")
+    shutil.copy(RIG_FILE, folder)
+    (folder / "scene.toml").write_text(small_scene(12, 4, pixels=30, pixel_mm=5.0, seed=1))
+    (folder / "text.txt").write_text("hello\n")
+    (folder / "random.bin").write_bytes(random.Random(1).randbytes(5000))
+    (folder / "empty").touch()
+    (folder / "damaged.toml").write_text("[grid\n")
+    np.savez(folder / "array.npz", a=np.arange(3))
+    scan = str(folder / "scan")
+    assert simulators(["simulate", str(folder / "scene.toml"), "--config", str(RIG_FILE), "--out", scan]) == 0
+    main(["process", scan, "--out", f"{scan}/products"])
+    return folder
+
+
+def commands() -> dict[str, argparse.ArgumentParser]:
+    """Parsers of the commands that are drawn."""
+    parser = parser_of("polysight.cli.main")
+    assert parser is not None
+    subcommands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    return {name: sub for name, sub in subcommands.choices.items() if name not in NOT_DRAWN}
+
+
+def draw_value(action: argparse.Action, draw: random.Random) -> str:
+    """A value of an option: right now and then, mostly wrong."""
+    if action.choices and draw.random() < 0.6:
+        return str(draw.choice(list(action.choices)))
+    kind = draw.choice((FILES, FILES, NUMBERS, BOXES, LAYERS, WORDS, ("scan", "3", "out/x")))
+    return draw.choice(kind)
+
+
+def draw_words(parser: argparse.ArgumentParser, draw: random.Random) -> Iterator[str]:
+    """Arguments and options of a command, in any number."""
+    for action in parser._actions:
+        if isinstance(action, argparse._HelpAction):
+            continue
+        if isinstance(action, argparse._SubParsersAction):
+            name = draw.choice(list(action.choices))
+            yield name
+            yield from draw_words(action.choices[name], draw)
+        elif not action.option_strings:
+            yield draw.choice(("scan", "scan/products", draw_value(action, draw)))
+        elif action.required or draw.random() < 0.3:
+            yield action.option_strings[-1]
+            if action.nargs != 0:
+                yield draw_value(action, draw)
+
+
+def check_end(words: list[str]) -> None:
+    """Run a command in this process: it ends with 0, or with another status and a message."""
+    out = io.StringIO()
+    err = io.StringIO()
+    try:
+        with redirect_stdout(out), redirect_stderr(err):
+            status = main(words)
+    except SystemExit as e:  # of argparse
+        status = e.code
+    shown = out.getvalue() + err.getvalue()
+    assert isinstance(status, int), words
+    assert shown.strip() or status == 0, words
+    assert "Traceback" not in shown, words
+    numbers = [word.strip("(),;:+-").lower() for word in out.getvalue().split()]
+    assert status != 0 or not {"nan", "inf"} & set(numbers), (words, out.getvalue())
+
+
+def test_random_command_lines_end_with_a_message(folder, monkeypatch, request):
+    draw = random.Random(1)
+    parsers = commands()
+    cases = CASES_LONG * len(parsers) if request.config.getoption("--long") else CASES
+    with chdir(folder):
+        for _ in range(cases):
+            name = draw.choice(list(parsers))
+            monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+            check_end([name, *(word for word in draw_words(parsers[name], draw) if word != "--yes")])

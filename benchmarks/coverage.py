@@ -144,7 +144,7 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     alone = msgspec.structs.replace(scene, plates=whole, plane_shift_mm=0.0, plane_tilt_deg=(0.0, 0.0))
     pipeline = _imaged(Cubes(rig, alone))
     images = pipeline.form_images()
-    found = plane_reference(*images.level(images.valid), images.x_m, images.y_m, images.valid)
+    found = plane_reference(images.level(images.valid))
     return replace(found, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 

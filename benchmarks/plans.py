@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks.data import RIG, SCENE
 from benchmarks.sparse_scans import predicted
 from polysight.capture.decode import row_words
-from polysight.imaging import ChannelImages, ImageBuilder
+from polysight.imaging import ImageBuilder, Images
 from polysight.imaging.sparse import reconstruct
 from polysight.materials import (
     Classifier,
@@ -33,7 +33,7 @@ from polysight.materials import (
     pixel_accuracy,
     truth_plates,
 )
-from polysight.materials.analyse import ImagePair, KnownScene, Optics
+from polysight.materials.analyse import KnownScene, Optics
 from polysight.materials.library import SIMULATED_LIBRARY
 from polysight.plan import Changes, scan_time
 from polysight.polarimetry import incidence_choice
@@ -73,7 +73,7 @@ def tell(text: str) -> None:
     sys.stderr.flush()
 
 
-def thinned(builder: ImageBuilder, every: int, rebuilt: bool) -> ChannelImages:
+def thinned(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
     """The images from every n-th row, by matched filter or by reconstruction; the builder is left as it was."""
     valid = {name: board.valid.copy() for name, board in builder.boards.items()}
     weights = {name: board.weights for name, board in builder.boards.items()}
@@ -92,12 +92,12 @@ def thinned(builder: ImageBuilder, every: int, rebuilt: bool) -> ChannelImages:
         return images
     flat = [
         np.divide(r, w, out=np.zeros_like(r), where=whole.valid).conj()
-        for r, w in zip(raw, (whole.h_footprint, whole.v_footprint), strict=True)
+        for r, w in zip(raw, whole.illumination.footprints, strict=True)
     ]
     return replace(whole, h=flat[0], v=flat[1], h_raw=raw[0], v_raw=raw[1])
 
 
-def image_error(images: ChannelImages, ideal: ChannelImages) -> float:
+def image_error(images: Images, ideal: Images) -> float:
     """Of both channels' whole images, relative, after the complex factor that fits best."""
     errors = []
     for made, wanted in ((images.h_raw, ideal.h_raw), (images.v_raw, ideal.v_raw)):
@@ -106,18 +106,18 @@ def image_error(images: ChannelImages, ideal: ChannelImages) -> float:
     return float(np.mean(errors))
 
 
-def named(rig: Instrument, images: ChannelImages, plates: tuple[TruthPlate, ...]) -> MaterialsResult:
+def named(rig: Instrument, images: Images, plates: tuple[TruthPlate, ...]) -> MaterialsResult:
     """Patches, permittivities and names."""
     angles = incidence_choice(rig, images.x_m, images.y_m, "one")
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
-    return analyse(ImagePair.of(images), Optics.of(rig, angles), known=KnownScene(plates=plates), classifier=classifier)
+    return analyse(images, Optics.of(rig, angles), known=KnownScene(plates=plates), classifier=classifier)
 
 
 def measure(
     name: str,
     rig: Instrument,
-    images: ChannelImages,
-    ideal: ChannelImages,
+    images: Images,
+    ideal: Images,
     plates: tuple[TruthPlate, ...],
     every: int = 1,
 ) -> None:
@@ -141,7 +141,7 @@ def measure(
     )
 
 
-Made = tuple[str, Instrument, ChannelImages, int]
+Made = tuple[str, Instrument, Images, int]
 
 
 def published(rig: Instrument, scene: Scene) -> Iterator[Made]:

@@ -45,7 +45,7 @@ class Pipeline:
         self.quality.boards[board].add(row, recorded, frames_whole, synced)
         return synced
 
-    def form_images(self, from_sums: bool = False) -> imaging.ChannelImages:
+    def form_images(self, from_sums: bool = False) -> imaging.Images:
         """Form both images on the rig file's plane, divided by the footprint, not referenced; `from_sums`: live."""
         with self.quality.timed("image"):
             images = self.images.current() if from_sums else self.images.finish()
@@ -57,7 +57,7 @@ class Pipeline:
         named = in_scene or options.metal_box_mm is not None
         return self.calibration.metal_plane(self.rig, options.reference, named, options.bands)
 
-    def place_plane(self, images: imaging.ChannelImages, move: bool = True) -> imaging.ChannelImages:
+    def place_plane(self, images: imaging.Images, move: bool = True) -> imaging.Images:
         """Estimate the plane of the plates; return the images on it (unchanged if `move` is False)."""
         with self.quality.timed("plane"):
             masks, swapped = materials.insides(images), self.source.mirrored
@@ -66,7 +66,7 @@ class Pipeline:
 
     def find_materials(
         self,
-        images: imaging.ChannelImages,
+        images: imaging.Images,
         metal: materials.MetalChoice = materials.FOUND,
         known: materials.KnownScene = materials.UNKNOWN_SCENE,
         classifier: materials.Classifier | None = None,
@@ -77,7 +77,7 @@ class Pipeline:
             rig, std = self.plane.applied_to(self.rig), self.plane.incidence_std_rad(self.rig)
             angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, incidence)
             optics = materials.Optics.of(self.rig, angles, std, self.synchroniser.direct_path_known)
-            found = materials.analyse(materials.ImagePair.of(images), optics, metal, known, classifier)
+            found = materials.analyse(images, optics, metal, known, classifier)
             self.quality.note_materials(found, angles, images.valid, metal.plane)
         with self.quality.timed("sub-bands"):
             moved = self.plane.offset_m if self.plane.worth_moving else 0.0
@@ -85,14 +85,14 @@ class Pipeline:
             return materials.with_bands(found, self.sub_bands.bands, parts, optics, metal.plane)
 
     def examine(
-        self, images: imaging.ChannelImages, options: process.Options, plates: materials.Plates = ()
+        self, images: imaging.Images, options: process.Options, plates: materials.Plates = ()
     ) -> process.Findings:
         """Find plane and materials, and judge them; a verdict "no result" removes names and permittivities."""
         classifier, boxes = options.classifier(self.rig), options.drawn(images.x_m, images.y_m)
         plane = self.metal_plane(options, boxes.metal is not None)
         images = self.place_plane(images)
         if plane is not None:
-            images = replace(images, valid=images.valid & plane.valid_on(images.x_m, images.y_m))
+            images = images.within(plane.valid_on(images.x_m, images.y_m))
         metal = materials.MetalChoice(options.metal_box_mm, boxes.metal, plane)
         known = materials.KnownScene(boxes.segmentation, plates)
         found = replace(self.find_materials(images, metal, known, classifier, options.incidence), boxes=boxes.names)

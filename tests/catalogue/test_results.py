@@ -95,6 +95,7 @@ def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed):
 def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
     """The V channel of the PET's pixels is made 30 % stronger in a copy."""
     import shutil
+    from dataclasses import replace
 
     from polysight.products import write_image
 
@@ -105,7 +106,7 @@ def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
     v[inside] *= 1.3
     with np.errstate(invalid="ignore", divide="ignore"):
         p = saved.h / v
-    write_image(tmp_path / "changed" / "image.npz", saved.h, v, p, saved.x_m, saved.y_m, saved.valid, saved.p_sigma)
+    write_image(tmp_path / "changed" / "image.npz", replace(saved.image, v=v, p=p))
     found = compare(processed / "one", tmp_path / "changed")
     answer = np.nan_to_num(found.sigmas)
     assert found.scatter == 0.1  # a copy, which shares its errors

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from polysight.imaging import Images
 from polysight.materials import Library, TrainingScan, TruthPlate, make_library
-from polysight.materials.analyse import FOUND, ImagePair, KnownScene, Optics, analyse
+from polysight.materials.analyse import FOUND, KnownScene, Optics, analyse
 
 THETA = np.radians(55.0)
 NINE = {
@@ -37,7 +38,7 @@ class Synthetic:
 
     @property
     def pair(self):
-        return ImagePair(self.h, self.v, self.x_m, self.y_m)
+        return Images(self.h, self.v, self.x_m, self.y_m, np.ones(self.h.shape, bool))
 
     def analyse(self, leakage=(0.0, 0.0), metal=FOUND, segmentation=None, classifier=None, pair=None):
         known = KnownScene(segmentation, self.plates)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.materials import UNKNOWN, Classifier, ImagePair, match_patches, pack_patches, read_patches
+from polysight.imaging import Images
+from polysight.materials import UNKNOWN, Classifier, match_patches, pack_patches, read_patches
 from polysight_shared.error_codes import ErrorCode
 
 
@@ -39,7 +40,7 @@ def test_brightness_that_all_plates_share_does_not_change_their_names(gain, synt
     plain = scene.analyse(classifier=classifier)
     metal = plain.segmentation.labels == plain.metal.label
     factor = np.where(metal, 1.0, gain)
-    pair = ImagePair(scene.h * factor, scene.v * factor, scene.x_m, scene.y_m)
+    pair = Images(scene.h * factor, scene.v * factor, scene.x_m, scene.y_m, np.ones(scene.h.shape, bool))
     found = scene.analyse(classifier=classifier, pair=pair)
     again = named_again(found, scene, classifier, tmp_path / "patches.npz")
     names = {r.patch.label: r.named.verdict.name for r in plain.patches if r.named is not None}

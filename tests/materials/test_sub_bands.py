@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from tests.support.rigs import published_rig
 
-from polysight.imaging import ChannelImages
-from polysight.imaging.images import SubBand
+from polysight.imaging import Images
+from polysight.imaging.builder import SubBand
 from polysight.materials.analyse import MetalChoice
 from polysight.materials.layer_fit import fit_layer
 from polysight.materials.layers import Bands, Layer
@@ -21,11 +21,10 @@ THICK = 4.0 - 0.4j
 INVERSE_STD = 0.01
 
 
-def channels(scene, valid) -> ChannelImages:
+def channels(scene, valid) -> Images:
     """Images as an image builder makes them: 0 where not valid."""
     h, v = (np.where(valid, c, 0).astype(np.complex64) for c in (scene.h, scene.v))
-    ones = np.ones_like(h)
-    return ChannelImages(h, v, h, v, ones, ones, scene.x_m, scene.y_m, valid, {})
+    return Images(h, v, scene.x_m, scene.y_m, valid)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from polysight.materials.analyse import ImagePair, KnownScene, MetalChoice, Optics, analyse, smooth_inside
+from polysight.imaging import Images
+from polysight.materials.analyse import KnownScene, MetalChoice, Optics, analyse, smooth_inside
 from polysight.materials.labels import patches_from_labels, patches_from_plates
 from polysight.materials.truth import TruthPlate
 from polysight.polarimetry import fresnel
@@ -37,7 +38,7 @@ def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
     valid = np.ones(h.shape, bool)
     valid[:, :12] = valid[:, 58:] = False
     h[~valid] = v[~valid] = 0  # as images have it
-    pair, optics = ImagePair(h, v, X_M, Y_M, valid), Optics(THETA, smooth_px=1.0)
+    pair, optics = Images(h, v, X_M, Y_M, valid), Optics(THETA, smooth_px=1.0)
     result = analyse(pair, optics, MetalChoice(label=labels["metal"]), KnownScene(found))
     rows = {r["label"]: r for r in result.rows()}
     left, nowhere = rows[labels["left"]], rows[labels["nowhere"]]

@@ -11,7 +11,7 @@ from matplotlib.image import imread
 from tests.support.rigs import published_rig
 
 from polysight.catalogue import PHASE, colour_bar, draw
-from polysight.imaging import ChannelImages
+from polysight.imaging import Images
 from polysight.page.images import range_profile_db
 from polysight.sync.chain import SyncedRow
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -24,11 +24,11 @@ def pixels(png: bytes) -> np.ndarray:
 
 
 @pytest.fixture
-def images() -> ChannelImages:
+def images() -> Images:
     one = np.full((NY, NX), 0.01, np.complex64)
     one[0, -1] = 1.0  # smallest y, largest x
     axes = (np.arange(NX, dtype=float), np.arange(NY, dtype=float))
-    return ChannelImages(one, one.copy(), one, one, one, one, *axes, np.ones((NY, NX), bool), {})
+    return Images(one, one.copy(), *axes, np.ones((NY, NX), bool))
 
 
 def test_smallest_y_is_at_the_bottom(images):

@@ -6,11 +6,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.support.refusals import refused
 
+from polysight.imaging import Images
 from polysight.polarimetry import fresnel, plane_reference
 from polysight_shared.error_codes import ErrorCode
 
 THETA = np.radians(55.0)
 X, Y = np.arange(60) * 2e-3, np.arange(50) * 2e-3
+
+
+def images_of(h, v):
+    shape = (Y.size, X.size)
+    return Images(np.broadcast_to(h, shape), np.broadcast_to(v, shape), X, Y, np.ones(shape, bool))
 
 
 def gains(rng, depth):
@@ -30,9 +36,9 @@ def test_gains_over_the_plane_are_divided_out(seed, phase, tilt):
     """For any distance and tilt of the plates: a common phase of both channels has no influence."""
     light = gains(np.random.default_rng(seed), 0.1)
     common = np.exp(1j * (phase + tilt * X))[None, :]
-    reference = plane_reference(-light[0] * common, -light[1] * common, X, Y)
+    reference = plane_reference(images_of(-light[0] * common, -light[1] * common))
     r = fresnel(4 - 0.4j, THETA)
-    got = reference.apply(light[0] * r[0], light[1] * r[1])
+    got = reference.apply(images_of(light[0] * r[0], light[1] * r[1]))
     at = reference.valid
     assert at.mean() > 0.9
     np.testing.assert_allclose(got.p[at], r[0] / r[1], rtol=0.08)
@@ -44,7 +50,7 @@ def test_gains_over_the_plane_are_divided_out(seed, phase, tilt):
 def test_speckle_of_the_plate_is_smoothed_and_measured():
     rng = np.random.default_rng(3)
     one = np.ones((Y.size, X.size), complex)
-    reference = plane_reference(noisy(one, rng, 0.05), noisy(one, rng, 0.05), X, Y)
+    reference = plane_reference(images_of(noisy(one, rng, 0.05), noisy(one, rng, 0.05)))
     p = (reference.h / reference.v)[reference.valid]
     assert np.std(p) < 0.01
     assert reference.spread == pytest.approx(0.05, rel=0.2)  # each part of V / H: two channels, half of each
@@ -53,28 +59,28 @@ def test_speckle_of_the_plate_is_smoothed_and_measured():
 def test_weak_parts_and_the_rim_are_masked():
     rng = np.random.default_rng(4)
     h = np.where(X[None, :] < 0.07, 1.0, 0.01) * np.ones((Y.size, 1), complex)
-    reference = plane_reference(noisy(h, rng, 0.01), noisy(h, rng, 0.01), X, Y, smooth_mm=4.0)
+    reference = plane_reference(images_of(noisy(h, rng, 0.01), noisy(h, rng, 0.01)), smooth_mm=4.0)
     assert reference.valid[:, X < 0.06].all()
     assert not reference.valid[:, X > 0.068].any()
     assert np.isnan(reference.h[:, -1]).all()
-    got = reference.apply(h, h)
+    got = reference.apply(images_of(h, h))
     assert np.isnan(got.p[:, -1]).all()
     np.testing.assert_allclose(got.p[reference.valid], 1, atol=0.02)
     assert reference.facts()["share_of_plane"] == pytest.approx(reference.valid.mean(), abs=1e-3)
 
 
 def test_its_facts_tell_how_the_gains_vary_over_the_plane():
-    reference = plane_reference(*gains(np.random.default_rng(5), 0.02), X, Y)
+    reference = plane_reference(images_of(*gains(np.random.default_rng(5), 0.02)))
     assert reference.facts()["ratio_variation_db"] > 0.01
 
 
 def test_images_without_a_metal_plate_are_refused():
     dark = np.zeros((Y.size, X.size), complex)
     with refused(ErrorCode.NO_DATA):
-        plane_reference(dark, dark, X, Y)
+        plane_reference(images_of(dark, dark))
     spots = dark.copy()
     spots[::10, ::10] = 1.0
     with refused(ErrorCode.NO_DATA):
-        plane_reference(spots, spots, X, Y, smooth_mm=2.0)
+        plane_reference(images_of(spots, spots), smooth_mm=2.0)
     with refused(ErrorCode.MISMATCH):
-        plane_reference(dark + 1, dark + 1, X, Y).check_axes(X + 1e-3, Y)
+        plane_reference(images_of(dark + 1, dark + 1)).check_axes(X + 1e-3, Y)

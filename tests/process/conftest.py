@@ -12,7 +12,7 @@ from tests.support.pipelines import pipeline_of
 from tests.support.rigs import published_rig, rig_with
 from tests.support.scenes import COPPER, PET, scene_of
 
-from polysight.imaging import ChannelImages
+from polysight.imaging import Images
 from polysight.materials import TruthPlate, read_truth
 from polysight.store.scan_folder import ScanFolder
 from polysight_shared.config import Instrument
@@ -24,7 +24,7 @@ class Imaged:
 
     def __init__(self, folder: Path) -> None:
         self.pipeline = pipeline_of(ScanFolder.load(folder))
-        self.images: ChannelImages = self.pipeline.form_images()
+        self.images: Images = self.pipeline.form_images()
         self.rig: Instrument = self.pipeline.source.instrument
         self.plates: tuple[TruthPlate, ...] = read_truth(folder / "truth.json")
 

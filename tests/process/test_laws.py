@@ -64,7 +64,7 @@ def test_metal_gives_one_at_every_pixel_within_noise(imaged):
     at = inside(scan, "copper", rim_mm=150.0)
     assert at.sum() > 1000
     middle = box_mask((-20, -20, 20, 20), scan.images.x_m, scan.images.y_m)
-    first, second = (calibrate(s.images.h, s.images.v, middle).p[at] for s in (scan, again))
+    first, second = (calibrate(s.images, middle).p[at] for s in (scan, again))
     noise = np.std(first - second) / np.sqrt(2)
     assert np.abs(first - 1).max() < 0.02 + 5 * noise
     assert np.abs(first.mean() - 1) < 0.01
@@ -76,8 +76,8 @@ OTHER = {"hv_gain_db": -3.0, "leakage_h": [0.08, 0.03], "leakage_v": [0.08, 0.03
 
 def test_the_set_gain_is_recovered_and_does_not_reach_the_images(imaged):
     def gains_db(scan):
-        h, v = (np.abs(scan.images.rx_calibration[b.name]).mean() for b in scan.rig.receivers)
-        c = calibrate(scan.images.h, scan.images.v, inside(scan, "copper"))
+        h, v = (np.abs(scan.images.rx_gains[b.name]).mean() for b in scan.rig.receivers)
+        c = calibrate(scan.images, inside(scan, "copper"))
         return 20 * np.log10(h / v), 20 * np.log10(abs(c.metal_h) / abs(c.metal_v))
 
     (received, image), (received_other, image_other) = (
@@ -92,7 +92,7 @@ def test_the_set_gain_is_recovered_and_does_not_reach_the_images(imaged):
 def test_the_set_leakage_is_recovered_from_a_known_material(imaged, disturbances):
     scan = imaged("nine-materials", **disturbances)
     leakage = complex(*disturbances.get("leakage_h", [0.05, 0.0]))
-    c = calibrate(scan.images.h, scan.images.v, inside(scan, "copper"))
+    c = calibrate(scan.images, inside(scan, "copper"))
     theta = scan.pipeline.find_materials(scan.images, known=KnownScene(plates=scan.plates)).theta_rad[0, 0]
     true = complex(ratio_from_permittivity(4.75 - 2.43j, theta))
     at = inside(scan, "ceramic")

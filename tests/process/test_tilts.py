@@ -5,7 +5,8 @@ import pytest
 from benchmarks.coverage import Cubes
 from tests.support.pipelines import pipeline_of
 
-from polysight.imaging import Illumination, correct_tilt
+from polysight.imaging import correct_tilt
+from polysight.imaging.images import Illumination
 from polysight.materials.segment import box_mask
 from polysight_simulators.scene import decode_scene
 
@@ -39,20 +40,20 @@ def _ratios(h, v, masks):
 
 def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted):
     images = tilted[0]
-    found = [images.lit.rise(images.h, images.v, mask) for mask in _insides(images)]
+    found = [images.illumination.rise(images.h, images.v, mask) for mask in _insides(images)]
     assert np.degrees(found) == pytest.approx(np.array(TILTS_DEG), abs=0.12)
 
 
 def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(tilted):
     images, level = tilted
     masks = _insides(images)
-    rises = [images.lit.rise(images.h, images.v, mask) for mask in masks]
-    h, v = correct_tilt(images.h, images.v, images.lit, masks, rises)
+    rises = [images.illumination.rise(images.h, images.v, mask) for mask in masks]
+    corrected = correct_tilt(images, masks, rises)
     truth = _ratios(level.h, level.v, masks)
-    before, after = (np.abs(_ratios(*c, masks) / truth - 1) for c in ((images.h, images.v), (h, v)))
+    before, after = (np.abs(_ratios(*c, masks) / truth - 1) for c in ((images.h, images.v), (corrected.h, corrected.v)))
     assert before.max() > 0.02
     assert after.max() < 0.015
-    brightness = [np.median(np.abs(h[m])) / np.median(np.abs(level.h[m])) for m in masks]
+    brightness = [np.median(np.abs(corrected.h[m])) / np.median(np.abs(level.h[m])) for m in masks]
     across = [i for i, (x, _) in enumerate(TILTS_DEG) if x == 0]
     assert np.array(brightness)[across] == pytest.approx(1, abs=0.015)
 
@@ -60,11 +61,12 @@ def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(ti
 def test_tilts_follow_a_transposed_image(tilted):
     images = tilted[0]
     turned = images.transposed()
-    assert (images.lit.across, turned.lit.across) == (1, 0)
+    assert (images.illumination.across, turned.illumination.across) == (1, 0)
     for mask in _insides(images):
-        rise, other = images.lit.rise(images.h, images.v, mask), turned.lit.rise(turned.h, turned.v, mask.T)
+        rise = images.illumination.rise(images.h, images.v, mask)
+        other = turned.illumination.rise(turned.h, turned.v, mask.T)
         assert other[::-1] == pytest.approx(rise, abs=1e-9)
-        factors, swapped = images.lit.to_level(mask, rise), turned.lit.to_level(mask.T, other)
+        factors, swapped = images.illumination.to_level(mask, rise), turned.illumination.to_level(mask.T, other)
         assert np.sort(swapped, axis=1) == pytest.approx(np.sort(factors, axis=1), rel=1e-6)
 
 

@@ -1,10 +1,12 @@
 """Files of products are written whole or not at all, and read back as they were."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from polysight.imaging import Images
 from polysight.products import plain, read_image, write_atomically, write_image, write_json
 from polysight_shared.errors import DataError
 
@@ -14,18 +16,19 @@ def test_image_product_round_trips(tmp_path):
     h, v, p = (rng.standard_normal((3, 5, 7)) + 1j * rng.standard_normal((3, 5, 7))).astype(np.complex64)
     x, y, valid = np.linspace(-0.1, 0.1, 7), np.linspace(0.0, 0.1, 5), rng.uniform(size=h.shape) < 0.8
     path = tmp_path / "products" / "image.npz"
-    write_image(path, h, v, p, x, y, valid)
+    images = Images(h, v, x, y, valid, p)
+    write_image(path, images)
     z = read_image(path)
-    assert {k: a.dtype for k, a in z.items()} == {
+    assert {k: a.dtype for k, a in vars(z).items() if isinstance(a, np.ndarray)} == {
         **dict.fromkeys(("h", "v", "p"), np.dtype(np.complex64)),
         **dict.fromkeys(("x_m", "y_m"), np.dtype(np.float64)),
         "valid": np.dtype(np.bool_),
     }
-    np.testing.assert_array_equal(z["h"], h)
-    np.testing.assert_array_equal(z["y_m"], y)
+    np.testing.assert_array_equal(z.h, h)
+    np.testing.assert_array_equal(z.y_m, y)
     assert [p.name for p in path.parent.iterdir()] == ["image.npz"]
     with pytest.raises(DataError):
-        write_image(path, h[1:], v, p, x, y, valid)
+        write_image(path, replace(images, h=h[1:]))
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(DataError):
         read_image(path)

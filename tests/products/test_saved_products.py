@@ -18,7 +18,7 @@ from tests.support.refusals import refused
 from tests.support.rigs import published_rig, rig_with
 
 from polysight.cli.main import main
-from polysight.imaging import ChannelImages, sub_bands
+from polysight.imaging import Images, sub_bands
 from polysight.materials import parse_layer
 from polysight.materials.layers import Layer, Spectrum, predict
 from polysight.products import write_json
@@ -140,7 +140,7 @@ def test_scan_json_has_gains_relative_to_each_boards_first_rx_and_the_rig_of_the
         "RH": np.array([2.0, 20.0, 2.0j, -0.2], np.complex128),
         "RV": np.array([5j, 5j], np.complex128),
     }
-    images = ChannelImages(none, none, none, none, none, none, axis, axis, np.ones((1, 1), bool), gains)
+    images = Images(none, none, axis, axis, np.ones((1, 1), bool), rx_gains=gains)
     write_scan_facts(tmp_path, SimpleNamespace(scan_id="s", simulated=True, instrument=HERE), placed, images)
     facts = json.loads((tmp_path / SCAN).read_text(encoding="utf-8"))
     assert (facts["scan_id"], facts["simulated"]) == ("s", True)

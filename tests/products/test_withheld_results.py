@@ -15,6 +15,7 @@ from tests.support.refusals import refused
 
 from polysight import open_scan
 from polysight.cli.main import main
+from polysight.imaging import Images
 from polysight.products import permittivity_spread, read_image, read_products, withhold, write_image, write_json
 from polysight_shared.error_codes import ErrorCode
 
@@ -24,7 +25,7 @@ def test_every_export_holds_the_verdict_and_p_sigma(tmp_path, level):
     folder, out = judged_products(tmp_path / "one", level), tmp_path / "out"
     assert main(["export", str(folder), "--hdf5", "--netcdf", "--zarr", "--mat", "--csv", "--out", str(out)]) == 0
     reasons = json.loads((folder / "materials.json").read_text(encoding="utf-8"))["verdict"]["reasons"]
-    sigma = read_image(folder / "image.npz")["p_sigma"]
+    sigma = read_image(folder / "image.npz").p_sigma
     with h5py.File(out / "image.h5") as f:
         found = [(dict(f.attrs), f["p_sigma"][()])]
     mat = scipy.io.loadmat(out / "image.mat", simplify_cells=True)
@@ -108,9 +109,9 @@ def test_products_of_earlier_releases_are_read_as_before(tmp_path):
 
 
 def test_p_sigma_has_the_shape_of_the_image(tmp_path):
-    one, axis = np.ones((2, 2), np.complex64), np.array([0.0, 0.1])
+    one, axis, valid = np.ones((2, 2), np.complex64), np.array([0.0, 0.1]), np.ones((2, 2), bool)
     with refused(ErrorCode.MISMATCH, "p_sigma"):
-        write_image(tmp_path / "i.npz", one, one, one, axis, axis, np.ones((2, 2), bool), np.ones((3, 2)))
+        write_image(tmp_path / "i.npz", Images(one, one, axis, axis, valid, one, np.ones((3, 2))))
     write_json(tmp_path / "materials.json", {"segments": []})
-    write_image(tmp_path / "i.npz", one, one, one, axis, axis, np.ones((2, 2), bool), np.full((2, 2), np.nan))
-    assert read_image(tmp_path / "i.npz")["p_sigma"].dtype == np.float32
+    write_image(tmp_path / "i.npz", Images(one, one, axis, axis, valid, one, np.full((2, 2), np.nan)))
+    assert read_image(tmp_path / "i.npz").p_sigma.dtype == np.float32

@@ -10,6 +10,7 @@ import pytest
 import xarray
 
 from polysight.cli.main import main
+from polysight.imaging import Images
 from polysight.products import dataset_files, write_image, write_json
 from polysight.products.dataset_files import join_complex, read_netcdf, split_complex
 from polysight_shared.config import load_instrument
@@ -35,7 +36,7 @@ def folder(tmp_path):
     h, v = (rng.standard_normal((2, 6, 11)) + 1j * rng.standard_normal((2, 6, 11))).astype(np.complex64)
     made = tmp_path / "one"
     x, y = np.linspace(-0.1, 0.1, 11), np.linspace(0.05, 0.15, 6)
-    write_image(made / "image.npz", h, v, h / v, x, y, rng.uniform(size=h.shape) < 0.8)
+    write_image(made / "image.npz", Images(h, v, x, y, rng.uniform(size=h.shape) < 0.8, h / v))
     write_json(made / "materials.json", {"scan_id": "s", "simulated": True, "segments": [PATCH, METAL]})
     rig = to_builtins(load_instrument(REPO / "instrument.toml"))
     write_json(made / "scan.json", {"scan_id": "s", "simulated": True, "versions": {"numpy": "2"}, "instrument": rig})

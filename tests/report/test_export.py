@@ -13,6 +13,7 @@ from tests.support.products import segments
 from tests.support.rigs import rig_table
 
 from polysight.cli.main import main
+from polysight.imaging import Images
 from polysight.products import write_image, write_json
 from polysight.products.files import read_products
 from polysight.report import exports as hdf5
@@ -27,7 +28,7 @@ def folder(tmp_path):
     valid = rng.uniform(size=(5, 7)) < 0.8
     x, y = np.linspace(-0.1, 0.1, 7), np.linspace(0.05, 0.15, 5)
     made = tmp_path / "one"
-    write_image(made / "image.npz", h, v, h / v, x, y, valid)
+    write_image(made / "image.npz", Images(h, v, x, y, valid, h / v))
     write_json(made / "materials.json", {"scan_id": "s", "simulated": True, "segments": segments("good")})
     write_json(made / "quality.json", {"boards": {"RH": {"frames_expected": 7}}})
     rig = rig_table()

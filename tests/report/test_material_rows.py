@@ -10,6 +10,7 @@ import pytest
 import scipy.io
 
 from polysight.cli.main import main
+from polysight.imaging import Images
 from polysight.products import write_image, write_json
 
 PATCH = {
@@ -62,7 +63,7 @@ def exported(tmp_path):
     """The folder of exports of products that hold these two patches."""
     products, ones = tmp_path / "products", np.ones((2, 3), np.complex64)
     axes = (np.array([-0.1, 0.0, 0.1]), np.array([0.0, 0.1]))
-    write_image(products / "image.npz", ones, ones, ones, *axes, np.ones((2, 3), bool))
+    write_image(products / "image.npz", Images(ones, ones, *axes, np.ones((2, 3), bool), ones))
     write_json(products / "materials.json", {"scan_id": "s", "simulated": True, "segments": [PATCH, METAL]})
     assert main(["export", str(products), "--csv", "--hdf5", "--mat", "--out", str(tmp_path / "out")]) == 0
     return tmp_path / "out"

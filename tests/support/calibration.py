@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header
-from polysight.imaging import ImagedWith, image_grid
+from polysight.imaging import ImagedWith, Images, image_grid
 from polysight.polarimetry import Leakage, PlaneReference, plane_reference
 from polysight_shared.config import Instrument
 
@@ -26,7 +26,8 @@ def metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:
     y, x = np.meshgrid(np.linspace(0, 1, grid.y_m.size), np.linspace(0, 1, grid.x_m.size), indexing="ij")
     gain = (1 + 0.2 * y) * np.exp(1j * x)
     noise = 1 + 0.02 * (rng.standard_normal((2, *x.shape)) + 1j * rng.standard_normal((2, *x.shape)))
-    plate = plane_reference(gain * noise[0], 0.7 * noise[1], grid.x_m, grid.y_m, smooth_mm=4.0, name="plate")
+    plate_seen = Images(gain * noise[0], 0.7 * noise[1], grid.x_m, grid.y_m, np.ones(x.shape, bool))
+    plate = plane_reference(plate_seen, smooth_mm=4.0, name="plate")
     return replace(plate, made_with=ImagedWith.of(rig, {}))
 
 

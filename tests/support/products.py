@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from polysight.imaging import Images
 from polysight.products import write_image, write_json
 
 NAMES = ("PET", "acrylic", "copper")
@@ -63,7 +64,7 @@ def judged_products(folder: Path, level: str | None, careless: bool = False) -> 
     h, v = (rng.standard_normal((2, 20, 30)) + 1j * rng.standard_normal((2, 20, 30))).astype(np.complex64)
     axes = (np.linspace(-0.06, 0.06, 30), np.linspace(-0.04, 0.04, 20))
     sigma = None if level is None else rng.uniform(0.1, 0.2, h.shape)
-    write_image(folder / "image.npz", h, v, h / v, *axes, np.ones(h.shape, bool), sigma)
+    write_image(folder / "image.npz", Images(h, v, *axes, np.ones(h.shape, bool), h / v, sigma))
     content: dict[str, Any] = {"scan_id": "s", "simulated": True, "segments": segments("good" if careless else level)}
     quality: dict[str, Any] = {}
     if level is not None:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from polysight.imaging import ChannelImages
+from polysight.imaging import Images
 from polysight.materials import find_truth, pixel_accuracy
 from polysight.pipeline import Pipeline
-from polysight.polarimetry import ratio
+from polysight.polarimetry import with_ratio
 from polysight.process import Options, materials_content
 from polysight.products import ProcessedScan, plain, scan_facts, withhold
 from polysight.store import Source
@@ -32,7 +32,7 @@ class Processing:
         return Pipeline(self.source, bands=self.options.bands, samples="read")
 
     @cached_property
-    def _images(self) -> ChannelImages:
+    def _images(self) -> Images:
         """Both channels from all rows that hold data. Raises DataError when there are none."""
         for row in self.pipeline.samples.processable(self.source, self.folder):
             self.pipeline.add_row(row)
@@ -44,8 +44,7 @@ class Processing:
     def unreferenced(self) -> ProcessedScan:
         """Images in arbitrary units, as `polysight image` writes them. Raises PolysightError."""
         images, none = self._images, np.zeros(self._images.h.shape, np.int32)
-        pixels = {"h": images.h, "v": images.v, "p": ratio(images.h, images.v), "valid": images.valid}
-        return self._processed(images, pixels, {}, none, None)
+        return self._processed(with_ratio(images), {}, none, None)
 
     @cached_property
     def referenced(self) -> ProcessedScan:
@@ -62,22 +61,21 @@ class Processing:
         if note:
             warnings.warn(note, stacklevel=2)
         findings = pipeline.examine(self._images, options, plates)
-        found, images = findings.found, findings.images
+        found = findings.found
         pipeline.quality.note(pixel_accuracy=pixel_accuracy(found), verdict=findings.verdict.to_dict())
-        c, labels = found.calibrated, found.segmentation.labels
+        labels = found.segmentation.labels
         interior = np.zeros(labels.shape, bool)
         for patch in found.segmentation.patches:
             interior |= patch.interior
         materials = plain(materials_content(self.source, findings, unnamed))
-        pixels = {"h": c.h, "v": c.v, "p": c.p, "valid": images.valid, "p_sigma": found.p_sigma(images.valid)}
-        return self._processed(images, pixels, materials, labels, interior)
+        return self._processed(findings.calibrated, materials, labels, interior)
 
-    def _processed(self, images: ChannelImages, pixels, materials, labels, interior) -> ProcessedScan:
+    def _processed(self, images: Images, materials, labels, interior) -> ProcessedScan:
         return ProcessedScan.computed(
             self.folder,
             labels,
             interior,
-            image={**pixels, "x_m": images.x_m, "y_m": images.y_m},
+            image=images,
             scan=plain(scan_facts(self.source, self.pipeline.rig, images)),
             quality=plain(self.pipeline.quality.to_dict()),
             materials=withhold(materials),

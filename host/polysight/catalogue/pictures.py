@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.imaging import ChannelImages
+from polysight.imaging import Images
 from polysight.materials import axis_mm
 from polysight.polarimetry import permittivity_from_ratio, specular_incidence_rad
 from polysight.products import SavedProducts
@@ -181,7 +181,7 @@ MAPS = {
 NEED_METAL = ("p_sigma", "permittivity", "loss")
 
 
-def draw(images: ChannelImages) -> dict[str, Picture]:
+def draw(images: Images) -> dict[str, Picture]:
     """Draw amplitude and phase of H, V and P = H / V: `h_amplitude`, `h_phase` and so on.
 
     P is that of the given images: during a scan it is not referenced to metal.
@@ -211,7 +211,7 @@ def thumbnail(pixels: Pixels) -> Picture:
     return draw_values(replace(values, numbers=values.numbers[small], opacity=values.opacity[small]))
 
 
-def _channel_values(images: ChannelImages | Pixels) -> dict[str, Values]:
+def _channel_values(images: Images | Pixels) -> dict[str, Values]:
     visible = images.valid & np.isfinite(images.h) & np.isfinite(images.v)
     values = {}
     for name, channel in (("h", images.h), ("v", images.v)):

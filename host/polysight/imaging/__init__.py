@@ -1,6 +1,6 @@
 """Imaging: from synchronised rows to the H and V images.
 
-`ImageBuilder` reduces each row to the range gate, chooses an imager and returns `ChannelImages`, divided by the
+`ImageBuilder` reduces each row to the range gate, chooses an imager and returns `Images`, divided by the
 footprint (the image of a mirror); `SubBandImages` does the same for parts of the sweep. The three imagers have one
 interface (`samples.Imager`): direct sum (`backproject` and its adjoint `project`), spectral, and incremental row by
 row. `move_to_plane` estimates the plane of the plates and images on it, `focus_sweep` finds the plane by sharpness,
@@ -9,14 +9,9 @@ settings that the gains of an image depend on.
 """
 
 from polysight.imaging.aperture import Aperture, window_weights
-from polysight.imaging.direct import backproject, project
-from polysight.imaging.focus import Focus, focus_sweep
-from polysight.imaging.gain_conditions import ImagedWith
-from polysight.imaging.geometry import Antennas, ImageGrid, image_grid, row_offsets_m, scan_offsets_m
-from polysight.imaging.images import (
+from polysight.imaging.builder import (
     AS_IN_RIG_FILE,
     TAPERS,
-    ChannelImages,
     ImageBuilder,
     SubBand,
     SubBandImages,
@@ -24,11 +19,15 @@ from polysight.imaging.images import (
     needed_gate_m,
     sub_bands,
 )
+from polysight.imaging.direct import backproject, project
+from polysight.imaging.focus import Focus, focus_sweep
+from polysight.imaging.gain_conditions import ImagedWith
+from polysight.imaging.geometry import Antennas, ImageGrid, image_grid, row_offsets_m, scan_offsets_m
+from polysight.imaging.images import Image, Images, Mask, Rise, correct_tilt
 from polysight.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, move_to_plane
 from polysight.imaging.reduce import reduction, scene_gate_m
 from polysight.imaging.resolution import PointResponse, imaging_facts, point_response
 from polysight.imaging.samples import ReducedRow
-from polysight.imaging.tilt import Illumination, Rise, correct_tilt
 
 __all__ = [
     "AS_IN_RIG_FILE",
@@ -37,12 +36,13 @@ __all__ = [
     "UNKNOWN_PLANE",
     "Antennas",
     "Aperture",
-    "ChannelImages",
     "Focus",
-    "Illumination",
+    "Image",
     "ImageBuilder",
     "ImageGrid",
     "ImagedWith",
+    "Images",
+    "Mask",
     "PlaneEstimate",
     "PointResponse",
     "ReducedRow",

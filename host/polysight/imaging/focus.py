@@ -19,7 +19,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.imaging.images import ImageBuilder
+from polysight.imaging.builder import ImageBuilder
 from polysight.imaging.resolution import limit_m
 
 _MAX_TILT_DEG = 3.0

@@ -1,287 +1,222 @@
-"""Form the H and V images from synchronised rows, for the whole sweep and for its sub-bands.
+"""Images of both channels, and the effect of tilted plates on them.
 
-`ImageBuilder` collects rows in any order and forms the images from the rows so far. `SubBandImages` does the same for
-parts of the sweep that overlap by half.
+`Images` is what every later step reads and returns: imaging forms it, polarimetry adds metal reference and ratio.
+
+A flat plate is visible where it reflects TX into RX: from the stage position whose specular point on the object plane
+is the pixel. A plate that rises by s (radians, along x and y) is visible from other positions, like the object plane at
+a distance
+
+    d = H^-1 C s        H = d2 (r1 + r2) / dx dy,   C = cos of TX's leg + cos of RX's leg to the plane's normal
+
+away: with the directions e1, e2 of both legs, specular reflection requires (e1 + e2)_xy + s (e1 + e2)_z = 0, and
+(e1 + e2)_xy grows with H from the specular point. There the aperture has another weight, which differs between H and V
+because their specular points differ: 2.5 % of V / H per degree on the published rig (simulated). So a pixel of a
+tilted plate is divided by the mirror's footprint `d` away. The tilt follows from the image: its phase grows by k C s
+per metre.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from importlib import import_module
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 
-import msgspec
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.imaging.aperture import Window, window_weights
-from polysight.imaging.geometry import Antennas, image_grid
-from polysight.imaging.reduce import reduction, scene_gate_m
-from polysight.imaging.samples import BoardSamples, Image
-from polysight.imaging.tilt import Illumination, correct_tilt, illumination_geometry
-from polysight.sync import SyncedRow
-from polysight_shared.config import Chirp, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
-from polysight_shared.raster import plan_raster
+from polysight.imaging.geometry import Antennas
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-_VISIBLE = 0.15  # smallest footprint relative to the strongest; weaker pixels are mostly noise
-_NEIGHBOURS = 15  # pixels, width of the majority filter
-TAPERS: dict[str, Window] = {"none": "boxcar", "kaiser": ("kaiser", 4.0), "taylor": ("taylor", 4, 30)}
-"""Windows over the aperture by their name in the rig file, as for scipy."""
-MIN_SAMPLES = 24
-"""Smallest number of samples in a sub-band; fewer do not separate the object from the direct path."""
+Image = NDArray[np.complexfloating]
+Mask = NDArray[np.bool_]
+Rise = tuple[float, float]
+"""Growth of a plate's height along x and along y."""
+MAX_RISE = 0.06
+"""Largest tilt of a plate (3.4 degrees); a steeper phase has another cause."""
+MIN_RISE = 2e-3
+"""Smallest tilt that is corrected (0.11 degrees); smaller ones may come from sidelobes of neighbours."""
+_COHERENT = 0.5
+"""Smallest coherence of the phase steps between pixels (1: all equal)."""
+_MAX_CHANGE = 2.0
+"""Largest change of the footprint over the distance `d`; a larger one occurs only at the edge of the aperture."""
 
 
 @dataclass(frozen=True)
-class ChannelImages:
-    """The two channels on one grid.
+class Illumination:
+    """Illumination of the object plane by both channels.
+
+    Attributes
+    ----------
+    footprints
+        complex64 [2, ny, nx]: the image of a uniform mirror, H and V.
+    moved_m
+        float64 [2, 2, 2]: `d` of each channel (x, y) for a rise of 1 along x and along y, metres.
+    steepness_rad_m
+        float64 [2]: growth of the phase, radians a metre, for a rise of 1.
+    pixel_m
+        Pitch of the pixels along x and y.
+    """
+
+    footprints: NDArray[np.complex64]
+    moved_m: NDArray[np.float64]
+    steepness_rad_m: NDArray[np.float64]
+    pixel_m: tuple[float, float]
+
+    @property
+    def across(self) -> int:
+        """Axis across the plane of incidence, 0 (x) or 1 (y), where a rise moves the specular point least."""
+        return int(np.argmin(np.abs(np.diagonal(self.moved_m.mean(axis=0)))))
+
+    def transposed(self) -> Illumination:
+        """Return the illumination with x and y swapped."""
+        turned = np.ascontiguousarray(self.footprints.transpose(0, 2, 1))
+        return replace(self, footprints=turned, moved_m=self.moved_m[:, ::-1, ::-1], pixel_m=self.pixel_m[::-1])
+
+    def rise(self, h: Image, v: Image, mask: Mask) -> Rise:
+        """Estimate the rise of a patch along x and y from its phase, radians; zero if undetermined.
+
+        `h`, `v` complex [ny, nx] are reflectivities (conjugates of the samples), `mask` bool [ny, nx] is the inside of
+        the patch.
+        """
+        out = []
+        for along in (0, 1):
+            # The phase of the conjugate falls where the plate rises.
+            step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in (h, v)) / 2
+            slope = float(np.angle(step)) / self.pixel_m[along] / float(self.steepness_rad_m.mean())
+            out.append(slope if abs(step) > _COHERENT and abs(slope) < MAX_RISE else 0.0)
+        return out[0], out[1]
+
+    def to_level(self, mask: Mask, rise: Rise) -> NDArray[np.float64]:
+        """Return factors [2, n] that convert H and V of a patch's pixels to those of a level plate.
+
+        They use only the magnitude of the footprint, for its phase ripples with the rows of the grid; and only the rise
+        across the plane of incidence. Along it, H and V are illuminated equally (|H| changes by 7 % per degree), and
+        the phase is less reliable: plates at the sides of the image seem to rise by up to 0.3 degrees (0.8 degrees
+        with a narrow aperture).
+        """
+        slope = rise[self.across]
+        if abs(slope) < MIN_RISE:
+            return np.ones((2, int(mask.sum())))
+        return np.stack([self._change(k, mask, self.moved_m[k][:, self.across] * slope) for k in (0, 1)])
+
+    def _change(self, channel: int, mask: Mask, moved_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the footprint at a patch's pixels divided by that `moved_m` away, [n]; 1 beyond the aperture."""
+        rows, columns = np.nonzero(mask)
+        level = np.abs(self.footprints[channel])
+        at = np.stack([rows + moved_m[1] / self.pixel_m[1], columns + moved_m[0] / self.pixel_m[0]])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change = level[rows, columns] / scipy.ndimage.map_coordinates(level, at, order=1, mode="nearest")
+        return np.where((change > 1 / _MAX_CHANGE) & (change < _MAX_CHANGE), change, 1.0)
+
+
+@dataclass(frozen=True)
+class Images:
+    """Both channels on one grid; what is added on the way is None before. Row 0 is the smallest y.
 
     Attributes
     ----------
     h, v
-        complex64 [ny, nx]: reflectivity with the sign convention of the Fresnel coefficients (time dependence
+        complex [ny, nx]: reflectivity with the sign convention of the Fresnel coefficients (time dependence
         exp(+j omega t)), 0 where not valid: the conjugate of the image divided by the footprint. The conjugate is
-        needed because samples have the phase +2 pi f tau, while a delayed wave has exp(-j 2 pi f tau). Not yet
-        referenced to metal: each channel contains a constant gain.
-    h_raw, v_raw
-        complex64 [ny, nx]: the images themselves, with the phase of the samples.
-    h_footprint, v_footprint
-        complex64 [ny, nx]: images of a uniform mirror.
+        needed because samples have the phase +2 pi f tau, while a delayed wave has exp(-j 2 pi f tau). Each channel
+        contains a constant gain until it is divided by metal.
     x_m, y_m
-        float64 [nx], [ny]: axes in the rig frame.
+        float64 [nx], [ny]: pixel centres in the rig frame.
     valid
-        bool [ny, nx]: both footprints are strong enough.
-    rx_calibration
+        bool [ny, nx]: pixels illuminated in both channels (and where the metal reference is valid).
+    p
+        complex [ny, nx]: h / v; NaN where v is zero.
+    p_sigma
+        float32 [ny, nx]: standard deviation of the complex p; NaN where unknown.
+    metal_h, metal_v
+        Metal by which h and v were divided: complex numbers, or images [ny, nx] of a reference over the whole plane.
+        Then |h| = |v| = 1 on metal, and their phase difference is zero there.
+    h_raw, v_raw
+        complex64 [ny, nx]: the images before the footprint was divided out, with the phase of the samples.
+    illumination
+        Illumination of the plane by both channels, to correct tilted plates.
+    rx_gains
         Board name to complex128 [rx]: gain of each RX, from the direct path, which was divided out.
     notices
         Notices for the user, for example of slow imaging.
-    lit
-        Illumination of the plane by both channels, to correct tilted plates; None if unknown.
     """
 
-    h: NDArray[np.complex64]
-    v: NDArray[np.complex64]
-    h_raw: NDArray[np.complex64]
-    v_raw: NDArray[np.complex64]
-    h_footprint: NDArray[np.complex64]
-    v_footprint: NDArray[np.complex64]
+    h: Image
+    v: Image
     x_m: NDArray[np.float64]
     y_m: NDArray[np.float64]
-    valid: NDArray[np.bool_]
-    rx_calibration: dict[str, NDArray[np.complex128]]
+    valid: Mask
+    p: Image | None = None
+    p_sigma: NDArray[np.floating] | None = None
+    metal_h: complex | Image | None = None
+    metal_v: complex | Image | None = None
+    h_raw: Image | None = None
+    v_raw: Image | None = None
+    illumination: Illumination | None = None
+    rx_gains: Mapping[str, NDArray[np.complex128]] = field(default_factory=dict)
     notices: tuple[str, ...] = ()
-    lit: Illumination | None = None
 
-    def transposed(self) -> ChannelImages:
+    @property
+    def usable(self) -> Mask:
+        """Pixels that are valid and finite in both channels, bool [ny, nx]."""
+        return self.valid & np.isfinite(self.h) & np.isfinite(self.v)
+
+    def within(self, area: Mask) -> Images:
+        """Return the images, valid only inside `area`, bool [ny, nx]."""
+        return replace(self, valid=self.valid & area)
+
+    def transposed(self) -> Images:
         """Return the images with x and y swapped."""
-        pixels = ("h", "v", "h_raw", "v_raw", "h_footprint", "v_footprint", "valid")
-        turned = {name: np.ascontiguousarray(getattr(self, name).T) for name in pixels}
-        lit = None if self.lit is None else self.lit.transposed()
-        return replace(self, **turned, x_m=self.y_m, y_m=self.x_m, lit=lit)
+        turned = {
+            f.name: np.ascontiguousarray(value.T)
+            for f in fields(self)
+            if isinstance(value := getattr(self, f.name), np.ndarray) and value.ndim == 2
+        }
+        illumination = None if self.illumination is None else self.illumination.transposed()
+        return replace(self, **turned, x_m=self.y_m, y_m=self.x_m, illumination=illumination)
 
-    def level(self, plate: NDArray[np.bool_]) -> tuple[NDArray[np.complexfloating], NDArray[np.complexfloating]]:
-        """Return H and V with the tilt of one plate, bool [ny, nx], corrected."""
-        if self.lit is None:
-            return self.h, self.v
-        return correct_tilt(self.h, self.v, self.lit, [plate], [self.lit.rise(self.h, self.v, plate)])
-
-
-@dataclass(frozen=True)
-class View:
-    """Plane and pixels other than the rig file's (None: as there); the plane lies `depth_mm` farther."""
-
-    depth_mm: float = 0.0
-    columns: int | None = None
-    rows: int | None = None
-    pixel_mm: float | None = None
-
-    def of(self, rig: Instrument, swapped: bool = False) -> Instrument:
-        """Return the rig with this plane and these pixels; `swapped`: the rig's x is the image's y."""
-        columns, rows = (self.rows, self.columns) if swapped else (self.columns, self.rows)
-        wanted = {"columns": columns, "rows": rows, "pixel_mm": self.pixel_mm}
-        image = msgspec.structs.replace(rig.image, **{k: v for k, v in wanted.items() if v is not None})
-        distance = rig.geometry.object_distance_mm + self.depth_mm
-        geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=distance)
-        return msgspec.structs.replace(rig, image=image, geometry=geometry)
+    def level(self, plate: Mask) -> Images:
+        """Return the images with the tilt of one plate, bool [ny, nx], corrected."""
+        if self.illumination is None:
+            return self
+        return correct_tilt(self, [plate], [self.illumination.rise(self.h, self.v, plate)])
 
 
-AS_IN_RIG_FILE = View()
+def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -> tuple[NDArray[np.float64], float]:
+    """Return `moved_m` [2, 2] and `steepness_rad_m` of a board at its specular point on the plane at `z_m`."""
+    tx, rx = antennas.tx_m, antennas.rx_m.mean(axis=0)
+    z_tx, z_rx = z_m - tx[2], z_m - rx[2]
+    point = np.append((tx[:2] * z_rx + rx[:2] * z_tx) / (z_tx + z_rx), z_m)
+    bend, cosines = np.zeros((2, 2)), 0.0
+    for place in (tx, rx):
+        leg = point - place
+        r = float(np.linalg.norm(leg))
+        e = leg / r
+        bend += (np.eye(2) - np.outer(e[:2], e[:2])) / r
+        cosines += float(e[2])
+    wave = 2 * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S
+    return np.asarray(np.linalg.inv(bend) * cosines, np.float64), wave * cosines
 
 
-def needed_gate_m(rig: Instrument, depth_m: float = 0.0) -> tuple[float, float]:
-    """Return the smallest and largest excess path in a rig's image, with planes `depth_m` nearer and farther."""
-    antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
-    return scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig), depth_m)
+def correct_tilt(images: Images, masks: Sequence[Mask], rises: Sequence[Rise]) -> Images:
+    """Return the images with the tilt of every patch corrected; other pixels are unchanged.
 
-
-class ImageBuilder:
-    """Collects rows in any order and forms images of the rows so far.
-
-    A row added again replaces the earlier one. Only reduced samples are kept: 10 frequencies instead of 192.
-
-    Parameters
-    ----------
-    rig
-        Rig of the scan.
-    taper
-        Window over the aperture in x and y, as for scipy; "boxcar" for none; None: the rig file's. Without a taper,
-        sidelobes make the inside of a plate depend on its surroundings, differently in H and V
-        (docs/decisions/0002-imaging.md).
-    live
-        Update running sums with every row (2 ms per row and board of the published grid), so that :meth:`current` is
-        fast, and compute the kernels of the final image in advance.
-    depth_m
-        Keep echoes from planes up to this much nearer or farther than the rig file's, for autofocus.
-    gate_m
-        Excess paths to keep, for example of kept samples; None: those needed by grid and `depth_m`.
+    Without the illumination of the plane the images are returned unchanged.
     """
-
-    def __init__(
-        self,
-        rig: Instrument,
-        taper: Window | None = None,
-        live: bool = False,
-        depth_m: float = 0.0,
-        gate_m: tuple[float, float] | None = None,
-    ) -> None:
-        self.rig, self.grid, self.live = rig, image_grid(rig), live
-        if live:
-            import_module("scipy.ndimage")  # load it now instead of after the last row
-        plan = plan_raster(rig.grid)
-        antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
-        self.gate_m = needed_gate_m(rig, depth_m) if gate_m is None else gate_m
-        taper = TAPERS[rig.image.apodisation] if taper is None else taper
-        weights = np.outer(window_weights(taper, plan.rows), window_weights(taper, plan.columns)).astype(np.float32)
-        gated = reduction(rig.chirp, self.gate_m)
-        self._antennas, self._middle_hz = antennas, float(np.mean(gated.frequencies_hz))
-        self.boards = {b.name: BoardSamples(rig, b, self.grid, gated, weights, live) for b in rig.receivers}
-
-    def add_row(
-        self, board_name: str, row_index: int, row: SyncedRow, offsets_m: NDArray[np.float64] | None = None
-    ) -> None:
-        """Add a synchronised row of a board, see :meth:`polysight.imaging.samples.BoardSamples.add_row`.
-
-        Raises
-        ------
-        DataError
-            if the row is not in the plan.
-        """
-        if board_name not in self.boards:
-            raise DataError(
-                f"row {row_index} of board {board_name!r} is not in this scan",
-                "the data were recorded with another rig file",
-                "use the rig file of this scan",
-                code=ErrorCode.MISMATCH,
-            )
-        self.boards[board_name].add_row(row_index, row, offsets_m)
-
-    def rx_calibration(self, board_name: str) -> NDArray[np.complex128]:
-        """Return the complex gain of each RX of a board, [rx]."""
-        return self.boards[board_name].rx_calibration()
-
-    def finish(self, offset_m: float = 0.0) -> ChannelImages:
-        """Form both images from the rows so far; more rows may be added later.
-
-        `offset_m`: distance of the imaged plane behind the rig file's plane.
-        """
-        grid = replace(self.grid, z_m=self.grid.z_m + offset_m) if offset_m else None
-        return self._channels({name: board.image(grid) for name, board in self.boards.items()}, offset_m)
-
-    def current(self) -> ChannelImages:
-        """Return the images from running sums, within 1e-6 of the peak; fast if the builder is `live`."""
-        return self._channels({name: board.current() for name, board in self.boards.items()})
-
-    def _channels(self, made: dict[str, tuple[Image, Image, str | None]], offset_m: float = 0.0) -> ChannelImages:
-        h, v = made.values()
-        visible = np.ones(self.grid.shape, bool)
-        for _, weight, _ in (h, v):
-            strong = np.abs(weight) >= _VISIBLE * np.abs(weight).max()
-            # The rim of the footprint ripples with the row spacing; a majority filter avoids stripes.
-            share = scipy.ndimage.uniform_filter(strong.astype(np.float32), size=_NEIGHBOURS, mode="nearest")
-            visible &= (share > 0.5) & (weight != 0)
-        flat = [np.divide(raw, w, out=np.zeros_like(raw), where=visible).conj() for raw, w, _ in (h, v)]
-        calibration = {name: board.rx_calibration() for name, board in self.boards.items()}
-        notices = tuple(f"{name}: {notice}" for name, (_, _, notice) in made.items() if notice)
-        axes = (self.grid.x_m, self.grid.y_m)
-        lit = self._illumination(np.stack([h[1], v[1]]), float(np.mean(self.grid.z_m)) + offset_m)
-        return ChannelImages(flat[0], flat[1], h[0], v[0], h[1], v[1], *axes, visible, calibration, notices, lit)
-
-    def _illumination(self, footprints: NDArray[np.complex64], z_m: float) -> Illumination:
-        """Return the illumination of the plane at `z_m` by both channels."""
-        moved, steep = zip(*(illumination_geometry(a, z_m, self._middle_hz) for a in self._antennas), strict=True)
-        pitch = self.grid.pixel_m
-        return Illumination(footprints, np.stack(moved), np.array(steep), (pitch, pitch))
+    if images.illumination is None:
+        return images
+    h = images.h.copy()
+    v = images.v.copy()
+    for mask, rise in zip(masks, rises, strict=True):
+        factor_h, factor_v = images.illumination.to_level(mask, rise)
+        h[mask] *= factor_h
+        v[mask] *= factor_v
+    return replace(images, h=h, v=v)
 
 
-@dataclass(frozen=True)
-class SubBand:
-    """Part of the sweep: its samples [first, last), and its first and last transmit frequency."""
-
-    samples: tuple[int, int]
-    first_hz: float
-    last_hz: float
-
-
-def sub_bands(chirp: Chirp, count: int) -> tuple[SubBand, ...]:
-    """Divide the linear samples into `count` parts that overlap by half, as in Welch's method.
-
-    Raises
-    ------
-    ConfigError
-        if the chirp is too short for so many parts.
-    """
-    first, last = chirp.linear_samples
-    length = 2 * (last - first) / (count + 1) if count > 0 else 0.0
-    if length < MIN_SAMPLES:
-        most = 2 * (last - first) // MIN_SAMPLES - 1
-        raise ConfigError(
-            f"{count} sub-bands of {last - first} linear samples",
-            f"each needs {MIN_SAMPLES} samples to separate the object from the direct path",
-            f"use 1 to {most}",
-            code=ErrorCode.VALUE_INVALID,
-        )
-    out = []
-    for k in range(count):
-        a = first + round(k * length / 2)
-        b = min(last, a + round(length))
-        edges = (chirp.first_sample_hz + chirp.hz_per_sample * n for n in (a, b - 1))
-        out.append(SubBand((a, b), *edges))
-    return tuple(out)
-
-
-class SubBandImages:
-    """Collects rows like :class:`ImageBuilder` and forms the images of every sub-band.
-
-    Parameters
-    ----------
-    rig
-        Rig of the scan.
-    count
-        Number of sub-bands; 1: none.
-    gate_m
-        Range gate of the whole sweep.
-    """
-
-    def __init__(self, rig: Instrument, count: int, gate_m: tuple[float, float] | None = None) -> None:
-        self.bands = sub_bands(rig.chirp, count) if count > 1 else ()
-        self.builders = tuple(ImageBuilder(_part(rig, band), gate_m=gate_m) for band in self.bands)
-
-    def add_row(self, board_name: str, row_index: int, row: SyncedRow) -> None:
-        """Add a synchronised row of a board; a row added again replaces the earlier one."""
-        for builder in self.builders:
-            builder.add_row(board_name, row_index, row)
-
-    def finish(self, transposed: bool = False, offset_m: float = 0.0) -> tuple[ChannelImages, ...]:
-        """Form the images of every sub-band from the rows so far, lowest frequency first.
-
-        `transposed`: swap x and y. `offset_m`: as in :meth:`ImageBuilder.finish`.
-        """
-        made = (builder.finish(offset_m) for builder in self.builders)
-        return tuple(images.transposed() if transposed else images for images in made)
-
-
-def _part(rig: Instrument, band: SubBand) -> Instrument:
-    """Return the rig with the linear samples limited to a sub-band."""
-    chirp = msgspec.structs.replace(rig.chirp, linear_samples=band.samples)
-    return msgspec.structs.replace(rig, chirp=chirp)
+def _step(image: Image, mask: Mask, axis: int) -> complex:
+    """Return exp(j mean phase step between pixels of a patch) times the coherence of the steps."""
+    inside = np.where(mask & np.isfinite(image), image, 0).astype(np.complex128)
+    ahead, behind = (np.take(inside, range(k, inside.shape[axis] - 1 + k), axis) for k in (1, 0))
+    product = ahead * np.conj(behind)
+    return complex(product.sum()) / max(float(np.abs(product).sum()), 1e-300)

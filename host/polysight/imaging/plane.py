@@ -18,7 +18,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.imaging.images import ChannelImages, ImageBuilder
+from polysight.imaging.builder import ImageBuilder
+from polysight.imaging.images import Images
 from polysight.imaging.samples import BoardSamples
 from polysight_shared.config import Instrument
 from polysight_shared.geometry import incidence_deg
@@ -167,8 +168,8 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
 
 
 def move_to_plane(
-    builder: ImageBuilder, images: ChannelImages, masks: Sequence[NDArray[np.bool_]], transposed: bool, move: bool
-) -> tuple[PlaneEstimate, ChannelImages]:
+    builder: ImageBuilder, images: Images, masks: Sequence[NDArray[np.bool_]], transposed: bool, move: bool
+) -> tuple[PlaneEstimate, Images]:
     """Estimate the plane of patches; return it and the images on it, if it differs from the rig file's plane.
 
     Parameters

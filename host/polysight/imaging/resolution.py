@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.imaging.aperture import Aperture
+from polysight.imaging.builder import ImageBuilder
 from polysight.imaging.direct import DirectImager, backproject
 from polysight.imaging.geometry import ImageGrid
-from polysight.imaging.images import ChannelImages, ImageBuilder
+from polysight.imaging.images import Images
 from polysight.imaging.samples import BoardSamples
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
@@ -140,7 +141,7 @@ def _sidelobe_db(cut: NDArray[np.float64]) -> float:
     return float(20 * np.log10(max(max(levels), 1e-9)))
 
 
-def imaging_facts(builder: ImageBuilder, images: ChannelImages) -> dict[str, Any]:
+def imaging_facts(builder: ImageBuilder, images: Images) -> dict[str, Any]:
     """Return the entry `imaging` of quality.json, by board."""
     out: dict[str, Any] = {name: board_facts(board) for name, board in builder.boards.items()}
     if images.notices:

@@ -29,7 +29,7 @@ class Reconstruction:
     Attributes
     ----------
     image
-        complex64 [ny, nx]: reflectivity of each pixel with the phase of the samples, the conjugate of `ChannelImages.h`
+        complex64 [ny, nx]: reflectivity of each pixel with the phase of the samples, the conjugate of `Images.h`
         and `v`. A point has its own amplitude in one pixel.
     residual
         float64 [iteration]: `|W (G A x - y)| / |W y|`, the unexplained share.

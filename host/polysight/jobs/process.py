@@ -14,8 +14,8 @@ from polysight.calibration import calibration_of_scan
 from polysight.imaging import (
     AS_IN_RIG_FILE,
     PLANE_REACH_M,
-    ChannelImages,
     Focus,
+    Images,
     PlaneEstimate,
     View,
     focus_sweep,
@@ -84,7 +84,7 @@ def axes_of(pipeline: Pipeline) -> Axes:
     return (grid.y_m, grid.x_m) if pipeline.source.mirrored else (grid.x_m, grid.y_m)
 
 
-def imaged(data: Path, config: Path | None, bands: int = 1) -> tuple[Pipeline, ChannelImages]:
+def imaged(data: Path, config: Path | None, bands: int = 1) -> tuple[Pipeline, Images]:
     """Process a recorded scan of any layout up to its images. Raises PolysightError."""
     pipeline = all_rows(open_source(data, config, dropped=True), data, bands=bands)
     return pipeline, pipeline.form_images()
@@ -156,11 +156,10 @@ def _why_no_pixel(pipeline: Pipeline) -> str:
     return f"no position of {boards} has a direct path: TX or RX is off, or its data are constant" if boards else ""
 
 
-def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
+def plane_of(pipeline: Pipeline, images: Images) -> PlaneReference:
     """Make a reference from images of a metal plate. Raises DataError if they show none."""
     name = pipeline.source.scan_id
-    h, v = images.level(images.valid)
-    found = plane_reference(h, v, images.x_m, images.y_m, images.valid, name=name)
+    found = plane_reference(images.level(images.valid), name=name)
     return replace(found, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 

@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
+from polysight.imaging import Images
 from polysight.jobs.demo import check_scenes, run_simulator
 from polysight.jobs.output import print_lines, steps
 from polysight.jobs.process import all_rows
 from polysight.materials import (
     TRUTH,
-    ImagePair,
     KnownScene,
     Labels,
     Library,
@@ -143,7 +143,7 @@ def _from_images(saved: SavedProducts, labels: Labels) -> TrainingScan:
     metal = next((label for label, name in names.items() if name == checked.metal), None)
     if metal is None:
         raise _no_metal(saved.folder)
-    pair = ImagePair(saved.h, saved.v, saved.x_m, saved.y_m, saved.valid)
+    pair = Images(saved.h, saved.v, saved.x_m, saved.y_m, saved.valid)
     found = analyse(pair, _optics_of(saved), MetalChoice(label=metal), KnownScene(segmentation))
     return _labelled(saved.scan_id, found, saved.simulated is not False, checked)
 

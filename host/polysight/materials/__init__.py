@@ -1,6 +1,6 @@
 """Materials: find patches in the two images, estimate their permittivities, and name them.
 
-`analyse` takes an `ImagePair`, the `Optics`, the choice of the metal reference (`MetalChoice`) and known facts of the
+`analyse` takes `Images`, the `Optics`, the choice of the metal reference (`MetalChoice`) and known facts of the
 scene (`KnownScene`); it returns a `MaterialsResult`. A `Classifier` names patches by a `Library` of labelled patches,
 which `make_library` makes of scans. `fit_layer` fits thin layers, `fit_concentration` solutions. `patch_files` stores
 the features of a scan's patches, `labels` reads and writes boxes with names, `published` reads the published data set.
@@ -30,7 +30,7 @@ from polysight.materials.concentration import (
     polarisation_angle_rad,
 )
 from polysight.materials.discriminant import REJECTED
-from polysight.materials.inputs import FOUND, UNKNOWN_SCENE, ImagePair, KnownScene, MetalChoice, Optics
+from polysight.materials.inputs import FOUND, UNKNOWN_SCENE, KnownScene, MetalChoice, Optics
 from polysight.materials.inversion import (
     PatchEstimate,
     PatchMeasurement,
@@ -146,7 +146,6 @@ __all__ = [
     "Classifier",
     "ConcentrationResult",
     "Entry",
-    "ImagePair",
     "KnownScene",
     "LabelledScan",
     "Labels",

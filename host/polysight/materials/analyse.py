@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from polysight.imaging import Image, Images
 from polysight.materials.classify import UNKNOWN, Classifier, NamedPatch, add_explanation, features_of
 from polysight.materials.inputs import (
     FOUND,
     UNKNOWN_SCENE,
-    Image,
-    ImagePair,
     KnownScene,
     MetalChoice,
     Optics,
@@ -46,15 +45,14 @@ from polysight.materials.segment import Patch, Segmentation, SegmentSettings, ax
 from polysight.materials.specimens import features, relative, softened
 from polysight.materials.truth import match_truth
 from polysight.polarimetry import (
-    Calibrated,
     IncidenceChoice,
     PlaneReference,
     calibrate,
-    calibrate_by_reference,
-    correct_leakage,
+    divide_by_metal,
     fresnel,
     permittivity_from_ratio,
     ratio,
+    remove_leakage,
     smooth,
 )
 from polysight_shared.errors import DataError
@@ -66,13 +64,13 @@ ACTIVE = 2.0
 
 
 def analyse(
-    images: ImagePair,
+    images: Images,
     optics: Optics,
     metal: MetalChoice = FOUND,
     known: KnownScene = UNKNOWN_SCENE,
     classifier: Classifier | None = None,
 ) -> MaterialsResult:
-    """Find the patches of an image pair, estimate their permittivities, and name them if there is a classifier.
+    """Find the patches of the images, estimate their permittivities, and name them if there is a classifier.
 
     A scene without patches or without metal is no error; see `metal` and `refused` of the result.
 
@@ -88,7 +86,7 @@ def analyse(
     found = _patches(images, plane, known)
     images, tilts = level(images, found)
     reference = _reference(images, metal, found)
-    raw = to_metal(images.h, images.v, reference, plane)
+    raw = to_metal(images, reference, plane)
     rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
     refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
     std = reference_std(reference_spread(rh, rv, reference, plane))
@@ -101,7 +99,7 @@ def analyse(
         channel = _channel_ratio(images, reference) if optics.channel_ratio_known else None
         reference = replace(reference, evidence=metal_evidence(measured, prior, channel))
     inversion = invert(measured, prior)
-    calibrated = without_leakage(raw, inversion.leakage)
+    calibrated = remove_leakage(raw, inversion.leakage)
     sh, sv = (smooth_inside(c, found, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
     labels = [p.label for p in judged]
@@ -178,29 +176,29 @@ def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
     return float(np.mean(inside))
 
 
-def _channel_ratio(images: ImagePair, metal: MetalReference) -> complex | None:
+def _channel_ratio(images: Images, metal: MetalReference) -> complex | None:
     """Return V / H of the metal reference in the images; None without signal."""
     h, v = images.h[metal.mask], images.v[metal.mask]
     power = float(np.sum(np.abs(h.astype(np.complex128)) ** 2))
     return complex(np.vdot(h.astype(np.complex128), v)) / power if power > 0 else None
 
 
-def _patches(images: ImagePair, plane: PlaneReference | None, known: KnownScene) -> Segmentation:
+def _patches(images: Images, plane: PlaneReference | None, known: KnownScene) -> Segmentation:
     """Return the known patches, cut to the valid pixels, or else find them."""
     given = _within(known.segmentation, images.valid)
     if given:
         return given
     if plane is None:
         return segment(images.h, images.v, images.x_m, images.y_m, images.valid, known.settings)
-    even = plane.apply(images.h, images.v)
+    even = plane.apply(images)
     found = segment(even.h, even.v, images.x_m, images.y_m, images.valid, known.settings)
     if not found.patches and float(np.median(np.abs(even.h[images.valid]))) > FILLED:
         margin_mm = (known.settings or SegmentSettings()).margin_mm
-        return whole_plane(plane.valid if images.valid is None else images.valid, images.x_m, images.y_m, margin_mm)
+        return whole_plane(images.valid, images.x_m, images.y_m, margin_mm)
     return found
 
 
-def _reference(images: ImagePair, metal: MetalChoice, found: Segmentation) -> MetalReference:
+def _reference(images: Images, metal: MetalChoice, found: Segmentation) -> MetalReference:
     """Return the chosen metal reference, or else the brightest patch; none without patches."""
     if metal.plane is not None:
         return MetalReference(metal.plane.valid, None, metal.plane.how, given=True)
@@ -211,25 +209,19 @@ def _reference(images: ImagePair, metal: MetalChoice, found: Segmentation) -> Me
     return find_metal(images.h, images.v, found) or no_metal(images.usable)
 
 
-def to_metal(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> Calibrated:
+def to_metal(images: Images, metal: MetalReference, reference: PlaneReference | None) -> Images:
     """Divide both channels by metal, in the scene or scanned separately; leakage is not removed.
 
     Without any signal of metal to divide by, the images are returned unchanged.
     """
     if reference is not None:
-        return reference.apply(h, v)
+        return reference.apply(images)
     try:
-        return calibrate(h, v, metal.mask)
+        return calibrate(images, metal.mask)
     except DataError:
         if metal.given:
             raise
-        return calibrate_by_reference(h, v, 1.0 + 0j, 1.0 + 0j)
-
-
-def without_leakage(c: Calibrated, leakage: tuple[complex, complex]) -> Calibrated:
-    """Remove the leakage from metal-referenced channels."""
-    h, v = correct_leakage(c.h, c.v, *leakage)
-    return Calibrated(h, v, ratio(h, v), c.metal_h, c.metal_v)
+        return divide_by_metal(images, 1.0 + 0j, 1.0 + 0j)
 
 
 def reference_spread(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
@@ -238,10 +230,10 @@ def reference_spread(h: Image, v: Image, metal: MetalReference, reference: Plane
     return spread if np.isfinite(spread) else 0.0
 
 
-def _within(found: Segmentation | None, valid: npt.NDArray[np.bool_] | None) -> Segmentation | None:
+def _within(found: Segmentation | None, valid: npt.NDArray[np.bool_]) -> Segmentation | None:
     """Cut the interiors of patches to the valid pixels."""
-    if found is None or valid is None:
-        return found
+    if found is None:
+        return None
     return replace(found, patches=tuple(replace(p, interior=p.interior & valid) for p in found.patches))
 
 

@@ -1,4 +1,4 @@
-"""Inputs of `analyse`: image pair, optics, choice of the metal reference, known facts of the scene; tilts of plates.
+"""Inputs of `analyse` beside the images: optics, choice of the metal reference, known facts of the scene; tilts.
 
 `level` corrects the images for the tilts of the plates.
 """
@@ -6,60 +6,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from polysight.imaging import ChannelImages, Illumination, Rise, correct_tilt
+from polysight.imaging import Images, Rise, correct_tilt
 from polysight.materials.inversion import RigPrior
 from polysight.materials.segment import Box, Segmentation, SegmentSettings
 from polysight.materials.truth import TruthPlate
 from polysight.polarimetry import IncidenceChoice, PlaneReference
 from polysight_shared.config import Instrument
 
-Image = npt.NDArray[np.complexfloating]
 LEAST_LEAKAGE_STD = 5e-4
 """Least standard deviation of the leakage, whatever the rig file says."""
-
-
-@dataclass(frozen=True)
-class ImagePair:
-    """The two channel images.
-
-    Attributes
-    ----------
-    h, v
-        complex [ny, nx], flattened by the footprint of a mirror, not yet metal-referenced.
-    x_m, y_m
-        Pixel centres, metres, [nx] and [ny].
-    valid
-        bool [ny, nx]; None: all pixels.
-    lit
-        Illumination of the plane in both channels; None: tilts are not estimated.
-    """
-
-    h: Image
-    v: Image
-    x_m: npt.ArrayLike
-    y_m: npt.ArrayLike
-    valid: npt.NDArray[np.bool_] | None = None
-    lit: Illumination | None = None
-
-    @classmethod
-    def of(cls, images: ChannelImages) -> ImagePair:
-        """Return the pair of channel images from imaging."""
-        return cls(images.h, images.v, images.x_m, images.y_m, images.valid, images.lit)
-
-    @property
-    def usable(self) -> npt.NDArray[np.bool_]:
-        """Pixels that are valid and finite, bool [ny, nx]."""
-        finite = np.isfinite(self.h) & np.isfinite(self.v)
-        return finite if self.valid is None else finite & self.valid
-
-    def within(self, area: npt.NDArray[np.bool_]) -> ImagePair:
-        """Return the pair, valid only inside `area`, bool [ny, nx]."""
-        return replace(self, valid=area if self.valid is None else self.valid & area)
 
 
 @dataclass(frozen=True)
@@ -178,17 +138,16 @@ class Tilts:
         return self.rises[label][self.across] if label in self.rises else 0.0
 
 
-def level(images: ImagePair, found: Segmentation, tilts: Tilts | None = None) -> tuple[ImagePair, Tilts]:
-    """Correct each patch for its tilt; return the pair and the tilts, as given or estimated from the phase.
+def level(images: Images, found: Segmentation, tilts: Tilts | None = None) -> tuple[Images, Tilts]:
+    """Correct each patch for its tilt; return the images and the tilts, as given or estimated from the phase.
 
-    Without the illumination of the plane the pair is returned unchanged.
+    Without the illumination of the plane the images are returned unchanged.
     """
-    if images.lit is None:
+    if images.illumination is None:
         return images, Tilts({}, 1)
     if tilts is None:
-        rises = {p.label: images.lit.rise(images.h, images.v, p.interior) for p in found.patches}
-        tilts = Tilts(rises, images.lit.across)
+        rises = {p.label: images.illumination.rise(images.h, images.v, p.interior) for p in found.patches}
+        tilts = Tilts(rises, images.illumination.across)
     there = [p for p in found.patches if p.label in tilts.rises]
     masks, own = [p.mask for p in there], [tilts.rises[p.label] for p in there]
-    h, v = correct_tilt(images.h, images.v, images.lit, masks, own)
-    return replace(images, h=h, v=v), tilts
+    return correct_tilt(images, masks, own), tilts

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from polysight.materials.labels import METALS, is_metal, read_labels
 from polysight.materials.library import Entry, Library
 from polysight.materials.segment import Box
-from polysight.polarimetry import calibrate
+from polysight.polarimetry import metal_gains
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 from polysight_shared.files import read_bounded, read_json
@@ -189,8 +189,9 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
             f"a metal box has one of these words in its name: {', '.join(METALS)}",
             code=ErrorCode.NO_DATA,
         )
-    relative = calibrate(scan.h, scan.v, scan.mask(scan.metal) & (scan.h != 0) & (scan.v != 0))
-    h, v = relative.h, relative.v
+    metal_h, metal_v = metal_gains(scan.h, scan.v, scan.mask(scan.metal) & (scan.h != 0) & (scan.v != 0))
+    h = scan.h / np.asarray(metal_h, scan.h.dtype)
+    v = scan.v / np.asarray(metal_v, scan.v.dtype)
     out = []
     for name in scan.boxes:
         hs, vs = h[scan.mask(name)], v[scan.mask(name)]

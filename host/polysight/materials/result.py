@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from polysight.imaging import Image, Images
 from polysight.materials.classify import NamedPatch, PatchName
 from polysight.materials.inputs import Tilts
 from polysight.materials.inversion import Inversion, RigPrior, ratio_error
@@ -19,9 +20,7 @@ from polysight.materials.permittivity import NOTHING, Permittivity
 from polysight.materials.samples import SceneErrors
 from polysight.materials.segment import Patch, Segmentation
 from polysight.materials.truth import TruthPlate
-from polysight.polarimetry import Calibrated
 
-Image = npt.NDArray[np.complexfloating]
 LEVEL = Tilts({}, 1)
 SHRINKS = {
     "noise": "a larger plate, a finer grid or more pulses a position",
@@ -68,12 +67,12 @@ class PatchResult:
 
 @dataclass(frozen=True)
 class MaterialsResult:
-    """Results of one image pair.
+    """Results of one scan's images.
 
     Attributes
     ----------
     calibrated
-        Metal-referenced, leakage-corrected channels [ny, nx], not smoothed.
+        Images with metal reference and leakage removed, not smoothed.
     h, v, p
         The same after the Gaussian filter inside each patch: the features of classification and permittivity. NaN
         outside the patches' interiors, to exclude edges and neighbours.
@@ -103,7 +102,7 @@ class MaterialsResult:
         Patch number to ln of |H| over that of a half space of its permittivity; not for metal-like patches.
     """
 
-    calibrated: Calibrated
+    calibrated: Images
     h: Image
     v: Image
     p: Image

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import scipy
 import skimage
 
-from polysight.imaging import ChannelImages
+from polysight.imaging import Images
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -218,9 +218,9 @@ def _reading_order(mask: Mask, y_mm: npt.NDArray[np.float64], row_pitch_mm: floa
     return -round(float(y_mm[rows].mean()) / row_pitch_mm), float(cols.mean())
 
 
-def insides(images: ChannelImages) -> list[Mask]:
+def insides(images: Images) -> list[Mask]:
     """Return the interiors of the patches of an image pair, bool [ny, nx] each; none without valid pixels."""
-    if not (images.valid & np.isfinite(images.h) & np.isfinite(images.v)).any():
+    if not images.usable.any():
         return []
     return [p.interior for p in segment(images.h, images.v, images.x_m, images.y_m, images.valid).patches]
 

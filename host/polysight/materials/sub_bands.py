@@ -13,22 +13,20 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from polysight.imaging import ChannelImages, SubBand
-from polysight.materials.analyse import reference_spread, smooth_inside, to_metal, without_leakage
-from polysight.materials.inputs import ImagePair, Optics, level
+from polysight.imaging import Image, Images, SubBand
+from polysight.materials.analyse import reference_spread, smooth_inside, to_metal
+from polysight.materials.inputs import Optics, level
 from polysight.materials.inversion import ratio_slopes
 from polysight.materials.layers import Bands, Spectrum
 from polysight.materials.measure import measure_patch
 from polysight.materials.permittivity import inverse_spread, median_ratio
 from polysight.materials.result import MaterialsResult
-from polysight.polarimetry import PlaneReference
+from polysight.polarimetry import PlaneReference, remove_leakage
 from polysight_shared.config import Chirp
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
-Image = npt.NDArray[np.complexfloating]
 AMPLITUDE_ERROR = 0.1
 """Relative standard deviation of |H| of a patch by its size, edges and tilt, which do not affect ratios."""
 BAND_SHARE = 0.75
@@ -51,7 +49,7 @@ out of focus. Measured in the same scenes."""
 def with_bands(
     found: MaterialsResult,
     bands: Sequence[SubBand],
-    images: Sequence[ChannelImages],
+    images: Sequence[Images],
     optics: Optics,
     plane: PlaneReference | None = None,
 ) -> MaterialsResult:
@@ -68,7 +66,7 @@ def with_bands(
 def band_rows(
     found: MaterialsResult,
     bands: Sequence[SubBand],
-    images: Sequence[ChannelImages],
+    images: Sequence[Images],
     leakage: tuple[complex, complex],
     smooth_px: float,
     references: Sequence[PlaneReference] | None = None,
@@ -137,7 +135,7 @@ def _with_covariance(rows: list[dict[str, Any]], found: MaterialsResult, common:
 
 def _relative_to_metal(
     found: MaterialsResult,
-    made: ChannelImages,
+    made: Images,
     leakage: tuple[complex, complex],
     smooth_px: float,
     reference: PlaneReference | None,
@@ -150,9 +148,9 @@ def _relative_to_metal(
     if not metal.mask.any():
         nothing = np.full(made.valid.shape, complex(np.nan, np.nan))
         return nothing, nothing, float("nan")
-    pair, _ = level(ImagePair.of(made), found.segmentation, found.tilts)
+    pair, _ = level(made, found.segmentation, found.tilts)
     h, v = (np.where(made.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (pair.h, pair.v))
-    relative = without_leakage(to_metal(h, v, metal, reference), leakage)
+    relative = remove_leakage(to_metal(replace(pair, h=h, v=v), metal, reference), leakage)
     h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
     return h, v, reference_spread(h, v, metal, reference)
 

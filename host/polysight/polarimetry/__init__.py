@@ -7,14 +7,14 @@ material, `permittivity_from_ratio` the permittivity from a polarisation ratio (
 """
 
 from polysight.polarimetry.calibrate import (
-    Calibrated,
-    Image,
-    Mask,
     calibrate,
-    calibrate_by_reference,
     correct_leakage,
+    divide_by_metal,
+    metal_gains,
     ratio,
+    remove_leakage,
     smooth,
+    with_ratio,
 )
 from polysight.polarimetry.fresnel import (
     brewster_angle_rad,
@@ -41,30 +41,30 @@ from polysight.polarimetry.leakage import (
 from polysight.polarimetry.reference import PlaneReference, plane_reference
 
 __all__ = [
-    "Calibrated",
-    "Image",
     "Incidence",
     "IncidenceChoice",
     "Leakage",
-    "Mask",
     "PlaneReference",
     "Standard",
     "brewster_angle_rad",
     "calibrate",
-    "calibrate_by_reference",
     "common_direction",
     "correct_leakage",
+    "divide_by_metal",
     "estimate_axial_ratio",
     "estimate_leakage",
     "fresnel",
     "incidence_choice",
     "leakage_from_images",
+    "metal_gains",
     "multilayer",
     "permittivity_from_ratio",
     "plane_reference",
     "ratio",
     "ratio_from_permittivity",
+    "remove_leakage",
     "smooth",
     "specular_incidence_rad",
     "strips_wave",
+    "with_ratio",
 ]

@@ -11,41 +11,16 @@ orientation cannot separate leakage from gain**. Leakage is therefore given, or 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
+from polysight.imaging import Image, Images, Mask
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError
-
-Image = npt.NDArray[np.complexfloating]
-Mask = npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Calibrated:
-    """Metal-referenced channels.
-
-    Attributes
-    ----------
-    h, v
-        complex [ny, nx], relative to metal: |h| = |v| = 1 on metal, and their phase difference is zero there.
-    p
-        h / v, complex [ny, nx]; NaN where v is zero.
-    metal_h, metal_v
-        The divisors: complex numbers, or images [ny, nx] of a reference over the whole plane. From a region, metal_v
-        is real: only the phase of the ratio is referenced, for the phase of H and V alone is that of the distance
-        (Eq. 7).
-    """
-
-    h: Image
-    v: Image
-    p: Image
-    metal_h: complex | Image
-    metal_v: complex | Image
 
 
 def ratio(h: Image, v: Image) -> Image:
@@ -56,11 +31,18 @@ def ratio(h: Image, v: Image) -> Image:
     return out
 
 
-def calibrate(h: Image, v: Image, metal_mask: Mask) -> Calibrated:
-    """Divide both channels by their value over a metal region (Eq. 8 and 9 of the paper).
+def with_ratio(images: Images) -> Images:
+    """Return the images with p = h / v."""
+    return replace(images, p=ratio(images.h, images.v))
+
+
+def metal_gains(h: Image, v: Image, metal_mask: Mask) -> tuple[complex, complex]:
+    """Return the gains of H and V over a metal region (Eq. 8 and 9 of the paper).
 
     Amplitudes are RMS values over the region, and the phase of the ratio is that of sum(h conj(v)): a common phase of
     H and V (distance, tilt) has no influence, and weak pixels do not dominate, as in the mean of the pixel ratios.
+    The gain of V is real: only the phase of the ratio is referenced, for the phase of H and V alone is that of the
+    distance (Eq. 7).
 
     Parameters
     ----------
@@ -91,14 +73,26 @@ def calibrate(h: Image, v: Image, metal_mask: Mask) -> Calibrated:
         )
     metal_v = float(np.sqrt(np.mean(np.abs(mv) ** 2)))
     metal_h = float(np.sqrt(np.mean(np.abs(mh) ** 2))) * cross / abs(cross)
-    return calibrate_by_reference(h, v, metal_h, complex(metal_v))
+    return metal_h, complex(metal_v)
 
 
-def calibrate_by_reference(h: Image, v: Image, metal_h: complex | Image, metal_v: complex | Image) -> Calibrated:
-    """Divide both channels by a known metal reference: numbers, or images of a metal plate [ny, nx]."""
-    kind = np.result_type(h, np.complex64)
-    ch, cv = ratio(h, np.asarray(metal_h, kind)), ratio(v, np.asarray(metal_v, kind))
-    return Calibrated(ch, cv, ratio(ch, cv), metal_h, metal_v)
+def calibrate(images: Images, metal_mask: Mask) -> Images:
+    """Divide both channels by their gains over a metal region, see :func:`metal_gains`; adds the ratio p."""
+    return divide_by_metal(images, *metal_gains(images.h, images.v, metal_mask))
+
+
+def divide_by_metal(images: Images, metal_h: complex | Image, metal_v: complex | Image) -> Images:
+    """Divide both channels by metal: numbers, or images of a metal plate [ny, nx]; adds the ratio p."""
+    kind = np.result_type(images.h, np.complex64)
+    h = ratio(images.h, np.asarray(metal_h, kind))
+    v = ratio(images.v, np.asarray(metal_v, kind))
+    return with_ratio(replace(images, h=h, v=v, metal_h=metal_h, metal_v=metal_v))
+
+
+def remove_leakage(images: Images, leakage: tuple[complex, complex]) -> Images:
+    """Remove known leakage (p in H, s in V) from metal-referenced images, see :func:`correct_leakage`."""
+    h, v = correct_leakage(images.h, images.v, *leakage)
+    return with_ratio(replace(images, h=h, v=v))
 
 
 def correct_leakage(h: Image, v: Image, leak_hv: complex, leak_vh: complex) -> tuple[Image, Image]:

@@ -28,7 +28,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from polysight.polarimetry.calibrate import Image, Mask, ratio
+from polysight.imaging import Image, Mask
+from polysight.polarimetry.calibrate import ratio
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError
 

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.imaging import ImagedWith
-from polysight.polarimetry.calibrate import Calibrated, Image, Mask, calibrate_by_reference, ratio, smooth
+from polysight.imaging import Image, ImagedWith, Images, Mask
+from polysight.polarimetry.calibrate import divide_by_metal, ratio, smooth
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -57,9 +57,9 @@ class PlaneReference:
     bands: tuple[PlaneReference, ...] = ()
     made_with: ImagedWith | None = None
 
-    def apply(self, h: Image, v: Image) -> Calibrated:
+    def apply(self, images: Images) -> Images:
         """Divide both channels of another scan by the reference; NaN where it is not valid."""
-        return calibrate_by_reference(h, v, self.h, self.v)
+        return divide_by_metal(images, self.h, self.v)
 
     def check_axes(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> None:
         """Raise DataError if a scan has other pixels."""
@@ -128,14 +128,7 @@ class PlaneReference:
 
 
 def plane_reference(
-    h: Image,
-    v: Image,
-    x_m: npt.NDArray[np.float64],
-    y_m: npt.NDArray[np.float64],
-    valid: Mask | None = None,
-    smooth_mm: float = SMOOTH_MM,
-    floor_db: float = FLOOR_DB,
-    name: str = "",
+    images: Images, smooth_mm: float = SMOOTH_MM, floor_db: float = FLOOR_DB, name: str = ""
 ) -> PlaneReference:
     """Make a reference from the images of a metal plate over the plane.
 
@@ -144,10 +137,8 @@ def plane_reference(
 
     Parameters
     ----------
-    h, v
-        complex [ny, nx], flattened by the footprint.
-    x_m, y_m, valid
-        Pixel centres, metres; bool [ny, nx], pixels to use.
+    images
+        Both channels, flattened by the footprint.
     smooth_mm
         Width (standard deviation) of the window, millimetres; the gains vary slowly, speckle does not.
     floor_db
@@ -160,8 +151,8 @@ def plane_reference(
     DataError
         if the image shows no metal.
     """
-    smooth_px = smooth_mm / 1e3 / abs(float(x_m[1] - x_m[0]))
-    usable = np.isfinite(h) & np.isfinite(v) & (True if valid is None else valid)
+    h, v, usable = images.h, images.v, images.usable
+    smooth_px = smooth_mm / 1e3 / abs(float(images.x_m[1] - images.x_m[0]))
     power_h, power_v = (smooth(np.where(usable, np.abs(z) ** 2, 0.0).astype(np.float64), smooth_px) for z in (h, v))
     strong = usable.copy()
     for power in (power_h, power_v):
@@ -184,7 +175,7 @@ def plane_reference(
     spread = _spread(h[inside] / metal_h[inside], v[inside] / metal_v[inside])
     share = 100 * float(inside.mean())
     how = f"a metal plate scanned on its own{f' ({name})' if name else ''}, by position on {share:.0f} % of the image"
-    return PlaneReference(metal_h, metal_v, inside, x_m, y_m, spread, how)
+    return PlaneReference(metal_h, metal_v, inside, images.x_m, images.y_m, spread, how)
 
 
 def _spread(h: Image, v: Image) -> float:

@@ -75,8 +75,8 @@ def judge(
         enough = e.enough and (metal.given or metal.label not in refused)
         reasons += metal_reasons(patch, enough, enough and e.sure, metal.given, e.against, e.others == 0)
     if found.prior.channels_known:
-        levels = {"H": found.calibrated.metal_h, "V": found.calibrated.metal_v}
-        reasons += level_reasons({k: float(np.median(np.abs(v))) for k, v in levels.items()})
+        gains = {"H": found.calibrated.metal_h, "V": found.calibrated.metal_v}
+        reasons += level_reasons({k: float(np.median(np.abs(v))) for k, v in gains.items() if v is not None})
     reasons += leakage_reasons(found.prior.leakage_measured, found.inversion.leakage_determined, _leakage_error(found))
     if plane is not None:
         std = float(np.degrees(found.prior.theta_std_rad))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.imaging import ChannelImages, ImageBuilder, imaging_facts
+from polysight.imaging import ImageBuilder, Images, imaging_facts
 from polysight.materials import MaterialsResult, permittivity_change
 from polysight.polarimetry import IncidenceChoice, PlaneReference
 from polysight.results import Coverage, plain
@@ -182,7 +182,7 @@ class Quality:
         """Add entries to quality.json."""
         self.notes |= entries
 
-    def note_imaging(self, builder: ImageBuilder, images: ChannelImages) -> None:
+    def note_imaging(self, builder: ImageBuilder, images: Images) -> None:
         """Add the point response of the aperture to quality.json."""
         with self.timed("point response"):
             self.note(imaging=imaging_facts(builder, images))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
-from polysight.imaging import ChannelImages, PlaneEstimate
+from polysight.imaging import Images, PlaneEstimate
 from polysight.materials import (
     PATCHES,
     UNKNOWN,
@@ -23,7 +23,7 @@ from polysight.materials import (
     pack_patches,
     pixel_accuracy,
 )
-from polysight.polarimetry import ratio
+from polysight.polarimetry import with_ratio
 from polysight.process.judge import error_budget, recording_verdict
 from polysight.process.quality import Quality
 from polysight.products import (
@@ -96,23 +96,28 @@ class Findings:
         True plates, if known.
     """
 
-    images: ChannelImages
+    images: Images
     found: MaterialsResult
     verdict: Verdict
     plane: PlaneEstimate
     classifier: Classifier | None = None
     plates: tuple[TruthPlate, ...] = ()
 
+    @property
+    def calibrated(self) -> Images:
+        """Images relative to metal, without leakage, with the ratio p and its standard deviation."""
+        valid = self.images.valid
+        return replace(self.found.calibrated, valid=valid, p_sigma=self.found.p_sigma(valid))
+
 
 def save_images(
-    out: Path, scan: Scan, rig: Instrument, images: ChannelImages, quality: Quality, backlash: bool = True
+    out: Path, scan: Scan, rig: Instrument, images: Images, quality: Quality, backlash: bool = True
 ) -> None:
     """Write image.npz without metal reference (p is h / v in arbitrary units), scan.json and quality.json.
 
     `rig` is the rig that the images were formed with; `backlash=False` leaves the backlash out of quality.json.
     """
-    p = ratio(images.h, images.v)
-    write_image(out / IMAGE, images.h, images.v, p, images.x_m, images.y_m, images.valid)
+    write_image(out / IMAGE, with_ratio(images))
     write_scan_facts(out, scan, rig, images)
     write_json(out / QUALITY, quality_content(quality, backlash))
 
@@ -131,11 +136,10 @@ def save_materials(
     """
     from polysight.report import write_report
 
-    found, images, c = findings.found, findings.images, findings.found.calibrated
+    found, images = findings.found, findings.images
     accuracy = pixel_accuracy(found)
     numbers = quality.to_dict(verdict=findings.verdict.to_dict(), pixel_accuracy=accuracy)
-    sigma = found.p_sigma(images.valid)
-    write_image(out / IMAGE, c.h, c.v, c.p, images.x_m, images.y_m, images.valid, sigma)
+    write_image(out / IMAGE, findings.calibrated)
     write_json(out / QUALITY, numbers)
     boxes = labels_of(found, f"patches of scan {scan.scan_id}, in pixels of image.npz")
     write_atomically(out / LABELS, pack_labels(boxes))

@@ -122,17 +122,17 @@ def image_dataset(done: ProcessedScan) -> xarray.Dataset:
     image, plane = done.image, ("y", "x")
     unit = "reflection relative to metal" if done.metal_referenced else "arbitrary units"
     data = {
-        "h": _described(plane, image["h"], "1", f"s-polarised channel, {unit}"),
-        "v": _described(plane, image["v"], "1", f"p-polarised channel, {unit}"),
-        "p": _described(plane, image["p"], "1", f"polarisation ratio H / V, {unit}"),
-        "valid": _described(plane, image["valid"], "1", "True where the scan illuminates the pixel"),
+        "h": _described(plane, image.h, "1", f"s-polarised channel, {unit}"),
+        "v": _described(plane, image.v, "1", f"p-polarised channel, {unit}"),
+        "p": _described(plane, image.p, "1", f"polarisation ratio H / V, {unit}"),
+        "valid": _described(plane, image.valid, "1", "True where the scan illuminates the pixel"),
     }
-    if "p_sigma" in image:
+    if image.p_sigma is not None:
         about = "standard deviation of p: root of the mean variance of its real and imaginary part"
-        data["p_sigma"] = _described(plane, image["p_sigma"], "1", about)
+        data["p_sigma"] = _described(plane, image.p_sigma, "1", about)
     if done.rig is not None:
         if done.quality.get("incidence", {}).get("used") == "by pixel":
-            angles = incidence_choice(done.rig, image["x_m"], image["y_m"], "pixel").used_rad
+            angles = incidence_choice(done.rig, image.x_m, image.y_m, "pixel").used_rad
             data["incidence_deg"] = _described(plane, np.degrees(angles), "degree", "incidence angle of the pixel")
         else:
             angle = np.degrees(specular_incidence_rad(done.rig))
@@ -142,7 +142,7 @@ def image_dataset(done: ProcessedScan) -> xarray.Dataset:
 
 def _axes(done: ProcessedScan) -> dict[str, Any]:
     return {
-        name: _described((name,), done.image[f"{name}_m"], "m", f"pixel centre, {name} of the rig frame")
+        name: _described((name,), getattr(done.image, f"{name}_m"), "m", f"pixel centre, {name} of the rig frame")
         for name in ("y", "x")
     }
 
@@ -186,7 +186,7 @@ def patch_dataset(done: ProcessedScan) -> xarray.Dataset:
 
 def _patch_axes(done: ProcessedScan) -> dict[str, Any]:
     columns = material_columns(done)
-    middle = image_centre_mm(done.image["x_m"], done.image["y_m"])
+    middle = image_centre_mm(done.image.x_m, done.image.y_m)
     axes = {"patch": _described(("patch",), np.array(columns["patch"], np.int32), "1", "number of the patch in label")}
     for name, offset_mm in zip("xy", middle, strict=True):
         at = (_numbers(columns[f"centre_{name}_mm"]) + offset_mm) / 1e3

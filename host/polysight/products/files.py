@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.imaging import ChannelImages
+from polysight.imaging import Images
 from polysight.materials import PATCHES, ScanPatches, read_patches
 from polysight.results import Verdict, read_verdict
 from polysight.store import Scan, open_npz, versions
@@ -36,6 +36,15 @@ SCAN = "scan.json"
 IMAGE, QUALITY, MATERIALS, LABELS = "image.npz", "quality.json", "materials.json", "labels.json"
 REPORT = "report.html"
 FINISHED = ".finished.json"  # settings of the products, written by batch processing
+_ARRAYS = {
+    "h": np.complex64,
+    "v": np.complex64,
+    "p": np.complex64,
+    "x_m": np.float64,
+    "y_m": np.float64,
+    "valid": np.bool_,
+    "p_sigma": np.float32,
+}
 _OPTIONAL = ("p_sigma",)  # arrays of image.npz that earlier releases did not write
 _PRODUCTS = "products"  # in a scan folder
 _NOTHING: dict[str, Any] = {
@@ -75,52 +84,36 @@ def write_atomically(path: Path, data: bytes) -> None:
             raise
 
 
-def write_image(
-    path: Path,
-    h: npt.NDArray[np.complexfloating],
-    v: npt.NDArray[np.complexfloating],
-    p: npt.NDArray[np.complexfloating],
-    x_m: npt.NDArray[np.float64],
-    y_m: npt.NDArray[np.float64],
-    valid: npt.NDArray[np.bool_],
-    p_sigma: npt.NDArray[np.floating] | None = None,
-) -> None:
+def write_image(path: Path, images: Images) -> None:
     """Write image.npz: h, v, p complex64 [ny, nx], x_m, y_m float64, valid bool; row 0 is the smallest y.
 
-    `p_sigma` float32 [ny, nx] is the standard deviation of the complex p, NaN where unknown; None leaves it out.
+    `p_sigma` float32 [ny, nx] is left out if it is None.
 
     Raises
     ------
     DataError
-        if the shapes do not agree.
+        if the shapes do not agree, or there is no ratio p.
     """
-    shape = (np.size(y_m), np.size(x_m))
-    more: dict[str, Any] = {} if p_sigma is None else {"p_sigma": p_sigma.astype(np.float32)}
-    for name, array in (("h", h), ("v", v), ("p", p), ("valid", valid), *more.items()):
-        if array.shape != shape:
-            raise DataError(f"image {name} has shape {array.shape}, the axes {shape}", code=ErrorCode.MISMATCH)
+    arrays = {name: getattr(images, name) for name in _ARRAYS if getattr(images, name) is not None}
+    try:
+        _check_image(arrays)
+    except (KeyError, ValueError) as e:
+        raise DataError(f"{path}: no image: {e}", code=ErrorCode.MISMATCH) from None
     buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        h=h.astype(np.complex64),
-        v=v.astype(np.complex64),
-        p=p.astype(np.complex64),
-        x_m=np.asarray(x_m, np.float64),
-        y_m=np.asarray(y_m, np.float64),
-        valid=valid.astype(np.bool_),
-        **more,
-    )
+    np.savez_compressed(buffer, **{name: np.asarray(array, _ARRAYS[name]) for name, array in arrays.items()})
     write_atomically(path, buffer.getvalue())
 
 
-def read_image(path: Path) -> dict[str, npt.NDArray]:
+def read_image(path: Path) -> Images:
     """Read image.npz (no pickle), with `p_sigma` if the file has it. Raises DataError."""
-    names = ("h", "v", "p", "x_m", "y_m", "valid")
     try:
         with open_npz(path) as z:
-            image = {k: z[k] for k in (*names, *(k for k in _OPTIONAL if k in z))}
-        _check_image(image)
-        return image
+            arrays = {name: z[name] for name in _ARRAYS if name in z or name not in _OPTIONAL}
+        _check_image(arrays)
+        rows, columns = arrays["valid"].shape
+        if min(rows, columns) < 2:
+            raise ValueError(f"an image has at least 2 x 2 pixels, not {columns} x {rows}")
+        return Images(**arrays)
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
         raise DataError(
             f"{path}: not an image product: {e}",
@@ -129,12 +122,12 @@ def read_image(path: Path) -> dict[str, npt.NDArray]:
         ) from None
 
 
-def _check_image(image: dict[str, npt.NDArray]) -> None:
-    """Raise ValueError if types or shapes of the arrays are wrong."""
-    shape = image["y_m"].size, image["x_m"].size
-    if min(shape) < 2:
-        raise ValueError(f"an image has at least 2 x 2 pixels, not {shape[1]} x {shape[0]}")
-    for name, array in image.items():
+def _check_image(arrays: dict[str, npt.NDArray]) -> None:
+    """Raise ValueError or KeyError if types or shapes of the arrays are wrong, or the ratio is missing."""
+    shape = arrays["y_m"].size, arrays["x_m"].size
+    if "p" not in arrays:
+        raise KeyError("p")
+    for name, array in arrays.items():
         if array.dtype.kind not in "cfb":
             raise ValueError(f"{name} holds {array.dtype}, not numbers")
         if name not in ("x_m", "y_m") and array.shape != shape:
@@ -166,10 +159,10 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-def rx_gains(images: ChannelImages) -> dict[str, list[dict[str, float]]]:
+def rx_gains(images: Images) -> dict[str, list[dict[str, float]]]:
     """Return gain and phase of each RX relative to its board's first, by board, as divided out of the images."""
     out = {}
-    for board, gains in images.rx_calibration.items():
+    for board, gains in images.rx_gains.items():
         relative = gains / gains[0]
         out[board] = [
             {"gain_db": float(20 * np.log10(abs(g))), "phase_deg": float(np.degrees(np.angle(g)))} for g in relative
@@ -177,7 +170,7 @@ def rx_gains(images: ChannelImages) -> dict[str, list[dict[str, float]]]:
     return out
 
 
-def scan_facts(source: Scan, rig: Instrument, images: ChannelImages) -> dict[str, Any]:
+def scan_facts(source: Scan, rig: Instrument, images: Images) -> dict[str, Any]:
     """Return the content of scan.json; `rig` is the rig that the images were formed with."""
     return {
         "scan_id": source.scan_id,
@@ -189,7 +182,7 @@ def scan_facts(source: Scan, rig: Instrument, images: ChannelImages) -> dict[str
     }
 
 
-def write_scan_facts(out: Path, source: Scan, rig: Instrument, images: ChannelImages) -> dict[str, Any]:
+def write_scan_facts(out: Path, source: Scan, rig: Instrument, images: Images) -> dict[str, Any]:
     """Write scan.json and return its content, see :func:`scan_facts`."""
     facts = scan_facts(source, rig, images)
     write_json(out / SCAN, facts)
@@ -228,39 +221,39 @@ class SavedProducts:
     folder: Path
 
     @cached_property
-    def image(self) -> dict[str, npt.NDArray[Any]]:
-        """Arrays of image.npz, see :func:`write_image`."""
+    def image(self) -> Images:
+        """Content of image.npz, see :func:`write_image`."""
         return read_image(self.folder / IMAGE)
 
     @property
     def h(self) -> npt.NDArray[np.complex64]:
         """H, complex64 [ny, nx]."""
-        return self.image["h"]
+        return self.image.h
 
     @property
     def v(self) -> npt.NDArray[np.complex64]:
         """V, complex64 [ny, nx]."""
-        return self.image["v"]
+        return self.image.v
 
     @property
     def p(self) -> npt.NDArray[np.complex64]:
         """P = H / V, complex64 [ny, nx]."""
-        return self.image["p"]
+        return np.asarray(self.image.p)
 
     @property
     def x_m(self) -> npt.NDArray[np.float64]:
         """Pixel centres, float64 [nx], rig frame."""
-        return self.image["x_m"]
+        return self.image.x_m
 
     @property
     def y_m(self) -> npt.NDArray[np.float64]:
         """Pixel centres, float64 [ny], rig frame."""
-        return self.image["y_m"]
+        return self.image.y_m
 
     @property
     def valid(self) -> npt.NDArray[np.bool_]:
         """Pixels illuminated by the scan, bool [ny, nx]."""
-        return self.image["valid"]
+        return self.image.valid
 
     @cached_property
     def materials(self) -> dict[str, Any]:
@@ -303,7 +296,7 @@ class SavedProducts:
     @property
     def p_sigma(self) -> npt.NDArray[np.float32] | None:
         """Standard deviation of the complex P, float32 [ny, nx]; None in products of earlier releases."""
-        return self.image.get("p_sigma")
+        return self.image.p_sigma
 
     @property
     def simulated(self) -> bool | None:

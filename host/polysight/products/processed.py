@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import skimage
 
+from polysight.imaging import Images
 from polysight.materials import PATCHES, axis_mm, box_mask
 from polysight.products.files import SavedProducts
 
@@ -48,7 +49,9 @@ class ProcessedScan(SavedProducts):
     """A processed scan with the patch of each pixel: saved products, or results that were just computed."""
 
     @classmethod
-    def computed(cls, folder: Path, labels: Labels, interior: Mask | None, **content: dict[str, Any]) -> ProcessedScan:
+    def computed(
+        cls, folder: Path, labels: Labels, interior: Mask | None, **content: Images | dict[str, Any]
+    ) -> ProcessedScan:
         """Return results that are not saved; `content` replaces `image`, `scan`, `quality` and `materials`."""
         made = cls(folder)
         vars(made).update(content, labels=labels, interior=interior)

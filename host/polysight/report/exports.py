@@ -92,8 +92,8 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
             f[name].attrs["units"] = "m"
             f[name].attrs["long_name"] = f"pixel centre, {name} of the rig frame"
             f[name].make_scale(name)
-        for name in (n for n in _PLANES if n in products.image):
-            data = f.create_dataset(name, data=products.image[name], compression="gzip", shuffle=True)
+        for name in (n for n in _PLANES if getattr(products.image, n) is not None):
+            data = f.create_dataset(name, data=getattr(products.image, name), compression="gzip", shuffle=True)
             data.attrs["units"], data.attrs["long_name"] = "1", _PLANES[name]
             for i, axis in enumerate(axes):
                 data.dims[i].attach_scale(f[axis])

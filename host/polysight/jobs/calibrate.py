@@ -23,12 +23,11 @@ from polysight.calibration import (
     source_scan,
     write_calibration,
 )
+from polysight.imaging import Image, Mask
 from polysight.jobs.output import print_json, say, steps
 from polysight.jobs.process import imaged, load_reference, plane_of
 from polysight.polarimetry import (
-    Image,
     Leakage,
-    Mask,
     leakage_from_images,
     specular_incidence_rad,
 )

@@ -100,7 +100,8 @@ def write_image(path: Path, images: Images) -> None:
     except (KeyError, ValueError) as e:
         raise DataError(f"{path}: no image: {e}", code=ErrorCode.MISMATCH) from None
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, **{name: np.asarray(array, _ARRAYS[name]) for name, array in arrays.items()})
+    stored: dict[str, Any] = {name: np.asarray(array, _ARRAYS[name]) for name, array in arrays.items()}
+    np.savez_compressed(buffer, **stored)
     write_atomically(path, buffer.getvalue())
 
 

@@ -178,7 +178,7 @@ def context_of(
         y_m=y_m,
         h=result.calibrated.h,
         v=result.calibrated.v,
-        p=result.calibrated.p,
+        p=np.asarray(result.calibrated.p),
         materials=result.rows(),
         segments=result.segmentation.labels,
         pixel_names={r.patch.label: (r.names, r.patch.interior) for r in result.patches if r.names is not None},

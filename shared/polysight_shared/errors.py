@@ -29,7 +29,10 @@ class PolysightError(Exception):
 
     def __init__(self, what: str, why: str = "", remedy: str = "", *, code: ErrorCode = ErrorCode.OTHER) -> None:
         super().__init__(what)
-        self.what, self.why, self.remedy, self.code = what, why, remedy, code
+        self.what = what
+        self.why = why
+        self.remedy = remedy
+        self.code = code
 
     def __str__(self) -> str:
         parts = [self.what]
@@ -69,12 +72,8 @@ def no_such(path: Path) -> DataError:
         near = did_you_mean(path.name, [p.name for p in path.parent.iterdir()])
     except OSError:
         near = f"{path.parent} does not exist either"
-    return DataError(
-        f"{path}: does not exist",
-        "the path is wrong",
-        near or "give the path of an existing file or folder",
-        code=ErrorCode.FILE_MISSING,
-    )
+    remedy = near or "give the path of an existing file or folder"
+    return DataError(f"{path}: does not exist", "the path is wrong", remedy, code=ErrorCode.FILE_MISSING)
 
 
 class ProtocolError(PolysightError):

@@ -30,12 +30,9 @@ def open_regular(path: Path) -> BinaryIO:
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise DataError(
-                f"{path}: is not a regular file",
-                "it is a folder, a device or a pipe",
-                "give a file",
-                code=ErrorCode.FILE_FOREIGN,
-            )
+            what = f"{path}: is not a regular file"
+            why = "it is a folder, a device or a pipe"
+            raise DataError(what, why, "give a file", code=ErrorCode.FILE_FOREIGN)
         return os.fdopen(os.dup(descriptor), "rb")
     finally:
         os.close(descriptor)
@@ -55,12 +52,8 @@ def read_bounded(path: Path, max_bytes: int) -> bytes:
         size = os.fstat(file.fileno()).st_size
         data = file.read(max_bytes + 1) if size <= max_bytes else b""
     if (size := max(size, len(data))) > max_bytes:
-        raise DataError(
-            f"{path}: {size} bytes, the limit is {max_bytes}",
-            "it is another kind of file",
-            "check the path",
-            code=ErrorCode.FILE_TOO_LARGE,
-        )
+        what = f"{path}: {size} bytes, the limit is {max_bytes}"
+        raise DataError(what, "it is another kind of file", "check the path", code=ErrorCode.FILE_TOO_LARGE)
     return data
 
 

@@ -15,7 +15,8 @@ Vector = tuple[float, float, float]
 
 def _turn(v: Vector, axis: str, degrees: float) -> Vector:
     """Rotate a column vector about x, y or z (right-handed)."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    c = math.cos(math.radians(degrees))
+    s = math.sin(math.radians(degrees))
     x, y, z = v
     if axis == "x":
         return (x, c * y - s * z, s * y + c * z)
@@ -54,13 +55,16 @@ def direct_path_m(rig: Instrument, board: Board) -> tuple[float, ...]:
 
 def specular_midpoint_m(rig: Instrument, board: Board) -> Vector:
     """Return the point of the object plane that reflects TX into the board's first RX, stage offset zero, metres."""
-    tx, rx, z = tx_position_m(rig), rx_positions_m(rig, board)[0], rig.geometry.object_distance_mm / 1e3
-    a, b = z - tx[2], z - rx[2]
-    t = a / (a + b)
+    tx = tx_position_m(rig)
+    rx = rx_positions_m(rig, board)[0]
+    z = rig.geometry.object_distance_mm / 1e3
+    # Mirror RX in the object plane: the straight path from TX to it crosses the plane at this part of its length.
+    t = (z - tx[2]) / ((z - tx[2]) + (z - rx[2]))
     return (tx[0] + t * (rx[0] - tx[0]), tx[1] + t * (rx[1] - tx[1]), z)
 
 
 def incidence_deg(rig: Instrument, board: Board) -> float:
     """Return the incidence angle at the specular midpoint of TX and the board's first RX, degrees."""
-    tx, mid = tx_position_m(rig), specular_midpoint_m(rig, board)
-    return math.degrees(math.atan2(math.hypot(mid[0] - tx[0], mid[1] - tx[1]), mid[2] - tx[2]))
+    tx = tx_position_m(rig)
+    midpoint = specular_midpoint_m(rig, board)
+    return math.degrees(math.atan2(math.hypot(midpoint[0] - tx[0], midpoint[1] - tx[1]), midpoint[2] - tx[2]))

@@ -40,9 +40,11 @@ Place = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 RowStatus = Literal["done", "aborted", "fault"]
 ExitStatus = Literal["success", "abort", "fail"]
 State = Literal["idle", "homing", "homed", "ready", "running", "held", "done", "fault"]
-GPIOD, GPIOMEM, SPI, WIRES = "gpiod", "gpiomem", "spi", "wires"
-"""Backends of the Pi's SYNC_IN output (`HelloReply.backend`): kernel, GPIO registers, SPI controller, simulated."""
-_HARDWARE = (GPIOD, GPIOMEM, SPI)
+# Backends of the Pi's SYNC_IN output (`HelloReply.backend`).
+GPIOD = "gpiod"  # kernel
+SPI = "spi"  # SPI controller
+WIRES = "wires"  # simulated
+_HARDWARE = (GPIOD, SPI, "gpiomem")  # the last one in scans of old releases: GPIO registers
 Timing = Literal["", "spi", "one-shot", "program"]
 """Timing source of a burst: SPI controller (widths and periods), one-shot (widths, periods by the program), program;
 "" in events of earlier releases."""

@@ -124,15 +124,15 @@ class Stage(Section, frozen=True):
 
     def misfit(self, raster: Grid | RasterPlan, speed_mm_s: float | None = None) -> str:
         """Explain why a raster with its run-up exceeds the travel around the centre; return "" if it fits."""
-        for axis, n, step, margin, centre, travel in (
-            ("x", raster.columns, raster.step_x_mm, self.run_up_mm(raster.step_x_mm, speed_mm_s),
-             self.centre_x_mm, self.travel_x_mm),
-            ("y", raster.rows, raster.step_y_mm, self.backlash_mm, self.centre_y_mm, self.travel_y_mm),
-        ):  # fmt: skip
-            half = (n - 1) / 2 * step + margin
+        run_up_mm = self.run_up_mm(raster.step_x_mm, speed_mm_s)
+        for axis, key, points, step, margin, centre, travel in (
+            ("x", "columns", raster.columns, raster.step_x_mm, run_up_mm, self.centre_x_mm, self.travel_x_mm),
+            ("y", "rows", raster.rows, raster.step_y_mm, self.backlash_mm, self.centre_y_mm, self.travel_y_mm),
+        ):
+            half = (points - 1) / 2 * step + margin
             if half > centre or centre + half > travel:
                 return (
-                    f"grid.{'columns' if axis == 'x' else 'rows'} = {n} of grid.step_{axis}_mm = {step}"
+                    f"grid.{key} = {points} of grid.step_{axis}_mm = {step}"
                     f" with {margin:g} mm of run-up on either side do not fit stage.travel_{axis}_mm = {travel} around"
                     f" stage.centre_{axis}_mm = {centre}: narrow the grid, lower stage.speed_mm_s, or raise"
                     " stage.accel_mm_s2"

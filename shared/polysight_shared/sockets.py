@@ -56,15 +56,21 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
     """
     if is_loopback(address):
         return
-    needed = PI_KEYS if server else HOST_KEYS
-    secret_file = key_dir / needed[-1]
+    if server:
+        files = PI_KEYS
+        remedy = "make keys with `polysight-pi keys`, or use a loopback address"
+    else:
+        files = HOST_KEYS
+        remedy = f"copy the Pi's {' and '.join(HOST_KEYS)} here (docs/how-to/install.md); pi.key_dir is {key_dir}"
+    secret_file = key_dir / files[-1]
     try:
         from zmq.auth import load_certificate
 
         public, secret = load_certificate(secret_file)
         if secret is None:
             raise OSError(f"{secret_file} holds no secret key")
-        socket.curve_publickey, socket.curve_secretkey = public, secret
+        socket.curve_publickey = public
+        socket.curve_secretkey = secret
         if server:
             socket.curve_server = True
         else:
@@ -72,25 +78,19 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
     except (OSError, ValueError) as e:
         raise ConfigError(
             f"{address} is not loopback, and no CURVE keys are usable: {e}",
-            f"{key_dir} lacks {' or '.join(needed)}, or they belong to another user",
-            "make keys with `polysight-pi keys`, or use a loopback address"
-            if server
-            else f"copy the Pi's {' and '.join(HOST_KEYS)} here (docs/how-to/install.md); pi.key_dir is {key_dir}",
+            f"{key_dir} lacks {' or '.join(files)}, or they belong to another user",
+            remedy,
             code=ErrorCode.FILE_MISSING,
         ) from None
 
 
 def _make(
-    context: zmq.Context[Any],
-    kind: int,
-    address: str,
-    key_dir: Path,
-    bind: bool,
-    options: dict[int, int | bytes] | None = None,
+    context: zmq.Context[Any], kind: int, address: str, key_dir: Path, bind: bool, options: dict[int, int | bytes]
 ) -> Socket:
     host_of(address)
     socket: Socket = context.socket(kind)
-    for option, value in {zmq.LINGER: 0, **(options or {})}.items():
+    socket.setsockopt(zmq.LINGER, 0)
+    for option, value in options.items():
         socket.setsockopt(option, value)
     try:
         _secure(socket, address, key_dir, server=bind)
@@ -100,14 +100,13 @@ def _make(
             socket.connect(address)
     except zmq.ZMQError as e:
         socket.close()
-        raise DeviceError(
-            f"{address}: {e.strerror}" if hasattr(e, "strerror") else f"{address}: {e}",
-            "another program uses this port"
-            if e.errno == zmq.EADDRINUSE
-            else "the address does not exist on this machine",
-            "stop the other program (ss -ltnp shows it), or change the address in instrument.toml",
-            code=ErrorCode.BUSY if e.errno == zmq.EADDRINUSE else ErrorCode.OTHER,
-        ) from None
+        why = "the address does not exist on this machine"
+        code = ErrorCode.OTHER
+        if e.errno == zmq.EADDRINUSE:
+            why = "another program uses this port"
+            code = ErrorCode.BUSY
+        remedy = "stop the other program (ss -ltnp shows it), or change the address in instrument.toml"
+        raise DeviceError(f"{address}: {e.strerror or e}", why, remedy, code=code) from None
     except ConfigError:
         socket.close()
         raise
@@ -117,15 +116,21 @@ def _make(
 def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the Pi's PUB socket, bound."""
     options: dict[int, int | bytes] = {zmq.SNDHWM: 100_000, zmq.MAXMSGSIZE: MAX_SUBSCRIPTION_BYTES}
-    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_TIMEOUT_MS}
+    options[zmq.HANDSHAKE_IVL] = HANDSHAKE_TIMEOUT_MS
     return _make(context, zmq.PUB, address, key_dir, bind=True, options=options)
+
+
+def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """Create the Pi's ROUTER socket, bound, for REQ sockets; a message over the limit closes its connection."""
+    options: dict[int, int | bytes] = {zmq.MAXMSGSIZE: MAX_COMMAND_BYTES, zmq.ROUTER_MANDATORY: 1}
+    options[zmq.HANDSHAKE_IVL] = HANDSHAKE_TIMEOUT_MS
+    return _make(context, zmq.ROUTER, address, key_dir, bind=True, options=options)
 
 
 def subscriber(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the host's SUB socket, connected, subscribed to all events, with a long queue."""
-    return _make(
-        context, zmq.SUB, address, key_dir, bind=False, options={zmq.RCVHWM: 100_000, zmq.SUBSCRIBE: EVENT_TOPIC}
-    )
+    options: dict[int, int | bytes] = {zmq.RCVHWM: 100_000, zmq.SUBSCRIBE: EVENT_TOPIC}
+    return _make(context, zmq.SUB, address, key_dir, bind=False, options=options)
 
 
 def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
@@ -133,16 +138,18 @@ def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
 
     The Pi has a queue for each subscriber; without the heartbeat it would keep the queue of one that hangs.
     """
-    heartbeat: dict[int, int | bytes] = {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TTL: 5000}
-    options = {zmq.RCVHWM: 1000, zmq.SUBSCRIBE: EVENT_TOPIC, **heartbeat}
+    options: dict[int, int | bytes] = {zmq.RCVHWM: 1000, zmq.SUBSCRIBE: EVENT_TOPIC}
+    options |= {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TTL: 5000}
     return _make(context, zmq.SUB, address, key_dir, bind=False, options=options)
 
 
-def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """Create the Pi's ROUTER socket, bound, for REQ sockets; a message over the limit closes its connection."""
-    options: dict[int, int | bytes] = {zmq.MAXMSGSIZE: MAX_COMMAND_BYTES, zmq.ROUTER_MANDATORY: 1}
-    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_TIMEOUT_MS}
-    return _make(context, zmq.ROUTER, address, key_dir, bind=True, options=options)
+def requester(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """Create the host's REQ socket, connected; relaxed, so that it can send again after a lost reply.
+
+    If the server refused the handshake, `send` raises zmq.Again after `SEND_TIMEOUT_MS`.
+    """
+    options: dict[int, int | bytes] = {zmq.REQ_RELAXED: 1, zmq.REQ_CORRELATE: 1, zmq.SNDTIMEO: SEND_TIMEOUT_MS}
+    return _make(context, zmq.REQ, address, key_dir, bind=False, options=options)
 
 
 class HandshakeMonitor:
@@ -164,12 +171,3 @@ class HandshakeMonitor:
         """Close the monitor; call it before closing the socket."""
         self._socket.disable_monitor()
         self._monitor.close()
-
-
-def requester(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """Create the host's REQ socket, connected; relaxed, so that it can send again after a lost reply.
-
-    If the server refused the handshake, `send` raises zmq.Again after `SEND_TIMEOUT_MS`.
-    """
-    options: dict[int, int | bytes] = {zmq.REQ_RELAXED: 1, zmq.REQ_CORRELATE: 1, zmq.SNDTIMEO: SEND_TIMEOUT_MS}
-    return _make(context, zmq.REQ, address, key_dir, bind=False, options=options)

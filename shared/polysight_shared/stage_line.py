@@ -77,7 +77,8 @@ def unseal(line: bytes) -> str:
         raise ProtocolError(f"stage line of {len(line)} bytes is longer than {MAX_LINE_BYTES}")
     if len(line) < 6 or line[-1:] != b"\n" or line[-6:-5] != b"*":
         raise ProtocolError(f"not a stage line: {line!r}")
-    body, tail = line[:-6], line[-5:-1]
+    body = line[:-6]
+    tail = line[-5:-1]
     if tail != b"%04X" % crc16(body):
         raise ProtocolError(f"checksum {tail!r} of stage line {body!r} is wrong, expected {crc16(body):04X}")
     if any(not 0x20 <= c < 0x7F or c == 0x2A for c in body):

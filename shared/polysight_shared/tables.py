@@ -39,23 +39,15 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(read_bounded(path, _MAX_BYTES).decode("utf-8"))
     except FileNotFoundError:
-        raise ConfigError(
-            f"{path}: no such file",
-            "the path is wrong",
-            "give the path of a TOML file",
-            code=ErrorCode.FILE_MISSING,
-        ) from None
+        remedy = "give the path of a TOML file"
+        raise ConfigError(f"{path}: no such file", "the path is wrong", remedy, code=ErrorCode.FILE_MISSING) from None
     except (OSError, UnicodeDecodeError, DataError) as e:
-        raise ConfigError(
-            f"{path}: cannot be read: {e}",
-            "it is not a readable text file",
-            "check the path",
-            code=ErrorCode.FILE_UNREADABLE,
-        ) from None
+        what = f"{path}: cannot be read: {e}"
+        why = "it is not a readable text file"
+        raise ConfigError(what, why, "check the path", code=ErrorCode.FILE_UNREADABLE) from None
     except (tomllib.TOMLDecodeError, RecursionError) as e:
-        raise ConfigError(
-            f"{path}: not valid TOML: {e}", "a typing error", "correct that line", code=ErrorCode.FILE_DAMAGED
-        ) from None
+        what = f"{path}: not valid TOML: {e}"
+        raise ConfigError(what, "a typing error", "correct that line", code=ErrorCode.FILE_DAMAGED) from None
 
 
 def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T:
@@ -71,13 +63,17 @@ def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as e:
-        rule, _, path = str(e).partition(" - at `")
+        message, _, path = str(e).partition(" - at `")
         path = path.rstrip("`") or "$"
-        value = _lookup(raw, path)
         key = path.removeprefix("$").lstrip(".")
-        rule, code = _plain_rule(rule, kind)
+        rule, code = _plain_rule(message, kind)
+        value = _lookup(raw, path)
+        if value:
+            rule = f"{key} = {value}: {rule}"
+        elif key:
+            rule = f"{key}: {rule}"
         raise ConfigError(
-            f"{source}: {key}{' = ' + value if value else ''}{': ' if key else ''}{rule}",
+            f"{source}: {rule}",
             "the file breaks a rule of its format",
             f"correct {key or 'that'} in {source}; {keys or _RIG_KEYS}",
             code=code,
@@ -92,38 +88,41 @@ _TYPES = {  # names of the types of JSON and TOML for messages
 
 def _plain_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
     """Rewrite a message of msgspec in plain words, with its code; keep a rule of `require` as it is."""
-    if found := re.search(r"unknown field `(.*)`", rule):
-        return f"no key {found[1]!r}: {_suggest_key(found[1], kind)}", ErrorCode.KEY_UNKNOWN
-    if found := re.search(r"missing required field `(.*)`", rule):
-        return f"the key {found[1]!r} is missing", ErrorCode.KEY_MISSING
-    if found := re.fullmatch(r"Invalid enum value (.*)", rule):
-        return f"{found[1]} is not an allowed value", ErrorCode.VALUE_INVALID
-    found = re.fullmatch(r"Expected `(.+?)`( .+?)?(?:, got `?(.+?)`?)?", rule)
-    if found is None:
+    if match := re.search(r"unknown field `(.*)`", rule):
+        return f"no key {match[1]!r}: {_suggest_key(match[1], kind)}", ErrorCode.KEY_UNKNOWN
+    if match := re.search(r"missing required field `(.*)`", rule):
+        return f"the key {match[1]!r} is missing", ErrorCode.KEY_MISSING
+    if match := re.fullmatch(r"Invalid enum value (.*)", rule):
+        return f"{match[1]} is not an allowed value", ErrorCode.VALUE_INVALID
+    match = re.fullmatch(r"Expected `(.+?)`( .+?)?(?:, got `?(.+?)`?)?", rule)
+    if match is None:
         return rule, ErrorCode.VALUE_INVALID
-    wanted = " or ".join(_TYPES.get(name, name) for name in found[1].split(" | ") if name != "null")
-    limit = (found[2] or "").replace("matching regex", "of the form")
-    given = f", not {_TYPES.get(found[3], found[3])}" if found[3] else ""
-    code = ErrorCode.TYPE_WRONG if given and not limit else ErrorCode.VALUE_INVALID
-    return f"must be {wanted}{limit}{given}", code
+    expected, limit, actual = match.groups()
+    types = " or ".join(_TYPES.get(name, name) for name in expected.split(" | ") if name != "null")
+    plain = f"must be {types}" + (limit or "").replace("matching regex", "of the form")
+    if actual:
+        plain += f", not {_TYPES.get(actual, actual)}"
+    code = ErrorCode.TYPE_WRONG if actual and not limit else ErrorCode.VALUE_INVALID
+    return plain, code
 
 
 def _suggest_key(key: str, kind: Any) -> str:
     """Suggest a correction of an unknown key: the table to which it belongs, or a similar key."""
-    known: dict[str, set[str]] = {}
-    _collect(msgspec.inspect.type_info(kind), "", known)
-    if key in known:
-        return f"it belongs to {' or '.join(f'[{table}]' if table else 'the top' for table in sorted(known[key]))}"
-    return did_you_mean(key, known) or "no key is similar"
+    tables_of_key: dict[str, set[str]] = {}
+    _collect_keys(msgspec.inspect.type_info(kind), "", tables_of_key)
+    if key in tables_of_key:
+        tables = [f"[{table}]" if table else "the top" for table in sorted(tables_of_key[key])]
+        return f"it belongs to {' or '.join(tables)}"
+    return did_you_mean(key, tables_of_key) or "no key is similar"
 
 
-def _collect(kind: Any, table: str, known: dict[str, set[str]]) -> None:
-    """Collect every key of a declaration with the tables that contain it into `known`."""
+def _collect_keys(kind: Any, table: str, tables_of_key: dict[str, set[str]]) -> None:
+    """Collect every key of a declaration with the tables that contain it."""
     for field in getattr(kind, "fields", ()):
-        known.setdefault(field.name, set()).add(table)
+        tables_of_key.setdefault(field.name, set()).add(table)
         parts = [field.type, *getattr(field.type, "types", ()), *getattr(field.type, "item_types", ())]
         for part in (*parts, getattr(field.type, "item_type", None), getattr(field.type, "value_type", None)):
-            _collect(part, f"{table}.{field.name}".lstrip("."), known)
+            _collect_keys(part, f"{table}.{field.name}".lstrip("."), tables_of_key)
 
 
 def to_builtins(config: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 import tomli_w
-from tests.support.pi.fake_stage import FakeStage
+from tests.support.pi.fakes import FakeStage
 from tests.support.pi.host_side import HostSide
 from tests.support.pi.program import Process
 from tests.support.rigs import at_stage_port, published_rig, timed_by_the_program

@@ -21,8 +21,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from tests.support.paths import REPO
-from tests.support.pi.program import require_stand_in_chip, run
-from tests.support.pi.wires_log import WiresLog
+from tests.support.pi.program import WiresLog, require_stand_in_chip, run
 from tests.support.stage.processes import StageProcess
 
 from polysight_pi.system import OTHERS_PRIORITY, PRIORITY

@@ -22,8 +22,7 @@ import msgspec
 import pytest
 import zmq
 from tests.support.pi.host_side import HostSide
-from tests.support.pi.program import resident_bytes
-from tests.support.pi.wires_log import WiresLog
+from tests.support.pi.program import WiresLog, resident_bytes
 
 from polysight_pi import executor as executors
 from polysight_pi.executor import REPLAYS_WAITING

@@ -9,7 +9,7 @@ from contextlib import closing
 
 import msgspec
 import pytest
-from tests.support.pi.fake_stage import FakeStage
+from tests.support.pi.fakes import FakeStage
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
 from tests.support.rigs import at_stage_port

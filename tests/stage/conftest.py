@@ -9,9 +9,8 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
-from tests.support.stage.drivers import Driver, FirmwareDriver, PortDriver, PythonDriver, UnoDriver
+from tests.support.stage.drivers import Driver, FirmwareDriver, Host, PortDriver, PythonDriver, UnoDriver
 from tests.support.stage.processes import StageProcess
-from tests.support.stage.uno_host import Host
 
 from polysight_shared.errors import DeviceError
 from polysight_simulators.builds import SKETCH_DIR, build_sketch, sketch_compiler

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.paths import REPO
-from tests.support.stage.uno_host import Host
+from tests.support.stage.drivers import Host
 
 from polysight_shared.stage_line import Immediate, Parameter
 from polysight_simulators.uno import HZ, firmware

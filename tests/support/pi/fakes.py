@@ -1,15 +1,25 @@
-"""A stage driver without a stage, and trigger lines on a clock that tests turn."""
+"""Stand-ins around the Pi's program: a stage, its driver, and trigger lines on a clock that tests turn."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import queue
+import select
+import termios
+import threading
+import time
+import tty
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from polysight_pi.trigger import Edge
 from polysight_shared.config import Stage
-from polysight_shared.errors import DeviceError
-from polysight_shared.stage_line import Immediate, Reply
+from polysight_shared.errors import DeviceError, PolysightError, ProtocolError
+from polysight_shared.faults import StageError
+from polysight_shared.stage_line import Command, Immediate, Reply
+from polysight_shared.wires import WireClient, WireEdge
 
 
 class FakeDriver:
@@ -96,3 +106,216 @@ class FakeLines:
 
 def gone() -> DeviceError:
     return DeviceError("the chip vanished")
+
+
+STEPS_PER_MM = 200
+
+
+class FakeStage:
+    """A stage behind a pty: speaks the stage line, raises the trigger on simulated wires.
+
+    Wrong behaviour on request: `deaf` (answers nothing), `lose` (swallow so many lines), `damage` (garble so many
+    answers), `lose_end` (swallow so many done or alarm lines), `skip` (points without a trigger), `extra` (a trigger
+    too many), `alarm_at` (alarm number at a point), `lost` (steps that homing finds lost), `pace_s` (wall time from
+    point to point).
+    """
+
+    def __init__(self, hub: Path | None, trigger: int = 26, banner: bool = True) -> None:
+        self.master, slave = os.openpty()
+        tty.setraw(slave, termios.TCSANOW)
+        self.port = os.ttyname(slave)
+        os.close(slave)
+        self.wire = WireClient(hub) if hub else None
+        self.trigger, self.banner = trigger, banner
+        self.deaf = False
+        self.steps = "200"
+        self.lose = self.damage = self.lose_end = 0
+        self.skip: set[int] = set()
+        self.extra = False
+        self.lost = (0, 0)
+        self.alarm_at: dict[int, int] = {}
+        self.pace_s = 0.0
+        self.homed = self.moving = self.held = False
+        self.alarm = 0
+        self.x = self.y = self.points = 0
+        self.t_ns = 1_000_000_000
+        self.seen: list[Command] = []
+        self.bytes_seen: list[int] = []
+        self.rows_run = 0
+        self._last: tuple[int, Reply] | None = None
+        self._end: tuple[int, Reply] | None = None
+        self._stopping = threading.Event()
+        self._closed = threading.Event()
+        self._write_lock = threading.Lock()
+        self._motion: threading.Thread | None = None
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def unplug(self) -> None:
+        """The cable is pulled: the port reports an error."""
+        self._closed.set()
+        self._stopping.set()
+        self._thread.join()
+        if self._motion:
+            self._motion.join()
+        if self.master >= 0:
+            os.close(self.master)
+        self.master = -1
+
+    def close(self) -> None:
+        self.unplug()
+        if self.wire:
+            self.wire.close()
+
+    def say(self, reply: Reply) -> None:
+        raw = reply.encode()
+        if self.damage and reply.kind in ("ok", "error"):
+            self.damage -= 1
+            raw = raw[:3] + bytes([raw[3] ^ 1]) + raw[4:]
+        self.say_raw(raw)
+
+    def say_raw(self, raw: bytes) -> None:
+        if self.deaf or self._closed.is_set():
+            return
+        with self._write_lock, contextlib.suppress(OSError):
+            os.write(self.master, raw)
+
+    def _serve(self) -> None:
+        open_before, buffer = False, b""
+        poller = select.poll()
+        poller.register(self.master, select.POLLIN)
+        while not self._closed.is_set():
+            events = dict(poller.poll(20)).get(self.master, 0)
+            is_open = not events & select.POLLHUP
+            if is_open and not open_before:
+                self.moving = False
+                if self.banner:
+                    time.sleep(0.05)  # a boot, and the port's flush on opening
+                    self.say(Reply("banner", fields={"fw": "fake", "proto": "2"}))
+            open_before = is_open
+            if not is_open:
+                time.sleep(0.005)
+                continue
+            if not events & select.POLLIN:
+                continue
+            for c in os.read(self.master, 4096):
+                if c >= 0x80:
+                    self._immediate(c)
+                elif c == 10:
+                    self._line(buffer + b"\n")
+                    buffer = b""
+                else:
+                    buffer += bytes([c])
+
+    def _immediate(self, c: int) -> None:
+        self.bytes_seen.append(c)
+        if c == Immediate.STATUS:
+            state = "hold" if self.held else "row" if self.moving else "alarm" if self.alarm else "idle"
+            fields = {"state": state, "x": self.x, "y": self.y, "points": self.points, "pulses": self.points}
+            self.say(Reply("status", fields={k: str(v) for k, v in fields.items()} | {"alarm": str(self.alarm)}))
+        elif c == Immediate.HOLD:
+            self.held = True
+        elif c == Immediate.RESUME:
+            self.held = False
+        elif c == Immediate.STOP:
+            self._stopping.set()
+
+    def _line(self, line: bytes) -> None:
+        if line == b"\n":
+            return None
+        if self.lose:
+            self.lose -= 1
+            return
+        try:
+            c = Command.decode(line)
+        except ProtocolError:
+            return self.say(Reply("error", None, StageError.BAD_CRC))
+        if self._last and self._last[0] == c.sequence and c.verb != "HELLO":
+            self.say(self._last[1])
+            if self._end and self._end[0] == c.sequence:
+                self.say(self._end[1])
+            return None
+        self.seen.append(c)
+        number = self._refusal(c)
+        fields = {"steps": self.steps} if c.verb == "HELLO" else {}
+        reply = Reply("error", c.sequence, number) if number else Reply("ok", c.sequence, fields=fields)
+        self._last = (c.sequence, reply)
+        self.say(reply)
+        if not number:
+            self._carry_out(c)
+
+    def _refusal(self, c: Command) -> int:
+        if c.verb in ("HOME", "MOVE", "ROW", "SET") and self.moving:
+            return StageError.BUSY
+        if c.verb in ("HOME", "MOVE", "ROW") and self.alarm:
+            return StageError.IN_ALARM
+        if c.verb in ("MOVE", "ROW") and not self.homed:
+            return StageError.NOT_HOMED
+        return 0
+
+    def _carry_out(self, c: Command) -> None:
+        if c.verb == "CLEAR":
+            self.alarm = 0
+        elif c.verb in ("HOME", "MOVE", "ROW"):
+            if self._motion:
+                self._motion.join()
+            self.moving = True
+            self._stopping.clear()
+            self._motion = threading.Thread(target=self._move, args=(c,))
+            self._motion.start()
+
+    def _move(self, c: Command) -> None:
+        try:
+            number = self._row(c) if c.verb == "ROW" else self._elsewhere(c)
+        except PolysightError:
+            return  # the wires are gone
+        self.moving = self.held = False
+        if self._closed.is_set():
+            return
+        where = {"points": self.points, "pulses": self.points, "x": self.x, "y": self.y}
+        if number:
+            self.alarm = number
+            end = Reply("alarm", number=number)
+        else:
+            lost = {"lostx": self.lost[0], "losty": self.lost[1]} if c.verb == "HOME" else {}
+            end = Reply("done", c.sequence, fields={k: str(v) for k, v in (where | lost).items()})
+        self._end = (c.sequence, end)
+        if self.lose_end:
+            self.lose_end -= 1
+        else:
+            self.say(end)
+
+    def _elsewhere(self, c: Command) -> int:
+        if self._stopping.wait(self.pace_s):
+            return StageError.STOPPED
+        self.homed = True
+        self.x, self.y = c.args[:2] if c.verb == "MOVE" else (0, 0)
+        return 0
+
+    def _row(self, c: Command) -> int:
+        x0, dx, n, self.y, feed = c.args
+        self.rows_run += 1
+        step_ns = abs(dx) * 10**9 // feed
+        self.points = 0
+        for i in range(n):
+            self.t_ns += step_ns
+            if self._stopping.wait(self.pace_s):
+                return StageError.STOPPED
+            while self.held:
+                if self._stopping.wait(0.005):
+                    return StageError.STOPPED
+            if i in self.alarm_at:
+                return self.alarm_at.pop(i)
+            self.x = x0 + i * dx
+            self.points += 1
+            if i not in self.skip:
+                self._edge(self.t_ns)
+        if self.extra:
+            self.t_ns += step_ns
+            self._edge(self.t_ns)
+            time.sleep(0.05)
+        return 0
+
+    def _edge(self, t_ns: int) -> None:
+        if self.wire:
+            self.wire.send(WireEdge(t_ns, self.trigger, 1), WireEdge(t_ns + 20_000, self.trigger, 0))

@@ -11,10 +11,10 @@ import pytest
 import serial
 
 from polysight_shared.errors import ProtocolError
-from polysight_shared.stage_line import Command, Immediate, Reply
+from polysight_shared.stage_line import Command, Immediate, Parameter, Reply
 from polysight_shared.wires import WireEdge, WireMessage, WireMotion, parse
 from polysight_simulators.stage import NS_PER_TICK, TICK_HZ, PythonStage, Rig
-from polysight_simulators.uno import HZ, EmulatedUno
+from polysight_simulators.uno import HZ, EmulatedUno, PinEdge
 
 LIMIT_S = 60.0
 LIMIT_TICKS = 600 * TICK_HZ
@@ -66,10 +66,14 @@ class Driver:
         lines, self.received = self.received.splitlines(keepends=True), b""
         return [Reply.decode(line) for line in lines]
 
+    def line(self, verb: str, *args: int) -> bytes:
+        """The bytes of the next command."""
+        self.sequence = (self.sequence + 1) % 65536
+        return Command(self.sequence, verb, args).encode()
+
     def command(self, verb: str, *args: int) -> Reply:
         """Send the next command and return its only answer."""
-        self.sequence = (self.sequence + 1) % 65536
-        self.rx(Command(self.sequence, verb, args).encode())
+        self.rx(self.line(verb, *args))
         (reply,) = self.replies()
         assert reply.sequence == self.sequence
         return reply
@@ -94,9 +98,9 @@ class Driver:
 
     def resync(self) -> None:
         """Greet again and drop everything received before the answer."""
-        self.sequence = (self.sequence + 1) % 65536
+        hello = self.line("HELLO")
         answer = b"ok N%d " % self.sequence
-        self.rx(b"\n" + Command(self.sequence, "HELLO").encode())
+        self.rx(b"\n" + hello)
         self.until(lambda: answer in self.received)
         *_, self.received = self.received.partition(answer)[2].partition(b"\n")
 
@@ -340,3 +344,58 @@ class PortDriver(Driver):
 
     def close(self) -> None:
         self._port.close()
+
+
+class Host(Driver):
+    """A host at the serial line of an emulated UNO, in lockstep; `uno` has the edges of the watched pins."""
+
+    def __init__(self, uno: EmulatedUno) -> None:
+        super().__init__()
+        self.uno = uno
+        self.zero = (0, 0)
+
+    def rx(self, data: bytes) -> None:
+        self.uno.feed(data)
+
+    def rest(self) -> None:
+        self.uno.rest()
+
+    def replies(self) -> list[Reply]:
+        self.uno.settle()
+        self.received = bytes(self.uno.received)
+        self.uno.received.clear()
+        return super().replies()
+
+    def status(self) -> Reply:
+        self.rx(bytes([Immediate.STATUS]))
+        (*_, last) = self.replies()
+        assert last.kind == "status"
+        return last
+
+    def obeyed(self, verb: str, *args: int) -> None:
+        assert self.command(verb, *args).kind == "ok"
+
+    def set(self, parameter: Parameter, value: int) -> None:
+        self.obeyed("SET", int(parameter), value)
+
+    def motion(self, verb: str, *args: int) -> Reply:
+        self.uno.edges.clear()
+        done, _ = super().motion(verb, *args)
+        assert (done.kind, done.sequence) == ("done", self.sequence), done
+        return done
+
+    def ready(self) -> Host:
+        assert [r.kind for r in self.replies()] == ["banner"]
+        self.obeyed("HELLO")
+        self.set(Parameter.HEARTBEAT, 60_000)
+        self.obeyed("ENABLE", 1)
+        self.motion("HOME")
+        x, left, right = self.uno.motors
+        assert left == right
+        self.zero = (x, left)
+        return self
+
+    def at(self, edge: PinEdge) -> tuple[int, int]:
+        """Return the position of the motors at an edge, in the firmware's coordinates."""
+        assert edge.left == edge.right
+        return edge.x - self.zero[0], edge.left - self.zero[1]

@@ -29,7 +29,7 @@ from polysight.materials.knn import ratio_distance
 from polysight.materials.library import FORMAT
 from polysight.materials.samples import majority
 from polysight.polarimetry import fresnel
-from polysight_papers.sensys2026.table2 import table2
+from polysight_papers.sensys2026.item import table2
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 

@@ -15,12 +15,19 @@ from tests.support.refusals import refused
 from polysight.cli.main import main
 from polysight.materials import Library, knn
 from polysight.polarimetry import ratio_from_permittivity
-from polysight_papers.sensys2026 import dataset_figures as authors_items
+from polysight_papers.sensys2026 import dataset_items as authors_items
 from polysight_papers.sensys2026.dataset import IMAGES, LABELS, MATERIALS, read_authors, read_names, row_of
-from polysight_papers.sensys2026.dataset_figures import Judgements, authors_fig20, paired, repeated, task_samples
-from polysight_papers.sensys2026.dataset_run import authors_recipe, text_of, without_leakage
-from polysight_papers.sensys2026.item import Table
-from polysight_papers.sensys2026.table2 import table2
+from polysight_papers.sensys2026.dataset_items import (
+    Judgements,
+    authors_fig20,
+    authors_recipe,
+    paired,
+    repeated,
+    task_samples,
+    text_of,
+    without_leakage,
+)
+from polysight_papers.sensys2026.item import Table, table2
 from polysight_shared.error_codes import ErrorCode
 
 CHOSEN = (1, 3, 12, 15, 27, 28, 30, 32, 34, 36)
@@ -106,17 +113,13 @@ def test_the_page_says_that_the_files_were_simulated_and_what_was_left_out(out, 
     assert "“copper” = 1" in page
     assert "How the noise was set" not in page
     assert (out / "fig20.csv").read_text().startswith("simulated files: ")
-    assert not read_authors(dataset, _rig()).sources[MATERIALS].names.count("unobtainium")
-
-
-def _rig():
-    return RIG_FILE
+    assert not read_authors(dataset, RIG_FILE).sources[MATERIALS].names.count("unobtainium")
 
 
 def test_what_a_name_means_can_be_said(dataset, tmp_path):
     names = tmp_path / "names.json"
     names.write_text('{"unobtainium": 20}')
-    data = read_authors(dataset, _rig(), names=names)
+    data = read_authors(dataset, RIG_FILE, names=names)
     assert ROWS[20].name in data.sources[MATERIALS].names
     names.write_text('{"unobtainium": 99}')
     with refused(ErrorCode.VALUE_INVALID, 99):
@@ -141,7 +144,7 @@ def test_images_made_here_are_turned_to_lie_as_the_authors_own(dataset, tmp_path
     folder.mkdir()
     ours = {"h": np.rot90(h, 1), "v": np.rot90(v, 1), "valid": np.ones(h.shape, bool)}
     np.savez(folder / "image.npz", **ours)
-    data = read_authors(dataset, _rig(), images=tmp_path)
+    data = read_authors(dataset, RIG_FILE, images=tmp_path)
     theirs = {(e.name, e.scan): e for e in data.sources[LABELS].entries}
     for e in data.sources[IMAGES].entries:
         assert e.scan == "scan0"
@@ -162,16 +165,16 @@ def test_a_hostile_or_damaged_file_is_refused_and_named_and_stops_no_other(datas
     target = tmp_path / "ran"
     (tmp_path / "dataset" / "materials" / "evil_60.pkl").write_bytes(pickle.dumps({"name": Hostile(target)}))
     (tmp_path / "dataset" / "labels" / "scan1" / "sar_v.npy").write_bytes(b"cut")
-    data = read_authors(tmp_path / "dataset", _rig())
+    data = read_authors(tmp_path / "dataset", RIG_FILE)
     assert not target.exists()
     assert any("evil_60.pkl: refused" in n and "system" in n for n in data.notices)
     assert any("sar_v.npy" in n for n in data.notices)
     assert data.sources[LABELS].scans == ("scan0",)
-    assert len(data.sources[MATERIALS].entries) == len(read_authors(dataset, _rig()).sources[MATERIALS].entries)
+    assert len(data.sources[MATERIALS].entries) == len(read_authors(dataset, RIG_FILE).sources[MATERIALS].entries)
 
 
 def test_pairs_of_scans_share_no_scan_and_both_angles_are_seen(dataset):
-    data = read_authors(dataset, _rig())
+    data = read_authors(dataset, RIG_FILE)
     first, second = (data.at(MATERIALS, range(1, 24), a) for a in (60.0, 55.0))
     a, b = paired(first, second)
     assert a.scans == b.scans
@@ -186,7 +189,7 @@ def test_pairs_of_scans_share_no_scan_and_both_angles_are_seen(dataset):
 
 
 def test_what_is_judged_is_kept(dataset):
-    judge = Judgements(read_authors(dataset, _rig()))
+    judge = Judgements(read_authors(dataset, RIG_FILE))
     judge.data.sources.pop(LABELS)
     a = judge.judged(MATERIALS, "powders", "weighted KNN (paper)", "H")
     assert judge.judged(MATERIALS, "powders", "weighted KNN (paper)", "H") is a

@@ -10,8 +10,8 @@ from polysight.materials.train import score
 from polysight.polarimetry import fresnel, permittivity_from_ratio
 from polysight_papers.sensys2026 import patches
 from polysight_papers.sensys2026.classification import pixel_bound
+from polysight_papers.sensys2026.item import published
 from polysight_papers.sensys2026.patches import Errors, calibrated_errors, draw, groups, h_accuracy
-from polysight_papers.sensys2026.table2 import published
 
 QUIET = Errors(0.0, 0.0)
 

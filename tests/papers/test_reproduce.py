@@ -8,10 +8,8 @@ import matplotlib.figure
 import pytest
 
 from polysight.cli.main import main
-from polysight_papers.sensys2026 import run as catalogue
 from polysight_papers.sensys2026 import run as report
-from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure
-from polysight_papers.sensys2026.table2 import published
+from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, published
 from polysight_shared.errors import DataError
 
 
@@ -42,8 +40,7 @@ def test_the_page_is_one_file_that_calls_everything_simulated_and_names_what_is_
         raise DataError("no such image", "it was not made")
 
     makers = {"fig3": lambda _: item(), "fig20": broken, "fig21": lambda _: item("fig21")}
-    for module in (catalogue, report, __import__("polysight_papers.sensys2026.run", fromlist=["run"])):
-        monkeypatch.setattr(module, "MAKERS", makers)
+    monkeypatch.setattr(report, "MAKERS", makers)
     assert main(["reproduce", "--out", str(tmp_path), "fig3", "fig20"]) == 1
     page = (tmp_path / "reproduce.html").read_text(encoding="utf-8")
     assert not re.search(r'(src|href)="(?!data:|#)', page)
@@ -55,7 +52,7 @@ def test_the_page_is_one_file_that_calls_everything_simulated_and_names_what_is_
     assert "no such image" in page
     assert "Not asked for in this run: fig21" in page
     missing = page.split("not reproduced yet:")[1].split("</p>")[0]
-    assert all(key in missing for key in catalogue.TITLES if key not in makers)
+    assert all(key in missing for key in report.TITLES if key not in makers)
 
 
 def test_the_files_hold_the_numbers(tmp_path):
@@ -76,7 +73,7 @@ def test_an_unknown_item_is_refused_by_name(tmp_path, capsys):
 
 
 def test_published_numbers_stand_in_the_data_file_alone():
-    folder = report.Path(catalogue.__file__).parent
+    folder = report.Path(report.__file__).parent
     numbers = [str(g["all_percent"]) for g in published()["classification"].values() if g["all_percent"] < 100]
     numbers += [str(published()["sugar_median_error_percent"]), "0.0021", "0.1081"]
     for file in folder.glob("*.py"):
@@ -86,7 +83,7 @@ def test_published_numbers_stand_in_the_data_file_alone():
 
 @pytest.mark.parametrize("key", ["fig3", "fig21", "table2"])
 def test_items_are_made_and_stand_beside_the_published_values(key, tmp_path):
-    made = catalogue.MAKERS[key](Run(quick=True))
+    made = report.MAKERS[key](Run(quick=True))
     assert made.key == key
     assert made.tables
     assert made.pictures

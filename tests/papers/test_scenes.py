@@ -8,10 +8,9 @@ from tests.support.rigs import published_rig
 
 from polysight.polarimetry import specular_incidence_rad
 from polysight_papers.sensys2026 import run as catalogue
-from polysight_papers.sensys2026.images import FIG13_DISTANCE_MM, PLACES_MM, front_on
+from polysight_papers.sensys2026.images import FIG13_DISTANCE_MM, PLACES_MM, front_on, plate, scanned
 from polysight_papers.sensys2026.item import Run
 from polysight_papers.sensys2026.permittivities import APART_MM, REACH_MM, places
-from polysight_papers.sensys2026.scenes import plate, scanned
 from polysight_papers.sensys2026.synchronisation import tones
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode

@@ -34,7 +34,7 @@ def _reproduce(args: argparse.Namespace) -> int:
     sys.stderr.write("polysight reproduce: starting\n")  # its figures' libraries take seconds to load
     sys.stderr.flush()
     if args.authors is not None:
-        from polysight_papers.sensys2026.dataset_run import reproduce_authors
+        from polysight_papers.sensys2026.dataset_items import reproduce_authors
 
         return reproduce_authors(args.authors, args.out, args.config, args.items, args.images, args.names)
     if args.images is not None or args.names is not None:

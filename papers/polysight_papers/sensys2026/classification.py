@@ -22,21 +22,17 @@ from polysight.materials import (
     REJECTED,
     Samples,
     Score,
-    best_model,
     score,
     score_unseen_materials,
 )
 from polysight.polarimetry import fresnel
 from polysight.report import INK, PALETTE
-from polysight_papers.sensys2026.accuracy_curves import curves_picture
-from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, percent
-from polysight_papers.sensys2026.patches import Errors, calibrated_errors, draw, groups
-from polysight_papers.sensys2026.specimen_spread import spread_table
-from polysight_papers.sensys2026.table2 import Published, published
+from polysight_papers.sensys2026.item import Item, Picture, Published, Run, Table, dress, new_figure, percent, published
+from polysight_papers.sensys2026.patches import Errors, calibrated_errors, draw, groups, spread_table
 
 SECOND_ANGLE_DEG = 55.0
-CHOICE, RESULT = 17, 20
-"""Seeds: the better model is selected on one draw and judged on another."""
+RESULT = 20
+"""Seed of the draw that is judged."""
 TASKS = ("solids", "solids, two angles", "liquids", "powders")
 OTHER_DRAWS = tuple(range(21, 29))
 """Seeds of further draws, for the random spread of one draw."""
@@ -65,13 +61,6 @@ def judged(task: str, model: str, channels: str, by_pixel: bool, quick: bool) ->
     return score(task_samples(task, RESULT, quick), model, channels, by_pixel)
 
 
-@cache
-def better_model(task: str, quick: bool) -> tuple[str, dict[str, float]]:
-    """Return the best model with whole scans left out, on a separate draw, and the accuracies of all models."""
-    name, scores = best_model(task_samples(task, CHOICE, quick))
-    return name, {s.model: s.pixels for s in scores}
-
-
 def noise_text(tasks: Iterable[str], quick: bool) -> str:
     """Return a sentence with the calibrated amplitude errors."""
     names = sorted({t.partition(", ")[0] for t in tasks})
@@ -88,13 +77,12 @@ def _angles(task: str) -> tuple[float, ...]:
 
 
 def chance(quick: bool) -> Table:
-    """Return the better model's accuracy over further draws of the same noise, beside the Bayes limit."""
+    """Return the discriminant's accuracy over further draws of the same noise, beside the Bayes limit."""
     rows = []
     for task in TASKS:
         name = task.partition(", ")[0]
-        model = better_model(task, quick)[0]
         seeds = OTHER_DRAWS[: 2 if quick else None]
-        found = [score(task_samples(task, seed, quick), model) for seed in seeds]
+        found = [score(task_samples(task, seed, quick), DISCRIMINANT) for seed in seeds]
         errors = calibrated_errors(name, _draws(quick))
         limits = [
             pixel_bound(groups()[name].materials, _angles(task), errors, reference, pixels)
@@ -108,27 +96,9 @@ def chance(quick: bool) -> Table:
     kinds = ("pixel alone", "pixel, scan known", "by patch, scan known")
     head = ("Task", *(f"{k}{w}" for k in kinds for w in (", found", ", bound")))
     caption = (
-        f"The better model with scans left out, mean and spread over {len(OTHER_DRAWS[: 2 if quick else None])} other"
+        f"The {DISCRIMINANT} with scans left out, mean and spread over {len(OTHER_DRAWS[: 2 if quick else None])} other"
         " draws; the bound is the best any classifier can do that knows every material's mean and the errors' sizes"
         " (and, where the scan is known, the reference's error)"
-    )
-    return Table(caption, head, tuple(rows))
-
-
-def sensitivity() -> Table:
-    """Return the effect of the share of errors common to a patch on the 23 solids; noise is recalibrated each time."""
-    group, rows = groups()["solids"], []
-    for shared in (0.0, 0.25, 0.5, 0.75):
-        errors = calibrated_errors("solids", 1, shared)
-        one, other = (draw(group.materials, a, errors, RESULT).samples() for a in (group.angle_deg, SECOND_ANGLE_DEG))
-        found = [score(s, DISCRIMINANT) for s in (one, one.joined(other))]
-        shares = [s for f in found for s in (f.pixels, f.in_scan, f.by_patch)]
-        rows.append((f"{shared:g}", f"{100 * errors.amplitude:.2f} %", *(percent(s) for s in shares)))
-    kinds = ("pixel alone", "pixel, scan known", "by patch")
-    head = ("share", "amplitude error", *(f"{a}, {k}" for a in ("60°", "60° and 55°") for k in kinds))
-    caption = (
-        "23 solids, H+V+P, scans left out, by the share of the errors' variance that the pixels of a patch share"
-        f" (assumed: 0.5); {DISCRIMINANT}"
     )
     return Table(caption, head, tuple(rows))
 
@@ -150,24 +120,25 @@ def unknowns(quick: bool) -> Table:
 
 @dataclass(frozen=True)
 class TaskScores:
-    """Scores of one task of Fig. 18: the paper's KNN and the better model, scans left out and by pixel."""
+    """Scores of one task of Fig. 18: the paper's KNN and the discriminant, scans left out and by pixel."""
 
     task: str
     knn: Score
     knn_pixel: Score
-    better: Score
-    better_pixel: Score
+    discriminant: Score
+    discriminant_pixel: Score
     h: Score  # the KNN on |H| alone, scans left out
     h_pixel: Score
 
     @staticmethod
     def of(task: str, quick: bool) -> TaskScores:
         """Judge both models on a task."""
-        best = better_model(task, quick)[0]
-        knn, knn_pixel = (judged(task, PAPER, "H+V+P", by_pixel, quick) for by_pixel in (False, True))
-        better, better_pixel = (judged(task, best, "H+V+P", by_pixel, quick) for by_pixel in (False, True))
-        h, h_pixel = (judged(task, PAPER, "H", by_pixel, quick) for by_pixel in (False, True))
-        return TaskScores(task, knn, knn_pixel, better, better_pixel, h, h_pixel)
+        scores = [
+            judged(task, model, channels, by_pixel, quick)
+            for model, channels in ((PAPER, "H+V+P"), (DISCRIMINANT, "H+V+P"), (PAPER, "H"))
+            for by_pixel in (False, True)
+        ]
+        return TaskScores(task, *scores)
 
     def row(self) -> tuple[str, ...]:
         """Return a line of the table, published shares beside simulated ones."""
@@ -176,27 +147,28 @@ class TaskScores:
         return (
             f"{len(self.knn.names)} {self.task}", percent(None if two else printed["h_percent"] / 100),
             percent(self.h_pixel.pixels), percent(_published_percent(self.task) / 100), percent(self.knn_pixel.pixels),
-            percent(self.knn.pixels), self.better.model, percent(self.better_pixel.pixels),
-            percent(self.better.pixels), percent(self.better.in_scan), percent(self.better.by_patch),
+            percent(self.knn.pixels), percent(self.discriminant_pixel.pixels),
+            percent(self.discriminant.pixels), percent(self.discriminant.in_scan), percent(self.discriminant.by_patch),
         )  # fmt: skip
 
     def plain(self, quick: bool) -> dict[str, Any]:
         """Return the content of the JSON file."""
         return {
             "published_percent": _published_percent(self.task),
-            "simulated": [asdict(s) for s in (self.knn_pixel, self.knn, self.better_pixel, self.better)],
+            "simulated": [asdict(s) for s in (self.knn_pixel, self.knn, self.discriminant_pixel, self.discriminant)],
             "h_only_pixel_split": self.h_pixel.pixels,
-            "choice_of_model": better_model(self.task, quick)[1],
             "errors": asdict(calibrated_errors(self.task.partition(", ")[0], _draws(quick))),
         }
 
     def picture(self) -> Picture:
-        """Return the confusion matrices of H alone, of the better model by pixel, and by patch."""
-        task, h, better = self.task, self.h, self.better
+        """Return the confusion matrices of H alone, of the discriminant by pixel, and by patch."""
+        task = self.task
+        h = self.h
+        best = self.discriminant
         panels = (
             (h, h.confusion, f"H alone: {percent(h.pixels)}\n{PAPER}"),
-            (better, better.confusion, f"H, V and P, pixels alone: {percent(better.pixels)}\n{better.model}"),
-            (better, better.patch_confusion, f"H, V and P, by patch: {percent(better.by_patch)}\n{better.model}"),
+            (best, best.confusion, f"H, V and P, pixels alone: {percent(best.pixels)}\n{DISCRIMINANT}"),
+            (best, best.patch_confusion, f"H, V and P, by patch: {percent(best.by_patch)}\n{DISCRIMINANT}"),
         )
         angle = " and ".join(f"{a:.0f}°" for a in _angles(task))
         return Picture(
@@ -212,11 +184,11 @@ def _published_percent(task: str) -> float:
 
 
 def fig18(run: Run) -> Item:
-    """Accuracy of the paper's KNN and of the better model under both splits, with confusion matrices."""
+    """Accuracy of the paper's KNN and of the discriminant under both splits, with confusion matrices."""
     scores = [TaskScores.of(task, run.quick) for task in TASKS]
     head = (
         "Task", "H, published", "H, simulated", "H+V+P, published", "KNN, by pixel (optimistic)", "KNN, scans left out",
-        "better model", "better, by pixel (optimistic)", "better, scans left out: pixel alone",
+        "discriminant, by pixel (optimistic)", "discriminant, scans left out: pixel alone",
         "… pixel, scan known", "… by patch",
     )  # fmt: skip
     return Item(
@@ -228,7 +200,7 @@ def fig18(run: Run) -> Item:
             " out, no pixel of a test scan was ever trained on. The column “H, simulated” is by pixel, as that is"
             " what the noise was set on; it differs from the published one by the chance of another draw.",
             "The KNN's weights λ_H, λ_V, λ_P are fitted on the training pixels of every fold, whole scans left out"
-            " there too. The better model was chosen among all by leaving whole scans out, on a draw of its own.",
+            " there too.",
             "“Pixel alone” knows nothing but the pixel. “Scan known”: the scan's other patches are looked at too, by"
             " their features, not their names; from them the error of the metal reference is found, which they all"
             " share. “By patch” names a patch from the mean of its pixels as well; each pixel counts as its patch.",
@@ -240,10 +212,8 @@ def fig18(run: Run) -> Item:
             chance(run.quick),
             spread_table(run.quick),
             unknowns(run.quick),
-            sensitivity(),
         ),
-        {s.task.replace(", ", "-").replace(" ", "-"): s.picture() for s in scores}
-        | {"conditions": curves_picture(run.quick)},
+        {s.task.replace(", ", "-").replace(" ", "-"): s.picture() for s in scores},
         {s.task: s.plain(run.quick) for s in scores},
     )
 

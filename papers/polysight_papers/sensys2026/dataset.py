@@ -32,7 +32,7 @@ from polysight.materials import (
 )
 from polysight.polarimetry import correct_leakage
 from polysight.store import COLLECTION, open_npz, read_settings, rig_of
-from polysight_papers.sensys2026.table2 import Published, table2
+from polysight_papers.sensys2026.item import Published, table2
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError

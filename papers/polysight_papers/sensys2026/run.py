@@ -6,8 +6,9 @@ import base64
 import csv
 import io
 import sys
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
@@ -17,10 +18,9 @@ from polysight.jobs.output import steps
 from polysight.products import write_atomically, write_json
 from polysight.report import STAMP, png
 from polysight_papers.sensys2026.classification import fig18, fig20
-from polysight_papers.sensys2026.concentration import fig21
 from polysight_papers.sensys2026.images import fig4, fig13, fig14, fig19
 from polysight_papers.sensys2026.item import Item, Run, Table
-from polysight_papers.sensys2026.permittivities import fig3, fig16, fig17, table2_item
+from polysight_papers.sensys2026.permittivities import fig3, fig16, fig17, fig21, table2_item
 from polysight_papers.sensys2026.synchronisation import fig9, fig12, fig15
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, PolysightError
@@ -84,28 +84,19 @@ def reproduce(out: Path, keys: Sequence[str] = (), run: Run | None = None) -> in
                 f"give some of: {' '.join(MAKERS)}",
                 code=ErrorCode.KEY_UNKNOWN,
             )
+    make_folder(out)
+    makers = {key: partial(make, run) for key, make in MAKERS.items()}
+    return make_items(out, keys, makers, SIMULATED, quick=run.quick)
+
+
+def make_folder(out: Path) -> None:
+    """Make the folder of the results. Raises ConfigError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
         raise ConfigError(
             f"{out} is a file", "the results need a folder", "give another --out", code=ErrorCode.FILE_EXISTS
         ) from None
-    items: list[Item] = []
-    pictures: dict[str, bytes] = {}
-    failed: dict[str, str] = {}
-    made = list(dict.fromkeys(keys) or MAKERS)
-    for key in steps(made, [f"simulating {TITLES[key]}" for key in made]):
-        try:
-            item = MAKERS[key](run)
-            pictures |= write_item(out, item)
-        except PolysightError as e:
-            failed[key] = str(e)
-            sys.stderr.write(f"\n{key}: {e}\n")
-            continue
-        items.append(item)
-    page = write_page(out, items, pictures, failed, run.quick)
-    sys.stdout.write(f"{page}: {len(items)} simulated items beside the published values\n")
-    return 1 if failed else 0
 
 
 @dataclass(frozen=True)
@@ -140,6 +131,38 @@ SIMULATED = Origin(
 )
 
 
+def make_items(
+    out: Path,
+    keys: Sequence[str],
+    makers: Mapping[str, Callable[[], Item]],
+    origin: Origin,
+    quick: bool = False,
+    on_item: Callable[[Item], None] | None = None,
+) -> int:
+    """Make items (default: all of `makers`), write their files and the page; return the exit status.
+
+    An item that fails is listed on the page and on stderr; the others are made. `on_item` is called with each item.
+    """
+    items: list[Item] = []
+    pictures: dict[str, bytes] = {}
+    failed: dict[str, str] = {}
+    chosen = list(dict.fromkeys(keys) or makers)
+    for key in steps(chosen, [f"making {TITLES[key]}" for key in chosen]):
+        try:
+            item = makers[key]()
+            pictures |= write_item(out, item, origin)
+        except PolysightError as e:
+            failed[key] = str(e)
+            sys.stderr.write(f"\n{key}: {e}\n")
+            continue
+        items.append(item)
+        if on_item is not None:
+            on_item(item)
+    page = write_page(out, items, pictures, failed, quick, origin, makers)
+    sys.stdout.write(f"{page}: {len(items)} items ({origin.word}) beside the published values\n")
+    return 1 if failed else 0
+
+
 def stamped_png(figure: Figure, origin: Origin = SIMULATED) -> bytes:
     """Return a figure as PNG with its origin, such as SIMULATED, above it."""
     figure.suptitle(origin.word.upper(), x=0.995, ha="right", fontsize=9, color=STAMP, fontweight="bold")
@@ -172,14 +195,13 @@ def write_page(
     pictures: dict[str, bytes],
     failed: dict[str, str],
     quick: bool,
-    origin: Origin = SIMULATED,
-    makers: Container[str] | None = None,
+    origin: Origin,
+    makers: Container[str],
 ) -> Path:
     """Write `reproduce.html` with the items and a list of missing ones; return its path.
 
-    `makers` are the keys of possible items; None: all.
+    `makers` holds the keys of possible items.
     """
-    makers = MAKERS if makers is None else makers
     environment = Environment(
         loader=PackageLoader("polysight_papers.sensys2026", "."),
         autoescape=select_autoescape(["html"]),

@@ -21,9 +21,8 @@ from polysight.capture import decode_row, row_words
 from polysight.imaging import ImageBuilder
 from polysight.report import INK, PALETTE, QUANTITIES, SyncReport
 from polysight.sync import STAGES, BoardSetup, HighPass, fit_high_pass, high_pass, synchronise_row
-from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure
-from polysight_papers.sensys2026.scenes import plate, scanned
-from polysight_papers.sensys2026.table2 import published
+from polysight_papers.sensys2026.images import plate, scanned
+from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, published
 from polysight_shared.config import Chirp, load_instrument
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 

@@ -25,16 +25,17 @@ from polysight.capture.decode import row_words
 from polysight.imaging import ImageBuilder, Images
 from polysight.imaging.sparse import reconstruct
 from polysight.materials import (
+    SIMULATED_LIBRARY,
     Classifier,
+    KnownScene,
     Library,
     MaterialsResult,
+    Optics,
     TruthPlate,
     analyse,
     pixel_accuracy,
     truth_plates,
 )
-from polysight.materials.analyse import KnownScene, Optics
-from polysight.materials.library import SIMULATED_LIBRARY
 from polysight.plan import Changes, scan_time
 from polysight.polarimetry import incidence_choice
 from polysight.sync import BoardSetup, synchronise_row

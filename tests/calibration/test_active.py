@@ -8,17 +8,15 @@ from tests.support.calibration import SOURCES, filter_file, metal_reference
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 
-from polysight.calibration.active import (
-    calibration_of_rig,
-    calibration_of_scan,
-    copy_into_scan,
-    load_calibration,
-)
 from polysight.calibration.files import (
     FilterFile,
     MetalFile,
     PlacesFile,
     SourceScan,
+    calibration_of_rig,
+    calibration_of_scan,
+    copy_into_scan,
+    load_calibration,
     read_calibration,
     write_calibration,
     write_metal,

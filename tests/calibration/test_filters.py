@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from polysight.calibration.active import load_calibration
-from polysight.calibration.files import FilterFile, read_calibration
-from polysight.calibration.filters import BIN_HZ, MIN_CHIRPS, binned
+from polysight.calibration.direct_signal import BIN_HZ, MIN_CHIRPS, binned
+from polysight.calibration.files import FilterFile, load_calibration, read_calibration
 from polysight.cli.main import main
 from polysight.pipeline import Pipeline
 from polysight.store.scan_folder import ScanFolder

@@ -8,8 +8,7 @@ import pytest
 from tests.support.calibration import SOURCES, filter_file, metal_reference
 from tests.support.refusals import refused
 
-from polysight.calibration.active import checked_calibration, load_calibration
-from polysight.calibration.files import write_calibration, write_metal
+from polysight.calibration.files import checked_calibration, load_calibration, write_calibration, write_metal
 from polysight.cli.main import main
 from polysight.imaging import ImagedWith
 from polysight.jobs.calibrate import load_reference

@@ -6,10 +6,8 @@ import tomli_w
 from tests.support.processes import output_of
 from tests.support.refusals import refused
 
-from polysight.calibration.active import Calibration, load_calibration
-from polysight.calibration.files import PlacesFile, read_calibration
+from polysight.calibration.files import Calibration, PlacesFile, load_calibration, open_raw, read_calibration
 from polysight.calibration.places import Prior, TargetPoint, fit_places, load_echoes, places_file, read_target
-from polysight.calibration.scans import open_raw
 from polysight.imaging.geometry import Antennas
 from polysight.jobs.calibrate import with_places_of
 from polysight_shared.error_codes import ErrorCode

@@ -6,8 +6,7 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.calibration.direct_signal import by_geometry, fit_start, start_of, unwrapped
-from polysight.calibration.files import StartFile, read_calibration
-from polysight.calibration.scans import open_raw
+from polysight.calibration.files import StartFile, open_raw, read_calibration
 from polysight.cli.main import main
 from polysight.radar.commands import direct_if_hz
 from polysight_shared.error_codes import ErrorCode

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 TOPS = ("host", "papers", "simulators", "benchmarks", "examples", "shared", "pi_controller")
 BY_HAND = re.compile(r"[-+−–] ?j\(?$")
 OTHERS = re.compile(r"[-+−–] ?j\(?(\$?\{|%)")
-WRITER = "host/polysight/materials/permittivity.py"
+WRITER = "host/polysight/materials/measure.py"
 
 
 def built_by_hand(text: str) -> list[int]:

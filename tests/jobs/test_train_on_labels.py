@@ -14,7 +14,8 @@ from tests.support.scenes import scene_of
 
 from polysight.cli.main import main
 from polysight.jobs.train import training_scan
-from polysight.materials import Library, entries_of
+from polysight.materials import Library
+from polysight.materials.train import entries_of
 from polysight_shared.errors import DataError
 from polysight_simulators.scene import decode_scene, simulate
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from polysight.materials.common_error import CommonError, Patches, costs, explanations, probabilities
+from polysight.materials.discriminant import CommonError, Patches, costs, explanations, probabilities
 
 ROW = np.arange(7.0)[:, None] * np.array([1.0, 0.0, 0.3])
 """Materials in a row: a common error of one step makes each look like its neighbour."""

@@ -6,10 +6,9 @@ from tests.support.refusals import refused
 
 from polysight.cli.main import main
 from polysight.materials import Classifier, Entry, Library
-from polysight.materials.classify import DISCRIMINANT, PAPER
+from polysight.materials.classify import DISCRIMINANT, PAPER, fit_weights
 from polysight.materials.discriminant import REJECTED, ErrorDiscriminant
-from polysight.materials.knn import fit_weights
-from polysight.materials.samples import Samples, feature_matrix
+from polysight.materials.library import Samples, feature_matrix
 from polysight.materials.train import fit_samples, score, score_unseen_materials
 from polysight.report.context import classifier_sentence
 from polysight_shared.error_codes import ErrorCode

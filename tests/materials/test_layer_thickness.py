@@ -10,8 +10,9 @@ from tests.support.rigs import published_rig
 from polysight import multilayer
 from polysight.cli.main import main
 from polysight.imaging import sub_bands
-from polysight.materials import METAL, Layer, LayerFit, bands_of_row, fit_layer, parse_layer
-from polysight.materials.layers import Bands, Spectrum, predict
+from polysight.materials import METAL, Layer, LayerFit, parse_layer
+from polysight.materials.layers import Bands, Spectrum, fit_layer, predict
+from polysight.materials.sub_bands import bands_of_row
 
 THETA = np.radians(55.0)
 CHIRP = published_rig().chirp

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
-from polysight.materials.layer_fit import LayerFit, check_range, fit_layer
-from polysight.materials.layers import Bands, Layer, Spectrum, check_stack, predict
+from polysight.materials.layers import Bands, Layer, LayerFit, Spectrum, check_range, check_stack, fit_layer, predict
 from polysight.polarimetry import permittivity_from_ratio, ratio_from_permittivity
 from polysight_shared.error_codes import ErrorCode
 

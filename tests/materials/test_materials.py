@@ -13,21 +13,18 @@ from polysight.materials import (
     UNKNOWN,
     Classifier,
     Library,
-    Weights,
     analyse,
     estimate_permittivity,
     expected_pixel_accuracy,
     fit_library,
     make_library,
-    median_ratio,
     pixel_accuracy,
     read_truth,
 )
 from polysight.materials.analyse import Optics
-from polysight.materials.classify import features_of
-from polysight.materials.knn import ratio_distance
-from polysight.materials.library import FORMAT
-from polysight.materials.samples import majority
+from polysight.materials.classify import Weights, features_of, ratio_distance
+from polysight.materials.library import FORMAT, majority
+from polysight.materials.measure import median_ratio
 from polysight.polarimetry import fresnel
 from polysight_papers.sensys2026.item import table2
 from polysight_shared.error_codes import ErrorCode

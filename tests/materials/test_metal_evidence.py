@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from polysight.materials.inversion import PatchMeasurement, RigPrior
-from polysight.materials.metal import metal_evidence
+from polysight.materials.inversion import PatchMeasurement, RigPrior, metal_evidence
 
 THETA = np.radians(55.0)
 EPS = [

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER
-from polysight.materials.knn import PaperKnn, Weights, fit_weights
-from polysight.materials.samples import CHANNELS, Model, Samples, feature_matrix
+from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, PaperKnn, Weights, fit_weights
+from polysight.materials.library import CHANNELS, Model, Samples, feature_matrix
 from polysight.materials.train import best_model, score, splits
 from polysight_shared.error_codes import ErrorCode
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polysight.materials.permittivity import estimate_permittivity
+from polysight.materials.measure import estimate_permittivity
 from polysight.polarimetry import permittivity_from_ratio, ratio_from_permittivity
 
 THETA = np.radians(55.0)

@@ -4,19 +4,10 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.materials import (
-    Labels,
-    SegmentSettings,
-    find_metal,
-    metal_by_label,
-    metal_in_box,
-    pack_labels,
-    patches_from_labels,
-    read_labels,
-    segment,
-)
-from polysight.materials.segment import box_mask
-from polysight.materials.truth import match_truth
+from polysight.materials import Labels, SegmentSettings, pack_labels, read_labels
+from polysight.materials.labels import match_truth, patches_from_labels
+from polysight.materials.measure import find_metal, metal_by_label, metal_in_box
+from polysight.materials.segment import box_mask, segment
 from polysight_shared.error_codes import ErrorCode
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from polysight.materials import MODELS, UNKNOWN, Classifier, Entry, Library, specimens
 from polysight.materials.classify import DISCRIMINANT, add_explanation
-from polysight.materials.samples import Samples, SceneErrors, feature_matrix
+from polysight.materials.library import Samples, SceneErrors, feature_matrix
 from polysight.materials.specimens import (
     PUBLISHED_SPREAD,
     cost_of_none,

@@ -9,8 +9,7 @@ from tests.support.rigs import published_rig
 from polysight.imaging import Images
 from polysight.imaging.builder import SubBand
 from polysight.materials.analyse import MetalChoice
-from polysight.materials.layer_fit import fit_layer
-from polysight.materials.layers import Bands, Layer
+from polysight.materials.layers import Bands, Layer, fit_layer
 from polysight.materials.sub_bands import band_rows, bands_of_row
 from polysight.polarimetry import fresnel, ratio_from_permittivity
 

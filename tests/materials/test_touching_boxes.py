@@ -4,8 +4,7 @@ import numpy as np
 
 from polysight.imaging import Images
 from polysight.materials.analyse import KnownScene, MetalChoice, Optics, analyse, smooth_inside
-from polysight.materials.labels import patches_from_labels, patches_from_plates
-from polysight.materials.truth import TruthPlate
+from polysight.materials.labels import TruthPlate, patches_from_labels, patches_from_plates
 from polysight.polarimetry import fresnel
 
 X_M, Y_M = np.arange(60) * 2e-3, np.arange(40) * 2e-3

@@ -12,7 +12,7 @@ from tests.support.products import NAMES, PERMITTIVITY, REASON, judged_products
 
 from polysight.cli.main import main
 from polysight.materials import PATCHES
-from polysight.materials.patch_files import FORMAT
+from polysight.materials.result import PATCHES_FORMAT
 from polysight.results import LEVELS, NoResult
 
 NUMBERS = ("2.9", "0.2", "3.0")
@@ -23,7 +23,7 @@ def with_pixels(folder: Path) -> Path:
     rows = [{"label": n, "centre_mm": [30.0 * n, 0.0], "truth": None, "pixels": 4} for n in (1, 2, 3)]
     places = np.concatenate([np.array([[30.0 * n + k, 0.0] for k in range(4)]) for n in (1, 2, 3)])
     features = np.tile([0.5, 0.15, 0.3, 0.05], (12, 1))
-    meta = {"format": FORMAT, "angle_deg": 55.0, "simulated": True, "patches": rows}
+    meta = {"format": PATCHES_FORMAT, "angle_deg": 55.0, "simulated": True, "patches": rows}
     out = io.BytesIO()
     np.savez_compressed(
         out,

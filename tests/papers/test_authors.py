@@ -13,7 +13,7 @@ from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 
 from polysight.cli.main import main
-from polysight.materials import Library, knn
+from polysight.materials import Library, classify
 from polysight.polarimetry import ratio_from_permittivity
 from polysight_papers.sensys2026 import dataset_items as authors_items
 from polysight_papers.sensys2026.dataset import IMAGES, LABELS, MATERIALS, read_authors, read_names, row_of
@@ -66,7 +66,7 @@ def out(dataset, tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(authors_items, "ALL", 240)  # pixels of a task, and weights tried: it is the page that is tested
-        patch.setattr(knn, "GRID", (1.0,))
+        patch.setattr(classify, "GRID", (1.0,))
         assert main(["reproduce", "--authors", str(dataset), "--out", str(folder)]) == 0
     return folder
 
@@ -207,7 +207,7 @@ def test_leakage_is_taken_out_exactly_and_the_recipe_undoes_its_own_constants():
 
 
 def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(knn, "GRID", (1.0,))
+    monkeypatch.setattr(classify, "GRID", (1.0,))
     out = tmp_path / "library.npz"
     assert main(["train", "--authors", str(dataset), "--out", str(out)]) == 0
     library = Library.load(out)

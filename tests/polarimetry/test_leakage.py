@@ -7,16 +7,15 @@ from hypothesis import strategies as st
 from tests.support.calibration import remaining
 from tests.support.refusals import refused
 
-from polysight.polarimetry import (
-    Leakage,
+from polysight.polarimetry import Leakage, leakage_from_images
+from polysight.polarimetry.calibrate import (
+    PLATE,
     Standard,
     common_direction,
     estimate_axial_ratio,
     estimate_leakage,
-    leakage_from_images,
     strips_wave,
 )
-from polysight.polarimetry.leakage import PLATE
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.scene import strips
 

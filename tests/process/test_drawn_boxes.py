@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from polysight.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library, MetalChoice
-from polysight.materials.labels import labels_of, pack_labels, read_labels
+from polysight.materials.labels import pack_labels, read_labels
+from polysight.materials.result import labels_of
 from polysight.process import Options
 
 

@@ -13,8 +13,9 @@ from tests.support.calibration import remaining
 from polysight.cli.main import main
 from polysight.jobs.calibrate import load_reference
 from polysight.jobs.process import imaged
-from polysight.materials import fit_layer, parse_layer, read_truth
+from polysight.materials import parse_layer, read_truth
 from polysight.materials.analyse import KnownScene, MetalChoice
+from polysight.materials.layers import fit_layer
 from polysight.materials.sub_bands import bands_of_row
 from polysight.polarimetry import Leakage, PlaneReference
 from polysight_shared.config import Instrument

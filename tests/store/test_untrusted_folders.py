@@ -22,11 +22,10 @@ from polysight.capture import read_index, read_packets
 from polysight.capture.packet_file import PACKETS, RUN
 from polysight.capture.segment import write_durably
 from polysight.cli.main import main
-from polysight.materials.labels import read_labels
+from polysight.materials.labels import read_labels, read_truth
 from polysight.materials.library import Library
-from polysight.materials.patch_files import read_patches
 from polysight.materials.published import read_material
-from polysight.materials.truth import read_truth
+from polysight.materials.result import read_patches
 from polysight.products.dataset_files import read_netcdf
 from polysight.products.files import SavedProducts, read_image, write_atomically
 from polysight.products.folder import making_products

@@ -6,35 +6,34 @@ dated calibration file. The rig file names the files that apply; a new scan gets
 filters and the metal reference.
 """
 
-from polysight.calibration.active import (
-    Calibration,
-    calibration_of_rig,
-    calibration_of_scan,
-    checked_calibration,
-    copy_into_scan,
-)
 from polysight.calibration.direct_signal import (
     FULL_SCALE,
     DirectSignal,
     band_hz,
     find_direct,
+    fit_filter,
     fit_start,
     jitter_hz,
     unwrapped,
 )
 from polysight.calibration.files import (
+    Calibration,
     CalibrationFile,
     FilterFile,
     MetalFile,
     StartFile,
+    calibration_of_rig,
+    calibration_of_scan,
+    checked_calibration,
+    copy_into_scan,
     header,
+    open_raw,
     read_calibration,
+    source_scan,
     write_calibration,
     write_metal,
 )
-from polysight.calibration.filters import fit_filter
 from polysight.calibration.places import Prior, fit_places, load_echoes, places_file, read_target
-from polysight.calibration.scans import open_raw, source_scan
 
 __all__ = [
     "FULL_SCALE",

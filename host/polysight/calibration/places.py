@@ -24,8 +24,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.calibration.files import BoardPlace, PlacesFile, SourceScan, Vector, header, places_crc32
-from polysight.calibration.scans import board_rows
+from polysight.calibration.files import BoardPlace, PlacesFile, SourceScan, Vector, board_rows, header, places_crc32
 from polysight.imaging import Antennas, image_grid, reduction, row_offsets_m, scene_gate_m
 from polysight.store import RawSource
 from polysight.sync import BoardSetup, HighPass, synchronise_row

@@ -1,28 +1,26 @@
 """Materials: find patches in the two images, estimate their permittivities, and name them.
 
-`analyse` takes `Images`, the `Optics`, the choice of the metal reference (`MetalChoice`) and known facts of the
-scene (`KnownScene`); it returns a `MaterialsResult`. A `Classifier` names patches by a `Library` of labelled patches,
-which `make_library` makes of scans. `fit_layer` fits thin layers, `fit_concentration` solutions. `patch_files` stores
-the features of a scan's patches, `labels` reads and writes boxes with names, `published` reads the published data set.
+`analyse` takes an `ImagePair`, the `Optics`, the choice of the metal reference (`MetalChoice`) and known facts of the
+scene (`KnownScene`); it returns a `MaterialsResult`. On the way: `segment.py` finds patches, `measure.py` measures
+them, `inversion.py` solves for all permittivities and the rig's errors together, `classify.py` names patches by a
+`Library`, with the materials' distributions of `discriminant.py`. `sub_bands.py` and `layers.py` fit thin layers.
+`make_library` makes a library of scans, `fit_concentration` a line through solutions. `labels.py` reads boxes with
+names and true plates, `published.py` the published data set.
 """
 
 from polysight.materials.analyse import (
+    FOUND,
+    UNKNOWN_SCENE,
+    KnownScene,
+    MetalChoice,
+    Optics,
     analyse,
     expected_pixel_accuracy,
     image_centre_mm,
     permittivity_change,
     pixel_accuracy,
 )
-from polysight.materials.classify import (
-    DISCRIMINANT,
-    MODELS,
-    PAPER,
-    SHORT,
-    UNKNOWN,
-    Classifier,
-    NamedPatch,
-    PatchName,
-)
+from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, SHORT, UNKNOWN, Classifier, NamedPatch, PatchName
 from polysight.materials.concentration import (
     ConcentrationResult,
     concentrations,
@@ -30,54 +28,45 @@ from polysight.materials.concentration import (
     polarisation_angle_rad,
 )
 from polysight.materials.discriminant import REJECTED
-from polysight.materials.inputs import FOUND, UNKNOWN_SCENE, KnownScene, MetalChoice, Optics
-from polysight.materials.inversion import (
-    PatchEstimate,
-    PatchMeasurement,
-    invert,
-    measured_ratio,
-)
-from polysight.materials.knn import Weights
-from polysight.materials.label_checks import (
-    box_name,
-    check_labels,
-    clean_name,
-    image_extent_mm,
-    name_taken,
-    no_box,
-)
 from polysight.materials.labels import (
     METALS,
     SPECIMEN,
+    TRUTH,
     Labels,
+    Plates,
+    TruthPlate,
+    box_name,
+    check_labels,
+    clean_name,
+    find_truth,
     format_box,
+    image_extent_mm,
     is_metal,
-    labels_of,
+    match_truth,
     material_of,
+    name_taken,
+    no_box,
     pack_labels,
-    patches_from_labels,
     patches_from_plates,
     read_labels,
+    read_truth,
+    specimen_seed,
+    truth_plates,
 )
-from polysight.materials.layer_fit import LayerFit, fit_layer
-from polysight.materials.layer_rows import LAYER_FORMS, fit_row, incidence_std_rad, layer_content, parse_layer
-from polysight.materials.layers import METAL, Layer
-from polysight.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Entry, Library
-from polysight.materials.measure import NOT_PASSIVE
-from polysight.materials.metal import (
-    find_metal,
-    metal_by_label,
-    metal_in_box,
+from polysight.materials.layers import METAL, Layer, LayerFit
+from polysight.materials.library import (
+    CHANNELS,
+    SAME_ANGLE_DEG,
+    SIMULATED_LIBRARY,
+    Entry,
+    Library,
+    Model,
+    Samples,
+    SceneErrors,
+    by_angle,
+    feature_matrix,
 )
-from polysight.materials.patch_files import (
-    PATCHES,
-    MatchedPatch,
-    ScanPatches,
-    match_patches,
-    pack_patches,
-    read_patches,
-)
-from polysight.materials.permittivity import Permittivity, estimate_permittivity, format_permittivity, median_ratio
+from polysight.materials.measure import NOT_PASSIVE, Permittivity, estimate_permittivity, format_permittivity
 from polysight.materials.published import (
     LabelledScan,
     angle_in_text,
@@ -88,38 +77,35 @@ from polysight.materials.published import (
     read_material,
     read_materials,
 )
-from polysight.materials.result import MaterialsResult
-from polysight.materials.samples import CHANNELS, Model, Samples, SceneErrors, by_angle, feature_matrix
-from polysight.materials.segment import (
-    Box,
-    Segmentation,
-    SegmentSettings,
-    axis_mm,
-    box_mask,
-    insides,
-    segment,
+from polysight.materials.result import (
+    PATCHES,
+    MatchedPatch,
+    MaterialsResult,
+    ScanPatches,
+    labels_of,
+    match_patches,
+    pack_patches,
+    read_patches,
 )
-from polysight.materials.sub_bands import AMPLITUDE_ERROR, bands_of_row, with_bands
+from polysight.materials.segment import Box, Segmentation, SegmentSettings, axis_mm, box_mask, insides
+from polysight.materials.sub_bands import (
+    AMPLITUDE_ERROR,
+    LAYER_FORMS,
+    fit_row,
+    incidence_std_rad,
+    layer_content,
+    parse_layer,
+    with_bands,
+)
 from polysight.materials.train import (
     Score,
     TrainingScan,
     best_model,
     calibration_error,
-    entries_of,
     fit_library,
     make_library,
     score,
     score_unseen_materials,
-)
-from polysight.materials.truth import (
-    TRUTH,
-    Plates,
-    TruthPlate,
-    find_truth,
-    match_truth,
-    read_truth,
-    specimen_seed,
-    truth_plates,
 )
 
 __all__ = [
@@ -158,8 +144,6 @@ __all__ = [
     "Model",
     "NamedPatch",
     "Optics",
-    "PatchEstimate",
-    "PatchMeasurement",
     "PatchName",
     "Permittivity",
     "Plates",
@@ -171,11 +155,9 @@ __all__ = [
     "Segmentation",
     "TrainingScan",
     "TruthPlate",
-    "Weights",
     "analyse",
     "angle_in_text",
     "axis_mm",
-    "bands_of_row",
     "best_model",
     "box_mask",
     "box_name",
@@ -184,15 +166,12 @@ __all__ = [
     "check_labels",
     "clean_name",
     "concentrations",
-    "entries_of",
     "entries_of_boxes",
     "estimate_permittivity",
     "expected_pixel_accuracy",
     "feature_matrix",
-    "find_metal",
     "find_truth",
     "fit_concentration",
-    "fit_layer",
     "fit_library",
     "fit_row",
     "format_box",
@@ -202,7 +181,6 @@ __all__ = [
     "image_orientation",
     "incidence_std_rad",
     "insides",
-    "invert",
     "is_metal",
     "label_folders",
     "labels_of",
@@ -211,16 +189,11 @@ __all__ = [
     "match_patches",
     "match_truth",
     "material_of",
-    "measured_ratio",
-    "median_ratio",
-    "metal_by_label",
-    "metal_in_box",
     "name_taken",
     "no_box",
     "pack_labels",
     "pack_patches",
     "parse_layer",
-    "patches_from_labels",
     "patches_from_plates",
     "permittivity_change",
     "pixel_accuracy",
@@ -233,7 +206,6 @@ __all__ = [
     "read_truth",
     "score",
     "score_unseen_materials",
-    "segment",
     "specimen_seed",
     "truth_plates",
     "with_bands",

@@ -1,49 +1,44 @@
-"""Find and name patches in the two images: segmentation, metal reference, joint inversion, classification."""
+"""Find and name the patches of two images: segmentation, metal reference, joint inversion, classification.
+
+`analyse` takes an `ImagePair`, the `Optics`, the choice of the metal reference (`MetalChoice`) and known facts of the
+scene (`KnownScene`). `level` corrects the images for the tilts of the plates.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from polysight.imaging import Image, Images
+from polysight.imaging import Image, Images, correct_tilt
 from polysight.materials.classify import UNKNOWN, Classifier, NamedPatch, add_explanation, features_of
-from polysight.materials.inputs import (
-    FOUND,
-    UNKNOWN_SCENE,
-    KnownScene,
-    MetalChoice,
-    Optics,
-    level,
-)
-from polysight.materials.inversion import Inversion, PatchMeasurement, RigPrior, invert
+from polysight.materials.inversion import Inversion, PatchMeasurement, RigPrior, invert, metal_evidence
+from polysight.materials.labels import TruthPlate, match_truth
+from polysight.materials.library import SceneErrors
 from polysight.materials.measure import (
     AMPLIFIES,
     BELOW_AIR,
     LEAST_STD,
+    MetalReference,
+    Permittivity,
     Refused,
     background,
     check_patches,
-    measure_patch,
-    reference_std,
-)
-from polysight.materials.metal import (
-    MetalReference,
     find_metal,
+    inverse_spread,
+    measure_patch,
     metal_by_label,
-    metal_evidence,
     metal_in_box,
     no_metal,
+    permittivity_of_patch,
+    reference_std,
 )
-from polysight.materials.permittivity import Permittivity, inverse_spread, permittivity_of_patch
-from polysight.materials.result import MaterialsResult, PatchResult
-from polysight.materials.samples import SceneErrors
-from polysight.materials.segment import Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
+from polysight.materials.result import MaterialsResult, PatchResult, Tilts
+from polysight.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
 from polysight.materials.specimens import features, relative, softened
-from polysight.materials.truth import match_truth
 from polysight.polarimetry import (
     IncidenceChoice,
     PlaneReference,
@@ -55,7 +50,128 @@ from polysight.polarimetry import (
     remove_leakage,
     smooth,
 )
+from polysight_shared.config import Instrument
 from polysight_shared.errors import DataError
+
+LEAST_LEAKAGE_STD = 5e-4
+"""Least standard deviation of the leakage, whatever the rig file says."""
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Quantities that turn images into permittivity, with their standard deviations.
+
+    Attributes
+    ----------
+    theta_rad
+        Incidence angle, a number or [ny, nx].
+    leakage
+        Cross-polar leakage (p in H, s in V): as measured, or zero.
+    smooth_px
+        Width (standard deviation, pixels) of the filter against speckle before permittivity and classification,
+        inside each patch.
+    theta_std_rad
+        Standard deviation of the angle's error, equal for all pixels.
+    leakage_std
+        Standard deviation of each part of the leakage: as measured, or that of the mount's prior.
+    leakage_measured
+        True if it was measured.
+    channel_ratio_known
+        True if V / H of the images is referenced to the direct path, which reaches both boards with equal strength.
+    """
+
+    theta_rad: npt.ArrayLike
+    leakage: tuple[complex, complex] = (0.0, 0.0)
+    smooth_px: float = 2.0
+    theta_std_rad: float = 1e-3
+    leakage_std: float = 0.003
+    leakage_measured: bool = True
+    channel_ratio_known: bool = False
+
+    @classmethod
+    def of(
+        cls, rig: Instrument, angles: IncidenceChoice, theta_std_rad: float = 1e-3, channel_ratio_known: bool = False
+    ) -> Optics:
+        """Return the optics of a rig under the chosen incidence angles.
+
+        Leakage without a `leakage_std` in the rig file was not measured: it is not subtracted, its mean is zero.
+        """
+        p = rig.polarimetry
+        measured = p.leakage_std is not None
+        leakage = (complex(*p.leakage_h), complex(*p.leakage_v)) if measured else (0j, 0j)
+        std = p.leakage_prior / np.sqrt(2) if p.leakage_std is None else p.leakage_std
+        least = max(float(std), LEAST_LEAKAGE_STD)
+        return cls(angles.used_rad, leakage, p.smooth_px, theta_std_rad, least, measured, channel_ratio_known)
+
+    def prior(self, reference_std: float) -> RigPrior:
+        """Return the prior of the joint inversion."""
+        return RigPrior(
+            self.theta_std_rad,
+            self.leakage,
+            self.leakage_std,
+            self.leakage_measured,
+            self.channel_ratio_known,
+            reference_std,
+        )
+
+
+@dataclass(frozen=True)
+class MetalChoice:
+    """The metal reference: a box, a known patch, or a plate scanned separately; none of them: it is searched for.
+
+    Attributes
+    ----------
+    box_mm
+        x0, y0, x1, y1 in millimetres from the image centre.
+    label
+        Number of one of the known patches.
+    plane
+        A metal plate over the whole plane, scanned separately; pixels where it is invalid are ignored.
+    """
+
+    box_mm: Box | None = None
+    label: int | None = None
+    plane: PlaneReference | None = None
+
+
+@dataclass(frozen=True)
+class KnownScene:
+    """Known facts of the scene.
+
+    Attributes
+    ----------
+    segmentation
+        Known patches (boxes drawn by hand); None: patches are searched for.
+    plates
+        The truth, if known: copied to the results, never used for them.
+    settings
+        Settings of the segmentation.
+    """
+
+    segmentation: Segmentation | None = None
+    plates: Sequence[TruthPlate] = ()
+    settings: SegmentSettings | None = None
+
+
+FOUND = MetalChoice()
+"""Search for the metal reference in the scene."""
+UNKNOWN_SCENE = KnownScene()
+
+
+def level(images: Images, found: Segmentation, tilts: Tilts | None = None) -> tuple[Images, Tilts]:
+    """Correct each patch for its tilt; return the images and the tilts, as given or estimated from the phase.
+
+    Without the illumination of the plane the images are returned unchanged.
+    """
+    if images.illumination is None:
+        return images, Tilts({}, 1)
+    if tilts is None:
+        rises = {p.label: images.illumination.rise(images.h, images.v, p.interior) for p in found.patches}
+        tilts = Tilts(rises, images.illumination.across)
+    there = [p for p in found.patches if p.label in tilts.rises]
+    masks, own = [p.mask for p in there], [tilts.rises[p.label] for p in there]
+    return correct_tilt(images, masks, own), tilts
+
 
 FILLED = 0.1
 """Least |H| relative to metal at which an image without edges counts as filled with one material."""

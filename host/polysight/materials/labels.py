@@ -1,28 +1,148 @@
-"""Label files (`labels.json`): boxes with names, the metal reference among them, and their specimens.
+"""Names of patches by people and simulators: label files (`labels.json`) and truth files (`truth.json`).
 
-`polysight label` writes the boxes of a person, in millimetres; `polysight process` writes a box inside each patch that
-it found, in pixels, named by the classifier. Both forms are read, and the published data set's files too.
-`Labels.patches` makes patches of the boxes.
+A label file holds boxes with names, the metal reference among them, and their specimens. `polysight label` writes the
+boxes of a person, in millimetres; `polysight process` writes a box inside each patch that it found, in pixels, named by
+the classifier. Both forms are read, and the published data set's files too. `Labels.patches` makes patches of the
+boxes; `check_labels` checks a file before training, `clean_name` and `box_name` one name. `match_truth` matches the
+plates of a truth file to patches by position.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Mapping, Sequence
+import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from polysight.materials.result import MaterialsResult
-from polysight.materials.segment import Box, Patch, Segmentation, axis_mm, box_mask, make_patch
-from polysight.materials.truth import TruthPlate
+from polysight.materials.segment import Box, Mask, Patch, Segmentation, axis_mm, box_mask, make_patch
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 from polysight_shared.files import read_json
+
+TRUTH = "truth.json"
+
+
+@dataclass(frozen=True)
+class TruthPlate:
+    """A rectangular plate of the true scene.
+
+    Box in millimetres from the image centre; permittivity eps' - j eps'', None for metal, strips and stacks of layers.
+    """
+
+    name: str
+    box_mm: Box
+    permittivity: complex | None
+    thickness_mm: float | None = None
+    metal: bool = False
+
+    @property
+    def centre_mm(self) -> tuple[float, float]:
+        """Middle of the box."""
+        return (self.box_mm[0] + self.box_mm[2]) / 2, (self.box_mm[1] + self.box_mm[3]) / 2
+
+
+def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
+    """Return the plates in the content of truth.json: name, centre_mm, size_mm, and permittivity or metal each.
+
+    Raises
+    ------
+    DataError
+        if the content is invalid.
+    """
+    try:
+        return tuple(_plate(p) for p in truth["plates"])
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as e:
+        raise DataError(
+            f"the content of the truth file is invalid: {type(e).__name__}: {e}",
+            "expected plates = [{name, centre_mm, size_mm, permittivity or metal}]",
+            code=ErrorCode.VALUE_INVALID,
+        ) from None
+
+
+Plates = tuple[TruthPlate, ...]
+
+
+def read_truth(path: Path) -> tuple[TruthPlate, ...]:
+    """Read the plates of a truth.json. Raises DataError."""
+    remedy = f"give the one that polysight simulate wrote beside its data, or move {path.name} away"
+    try:
+        return truth_plates(read_json(path))
+    except DataError as e:
+        raise DataError(f"{path}: {e.what}", e.why, remedy, code=e.code) from None
+    except (OSError, ValueError) as e:
+        raise DataError(
+            f"{path}: cannot be read as truth: {e}", "another program's file, or damaged", remedy,
+            code=ErrorCode.FILE_UNREADABLE,
+        ) from None  # fmt: skip
+
+
+def specimen_seed(path: Path) -> int | None:
+    """Return the seed of the plates' random permittivities (`specimen_spread`) in a truth.json; None if not random.
+
+    Raises DataError.
+    """
+    read_truth(path)
+    scene = read_json(path).get("scene")
+    spread = scene.get("specimen_spread") if isinstance(scene, dict) else None
+    return scene.get("seed") if isinstance(scene, dict) and isinstance(spread, list) and any(spread) else None
+
+
+def find_truth(folder: Path) -> tuple[Plates, str]:
+    """Read the plates of a scan folder's truth.json, if there is one.
+
+    Returns
+    -------
+    plates, note
+        No plates without the file; no plates and the reason, in one line, if the file is invalid.
+    """
+    path = folder / TRUTH
+    if not path.exists():
+        return (), ""
+    try:
+        return read_truth(path), ""
+    except DataError as e:
+        return (), f"{e.what}; {e.why}. The truth is not used.".replace("\n", " ")
+
+
+def _plate(raw: Mapping[str, Any]) -> TruthPlate:
+    cx, cy = (float(c) for c in raw["centre_mm"])
+    w, h = (float(s) for s in raw["size_mm"])
+    eps = None
+    metal = bool(raw.get("metal", False))
+    if not metal and not raw.get("layers") and raw.get("strips_deg") is None:
+        re, loss = raw["permittivity"]
+        eps = complex(float(re), -float(loss))
+    thickness = raw.get("thickness_mm")
+    if not np.isfinite([cx, cy, w, h, *([] if eps is None else [eps.real, eps.imag])]).all():
+        raise ValueError(f"a number of plate {raw['name']} is not finite")
+    box = (cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2)
+    return TruthPlate(str(raw["name"]), box, eps, None if thickness is None else float(thickness), metal)
+
+
+def match_truth(patches: Iterable[Patch], plates: Iterable[TruthPlate]) -> dict[int, TruthPlate]:
+    """Return patch label to plate: the patch's centre lies in the plate; of several patches the nearest gets it."""
+    pairs = []
+    for plate in plates:
+        x0, y0, x1, y1 = plate.box_mm
+        for patch in patches:
+            x, y = patch.centre_mm
+            if x0 <= x <= x1 and y0 <= y <= y1:
+                distance = float(np.hypot(x - plate.centre_mm[0], y - plate.centre_mm[1]))
+                pairs.append((distance, patch.label, plate))
+    out: dict[int, TruthPlate] = {}
+    for _, label, plate in sorted(pairs, key=lambda p: p[0]):
+        if label not in out and all(p is not plate for p in out.values()):
+            out[label] = plate
+    return out
+
 
 METALS = ("metal", "copper", "aluminium", "aluminum", "steel", "brass", "iron")
 SPECIMEN = "#"
@@ -160,19 +280,6 @@ def pack_labels(labels: Labels) -> bytes:
     return (json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
 
 
-def labels_of(found: MaterialsResult, description: str = "") -> Labels:
-    """Return boxes around the interiors of a result's patches, in pixels, with unique names as drawn or classified."""
-    out: dict[str, Box] = {}
-    for r in found.patches:
-        named = r.verdict.name if r.verdict is not None else None
-        name = found.boxes.get(r.patch.label) or ("metal" if r.patch.label == found.metal.label else named or "patch")
-        inside = r.patch.interior if r.patch.interior.any() else r.patch.mask
-        rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-        key = name if name not in out else f"{name} ({r.patch.label})"
-        out[key] = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
-    return Labels(out, description=description)
-
-
 def patches_from_plates(
     plates: Sequence[TruthPlate], x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float
 ) -> tuple[Segmentation, dict[int, str]]:
@@ -236,3 +343,164 @@ def patches_from_labels(
         labels[mask] = n
         names[n] = name
     return Segmentation(labels, tuple(patches)), names
+
+
+LONGEST_NAME = 80
+RESERVED = ("unknown", "none of these")
+"""Words that the classifier uses."""
+_TOLERANCE_MM = 0.01  # files hold three decimals
+_HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]")  # invisible characters
+
+
+def clean_name(text: str, kind: str = "name") -> str:
+    """Return a name in Unicode form NFC, with trimmed spaces; `kind` is its description in errors.
+
+    Raises
+    ------
+    DataError
+        if it is empty, longer than `LONGEST_NAME`, has control characters, is a plain number or a reserved word.
+    """
+    name = re.sub(" +", " ", unicodedata.normalize("NFC", text).strip())
+    shown = name if len(name) <= 40 else f"{name[:40]}..."
+    wrong = ""
+    if not name:
+        wrong = "it is empty"
+    elif len(name) > LONGEST_NAME:
+        wrong = f"it has {len(name)} characters, the limit is {LONGEST_NAME}"
+    elif _HIDDEN.search(name) or any(unicodedata.category(c) in ("Cc", "Cs", "Co", "Zl", "Zp") for c in name):
+        wrong = "it has control characters, which figures and tables cannot show"
+    elif kind == "name" and name.casefold() in RESERVED:
+        wrong = "the classifier uses this word for unknown materials"
+    elif kind == "name" and name.isdecimal():
+        wrong = "a plain number is the number of a patch"
+    if wrong:
+        raise DataError(
+            f"{kind} {shown!a} cannot be used", wrong, "give another one, such as oak or PMMA 3 mm",
+            code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
+    return name
+
+
+def box_name(text: str) -> str:
+    """Clean the name of a box: material or material#specimen. Raises DataError as :func:`clean_name`."""
+    material, mark, specimen = text.partition(SPECIMEN)
+    if not mark:
+        return clean_name(material)
+    return f"{clean_name(material)}{SPECIMEN}{clean_name(specimen, 'specimen')}"
+
+
+def image_extent_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Box:
+    """Return the outer edges (x0, y0, x1, y1) of an image, millimetres from its centre."""
+    x, y = axis_mm(x_m), axis_mm(y_m)
+    dx, dy = float(x[1] - x[0]) / 2, float(y[1] - y[0]) / 2
+    return float(x[0]) - dx, float(y[0]) - dy, float(x[-1]) + dx, float(y[-1]) + dy
+
+
+def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: Mask | None = None) -> Labels:
+    """Check labels for training; return them in millimetres, with clean names and the metal box.
+
+    Parameters
+    ----------
+    labels
+        Boxes of an image.
+    x_m, y_m
+        Its axes.
+    valid
+        bool [ny, nx], illuminated pixels; None: all.
+
+    Raises
+    ------
+    DataError
+        if a box is empty, not finite, outside the image or without a valid pixel; if two boxes overlap; if a name is
+        invalid or used twice; if there are several boxes and the metal reference is not known.
+    """
+    given = labels.in_mm(x_m, y_m)
+    boxes, extent = {}, image_extent_mm(x_m, y_m)
+    for name, box in given.boxes.items():
+        clean = box_name(name)
+        if twin := next((other for other in boxes if other.casefold() == clean.casefold()), None):
+            raise name_taken(clean, twin)
+        boxes[clean] = _checked_box(clean, box, extent)
+        mask = box_mask(box, x_m, y_m)
+        if not (mask if valid is None else mask & valid).any():
+            raise DataError(
+                f"box of {clean}, {format_box(box)}: no scanned pixel",
+                "it is smaller than a pixel, or outside the scanned area",
+                "draw it where labels.png shows the material",
+                code=ErrorCode.NO_DATA,
+            )
+    for (one, a), (other, b) in combinations(boxes.items(), 2):
+        _check_apart(one, a, other, b)
+    specimens = {box_name(n): clean_name(s, "specimen") for n, s in given.specimens.items()}
+    metal = None if given.metal is None else box_name(given.metal)
+    missing = [n for n in (*specimens, *([] if metal is None else [metal])) if n not in boxes]
+    if missing:
+        raise no_box(missing[0], boxes)
+    return replace(given, boxes=boxes, specimens=specimens, metal=metal or _metal_by_name(boxes))
+
+
+def name_taken(name: str, twin: str) -> DataError:
+    """Return the error for a name that exists already."""
+    as_said = "" if name == twin else f" (as {twin})"
+    return DataError(
+        f"the name {name} exists already{as_said}",
+        "each box needs its own name",
+        f"name a second piece of the same material {material_of(name)}{SPECIMEN}2;"
+        f" to move a box: --remove {twin} --box {twin}=x0,y0,x1,y1",
+        code=ErrorCode.NAME_TAKEN,
+    )
+
+
+def no_box(name: str, boxes: Mapping[str, Any]) -> DataError:
+    """Return the error for an unknown name of a box."""
+    known = ", ".join(boxes) if boxes else "there are none"
+    return DataError(
+        f"no box is called {name}", f"the boxes: {known}", "polysight label SCAN --list shows them",
+        code=ErrorCode.KEY_UNKNOWN,
+    )  # fmt: skip
+
+
+def _checked_box(name: str, box: Box, extent: Box) -> Box:
+    if not all(math.isfinite(b) for b in box) or not (box[0] < box[2] and box[1] < box[3]):
+        raise DataError(
+            f"box of {name}, {', '.join(f'{b:g}' for b in box)}: it is empty",
+            "x0 must be below x1 and y0 below y1, in millimetres from the image centre",
+            f"--box {name}=x0,y0,x1,y1 with the lower left and the upper right corner",
+            code=ErrorCode.VALUE_INVALID,
+        )
+    over = max(extent[0] - box[0], extent[1] - box[1], box[2] - extent[2], box[3] - extent[3])
+    if over > _TOLERANCE_MM:
+        raise DataError(
+            f"box of {name}, {format_box(box)}, reaches {over:.1f} mm outside the image",
+            f"the image spans {format_box(extent)} from its centre",
+            "draw the box inside the image, or scan again with the plate nearer to the centre",
+            code=ErrorCode.VALUE_INVALID,
+        )
+    return box
+
+
+def _check_apart(one: str, a: Box, other: str, b: Box) -> None:
+    across, up = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
+    if across > _TOLERANCE_MM and up > _TOLERANCE_MM:
+        raise DataError(
+            f"the boxes of {one} and {other} overlap by {across:.1f} x {up:.1f} mm",
+            f"pixels of one material would count as another; {one}: {format_box(a)}; {other}: {format_box(b)}",
+            "make one of them smaller: a box lies inside its material, 5 mm or more from the edge",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
+
+
+def _metal_by_name(boxes: Mapping[str, Box]) -> str | None:
+    """Return the only box with a metal's name. Raises DataError if there are several boxes and not exactly one."""
+    metals = [name for name in boxes if is_metal(material_of(name))]
+    if len(metals) == 1:
+        return metals[0]
+    if len(boxes) > 1:
+        found = f"{' and '.join(metals)} are possible" if metals else "no name is that of a metal"
+        raise DataError(
+            f"the metal reference among the {len(boxes)} boxes is not known: {found}",
+            "training data are relative to metal in the same scan",
+            f"add --metal NAME: {', '.join(metals or boxes)}",
+            code=ErrorCode.KEY_MISSING,
+        )
+    return None

@@ -1,25 +1,35 @@
-"""Stacks of layers: sheets thinner than the wave, sheets on metal, liquids behind a container's wall.
+"""Stacks of layers: sheets thinner than the wave, sheets on metal, liquids behind a container's wall; their fit.
 
 Eq. 3 of the paper holds for one interface. A sheet has two, a filled container three, and the echoes of the rear ones
 are as strong as the first. Here the model is the whole stack (:func:`polysight.polarimetry.multilayer`), and the
 data are those of the sub-bands of the sweep (`Spectrum`, `Bands`).
-:func:`polysight.materials.layer_fit.fit_layer` fits the unknown layer.
+
+`fit_layer` fits the one unknown layer: its permittivity, and its thickness if it is not known. The solution has the
+least chi-square, with the full covariance of the data (errors common to all sub-bands do not average out, differences
+between them are known better) and the incidence angle as a nuisance with its prior. Start values come from a grid over
+index, loss and phase, so that no branch (half a wave more in the sheet) is missed. Error bars are those of the
+curvature, or of samples of the posterior if the valley is bent. Other solutions that the data do not exclude are listed
+as rivals.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
 from polysight.imaging import window_weights
+from polysight.materials.measure import format_permittivity
 from polysight.polarimetry import multilayer
 from polysight_shared.config import Chirp
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -227,3 +237,374 @@ def check_stack(stack: Sequence[Layer]) -> None:
                 "give eps' of at least 1 and eps'' of at least 0; a metal layer as the word metal",
                 code=ErrorCode.VALUE_INVALID,
             )
+
+
+Real = npt.NDArray[np.float64]
+REAL_RANGE = (1.0, 40.0)
+LOSS_RANGE = (0.0, 60.0)
+"""Search ranges of the permittivity: from air to beyond water at these frequencies (9.4 - j18)."""
+THICKNESS_RANGE_M = (0.1e-3, 12e-3)
+"""Search range of an unknown thickness."""
+START_PHASE_RAD = 0.25
+"""Step of the start grid in the phase of the path through the layer and back: no valley is narrower."""
+LOSS_TANGENTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 2.0)
+INDEX_STEPS = 60
+STARTS = 24
+RIVAL = 9.0
+"""A second solution is a rival if its chi-square is within this of the best: three standard deviations, enlarged as the
+error bars if the model misses the data."""
+MAX_THICKNESS_M = 30e-3
+"""Largest thickness to fit."""
+UNLIKELY = 1e-3
+"""Probability of a larger chi-square below which the stack does not explain the data."""
+DETERMINED = 0.05
+"""Largest relative half width of 95 % regions of a fit that is not ambiguous."""
+_DRAWS = 1500
+_REACH = 4.0  # standard deviations
+_BENT = 1.15  # ratio of sampled to linear standard deviations above which the sampled ones are used
+
+
+@dataclass(frozen=True)
+class LayerFit:
+    """One solution.
+
+    Attributes
+    ----------
+    permittivity
+        eps' - j eps''.
+    thickness_m
+        Thickness of the unknown layer, fitted or given; None: half space.
+    std_real, std_loss, std_thickness_m
+        Standard deviations, enlarged by sqrt(chi-square per degree of freedom) if that is above 1. Zero for a given
+        thickness.
+    chi2, freedom
+        Sum of squared residuals over their deviations; data minus unknowns.
+    rivals
+        Other solutions that the data do not exclude (chi-square within 9, or more if the model misses the data).
+    at_limit
+        Unknowns at an end of their search range, except a loss of zero.
+    covariance
+        float64 [2, 2] of (eps', eps''), or [3, 3] of (eps', eps'', thickness in metres) where that was fitted.
+    """
+
+    permittivity: complex
+    thickness_m: float | None
+    std_real: float
+    std_loss: float
+    std_thickness_m: float
+    chi2: float
+    freedom: int
+    rivals: tuple[LayerFit, ...] = field(default=())
+    at_limit: tuple[str, ...] = ()
+    covariance: Real | None = field(default=None, compare=False)
+
+    @property
+    def stretch(self) -> float:
+        """Chi-square per degree of freedom, at least 1."""
+        return max(1.0, self.chi2 / self.freedom) if self.freedom > 0 else 1.0
+
+    @property
+    def relative_std(self) -> float:
+        """The larger of the standard deviations of permittivity and of thickness, relative."""
+        own = float(np.hypot(self.std_real, self.std_loss)) / abs(self.permittivity)
+        return max(own, self.std_thickness_m / self.thickness_m if self.thickness_m else 0.0)
+
+    @property
+    def ambiguous(self) -> bool:
+        """True if there are rivals, or a fitted thickness makes permittivity or thickness uncertain by over 5 %."""
+        return bool(self.rivals) or (self.std_thickness_m > 0 and 2 * self.relative_std > DETERMINED)
+
+    def warnings(self) -> list[str]:
+        """Return the warnings about this fit, one sentence each."""
+        out = []
+        for r in self.rivals:
+            size = "" if r.thickness_m is None or not self.std_thickness_m else f" at {1e3 * r.thickness_m:.3g} mm"
+            out.append(
+                f"{format_permittivity(r.permittivity)}{size} is not excluded: chi-square {r.chi2:.1f}, the best has"
+                f" {self.chi2:.1f} for {self.freedom} degrees"
+            )
+        if not self.rivals and self.ambiguous:
+            out.append(
+                f"ambiguous: permittivity and thickness are determined to {100 * self.relative_std:.0f} % only;"
+                " measure the thickness"
+            )
+        if self.freedom > 0 and scipy.special.chdtrc(self.freedom, self.chi2) < UNLIKELY:
+            out.append(f"the stack does not explain the data: chi-square {self.chi2:.0f} for {self.freedom} degrees")
+        if self.std_real > 0.2 * self.permittivity.real or self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):
+            out.append("the data hardly depend on this layer: its error bar is large")
+        if self.at_limit:
+            out.append(f"{' and '.join(self.at_limit)} at the limit of the search range: the true value may be beyond")
+        return out
+
+
+def fit_layer(
+    bands: Bands, stack: Sequence[Layer], theta_rad: float, thickness_range_m: tuple[float, float] | None = None
+) -> LayerFit:
+    """Fit the permittivity of the one layer whose permittivity is None, and its thickness if a range is given.
+
+    Parameters
+    ----------
+    bands
+        The measurement.
+    stack
+        Layers in the order the wave meets them, exactly one of unknown permittivity.
+    theta_rad
+        Incidence angle in air.
+    thickness_range_m
+        Range for fitting the unknown layer's thickness; None: the layer's own `thickness_m` or `thickness_range_m`.
+
+    Returns
+    -------
+    LayerFit
+        The best solution with its error bars; see `ambiguous`, `rivals` and `warnings()`.
+
+    Raises
+    ------
+    PolysightError
+        if not exactly one layer is unknown, or a thickness is missing.
+    DataError
+        with fewer data than unknowns.
+    """
+    at = [i for i, layer in enumerate(stack) if layer.permittivity is None]
+    if len(at) != 1:
+        raise PolysightError(
+            f"{len(at)} layers of unknown permittivity",
+            "one can be fitted",
+            "give the permittivity of the others",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
+    check_range(thickness_range_m or stack[at[0]].thickness_range_m)
+    model = _Model(bands, tuple(stack), at[0], theta_rad, thickness_range_m or stack[at[0]].thickness_range_m)
+    if model.freedom < 0:
+        raise DataError(
+            f"{model.data} numbers for {model.unknowns} unknowns",
+            "one sub-band's ratio does not determine a thickness",
+            "give more sub-bands, the amplitude, or the thickness",
+            code=ErrorCode.NOT_ENOUGH_DATA,
+        )
+    rough = sorted((model.solve(start, precision=1e-3) for start in model.starts()), key=lambda one: one.chi2)
+    level = rough[0].chi2 + 3 * RIVAL * model.fit(rough[0], drawn=False).stretch
+    found = sorted((model.solve(one.x) for one in _apart(rough, level, 0.01)), key=lambda one: one.chi2)
+    level = found[0].chi2 + RIVAL * model.fit(found[0], drawn=False).stretch
+    near = [model.fit(one, drawn=True) for one in _apart(found, level, 1e-3)]
+    best, rivals = near[0], list[LayerFit]()
+    for other in near[1:]:
+        if all(_differ(other, known) for known in (best, *rivals)):
+            rivals.append(other)
+    return replace(best, rivals=tuple(rivals))
+
+
+def check_range(thickness_range_m: tuple[float, float] | None) -> None:
+    """Raise PolysightError if the search range is too large for a sweep of a few GHz."""
+    if thickness_range_m is not None and thickness_range_m[1] > MAX_THICKNESS_M:
+        raise PolysightError(
+            f"a thickness of up to {1e3 * thickness_range_m[1]:g} mm",
+            f"above {1e3 * MAX_THICKNESS_M:g} mm a layer has too many half waves to distinguish them",
+            "narrow the range, or measure the thickness; a thick lossy layer is a half space",
+            code=ErrorCode.VALUE_INVALID,
+        )
+
+
+def _differ(a: LayerFit, b: LayerFit) -> bool:
+    """Return true if two solutions differ by more than their error bars and the solver's precision."""
+    real = abs(a.permittivity.real - b.permittivity.real)
+    loss = abs(a.permittivity.imag - b.permittivity.imag)
+    thick = abs((a.thickness_m or 0.0) - (b.thickness_m or 0.0))
+    return bool(
+        real > 2 * min(a.std_real, b.std_real) + 1e-3 * abs(b.permittivity)
+        or loss > 2 * min(a.std_loss, b.std_loss) + 1e-3 * abs(b.permittivity)
+        or thick > 2 * min(a.std_thickness_m, b.std_thickness_m) + 1e-3 * (b.thickness_m or 0.0)
+    )
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Result of the solver: unknowns, chi-square, Jacobian of the residuals, and active bounds."""
+
+    x: Real
+    chi2: float
+    jacobian: Real
+    active: npt.NDArray[np.intp]
+
+
+def _apart(found: Sequence[_Solution], level: float, relative: float) -> list[_Solution]:
+    """Return solutions up to a chi-square `level`, without repetitions (closer than `relative`), best first."""
+    out: list[_Solution] = []
+    for one in found:
+        if one.chi2 <= level and all(
+            np.any(np.abs(one.x - o.x) > relative * np.maximum(np.abs(o.x), 0.1)) for o in out
+        ):
+            out.append(one)
+    return out
+
+
+class _Model:
+    """Residuals of one fit. Unknowns: eps', eps'', the thickness in mm if fitted, the angle's error over its deviation.
+
+    The last only if the angle has a deviation; it is no unknown of the layer and has its own residual (the prior).
+    """
+
+    def __init__(
+        self,
+        bands: Bands,
+        stack: tuple[Layer, ...],
+        at: int,
+        theta_rad: float,
+        thickness_range_m: tuple[float, float] | None,
+    ) -> None:
+        self.sized = thickness_range_m is not None
+        check_stack(
+            [replace(layer, thickness_m=1.0) if self.sized and i == at else layer for i, layer in enumerate(stack)]
+        )
+        self.bands, self.stack, self.at, self.theta_rad = bands, stack, at, theta_rad
+        self.range_mm = tuple(1e3 * d for d in thickness_range_m or (0.0, 0.0))
+        self.turned = bands.theta_std_rad > 0
+        limits = [REAL_RANGE, LOSS_RANGE, *([self.range_mm] * self.sized), *([(-8.0, 8.0)] * self.turned)]
+        self.lower, self.upper = (np.array(end, np.float64) for end in zip(*limits, strict=True))
+        self.unknowns = 2 + self.sized
+        self.data = (2 if bands.amplitude_h is None else 3) * bands.inverse_ratio.size
+        self.freedom = self.data - self.unknowns
+        self.whiten = np.linalg.inv(np.linalg.cholesky(bands.data_covariance))
+        self.wavenumber = 2 * np.pi * float(np.mean(bands.spectrum.frequency_hz)) / SPEED_OF_LIGHT_M_S * 1e-3  # per mm
+
+    def residuals(self, x: npt.ArrayLike, thin: int = 1) -> Real:
+        """Return normalised residuals, [..., data (+ 1)], of unknowns [..., n]; with every `thin`-th frequency."""
+        x = np.asarray(x, np.float64)
+        wide = x[..., None, None, :]
+        eps: list[npt.ArrayLike] = [
+            wide[..., 0] - 1j * wide[..., 1] if i == self.at else complex(layer.permittivity or 1.0)
+            for i, layer in enumerate(self.stack)
+        ]
+        thick: list[npt.ArrayLike] = [np.inf if y.thickness_m is None else y.thickness_m for y in self.stack]
+        if self.sized:
+            thick[self.at] = wide[..., 2] * 1e-3
+        theta = self.theta_rad + (self.bands.theta_std_rad * wide[..., -1] if self.turned else 0.0)
+        spectrum = self.bands.spectrum.thinned(thin) if thin > 1 else self.bands.spectrum
+        q, h = average(eps, thick, spectrum, theta)
+        if self.turned:
+            q = q * np.exp(1j * self.bands.phase_per_angle * self.bands.theta_std_rad * x[..., -1:])
+        miss = q - self.bands.inverse_ratio
+        parts = np.stack([miss.real, miss.imag], axis=-1).reshape(*miss.shape[:-1], -1)
+        if self.bands.amplitude_h is not None:
+            parts = np.concatenate([parts, h - self.bands.amplitude_h], axis=-1)
+        out = np.nan_to_num(parts @ self.whiten.T, nan=1e6, posinf=1e6, neginf=-1e6)
+        return np.concatenate([out, x[..., -1:]], axis=-1) if self.turned else out
+
+    def starts(self) -> list[Real]:
+        """Return local minima of chi-square on a grid of index, phase and loss, best first."""
+        sine2 = float(np.sin(self.theta_rad) ** 2)
+        low, high = (float(np.sqrt(max(real - sine2, 1e-3))) for real in REAL_RANGE)
+        known_mm = 1e3 * (self.stack[self.at].thickness_m or 0.0)
+        axes = [np.geomspace(low, high, INDEX_STEPS), np.array(LOSS_TANGENTS)]
+        if self.sized:
+            most = 2 * self.wavenumber * self.range_mm[1] * high
+            axes.append(np.linspace(0.0, most, int(most / START_PHASE_RAD) + 2)[1:])
+        else:
+            steps = max(INDEX_STEPS, int(2 * self.wavenumber * known_mm * (high - low) / START_PHASE_RAD))
+            axes[0] = np.linspace(low, high, steps)
+            axes[1] = np.geomspace(0.02, LOSS_RANGE[1] + 0.02, 25) - 0.02
+        mesh = np.meshgrid(*axes, indexing="ij")
+        real = mesh[0] ** 2 + sine2
+        x = [real, np.minimum(mesh[1] * real, LOSS_RANGE[1]) if self.sized else mesh[1]]
+        out = np.zeros(real.shape, bool)
+        if self.sized:
+            x.append(mesh[2] / (2 * self.wavenumber * mesh[0]))
+            out = (x[2] < self.range_mm[0]) | (x[2] > self.range_mm[1])
+        grid = np.stack([*x, *([np.zeros(real.shape)] * self.turned)], axis=-1)
+        chi2 = np.full(real.shape, np.inf)
+        # A few frequencies of a sub-band are enough for start values.
+        chi2[~out] = np.sum(self.residuals(grid[~out], thin=6) ** 2, axis=-1)
+        valleys = (chi2 == scipy.ndimage.minimum_filter(chi2, size=3, mode="nearest")) & ~out
+        index = np.argwhere(valleys)
+        order = np.argsort(chi2[tuple(index.T)])[:STARTS]
+        return [grid[tuple(one)] for one in index[order]]
+
+    def _slopes(self, x: Real) -> Real:
+        """Return the Jacobian of the residuals, [data, n], by central differences."""
+        step = np.diag(1e-6 * np.maximum(np.abs(x), 0.1))
+        apart = self.residuals(np.concatenate([x + step, x - step]))
+        return ((apart[: x.size] - apart[x.size :]) / (2 * np.diag(step)[:, None])).T
+
+    def solve(self, start: Real, precision: float = 1e-10) -> _Solution:
+        """Solve by least squares from one start."""
+        width = self.upper - self.lower
+        done = scipy.optimize.least_squares(
+            self.residuals,
+            np.clip(start, self.lower + 1e-9 * width, self.upper - 1e-9 * width),
+            bounds=(self.lower, self.upper),
+            x_scale="jac",
+            jac=cast("Any", self._slopes),  # scipy-stubs accept only a name
+            xtol=precision,
+            ftol=precision,
+            gtol=precision,
+            max_nfev=200,
+        )
+        # At a bound (no loss) the solver's Jacobian still has the slope for the error bar.
+        return _Solution(done.x, float(2 * done.cost), done.jac, done.active_mask)
+
+    def fit(self, one: _Solution, drawn: bool) -> LayerFit:
+        """Return a solution with its error bars; by samples of the posterior if `drawn` and the valley is bent."""
+        n = self.unknowns
+        covariance = np.asarray(np.linalg.pinv(one.jacobian.T @ one.jacobian), np.float64)
+        own = self._drawn(one, covariance) if drawn else covariance[:n, :n]
+        wider = max(1.0, one.chi2 / self.freedom) if self.freedom > 0 else 1.0
+        units = np.array([1.0, 1.0, 1e-3])[:n]
+        own = np.asarray(wider * own * np.outer(units, units), np.float64)
+        std = np.sqrt(np.maximum(np.diag(own), 0.0))
+        ends = zip(("the real part", "the loss", "the thickness"), one.active, (True, False, True), strict=False)
+        return LayerFit(
+            complex(one.x[0], -one.x[1]),
+            float(one.x[2]) * 1e-3 if self.sized else self.stack[self.at].thickness_m,
+            float(std[0]),
+            float(std[1]),
+            float(std[2]) if self.sized else 0.0,
+            one.chi2,
+            self.freedom,
+            at_limit=tuple(name for name, end, both in itertools.islice(ends, n) if end > 0 or (both and end < 0)),
+            covariance=own,
+        )
+
+    def _drawn(self, one: _Solution, covariance: Real) -> Real:
+        """Return second moments of the posterior about a solution, [unknowns, unknowns]; linear in straight valleys.
+
+        By importance sampling along index and phase, where the valley is straighter than in thickness.
+        """
+        n, x = self.unknowns, one.x
+        to_z = self._straight(x)
+        spread = to_z @ covariance @ to_z.T
+        spread = spread + np.diag(1e-12 * np.maximum(np.diag(spread), 1e-18))
+        # A wide proposal (Student's t, five degrees of freedom); beyond _REACH there is another valley: a rival.
+        rng, freedom = np.random.default_rng(0), 5.0
+        unit = rng.standard_normal((_DRAWS, x.size)) / np.sqrt(rng.chisquare(freedom, (_DRAWS, 1)) / freedom)
+        unit = 1.15 * unit[np.sum(unit**2, axis=1) < (_REACH / 1.15) ** 2]
+        at = self._from_straight(x, unit @ np.linalg.cholesky(spread).T)
+        inside = np.all((at >= self.lower) & (at <= self.upper), axis=-1)
+        linear = covariance[:n, :n]
+        if not np.any(inside):
+            return linear
+        at, unit = at[inside], unit[inside]
+        log = -0.5 * np.sum(self.residuals(at) ** 2, axis=-1)
+        log += (freedom + x.size) / 2 * np.log1p(np.sum((unit / 1.15) ** 2, axis=1) / freedom)
+        weight = np.exp(log - log.max())
+        weight /= weight.sum()
+        away = (at - x)[:, :n]
+        second = (away * weight[:, None]).T @ away
+        ratio = np.sqrt(np.diag(second) / np.maximum(np.diag(linear), 1e-30))
+        return second if np.any(ratio > _BENT) else linear
+
+    def _straight(self, x: Real) -> Real:
+        """Return derivatives of (eps', eps'', phase instead of thickness, angle) by the unknowns, [n, n]."""
+        out = np.eye(x.size)
+        if self.sized:
+            index = float(np.sqrt(max(x[0] - np.sin(self.theta_rad) ** 2, 1e-3)))
+            out[2, 0], out[2, 2] = x[2] / (2 * index), index
+        return out
+
+    def _from_straight(self, x: Real, draws: Real) -> Real:
+        """Return unknowns [..., n] at samples (eps', eps'', thickness times index, angle) about x."""
+        out = x + draws
+        if self.sized:
+            sine2 = np.sin(self.theta_rad) ** 2
+            path = x[2] * np.sqrt(max(x[0] - sine2, 1e-3)) + draws[:, 2]
+            out[:, 2] = path / np.sqrt(np.maximum(out[:, 0] - sine2, 1e-3))
+        return out

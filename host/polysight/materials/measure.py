@@ -1,16 +1,29 @@
-"""Measure each patch (ratio, brightness, standard deviations) and refuse patches that are no flat plates."""
+"""Measure patches: ratio, brightness and their errors, the metal reference, and the permittivity.
+
+`measure_patch` gives the input of the joint inversion, `permittivity_of_patch` combines its result with the percentiles
+of the pixels. `check_patches` refuses patches that are no flat plates. `MetalReference` is the region that everything
+is divided by: given as a box or a patch, or found.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.materials.inversion import PatchMeasurement
-from polysight.materials.permittivity import inverse_spread, median_ratio
-from polysight.materials.segment import Mask, Patch, Segmentation
+from polysight.materials.inversion import (
+    MetalEvidence,
+    PatchEstimate,
+    PatchMeasurement,
+    slope,
+)
+from polysight.materials.segment import Box, Mask, Patch, Segmentation, box_mask
+from polysight.polarimetry import permittivity_from_ratio
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
 
 Image = npt.NDArray[np.complexfloating]
 
@@ -174,3 +187,306 @@ def ratio_sigma(
         noise = np.hypot(dark[1], np.abs(inverse) * dark[0]) / np.abs(h) / np.sqrt(2)
         sigma = np.hypot(np.nan_to_num(noise), systematic) / np.abs(inverse) ** 2
     return np.where(np.isfinite(sigma) & np.isfinite(h) & np.isfinite(v), sigma, np.nan).astype(np.float32)
+
+
+METAL_LIKE = 0.25
+"""|P - 1| below which no permittivity is given.
+
+A relative error d of P changes eps by about 4 d / |P - 1/P|: at |P - 1| = 0.25 the usual 3 % of P are already a quarter
+of the permittivity, and the error grows without bound towards P = 1.
+"""
+
+
+@dataclass(frozen=True)
+class Permittivity:
+    """Permittivity of one patch.
+
+    Attributes
+    ----------
+    value
+        eps' - j eps'' of the median ratio; None if the patch is metal-like.
+    real_range, imag_range
+        30th to 70th percentile of the real part and of the imaginary part over the pixels (the paper's choice); None if
+        metal-like.
+    real_std, loss_std
+        Standard error of eps' and of eps'', including the effect of the plate's place on the plane. None if metal-like.
+    ratio
+        Median polarisation ratio P.
+    inverse_std
+        Standard error of V / H, of its real part and of its imaginary part.
+    metal_distance
+        The smaller of |P - 1| and |1/P - 1|.
+    pixels
+        Pixels used.
+    covariance
+        float64 [2, 2] of the real and the imaginary part by the scene's error budget; None without one.
+    shares
+        Source of error to its share of that covariance's trace.
+    """
+
+    value: complex | None
+    real_range: tuple[float, float] | None
+    imag_range: tuple[float, float] | None
+    real_std: float | None
+    loss_std: float | None
+    ratio: complex
+    inverse_std: float
+    metal_distance: float
+    pixels: int
+    covariance: npt.NDArray[np.float64] | None = None
+    shares: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def dominated_by(self) -> str | None:
+        """The source with the largest share of the error."""
+        return max(self.shares, key=lambda s: self.shares[s]) if self.shares else None
+
+    @property
+    def metal_like(self) -> bool:
+        """True if P is known and too close to 1 for a permittivity."""
+        return bool(np.isfinite(self.ratio)) and not self.metal_distance >= METAL_LIKE
+
+
+def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
+    """Format a permittivity: `2.89 - j0.43` for a lossy medium, `2.89 + j27.30` for one with gain.
+
+    Parameters
+    ----------
+    value
+        eps' - j eps''.
+    digits
+        Digits behind the point.
+    width
+        Least width of the real part, for aligned columns.
+    """
+    real, imag = (round(float(part), digits) + 0.0 for part in (value.real, value.imag))  # + 0.0: no -0.00
+    return f"{real:{width}.{digits}f} {'+' if imag > 0 else '-'} j{abs(imag):.{digits}f}"
+
+
+NOTHING = Permittivity(None, None, None, None, None, complex(np.nan, np.nan), float("nan"), float("nan"), 0)
+"""Permittivity of a patch without a result."""
+
+
+def median_ratio(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating]) -> complex:
+    """Return a robust mean of P = H / V over pixels: the reciprocal of the median of V / H; NaN without usable pixels.
+
+    Dielectrics reflect s more strongly than p. With the strong channel in the denominator the noise of the ratio is
+    additive and symmetric even where V nearly vanishes; H / V itself has no mean there. Medians are taken of real and
+    imaginary part separately.
+    """
+    good = np.isfinite(h) & np.isfinite(v) & (h != 0)
+    if not good.any():
+        return complex(np.nan, np.nan)
+    inverse = v[good].astype(np.complex128) / h[good]
+    middle = complex(np.median(inverse.real), np.median(inverse.imag))
+    return 1 / middle if middle != 0 else complex(np.inf, 0.0)
+
+
+def inverse_spread(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating]) -> float:
+    """Return the standard deviation of V / H over pixels, of the real part and of the imaginary part (1.48 MAD)."""
+    good = np.isfinite(h) & np.isfinite(v) & (h != 0)
+    if not good.any():
+        return float("nan")
+    inverse = v[good].astype(np.complex128) / h[good]
+    parts = np.concatenate([inverse.real - np.median(inverse.real), inverse.imag - np.median(inverse.imag)])
+    return float(1.4826 * np.median(np.abs(parts)))
+
+
+def estimate_permittivity(
+    h: npt.NDArray[np.complexfloating],
+    v: npt.NDArray[np.complexfloating],
+    theta_rad: npt.ArrayLike,
+) -> Permittivity:
+    """Estimate the permittivity of one patch from its metal-referenced pixels, with its error by the delta method.
+
+    The error of V / H is the spread of the pixels, **not** divided by the root of their number: the main errors inside
+    a patch, diffraction at its edges and the neighbours' sidelobes, are as wide as the patch and do not average out.
+    Differences between the illumination of H and V that vary more slowly than a patch are not included; a reference
+    over the whole plane removes them. Eq. 3 is holomorphic, so both parts of the permittivity have the standard error
+    |d eps / d q| times that of q = V / H.
+
+    On simulated scans (eight placements of eight materials, all disturbances) the error is half of what is claimed,
+    rms, and 94 % of the values lie within one standard error.
+
+    Parameters
+    ----------
+    h, v
+        complex [n], pixels of the interior, metal-referenced and leakage-corrected.
+    theta_rad
+        Incidence angle, one number or [n].
+    """
+    ratio = median_ratio(h, v)
+    good = np.isfinite(h) & np.isfinite(v) & (h != 0)
+    distance = min(abs(ratio - 1), abs(1 / ratio - 1) if ratio != 0 else np.inf)
+    n = int(good.sum())
+    inverse = 1 / ratio if ratio != 0 else complex(np.inf, 0.0)
+    inverse_std = inverse_spread(h, v)
+    if not distance >= METAL_LIKE:  # also when it is not a number
+        return Permittivity(None, None, None, None, None, ratio, inverse_std, float(distance), n)
+    theta = np.broadcast_to(np.asarray(theta_rad, np.float64), h.shape)[good]
+    value = complex(permittivity_from_ratio(ratio, float(theta.mean())))
+    pixels = permittivity_from_ratio(v[good].astype(np.complex128) / h[good], theta)
+    pixels = pixels[np.isfinite(pixels)]
+    re, im = (np.percentile(part, [30, 70]) for part in (pixels.real, pixels.imag))
+    std = float(abs(slope(inverse, float(theta.mean()))) * inverse_std)
+    return Permittivity(
+        value,
+        (float(re[0]), float(re[1])),
+        (float(im[0]), float(im[1])),
+        std,
+        std,
+        ratio,
+        inverse_std,
+        float(distance),
+        n,
+    )
+
+
+def permittivity_of_patch(
+    h: npt.NDArray[np.complexfloating],
+    v: npt.NDArray[np.complexfloating],
+    theta_rad: float,
+    estimate: PatchEstimate | None,
+) -> Permittivity:
+    """Return the permittivity of one patch with the error budget of the joint inversion.
+
+    Parameters
+    ----------
+    h, v
+        complex [n], pixels of the interior, metal-referenced and leakage-corrected, for the percentiles.
+    theta_rad
+        Incidence angle.
+    estimate
+        Result of the inversion; None for a patch that it did not include, which gets no permittivity.
+    """
+    alone = estimate_permittivity(h, v, theta_rad)
+    if estimate is None or estimate.permittivity is None or estimate.covariance is None:
+        return replace(alone, value=None, real_range=None, imag_range=None, real_std=None, loss_std=None)
+    ratio = 1 / estimate.inverse_ratio if estimate.inverse_ratio else complex(np.inf, 0.0)
+    real_std, loss_std = (float(s) for s in np.sqrt(np.diag(estimate.covariance)))
+    own = estimate.inverse_ratio_covariance
+    ranges = alone.real_range or (np.nan, np.nan), alone.imag_range or (np.nan, np.nan)
+    return replace(
+        alone,
+        value=estimate.permittivity,
+        real_range=ranges[0],
+        imag_range=ranges[1],
+        real_std=real_std,
+        loss_std=loss_std,
+        ratio=ratio,
+        inverse_std=float(np.sqrt(np.trace(own) / 2)),
+        covariance=estimate.covariance,
+        shares=estimate.shares,
+    )
+
+
+@dataclass(frozen=True)
+class MetalReference:
+    """The metal region and its origin.
+
+    Attributes
+    ----------
+    mask
+        bool [ny, nx], interior of the region.
+    label
+        Patch number; None for a given box outside all patches.
+    how
+        One sentence for the report.
+    given
+        True if the user or a calibration declares it metal.
+    evidence
+        Evidence of the rest of the scene; None if it was not computed.
+    """
+
+    mask: Mask
+    label: int | None
+    how: str
+    given: bool = False
+    evidence: MetalEvidence | None = None
+
+    @property
+    def certain(self) -> bool:
+        """True if the rest of the scene shows that it is metal, or it is given and nothing contradicts it."""
+        if self.evidence is None:
+            return self.given
+        return self.evidence.enough or (self.given and not self.evidence.against)
+
+
+def metal_in_box(
+    box_mm: Box, segmentation: Segmentation, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: Mask | None = None
+) -> MetalReference:
+    """Take the metal reference from a box (x0, y0, x1, y1), millimetres from the image centre.
+
+    If the box overlaps a found patch, only that patch's interior inside the box is used, so that the box may be too
+    large. Raises DataError if the box has no valid pixel.
+    """
+    mask = box_mask(box_mm, x_m, y_m)
+    if valid is not None:
+        mask &= valid
+    overlaps = [(int((p.interior & mask).sum()), p) for p in segmentation.patches]
+    count, patch = max(overlaps, key=lambda o: o[0], default=(0, None))
+    label = None
+    if patch is not None and count >= 9:
+        mask, label = mask & patch.interior, patch.label
+    if not mask.any():
+        raise DataError(
+            f"the metal box {tuple(round(b, 1) for b in box_mm)} mm holds no valid pixel",
+            "it lies outside the image; boxes are in millimetres from the image centre",
+            "give --metal x,y,w,h inside the image",
+            code=ErrorCode.NO_DATA,
+        )
+    where = "" if label is None else f", inside patch {label}"
+    return MetalReference(
+        mask, label, f"given as a box around ({', '.join(f'{b:.0f}' for b in box_mm)}) mm{where}", given=True
+    )
+
+
+def metal_by_label(label: int, segmentation: Segmentation) -> MetalReference:
+    """Take this patch as the metal reference. Raises DataError if there is no such patch."""
+    for p in segmentation.patches:
+        if p.label == label:
+            return MetalReference(p.interior, label, f"given as patch {label}", given=True)
+    raise DataError(
+        f"there is no patch {label} to take as metal",
+        f"{len(segmentation.patches)} patches were found",
+        code=ErrorCode.NO_DATA,
+    )
+
+
+def no_metal(usable: Mask) -> MetalReference:
+    """Return the reference of a scene without patches: images are scaled by their own mean brightness."""
+    return MetalReference(usable, None, "none: no patch was found")
+
+
+def find_metal(
+    h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating], segmentation: Segmentation
+) -> MetalReference | None:
+    """Return the patch that is brightest in both channels; None without patches.
+
+    The measure is median |H||V| over the interior. Metal reflects both polarisations fully (|r_s| = |r_p| = 1), every
+    dielectric loses most of p at these angles; the product does not depend on the unknown gains of H and V. The
+    brightest patch of a scene without metal is a dielectric: whether it is metal is another question
+    (:func:`metal_evidence`).
+
+    Parameters
+    ----------
+    h, v
+        complex [ny, nx], flattened by the footprint.
+    segmentation
+        Patches.
+    """
+    scores = sorted(
+        (
+            (float(np.median(np.abs(h[p.interior]) * np.abs(v[p.interior]))), p)
+            for p in segmentation.patches
+            if p.interior.any()
+        ),
+        key=lambda s: -s[0],
+    )
+    if not scores:
+        return None
+    best, patch = scores[0]
+    margin = best / scores[1][0] if len(scores) > 1 and scores[1][0] > 0 else float("inf")
+    beside = "the only patch found" if len(scores) == 1 else f"|H||V| {margin:.1f} times the next"
+    how = f"chosen as the patch that is brightest in both channels ({beside})"
+    return MetalReference(patch.interior, patch.label, how)

@@ -21,11 +21,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER
-from polysight.materials.knn import fit_weights
-from polysight.materials.library import Entry, Library
+from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, fit_weights
+from polysight.materials.library import Entry, Library, Real, Samples, majority
 from polysight.materials.result import MaterialsResult
-from polysight.materials.samples import Real, Samples, majority
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 

@@ -7,10 +7,14 @@ material, `permittivity_from_ratio` the permittivity from a polarisation ratio (
 """
 
 from polysight.polarimetry.calibrate import (
+    Leakage,
+    PlaneReference,
     calibrate,
     correct_leakage,
     divide_by_metal,
+    leakage_from_images,
     metal_gains,
+    plane_reference,
     ratio,
     remove_leakage,
     smooth,
@@ -23,36 +27,17 @@ from polysight.polarimetry.fresnel import (
     permittivity_from_ratio,
     ratio_from_permittivity,
 )
-from polysight.polarimetry.incidence import (
-    Incidence,
-    IncidenceChoice,
-    incidence_choice,
-    specular_incidence_rad,
-)
-from polysight.polarimetry.leakage import (
-    Leakage,
-    Standard,
-    common_direction,
-    estimate_axial_ratio,
-    estimate_leakage,
-    leakage_from_images,
-    strips_wave,
-)
-from polysight.polarimetry.reference import PlaneReference, plane_reference
+from polysight.polarimetry.incidence import Incidence, IncidenceChoice, incidence_choice, specular_incidence_rad
 
 __all__ = [
     "Incidence",
     "IncidenceChoice",
     "Leakage",
     "PlaneReference",
-    "Standard",
     "brewster_angle_rad",
     "calibrate",
-    "common_direction",
     "correct_leakage",
     "divide_by_metal",
-    "estimate_axial_ratio",
-    "estimate_leakage",
     "fresnel",
     "incidence_choice",
     "leakage_from_images",
@@ -65,6 +50,5 @@ __all__ = [
     "remove_leakage",
     "smooth",
     "specular_incidence_rad",
-    "strips_wave",
     "with_ratio",
 ]

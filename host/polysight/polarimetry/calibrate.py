@@ -1,4 +1,4 @@
-"""Metal reference, leakage and smoothing of the H and V images (section 6.2 of the paper).
+"""Metal reference, cross-polar leakage and smoothing of the H and V images (section 6.2 of the paper).
 
 Model of one pixel, for a transmitter that excites s and p equally:
 
@@ -7,18 +7,42 @@ Model of one pixel, for a transmitter that excites s and p equally:
 r_s and r_p are the reflection coefficients of the material, g_h and g_v complex gains, a and b the cross-polar leakages
 of the H and V receivers. A metal region (r_s = r_p) determines only g_h (1 + a) and g_v (1 + b): **metal at one
 orientation cannot separate leakage from gain**. Leakage is therefore given, or estimated from a second known material.
+
+A metal patch in the scene gives one number per channel (`calibrate`). A plate over the plane, scanned separately, gives
+one per pixel (`PlaneReference`), which also removes differences between H and V that vary over the plane (antenna
+patterns, illumination). Samples are referenced to the direct path, so that reference stays valid after a power cycle;
+geometry and boards must be the same, see :meth:`PlaneReference.check_rig`.
+
+Leakage is estimated from metal at two orientations (`leakage_from_images`). Metal strips with a pitch well below a
+wavelength reflect only the field along them. Strips rotated by psi from the vertical (s), flat on the plane at
+incidence theta, project the wave on w = (cos psi, sin psi cos theta): the current along them cancels the field along
+them and radiates both polarisations. TX sends s and p equally, so the reflected wave is proportional to w. Vertical
+strips reflect s alone, so V receives only leakage; horizontal strips reflect p alone, so H receives only leakage.
+
+Thin free wires are a good approximation. Wires with a diameter of a tenth of their pitch d reflect about 0.025 d /
+wavelength of the field across them (Marcuvitz, Waveguide Handbook, section 5.18: 0.003 at 0.5 mm). They reflect the
+field along them less than a plate, a common factor without influence. A printed board is unsuitable, for its substrate
+reflects both polarisations.
+
+With the wave e of each standard known up to a factor (distance and size), and the measured pair m = (H, V),
+
+    m ~ [[g_h, g_h a], [g_v b, g_v]] e
+
+is a homography of the projective line. Three different waves (the plate, and strips at two orientations) determine it
+up to one factor, by linear equations. More waves give a least-squares solution.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.imaging import Image, Images, Mask
+from polysight.imaging import Image, ImagedWith, Images, Mask
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError
 
@@ -145,3 +169,365 @@ def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
         weight = scipy.ndimage.gaussian_filter(good.astype(np.float64), sigma_px, mode="nearest")
         out = np.where(good, out / np.where(good, weight, 1.0), image)
     return out.astype(image.dtype)
+
+
+SMOOTH_MM = 8.0
+FLOOR_DB = -10.0
+MIN_PIXELS = 100
+
+
+@dataclass(frozen=True)
+class PlaneReference:
+    """Metal reference of both channels at every pixel.
+
+    Attributes
+    ----------
+    h, v
+        complex [ny, nx]: amplitudes of metal, with the phase of H / V in h, and v real; NaN where not valid.
+    valid
+        bool [ny, nx]: pixels where metal is strong enough in both channels.
+    x_m, y_m
+        Pixel centres, rig frame, metres.
+    spread
+        Standard deviation of the real and the imaginary part of V / H over the plate: noise and speckle.
+    how
+        One sentence for the report.
+    bands
+        References of the imaged sub-bands.
+    made_with
+        Settings that the gains depend on; None if unknown.
+    """
+
+    h: Image
+    v: Image
+    valid: Mask
+    x_m: npt.NDArray[np.float64]
+    y_m: npt.NDArray[np.float64]
+    spread: float
+    how: str
+    bands: tuple[PlaneReference, ...] = ()
+    made_with: ImagedWith | None = None
+
+    def apply(self, images: Images) -> Images:
+        """Divide both channels of another scan by the reference; NaN where it is not valid."""
+        return divide_by_metal(images, self.h, self.v)
+
+    def check_axes(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> None:
+        """Raise DataError if a scan has other pixels."""
+        same = all(
+            np.shape(own) == np.shape(other) and np.allclose(own, other, rtol=0, atol=1e-5)
+            for own, other in ((self.x_m, x_m), (self.y_m, y_m))
+        )
+        if not same:
+            raise DataError(
+                "the images of the metal reference and of this scan have different pixels",
+                "the reference was scanned with another [image], another geometry or another chirp",
+                "scan the metal plate with the same rig file; only [grid] may differ",
+                code=ErrorCode.MISMATCH,
+            )
+
+    def valid_on(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Return `valid` for a scan with these pixels. Raises DataError if its pixels differ."""
+        self.check_axes(x_m, y_m)
+        return self.valid
+
+    def check_rig(self, now: ImagedWith, name: str = "the metal reference") -> None:
+        """Raise DataError if the gains do not apply to images made with `now`; `name` is for the message."""
+        if self.made_with is None:
+            raise DataError(
+                f"{name} does not contain the rig that it was scanned with",
+                "an older release wrote it, so later changes of the rig cannot be detected",
+                "make it again from the same scan: `polysight calibrate metal SCAN`; one scan can be processed with"
+                " --reference SCAN instead",
+                code=ErrorCode.KEY_MISSING,
+            )
+        if found := self.made_with.differences(now):
+            raise DataError(
+                f"{name} is of another rig: {'; '.join(found)}",
+                "the rig or its file was changed after the scan of the metal plate, which changes the gains",
+                "empty calibration.metal, scan the metal plate again with the present rig, and calibrate with it; or"
+                " restore the rig file",
+                code=ErrorCode.MISMATCH,
+            )
+
+    def check_bands(self, count: int, name: str = "the metal reference") -> None:
+        """Raise DataError if the reference does not have `count` sub-bands; one band is always there."""
+        if count > 1 and len(self.bands) != count:
+            held = f"{len(self.bands)} sub-bands" if self.bands else "no sub-bands"
+            instead = f"--bands {len(self.bands)} uses those it has" if self.bands else "leave --bands out"
+            raise DataError(
+                f"{name} holds {held}, not {count}",
+                "each sub-band needs a metal reference in the same part of the sweep",
+                f"`polysight calibrate metal SCAN --bands {count}` adds them; or {instead}; or --reference SCAN",
+                code=ErrorCode.MISMATCH,
+            )
+
+    def facts(self) -> dict[str, Any]:
+        """Return the variation of the gains over the plane, for quality.json."""
+        at = self.valid
+        h, v = self.h[at], self.v[at]
+        out: dict[str, Any] = {"how": self.how, "share_of_plane": round(float(at.mean()), 4)}
+        for name, z in (("h", h), ("v", v), ("ratio", h / v)):
+            level = 20 * np.log10(np.abs(z))
+            out[f"{name}_variation_db"] = round(float(np.std(level)), 4)
+        turned = np.angle(h / v * np.conj(np.mean(h / v)))
+        out["ratio_variation_deg"] = round(float(np.degrees(np.std(turned))), 4)
+        out["spread"] = round(self.spread, 5)
+        if self.bands:
+            out["sub_bands"] = len(self.bands)
+        return out
+
+
+def plane_reference(
+    images: Images, smooth_mm: float = SMOOTH_MM, floor_db: float = FLOOR_DB, name: str = ""
+) -> PlaneReference:
+    """Make a reference from the images of a metal plate over the plane.
+
+    Amplitudes and H conj(V) are averaged over a Gaussian window, so a common phase of both channels (distance and tilt
+    of the plate) has no influence. A pixel is valid if both channels exceed `floor_db` within two widths of the window.
+
+    Parameters
+    ----------
+    images
+        Both channels, flattened by the footprint.
+    smooth_mm
+        Width (standard deviation) of the window, millimetres; the gains vary slowly, speckle does not.
+    floor_db
+        Lowest level relative to the plate's 90th percentile, in each channel.
+    name
+        Name of the scan, for the report.
+
+    Raises
+    ------
+    DataError
+        if the image shows no metal.
+    """
+    h, v, usable = images.h, images.v, images.usable
+    smooth_px = smooth_mm / 1e3 / abs(float(images.x_m[1] - images.x_m[0]))
+    power_h, power_v = (smooth(np.where(usable, np.abs(z) ** 2, 0.0).astype(np.float64), smooth_px) for z in (h, v))
+    strong = usable.copy()
+    for power in (power_h, power_v):
+        top = float(np.percentile(power[usable], 90)) if usable.any() else 0.0
+        strong &= power >= max(top * 10 ** (floor_db / 10), np.finfo(np.float32).tiny)
+    # The border of the image does not count as an edge of the plate.
+    inside = np.asarray(scipy.ndimage.binary_erosion(strong, _disk(round(2 * smooth_px)), border_value=1), bool)
+    if int(inside.sum()) < MIN_PIXELS:
+        raise DataError(
+            "the reference scan shows no metal plate",
+            "no area wider than the smoothing window is bright in both channels",
+            "scan a flat metal plate that covers the plane, larger than the grid on every side",
+            code=ErrorCode.NO_DATA,
+        )
+    cut_h, cut_v = (np.where(strong, z, complex(np.nan, np.nan)) for z in (h, v))
+    level_h, level_v = (np.sqrt(np.abs(smooth(np.abs(z) ** 2, smooth_px))) for z in (cut_h, cut_v))
+    cross = smooth(cut_h * np.conj(cut_v), smooth_px)
+    metal_h = np.where(inside, level_h * np.exp(1j * np.angle(cross)), np.nan).astype(np.result_type(h, np.complex64))
+    metal_v = np.where(inside, level_v, np.nan).astype(metal_h.dtype)
+    spread = _spread(h[inside] / metal_h[inside], v[inside] / metal_v[inside])
+    share = 100 * float(inside.mean())
+    how = f"a metal plate scanned on its own{f' ({name})' if name else ''}, by position on {share:.0f} % of the image"
+    return PlaneReference(metal_h, metal_v, inside, images.x_m, images.y_m, spread, how)
+
+
+def _spread(h: Image, v: Image) -> float:
+    """Return the standard deviation of the real and the imaginary part of V / H (median absolute deviation)."""
+    q = ratio(v, h)
+    q = q[np.isfinite(q)]
+    parts = np.concatenate([q.real - np.median(q.real), q.imag - np.median(q.imag)])
+    return 1.4826 * float(np.median(np.abs(parts - np.median(parts))))
+
+
+def _disk(radius: int) -> npt.NDArray[np.bool_]:
+    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    return x**2 + y**2 <= radius**2
+
+
+PLATE = (1.0, 1.0)
+"""The s and p reflected by a metal plate."""
+MIN_CONDITION = 0.02
+"""Smallest ratio of third to first singular value: below it the waves do not determine three unknowns."""
+Wave = tuple[complex, complex]
+
+
+@dataclass(frozen=True)
+class Standard:
+    """Measurement of a metal standard.
+
+    Attributes
+    ----------
+    measured
+        H and V, up to a common factor (:func:`common_direction`).
+    wave
+        Reflected s and p, up to a factor: :data:`PLATE` or :func:`strips_wave`.
+    """
+
+    measured: Wave
+    wave: Wave
+
+
+@dataclass(frozen=True)
+class Leakage:
+    """Leakage and imbalance: H = g_h (r_s + h r_p), V = g_v (r_p + v r_s).
+
+    Attributes
+    ----------
+    h, v
+        Leakage of p into H and of s into V: `leakage_h` and `leakage_v` of the rig file.
+    imbalance
+        g_h / g_v, complex.
+    residual
+        RMS misfit of the standards, as an angle in radians; zero if there are only as many as unknowns.
+    """
+
+    h: complex
+    v: complex
+    imbalance: complex
+    residual: float
+
+    def matrix(self) -> npt.NDArray[np.complex128]:
+        """Return the 2 x 2 matrix from (s, p) to (H, V), with g_v = 1."""
+        g = self.imbalance
+        return np.array([[g, g * self.h], [self.v, 1.0]], np.complex128)
+
+
+def strips_wave(psi_rad: float, theta_rad: float) -> Wave:
+    """Return the s and p reflected by ideal metal strips rotated by psi from the vertical; TX sends both equally.
+
+    With the signs of Eq. 2: -w (w_s + w_p) / |w|^2 with w = (cos psi, sin psi cos theta), so that strips along the
+    field reflect like a plate.
+
+    Raises
+    ------
+    PolysightError
+        if TX's field is across the strips (w_s = -w_p), which then reflect nothing.
+    """
+    w = np.array([np.cos(psi_rad), np.sin(psi_rad) * np.cos(theta_rad)])
+    total = float(w.sum())
+    if abs(total) < 0.1:
+        raise PolysightError(
+            f"strips at {np.degrees(psi_rad):.0f} degrees reflect almost nothing",
+            "the transmitter's field is across them",
+            "rotate them to 0 and 90 degrees",
+            code=ErrorCode.VALUE_INVALID,
+        )
+    s, p = -w * total / float(w @ w)
+    return complex(s), complex(p)
+
+
+def common_direction(h: Image, v: Image, mask: Mask | None = None) -> Wave:
+    """Return the common pair (H, V) of pixels, up to a factor: the first eigenvector of their 2 x 2 covariance.
+
+    A common phase or amplitude of both channels may vary from pixel to pixel.
+
+    Raises
+    ------
+    DataError
+        if there is no signal.
+    """
+    at = np.isfinite(h) & np.isfinite(v) & (True if mask is None else mask)
+    m = np.stack([h[at], v[at]]).astype(np.complex128)
+    if m.size == 0 or not np.any(m):
+        raise DataError(
+            "a metal standard has no signal",
+            "its region lies outside the image",
+            "correct the region",
+            code=ErrorCode.NO_DATA,
+        )
+    values, vectors = np.linalg.eigh(m @ m.conj().T)
+    pair = vectors[:, int(np.argmax(values))]
+    return complex(pair[0]), complex(pair[1])
+
+
+def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
+    """Estimate leakage of both boards and gain imbalance from three or more metal standards.
+
+    Raises
+    ------
+    DataError
+        if there are fewer than three, or their waves are too similar.
+    """
+    if len(standards) < 3:
+        raise DataError(
+            f"{len(standards)} metal standards for three unknowns",
+            "leakage of H, leakage of V and gain imbalance need three different waves",
+            "scan the plate, and strips at two orientations; or use the one-parameter axial ratio",
+            code=ErrorCode.NOT_ENOUGH_DATA,
+        )
+    m = np.array([s.measured for s in standards], np.complex128)
+    scale = np.sqrt(np.mean(np.abs(m / np.linalg.norm(m, axis=1, keepdims=True)) ** 2, axis=0))
+    m = m / scale
+    m /= np.linalg.norm(m, axis=1, keepdims=True)
+    e = np.array([s.wave for s in standards], np.complex128)
+    e /= np.linalg.norm(e, axis=1, keepdims=True)
+    # m x (M e) = 0: one equation per standard for the entries g_h, g_h a, g_v b, g_v of M.
+    rows = np.stack([m[:, 1] * e[:, 0], m[:, 1] * e[:, 1], -m[:, 0] * e[:, 0], -m[:, 0] * e[:, 1]], axis=1)
+    _, sizes, vh = np.linalg.svd(rows)
+    if sizes[2] < MIN_CONDITION * sizes[0]:
+        raise DataError(
+            "the metal standards do not separate leakage from gain",
+            "their waves are too similar: a plate reflects the same in every orientation, strips must be rotated",
+            "scan the plate, and strips at 0 and at 90 degrees",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
+    g_h, g_ha, g_vb, g_v = vh[3].conj() * np.array([scale[0], scale[0], scale[1], scale[1]])
+    fitted = (np.array([[g_h, g_ha], [g_vb, g_v]]) / scale[:, None] @ e.T).T
+    sine = np.abs(m[:, 1] * fitted[:, 0] - m[:, 0] * fitted[:, 1]) / np.linalg.norm(fitted, axis=1)
+    residual = float(np.sqrt(np.mean(np.minimum(sine, 1.0) ** 2))) if len(standards) > 3 else 0.0
+    return Leakage(complex(g_ha / g_h), complex(g_vb / g_v), complex(g_h / g_v), residual)
+
+
+def estimate_axial_ratio(plate: Standard, strips: Standard) -> Leakage:
+    """Estimate equal leakage of both boards (the authors' axial ratio) from the plate and strips in one orientation."""
+    # Relative to the plate (H, V) ~ (s + a p, p + a s).
+    h, v = (m / whole for m, whole in zip(strips.measured, plate.measured, strict=True))
+    s, p = strips.wave
+    size = float(np.hypot(abs(s), abs(p)) * np.hypot(abs(h), abs(v)))
+    if abs(s - p) * np.hypot(abs(h), abs(v)) < 0.1 * size or abs(v * p - h * s) < 1e-9 * size:
+        raise DataError(
+            "leakage cannot be estimated from these strips",
+            "they reflect s and p equally, like a plate",
+            "rotate them to 0 or to 90 degrees",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
+    a = (h * p - v * s) / (v * p - h * s)
+    return Leakage(a, a, plate.measured[0] / plate.measured[1], 0.0)
+
+
+def leakage_from_images(
+    plate: tuple[Image, Image], strips: Sequence[tuple[float, Image, Image]], mask: Mask, theta_rad: float
+) -> Leakage:
+    """Estimate leakage from images of a plate and of strips that cover the same plane.
+
+    The strips are divided by the plate pixel by pixel, which removes uneven illumination.
+
+    Parameters
+    ----------
+    plate
+        H and V of the plate, complex [ny, nx] (smoothed: h and v of a `PlaneReference`).
+    strips
+        (psi in radians from the vertical, H, V) of each orientation; one gives the axial ratio only.
+    mask
+        bool [ny, nx]: pixels where both are metal, without edges.
+    theta_rad
+        Incidence angle.
+
+    Returns
+    -------
+    Leakage
+        The imbalance is that of the plate's mean.
+
+    Raises
+    ------
+    DataError
+        as :func:`estimate_leakage`.
+    """
+    gain_h, gain_v = plate
+    relative = [
+        Standard(common_direction(ratio(h, gain_h), ratio(v, gain_v), mask), strips_wave(psi, theta_rad))
+        for psi, h, v in strips
+    ]
+    whole = Standard(PLATE, PLATE)
+    found = estimate_axial_ratio(whole, relative[0]) if len(relative) == 1 else estimate_leakage([whole, *relative])
+    mean = common_direction(gain_h, gain_v, mask)
+    # Relative to the plate g is (1 + b) / (1 + a); the plate itself is g_h (1 + a) / (g_v (1 + b)).
+    return Leakage(found.h, found.v, found.imbalance * mean[0] / mean[1], found.residual)

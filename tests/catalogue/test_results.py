@@ -11,8 +11,8 @@ from tests.support.refusals import refused
 from tests.support.scenes import COPPER, PET
 
 from polysight.catalogue import Pixels, compare, draw_comparison, draw_products, probe, result_of, thumbnail
-from polysight.catalogue.compare import SIGNIFICANT, scatter_of
 from polysight.catalogue.pictures import MAPS
+from polysight.catalogue.results import SIGNIFICANT, scatter_of
 from polysight.polarimetry import permittivity_from_ratio
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -25,12 +25,12 @@ def test_a_place_tells_its_own_pixel(processed):
     row, column = pixels.nearest(*CENTRE)
     answer = probe(processed / "one", *CENTRE)
     p = complex(pixels.p[row, column])
-    assert complex(answer["p"]["real"], answer["p"]["imag"]) == pytest.approx(p, abs=1e-4)
+    assert answer.p.value == pytest.approx(p, abs=1e-4)
     eps = complex(permittivity_from_ratio(p, pixels.theta_rad))
-    assert complex(answer["permittivity"]["real"], answer["permittivity"]["imag"]) == pytest.approx(eps, abs=1e-3)
-    assert answer["place_mm"] == pytest.approx([pixels.x_mm[column], pixels.y_mm[row]], abs=0.01)
-    assert answer["patch"]["truth"]["name"] == "PET"
-    assert answer["nearest"][0]["name"].startswith("PET")
+    assert answer.permittivity.value == pytest.approx(eps, abs=1e-3)
+    assert answer.place_mm == pytest.approx([pixels.x_mm[column], pixels.y_mm[row]], abs=0.01)
+    assert answer.patch.truth.name == "PET"
+    assert answer.nearest[0].name.startswith("PET")
 
 
 def test_the_error_of_a_pixel_is_that_of_draws(processed):
@@ -48,16 +48,16 @@ def test_the_error_of_a_pixel_is_that_of_draws(processed):
 
 def test_the_range_profile_has_its_peak_at_the_plate(processed):
     for plate in (COPPER, PET):
-        answer = probe(processed / "one", *plate["centre_mm"])["profile"]
-        for levels in answer["boards"].values():
-            assert abs(answer["path_m"][int(np.argmax(levels))]) < 0.03
+        answer = probe(processed / "one", *plate["centre_mm"]).profile
+        for levels in answer.boards.values():
+            assert abs(answer.path_m[int(np.argmax(levels))]) < 0.03
 
 
 def test_metal_has_no_permittivity_and_says_why(processed):
     answer = probe(processed / "one", *COPPER["centre_mm"])
-    assert answer["permittivity"] is None
-    assert "metal" in answer["why"]
-    assert answer["patch"]["metal_reference"]
+    assert answer.permittivity is None
+    assert "metal" in answer.why
+    assert answer.patch.metal_reference
 
 
 def test_places_outside_the_image_are_refused(processed):
@@ -69,21 +69,20 @@ def test_places_outside_the_image_are_refused(processed):
 def test_without_a_result_nothing_is_told_of_materials(tmp_path):
     judged_products(tmp_path, "none", careless=True)
     answer = probe(tmp_path, 0.0, 0.0)
-    assert (answer["permittivity"], answer["patch"], answer["nearest"]) == (None, None, [])
-    assert result_of(tmp_path)["referenced"] is False
-    assert {p["name"] for p in result_of(tmp_path)["pictures"]} <= {n for n in MAPS if n[0] in "hvp" and n != "p_sigma"}
+    assert (answer.permittivity, answer.patch, answer.nearest) == (None, None, [])
+    assert {p.name for p in result_of(tmp_path).pictures} <= {n for n in MAPS if n[0] in "hvp" and n != "p_sigma"}
 
 
 def test_a_scan_does_not_differ_from_itself(processed):
     found = compare(processed / "one", processed / "one")
     assert np.nanmax(np.abs(found.p)) == 0
-    assert found.to_dict()["significant_share"] == 0
-    assert all(pair["sigmas"] == 0 for pair in found.patches if pair["difference"])
+    assert found.figures().significant_share == 0
+    assert all(pair.sigmas == 0 for pair in found.patches if pair.difference)
 
 
 def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed):
     found = compare(processed / "one", processed / "two")
-    answer = [pair["sigmas"] for pair in found.patches if pair["sigmas"] is not None]
+    answer = [pair.sigmas for pair in found.patches if pair.sigmas is not None]
     assert answer
     assert max(answer) < 3
     assert (found.sigmas > 5).mean() < 0.05  # few pixels that are independent of each other

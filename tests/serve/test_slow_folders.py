@@ -68,7 +68,7 @@ def test_other_scans_are_read_while_one_folder_hangs(dead, view):
     for one in many:
         one.start()
     began = time.monotonic()
-    assert get(view, "/api/result?scan=alive")["scan_id"]
+    assert get(view, "/api/result?scan=alive")["extent_mm"]
     assert get(view, "/api/scans")["scans"]
     for one in many:
         one.join(20)

@@ -5,7 +5,6 @@ tags beside a scan. Of a processed scan, `result_of` gives the results as plain 
 `probe` reads one place; `compare` takes two scans. They share `Pixels`: images with permittivity and errors.
 """
 
-from polysight.catalogue.compare import DIFFERENCE, Comparison, compare, draw_comparison
 from polysight.catalogue.pictures import (
     AMPLITUDE,
     PHASE,
@@ -16,8 +15,17 @@ from polysight.catalogue.pictures import (
     draw_products,
     thumbnail,
 )
-from polysight.catalogue.probe import probe
-from polysight.catalogue.result import EXPORT, files_of, result_of
+from polysight.catalogue.results import (
+    DIFFERENCE,
+    EXPORT,
+    Comparison,
+    PermittivityDifference,
+    compare,
+    draw_comparison,
+    files_of,
+    probe,
+    result_of,
+)
 from polysight.catalogue.scans import (
     NOTES,
     PROGRAM,
@@ -41,6 +49,7 @@ __all__ = [
     "PROGRAM",
     "Comparison",
     "Notes",
+    "PermittivityDifference",
     "Picture",
     "Pixels",
     "Scans",

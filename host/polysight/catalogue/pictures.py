@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from polysight.imaging import Images
 from polysight.materials import axis_mm
 from polysight.polarimetry import permittivity_from_ratio, specular_incidence_rad
-from polysight.products import SavedProducts
+from polysight.products import MATERIALS, SavedProducts
+from polysight.results import PatchFigures, ScanMaterials
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -45,6 +46,16 @@ class Pixels(SavedProducts):
     def referenced(self) -> bool:
         """True if the images are relative to metal and the verdict allows a result."""
         return self.metal_referenced and (self.verdict is None or self.verdict.usable)
+
+    @cached_property
+    def results(self) -> ScanMaterials | None:
+        """Content of materials.json; None if only images were made. Raises DataError if it is damaged."""
+        return ScanMaterials.read(self.folder / MATERIALS)
+
+    @property
+    def figures(self) -> list[PatchFigures]:
+        """Patches; empty if only images were made."""
+        return [] if self.results is None else self.results.segments
 
     @cached_property
     def clear(self) -> NDArray[np.bool_]:
@@ -85,11 +96,9 @@ class Pixels(SavedProducts):
     @cached_property
     def theta_rad(self) -> float:
         """Incidence angle, from the error budget or the rig. Raises DataError."""
-        budget = self.materials.get("error_budget") or {}
-        try:
-            return float(np.radians(budget["incidence"]["deg"]))
-        except (KeyError, TypeError):
-            pass
+        budget = None if self.results is None else self.results.error_budget
+        if budget and budget.incidence is not None and budget.incidence.deg is not None:
+            return float(np.radians(budget.incidence.deg))
         if self.rig is None:
             raise DataError(
                 f"{self.folder}: the incidence angle is not known", "an earlier release made these products",

@@ -23,6 +23,7 @@ from msgspec.structs import replace
 
 from polysight.acquisition import last_alive_s
 from polysight.products import IMAGE, MATERIALS, QUALITY, SavedProducts, write_atomically
+from polysight.results import ScanMaterials
 from polysight.store import MANIFEST, Manifest, manifest
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, PolysightError, ScanError, no_such
@@ -244,13 +245,14 @@ def _add_products(folder: Path, summary: Summary) -> Summary:
     summary = replace(summary, processed=processed, images_only=not processed)
     try:
         products = SavedProducts(places[0])
-        if processed:
+        materials = ScanMaterials.read(places[0] / MATERIALS)
+        if materials is not None:
             level = "" if products.verdict is None else products.verdict.level
-            names = [str(s["name"]) for s in products.segments if s.get("name")]
-            summary = replace(summary, verdict=level, materials=tuple(dict.fromkeys(names))[:12])
+            names = dict.fromkeys(patch.name for patch in materials.segments if patch.name)
+            summary = replace(summary, verdict=level, materials=tuple(names)[:12])
         if places[0] == folder:
             summary = replace(summary, scan_id=products.scan_id, simulated=products.simulated)
-    except (PolysightError, TypeError, KeyError, AttributeError):
+    except PolysightError:
         # The page of the scan says what is wrong.
         return replace(summary, verdict="damaged")
     return summary

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from polysight.acquisition import ScanCommand, send_command
 from polysight.catalogue import (
     Notes,
+    PermittivityDifference,
     Scans,
     Summary,
     compare,
@@ -22,6 +22,7 @@ from polysight.catalogue import (
 )
 from polysight.jobs.output import print_json
 from polysight.materials import UNKNOWN
+from polysight.results import ComplexNumber, plain
 from polysight_shared.errors import DataError, no_such
 
 _NAME_WIDTH = 40
@@ -91,22 +92,22 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
     """Print the results of a processed scan at one place; return 0. Raises DataError."""
     found = probe(folder, *place_mm, library)
     if as_json:
-        print_json(found)
+        print_json(plain(found))
         return 0
-    lines = [f"x {found['place_mm'][0]:g} mm, y {found['place_mm'][1]:g} mm from the image's centre"]
-    if not found["lit"]:
+    lines = [f"x {found.place_mm[0]:g} mm, y {found.place_mm[1]:g} mm from the image's centre"]
+    if not found.lit:
         lines.append("the scan does not light this place")
-    lines.append(f"|H| {_value(found['h_db'])} dB, |V| {_value(found['v_db'])} dB")
-    lines.append(f"P = {_complex(found['p'])} +- {_value(found['p_sigma'])} a part")
-    if found["permittivity"]:
-        error = _value(found["permittivity_sigma"])
-        lines.append(f"permittivity {_complex(found['permittivity'])} +- {error} a part, as a half space")
+    lines.append(f"|H| {_value(found.h_db)} dB, |V| {_value(found.v_db)} dB")
+    lines.append(f"P = {_complex(found.p)} +- {_value(found.p_sigma)} a part")
+    if found.permittivity:
+        error = _value(found.permittivity_sigma)
+        lines.append(f"permittivity {_complex(found.permittivity)} +- {error} a part, as a half space")
     else:
-        lines.append(f"no permittivity: {found['why']}")
-    if (patch := found["patch"]) is not None:
-        lines.append(f"in patch {patch['label']}: {_called(patch.get('name'))}")
-    lines += [f"  {n['sigmas']:g} standard deviations from {n['name']}" for n in found["nearest"]]
-    lines.append(found["profile_why"] or "range profile: --json")
+        lines.append(f"no permittivity: {found.why}")
+    if found.patch is not None:
+        lines.append(f"in patch {found.patch.label}: {_called(found.patch.name)}")
+    lines += [f"  {n.sigmas:g} standard deviations from {n.name}" for n in found.nearest]
+    lines.append(found.profile_why or "range profile: --json")
     sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
     return 0
 
@@ -114,7 +115,7 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
 def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool) -> int:
     """Print the differences of two processed scans; returns 0. Raises DataError."""
     found = compare(first, second)
-    values = found.to_dict()
+    values = found.figures()
     if picture is not None:
         from polysight.catalogue import draw_comparison
 
@@ -123,21 +124,20 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
         except OSError as e:
             raise DataError(f"{picture}: cannot be written: {e.strerror}", "no such folder, or no permission") from None
     if as_json:
-        print_json(values)
+        print_json(plain(values))
         return 0
-    lines = [f"{first} minus {second}: {values['compared']} pixels", *(f"note: {n}" for n in values["notes"])]
-    if values["significant_share"] is not None:
-        share = f"{100 * values['significant_share']:.1f} %"
-        lines.append(f"P differs by more than {values['significant_sigmas']:g} standard deviations in {share} of them")
-    for pair in values["patches"]:
-        names = " and ".join(map(_called, pair["names"]))
-        where = f"x {pair['place_mm'][0]:g}, y {pair['place_mm'][1]:g} mm ({names})"
-        d = pair["difference"]
-        if d is None:
-            lines.append(f"{where}: no permittivity in one of them")
+    lines = [f"{first} minus {second}: {values.compared} pixels", *(f"note: {n}" for n in values.notes)]
+    if values.significant_share is not None:
+        share = f"{100 * values.significant_share:.1f} %"
+        lines.append(f"P differs by more than {values.significant_sigmas:g} standard deviations in {share} of them")
+    for pair in values.patches:
+        names = " and ".join(map(_called, pair.names))
+        place = f"x {pair.place_mm[0]:g}, y {pair.place_mm[1]:g} mm ({names})"
+        if pair.difference is None:
+            lines.append(f"{place}: no permittivity in one of them")
             continue
-        sure = "" if pair["sigmas"] is None else f": {pair['sigmas']:g} standard deviations"
-        lines.append(f"{where}: permittivity differs by {_complex(d)}{sure}")
+        sure = "" if pair.sigmas is None else f": {pair.sigmas:g} standard deviations"
+        lines.append(f"{place}: permittivity differs by {_complex(pair.difference)}{sure}")
     sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
     return 0
 
@@ -151,9 +151,8 @@ def _value(value: float | None) -> str:
     return "not known" if value is None else f"{value:.3g}"
 
 
-def _complex(parts: dict[str, Any]) -> str:
+def _complex(number: ComplexNumber | PermittivityDifference) -> str:
     """`3.1 - 0.2j`."""
-    real, imag = parts["real"], parts["imag"]
-    if real is None or imag is None:
+    if number.real is None or number.imag is None:
         return "not known"
-    return f"{real:.3g} {'-' if imag < 0 else '+'} {abs(imag):.3g}j"
+    return f"{number.real:.3g} {'-' if number.imag < 0 else '+'} {abs(number.imag):.3g}j"

@@ -78,7 +78,7 @@ const patchName = (p) => (p.metal_reference ? "metal reference" : p.refused ? "n
 
 function showPatches() {
   by("patches").hidden = !result.patches.length;
-  by("patches-note").textContent = result.metal_reference.how ? `metal reference: ${result.metal_reference.how}` : "";
+  by("patches-note").textContent = result.metal ? `metal reference: ${result.metal}` : "";
   by("rows").replaceChildren(...result.patches.map((p) => {
     const row = make("tr", null, null, { id: `patch-${p.label}` });
     const sure = p.confidence === null || p.confidence === undefined || p.name === "unknown" ? "" : ` ${Math.round(100 * p.confidence)} %`;

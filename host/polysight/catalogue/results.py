@@ -1,0 +1,554 @@
+"""What a processed scan says: all of it for a page, one place of it, and two scans compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import skimage
+from numpy.typing import NDArray
+
+from polysight.catalogue.pictures import MAPS, NEED_METAL, Picture, Pixels, draw_values, mask_values
+from polysight.materials import PATCHES, SIMULATED_LIBRARY, Library, is_metal
+from polysight.pipeline import Pipeline
+from polysight.polarimetry import permittivity_from_ratio
+from polysight.products import (
+    IMAGE,
+    MATERIALS,
+    QUALITY,
+    REPORT,
+    SCAN,
+    find_labels,
+    label_folder,
+    read_products,
+    scan_folder_of,
+)
+from polysight.results import ComplexNumber, PatchFigures, PermittivityFigures, Verdict
+from polysight.store import MANIFEST, ScanFolder
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError, PolysightError
+
+Real = NDArray[np.float64]
+EXPORT = "export"
+"""Folder of a scan that a page has exports written into."""
+FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES)
+EXPORTS = (".mat", ".csv", ".nc")
+MAX_NEAREST = 5
+# The range profile, to either side.
+PROFILE_REACH_M = 0.3
+PROFILE_POINTS = 121
+PROFILE_FLOOR_DB = -50.0
+# Smallest spread of a material's ratio between its patches.
+LEAST_SPREAD = 5e-3
+DIFFERENCE = "RdBu"
+SIGNIFICANT = 3.0
+"""Standard deviations above which a difference is significant."""
+# Smallest scatter of two scans in their stated errors: a copy has none at all.
+LEAST_SCATTER = 0.1
+# Largest distance of the centres of one patch in both scans.
+NEAR_MM = 15.0
+
+
+# --- all of it ---
+
+
+class NamedMap(msgspec.Struct, frozen=True):
+    """A picture that can be drawn."""
+
+    name: str
+    title: str
+    colours: str
+
+
+class DrawnLabels(msgspec.Struct, frozen=True):
+    """Boxes drawn by hand, in millimetres (x0, y0, x1, y1), or the `problem` of their file."""
+
+    boxes: dict[str, tuple[float, float, float, float]] = {}
+    metal: str | None = None
+    specimens: dict[str, str] = {}
+    problem: str = ""
+
+
+class File(msgspec.Struct, frozen=True):
+    """A file that may be downloaded: its folder (`products` or `export`), name and size."""
+
+    of: str
+    name: str
+    bytes: int
+
+
+class Result(msgspec.Struct, frozen=True, kw_only=True):
+    """A processed scan for its page; `metal` says how the metal reference was chosen."""
+
+    processed_utc: str
+    extent_mm: tuple[float, float, float, float]
+    pictures: list[NamedMap]
+    metal: str
+    verdict: Verdict | None
+    patches: list[PatchFigures]
+    labels: DrawnLabels | None
+    files: list[File]
+
+
+def result_of(folder: Path) -> Result:
+    """Collect the products of a scan folder, or of a folder of products.
+
+    Raises
+    ------
+    DataError
+        if there are none, or one is damaged.
+    """
+    pixels = Pixels(read_products(folder).folder)
+    maps = {name: map_ for name, map_ in MAPS.items() if pixels.referenced or name not in NEED_METAL}
+    source = None if pixels.results is None else pixels.results.metal_reference
+    return Result(
+        processed_utc=pixels.scan.get("processed_utc", ""),
+        extent_mm=pixels.extent_mm,
+        pictures=[NamedMap(name, map_.title, map_.colours) for name, map_ in maps.items()],
+        metal=source.how if source else "",
+        verdict=pixels.verdict,
+        patches=pixels.figures,
+        labels=_labels(folder, pixels),
+        files=files_of(folder),
+    )
+
+
+def _labels(folder: Path, pixels: Pixels) -> DrawnLabels | None:
+    try:
+        labelled = find_labels(folder)
+        if labelled is None:
+            return None
+        _, labels = labelled
+        labels = labels.in_mm(pixels.x_m, pixels.y_m)
+    except PolysightError as e:
+        return DrawnLabels(problem=f"{label_folder(folder)}: {e.what}")
+    return DrawnLabels(dict(labels.boxes), labels.metal, dict(labels.specimens))
+
+
+def files_of(folder: Path) -> list[File]:
+    """Downloadable files of a scan's products and exports."""
+    products = read_products(folder).folder
+    files = []
+    for of, place in (("products", products), (EXPORT, folder / EXPORT)):
+        if place.is_symlink() or not place.is_dir():
+            continue
+        for path in sorted(place.iterdir()):
+            is_listed = path.name in FILES or path.suffix in EXPORTS
+            if is_listed and path.is_file() and not path.is_symlink():
+                files.append(File(of, path.name, path.stat().st_size))
+    return files
+
+
+# --- one place ---
+
+
+class FocusedProfile(msgspec.Struct, frozen=True):
+    """Level by board (dB below the highest) against the path beyond the place."""
+
+    path_m: list[float]
+    boards: dict[str, list[float]]
+
+
+class NearMaterial(msgspec.Struct, frozen=True):
+    """A material of the library, with the distance of its ratio and its permittivity as a half space."""
+
+    name: str
+    sigmas: float | None
+    permittivity: ComplexNumber | None
+
+
+class Probe(msgspec.Struct, frozen=True, kw_only=True):
+    """All results at one place.
+
+    Attributes
+    ----------
+    place_mm
+        The pixel's, from the middle of the image.
+    lit
+        True if the scan illuminates it.
+    permittivity, permittivity_sigma
+        Of this pixel as a half space; `why` it is unknown.
+    patch
+        The patch whose outline holds the place.
+    nearest
+        Materials by the distance of their ratio.
+    profile
+        Focused range profile through the place; `profile_why` there is none.
+    """
+
+    place_mm: tuple[float, float]
+    lit: bool
+    h_db: float | None
+    v_db: float | None
+    p: ComplexNumber
+    p_sigma: float | None
+    referenced: bool
+    permittivity: ComplexNumber | None
+    permittivity_sigma: float | None
+    why: str
+    patch: PatchFigures | None
+    nearest: list[NearMaterial]
+    profile: FocusedProfile | None
+    profile_why: str
+
+
+def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -> Probe:
+    """Read all results of a processed scan at one place, in mm from the middle of the image.
+
+    `library` names materials (None: the simulated one).
+
+    Raises
+    ------
+    DataError
+        if there are no products, or the place lies outside the image.
+    """
+    pixels = Pixels(read_products(folder).folder)
+    row, column = pixels.nearest(x_mm, y_mm)
+    place = (float(pixels.x_mm[column]), float(pixels.y_mm[row]))
+    why = _why_no_permittivity(pixels, row, column)
+    eps = None if why else _parts(complex(pixels.permittivity[row, column]))
+    profile, profile_why = _profile(folder, float(pixels.x_m[column]), float(pixels.y_m[row]))
+    return Probe(
+        place_mm=(round(place[0], 2), round(place[1], 2)),
+        lit=bool(pixels.valid[row, column]),
+        h_db=_db(complex(pixels.h[row, column])),
+        v_db=_db(complex(pixels.v[row, column])),
+        p=_parts(complex(pixels.p[row, column])),
+        p_sigma=_number(pixels.p_std[row, column]),
+        referenced=pixels.referenced,
+        permittivity=eps,
+        permittivity_sigma=None if why else _number(pixels.permittivity_sigma[row, column]),
+        why=why,
+        patch=_patch_at(pixels.figures, place) if pixels.referenced else None,
+        nearest=_nearest_materials(pixels, row, column, library) if eps else [],
+        profile=profile,
+        profile_why=profile_why,
+    )
+
+
+def _why_no_permittivity(pixels: Pixels, row: int, column: int) -> str:
+    if not pixels.referenced:
+        return "the images are not referenced to metal, or support no result"
+    if not pixels.clear[row, column]:
+        return "too dark: only noise"
+    if pixels.metal_like[row, column]:
+        return "too close to metal: any large permittivity looks like this"
+    return ""
+
+
+def _patch_at(patches: list[PatchFigures], place_mm: tuple[float, float]) -> PatchFigures | None:
+    """The patch whose outline holds a place."""
+    for patch in patches:
+        outline = patch.outline_mm
+        if len(outline) > 2 and skimage.measure.points_in_poly([place_mm], outline)[0]:
+            return patch
+    return None
+
+
+@lru_cache(maxsize=4)
+def _library_ratios(path: Path, changed_ns: int, angle_deg: float) -> dict[str, tuple[complex, float]]:
+    """Mean of V / H and spread of its patches (of each part), by material. A file that has changed is read again."""
+    del changed_ns
+    patches: dict[str, list[complex]] = {}
+    for entry in Library.load(path).at(angle_deg).entries:
+        inverse = 1 / entry.p
+        patches.setdefault(entry.name, []).append(complex(np.median(inverse.real), np.median(inverse.imag)))
+    ratios = {}
+    for name, values in patches.items():
+        means = np.array(values)
+        spread = float(np.sqrt(np.mean(np.abs(means - means.mean()) ** 2) / 2)) if len(means) > 1 else 0.0
+        ratios[name] = (complex(means.mean()), spread)
+    return ratios
+
+
+def _nearest_materials(pixels: Pixels, row: int, column: int, library: Path | None) -> list[NearMaterial]:
+    """Materials of the library by the distance of their ratio, in standard deviations of pixel and material."""
+    path = library or SIMULATED_LIBRARY
+    try:
+        ratios = _library_ratios(path, path.stat().st_mtime_ns, float(np.degrees(pixels.theta_rad)))
+    except (PolysightError, OSError):
+        # A library of another angle.
+        return []
+    p = complex(pixels.p[row, column])
+    p_std = float(pixels.p_std[row, column])
+    pixel_std = p_std / max(abs(p) ** 2, 1e-9) if np.isfinite(p_std) else 0.0
+    materials = []
+    for name, (mean, spread) in ratios.items():
+        std = float(np.hypot(pixel_std, max(spread, LEAST_SPREAD)))
+        eps = None
+        if mean and not is_metal(name):
+            half_space = complex(permittivity_from_ratio(1 / mean, pixels.theta_rad))
+            eps = _parts(half_space) if np.isfinite(half_space) else None
+        sigmas = round(abs(1 / p - mean) / std, 1) if p else None
+        materials.append(NearMaterial(name, sigmas, eps))
+    return sorted(materials, key=lambda m: np.inf if m.sigmas is None else m.sigmas)[:MAX_NEAREST]
+
+
+def _profile(folder: Path, x_m: float, y_m: float) -> tuple[FocusedProfile | None, str]:
+    """Focused range profile through a place, from the scan's kept samples, or why there is none."""
+    scan = scan_folder_of(folder)
+    if scan is None or not (scan / MANIFEST).exists():
+        return None, "the rows are not in this folder"
+    samples = scan / "samples" / "rows.jsonl"
+    try:
+        pipeline = _restore_rows(scan, samples.stat().st_mtime_ns) if samples.exists() else None
+    except (PolysightError, OSError) as e:
+        return None, str(e).splitlines()[0]
+    if pipeline is None:
+        return None, "no samples were kept of this scan: `polysight process` makes them"
+    shifts = np.linspace(-PROFILE_REACH_M, PROFILE_REACH_M, PROFILE_POINTS)
+    point = np.array([x_m, y_m, float(np.mean(pipeline.images.grid.z_m))])
+    levels = {name: np.abs(board.range_profile(point, shifts)) for name, board in pipeline.images.boards.items()}
+    highest = max(float(level.max()) for level in levels.values()) or 1.0
+    boards = {}
+    for name, level in levels.items():
+        level_db = 20 * np.log10(np.maximum(level / highest, 1e-9))
+        boards[name] = np.maximum(level_db, PROFILE_FLOOR_DB).round(1).tolist()
+    return FocusedProfile(shifts.round(4).tolist(), boards), ""
+
+
+@lru_cache(maxsize=2)
+def _restore_rows(scan: Path, changed_ns: int) -> Pipeline | None:
+    """A pipeline that holds the kept samples of every row; None where some are not kept."""
+    del changed_ns
+    pipeline = Pipeline(ScanFolder.load(scan), samples="read")
+    rows = list(pipeline.source.rows())
+    return pipeline if rows and all(map(pipeline.samples.restore, rows)) else None
+
+
+def _db(value: complex) -> float | None:
+    return round(float(20 * np.log10(abs(value))), 2) if value and np.isfinite(value) else None
+
+
+def _number(value: float) -> float | None:
+    return round(float(value), 5) if np.isfinite(value) else None
+
+
+def _parts(value: complex) -> ComplexNumber:
+    return ComplexNumber(_number(value.real), _number(value.imag))
+
+
+# --- two scans ---
+
+
+class PermittivityDifference(msgspec.Struct, frozen=True):
+    """First minus second, with standard errors where both are known."""
+
+    real: float
+    imag: float
+    real_std: float | None = None
+    imag_std: float | None = None
+
+
+class PatchPair(msgspec.Struct, frozen=True, kw_only=True):
+    """Patches of two scans at one place; `sigmas` is their difference in standard deviations."""
+
+    place_mm: tuple[float, float]
+    names: tuple[str | None, str | None]
+    labels: tuple[int, int]
+    permittivity: tuple[PermittivityFigures | None, PermittivityFigures | None]
+    difference: PermittivityDifference | None = None
+    sigmas: float | None = None
+
+
+class ComparisonFigures(msgspec.Struct, frozen=True):
+    """A comparison without its maps: the share of `compared` pixels that differs significantly, and the pairs."""
+
+    patches: tuple[PatchPair, ...]
+    notes: tuple[str, ...]
+    extent_mm: tuple[float, float, float, float]
+    compared: int
+    significant_share: float | None
+    scatter: float | None
+    significant_sigmas: float = SIGNIFICANT
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Differences of the first scan minus the second, on the first one's pixels [ny, nx].
+
+    Attributes
+    ----------
+    p, permittivity
+        complex128; nan where one of the scans has no value.
+    sigmas
+        float64: |difference of P| in standard deviations of such differences; nan where the error is not known.
+    scatter
+        Those standard deviations in stated errors, :func:`scatter_of`; nan if the errors are not known.
+    patches
+        For each pair of patches at one place: names, permittivities, difference.
+    notes
+        Reasons why the two are hard to compare.
+    """
+
+    first: Pixels
+    second: Pixels
+    p: NDArray[np.complex128]
+    permittivity: NDArray[np.complex128]
+    sigmas: Real
+    scatter: float
+    patches: tuple[PatchPair, ...]
+    notes: tuple[str, ...]
+
+    def figures(self) -> ComparisonFigures:
+        """The comparison without the maps."""
+        judged = self.sigmas[np.isfinite(self.sigmas)]
+        return ComparisonFigures(
+            self.patches,
+            self.notes,
+            self.first.extent_mm,
+            compared=int(np.isfinite(self.p).sum()),
+            significant_share=float((judged > SIGNIFICANT).mean()) if judged.size else None,
+            scatter=None if np.isnan(self.scatter) else round(self.scatter, 3),
+        )
+
+
+def compare(first: Path, second: Path) -> Comparison:
+    """Compare two processed scans, pixel by pixel and patch by patch.
+
+    Raises
+    ------
+    DataError
+        if one of them has no products or is not referenced to metal, or they show different places.
+    """
+    a, b = (Pixels(read_products(folder).folder) for folder in (first, second))
+    for folder, pixels in ((first, a), (second, b)):
+        if not pixels.referenced:
+            raise DataError(
+                f"{folder}: cannot be compared", "its images are not referenced to metal, or support no result",
+                "process it with a metal reference", code=ErrorCode.NO_DATA,
+            )  # fmt: skip
+    rows, row_inside = _match_axes(a.y_mm, b.y_mm)
+    columns, column_inside = _match_axes(a.x_mm, b.x_mm)
+    same_place = np.ix_(rows, columns)
+    in_both = row_inside[:, None] & column_inside[None, :] & a.clear & b.clear[same_place]
+    if not in_both.any():
+        raise DataError(
+            "the two scans have no place in common", "their images lie apart, or one of them is dark",
+            "take other scans", code=ErrorCode.MISMATCH,
+        )  # fmt: skip
+    p = np.where(in_both, a.p - b.p[same_place], np.nan).astype(np.complex128)
+    eps = np.where(in_both, a.permittivity - b.permittivity[same_place], np.nan)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        stated = np.abs(p) / np.hypot(a.p_std, b.p_std[same_place])
+    scatter = scatter_of(stated)
+    pairs = tuple(_pair_patches(a.figures, b.figures))
+    return Comparison(a, b, p, eps, stated / scatter, scatter, pairs, tuple(_notes(a, b, scatter)))
+
+
+def scatter_of(differences: Real) -> float:
+    """Estimate the scatter of unchanged pixels, 0.1 to 1, from |differences| in stated errors; nan without any.
+
+    Stated errors include those that both scans share (leakage, metal reference, sidelobes), which cancel in a
+    difference. Taken from the median, so that changes of less than half of the image hardly matter: the median of a
+    complex normal error with unit variance in each part is sqrt(2 ln 2).
+    """
+    finite = differences[np.isfinite(differences)]
+    if finite.size == 0:
+        return float("nan")
+    return float(np.clip(np.median(finite) / np.sqrt(2 * np.log(2)), LEAST_SCATTER, 1.0))
+
+
+def _match_axes(first: Real, second: Real) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Index of the nearest of `second` for each of `first` (mm), and True where it is within half a pixel."""
+    nearest = np.abs(first[:, None] - second[None, :]).argmin(axis=1)
+    pixel = max(abs(second[1] - second[0]), abs(first[1] - first[0]))
+    return nearest, np.abs(first - second[nearest]) <= pixel * 0.51
+
+
+def _notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
+    notes = []
+    if scatter < 1:
+        notes.append(
+            f"P of unchanged pixels scatters by {scatter:.2f} of the stated errors, of which the scans share a part:"
+            " significance counts from that scatter"
+        )
+    a_deg = float(np.degrees(a.theta_rad))
+    b_deg = float(np.degrees(b.theta_rad))
+    if abs(a_deg - b_deg) > 0.5:
+        notes.append(f"the incidence angles differ: {a_deg:.1f} and {b_deg:.1f} degrees; P depends on them")
+    if a.simulated != b.simulated:
+        notes.append("one of the two is simulated")
+    if not (np.isfinite(a.p_std).any() and np.isfinite(b.p_std).any()):
+        notes.append("the errors of one are not known (processed by an earlier release): significance cannot be judged")
+    return notes
+
+
+def _pair_patches(first: list[PatchFigures], second: list[PatchFigures]) -> list[PatchPair]:
+    """Pairs of patches with their centres at one place."""
+    pairs = []
+    candidates = [patch for patch in second if not patch.metal_reference]
+    for patch in first:
+        if patch.metal_reference or not candidates:
+            continue
+        nearest = min(candidates, key=lambda other, patch=patch: _distance_mm(patch, other))
+        if _distance_mm(patch, nearest) <= NEAR_MM:
+            pairs.append(_pair(patch, nearest))
+    return pairs
+
+
+def _distance_mm(a: PatchFigures, b: PatchFigures) -> float:
+    return float(np.hypot(a.centre_x_mm - b.centre_x_mm, a.centre_y_mm - b.centre_y_mm))
+
+
+def _pair(a: PatchFigures, b: PatchFigures) -> PatchPair:
+    pair = PatchPair(
+        place_mm=(round(a.centre_x_mm, 1), round(a.centre_y_mm, 1)),
+        names=(a.name, b.name),
+        labels=(a.label, b.label),
+        permittivity=(a.permittivity, b.permittivity),
+    )
+    if a.permittivity is None or b.permittivity is None:
+        return pair
+    difference = a.permittivity.value - b.permittivity.value
+    covariance = _covariance(a.permittivity) + _covariance(b.permittivity)
+    real = round(difference.real, 4)
+    imag = round(difference.imag, 4)
+    if not np.isfinite(covariance).all() or np.linalg.det(covariance) <= 0:
+        return msgspec.structs.replace(pair, difference=PermittivityDifference(real, imag))
+    parts = np.array([difference.real, difference.imag])
+    real_std, imag_std = (round(float(std), 4) for std in np.sqrt(np.diag(covariance)))
+    return msgspec.structs.replace(
+        pair,
+        difference=PermittivityDifference(real, imag, real_std, imag_std),
+        sigmas=round(float(np.sqrt(parts @ np.linalg.solve(covariance, parts))), 2),
+    )
+
+
+def _covariance(permittivity: PermittivityFigures) -> Real:
+    """Covariance of (real, imaginary); nan if an earlier release did not write it."""
+    if permittivity.covariance is None:
+        return np.full((2, 2), np.nan)
+    return np.array(permittivity.covariance, np.float64)
+
+
+def draw_comparison(comparison: Comparison, name: str) -> Picture:
+    """A map of the differences: `p` (|difference of P|), `sigmas`, `permittivity` or `loss` (first minus second).
+
+    Raises DataError where there is no such map.
+    """
+    maps = {
+        "p": np.abs(comparison.p),
+        "sigmas": comparison.sigmas,
+        "permittivity": comparison.permittivity.real,
+        "loss": -comparison.permittivity.imag,
+    }
+    if name not in maps:
+        raise DataError(
+            f"no map is called {name[:40]!r}", "the name is wrong", f"one of {', '.join(maps)}",
+            code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
+    values = maps[name]
+    visible = np.isfinite(values)
+    is_signed = name in ("permittivity", "loss")
+    reach = 1.0
+    if visible.any():
+        reach = max(float(np.percentile(np.abs(values[visible]), 95 if is_signed else 98)), 1e-3)
+    if name == "sigmas":
+        reach = max(reach, 2 * SIGNIFICANT)
+    if is_signed:
+        return draw_values(mask_values(values, visible, (-reach, reach), DIFFERENCE))
+    return draw_values(mask_values(values, visible, (0.0, reach)))

@@ -46,7 +46,8 @@ def _simulate(args: argparse.Namespace) -> int:
         raise ConfigError(
             f"{given} with --layout own", "only the published data has such scans", "add --layout authors"
         )
-    rig, scene = load_instrument(args.config), load_scene(args.scene)
+    rig = load_instrument(args.config)
+    scene = load_scene(args.scene)
     if args.specimens:
         scene = msgspec.structs.replace(scene, seed=scene.seed + 1000 * args.specimens)
     began = time.perf_counter()

@@ -62,9 +62,11 @@ def compiled(product: str, sources: Iterable[Path], command: Sequence[str], on_f
 def _run(command: list[str], product: str, on_failure: tuple[str, str]) -> None:
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-        message, failed = done.stderr.strip(), done.returncode != 0
+        message = done.stderr.strip()
+        failed = done.returncode != 0
     except OSError as e:
-        message, failed = str(e), True
+        message = str(e)
+        failed = True
     if failed:
         raise DeviceError(f"{product} does not compile on this machine:\n{message}", *on_failure)
 

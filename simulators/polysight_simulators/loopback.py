@@ -16,7 +16,8 @@ from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.cards import SOURCE_PORT, bound_udp
 
 _TRIES = 50
-_COMMAND_PORT, _EVENT_PORT = 5601, 5602
+_COMMAND_PORT = 5601
+_EVENT_PORT = 5602
 _PI_HOST_PART = "10"
 _RADAR_PORT = 5700
 

@@ -8,6 +8,9 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Callable
+
+from polysight_shared.errors import PolysightError, os_error
 
 _PR_SET_PDEATHSIG = 1
 
@@ -36,6 +39,25 @@ def announce_ready(text: str = "") -> None:
     """Print `ready <text>`, for which the parent process waits."""
     sys.stdout.write(f"ready {text}".rstrip() + "\n")
     sys.stdout.flush()
+
+
+def run_until_stopped(run: Callable[[threading.Event], object]) -> int:
+    """Run a simulator until SIGTERM, SIGINT or the end of the parent process; return the exit status.
+
+    `run` gets an event that is set by the signals. An error is one message on stderr.
+    """
+    stop = stop_requested()
+    die_with_parent()
+    try:
+        run(stop)
+    except PolysightError as e:
+        sys.stderr.write(f"error: {e}\n")
+        return e.exit_status
+    except OSError as e:
+        error = os_error(e)
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_status
+    return 0
 
 
 def stop_requested() -> threading.Event:

@@ -21,10 +21,10 @@ from threading import Event
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight_shared.errors import ConfigError, DataError, PolysightError
+from polysight_shared.errors import ConfigError, DataError
 from polysight_simulators.cards import MAC, CardEndpoint, Clock, EventKind, Network, Pace
 from polysight_simulators.faults import OF_CONTROL, read_faults
-from polysight_simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight_simulators.process import announce_ready, command_line, run_until_stopped
 
 _OF_PULSES = ("overflow", "ddr_full", "missed_pulse", "miss_pulses", *(kind.value for kind in EventKind))
 _OF_RADARS = tuple(key for keys in OF_CONTROL.values() for key in keys)
@@ -44,9 +44,9 @@ class Recording:
         if not path.is_file() or path.stat().st_size == 0:
             raise DataError(f"{path}: nothing to replay", "not a file, or an empty one", "give a recorded .bin file")
         self._data = np.memmap(path, np.uint8, "r")
-        self._left = max_bytes if loop or max_bytes is None else min(max_bytes, len(self._data))
-        if self._left is None and not loop:
-            self._left = len(self._data)
+        self._left = max_bytes  # None: without end
+        if not loop:
+            self._left = len(self._data) if max_bytes is None else min(max_bytes, len(self._data))
         self._at = 0
 
     @property
@@ -56,11 +56,12 @@ class Recording:
 
     def read(self, n: int) -> NDArray[np.uint8]:
         """Return the next n bytes; fewer or none at the end."""
-        n = min(n, len(self._data) - self._at, n if self._left is None else self._left)
+        n = min(n, len(self._data) - self._at)
+        if self._left is not None:
+            n = min(n, self._left)
+            self._left -= n
         data = self._data[self._at : self._at + n]
         self._at = (self._at + n) % len(self._data)
-        if self._left is not None:
-            self._left -= n
         return np.asarray(data)
 
 
@@ -82,7 +83,9 @@ def scan_rows(scan: Path, board: str, row: int | None) -> list[Path]:
                 files[fact["row"]] = scan / fact["boards"][board]["file"]
         except (ValueError, KeyError, TypeError):
             continue  # `polysight validate` reports damaged lines
-    rows = sorted(files) if row is None else [row] if row in files else []
+    rows = sorted(files)
+    if row is not None:
+        rows = [r for r in rows if r == row]
     if not rows:
         raise DataError(
             f"{manifest}: no committed row {'' if row is None else row} of board {board}",
@@ -109,10 +112,12 @@ class Player:
     def turn(self) -> float:
         """Do what is due; return the seconds until the next call."""
         self._endpoint.serve_commands()
-        card, now = self._endpoint.card, self._clock_s()
+        card = self._endpoint.card
+        now = self._clock_s()
         if card.records != self._records:
             self._records = card.records
-            self._playing, self._fed_to_s = next(self._recordings), now
+            self._playing = next(self._recordings)
+            self._fed_to_s = now
         if not card.recording:
             self._playing = None
         if self._playing is not None:
@@ -128,7 +133,8 @@ class Player:
         room = _MAX_QUEUED_BYTES - self._endpoint.sender.queued_bytes
         due = int((now - self._fed_to_s) * self._bytes_per_s)
         if due > room:  # the radar waits for the network, and does not catch up
-            due, self._fed_to_s = max(0, room), now
+            due = max(0, room)
+            self._fed_to_s = now
         else:
             self._fed_to_s += due / self._bytes_per_s
         while due > 0 and not recording.ended:
@@ -147,21 +153,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("source", type=Path, help="a .bin file, or a scan folder, each row of which fills one record")
     parser.add_argument("--board", help="board of the scan folder")
     parser.add_argument("--row", type=int, help="only this row of the scan folder")
-    parser.add_argument(
-        "--card-address", default="127.0.0.180", help="address of the card, on this machine (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--host-address", default="127.0.0.30", help="address of the recording program (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--command-port",
-        type=int,
-        default=4096,
-        help="command port of card and recording program (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--data-port", type=int, default=4098, help="data port of the recording program (default: %(default)s)"
-    )
+    parser.add_argument("--card-address", default="127.0.0.180", help="card, on this machine (default: %(default)s)")
+    parser.add_argument("--host-address", default="127.0.0.30", help="recording program (default: %(default)s)")
+    parser.add_argument("--command-port", type=int, default=4096, help="of card and program (default: %(default)s)")
+    parser.add_argument("--data-port", type=int, default=4098, help="of the program (default: %(default)s)")
     parser.add_argument("--rate-mbit", type=float, default=50.0, help="LVDS data rate in Mbit/s (default: %(default)s)")
     parser.add_argument("--loop", action="store_true", help="repeat the recording until record stop")
     parser.add_argument("--frames", type=int, help="end after this number of frames")
@@ -226,14 +221,7 @@ def _run(args: argparse.Namespace, stop: Event) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Replay until SIGTERM or SIGINT."""
     args = _parser().parse_args(argv)
-    stop = stop_requested()
-    die_with_parent()
-    try:
-        _run(args, stop)
-    except PolysightError as e:
-        sys.stderr.write(f"error: {e}\n")
-        return e.exit_status
-    return 0
+    return run_until_stopped(lambda stop: _run(args, stop))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from threading import Event
 from typing import Any, NamedTuple
@@ -22,11 +23,11 @@ from typing import Any, NamedTuple
 import tomli_w
 
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.errors import ConfigError, DeviceError, PolysightError, os_error
+from polysight_shared.errors import ConfigError, DeviceError, PolysightError
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.faults import read_faults
 from polysight_simulators.loopback import on_free_subnet
-from polysight_simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight_simulators.process import announce_ready, command_line, die_with_parent, run_until_stopped
 from polysight_simulators.radars import make_image
 from polysight_simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight_simulators.wires import MAX_SOCKET_PATH
@@ -141,7 +142,7 @@ class RigOptions(NamedTuple):
     seed: int | None = None
     pattern: bool = False
     faults: Path | None = None
-    single_faults: tuple[str, ...] = ()
+    fault: Sequence[str] = ()  # single ones, KEY=VALUE
     cache: Path | None = None
     real_pacing: bool = False
     uno: bool = False
@@ -155,7 +156,8 @@ class RigProcesses:
     """
 
     def __init__(self, rig: Instrument, scene: Path | None, folder: Path, options: RigOptions, stop: Event) -> None:
-        self._folder, self._logs = folder, folder / "logs"
+        self._folder = folder
+        self._logs = folder / "logs"
         self._logs.mkdir(parents=True, exist_ok=True)
         self._stop = stop
         self.children: list[Child] = []
@@ -167,28 +169,17 @@ class RigProcesses:
 
     def _start(self, rig: Instrument, scene: Path | None, options: RigOptions) -> None:
         wires = str(self._folder / "wires.sock")
-        config, scale = str(self._folder / "instrument.toml"), repr(options.time_scale)
+        config = str(self._folder / "instrument.toml")
         self._wait([self._module("wires", "wires", "--socket", wires)])
-        common = ["--config", config, "--wires", wires, "--time-scale", scale]
+        common = ["--config", config, "--wires", wires, "--time-scale", repr(options.time_scale)]
         started = [self._module("stage", "uno" if options.uno else "stage", *common, "--link", rig.stage.port)]
-        started += [
-            self._module(
-                f"cards-{group.partition(',')[0]}",
-                "cards",
-                *common,
-                "--boards",
-                group,
-                *_card_options(scene, options),
-                *self._report(group),
-            )
-            for group in card_groups(rig)
-        ]
+        for group in card_groups(rig):
+            name = f"cards-{group.partition(',')[0]}"
+            own = ["--boards", group, "--report", str(self._folder / f"{name}.json")]
+            started.append(self._module(name, "cards", *common, *own, *_card_options(scene, options)))
         self._wait(started)
         if options.with_pi:
             self._wait([self._launch("pi", [_pi_program(), "run", "--config", config, "--wires", wires])])
-
-    def _report(self, group: str) -> tuple[str, str]:
-        return "--report", str(self._folder / f"cards-{group.partition(',')[0]}.json")
 
     def _module(self, name: str, module: str, *arguments: str) -> Child:
         return self._launch(name, [sys.executable, "-m", f"polysight_simulators.{module}", *arguments])
@@ -238,13 +229,20 @@ def card_groups(rig: Instrument) -> list[str]:
 
 
 def _card_options(scene: Path | None, options: RigOptions) -> list[str]:
-    given = ["--scene", str(scene), "--offset-in-rig"] if scene is not None else []
-    given += ["--pattern"] if options.pattern else []
-    given += ["--seed", str(options.seed)] if options.seed is not None else []
-    given += ["--faults", str(options.faults)] if options.faults is not None else []
-    given += ["--cache", str(options.cache)] if options.cache is not None else []
-    given += ["--real-pacing"] if options.real_pacing else []
-    return given + [word for fault in options.single_faults for word in ("--fault", fault)]
+    words = []
+    if scene is not None:
+        words += ["--scene", str(scene), "--offset-in-rig"]
+    if options.pattern:
+        words.append("--pattern")
+    if options.real_pacing:
+        words.append("--real-pacing")
+    values = {"--seed": options.seed, "--faults": options.faults, "--cache": options.cache}
+    for option, value in values.items():
+        if value is not None:
+            words += [option, str(value)]
+    for fault in options.fault:
+        words += ["--fault", fault]
+    return words
 
 
 def _pi_program() -> str:
@@ -288,9 +286,8 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
         raise ConfigError("neither --scene nor --pattern", "the radars need a signal", "give one of them")
     rig = derive(load_instrument(config), scene, folder, options.native)
     boards = tuple(b.name for b in rig.boards)
-    read_faults(
-        options.faults, list(options.single_faults), boards, control=rig.radar.control
-    )  # raises before anything starts
+    # Raises before anything starts.
+    read_faults(options.faults, list(options.fault), boards, control=rig.radar.control)
     folder.mkdir(parents=True, exist_ok=True)
     _write_files(rig, scene, folder, options)
     power_cycle = Event()
@@ -332,20 +329,10 @@ def main(argv: list[str] | None = None) -> int:
         help=f"run the sketch's machine code on an emulated board; --time-scale at most {UNO_TIME_SCALE:g}",
     )
     parser.add_argument("--native", action="store_true", help="the host configures and arms the radars (simulated USB)")
-    args = parser.parse_args(argv)
-    stop = stop_requested()
-    die_with_parent()
-    options = RigOptions(
-        args.time_scale, args.with_pi, args.seed, args.pattern, args.faults, tuple(args.fault), args.cache,
-        args.real_pacing, args.uno, args.native,
-    )  # fmt: skip
-    try:
-        run(args.config, args.scene, args.dir, options, stop)
-    except (PolysightError, OSError) as e:
-        e = os_error(e) if isinstance(e, OSError) else e
-        sys.stderr.write(f"error: {e}\n")
-        return e.exit_status
-    return 0
+    given = vars(parser.parse_args(argv))
+    config, scene, folder = (given.pop(name) for name in ("config", "scene", "dir"))
+    options = RigOptions(**given)
+    return run_until_stopped(lambda stop: run(config, scene, folder, options, stop))
 
 
 if __name__ == "__main__":

@@ -10,13 +10,14 @@ import selectors
 import socket
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from threading import Event
 
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError, PolysightError, ProtocolError
+from polysight_shared.errors import ConfigError, DeviceError, ProtocolError
 from polysight_shared.wires import WireMotion, parse
-from polysight_simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight_simulators.process import announce_ready, command_line, run_until_stopped
 
 MAX_LINE_BYTES = 200
 MAX_PENDING_BYTES = 64 << 20
@@ -133,11 +134,11 @@ class WireHub:
             tag = line[:2]
             if tag == b"S ":
                 fields = line.split(b" ")
-                wanted = len(fields) == 4 and fields[2]
-                if not wanted:
+                if len(fields) != 4 or not fields[2]:
                     raise ProtocolError(f"not a wire line: {line!r}")
+                gpio_line = fields[2]
                 for p in others:
-                    if wanted in p.lines and wanted not in self._cut:
+                    if gpio_line in p.lines and gpio_line not in self._cut:
                         p.pending += line + b"\n"
                         self.relayed += 1
             elif tag == b"M ":
@@ -152,7 +153,10 @@ class WireHub:
                 sender.lines.update(line[2:].split())
                 sender.pending += b"K\n"
             elif tag == b"X " and len(fields := line.split(b" ")) == 3 and fields[2] in (b"0", b"1"):
-                (self._cut.add if fields[2] == b"1" else self._cut.discard)(fields[1])
+                if fields[2] == b"1":
+                    self._cut.add(fields[1])
+                else:
+                    self._cut.discard(fields[1])
                 sender.pending += b"K\n"
             elif line == b"W":
                 sender.motion = True
@@ -172,9 +176,11 @@ class WireHub:
         if len(client.pending) > self._max_pending:
             self._disconnect(client, f"{len(client.pending)} unread bytes")
             return
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.pending else 0)
-        if self._selector.get_key(client.connection).events != wanted:
-            self._selector.modify(client.connection, wanted, client)
+        events = selectors.EVENT_READ
+        if client.pending:
+            events |= selectors.EVENT_WRITE
+        if self._selector.get_key(client.connection).events != events:
+            self._selector.modify(client.connection, events, client)
 
     def _disconnect(self, client: _Client, why: str) -> None:
         lines = ", ".join(sorted(word.decode() for word in client.lines)) or "none"
@@ -218,19 +224,13 @@ def main(argv: list[str] | None = None) -> int:
     parser = command_line("polysight_simulators.wires", "Hub of the simulated wires.", "--socket out/wires.sock")
     parser.add_argument("--socket", type=Path, required=True, help="Unix socket to serve")
     args = parser.parse_args(argv)
-    stop = stop_requested()
-    die_with_parent()
-    try:
-        hub = WireHub(args.socket, lambda message: sys.stderr.write(f"wires: {message}\n"))
-    except PolysightError as e:
-        sys.stderr.write(f"error: {e}\n")
-        return e.exit_status
-    announce_ready(str(args.socket))
-    try:
-        hub.serve(stop)
-    finally:
-        hub.close()
-    return 0
+
+    def serve(stop: Event) -> None:
+        with closing(WireHub(args.socket, lambda message: sys.stderr.write(f"wires: {message}\n"))) as hub:
+            announce_ready(str(args.socket))
+            hub.serve(stop)
+
+    return run_until_stopped(serve)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from tests.support.rigs import published_rig
 
-from polysight_simulators import replay
+from polysight_simulators import process, replay
 from polysight_simulators.cards import MAC, CardEndpoint, Network, Pace, bound_udp
 from polysight_simulators.faults import Faults
 from polysight_simulators.loopback import on_free_subnet
@@ -218,7 +218,7 @@ def test_invalid_arguments_are_refused(
     recording: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str],
     named: str, status: int,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(replay, "die_with_parent", lambda: None)
-    monkeypatch.setattr(replay, "stop_requested", threading.Event)
+    monkeypatch.setattr(process, "die_with_parent", lambda: None)
+    monkeypatch.setattr(process, "stop_requested", threading.Event)
     assert replay.main([a.format(folder=recording.parent, file=recording) for a in arguments]) == status
     assert named in capsys.readouterr().err

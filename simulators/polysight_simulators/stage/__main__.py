@@ -15,21 +15,25 @@ import sys
 import termios
 import time
 import tty
+from contextlib import closing
 from pathlib import Path
 from threading import Event as Signal
 
 from polysight_shared.config import load_instrument
-from polysight_shared.errors import DeviceError, PolysightError
+from polysight_shared.errors import DeviceError
 from polysight_shared.units import NS_PER_MS
 from polysight_shared.wires import WireClient
 from polysight_simulators.builds import build_sketch, sketch_compiler
-from polysight_simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight_simulators.process import announce_ready, command_line, run_until_stopped
 from polysight_simulators.stage.motion import TICK_HZ
 from polysight_simulators.stage.python_stage import PythonStage, Rig
 
 BOOT_MS = 200
-STEP_POLL_MS, REST_POLL_MS = 2, 20
-_IN_CLOSE, _IN_OPEN = 0x08 | 0x10, 0x20  # inotify(7)
+STEP_POLL_MS = 2
+REST_POLL_MS = 20
+# inotify(7)
+_IN_CLOSE = 0x08 | 0x10
+_IN_OPEN = 0x20
 _EVENT = struct.Struct("iIII")
 # A process without CPU time slows the simulated world down: the longest advance at once, wall time.
 LONGEST_LEAP_NS = 20 * NS_PER_MS
@@ -56,7 +60,8 @@ class SerialPort:
             self._watch = libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
             if libc.inotify_add_watch(self._watch, os.fsencode(name), _IN_OPEN | _IN_CLOSE) < 0:
                 raise OSError(ctypes.get_errno(), f"no watch on {name}")
-            self._clients, self._dtr = 0, False
+            self._clients = 0
+            self._dtr = False
             fresh = link.with_name(link.name + ".new")
             fresh.unlink(missing_ok=True)
             fresh.symlink_to(name)
@@ -140,7 +145,8 @@ def serve(
         ticks += leap * time_scale * TICK_HZ * 1e-9
         now_ms = (now - started) // NS_PER_MS
         if port.opened():  # opening the port resets the board; its boot loader ignores bytes until it ends
-            boots_at, running = now + boot_ms * NS_PER_MS, False
+            boots_at = now + boot_ms * NS_PER_MS
+            running = False
         is_open = port.is_open
 
         # Read bytes first, so that a late process does not detect a silent host.
@@ -181,32 +187,27 @@ def main(argv: list[str] | None = None) -> int:
     args = p.parse_args(argv)
     if not args.time_scale > 0:
         p.error("--time-scale must be positive")
-    die_with_parent()
-    try:
-        rig = load_instrument(args.config)
-        gxx = None if args.python else sketch_compiler()
-        if gxx is not None:
-            program = str(build_sketch(gxx))
-            command = [program, "--link", str(args.link), "--time-scale", repr(args.time_scale)]
-            command += ["--boot-ms", str(args.boot_ms), "--trigger-line", str(rig.pi.trigger_in)]
-            command += ["--steps-per-mm", repr(rig.stage.steps_per_mm)]
-            command += ["--wires", str(args.wires)] if args.wires else []
-            os.execv(program, command)
-        if not args.python:
-            sys.stderr.write("stage: no C++ compiler or no sketch here: the Python stand-in runs instead\n")
-        stop = stop_requested()
-        wires = WireClient(args.wires) if args.wires else None
-        port = SerialPort(args.link)
-        try:
-            announce_ready(str(args.link))
-            stage = PythonStage(Rig(rig.stage.steps_per_mm, rig.pi.trigger_in))
-            serve(stage, port, wires, args.time_scale, args.boot_ms, stop)
-        finally:
-            port.close()
-    except PolysightError as e:
-        sys.stderr.write(f"stage: {e}\n")
-        return e.exit_status
-    return 0
+    return run_until_stopped(lambda stop: _run(args, stop))
+
+
+def _run(args: argparse.Namespace, stop: Signal) -> None:
+    rig = load_instrument(args.config)
+    gxx = None if args.python else sketch_compiler()
+    if gxx is not None:
+        program = str(build_sketch(gxx))
+        command = [program, "--link", str(args.link), "--time-scale", repr(args.time_scale)]
+        command += ["--boot-ms", str(args.boot_ms), "--trigger-line", str(rig.pi.trigger_in)]
+        command += ["--steps-per-mm", repr(rig.stage.steps_per_mm)]
+        if args.wires:
+            command += ["--wires", str(args.wires)]
+        os.execv(program, command)
+    if not args.python:
+        sys.stderr.write("stage: no C++ compiler or no sketch here: the Python stand-in runs instead\n")
+    wires = WireClient(args.wires) if args.wires else None
+    with closing(SerialPort(args.link)) as port:
+        announce_ready(str(args.link))
+        stage = PythonStage(Rig(rig.stage.steps_per_mm, rig.pi.trigger_in))
+        serve(stage, port, wires, args.time_scale, args.boot_ms, stop)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,11 @@ from polysight_simulators.stage.motion import EMERGENCY, LOOKS, MAX_RATE, MIN_RA
 MAX_TRAVEL = 999_999
 MAX_POINTS = 9_999
 MAX_BACKLASH = 20_000
-HOME_RATE, CREEP_RATE, PULL_OFF, MAX_RELEASE = 4000, 400, 400, 4000  # steps/s and steps
+# steps/s and steps
+HOME_RATE = 4000
+CREEP_RATE = 400
+PULL_OFF = 400
+MAX_RELEASE = 4000
 HOME_ACCEL = 40_000  # steps/s^2
 QUIET_MS = 4
 _RANGES = {
@@ -74,7 +78,9 @@ class StageLogic:
     """
 
     def __init__(self, engine: StepEngine, arm: Callable[[int], None], inputs: Callable[[], int]) -> None:
-        self._engine, self._arm, self._inputs = engine, arm, inputs
+        self._engine = engine
+        self._arm = arm
+        self._inputs = inputs
         self.parameters = {
             Parameter.ACCEL: 40_000,
             Parameter.HEARTBEAT: 500,
@@ -153,7 +159,8 @@ class StageLogic:
     def _home(self) -> None:
         self._begin("home")
         self._engine.set_accel(HOME_ACCEL)
-        self._knew, self.homed = self.homed, False
+        self._knew = self.homed
+        self.homed = False
         self._phase = 0
 
     def _move(self, x: int, y: int, rate: int) -> None:
@@ -166,7 +173,8 @@ class StageLogic:
     def _row(self, x0: int, pitch: int, points: int, y: int, rate: int) -> None:
         _require(1 <= points <= MAX_POINTS and pitch != 0 and rate >= MIN_RATE, StageError.OUT_OF_RANGE)
         _require(rate <= MAX_RATE, StageError.TOO_FAST)
-        last, spacing = x0 + pitch * (points - 1), abs(pitch)
+        last = x0 + pitch * (points - 1)
+        spacing = abs(pitch)
         _require(self._within(x0, y) and self._within(last, y) and spacing <= MAX_TRAVEL, StageError.SOFT_LIMIT)
         width_us = self.parameters[Parameter.TRIGGER]
         _require(width_us * rate < min(spacing, 4000) * 1_000_000, StageError.OUT_OF_RANGE)
@@ -198,10 +206,14 @@ class StageLogic:
 
     def immediate(self, byte: int) -> bool:
         """Process a byte; return False if it is not an immediate one."""
-        alone, confirmed = self._quiet, self._resume_begun
-        self._quiet, self._byte_seen, self._resume_begun = False, True, byte == Immediate.RESUME
+        alone = self._quiet
+        confirmed = self._resume_begun
+        self._quiet = False
+        self._byte_seen = True
+        self._resume_begun = byte == Immediate.RESUME
         if byte == Immediate.HOLD:
-            self._engine.hold, self._resume = True, False
+            self._engine.hold = True
+            self._resume = False
         elif byte == Immediate.RESUME:
             self._resume |= confirmed
             self._resume_begun = not confirmed
@@ -216,11 +228,13 @@ class StageLogic:
 
     def _listen(self, now_ms: int) -> None:
         if self._byte_seen:
-            self._byte_seen, self._byte_ms = False, now_ms
+            self._byte_seen = False
+            self._byte_ms = now_ms
         elif now_ms - self._byte_ms >= QUIET_MS:
             self._quiet = True
         if self.heard:
-            self.heard, self._heard_ms = False, now_ms
+            self.heard = False
+            self._heard_ms = now_ms
         if now_ms != self._looked_ms and not self._engine.stepping:
             self._looked_ms = now_ms
             self._engine.look(self._inputs())
@@ -256,11 +270,9 @@ class StageLogic:
             self._stopping = StageError.HEARTBEAT_LOST
         if self._stopping is not None:
             engine.hold = True
-            return (
-                Event.NONE
-                if engine.stepping
-                else self._raise(self._stopping, self._stopping == StageError.HEARTBEAT_LOST)
-            )
+            if engine.stepping:
+                return Event.NONE
+            return self._raise(self._stopping, self._stopping == StageError.HEARTBEAT_LOST)
         if self._resume:
             self._resume = False
             self._arm(engine.resume())
@@ -290,24 +302,26 @@ class StageLogic:
             if self._engine.reached != (self._phase % 3 != 2):
                 return self._raise(StageError.HOMING_FAILED, True)
             if self._phase == 2:
-                self.lost_x, self._engine.x = -self._engine.x if self._knew else 0, 0
+                self.lost_x = -self._engine.x if self._knew else 0
+                self._engine.x = 0
             if self._phase == 5:
-                self.lost_y, self._engine.y = -self._engine.y if self._knew else 0, 0
+                self.lost_y = -self._engine.y if self._knew else 0
+                self._engine.y = 0
             self._phase += 1
         if self._phase == 6:
             self._engine.set_accel(self.parameters[Parameter.ACCEL])
             self.homed = True
             return self._end()
-        along_x, step = self._phase < 3, self._phase % 3
+        along_x = self._phase < 3
+        step = self._phase % 3
+        # To the switch, slowly off it until it opens, and away from it.
         travel = self.parameters[Parameter.TRAVEL_X if along_x else Parameter.TRAVEL_Y]
         distance = (-(travel + travel // 10 + PULL_OFF), MAX_RELEASE, PULL_OFF)[step]
-        leg = Leg(
-            distance if along_x else 0,
-            0 if along_x else distance,
-            CREEP_RATE if step == 1 else HOME_RATE,
-            until=SWITCH_X if along_x else SWITCH_Y,
-            until_open=step == 1,
-        )
+        rate = CREEP_RATE if step == 1 else HOME_RATE
+        if along_x:
+            leg = Leg(distance, 0, rate, until=SWITCH_X, until_open=step == 1)
+        else:
+            leg = Leg(0, distance, rate, until=SWITCH_Y, until_open=step == 1)
         self._homing_leg_made = True
         self._arm(self._engine.start(leg))
         return Event.NONE

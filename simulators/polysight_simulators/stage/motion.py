@@ -13,8 +13,11 @@ from polysight_shared.faults import StageError
 
 TICK_HZ = 2_000_000
 NS_PER_TICK = 1_000_000_000 // TICK_HZ
-MIN_RATE, MAX_RATE = 31, 20_000
-SWITCH_X, SWITCH_Y, EMERGENCY = 1, 2, 4
+MIN_RATE = 31
+MAX_RATE = 20_000
+SWITCH_X = 1
+SWITCH_Y = 2
+EMERGENCY = 4
 SWITCHES = SWITCH_X | SWITCH_Y
 LOOKS = 5  # equal readings after which a switch changes (debouncing)
 
@@ -73,14 +76,18 @@ class StepEngine:
 
     def start(self, leg: Leg) -> int:
         """Plan a leg; return the ticks to its first step, or 0 if there is none now."""
-        nx, ny = abs(leg.dx), abs(leg.dy)
+        nx = abs(leg.dx)
+        ny = abs(leg.dy)
         self.leg = leg
         self.x_major = nx >= ny
-        self.major, self.minor = max(nx, ny), min(nx, ny)
+        self.major = max(nx, ny)
+        self.minor = min(nx, ny)
         self.error = self.major // 2
-        self.x_direction, self.y_direction = (leg.dx > 0) - (leg.dx < 0), (leg.dy > 0) - (leg.dy < 0)
+        self.x_direction = (leg.dx > 0) - (leg.dx < 0)
+        self.y_direction = (leg.dy > 0) - (leg.dy < 0)
         self.left, self.ramp, self.ramp_full = self.major, 0, self.ramp_steps(leg.rate)
-        self.to_trigger, self.points_left = leg.lead, leg.points
+        self.to_trigger = leg.lead
+        self.points_left = leg.points
         self.reached = self.cruise = False
         return self._from_rest()
 
@@ -105,7 +112,8 @@ class StepEngine:
         """Read and debounce the switches: a change counts after :data:`LOOKS` equal readings."""
         self._looks = 0 if inputs == self.stable else self._looks + 1
         if self._looks >= LOOKS:
-            self.stable, self._looks = inputs, 0
+            self.stable = inputs
+            self._looks = 0
 
     def step(self, inputs: int) -> tuple[int, int, bool]:
         """Make the step that is due; return the steps of x and y (signed), and True if the trigger is raised."""
@@ -147,15 +155,13 @@ class StepEngine:
         if not self.cruise or self.hold or self.leg.until or self.stable:
             return 0, 0, 0, 0
         rate = self.leg.rate
-        n = min(
-            self.left - self.ramp - 1,
-            ((wait_ticks + 1) * rate - 1 - self.carry) // TICK_HZ + 1,
-            clear_x if self.x_major else clear_y,
-            self.to_trigger - 1 if self.points_left else self.left,
-        )
+        clear_major, clear_minor = (clear_x, clear_y) if self.x_major else (clear_y, clear_x)
+        n = min(self.left - self.ramp - 1, ((wait_ticks + 1) * rate - 1 - self.carry) // TICK_HZ + 1, clear_major)
+        if self.points_left:
+            n = min(n, self.to_trigger - 1)
         if self.minor:
             # Over n steps of the longer axis the other makes at most n minor / major + 1.
-            n = min(n, ((clear_y if self.x_major else clear_x) - 1) * self.major // self.minor)
+            n = min(n, (clear_minor - 1) * self.major // self.minor)
         if n < 2:
             return 0, 0, 0, 0
         self._looks = 0
@@ -169,7 +175,8 @@ class StepEngine:
         self.left -= n
         others, self.error = divmod(self.error + n * self.minor, self.major)
         nx, ny = (n, others) if self.x_major else (others, n)
-        dx, dy = nx * self.x_direction, ny * self.y_direction
+        dx = nx * self.x_direction
+        dy = ny * self.y_direction
         self.x += dx
         self.y += dy
         trigger = False
@@ -195,7 +202,9 @@ class StepEngine:
             self.speed_q16 = max(slowest, self.speed_q16 - (self.ticks * self._accel_q20 >> 4))
         elif self.cruise or self.ramp == self.ramp_full:
             if not self.cruise:
-                self.cruise, self.carry, self.speed_q16 = True, 0, rate << 16
+                self.cruise = True
+                self.carry = 0
+                self.speed_q16 = rate << 16
             self.ticks, self.carry = divmod(TICK_HZ + self.carry, rate)
             return self.ticks
         elif self.left > self.ramp + 1:

@@ -44,7 +44,10 @@ class PythonStage:
         self._now_ms = self._pressed = self._told = self._next = 0
         self._armed = False
         self._fall: int | None = None
-        self._x, self._y, self._zero_x, self._zero_y = rig.x, rig.y, 0, 0
+        self._x = rig.x
+        self._y = rig.y
+        self._zero_x = 0
+        self._zero_y = 0
         self._power_on()
 
     def _power_on(self) -> None:
@@ -110,11 +113,14 @@ class PythonStage:
 
     def _steps(self, until: int) -> None:
         engine = self._engine
-        clear = (abs(self._x) - 1, abs(self._y) - 1) if not self._inputs() else (0, 0)
-        wait = (min(until, self._fall - 1) if self._fall is not None else until) - self.tick
-        n, dx, dy, ticks = engine.skip(wait, *clear) if wait > 0 else (0, 0, 0, 0)
+        end = until if self._fall is None else min(until, self._fall - 1)
+        n = dx = dy = ticks = 0
+        if end > self.tick and not self._inputs():
+            n, dx, dy, ticks = engine.skip(end - self.tick, abs(self._x) - 1, abs(self._y) - 1)
         if n:
-            self._x, self._y, self._next = self._x + dx, self._y + dy, self._next + ticks
+            self._x += dx
+            self._y += dy
+            self._next += ticks
             self.tick = self._next - engine.ticks
             return
         cruised = engine.cruise
@@ -153,18 +159,25 @@ class PythonStage:
             if not (self._logic.busy and self._engine.finished):
                 break
         if self._logic.homed and not self._was_homed:
-            self._zero_x, self._zero_y = self._x - self._engine.x, self._y - self._engine.y
+            self._zero_x = self._x - self._engine.x
+            self._zero_y = self._y - self._engine.y
             self._report_motion()
         self._was_homed = self._logic.homed
 
     def _arm(self, ticks: int) -> None:
         if ticks:
-            self._next, self._armed = self.tick + ticks, True
+            self._next = self.tick + ticks
+            self._armed = True
             if self._engine.cruise:  # a leg without a ramp
                 self._report_motion()
 
     def _inputs(self) -> int:
-        return self._pressed | (SWITCH_X if self._x <= 0 else 0) | (SWITCH_Y if self._y <= 0 else 0)
+        inputs = self._pressed
+        if self._x <= 0:
+            inputs |= SWITCH_X
+        if self._y <= 0:
+            inputs |= SWITCH_Y
+        return inputs
 
     def _edge(self, tick: int, value: int) -> None:
         self._fall = self._fall if value else None
@@ -187,7 +200,8 @@ class PythonStage:
         if byte != 0x0A:
             self._line.append(byte)
             return
-        line, self._line = bytes(self._line), bytearray()
+        line = bytes(self._line)
+        self._line = bytearray()
         if len(line) >= MAX_LINE_BYTES:
             self._refuse(StageError.LINE_TOO_LONG)
         elif line:
@@ -225,22 +239,26 @@ class PythonStage:
         if hello:
             steps = round(self._rig.steps_per_mm)
             fields = {"fw": FIRMWARE, "proto": str(PROTOCOL_VERSION), "steps": str(steps)}
-        self._last, accepted = command, True
+        self._last = command
+        accepted = True
         try:
             self._logic.execute(command.verb, command.args)
             answer = Reply("ok", command.sequence, fields=fields)
         except Refused as e:
-            answer, accepted = Reply("error", command.sequence, int(e.number)), False
+            answer = Reply("error", command.sequence, int(e.number))
+            accepted = False
         self._fresh = hello and accepted
         self._greeted = self._greeted or self._fresh
         self._last_is_motion = accepted and command.verb in MOTION_VERBS
         if self._last_is_motion:
-            self._motion_sequence, self._outcome = command.sequence, b""
+            self._motion_sequence = command.sequence
+            self._outcome = b""
         self._last_answer = answer.encode()
         self._send(self._last_answer)
 
     def _done(self) -> bytes:
-        engine, logic = self._engine, self._logic
+        engine = self._engine
+        logic = self._logic
         fields = {"points": engine.points, "pulses": engine.pulses} if logic.row_command else {}
         fields |= {"x": engine.x, "y": engine.y}
         if logic.row_command:
@@ -250,7 +268,8 @@ class PythonStage:
         return Reply("done", self._motion_sequence, fields={k: str(v) for k, v in fields.items()}).encode()
 
     def _status(self) -> bytes:
-        engine, logic = self._engine, self._logic
+        engine = self._engine
+        logic = self._logic
         fields: dict[str, object] = {"state": logic.state, "x": engine.x, "y": engine.y}
         fields |= {"points": engine.points, "pulses": engine.pulses, "alarm": int(logic.alarm or 0)}
         fields |= {"limits": self._inputs(), "homed": int(logic.homed)}

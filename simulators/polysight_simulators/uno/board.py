@@ -23,7 +23,6 @@ _CC = ("gcc", "-O2", "-Wall", "-Wextra")
 _LIBRARIES = ("-lsimavr", "-lelf", "-lutil", "-lm")
 _ON_FAILURE = ("a package is missing, or the sources were changed", ENABLING_COMMAND)
 HZ = 16_000_000
-STEP_VECTOR, TRIGGER_END_VECTOR, MILLIS_VECTOR, RECEIVE_VECTOR, SEND_VECTOR = 11, 12, 16, 18, 19
 
 
 class PinEdge(NamedTuple):

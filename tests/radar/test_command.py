@@ -18,8 +18,7 @@ from polysight.radar.messages import decode
 from polysight_shared.tables import to_builtins
 from polysight_simulators.radars import RadarBoard, make_image
 from polysight_simulators.radars.__main__ import replay
-from polysight_simulators.radars.cores import BOOT_S
-from polysight_simulators.radars.wire import FAULT_DATA
+from polysight_simulators.radars.cores import BOOT_S, FAULT_DATA
 
 STEPS = ["USB", "reset", "power rails", "firmware", "RF power-up", "versions", "settings", "RF init", "chirp", "die id"]
 STEPS += ["one frame", "read back"]

@@ -16,7 +16,7 @@ from polysight.radar.events import BOOT_STATUS, MAIN_CPU_FAULT, MAIN_POWER_UP, d
 from polysight.radar.link import Link
 from polysight.radar.messages import Direction, Kind, SubBlock, decode, decode_header
 from polysight_shared.error_codes import ErrorCode
-from polysight_simulators.radars.wire import frame, ones_sum
+from polysight_simulators.radars.cores import frame, ones_sum
 
 
 class Sent:

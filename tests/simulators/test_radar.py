@@ -10,10 +10,9 @@ from tests.support.rigs import published_rig
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_simulators.scene import decode_scene
 from polysight_simulators.scene.cubes import reference_cube
-from polysight_simulators.scene.draws import pulse_uniform
 from polysight_simulators.scene.optics import antennas, field_exact
-from polysight_simulators.scene.radar import SimulatedRig, sample_frequencies_hz
-from polysight_simulators.scene.receiver import high_pass, power_on, sync_delay_s
+from polysight_simulators.scene.radar import SimulatedRig, high_pass, power_on, sample_frequencies_hz, sync_delay_s
+from polysight_simulators.scene.scene_file import pulse_uniform
 
 RIG = published_rig()
 GRID = {"columns": 9, "rows": 6, "step_x_mm": 10.0, "step_y_mm": 10.0}

@@ -11,7 +11,7 @@ from tests.support.rigs import published_rig
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError
 from polysight_simulators.scene import Scene, SimulatedRig, apply_scene, decode_scene, draw_specimens, simulate, truth
-from polysight_simulators.scene.specimens import facets
+from polysight_simulators.scene.scene_file import facets
 
 RIG = published_rig()
 PLATE = {"name": "a", "centre_mm": [30.0, -20.0], "size_mm": [45.0, 30.0], "permittivity": [4.0, 0.4]}

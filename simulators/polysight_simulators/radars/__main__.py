@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from polysight_simulators.radars.board import FUNCTIONAL, RadarBoard
-from polysight_simulators.radars.image import make_image
+from polysight_simulators.radars.cores import make_image
 
 _STEP_S, _TIMEOUT_S = 1e-4, 15.0
 

@@ -15,8 +15,19 @@ from enum import Enum
 
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
-from polysight_simulators.radars.cores import ERASE_S, FRAME_END, RF_FAULT, Cores
-from polysight_simulators.radars.wire import EVENT, NACK, READY, RESPONSE, TO_DEVICE, frame, ones_sum
+from polysight_simulators.radars.cores import (
+    ERASE_S,
+    EVENT,
+    FRAME_END,
+    NACK,
+    READY,
+    RESPONSE,
+    RF_FAULT,
+    TO_DEVICE,
+    Cores,
+    frame,
+    ones_sum,
+)
 
 FUNCTIONAL = 4  # sense-on-power mode
 ANSWER_S, DATA_S = 1e-4, 1e-3

@@ -1,16 +1,84 @@
-"""The two cores of a simulated AWR2243: their states, and the effect of each command.
+"""The two cores of a simulated AWR2243: their states, the effect of each command, messages and firmware images.
 
-The table in docs/spec/mmwavelink.md ("The stand-in") has the answers in each state, with the sections of TI's document.
+The table in docs/spec/mmwavelink.md ("The stand-in") has the answers in each state, with the sections of TI's document
+("ICD", revision 2.23). Messages are encoded independently of the host's codec, after that document and received ones.
+
+Firmware images have TI's file format without a program, that of public copies of TI's `xwr22xx_metaImage.bin` (7,940
+bytes): `MSTR`, length without the CRC at byte 20, `MEND`, an `RPRC` part for the main core at byte 128 and one for the
+RF core after it, CRC-32 at the end. A part has its ROM version at offset 56 and the patch version at 72: major, minor,
+build, debug, year, month, day.
 """
 
 from __future__ import annotations
 
+import binascii
 import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from polysight_simulators.radars.image import boot_errors, patch_of
-from polysight_simulators.radars.wire import FAULT_DATA, OLD_UP_EMPTY, OLD_UP_WRITTEN
+TO_DEVICE, READY, FROM_DEVICE = bytes.fromhex("34122143"), bytes.fromhex("78566587"), bytes.fromhex("badccdab")
+RESPONSE, NACK, EVENT = 1, 2, 3
+
+# Received from real devices (TI E2E forum, threads 670135, 752121, 1267477).
+FAULT_DATA = bytes.fromhex("05000000800000fe") + bytes(16) + b"\xff" * 6 + bytes(2)
+OLD_UP_EMPTY = bytes.fromhex("00000000ff7c0c000000000000000000")
+OLD_UP_WRITTEN = bytes.fromhex("10aa0500") + bytes(16)
+
+
+def ones_sum(head: bytes) -> int:
+    """Compute the ones-complement sum of 16-bit words; 0xFFFF over a header with its checksum (ICD 2.3.2)."""
+    total = sum(struct.unpack(f"<{len(head) // 2}H", head))
+    while total > 0xFFFF:
+        total = (total & 0xFFFF) + (total >> 16)
+    return total
+
+
+def frame(direction: int, kind: int, number: int, body: bytes, count: int, sequence: int, wide: bool) -> bytes:
+    """Encode a message with a CRC of 32 (`wide`) or 16 bits (ICD 2.3); the latter has its acknowledgement bits set."""
+    flags = sequence << 12 | (1 << 10 if wide else 0xC)
+    head = struct.pack("<5H", direction | kind << 4 | number << 6, 12 + len(body) + (4 if wide else 2), flags, 0, count)
+    head += struct.pack("<H", 0xFFFF - ones_sum(head))
+    crc = zlib.crc32(head + body).to_bytes(4, "little")
+    if not wide:
+        crc = binascii.crc_hqx(head + body, 0xFFFF).to_bytes(2, "little")
+    return FROM_DEVICE + head + body + crc
+
+
+METAHEADER_NOT_FOUND, METAHEADER_CRC_FAILURE, MSSIMAGE_NOT_FOUND = 1 << 6, 1 << 30, 1 << 28  # ICD table 7.3
+_ROM = bytes((2, 2, 1, 7, 20, 3, 17))
+_MAIN_PATCH, _RF_PATCH = bytes((2, 2, 2, 0, 20, 7, 29)), bytes((2, 2, 4, 0, 22, 7, 6))
+_MAIN_AT, _RF_AT = 0x80, 0x880
+
+
+def make_image(size: int = 7940, *, rom: bytes = _ROM) -> bytes:
+    """Make an image of `size` bytes from which a simulated board boots."""
+    filler = bytes(n * 7 % 251 for n in range(size - 4))
+    image = bytearray(filler)
+    image[:0x80] = struct.pack("<4s5I", b"MSTR", 2, 0x37, 0, 0, size - 4).ljust(0x5C, b"\0") + b"MEND".ljust(
+        0x24, b"\0"
+    )
+    for at, patch in ((_MAIN_AT, _MAIN_PATCH), (_RF_AT, _RF_PATCH)):
+        image[at : at + 0x60] = b"RPRC".ljust(0x38, b"\0") + rom.ljust(0x10, b"\0") + patch.ljust(0x18, b"\0")
+    return bytes(image) + zlib.crc32(image).to_bytes(4, "little")
+
+
+def boot_errors(image: bytes) -> int:
+    """Return the status bits of a boot from this image (ICD table 7.3); 0 if it succeeds."""
+    if image[:4] != b"MSTR":
+        return METAHEADER_NOT_FOUND | MSSIMAGE_NOT_FOUND
+    length = int.from_bytes(image[20:24], "little")
+    if len(image) < length + 4 or zlib.crc32(image[:length]) != int.from_bytes(image[length : length + 4], "little"):
+        return METAHEADER_CRC_FAILURE
+    return 0
+
+
+def patch_of(image: bytes, main: bool) -> bytes:
+    """Return the last six bytes of a version answer (ICD tables 5.66, 5.157): major, minor, date, build and debug."""
+    at = (_MAIN_AT if main else _RF_AT) + 0x48
+    major, minor, build, debug, *date = image[at : at + 7]
+    return bytes((major, minor, *date, build << 4 | debug))
+
 
 BOOT_S, RF_UP_S, RF_INIT_S, ERASE_S, READY_S = 0.05, 0.02, 0.3, 4.0, 1e-3
 UP_MAIN, UP_RF, MAIN_FAULT, BOOTED = 0x5000, 0x5001, 0x5002, 0x5005

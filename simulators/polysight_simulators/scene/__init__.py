@@ -1,17 +1,15 @@
 """Simulate radar data: from a scene file to the frames of the radars, and to whole scans on disk.
 
-`scene_file` defines the scene file: plates, points and disturbances; `specimens` draws the true permittivities and
-positions. `optics` has the reflection of plates and the exact but slow sum of their echo; `field` (with `field_grid`
-and `spectral`) computes the same echo fast at every stage position. `receiver` adds the effects of a board, and `radar`
-(`SimulatedRig`) gives the frames for stage offsets. `cubes` gives the samples after ideal synchronisation without
-frames. `simulate` writes a scan, as a scan folder (`layouts`) or in the published data set's layout
-(`published_layout`), with truth.json.
+`scene_file` defines the scene file (plates, points, disturbances) and draws the true permittivities and positions.
+`optics` has the reflection of plates and the exact but slow sum of their echo; `field` computes the same echo fast at
+every stage position. `radar` (`SimulatedRig`) adds the effects of a board and gives the frames for stage offsets;
+`cubes` gives the samples after ideal synchronisation without frames. `simulate` writes a scan, as a scan folder or in
+the published data set's layout (`layouts`), with truth.json.
 """
 
 from polysight_simulators.scene.cubes import reference_cube, synced_cube
-from polysight_simulators.scene.layouts import OwnLayout
+from polysight_simulators.scene.layouts import AuthorsLayout, OwnLayout, write_cube
 from polysight_simulators.scene.optics import layered, strips
-from polysight_simulators.scene.published_layout import AuthorsLayout, write_cube
 from polysight_simulators.scene.radar import PatternSource, SignalSource, SimulatedRig, pattern_frames
 from polysight_simulators.scene.scene_file import (
     Disturbances,
@@ -21,11 +19,11 @@ from polysight_simulators.scene.scene_file import (
     Scene,
     apply_scene,
     decode_scene,
+    draw_specimens,
     load_scene,
     without_offset,
 )
 from polysight_simulators.scene.simulated_scan import lost_bytes, row_offsets_mm, simulate, truth
-from polysight_simulators.scene.specimens import draw_specimens
 
 __all__ = [
     "AuthorsLayout",

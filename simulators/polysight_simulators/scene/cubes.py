@@ -20,12 +20,10 @@ from numpy.typing import NDArray
 from polysight_shared.config import Board, Instrument
 from polysight_shared.raster import mean_burst_travel_mm, plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
-from polysight_simulators.scene.draws import stream_key
 from polysight_simulators.scene.field import ObjectField, build_field, node_matrix
 from polysight_simulators.scene.optics import Real, antennas, direct_factor
-from polysight_simulators.scene.radar import sample_frequencies_hz
-from polysight_simulators.scene.receiver import high_pass, power_on
-from polysight_simulators.scene.scene_file import Scene, apply_scene
+from polysight_simulators.scene.radar import high_pass, power_on, sample_frequencies_hz
+from polysight_simulators.scene.scene_file import Scene, apply_scene, stream_key
 
 
 def reference_cube(rig: Instrument, scene: Scene, remove_direct: bool = True) -> dict[str, NDArray[np.complex64]]:

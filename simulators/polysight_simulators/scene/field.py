@@ -9,13 +9,23 @@ field(u) = integral A(v) g(v - u) dv, a convolution. It is computed in the spect
 * only a few Chebyshev nodes of the IF band are computed, with the centre delay removed; the rest is interpolated;
 * the result is oversampled, and evaluated at any stage position with a windowed sinc.
 
-The computation is in :mod:`polysight_simulators.scene.spectral`, also for tilted, raised or rough plates.
+Plates and points of similar height share a kernel, computed at that height (a :class:`_Level`). The remaining height z
+of a point, from tilt, roughness and height of its plate, adds C z to the path, with C = dpath/dz of about 2 cos(theta).
+exp(j k C z) does not separate into plate and kernel, for C varies over the kernel, but its interpolation between a few
+values C_m does:
+
+    exp(j k C z) = sum over m of l_m(C) exp(j k C_m z).
+
+l_m belongs to the kernel and exp(j k C_m z) to the plate: a tilt shifts the spectrum of its rectangle, the height of a
+facet changes its phase. Neglected are the change of C over z (except for its mean over the plate's height), the changes
+of spreading and angle, and the rotation of the plate's normal in the obliquity.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,12 +38,395 @@ from numpy.typing import NDArray
 from polysight_shared.config import Board, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
+from polysight_shared.raster import mean_burst_travel_mm
 from polysight_shared.tables import to_builtins
-from polysight_simulators.scene.field_grid import TAPS
-from polysight_simulators.scene.optics import Real
-from polysight_simulators.scene.scene_file import Scene
-from polysight_simulators.scene.specimens import draw_specimens
-from polysight_simulators.scene.spectral import cheb_nodes, compute
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_simulators.scene.optics import (
+    Antennas,
+    Complex,
+    Real,
+    Reflectivity,
+    antennas,
+    board_reflectivity,
+    direct_factor,
+    plate_scale,
+    point_scale,
+    sampled,
+)
+from polysight_simulators.scene.scene_file import Facets, Plate, Scene, draw_specimens, facets, slopes
+
+FADE_M = 0.06  # length of the kernel's fade-out beyond the scene
+TAPS = 12  # taps of the windowed sinc
+MARGIN_M = 0.012  # offsets beyond the aperture, for the taps of the sinc
+OVERSAMPLING = 2
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of the computation: range of offsets and spectral grid, metres."""
+
+    low_u: float
+    high_u: float
+    low_w: float
+    high_w: float
+    step: float
+    points: int
+
+    @property
+    def w(self) -> Real:
+        """Kernel positions (object point minus stage offset)."""
+        return self.low_w - FADE_M + self.step * np.arange(self.points)
+
+    @property
+    def fade(self) -> Real:
+        """Fade-out of the kernel: 1 within the scene, smoothly 0 outside."""
+        w = self.w
+        beyond = np.maximum(self.low_w - w, w - self.high_w) / FADE_M
+        return np.cos(np.pi / 2 * np.clip(beyond, 0.0, 1.0)) ** 4
+
+    @property
+    def kappa(self) -> Real:
+        """Spatial frequencies of the DFT, rad/m."""
+        return 2 * np.pi * np.fft.fftfreq(self.points, self.step)
+
+    @property
+    def first_u(self) -> float:
+        """First offset of the output grid, some taps before the aperture."""
+        return self.low_u - (TAPS // 2) * self.step / OVERSAMPLING
+
+    @property
+    def outputs(self) -> int:
+        """Number of offsets of the output grid."""
+        return int(np.ceil((self.high_u - self.low_u) / self.step * OVERSAMPLING)) + TAPS + 1
+
+
+def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -> tuple[Axis, Axis]:
+    """Return extent and pitch in x and y from the extent of the scene and the steepest phase of the kernel.
+
+    A tilt moves the specular point of a plate (26 mm per degree), but the kernel already extends from every offset to
+    the edges of every plate.
+    """
+    travel = 2 * mean_burst_travel_mm(rig.burst, rig.stage) + abs(scene.disturbances.backlash_mm)
+    edges = [(*p.centre_mm, p.size_mm[0] / 2, p.size_mm[1] / 2) for p in scene.plates]
+    edges += [(*p.position_mm, 0.0, 0.0) for p in scene.points]
+    table = np.array(edges or [(0.0, 0.0, 0.0, 0.0)])
+    spans = []
+    for i, (n, step, extra) in enumerate(
+        ((rig.grid.columns, rig.grid.step_x_mm, travel + 1.0), (rig.grid.rows, rig.grid.step_y_mm, 1.0))
+    ):
+        half = (n - 1) / 2 * step + extra
+        low_v = ant.centre_m[i] * 1e3 + np.min(table[:, i] - table[:, i + 2])
+        high_v = ant.centre_m[i] * 1e3 + np.max(table[:, i] + table[:, i + 2])
+        spans.append(np.array([-half, half, low_v - half, high_v + half]) / 1e3 + [0, 0, -MARGIN_M, MARGIN_M])
+    corners = np.meshgrid(*(np.linspace(s[2] - FADE_M, s[3] + FADE_M, 9) for s in spans))
+    wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
+    nearest_z = ant.plane_z_m + min([0.0, *(p.height_mm for p in (*scene.plates, *scene.points))]) / 1e3
+    axes = []
+    for i, span in enumerate(spans):
+        steepest = 0.0
+        for rx in ant.rx_m:
+            slope = np.zeros_like(corners[0])
+            for antenna in (ant.tx_m, rx):
+                away = np.stack([corners[0] - antenna[0], corners[1] - antenna[1]])
+                slope += away[i] / np.sqrt(away[0] ** 2 + away[1] ** 2 + (nearest_z - antenna[2]) ** 2)
+            steepest = max(steepest, wave * float(np.abs(slope).max()))
+        step = min(np.pi / (1.1 * steepest + 6 * np.pi / FADE_M), 4e-3)
+        points = int(scipy.fft.next_fast_len(int(np.ceil((span[3] - span[2] + 2 * FADE_M) / step)) + 1) or 0)
+        axes.append(Axis(span[0], span[1], span[2], span[3], step, points))
+    return axes[0], axes[1]
+
+
+_ANGLE_TOLERANCE = 1e-4  # error of the Chebyshev series in the local angle
+_RELIEF_TOLERANCE = 2e-4  # error of the interpolation in dpath/dz
+_LEVEL_MM = 2.0  # range of heights that share a kernel
+
+
+def cheb_nodes(q: int) -> Real:
+    """Return the q zeros of the Chebyshev polynomial of order q, descending."""
+    return np.cos(np.pi * (np.arange(q) + 0.5) / q)
+
+
+def _angle_series(
+    scene: Scene, reflect: Reflectivity, nodes_hz: Real, theta: tuple[float, float]
+) -> NDArray[np.complexfloating]:
+    """Return the Chebyshev coefficients of r(theta) for each plate and node, [plate, node, order]."""
+    centre, half = (theta[0] + theta[1]) / 2, max((theta[1] - theta[0]) / 2, 1e-9)
+    many = 16
+    x = cheb_nodes(many)
+    to_series = chebyshev.chebvander(x, many - 1).T * (2.0 / many)
+    to_series[0] /= 2.0
+    rows = [[reflect(p, f, centre + half * x) for f in nodes_hz] for p in scene.plates]
+    values = np.array(rows, dtype=np.complex128)
+    series = np.einsum("pfm,jm->pfj", values.reshape(len(scene.plates), len(nodes_hz), many), to_series)
+    tail = np.cumsum(np.abs(series).max(axis=(0, 1), initial=0.0)[::-1])[::-1]
+    orders = max(1, int(np.sum(tail > _ANGLE_TOLERANCE)))
+    return series[:, :, :orders]
+
+
+def _spectra(axis: Axis, centres: Real, sizes: Real, shifts: Real | float = 0.0) -> Complex:
+    """Return the Fourier transforms of intervals (or points, size 0) along an axis, [item, kappa], on the grid.
+
+    `shifts` [item] are linear phases over each interval, rad/m, zero at its centre.
+    """
+    k = axis.kappa
+    width = np.where(sizes > 0, sizes, 1.0)[:, None]
+    shift = axis.w[0] + axis.first_u - centres
+    envelope = width * np.sinc((np.outer(sizes, k) - (sizes * shifts)[:, None]) / (2 * np.pi))
+    return envelope.astype(np.complex128) * np.exp(1j * np.outer(shift, k))
+
+
+def _outer(
+    y: NDArray[np.complexfloating], weight: NDArray[np.complexfloating], x: NDArray[np.complexfloating]
+) -> NDArray[np.complex64]:
+    """Return the weighted sum of outer products over items, [kappa_y, kappa_x]; without BLAS threads."""
+    scaled = (y * weight[:, None]).astype(np.complex64)
+    return np.einsum("py,px->yx", scaled, x.astype(np.complex64))
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Plates and points of similar height, which share a kernel.
+
+    Attributes
+    ----------
+    plates, points
+        Indices of the members.
+    lift_m, point_lift_m
+        Their heights relative to the level.
+    legs
+        r1, r2, incidence and obliquity over the kernel at the level's height, for each RX.
+    bend
+        d2path/dz2 at the image centre, 1/m.
+    steepness
+        Interpolation nodes C_m of dpath/dz.
+    middle, half
+        Middle and half width of the range of dpath/dz over the kernel.
+    """
+
+    plates: list[int]
+    points: list[int]
+    lift_m: Real
+    point_lift_m: Real
+    legs: list[tuple[Real, Real, Real, Real]]
+    bend: float
+    steepness: Real
+    middle: float
+    half: float
+
+    def shares(self, oblique: Real) -> list[Real] | None:
+        """Return l_m of dpath/dz over the kernel for each m; None for a single node."""
+        n = len(self.steepness)
+        if n == 1:
+            return None
+        at_nodes = chebyshev.chebvander(cheb_nodes(n), n - 1) * (2.0 / n)
+        at_nodes[:, 0] /= 2.0
+        everywhere = chebyshev.chebvander((2 * oblique - self.middle) / self.half, n - 1)
+        return [everywhere @ row for row in at_nodes]
+
+    def lifted(self, lift_m: Real, wave: float, m: int) -> Complex | float:
+        """Return the phase factors of heights relative to the level, with the mean change of dpath/dz."""
+        if not lift_m.any():
+            return 1.0
+        return np.exp(1j * wave * (self.steepness[m] * lift_m + 0.5 * self.bend * lift_m**2))
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """Scene and grid of the computation."""
+
+    ant: Antennas
+    scene: Scene
+    x: Axis
+    y: Axis
+    surfaces: tuple[Facets, ...]
+    amplitudes: Complex
+
+    def levels(self, rx: Sequence[int], top_hz: float) -> list[_Level]:
+        """Group plates and points by height; at least one level, also for an empty scene."""
+        plates, points = self.scene.plates, self.scene.points
+        heights = np.array([p.height_mm for p in (*plates, *points)])
+        groups: list[list[float]] = []
+        for height in np.unique(heights) if len(heights) else [0.0]:
+            if groups and height - groups[-1][0] <= _LEVEL_MM:
+                groups[-1].append(float(height))
+            else:
+                groups.append([float(height)])
+        found = []
+        for group in groups:
+            inside = [i for i, height in enumerate(heights) if group[0] <= height <= group[-1]]
+            members = [i for i in inside if i < len(plates)], [i - len(plates) for i in inside if i >= len(plates)]
+            found.append(self._level((group[0] + group[-1]) / 2, members, rx, top_hz))
+        return found
+
+    def _level(
+        self, height_mm: float, members: tuple[list[int], list[int]], rx: Sequence[int], top_hz: float
+    ) -> _Level:
+        z, centre = self.ant.plane_z_m + height_mm / 1e3, self.ant.centre_m
+        wx, wy = np.meshgrid(self.x.w, self.y.w)
+        legs = [self.ant.legs(wx, wy, r, z) for r in rx]
+        lifts = [
+            np.array([(table[i].height_mm - height_mm) / 1e3 for i in own])
+            for table, own in zip((self.scene.plates, self.scene.points), members, strict=True)
+        ]
+        relief = float(np.abs(lifts[1]).max(initial=0.0))
+        for i, lift in zip(members[0], lifts[0], strict=True):
+            plate = self.scene.plates[i]
+            tilted = sum(abs(t) * side / 2e3 for t, side in zip(slopes(plate), plate.size_mm, strict=True))
+            relief = max(relief, abs(lift) + tilted + float(np.abs(self.surfaces[i].height_m).max()))
+        low, high = _range(legs)
+        half = (high - low) / 2
+        reach, n = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S * relief * half, 1
+        # Remainder of Chebyshev interpolation of exp(j reach x), -1 <= x <= 1.
+        while reach**n / (2.0 ** (n - 1) * math.factorial(n)) > _RELIEF_TOLERANCE:
+            n += 1
+        r1, r2, _, _ = self.ant.legs(centre[0], centre[1], 0, z)
+        away = z - self.ant.tx_m[2], z - self.ant.rx_m[0, 2]
+        bend = float(sum((r**2 - h**2) / r**3 for r, h in zip((r1, r2), away, strict=True)))
+        nodes = (low + high) / 2 + half * cheb_nodes(n)
+        return _Level(members[0], members[1], lifts[0], lifts[1], legs, bend, nodes, (low + high) / 2, half)
+
+    def plate_maps(self, level: _Level, series: Complex, f: float, m: int) -> list[NDArray[np.complex64]]:
+        """Return the spectra of a level's plates by order of the local angle, with the phases of C_m."""
+        if not level.plates:
+            return []
+        wave, ant = 2 * np.pi * f / SPEED_OF_LIGHT_M_S, self.ant
+        plates = [self.scene.plates[i] for i in level.plates]
+        table = np.array([(*p.centre_mm, *p.size_mm) for p in plates]) / 1e3
+        turn = wave * level.steepness[m] * np.array([slopes(p) for p in plates])
+        weights = series[level.plates] * plate_scale(ant, self.scene, f)
+        weights = weights * np.reshape(level.lifted(level.lift_m, wave, m), (-1, 1))
+        smooth = np.array([self.surfaces[i].height_m.size == 1 for i in level.plates])
+        x = _spectra(self.x, ant.centre_m[0] + table[smooth, 0], table[smooth, 2], turn[smooth, 0])
+        y = _spectra(self.y, ant.centre_m[1] + table[smooth, 1], table[smooth, 3], turn[smooth, 1])
+        maps = [_outer(y, weights[smooth, j], x) for j in range(series.shape[1])]
+        for n in np.flatnonzero(~smooth):
+            own = self._rough_map(self.surfaces[level.plates[n]], table[n, :2], turn[n], wave * level.steepness[m])
+            for j, one in enumerate(maps):
+                one += np.complex64(weights[n, j]) * own
+        return maps
+
+    def _rough_map(self, parts: Facets, centre_m: Real, turn: Real, per_metre: float) -> NDArray[np.complex64]:
+        """Return the spectrum of a plate of facets: `turn` is the phase of its tilt in rad/m, `per_metre` of height."""
+        x = _spectra(
+            self.x, self.ant.centre_m[0] + centre_m[0] + parts.x_m, np.full(parts.x_m.shape, parts.size_m[0]), turn[0]
+        )
+        y = _spectra(
+            self.y, self.ant.centre_m[1] + centre_m[1] + parts.y_m, np.full(parts.y_m.shape, parts.size_m[1]), turn[1]
+        )
+        phase = per_metre * parts.height_m + turn[0] * parts.x_m + turn[1] * parts.y_m[:, None]
+        rows = np.einsum("rc,cx->rx", np.exp(1j * phase).astype(np.complex64), x.astype(np.complex64))
+        return np.einsum("ry,rx->yx", y.astype(np.complex64), rows)
+
+    def point_map(self, level: _Level, f: float, m: int) -> NDArray[np.complex64] | None:
+        """Return the spectrum of a level's points, with the phases of C_m."""
+        if not level.points:
+            return None
+        table = np.array([self.scene.points[i].position_mm for i in level.points]) / 1e3
+        none = np.zeros(len(table))
+        x = _spectra(self.x, self.ant.centre_m[0] + table[:, 0], none)
+        y = _spectra(self.y, self.ant.centre_m[1] + table[:, 1], none)
+        lifted = level.lifted(level.point_lift_m, 2 * np.pi * f / SPEED_OF_LIGHT_M_S, m)
+        return _outer(y, self.amplitudes[level.points] * lifted, x)
+
+
+def _range(legs: list[tuple[Real, Real, Real, Real]]) -> tuple[float, float]:
+    """Return the smallest and largest dpath/dz over the kernel."""
+    return 2 * min(float(leg[3].min()) for leg in legs), 2 * max(float(leg[3].max()) for leg in legs)
+
+
+def compute(
+    rig: Instrument, scene: Scene, board: Board, samples_hz: Real, rx: Sequence[int]
+) -> tuple[NDArray[np.complex64], tuple[float, float], tuple[float, float], Real, float]:
+    """Return the fields of :class:`polysight_simulators.scene.field.ObjectField` for a scene of drawn specimens."""
+    ant, reflect = antennas(rig, board), board_reflectivity(board, scene)
+    ax, ay = spectral_axes(rig, scene, ant, float(samples_hz[-1]))
+    amplitudes = sampled(np.array([complex(*p.amplitude) for p in scene.points])) * point_scale(ant)
+    surfaces = tuple(facets(p, i, scene.seed) for i, p in enumerate(scene.plates))
+    plane = _Plane(ant, scene, ax, ay, surfaces, amplitudes * direct_factor(board, scene))
+    levels = plane.levels(rx, float(samples_hz[-1]))
+    legs = [leg for level in levels for leg in level.legs]
+    nodes_hz, centre = _frequencies(scene.plates, ax, ay, legs, samples_hz)
+
+    low, high = min(leg[2].min() for leg in legs), max(leg[2].max() for leg in legs)
+    series = _angle_series(scene, reflect, nodes_hz, (low, high))
+    kernels = [(level, *_factors(level, low, high, series.shape[2])) for level in levels]
+    values = np.empty((ay.outputs, ax.outputs, len(rx), len(nodes_hz)), dtype=np.complex64)
+    for q, f in enumerate(nodes_hz):
+        total = np.zeros((len(rx), ay.points, ax.points), dtype=np.complex64)
+        for level, angle, shares in kernels:
+            _add_level(total, plane, level, series[:, q], f, centre, angle, shares)
+        for r, spectrum in enumerate(total):
+            values[:, :, r, q] = _oversampled(_oversampled(spectrum, ay, 0), ax, 1)
+    return values, (ax.first_u, ay.first_u), (ax.step / OVERSAMPLING, ay.step / OVERSAMPLING), nodes_hz, centre
+
+
+def _frequencies(
+    plates: Sequence[Plate], ax: Axis, ay: Axis, legs: list[tuple[Real, Real, Real, Real]], samples_hz: Real
+) -> tuple[Real, float]:
+    """Return the nodes in the samples' band (the samples if they are fewer), and the path whose phase is removed."""
+    reach = np.stack([r1 + r2 for r1, r2, _, _ in legs])[:, (ay.fade == 1)[:, None] & (ax.fade == 1)]
+    inside = 0.0
+    for p in plates:  # inner echoes extend the response
+        depth = sum((layer.thickness_mm or 0.0) / 1e3 * abs(np.sqrt(layer.epsilon)) for layer in p.stack)
+        inside = max(inside, 4 * depth)
+    spread = float(reach.max() - reach.min()) + 2 * inside
+    centre = float(reach.max() + reach.min()) / 2
+    # Time-bandwidth product plus a few: interpolation error of the Chebyshev series below 1e-6.
+    nodes = int(np.ceil((samples_hz[-1] - samples_hz[0]) * spread / SPEED_OF_LIGHT_M_S)) + 8
+    if len(samples_hz) <= nodes:
+        return samples_hz, centre
+    return samples_hz[0] + (samples_hz[-1] - samples_hz[0]) * (cheb_nodes(nodes) + 1) / 2, centre
+
+
+def _factors(level: _Level, low: float, high: float, orders: int) -> tuple[Real, list[list[Real] | None]]:
+    """Return Chebyshev polynomials of the local angle, [rx, y, x, order], and shares of dpath/dz by RX."""
+    theta = np.stack([leg[2] for leg in level.legs])
+    angle = chebyshev.chebvander((theta - (low + high) / 2) / max((high - low) / 2, 1e-9), orders - 1)
+    return angle, [level.shares(leg[3]) for leg in level.legs]
+
+
+def _add_level(
+    total: NDArray[np.complex64],
+    plane: _Plane,
+    level: _Level,
+    series: Complex,
+    f: float,
+    centre_m: float,
+    angle: Real,
+    shares: list[list[Real] | None],
+) -> None:
+    """Add a level's spectra at one frequency to `total` [rx, kappa_y, kappa_x]; series [plate, order]."""
+    fade = np.outer(plane.y.fade, plane.x.fade)
+    bases = []
+    for r1, r2, _, _ in level.legs:
+        phase = np.exp(2j * np.pi * f / SPEED_OF_LIGHT_M_S * (r1 + r2 - centre_m))
+        bases.append(phase * (fade / (r1 * r2)))
+    for m in range(len(level.steepness)):
+        maps, point_map = plane.plate_maps(level, series, f, m), plane.point_map(level, f, m)
+        for r, whole in enumerate(bases):
+            part = shares[r]
+            base = whole if part is None else whole * part[m]
+            for j, plate_map in enumerate(maps):
+                kernel = (base * level.legs[r][3] * angle[r, :, :, j]).astype(np.complex64)
+                total[r] += plate_map * np.asarray(scipy.fft.ifft2(kernel, norm="forward"))
+            if point_map is not None:
+                total[r] += point_map * np.asarray(scipy.fft.ifft2(base.astype(np.complex64), norm="forward"))
+
+
+def _oversampled(spectrum: NDArray[np.complex64], axis: Axis, along: int) -> NDArray[np.complex64]:
+    """Return the inverse DFT along an axis on the finer output grid, limited to its offsets."""
+    n = axis.points
+    shape = list(spectrum.shape)
+    shape[along] = n * OVERSAMPLING
+    padded = np.zeros(shape, dtype=np.complex64)
+    head, tail = (n + 1) // 2, n // 2
+    lead = (slice(None),) * along
+    padded[(*lead, slice(0, head))] = spectrum[(*lead, slice(0, head))]
+    padded[(*lead, slice(-tail, None))] = spectrum[(*lead, slice(n - tail, n))]
+    line = np.asarray(scipy.fft.ifft(padded, axis=along), dtype=np.complex64)
+    line *= np.float32(OVERSAMPLING)
+    return line[(*lead, slice(0, axis.outputs))]
+
 
 _PHYSICS = 2  # version of the content of cached fields
 

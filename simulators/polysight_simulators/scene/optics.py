@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
-from polysight_simulators.scene.scene_file import Layer, Plate, Scene
-from polysight_simulators.scene.specimens import draw_specimens, facets, slopes
+from polysight_simulators.scene.scene_file import Layer, Plate, Scene, draw_specimens, facets, slopes
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]

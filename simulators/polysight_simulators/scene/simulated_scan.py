@@ -18,12 +18,17 @@ from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import Vector, incidence_deg, specular_midpoint_m
 from polysight_shared.raster import Grid, RasterPlan, Row, check_burst_fits, mean_burst_travel_mm, plan_raster
 from polysight_shared.tables import to_builtins
-from polysight_simulators.scene.draws import stream_key
-from polysight_simulators.scene.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
-from polysight_simulators.scene.published_layout import AuthorsLayout, Skipped
+from polysight_simulators.scene.layouts import (
+    AuthorsLayout,
+    Gaps,
+    Layout,
+    OwnLayout,
+    Skipped,
+    packet_payload_bytes,
+    versions,
+)
 from polysight_simulators.scene.radar import SimulatedRig
-from polysight_simulators.scene.scene_file import Pair, Plate, Scene, apply_scene
-from polysight_simulators.scene.specimens import draw_specimens
+from polysight_simulators.scene.scene_file import Pair, Plate, Scene, apply_scene, draw_specimens, stream_key
 
 Progress = Callable[[int, int], None]
 
@@ -140,7 +145,7 @@ def simulate(
     cache_dir, progress
         Folder that caches object fields (None: no cache); callback with rows done and total rows.
     zero_filling, by_columns, skipped
-        Authors' layout only: see :class:`polysight_simulators.scene.published_layout.AuthorsLayout`.
+        Authors' layout only: see :class:`polysight_simulators.scene.layouts.AuthorsLayout`.
 
     Returns
     -------

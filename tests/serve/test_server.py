@@ -91,7 +91,7 @@ def test_a_view_is_read_only_unless_told_otherwise(desk, watching):
             status, body, _ = ask(view, "/api/control/abort", "POST", **given)
             assert status == 403
             assert "read-only" in json.loads(body)["what"]
-    assert json.loads(watch.state.data)["control"]["enabled"] is False
+    assert json.loads(watch.state.data)["control"] is False
     assert not stop.after_row
 
 

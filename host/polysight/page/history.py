@@ -7,9 +7,11 @@ finding: a sentence with its likely cause and remedy (`CAUSES`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
+
+import msgspec
 
 from polysight.acquisition import FaultKind, typical_row_s
 from polysight.plan import scan_time
@@ -129,28 +131,25 @@ def _row_notice(row: int, what: str, why_do: tuple[str, str], reasons: Sequence[
     return Finding("warning", what, *why_do, where=f"row {row}", facts={"detail": "; ".join(reasons), "utc": utc})
 
 
-@dataclass
-class BoardCounts:
-    """Data of one board over the committed rows; `retaken` counts takes that were rejected because of it."""
+class BoardCounts(msgspec.Struct):
+    """Data of one board over the committed rows.
 
+    `retaken` counts takes that were rejected because of it, `masked` positions without a direct path.
+    """
+
+    name: str
     frames_expected: int = 0
     frames_received: int = 0
-    missing_bytes: int = 0
-    counts: dict[str, int] = field(default_factory=dict)
     retaken: int = 0
+    masked: int = 0
+    counts: dict[str, int] = {}
 
 
-@dataclass
-class TriggerHealth:
-    """Longest SYNC_IN pulse and largest jitter of one row, measured by the Pi."""
+class TriggerHealth(msgspec.Struct, frozen=True):
+    """Longest SYNC_IN pulse and largest jitter, measured by the Pi."""
 
-    width_max_ns: int = 0
-    jitter_max_ns: int = 0
-
-    def add(self, event: Capture) -> None:
-        """Add one burst."""
-        self.width_max_ns = max(self.width_max_ns, event.width_max_ns)
-        self.jitter_max_ns = max(self.jitter_max_ns, event.jitter_ns)
+    width_max_ns: int
+    jitter_max_ns: int
 
 
 @dataclass(frozen=True)
@@ -220,7 +219,7 @@ class ScanHistory:
         self.paused = False
         self.run_started_s = seconds(started.started_utc or "1970-01-01T00:00:00+00:00")
         self.last_commit_s = 0.0
-        self.trigger: dict[int, TriggerHealth] = {}
+        self.trigger: TriggerHealth | None = None
         # Rows committed whole since one was rejected or kept with gaps.
         self.rows_since_trouble = 0
         self._rows: dict[int, RowCommitted] = {}
@@ -305,7 +304,9 @@ class ScanHistory:
         """Add events of the event log; repeated ones change nothing."""
         for event in events:
             if isinstance(event, Capture):
-                self.trigger.setdefault(event.row_index, TriggerHealth()).add(event)
+                worst = self.trigger or TriggerHealth(0, 0)
+                width_ns = max(worst.width_max_ns, event.width_max_ns)
+                self.trigger = TriggerHealth(width_ns, max(worst.jitter_max_ns, event.jitter_ns))
             elif isinstance(event, Fault) and event.seq not in self._fault_seqs:
                 self._fault_seqs.add(event.seq)
                 self.notices.append(notice_of_fault(event))
@@ -313,20 +314,19 @@ class ScanHistory:
     # --- derived ---
 
     @property
-    def boards(self) -> dict[str, BoardCounts]:
-        """Counts over the committed rows, by board."""
-        totals = {name: BoardCounts(retaken=n) for name, n in self._rejected.items()}
+    def boards(self) -> list[BoardCounts]:
+        """Counts over the committed rows of each board."""
+        totals = {name: BoardCounts(name, retaken=rejected) for name, rejected in self._rejected.items()}
         for row in self._rows.values():
             for name, part in row.boards.items():
-                total = totals.setdefault(name, BoardCounts())
+                total = totals.setdefault(name, BoardCounts(name))
                 total.frames_expected += part.frames_expected
                 total.frames_received += part.frames_received
-                total.missing_bytes += part.missing_bytes
                 for kind in _RECEPTION:
                     count = getattr(part, kind)
                     if count is not None:
                         total.counts[kind] = total.counts.get(kind, 0) + count
-        return totals
+        return list(totals.values())
 
     @property
     def row_seconds(self) -> tuple[float, str] | None:

@@ -14,7 +14,7 @@ from typing import Literal
 import msgspec
 
 from polysight.acquisition import ScanCommand, time_left
-from polysight.page.history import PiState, ScanHistory, sentence
+from polysight.page.history import BoardCounts, PiState, ScanHistory, TriggerHealth, sentence
 from polysight.page.images import Profile, Shown
 from polysight.results import Verdict
 from polysight.store import ScanEnded
@@ -90,7 +90,7 @@ class Status(msgspec.Struct, frozen=True):
 
 
 class ScanState(msgspec.Struct, frozen=True, kw_only=True):
-    """The scan, its plan, and its rows so far: their number, and one letter for each (`MARKS`)."""
+    """The scan, its plan, and its rows so far: their number, one letter for each (`MARKS`), and their pulses."""
 
     folder: str
     rig: str
@@ -102,35 +102,8 @@ class ScanState(msgspec.Struct, frozen=True, kw_only=True):
     receivers: list[str]
     committed: int
     marks: str
-
-
-class ControlState(msgspec.Struct, frozen=True):
-    """Whether the scan may be controlled, runs, is paused, and what it was asked."""
-
-    enabled: bool
-    running: bool
-    paused: bool
-    asked: ScanCommand | None
-
-
-class BoardState(msgspec.Struct, frozen=True):
-    """Data of one board over the committed rows."""
-
-    name: str
-    frames_expected: int
-    frames_lost: int
-    retaken: int
-    masked: int
-    counts: dict[str, int]
-
-
-class TriggerState(msgspec.Struct, frozen=True):
-    """SYNC_IN pulses: their number, the longest, and the latest after its edge."""
-
     pulses: int
-    width_max_us: float
-    jitter_max_us: float
-    width_limit_us: float
+    pulse_limit_us: float
 
 
 class PicturesState(msgspec.Struct, frozen=True):
@@ -144,42 +117,36 @@ class PicturesState(msgspec.Struct, frozen=True):
     scales: dict[str, tuple[float, float, str]]
 
 
-class SyncState(msgspec.Struct, frozen=True):
-    """Phase left over by board and row, degrees (nan: unknown), beside the paper's."""
-
-    paper_deg: float
-    boards: dict[str, dict[int, float]]
-
-
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
-    """The whole state of a scan; `scan` and what follows are None where there is no scan yet."""
+    """The whole state of a scan; `scan` and what follows are empty where there is no scan yet.
+
+    `control`: it may be controlled; `asked`: what it was asked and has not carried out. `sync` is the phase left over
+    by board and row, degrees (nan: unknown).
+    """
 
     status: Status
-    control: ControlState
     notices: list[Finding]
+    control: bool
+    running: bool = False
+    paused: bool = False
+    asked: ScanCommand | None = None
     scan: ScanState | None = None
-    boards: list[BoardState] = []
-    trigger: TriggerState | None = None
+    boards: list[BoardCounts] = []
+    trigger: TriggerHealth | None = None
     pictures: PicturesState | None = None
     profile: Profile | None = None
-    sync: SyncState | None = None
+    sync: dict[str, dict[int, float]] = {}
+    paper_deg: float = round(math.degrees(PAPER_PHASE_RAD), 2)
     verdict: Verdict | None = None
 
 
-class Place(msgspec.Struct, frozen=True):
-    """Stage offset in the rig frame."""
-
-    x_mm: float
-    y_mm: float
-
-
 class Motion(msgspec.Struct, frozen=True, kw_only=True):
-    """Position of the stage, and time left with its origin (`measured`, `first row`, `plan`)."""
+    """Stage offset in the rig frame (x, y), mm, and time left with its origin (`measured`, `first row`, `plan`)."""
 
     now_s: int
     left_s: int | None = None
     left_from: str = ""
-    stage: Place | None = None
+    stage: tuple[float, float] | None = None
     row: int = -1
     point: int = 0
 
@@ -190,14 +157,22 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
     shown = inputs.shown
     if history is None:
         status = _unreadable(inputs) if inputs.problem else no_scan(inputs.folder)
-        control = ControlState(inputs.control, running=False, paused=False, asked=inputs.asked)
-        return Snapshot(status=status, control=control, notices=_notices(inputs))
+        return Snapshot(status=status, notices=_notices(inputs), control=inputs.control)
     plan = history.plan
-    running = history.ended is None and inputs.signs.alive
+    boards = history.boards
+    for board in boards:
+        board.masked = sum(sync.masked for sync in shown.sync.get(board.name, {}).values())
+    sync = {
+        name: {row: round(math.degrees(sync.object_rad), 3) for row, sync in rows.items()}
+        for name, rows in shown.sync.items()
+    }
     return Snapshot(
         status=judge(inputs, history),
-        control=ControlState(inputs.control, running, history.paused, inputs.asked),
         notices=_notices(inputs),
+        control=inputs.control,
+        running=history.ended is None and inputs.signs.alive,
+        paused=history.paused,
+        asked=inputs.asked,
         scan=ScanState(
             folder=str(inputs.folder),
             rig=history.instrument.name,
@@ -209,12 +184,14 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
             receivers=[board.name for board in history.instrument.receivers],
             committed=len(history.takes),
             marks="".join(MARKS.get(history.marks.get(row, ""), ".") for row in range(plan.rows)),
+            pulses=len(history.takes) * plan.columns * history.instrument.burst.pulses,
+            pulse_limit_us=WIDTH_US[1],
         ),
-        boards=_boards(history, shown),
-        trigger=_trigger(history),
+        boards=boards,
+        trigger=history.trigger,
         pictures=_pictures(history, shown),
         profile=shown.profile,
-        sync=_sync(shown),
+        sync=sync,
         # Products of an earlier run may lie there while the scan goes on.
         verdict=inputs.verdict if history.ended is not None else None,
     )
@@ -229,7 +206,7 @@ def make_motion(inputs: Inputs) -> Motion:
     left_s, basis = remaining(inputs.history, inputs.signs.now_s) if inputs.signs.alive else (None, "")
     stage = None
     if pi.x_mm is not None and pi.y_mm is not None:
-        stage = Place(round(pi.x_mm, 1), round(pi.y_mm, 1))
+        stage = (round(pi.x_mm, 1), round(pi.y_mm, 1))
     return Motion(now_s=now_s, left_s=left_s, left_from=basis, stage=stage, row=pi.row, point=pi.point)
 
 
@@ -244,27 +221,6 @@ def remaining(history: ScanHistory, now_s: float) -> tuple[int | None, str]:
     return round(time_left(rows_left, row_s, in_row_s)), basis
 
 
-def _boards(history: ScanHistory, shown: Shown) -> list[BoardState]:
-    boards = []
-    for name, board in history.boards.items():
-        masked = sum(sync.masked for sync in shown.sync.get(name, {}).values())
-        frames_lost = board.frames_expected - board.frames_received
-        boards.append(BoardState(name, board.frames_expected, frames_lost, board.retaken, masked, board.counts))
-    return boards
-
-
-def _trigger(history: ScanHistory) -> TriggerState | None:
-    if not history.trigger:
-        return None
-    bursts = history.trigger.values()
-    return TriggerState(
-        pulses=len(history.takes) * history.plan.columns * history.instrument.burst.pulses,
-        width_max_us=max(b.width_max_ns for b in bursts) / 1e3,
-        jitter_max_us=max(b.jitter_max_ns for b in bursts) / 1e3,
-        width_limit_us=WIDTH_US[1],
-    )
-
-
 def _pictures(history: ScanHistory, shown: Shown) -> PicturesState:
     image = history.instrument.image
     waiting = max(0, len(history.takes) - len(shown.rows))
@@ -272,15 +228,6 @@ def _pictures(history: ScanHistory, shown: Shown) -> PicturesState:
     width_mm = image.columns * image.pixel_mm
     height_mm = image.rows * image.pixel_mm
     return PicturesState(shown.revision, len(shown.rows), waiting, width_mm, height_mm, scales)
-
-
-def _sync(shown: Shown) -> SyncState:
-    boards = {
-        # What is not a number is sent as null.
-        name: {row: round(math.degrees(sync.object_rad), 3) for row, sync in rows.items()}
-        for name, rows in shown.sync.items()
-    }
-    return SyncState(round(math.degrees(PAPER_PHASE_RAD), 2), boards)
 
 
 def _notices(inputs: Inputs) -> list[Finding]:

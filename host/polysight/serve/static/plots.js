@@ -99,8 +99,8 @@ export function raster(canvas, state, motion) {
     fill(motion.row, motion.row % 2 ? margin + inner - part : margin, part);
   }
   if (motion.stage) {
-    const x = margin + inner * Math.min(1, Math.max(0, motion.stage.x_mm / wide + 0.5));
-    const y = height - margin - (height - 2 * margin) * Math.min(1, Math.max(0, motion.stage.y_mm / high + 0.5));
+    const x = margin + inner * Math.min(1, Math.max(0, motion.stage[0] / wide + 0.5));
+    const y = height - margin - (height - 2 * margin) * Math.min(1, Math.max(0, motion.stage[1] / high + 0.5));
     pen.beginPath();
     pen.arc(x, y, 5.5, 0, 7);
     pen.fillStyle = colour("--mark-k");

@@ -28,9 +28,9 @@ function showStatus() {
     const open = scan.committed < scan.rows;
     if (open && Number.isFinite(motion.left_s)) {
       left = motion.left_s ? `${span(motion.left_s)} left` : "nearly done";
-      ends = state.control.paused ? "once it goes on" : `ends about ${clock(motion.now_s + motion.left_s)}`;
+      ends = state.paused ? "once it goes on" : `ends about ${clock(motion.now_s + motion.left_s)}`;
       if (motion.left_from !== "measured") ends += motion.left_from === "plan" ? ", by the plan" : ", a first guess";
-    } else if (open && state.control.running) {
+    } else if (open && state.running) {
       ends = "time left: known after the first row";
     }
   }
@@ -61,10 +61,10 @@ function showResult() {
 }
 
 function showButtons() {
-  const { enabled, running, paused, asked } = state.control;
+  const { control, running, paused, asked } = state;
   const open = state.scan && state.scan.committed < state.scan.rows;
   const resumes = Boolean(server.starts && open && !running && !asked && !summary.programs?.some((p) => p.kind === "scan" && p.running));
-  by("buttons").hidden = !(enabled && running) && !resumes;
+  by("buttons").hidden = !(control && running) && !resumes;
   by("resume").hidden = !resumes;
   for (const id of ["pause", "continue", "stop", "abort"]) by(id).hidden = !running;
   if (!running) return;
@@ -107,7 +107,7 @@ function showImages() {
   const early = p.rows && p.rows < state.scan.rows / 3 ? "; sharp when more rows are in" : "";
   by("images-note").textContent = `${p.rows} rows in${waiting}; ${p.width_mm} × ${p.height_mm} mm${early}`;
   by("p_note").textContent = summary.processed ? "as received; relative to metal under Result"
-    : state.control.running ? "not referenced to metal yet" : "not referenced to metal: not processed";
+    : state.running ? "not referenced to metal yet" : "not referenced to metal: not processed";
   if (p.revision === revision) return;
   revision = p.revision;
   for (const [key, [low, high, unit]] of Object.entries(p.scales)) {
@@ -122,7 +122,7 @@ function showImages() {
 function showStage() {
   const { stage, row, point } = motion, notes = [];
   if (row >= 0) notes.push(`row ${row}, point ${point}`);
-  if (stage) notes.push(`x ${signed(stage.x_mm)}, y ${signed(stage.y_mm)} mm`);
+  if (stage) notes.push(`x ${signed(stage[0])}, y ${signed(stage[1])} mm`);
   by("stage-note").textContent = notes.join(" · ");
   raster(by("raster"), state, motion);
 }
@@ -172,8 +172,9 @@ function showBoards() {
     }));
   };
   const bad = (n) => [grouped(n), n ? "warn" : ""];
-  line("data", (b) => (b.frames_lost ? ["gaps", "warn"] : b.frames_expected ? ["✓ whole", "good"] : ["–", ""]));
-  line("frames lost", (b) => bad(b.frames_lost));
+  const lost = (b) => b.frames_expected - b.frames_received;
+  line("data", (b) => (lost(b) ? ["gaps", "warn"] : b.frames_expected ? ["✓ whole", "good"] : ["–", ""]));
+  line("frames lost", (b) => bad(lost(b)));
   line("frames in all", (b) => [grouped(b.frames_expected), ""]);
   if (state.boards.some((b) => "packets" in b.counts)) {
     line("packets", (b) => [grouped(b.counts.packets ?? 0), ""]);
@@ -186,13 +187,13 @@ function showBoards() {
   by("board-table").replaceChildren(table);
   const t = state.trigger;
   by("trigger").textContent = t
-    ? `Triggers: ${grouped(t.pulses)} pulses; the longest ${t.width_max_us.toFixed(1)} µs of ${t.width_limit_us} allowed, `
-      + `the latest ${t.jitter_max_us.toFixed(1)} µs late.`
+    ? `Triggers: ${grouped(state.scan.pulses)} pulses; the longest ${(t.width_max_ns / 1e3).toFixed(1)} µs of ${state.scan.pulse_limit_us} allowed, `
+      + `the latest ${(t.jitter_max_ns / 1e3).toFixed(1)} µs late.`
     : "Triggers: no data yet.";
 }
 
 function showPlots() {
-  const names = state.scan.receivers, p = state.profile, boards = state.sync.boards;
+  const names = state.scan.receivers, p = state.profile, boards = state.sync;
   if (p) {
     const levels = Object.values(p.boards).flat();
     by("range-note").textContent = `row ${p.row}, dB below the direct path`;
@@ -209,8 +210,8 @@ function showPlots() {
   if (values.length) {
     by("sync-note").textContent = "phase left over, by row";
     plot(by("sync"), {
-      x: [0, Math.max(1, state.scan.rows - 1)], y: [0, Math.max(2 * state.sync.paper_deg, 1.15 * Math.max(...values))],
-      xLabel: "row", yLabel: "degrees (std)", lines, level: [{ y: state.sync.paper_deg, name: "the paper's" }],
+      x: [0, Math.max(1, state.scan.rows - 1)], y: [0, Math.max(2 * state.paper_deg, 1.15 * Math.max(...values))],
+      xLabel: "row", yLabel: "degrees (std)", lines, level: [{ y: state.paper_deg, name: "the paper's" }],
     });
   } else by("sync").replaceChildren(make("p", "After the first row.", "empty"));
 }

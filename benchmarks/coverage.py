@@ -30,7 +30,8 @@ from polysight.materials import (
 )
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference, plane_reference
-from polysight.process import Findings, Options
+from polysight.process import NO_INPUTS, Findings, Inputs
+from polysight.settings import Settings
 from polysight.store import CubeRow, open_source
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.raster import RasterPlan, plan_raster
@@ -148,8 +149,8 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     return replace(found, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 
-def _imaged(source: Any) -> Pipeline:
-    pipeline = Pipeline(source)
+def _imaged(source: Any, model: str | None = "none", inputs: Inputs = NO_INPUTS) -> Pipeline:
+    pipeline = Pipeline(source, Settings(model=model), inputs)
     for row in source.rows():
         pipeline.add_row(row)
     return pipeline
@@ -158,17 +159,18 @@ def _imaged(source: Any) -> Pipeline:
 def judged(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Instrument, Findings, PlaneEstimate]:
     """One scene, drawn, simulated and judged."""
     rig, scene = load_instrument(packaged(Path("instrument.toml"))), draw_scene(seed, kind)
-    options = Options(model=None if kind == "named" else "none")
+    model = None if kind == "named" else "none"
+    inputs = NO_INPUTS
     if kind in WHOLE and not any(p.metal for p in scene.plates):
-        options = replace(options, reference=metal_scan(rig, scene))
+        inputs = Inputs(reference=metal_scan(rig, scene))
     if raw or kind in ("no direct path", "noise"):
         with tempfile.TemporaryDirectory(prefix="polysight-coverage-") as folder:
             simulate(rig, scene, Path(folder) / "scan")
-            pipeline = _imaged(open_source(Path(folder) / "scan", None))
-            findings = pipeline.examine(pipeline.form_images(), options)
+            pipeline = _imaged(open_source(Path(folder) / "scan", None), model, inputs)
+            findings = pipeline.examine(pipeline.form_images())
     else:
-        pipeline = _imaged(Cubes(rig, scene))
-        findings = pipeline.examine(pipeline.form_images(), options)
+        pipeline = _imaged(Cubes(rig, scene), model, inputs)
+        findings = pipeline.examine(pipeline.form_images())
     return scene, apply_scene(rig, scene), findings, pipeline.plane
 
 

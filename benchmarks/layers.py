@@ -29,7 +29,8 @@ from polysight.jobs.process import plane_of
 from polysight.materials import METAL, Layer, LayerFit, fit_row, match_truth, truth_plates
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference
-from polysight.process import Options
+from polysight.process import Inputs
+from polysight.settings import Settings
 from polysight_shared.config import Instrument, load_instrument
 from polysight_simulators.scene import decode_scene
 from polysight_simulators.scene.scene_file import Plate, Scene, apply_scene
@@ -118,7 +119,7 @@ def draw_scene(seed: int) -> Scene:
 
 def _imaged(rig: Instrument, scene: Scene) -> Pipeline:
     source = Cubes(rig, scene)
-    pipeline = Pipeline(source, bands=BANDS)
+    pipeline = Pipeline(source, Settings(model="none", bands=BANDS))
     for row in source.rows():
         pipeline.add_row(row)
     return pipeline
@@ -136,7 +137,8 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
 def rows_of(seed: int, rig: Instrument, scene: Scene, metal: PlaneReference) -> tuple[dict[str, dict[str, Any]], float]:
     """One scene, simulated and processed: a row of materials.json for each plate found; the angle's deviation, rad."""
     pipeline = _imaged(rig, scene)
-    findings = pipeline.examine(pipeline.form_images(), Options(model="none", reference=metal, bands=BANDS))
+    pipeline.inputs = Inputs(reference=metal)
+    findings = pipeline.examine(pipeline.form_images())
     found = findings.found
     plates = match_truth([r.patch for r in found.patches], truth_plates(truth(apply_scene(rig, scene), scene, seed)))
     rows = {plates[row["label"]].name: row for row in found.rows() if row["label"] in plates}

@@ -15,10 +15,9 @@ from benchmarks.data import ROOT, SCENE, published, recorded_rows, temporary, wr
 from benchmarks.measure import Line, Seconds, add_arguments, show, write
 from benchmarks.whole import rows_that_fit
 from polysight.catalogue import Scans
-from polysight.imaging import View
 from polysight.jobs.process import make_products, publish_images
 from polysight.pipeline import Pipeline
-from polysight.process import Options
+from polysight.settings import Settings
 from polysight.store import MANIFEST, ScanFolder
 
 __all__ = ["add_arguments", "run"]
@@ -43,7 +42,7 @@ def rows_then_products(scan: Path, out: Path) -> dict[str, float]:
     pipeline.samples.save(rows[-1])
     publish_images(pipeline, out)
     image_s = time.perf_counter() - began
-    make_products(pipeline, out, Options(), ())
+    make_products(pipeline, out, ())
     return {"image": image_s, "report": time.perf_counter() - began}
 
 
@@ -51,9 +50,9 @@ def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
     """All rows read back and both images made: of the rig file's plane, and of another, each in a new pipeline."""
     same, other = Seconds(), Seconds()
     for _ in range(repeats + 1):
-        for took, view in ((same, View()), (other, View(depth_mm=5.0))):
+        for took, depth_mm in ((same, 0.0), (other, 5.0)):
             source = ScanFolder.load(scan)
-            pipeline, rows = Pipeline(source, samples="read", view=view, depth_m=0.0), list(source.rows())
+            pipeline, rows = Pipeline(source, Settings(depth_mm=depth_mm), samples="read"), list(source.rows())
             if not all(pipeline.samples.is_kept(row) for row in rows):
                 raise RuntimeError("samples were not kept")
             with took.timed():

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from polysight.materials import read_truth
 from polysight.pipeline import Pipeline
-from polysight.process.request import Options
 from polysight.store.scan_folder import ScanFolder
 from polysight_shared.config import load_instrument
 from polysight_simulators.scene import load_scene, simulate
@@ -25,5 +24,5 @@ folder = simulate(rig, scene, Path("out/own-scene"))
 pipeline = Pipeline(ScanFolder.load(folder))
 for row in pipeline.source.rows():
     pipeline.add_row(row)
-products = pipeline.finish(Path("out/own-products"), Options(), read_truth(folder / "truth.json"))
+products = pipeline.finish(Path("out/own-products"), read_truth(folder / "truth.json"))
 print(products.summary())

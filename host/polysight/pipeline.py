@@ -4,25 +4,31 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Unpack
 
 from polysight import calibration, imaging, materials, polarimetry, process, store, sync
 from polysight.process import Progress, no_progress
+from polysight.settings import DEFAULT, Settings
 
 
 class Pipeline:
-    """Processes one scan: add its rows, in any order, then `finish`.
+    """Processes one scan: add its rows, in any order, then `finish`. `live` and `samples` as of `KeptSamples`."""
 
-    `choices` are the settings of imaging and kept samples, see `process.Choices`.
-    """
-
-    def __init__(self, source: store.Source, **choices: Unpack[process.Choices]) -> None:
-        self.source, self.calibration = source, calibration.calibration_of_scan(source)
+    def __init__(
+        self,
+        source: store.Source,
+        settings: Settings = DEFAULT,
+        inputs: process.Inputs = process.NO_INPUTS,
+        *,
+        live: bool = False,
+        samples: process.Use = "none",
+    ) -> None:
+        self.source, self.settings, self.inputs = source, settings, inputs
+        self.calibration = calibration.calibration_of_scan(source)
         rig = self.calibration.rig(source.instrument)
         filters, self.plane = self.calibration.high_passes(rig), imaging.UNKNOWN_PLANE
         self.synchroniser, self.quality = sync.RowSynchroniser(source, rig, filters), process.Quality(rig, source)
-        self.samples = process.KeptSamples(source, rig, filters, self.quality, **choices)
-        self.images, self.sub_bands = self.samples.images, self.samples.sub_bands
+        kept = process.KeptSamples(source, rig, filters, self.quality, settings, live=live, samples=samples)
+        self.samples, self.images, self.sub_bands = kept, kept.images, kept.sub_bands
         self.rig = store.mirrored(self.images.rig) if source.mirrored else self.images.rig  # x from TX to RX
 
     def add_row(self, row: int) -> None:
@@ -52,11 +58,6 @@ class Pipeline:
         self.quality.note(**self.calibration.quality_facts(), **self.synchroniser.recording_facts())
         return images.transposed() if self.source.mirrored else images
 
-    def metal_plane(self, options: process.Options, in_scene: bool = False) -> polarimetry.PlaneReference | None:
-        """Return the metal plate given in `options`, or the calibrated one unless metal `in_scene` is given."""
-        named = in_scene or options.metal_box_mm is not None
-        return self.calibration.metal_plane(self.rig, options.reference, named, options.bands)
-
     def place_plane(self, images: imaging.Images, move: bool = True) -> imaging.Images:
         """Estimate the plane of the plates; return the images on it (unchanged if `move` is False)."""
         with self.quality.timed("plane"):
@@ -70,12 +71,11 @@ class Pipeline:
         metal: materials.MetalChoice = materials.FOUND,
         known: materials.KnownScene = materials.UNKNOWN_SCENE,
         classifier: materials.Classifier | None = None,
-        incidence: polarimetry.Incidence = "one",
     ) -> materials.MaterialsResult:
         """Find patches (unless known), metal reference, permittivities and names; in sub-bands too, if imaged."""
         with self.quality.timed("materials"):
             rig, std = self.plane.applied_to(self.rig), self.plane.incidence_std_rad(self.rig)
-            angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, incidence)
+            angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, self.settings.incidence)
             optics = materials.Optics.of(self.rig, angles, std, self.synchroniser.direct_path_known)
             found = materials.analyse(images, optics, metal, known, classifier)
             self.quality.note_materials(found, angles, images.valid, metal.plane)
@@ -84,31 +84,30 @@ class Pipeline:
             parts = self.sub_bands.finish(self.source.mirrored, moved)
             return materials.with_bands(found, self.sub_bands.bands, parts, optics, metal.plane)
 
-    def examine(
-        self, images: imaging.Images, options: process.Options, plates: materials.Plates = ()
-    ) -> process.Findings:
+    def examine(self, images: imaging.Images, plates: materials.Plates = ()) -> process.Findings:
         """Find plane and materials, and judge them; a verdict "no result" removes names and permittivities."""
-        classifier, boxes = options.classifier(self.rig), options.drawn(images.x_m, images.y_m)
-        plane = self.metal_plane(options, boxes.metal is not None)
+        classifier = process.load_classifier(self.settings, self.rig)
+        boxes = process.boxes_as_patches(self.settings, self.inputs, images.x_m, images.y_m)
+        in_scene = boxes.metal is not None or self.settings.metal_box_mm is not None
+        plane = self.calibration.metal_plane(self.rig, self.inputs.reference, in_scene, self.settings.bands)
         images = self.place_plane(images)
         if plane is not None:
             images = images.within(plane.valid_on(images.x_m, images.y_m))
-        metal = materials.MetalChoice(options.metal_box_mm, boxes.metal, plane)
+        metal = materials.MetalChoice(self.settings.metal_box_mm, boxes.metal, plane)
         known = materials.KnownScene(boxes.segmentation, plates)
-        found = replace(self.find_materials(images, metal, known, classifier, options.incidence), boxes=boxes.names)
+        found = replace(self.find_materials(images, metal, known, classifier), boxes=boxes.names)
         verdict = process.judge(self.quality, found, self.plane, classifier)
         shown = found if verdict.usable else found.without_result()
         return process.Findings(images, shown, verdict, self.plane, classifier, plates)
 
-    def finish(
-        self, out: Path, options: process.Options, plates: materials.Plates = (), progress: Progress = no_progress
-    ) -> process.Products:
+    def finish(self, out: Path, plates: materials.Plates = (), progress: Progress = no_progress) -> process.Products:
         """Write all products into `out`: images first, so that they stay if a later step fails."""
         images = self.form_images()
         process.save_images(out, self.source, self.rig, images, self.quality)
         progress("point response")
         self.quality.note_imaging(self.images, images)
         progress("materials")
-        findings = self.examine(images, options, plates)
+        findings = self.examine(images, plates)
         progress("figures and report")
-        return process.save_materials(out, self.source, self.rig, findings, options.unnamed(self.rig), self.quality)
+        unnamed = process.why_unnamed(self.settings, self.rig)
+        return process.save_materials(out, self.source, self.rig, findings, unnamed, self.quality)

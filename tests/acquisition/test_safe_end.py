@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -27,7 +26,8 @@ from polysight.acquisition.ready import make_ready
 from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.jobs import live_scan as live
 from polysight.jobs import live_scan as progress
-from polysight.process.request import ProcessRequest
+from polysight.jobs import process as processing
+from polysight.settings import DEFAULT
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared import messages as m
@@ -42,10 +42,6 @@ def commands(pi) -> list[type]:
 
 
 # --- what moves by itself ---------------------------------------------------------------------------------------------
-
-
-def request(folder: Path) -> ProcessRequest:
-    return ProcessRequest(data=str(folder), out=str(folder / "products"))
 
 
 @pytest.mark.parametrize("fault", [102, 109])
@@ -227,12 +223,12 @@ def test_scan_without_a_terminal_is_recorded_and_processed(rig, tmp_path, monkey
     config = tmp_path / "rig.toml"
     config.write_text(tomli_w.dumps(to_builtins(rig.instrument)))
     made, streams = [], [kind(), kind()]
-    monkeypatch.setattr(live, "_check_options", lambda *_: None)
-    monkeypatch.setattr(live, "Pipeline", lambda *_, **__: SimpleNamespace(add_row=lambda _: None))
+    monkeypatch.setattr(processing, "check_inputs", lambda *_: None)
+    monkeypatch.setattr(processing, "Pipeline", lambda *_, **__: SimpleNamespace(add_row=lambda _: None))
     monkeypatch.setattr(
-        live, "make_products", lambda *given: made.append(given) or SimpleNamespace(summary=str, exit_status=0)
+        processing, "make_products", lambda *given: made.append(given) or SimpleNamespace(summary=str, exit_status=0)
     )
-    monkeypatch.setattr(live, "publish_images", lambda *_: None)
+    monkeypatch.setattr(processing, "publish_images", lambda *_: None)
     update = progress.ScanBar.update
 
     def updated(bar, p) -> None:
@@ -247,7 +243,7 @@ def test_scan_without_a_terminal_is_recorded_and_processed(rig, tmp_path, monkey
         patch.setattr(sys, "stderr", streams[0])
         patch.setattr(sys, "stdout", streams[1])
         with suppress(OSError):  # of the summary, which comes last
-            live.scan(config, request(tmp_path / "s"), None, False, True)
+            live.scan(config, tmp_path / "s", DEFAULT, None, False, True)
     for stream in streams:
         stream.close()
     assert validate(tmp_path / "s") == []
@@ -273,14 +269,14 @@ def test_lost_terminal_is_ignored_and_then_as_before():
 def test_processing_that_fails_does_not_hide_that_every_row_is_there(rig, tmp_path, monkeypatch, capsys, error):
     config = tmp_path / "rig.toml"
     config.write_text(tomli_w.dumps(to_builtins(rig.instrument)))
-    monkeypatch.setattr(live, "_check_options", lambda *_: None)
+    monkeypatch.setattr(processing, "check_inputs", lambda *_: None)
 
     def broken(*_: object, **__: object):
         raise error
 
-    monkeypatch.setattr(live, "Pipeline", broken)
+    monkeypatch.setattr(processing, "Pipeline", broken)
     with pytest.raises(PolysightError) as e:
-        live.scan(config, request(tmp_path / "s"), None, False, True)
+        live.scan(config, tmp_path / "s", DEFAULT, None, False, True)
     assert str(error.args[0]) in e.value.what
     assert "every row is committed" in capsys.readouterr().out
     assert f"polysight process {tmp_path / 's'}" in e.value.remedy

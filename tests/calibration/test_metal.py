@@ -14,7 +14,7 @@ from polysight.imaging import ImagedWith
 from polysight.jobs.calibrate import load_reference
 from polysight.materials import MetalChoice
 from polysight.pipeline import Pipeline
-from polysight.process import Options
+from polysight.settings import Settings
 from polysight.store import ScanFolder
 from polysight_shared.error_codes import ErrorCode
 
@@ -173,12 +173,15 @@ def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows
 
 
 def test_processing_refuses_the_calibration_of_another_rig(whole, taken_with):
-    assert Pipeline(taken_with(whole)).metal_plane(Options()) is not None
+    assert metal_plane(Pipeline(taken_with(whole))) is not None
     moved = Pipeline(taken_with(whole, MATTERS["V moved"][0]))
     with refused(ErrorCode.MISMATCH, "RV"):
-        moved.metal_plane(Options())
-    assert moved.metal_plane(Options(metal_box_mm=(0, 0, 9, 9))) is None  # metal in the scene has the scene's rig
-    assert moved.metal_plane(Options(), in_scene=True) is None
+        metal_plane(moved)
+    assert metal_plane(moved, in_scene=True) is None  # metal in the scene has the scene's rig
+
+
+def metal_plane(pipeline, bands=1, in_scene=False):
+    return pipeline.calibration.metal_plane(pipeline.rig, None, in_scene, bands)
 
 
 def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band(plate, banded, taken_with):
@@ -189,10 +192,10 @@ def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band
             np.testing.assert_array_equal(getattr(read, name), getattr(made, name))
         assert (read.spread, read.how) == (made.spread, made.how)
     pipeline = Pipeline(taken_with(banded))
-    assert len(pipeline.metal_plane(Options(bands=BANDS)).bands) == BANDS
-    assert pipeline.metal_plane(Options()) is not None
+    assert len(metal_plane(pipeline, BANDS).bands) == BANDS
+    assert metal_plane(pipeline) is not None
     with refused(ErrorCode.MISMATCH, "2 sub-bands, not 3", "--bands 3", "--bands 2"):
-        pipeline.metal_plane(Options(bands=3))
+        metal_plane(pipeline, 3)
 
 
 def test_missing_sub_bands_are_refused_before_rows_are_read(whole, taken_with, tmp_path):
@@ -202,10 +205,10 @@ def test_missing_sub_bands_are_refused_before_rows_are_read(whole, taken_with, t
 
 
 def test_metal_is_one_in_the_whole_sweep_and_in_every_sub_band(banded, taken_with):
-    pipeline = Pipeline(taken_with(banded), bands=BANDS)
+    pipeline = Pipeline(taken_with(banded), Settings(bands=BANDS))
     for row in pipeline.source.rows():
         pipeline.add_row(row)
-    reference = pipeline.metal_plane(Options(bands=BANDS))
+    reference = metal_plane(pipeline, BANDS)
     (found,) = pipeline.find_materials(pipeline.form_images(), MetalChoice(plane=reference)).rows()
     assert len(found["bands"]) == BANDS
     for ratio in (found["ratio"], *(band["ratio"] for band in found["bands"])):

@@ -42,7 +42,6 @@ def test_every_stop_is_a_file_and_a_function(file, name):
 
 def test_a_scan_passes_the_stops_in_their_order(tmp_path):
     from polysight.jobs.process import process
-    from polysight.process.request import ProcessRequest
     from polysight_simulators.__main__ import main
 
     scan = tmp_path / "scan"
@@ -61,7 +60,7 @@ def test_a_scan_passes_the_stops_in_their_order(tmp_path):
     names = {name for _, name in wanted}
     sys.setprofile(look)
     try:
-        assert process(ProcessRequest(data=str(scan), out=str(tmp_path / "out")), threads=1) == 0
+        assert process(scan, tmp_path / "out", threads=1) == 0
     finally:
         sys.setprofile(None)
     assert passed == sorted(wanted.values())

@@ -15,10 +15,10 @@ from tests.support.store.plain_scan import write_scan
 
 from polysight.cli.main import main
 from polysight.jobs import batch as many
-from polysight.jobs.batch import Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of, table
+from polysight.jobs.batch import Outcome, at_once, finished, make_jobs, memory_bytes, process_many, scans_of, table
 from polysight.process import cores
-from polysight.process.request import ProcessRequest
 from polysight.products.files import FINISHED
+from polysight.settings import Settings
 from polysight.store import ScanFolder, drop
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.scene import decode_scene, simulate
@@ -28,7 +28,7 @@ import json, os, sys, time
 from pathlib import Path
 import msgpack
 job = msgpack.unpackb(sys.stdin.buffer.read())  # plain data: without the host's imports, which take seconds
-out = Path(job["request"]["out"])
+out = Path(job["products"])
 out.mkdir(parents=True, exist_ok=True)
 with (out.parent / "runs.txt").open("a") as f:
     f.write(out.name + "\\n")
@@ -69,15 +69,15 @@ def scans(folder, *names):
     return [folder / n for n in names]
 
 
-def request(data, out, **options):
+def job_of(data, out, **options):
     text = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
-    return ProcessRequest(data=str(data), out=str(out / data.name), **text)
+    return make_jobs([(data, Settings(**text))], out)[0]
 
 
-def jobs(folder, *names, **options):
+def jobs(folder, *names):
     found = scans_of([folder])
     assert sorted(p.name for p in found) == sorted(names)
-    return jobs_of([request(data, folder.parent / "out", **options) for data in found])
+    return make_jobs([(data, Settings()) for data in found], folder.parent / "out")
 
 
 def runs(folder):
@@ -121,7 +121,7 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
 
     def job(config=rig, **changes):
         options = {"library": library, "config": config, **changes}
-        return jobs_of([request(folder, tmp_path / "out", **options)])[0]
+        return job_of(folder, tmp_path / "out", **options)
 
     assert not finished(job())
     process_many([job()], tmp_path / "out", 1)
@@ -205,7 +205,7 @@ def test_names_folders_and_what_is_a_scan(tmp_path):
     assert scans_of([raw, found[1]]) == [raw, found[1]]
     assert scans_of([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
     with refused(ErrorCode.NAME_TAKEN, "s1"):
-        jobs_of([request(found[0], tmp_path / "out"), request(raw, tmp_path / "out")])
+        make_jobs([(found[0], Settings()), (raw, Settings())], tmp_path / "out")
 
 
 def test_scans_at_a_time_follow_cores_and_memory():
@@ -285,7 +285,7 @@ from polysight.jobs import batch
 child = "from polysight.jobs import batch_worker as w, batch; import os, sys, time;" \
     "w.end_with(os.environ[batch.ALIVE]); open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
 batch.PROGRAM = (sys.executable, "-c", child, sys.argv[2])
-batch.run_scan(batch.jobs_of([batch.ProcessRequest(data=sys.argv[1], out=sys.argv[1] + "-out")])[0])
+batch.run_scan(batch.make_jobs([(Path(sys.argv[1]), batch.Settings())], Path(sys.argv[1] + "-out"))[0])
 """
 
 

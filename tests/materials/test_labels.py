@@ -18,7 +18,8 @@ from polysight.materials import (
     pack_labels,
     read_labels,
 )
-from polysight.process import Options
+from polysight.process import Inputs, boxes_as_patches
+from polysight.settings import DEFAULT
 from polysight_shared.error_codes import ErrorCode
 
 X_M = Y_M = np.linspace(-0.049, 0.049, 50)  # 50 pixels of 2 mm: -50 to 50 mm
@@ -131,8 +132,9 @@ def test_keys_of_another_form_are_refused(tmp_path, more):
 def test_boxes_by_hand_are_judged_before_a_scan_is_processed_with_them():
     overlapping = Labels({"copper": COPPER, "oak": (-15.0, -10.0, 40.0, 10.0)}, "mm", by_hand=True)
     with refused(ErrorCode.VALUES_CONFLICT, "copper", "oak"):
-        Options(labels=overlapping).drawn(X_M, Y_M)
-    drawn = Options(labels=Labels({"tin": COPPER, "oak": OAK}, "mm", "tin", by_hand=True)).drawn(X_M, Y_M)
+        boxes_as_patches(DEFAULT, Inputs(overlapping), X_M, Y_M)
+    labels = Labels({"tin": COPPER, "oak": OAK}, "mm", "tin", by_hand=True)
+    drawn = boxes_as_patches(DEFAULT, Inputs(labels), X_M, Y_M)
     assert (drawn.metal, drawn.names) == (1, {1: "tin", 2: "oak"})
 
 

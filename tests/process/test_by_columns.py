@@ -10,7 +10,6 @@ from tests.support.processes import output_of
 from tests.support.rigs import rig_with
 from tests.support.scenes import COPPER, PET, scene_of
 
-from polysight.process import Options
 from polysight.store.sources.open import open_source
 from polysight_shared.files import read_json
 from polysight_shared.tables import to_builtins
@@ -27,7 +26,8 @@ def scan(scan_of, tmp_path_factory):
 
 
 def test_sub_bands_have_the_pixels_of_the_whole_band(scan, tmp_path):
-    pipeline = pipeline_of(open_source(scan, RIG), bands=BANDS)
+    box = (-55.0, -5.0, -25.0, 25.0)
+    pipeline = pipeline_of(open_source(scan, RIG), bands=BANDS, model="none", metal_box_mm=box)
     whole, parts = pipeline.form_images(), pipeline.sub_bands.finish(pipeline.source.mirrored)
     assert whole.h.shape == (IMAGE["rows"], IMAGE["columns"])
     assert len(parts) == BANDS
@@ -39,7 +39,7 @@ def test_sub_bands_have_the_pixels_of_the_whole_band(scan, tmp_path):
             a, b = (np.abs(getattr(image, name)[whole.valid & part.valid]) for image in (part, whole))
             assert np.corrcoef(a, b)[0, 1] > 0.8
     # scan.json contains the rig of the images: rows along x, as in the rig file.
-    pipeline.finish(tmp_path, Options(model="none", metal_box_mm=(-55.0, -5.0, -25.0, 25.0)))
+    pipeline.finish(tmp_path)
     assert grid_written(tmp_path) == (COLUMNS, ROWS)
     bands = [s["bands"] for s in read_json(tmp_path / "materials.json")["segments"]]
     assert bands

@@ -8,7 +8,8 @@ import pytest
 from polysight.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library, MetalChoice
 from polysight.materials.labels import pack_labels, read_labels
 from polysight.materials.result import labels_of
-from polysight.process import Options
+from polysight.process import Inputs, boxes_as_patches
+from polysight.settings import DEFAULT
 
 
 @pytest.fixture
@@ -20,7 +21,8 @@ def found(imaged):
 
 
 def again(scan, path, plates=()):
-    boxes, names, metal = Options(labels=read_labels(path)).drawn(scan.images.x_m, scan.images.y_m)
+    inputs = Inputs(labels=read_labels(path))
+    boxes, names, metal = boxes_as_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m)
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
     known = KnownScene(boxes, plates)
     return scan.pipeline.find_materials(scan.images, MetalChoice(label=metal), known, classifier), names

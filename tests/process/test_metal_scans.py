@@ -18,6 +18,7 @@ from polysight.materials.analyse import KnownScene, MetalChoice
 from polysight.materials.layers import fit_layer
 from polysight.materials.sub_bands import bands_of_row
 from polysight.polarimetry import Leakage, PlaneReference
+from polysight.settings import Settings
 from polysight_shared.config import Instrument
 from polysight_simulators.scene import decode_scene, simulate
 
@@ -97,8 +98,8 @@ def reference(scan) -> PlaneReference:
 def test_layers_are_recovered_where_a_half_space_is_wrong(scan, reference, rig, name):
     """Water behind 3 mm of glass within 10 % in both parts; thin sheets within 5 %; Eq. 3 is beside in every row."""
     layers, truth = STACKS[name]
-    pipeline, images = imaged(scan(name), None, bands=BANDS)
-    (row,) = pipeline.find_materials(images, MetalChoice(plane=reference), incidence="pixel").rows()
+    pipeline, images = imaged(scan(name), Settings(bands=BANDS, incidence="pixel"))
+    (row,) = pipeline.find_materials(images, MetalChoice(plane=reference)).rows()
     bands = bands_of_row(row, rig.chirp, BANDS)
     assert bands is not None
     fit = fit_layer(bands, [parse_layer(layer) for layer in layers], np.radians(row["incidence_deg"]))
@@ -190,7 +191,7 @@ def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytes
     }
     scene = decode_scene(raw, "test")
     folder = simulate(rig, scene, tmp_path / "scan")
-    pipeline, images = imaged(folder, None, bands=BANDS)
+    pipeline, images = imaged(folder, Settings(bands=BANDS))
     found = pipeline.find_materials(images, known=KnownScene(plates=read_truth(folder / "truth.json")))
     assert len(found.patches) == 6
     for row in found.rows():

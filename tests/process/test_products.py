@@ -13,11 +13,11 @@ from tests.support.processes import output_of
 from tests.support.refusals import refused
 
 from polysight.cli.main import main
-from polysight.jobs.process import all_rows, make_products, publish_images
+from polysight.jobs.process import make_products, processed_rows, publish_images
 from polysight.pipeline import Pipeline
-from polysight.process import Options
 from polysight.products import read_products
 from polysight.products.files import FINISHED
+from polysight.settings import Settings
 from polysight.store import ScanFolder
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -27,7 +27,7 @@ from polysight_shared.files import read_json
 @pytest.fixture(scope="module")
 def scan(two_plates: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = Path(shutil.copytree(two_plates, tmp_path_factory.mktemp("first") / "scan"))
-    all_rows(ScanFolder.load(folder), folder)
+    processed_rows(ScanFolder.load(folder), folder)
     return folder
 
 
@@ -62,7 +62,7 @@ def test_an_earlier_report_stays_until_the_new_one_is_complete(scan: Path, tmp_p
     out = tmp_path / "out"
     out.mkdir()
     (out / "report.html").write_text("earlier")
-    publish_images(all_rows(ScanFolder.load(scan), scan), out)
+    publish_images(processed_rows(ScanFolder.load(scan), scan), out)
     assert [p.name for p in out.iterdir()] == ["report.html"]
 
 
@@ -70,17 +70,17 @@ def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monke
     def fails(*_: object) -> None:
         raise DataError("no metal", code=ErrorCode.NO_DATA)
 
-    pipeline, out = all_rows(ScanFolder.load(scan), scan), tmp_path / "out"
+    pipeline, out = processed_rows(ScanFolder.load(scan), scan), tmp_path / "out"
     publish_images(pipeline, out)
     monkeypatch.setattr(Pipeline, "examine", fails)
     with refused(ErrorCode.NO_DATA):
-        make_products(pipeline, out, Options(), ())
+        make_products(pipeline, out, ())
     assert read_products(out).valid.any()
 
 
 def test_progress_is_reported_before_each_step(scan: Path, tmp_path: Path) -> None:
     steps: list[str] = []
-    all_rows(ScanFolder.load(scan), scan).finish(tmp_path, Options(model="none"), (), steps.append)
+    processed_rows(ScanFolder.load(scan), scan, Settings(model="none")).finish(tmp_path, (), steps.append)
     assert steps == ["point response", "materials", "figures and report"]
 
 

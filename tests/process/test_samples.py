@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -13,10 +14,10 @@ import pytest
 from tests.support.pipelines import pipeline_of
 from tests.support.refusals import refused
 
-from polysight.imaging import PLANE_REACH_M, Images, View
+from polysight.imaging import PLANE_REACH_M, Images
 from polysight.jobs.process import image, process
 from polysight.pipeline import Pipeline
-from polysight.process import ProcessRequest, map_rows
+from polysight.process import Use, map_rows
 from polysight.store import RowData, ScanFolder
 from polysight.store.manifest import encode_line
 from polysight.store.source import pieces_of
@@ -26,8 +27,8 @@ from polysight_shared.errors import DataError
 PIXELS = ("h", "v", "h_raw", "v_raw", "valid")
 
 
-def processed(folder: Path, samples: str = "keep", **more: object) -> Pipeline:
-    return pipeline_of(ScanFolder.load(folder), samples=samples, **more)
+def processed(folder: Path, samples: Use = "keep", **settings: Any) -> Pipeline:
+    return pipeline_of(ScanFolder.load(folder), samples=samples, **settings)
 
 
 def same(one: Images, other: Images) -> bool:
@@ -94,11 +95,11 @@ def test_samples_without_the_sub_bands_asked_for_are_not_used(kept: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "view", [View(depth_mm=8.0), View(depth_mm=-12.0), View(columns=31, rows=24, pixel_mm=5.0), View(pixel_mm=2.0)]
+    "view", [{"depth_mm": 8.0}, {"depth_mm": -12.0}, {"columns": 31, "rows": 24, "pixel_mm": 5.0}, {"pixel_mm": 2.0}]
 )
-def test_other_planes_and_grids_come_from_the_same_samples(two_plates: Path, kept: Path, view: View) -> None:
-    expected = processed(two_plates, "none", depth_m=0.0, view=view).form_images()
-    found = processed(without_raw(kept), depth_m=0.0, view=view).form_images()
+def test_other_planes_and_grids_come_from_the_same_samples(two_plates: Path, kept: Path, view: dict[str, Any]) -> None:
+    expected = processed(two_plates, "none", **view).form_images()
+    found = processed(without_raw(kept), **view).form_images()
     np.testing.assert_array_equal(found.x_m, expected.x_m)
     pairs = [(found.h_raw, expected.h_raw), (found.v_raw, expected.v_raw)]
     pairs += zip(found.illumination.footprints, expected.illumination.footprints, strict=True)
@@ -108,16 +109,16 @@ def test_other_planes_and_grids_come_from_the_same_samples(two_plates: Path, kep
 
 
 def test_a_plane_beyond_what_was_kept_needs_raw_data(kept: Path) -> None:
-    beyond = View(depth_mm=1e3 * PLANE_REACH_M + 200)
-    processed(kept, depth_m=0.0, view=beyond)
+    beyond = 1e3 * PLANE_REACH_M + 200
+    processed(kept, depth_mm=beyond)
     with pytest.raises(DataError):
-        processed(without_raw(kept), depth_m=0.0, view=beyond)
+        processed(without_raw(kept), depth_mm=beyond)
 
 
 def test_other_planes_do_not_change_the_kept_samples(kept: Path) -> None:
     before = {p.name: p.read_bytes() for p in (kept / "samples").iterdir()}
-    processed(kept, depth_m=0.0, view=View(depth_mm=300.0))
-    processed(kept, depth_m=0.05)
+    processed(kept, depth_mm=300.0)
+    processed(kept, depth_range_mm=50.0)
     assert {p.name: p.read_bytes() for p in (kept / "samples").iterdir()} == before
 
 
@@ -255,9 +256,9 @@ def test_an_image_without_a_valid_pixel_is_an_error_that_names_the_board(
     damaged_raw(monkeypatch, silent)
     with refused(ErrorCode.NO_DATA, " and ".join(dead)):
         if command == "image":
-            image(scan, tmp_path / "out", None)
+            image(scan, tmp_path / "out")
         else:
-            process(ProcessRequest(data=str(scan), out=str(tmp_path / "out")))
+            process(scan, tmp_path / "out")
     assert (tmp_path / "out" / "image.npz").exists()
 
 

@@ -9,7 +9,6 @@ from benchmarks.coverage import Cubes
 from tests.support.pipelines import pipeline_of
 
 from polysight.materials import match_truth, truth_plates
-from polysight.process import Options
 from polysight.store import open_source
 from polysight_simulators.scene import decode_scene
 from polysight_simulators.scene.simulated_scan import simulate, truth
@@ -46,7 +45,7 @@ def examine(rig):
     def make(scene, drop_rows=0):
         source = Cubes(rig, scene, drop_rows)
         pipeline, images = imaged(source)
-        findings = pipeline.examine(images, Options())
+        findings = pipeline.examine(images)
         plates = truth_plates(truth(source.instrument, scene, scene.seed))
         true = match_truth([r.patch for r in findings.found.patches], plates)
         return findings, true
@@ -155,7 +154,7 @@ def test_without_a_direct_path_there_is_no_result(rig, tmp_path, plates):
     small = {"columns": 31, "rows": 25, "step_x_mm": 14.0, "step_y_mm": 10.0}
     folder = simulate(rig, world(plates, {"direct_loss_db": "absent"}, grid=small), tmp_path / "scan")
     pipeline, images = imaged(open_source(folder, None))
-    findings = pipeline.examine(images, Options())
+    findings = pipeline.examine(images)
     assert findings.verdict.level == "none"
     assert "direct path" in findings.verdict.reasons[0].what
     assert silent(findings)
@@ -163,7 +162,7 @@ def test_without_a_direct_path_there_is_no_result(rig, tmp_path, plates):
 
 def test_products_without_a_result_hold_images_and_no_name(rig, tmp_path):
     pipeline, _ = imaged(Cubes(rig, world(("ceramic", "wood"))))
-    products = pipeline.finish(tmp_path / "out", Options())
+    products = pipeline.finish(tmp_path / "out")
     assert products.exit_status == 7
     content = json.loads((tmp_path / "out/materials.json").read_text())
     quality = json.loads((tmp_path / "out/quality.json").read_text())

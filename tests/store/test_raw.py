@@ -21,10 +21,10 @@ from tests.support.store.plain_scan import errors
 from polysight.cli.main import main
 from polysight.jobs.drop_raw import drop_raw, processed_digests
 from polysight.jobs.live_scan import resume
-from polysight.jobs.process import all_rows, load_options, make_products, process
-from polysight.process.request import ProcessRequest
+from polysight.jobs.process import make_products, process, processed_rows
 from polysight.products import REPORT, making_products
 from polysight.results import NoResult
+from polysight.settings import DEFAULT
 from polysight.store import locked_samples
 from polysight.store.append_only import AppendFile
 from polysight.store.raw import drop, droppable, dropped_files, require_raw
@@ -90,7 +90,7 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     assert (done.returncode, done.stdout.count("note: raw: ")) == (0, 1)
     assert f"the raw data of {ROWS} rows was dropped after processing into products" in done.stdout
     with refused(ErrorCode.NO_DATA, ROWS):
-        resume(ProcessRequest(data=str(scan), out=str(scan / "products")), keep_incomplete=False, process=True)
+        resume(scan, DEFAULT, keep_incomplete=False, process=True)
     assert contents(scan / "products") == products
     assert drop_raw(scan, None, yes=True) == 0
     assert "dropped already" in capsys.readouterr().out
@@ -101,10 +101,9 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
 
 
 def test_products_replaced_after_a_drop_in_between_keep_its_mark(scan):
-    request = ProcessRequest(data=str(scan), out=str(scan / "products"))
-    pipeline = all_rows(ScanFolder.load(scan), scan)
+    pipeline = processed_rows(ScanFolder.load(scan), scan)
     assert drop_raw(scan, None, yes=True) == 0
-    make_products(pipeline, scan / "products", load_options(request), ())
+    make_products(pipeline, scan / "products", ())
     assert "raw_dropped" in json.loads((scan / "products" / "quality.json").read_text())
 
 
@@ -156,11 +155,11 @@ def test_a_damaged_sample_of_a_dropped_row_is_named_and_costs_this_row(scan, tmp
     assert coverage["rows_absent"] == [2]
     before = contents(scan / "products")
     with refused(ErrorCode.NOT_ENOUGH_DATA, "products"):
-        process(ProcessRequest(data=str(scan), out=str(scan / "products")))
+        process(scan, scan / "products")
     assert contents(scan / "products") == before
     (scan / "samples" / "rows.jsonl").unlink()
     with refused(ErrorCode.NO_DATA, ROWS):
-        process(ProcessRequest(data=str(scan), out=str(scan / "products")))
+        process(scan, scan / "products")
 
 
 def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypatch, capsys):

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from polysight.pipeline import Pipeline
+from polysight.process import Use
+from polysight.settings import Settings
 from polysight.store import Source
 
 
-def pipeline_of(source: Source, **choices: Any) -> Pipeline:
-    """A pipeline to which all rows of a source were added; `choices` as :class:`polysight.process.Choices`."""
-    pipeline = Pipeline(source, **choices)
+def pipeline_of(source: Source, live: bool = False, samples: Use = "none", **settings: Any) -> Pipeline:
+    """A pipeline to which all rows of a source were added; `settings` as of :class:`polysight.settings.Settings`."""
+    pipeline = Pipeline(source, Settings(**settings), live=live, samples=samples)
     for row in source.rows():
         pipeline.add_row(row)
     return pipeline

@@ -12,8 +12,9 @@ from polysight.imaging import Images
 from polysight.materials import find_truth, pixel_accuracy
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import with_ratio
-from polysight.process import Options, materials_content
+from polysight.process import materials_content, why_unnamed
 from polysight.products import ProcessedScan, plain, scan_facts, withhold
+from polysight.settings import Settings
 from polysight.store import Source
 
 
@@ -23,13 +24,13 @@ class Processing:
     `folder` is where the source was read; `truth.json` there holds the truth of a simulated scene.
     """
 
-    def __init__(self, source: Source, folder: Path, options: Options) -> None:
-        self.source, self.folder, self.options = source, folder, options
+    def __init__(self, source: Source, folder: Path, settings: Settings) -> None:
+        self.source, self.folder, self.settings = source, folder, settings
 
     @cached_property
     def pipeline(self) -> Pipeline:
         """The pipeline, without rows at first. Raises PolysightError when calibration and rig do not fit."""
-        return Pipeline(self.source, bands=self.options.bands, samples="read")
+        return Pipeline(self.source, self.settings, samples="read")
 
     @cached_property
     def _images(self) -> Images:
@@ -55,12 +56,12 @@ class Processing:
         DataError
             when no metal is found, a row is damaged, or library or metal reference do not fit the scan.
         """
-        pipeline, options = self.pipeline, self.options
-        unnamed = options.unnamed(pipeline.rig)
+        pipeline = self.pipeline
+        unnamed = why_unnamed(self.settings, pipeline.rig)
         plates, note = find_truth(self.folder)
         if note:
             warnings.warn(note, stacklevel=2)
-        findings = pipeline.examine(self._images, options, plates)
+        findings = pipeline.examine(self._images, plates)
         found = findings.found
         pipeline.quality.note(pixel_accuracy=pixel_accuracy(found), verdict=findings.verdict.to_dict())
         labels = found.segmentation.labels

@@ -11,7 +11,6 @@ from polysight.api.processing import Processing
 from polysight.data import packaged
 from polysight.materials import MODELS, SHORT
 from polysight.polarimetry import Incidence
-from polysight.process import Options
 from polysight.products import (
     IMAGE,
     ProcessedScan,
@@ -26,6 +25,7 @@ from polysight.products import (
     write_zarr,
 )
 from polysight.results import Verdict
+from polysight.settings import Settings
 from polysight.store import MANIFEST, ScanFolder, Source, open_source
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
@@ -88,21 +88,21 @@ def open_scan(
     """
     _check_arguments(model, library, metal_box_mm, bands, incidence)
     path = Path(folder)
-    options = Options(
+    settings = Settings(
         metal_box_mm=metal_box_mm,
-        library=None if library is None else Path(library),
+        library=None if library is None else os.fspath(library),
         model=model,
         bands=bands,
         incidence=incidence,
     )
-    anew = fresh or options != Options()
+    anew = fresh or settings != Settings()
     if (path / IMAGE).exists() and not (path / MANIFEST).exists():
-        return _products_only(path, options, anew)
+        return _products_only(path, settings, anew)
     source = _open_source(path, rig)
     saved = None if anew else find_products(path)
     if saved is not None and isinstance(source, ScanFolder) and not _is_current(saved, source):
         saved = None
-    return Scan(path, source, saved, options)
+    return Scan(path, source, saved, settings)
 
 
 def _check_arguments(
@@ -124,14 +124,14 @@ def _check_arguments(
         raise ConfigError(wrong, "the argument is wrong", "see help(polysight.open_scan)", code=ErrorCode.VALUE_INVALID)
 
 
-def _products_only(path: Path, options: Options, anew: bool) -> Scan:
+def _products_only(path: Path, settings: Settings, anew: bool) -> Scan:
     if anew:
         raise ConfigError(
             f"{path}: products cannot be processed again", "the recorded rows are not in this folder",
             "give the scan folder with these parameters, or leave them out to read the products",
             code=ErrorCode.VALUES_CONFLICT,
         )  # fmt: skip
-    return Scan(path, None, SavedProducts(path), options)
+    return Scan(path, None, SavedProducts(path), settings)
 
 
 def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:
@@ -166,9 +166,9 @@ class Scan:
         The folder that was opened.
     """
 
-    def __init__(self, folder: Path, source: Source | None, saved: SavedProducts | None, options: Options) -> None:
+    def __init__(self, folder: Path, source: Source | None, saved: SavedProducts | None, settings: Settings) -> None:
         self.folder = folder
-        self._source, self._saved_products, self._options = source, saved, options
+        self._source, self._saved_products, self._settings = source, saved, settings
 
     @property
     def scan_id(self) -> str:
@@ -352,7 +352,7 @@ class Scan:
                 f"{self.folder}: holds no recorded rows", "it is a folder of products", "open the scan folder instead",
                 code=ErrorCode.NO_DATA,
             )  # fmt: skip
-        return Processing(self._source, self.folder, self._options)
+        return Processing(self._source, self.folder, self._settings)
 
     @cached_property
     def _saved(self) -> ProcessedScan:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from polysight.data import packaged
+from polysight.settings import Settings, path_text
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 
@@ -99,19 +100,19 @@ def add_json_option(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--json", action="store_true", help="print JSON, for programs")
 
 
-def material_request(args: argparse.Namespace) -> dict[str, Any]:
-    """Fields of a ProcessRequest from the options of :func:`add_material_options`.
+def material_settings(args: argparse.Namespace) -> Settings:
+    """Settings from the options of :func:`add_material_options`.
 
     Raises
     ------
     ConfigError
         when an option would have no effect.
     """
-    given = {"--library": args.library, "--metal": args.metal, "--labels": args.labels, "--model": args.model}
-    asked = [name for name, value in given.items() if value is not None]
-    if asked and getattr(args, "no_process", False):
+    options = {"--library": args.library, "--metal": args.metal, "--labels": args.labels, "--model": args.model}
+    given = [name for name, value in options.items() if value is not None]
+    if given and getattr(args, "no_process", False):
         raise ConfigError(
-            f"{' and '.join(asked)} with --no-process would do nothing",
+            f"{' and '.join(given)} with --no-process would do nothing",
             "it says how the scan is processed, and it will only be recorded",
             "give it to `polysight process` later, or leave --no-process out",
             code=ErrorCode.VALUES_CONFLICT,
@@ -121,17 +122,9 @@ def material_request(args: argparse.Namespace) -> dict[str, Any]:
             "--library with --model none would do nothing", "nothing is named", "leave one of them out",
             code=ErrorCode.VALUES_CONFLICT,
         )  # fmt: skip
-    return {
-        "metal_box_mm": args.metal,
-        "library": text_of(args.library),
-        "model": args.model,
-        "labels": text_of(args.labels),
-    }
-
-
-def text_of(path: Path | None) -> str | None:
-    """A path as text, for a request."""
-    return None if path is None else str(path)
+    return Settings(
+        metal_box_mm=args.metal, library=path_text(args.library), model=args.model, labels=path_text(args.labels)
+    )
 
 
 def rig_file(config: Path | None, data: Path) -> Path | None:

@@ -5,34 +5,28 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import msgspec
 
 from polysight.cli.options import (
     Add,
     add_material_options,
     count,
-    material_request,
+    material_settings,
     positive,
     rig_file,
-    text_of,
 )
-
-if TYPE_CHECKING:
-    from polysight.process import ProcessRequest
+from polysight.settings import Settings, path_text
 
 
-def request_of(args: argparse.Namespace, data: Path, out: Path) -> ProcessRequest:
-    """The request of `polysight process` for one scan. Raises ConfigError."""
-    from polysight.process import ProcessRequest
-
-    return ProcessRequest(
-        data=str(data),
-        out=str(out),
-        config=text_of(rig_file(args.config, data)),
-        reference=text_of(args.reference),
+def settings_of(args: argparse.Namespace, data: Path) -> Settings:
+    """The settings of `polysight process` for one scan. Raises ConfigError."""
+    return msgspec.structs.replace(
+        material_settings(args),
+        config=path_text(rig_file(args.config, data)),
+        reference=path_text(args.reference),
         incidence=args.incidence,
         bands=args.bands,
-        **material_request(args),
     )
 
 
@@ -42,17 +36,23 @@ def _process(args: argparse.Namespace) -> int:
 
     scans = scans_of(args.data)
     if len(args.data) == 1 and scans == args.data and args.dask is None:
-        return process(request_of(args, args.data[0], args.out))
-    requests = [request_of(args, data.absolute(), args.out.absolute() / data.absolute().name) for data in scans]
-    return process_several(requests, args.out, args.jobs, args.dask, args.again)
+        return process(args.data[0], args.out, settings_of(args, args.data[0]))
+    several = [(data, settings_of(args, data.absolute())) for data in scans]
+    return process_several(several, args.out, args.jobs, args.dask, args.again)
 
 
 def _image(args: argparse.Namespace) -> int:
-    from polysight.imaging import View
     from polysight.jobs.process import image
 
-    view = View(args.depth, *(args.grid or (None, None, None)))
-    return image(args.data, args.out, rig_file(args.config, args.data), view)
+    columns, rows, pixel_mm = args.grid or (None, None, None)
+    settings = Settings(
+        config=path_text(rig_file(args.config, args.data)),
+        depth_mm=args.depth,
+        columns=columns,
+        rows=rows,
+        pixel_mm=pixel_mm,
+    )
+    return image(args.data, args.out, settings)
 
 
 def _focus(args: argparse.Namespace) -> int:

@@ -4,31 +4,21 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from polysight.cli.options import Add, add_config_option, add_json_option, add_material_options, material_request
-
-if TYPE_CHECKING:
-    from polysight.process import ProcessRequest
-
-
-def _request(args: argparse.Namespace, folder: Path) -> ProcessRequest:
-    """Request to process a scan into its own folder."""
-    from polysight.process import ProcessRequest
-
-    return ProcessRequest(data=str(folder), out=str(folder / "products"), **material_request(args))
+from polysight.cli.options import Add, add_config_option, add_json_option, add_material_options, material_settings
 
 
 def _scan(args: argparse.Namespace) -> int:
     from polysight.jobs.live_scan import scan
 
-    return scan(args.config, _request(args, args.out), args.truth, args.keep_incomplete, not args.no_process)
+    settings = material_settings(args)
+    return scan(args.config, args.out, settings, args.truth, args.keep_incomplete, not args.no_process)
 
 
 def _resume(args: argparse.Namespace) -> int:
     from polysight.jobs.live_scan import resume
 
-    return resume(_request(args, args.folder), args.keep_incomplete, not args.no_process, args.config)
+    return resume(args.folder, material_settings(args), args.keep_incomplete, not args.no_process, args.config)
 
 
 def _validate(args: argparse.Namespace) -> int:

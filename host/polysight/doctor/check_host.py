@@ -12,8 +12,9 @@ from polysight.doctor.context import CheckContext, Finding, error, not_checked, 
 from polysight.doctor.receiver_load import PACKET_TIME_US, card_rates
 from polysight.materials import SIMULATED_LIBRARY, Library
 from polysight.plan import scan_time
-from polysight.process import Options
+from polysight.process import why_unnamed
 from polysight.radar import require
+from polysight.settings import DEFAULT
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import ConfigError
 from polysight_shared.geometry import incidence_deg
@@ -82,7 +83,7 @@ def check_library(context: CheckContext) -> Finding:
     known = " and ".join(f"{a:g}" for a in angles)
     facts = {"incidence_deg": angle, "library_deg": list(angles)}
     found = f"incidence angle of the rig {angle:.1f} degrees, of {SIMULATED_LIBRARY.name} {known} degrees"
-    if not Options().unnamed(context.rig):
+    if not why_unnamed(DEFAULT, context.rig):
         return ok(found, **facts)
     return warning(
         found,

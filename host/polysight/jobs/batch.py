@@ -23,10 +23,20 @@ from typing import Any, Literal
 import msgspec
 
 from polysight.calibration import calibration_of_scan
-from polysight.materials import TRUTH
-from polysight.process import ProcessRequest, cores
+from polysight.process import cores
 from polysight.products import FINISHED, SavedProducts, write_json
-from polysight.store import COLLECTION, MANIFEST, SAMPLES, ScanFolder, dropped_rows, is_source, open_source, versions
+from polysight.settings import Settings
+from polysight.store import (
+    COLLECTION,
+    MANIFEST,
+    SAMPLES,
+    TRUTH,
+    ScanFolder,
+    dropped_rows,
+    is_source,
+    open_source,
+    versions,
+)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, PolysightError
 from polysight_shared.files import read_json
@@ -43,16 +53,18 @@ _POLL_S = 0.2
 
 
 class Job(msgspec.Struct, frozen=True):
-    """One scan to process, as plain data: request, dependencies of its products, rows at a time."""
+    """One scan to process, as plain data: folders, settings, dependencies of its products, rows at a time."""
 
-    request: ProcessRequest
+    data: str
+    products: str
+    settings: Settings
     made_with: dict[str, Any]
     threads: int = 1
 
     @property
     def out(self) -> Path:
         """Folder of its products."""
-        return Path(self.request.out)
+        return Path(self.products)
 
     @property
     def name(self) -> str:
@@ -80,8 +92,8 @@ def scans_of(paths: Sequence[Path]) -> list[Path]:
     return out
 
 
-def jobs_of(requests: Sequence[ProcessRequest]) -> list[Job]:
-    """Make a job for each request.
+def make_jobs(scans: Sequence[tuple[Path, Settings]], out: Path) -> list[Job]:
+    """Make a job for each scan and its settings; its products go to `out`/<name of the scan>.
 
     Raises
     ------
@@ -89,18 +101,19 @@ def jobs_of(requests: Sequence[ProcessRequest]) -> list[Job]:
         when two scans have one name, and so one folder of products.
     """
     jobs: dict[str, Job] = {}
-    for request in (r.absolute() for r in requests):
-        data = Path(request.data)
+    for folder, settings in scans:
+        data = folder.absolute()
         if data.name in jobs:
             raise ConfigError(
-                f"two scans are named {data.name}: {jobs[data.name].request.data} and {data}",
+                f"two scans are named {data.name}: {jobs[data.name].data} and {data}",
                 "their products would go into one folder",
                 "process them in two runs, each with its own --out",
                 code=ErrorCode.NAME_TAKEN,
             )
+        settings = settings.absolute()
         if (data / MANIFEST).exists():  # it brings its own rig file
-            request = msgspec.structs.replace(request, config=None)
-        jobs[data.name] = Job(request, made_with(request))
+            settings = msgspec.structs.replace(settings, config=None)
+        jobs[data.name] = Job(str(data), str(out.absolute() / data.name), settings, made_with(data, settings))
     return list(jobs.values())
 
 
@@ -109,15 +122,19 @@ _OWN_FILES = (MANIFEST, TRUTH, "raw/*/*.bin", "raw/*/*.idx")
 _PUBLISHED_FILES = ("*_cfg.json", TRUTH, "*/*.bin", "*/*_log.csv", "*_synced.npy")
 
 
-def made_with(request: ProcessRequest) -> dict[str, Any]:
+def made_with(data: Path, settings: Settings) -> dict[str, Any]:
     """Return the dependencies of products: releases, options (files by digest), data files by size and time."""
-    config = None if request.config is None else Path(request.config)
-    options = request.choices()
-    for name, path in request.paths().items():
+    config = settings.path("config")
+    options = settings.choices()
+    for name, path in settings.files().items():
         is_file = path.is_file()
         options[name] = hashlib.sha256(path.read_bytes()).hexdigest() if is_file else _digest_scan(path, config)
-    data = _digest_scan(Path(request.data), config)
-    return {"versions": versions(), "products": PRODUCTS_VERSION, "options": options, "data": data}
+    return {
+        "versions": versions(),
+        "products": PRODUCTS_VERSION,
+        "options": options,
+        "data": _digest_scan(data, config),
+    }
 
 
 def _digest_scan(folder: Path, config: Path | None) -> str:
@@ -317,7 +334,7 @@ def process_many(
 
 
 def process_several(
-    requests: Sequence[ProcessRequest], out: Path, at_a_time: int | None, dask: str | None, again: bool
+    scans: Sequence[tuple[Path, Settings]], out: Path, at_a_time: int | None, dask: str | None, again: bool
 ) -> int:
     """Process several scans, `at_a_time` (None: as many as fit); prints their table and returns the exit status.
 
@@ -328,8 +345,8 @@ def process_several(
     """
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out} is a file", "several scans need a folder", "give another --out")
-    jobs = jobs_of(requests)
-    positions = max((_positions(Path(r.data)) for r in requests), default=0)
+    jobs = make_jobs(scans, out)
+    positions = max((_positions(folder) for folder, _ in scans), default=0)
     n = at_a_time or at_once(positions, cores(), free_memory_bytes())
     n = min(n, len(jobs))
     if dask is None:

@@ -7,6 +7,7 @@ import resource
 import sys
 import threading
 import time
+from pathlib import Path
 
 import msgspec
 
@@ -36,7 +37,7 @@ def main() -> int:
     began = time.monotonic()
     try:
         (job.out / FINISHED).unlink(missing_ok=True)
-        status = process(job.request, job.threads)
+        status = process(Path(job.data), job.out, job.settings, job.threads)
     except PolysightError as e:
         sys.stderr.write(f"{e}\n")
         return e.exit_status

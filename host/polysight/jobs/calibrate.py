@@ -31,6 +31,7 @@ from polysight.polarimetry import (
     leakage_from_images,
     specular_incidence_rad,
 )
+from polysight.settings import Settings, path_text
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.tables import to_builtins
@@ -138,7 +139,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
 
     source = open_raw(scan, None if config is None else load_instrument(config))
     parts = sub_bands(source.instrument.chirp, bands) if bands > 1 else ()
-    path = write_metal(load_reference(scan, config, bands=bands), [source_scan(source, scan)], out, parts)
+    path = write_metal(load_reference(scan, config, bands), [source_scan(source, scan)], out, parts)
     file = read_calibration(path, MetalFile, "metal")
     lines = [
         f"metal on {100 * file.share_of_plane:.0f} % of the image; elsewhere pixels are masked",
@@ -205,13 +206,14 @@ def leakage_of_scans(
     DataError
         when the scans are of different rigs, do not show metal at the same pixels, or are too alike in orientation.
     """
-    pipeline, images = imaged(plate, config)
+    settings = Settings(config=path_text(config))
+    pipeline, images = imaged(plate, settings)
     whole = plane_of(pipeline, images)
     theta = specular_incidence_rad(pipeline.rig)
     mask, turned, names = whole.valid & images.valid, [], [pipeline.source.scan_id]
     simulated = pipeline.source.simulated
     for degrees, folder in strips:
-        other, seen = imaged(folder, config)
+        other, seen = imaged(folder, settings)
         whole.check_rig(other.calibration.imaged_with(other.rig), str(plate))
         whole.check_axes(seen.x_m, seen.y_m)
         mask = mask & seen.valid

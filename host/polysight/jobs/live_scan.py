@@ -1,6 +1,7 @@
 """`polysight scan` and `resume`: a scan that is processed while it runs, with a progress bar.
 
-Rows go into the images as they are committed, so that the products are there soon after the last row.
+Rows go into the images as they are committed, so that the products are there soon after the last row. With
+`--no-process` nothing of the processing is loaded.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -27,18 +29,14 @@ from polysight.acquisition import (
     resume_scan,
     run_scan,
 )
-from polysight.calibration import Calibration, calibration_of_rig, calibration_of_scan
-from polysight.imaging import image_grid
-from polysight.jobs.process import check_options, load_options, make_products, publish_images, truth_of
-from polysight.materials import TRUTH, read_truth
-from polysight.pipeline import Pipeline
-from polysight.process import Options, ProcessRequest
-from polysight.products import check_products_folder
-from polysight.store import MANIFEST, ScanFolder, check_same_scan, manifest, require_raw
-from polysight_shared.config import Instrument, load_instrument
+from polysight.settings import Settings
+from polysight.store import MANIFEST, TRUTH, ScanFolder, check_same_scan, manifest, require_raw
+from polysight_shared.config import load_instrument
 from polysight_shared.errors import ConfigError, PolysightError, ScanError, advice
 
-PRODUCTS = "products"
+if TYPE_CHECKING:
+    from polysight.jobs.process import LiveProcessing
+
 _BESIDE = ("program", "operator.json")
 """Entries allowed in a folder before its scan begins: a program's log, notes."""
 RunScan = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
@@ -105,28 +103,8 @@ class ScanBar:
                 self._console.print(f"{p.committed} of {p.rows} rows, {_clock(p.remaining_s)}", highlight=False)
 
 
-class _Live:
-    """Feeds committed rows to a pipeline (made with the first row) and writes the images after the last one."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._source: ScanFolder | None = None
-        self.pipeline: Pipeline | None = None
-
-    def add_row(self, row: int) -> None:
-        """Process one committed row."""
-        if self._source is None or self.pipeline is None:
-            self._source = ScanFolder.load(self._folder)
-            self.pipeline = Pipeline(self._source, live=True, samples="keep")
-        self._source.reload()
-        self.pipeline.add_row(row)
-        if self._source.complete:
-            publish_images(self.pipeline, self._folder / PRODUCTS)
-
-
 @ignore_hangup()
-def _run(folder: Path, options: Options, process: bool, run_rows: RunScan) -> int:
-    live = _Live(folder)
+def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan) -> int:
     stop = StopRequest()
     with ScanBar() as bar, ControlFolder(folder, stop) as control:
 
@@ -135,18 +113,14 @@ def _run(folder: Path, options: Options, process: bool, run_rows: RunScan) -> in
                 control.open()  # the scan folder is there, and locked by this program
             bar.update(progress)
 
-        result = run_rows(live.add_row if process else None, show, stop)
+        result = run_rows(None if processing is None else processing.add_row, show, stop)
     if result.exit_status == "success":
         _print(f"{folder}: every row is committed\n")
     if result.processing_error is not None:
         raise _unprocessed(folder, result, result.processing_error)
     if result.exit_status != "success":
         raise ScanError(f"{folder}: {result.reason}", "", f"polysight resume {folder}")
-    if live.pipeline is not None:
-        products = make_products(live.pipeline, folder / PRODUCTS, options, truth_of(folder))
-        sys.stdout.write(products.summary())
-        return products.exit_status
-    return 0
+    return 0 if processing is None else processing.finish()
 
 
 def _print(text: str) -> None:
@@ -172,15 +146,11 @@ def _unprocessed(folder: Path, result: ScanResult, e: BaseException) -> Polysigh
     )
 
 
-def _check_options(options: Options, rig: Instrument, calibration: Calibration) -> None:
-    """Check before the rig moves that the options can be used after the scan. Raises PolysightError."""
-    placed = calibration.rig(rig)
-    grid = image_grid(placed)
-    metal = check_options(options, placed, (grid.x_m, grid.y_m))
-    in_scene = options.metal_box_mm is not None or metal is not None
-    plane = calibration.metal_plane(placed, None, in_scene, options.bands)
-    if plane is not None:
-        plane.check_axes(grid.x_m, grid.y_m)
+def _processing(folder: Path, settings: Settings) -> LiveProcessing:
+    """Return the processing of a running scan: imported here, so that a scan that is only recorded loads none of it."""
+    from polysight.jobs.process import LiveProcessing
+
+    return LiveProcessing(folder, settings)
 
 
 def _check_new(folder: Path) -> None:
@@ -197,17 +167,17 @@ def _check_new(folder: Path) -> None:
         raise ConfigError(f"{folder} is not an empty folder", "a scan has a folder of its own", "give another --out")
 
 
-def scan(config: Path, request: ProcessRequest, truth: Path | None, keep_incomplete: bool, process: bool) -> int:
-    """Run a new scan into the request's `data`, and process it; returns the exit status. Raises PolysightError."""
-    options, folder = load_options(request), Path(request.data)
+def scan(
+    config: Path, folder: Path, settings: Settings, truth: Path | None, keep_incomplete: bool, process: bool
+) -> int:
+    """Run a new scan into `folder`, and process it; returns the exit status. Raises PolysightError."""
     rig = load_instrument(config)
     _check_new(folder)
     if truth is not None and not truth.is_file():
         raise ConfigError(f"{truth}: no such file", "--truth names it", "give truth.json, or leave --truth out")
-    if process:
-        _check_options(options, rig, calibration_of_rig(rig))
-        if truth is not None:
-            read_truth(truth)
+    processing = _processing(folder, settings) if process else None
+    if processing is not None:
+        processing.check_new(rig, truth)
 
     def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
         def show(progress: ScanProgress) -> None:
@@ -221,27 +191,26 @@ def scan(config: Path, request: ProcessRequest, truth: Path | None, keep_incompl
             sys.stderr.write(f"note: {truth} was not copied into {folder}; a report does without\n")
         return result
 
-    return _run(folder, options, process, run_rows)
+    return _run(folder, processing, run_rows)
 
 
-def resume(request: ProcessRequest, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
-    """Resume the scan `data` at its first uncommitted row; return the exit status. Raises PolysightError.
+def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
+    """Resume a scan at its first uncommitted row; return the exit status. Raises PolysightError.
 
     `config` is a rig file that says how the rig is reached from now on; the scan's own, where it is None.
     """
-    options, folder = load_options(request), Path(request.data)
     source = ScanFolder.load(folder)
     require_raw(source)
     rig_now = None if config is None else load_instrument(config)
     if rig_now is not None:
         check_same_scan(source.instrument, rig_now, str(config))
-    if process:
-        _check_options(options, source.instrument, calibration_of_scan(source))
-        check_products_folder(folder / PRODUCTS, source.scan_id)
+    processing = _processing(folder, settings) if process else None
+    if processing is not None:
+        processing.check_resumed(source)
 
     def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
         return resume_scan(
             folder, on_row=on_row, progress=on_progress, keep_incomplete=keep_incomplete, stop=stop, rig_now=rig_now
         )
 
-    return _run(folder, options, process, run_rows)
+    return _run(folder, processing, run_rows)

@@ -263,9 +263,8 @@ def report(folder: Path) -> int:
         if not is_source(folder):
             read_products(folder, REPORT)  # raises with the reason
         from polysight.jobs.process import process
-        from polysight.process import ProcessRequest
 
-        status = process(ProcessRequest(data=str(folder), out=str(folder / "products")))
+        status = process(folder, folder / "products")
         made = find_products(folder, REPORT)
         return status if status or made is None else print_verdict(made, to_terminal=False)
     status = print_verdict(found)

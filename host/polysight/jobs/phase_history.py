@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from polysight.imaging import scan_offsets_m
-from polysight.jobs.process import all_rows
+from polysight.jobs.process import processed_rows
 from polysight.pipeline import Pipeline
 from polysight.products import scan_folder_of
 from polysight.store import ScanFolder, open_source
@@ -44,7 +44,7 @@ def export_cphd(folder: Path, out: Path | None) -> int:
         )
     sys.stderr.write(f"writing {FILE}: rows of {scan} ...\n")
     sys.stderr.flush()
-    pipeline = all_rows(open_source(scan, None, dropped=True), scan)
+    pipeline = processed_rows(open_source(scan, None, dropped=True), scan)
     file = export_folder(folder, out) / FILE
     write_cphd(file, phase_history(pipeline))
     sys.stdout.write(f"{file}\n")

@@ -1,4 +1,4 @@
-"""Commands that process recorded data: process, image, focus, sync-report."""
+"""Processing of recorded data, and of a scan while it runs; commands process, image, focus, sync-report."""
 
 from __future__ import annotations
 
@@ -10,31 +10,33 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.calibration import calibration_of_scan
+from polysight.calibration import Calibration, calibration_of_rig, calibration_of_scan
 from polysight.imaging import (
-    AS_IN_RIG_FILE,
     PLANE_REACH_M,
     Focus,
     Images,
     PlaneEstimate,
-    View,
     focus_sweep,
+    image_grid,
 )
 from polysight.jobs.output import counted, current_step, print_lines, say
 from polysight.materials import (
-    TruthPlate,
+    Plates,
     find_truth,
     read_labels,
+    read_truth,
 )
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference, plane_reference
 from polysight.process import (
-    Options,
-    ProcessRequest,
+    Inputs,
     Products,
+    boxes_as_patches,
+    load_classifier,
     map_rows,
     quality_content,
     save_images,
+    why_unnamed,
 )
 from polysight.products import (
     IMAGE,
@@ -46,35 +48,31 @@ from polysight.products import (
     raw_dropped,
     write_json,
 )
+from polysight.settings import DEFAULT, Settings, path_text
 from polysight.store import ScanFolder, Source, dropped_rows, open_source, raw_source, require_raw
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, advice
 
+PRODUCTS = "products"
+"""Folder of the products of a scan, in the scan's folder."""
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def all_rows(
-    source: Source,
-    data: Path,
-    depth_m: float = PLANE_REACH_M,
-    bands: int = 1,
-    options: Options | None = None,
-    view: View = AS_IN_RIG_FILE,
-    threads: int | None = None,
-) -> Pipeline:
-    """Run a pipeline over all rows of a source, `threads` at a time (None: one a core), with a progress bar.
+def add_rows(pipeline: Pipeline, data: Path, threads: int | None = None) -> None:
+    """Add all rows of the pipeline's source, `threads` at a time (None: one a core), with a progress bar.
 
-    What `options` cannot use is refused first. Rows whose samples the scan folder keeps are not synchronised again;
-    others are, and then kept.
+    Rows whose samples the scan folder keeps are not synchronised again; others are, and then kept.
     """
-    pipeline = Pipeline(source, depth_m=depth_m, bands=bands, samples="keep", view=view)
-    if options is not None:
-        metal = check_options(options, pipeline.rig, axes_of(pipeline))
-        pipeline.metal_plane(options, metal is not None)
-    rows = pipeline.samples.processable(source, data)
+    rows = pipeline.samples.processable(pipeline.source, data)
     for _ in counted(map_rows(pipeline.add_row, rows, threads), len(rows), "rows"):
         pass
+
+
+def processed_rows(source: Source, data: Path, settings: Settings = DEFAULT) -> Pipeline:
+    """Return a pipeline to which all rows of a source were added."""
+    pipeline = Pipeline(source, settings, samples="keep")
+    add_rows(pipeline, data)
     return pipeline
 
 
@@ -84,13 +82,13 @@ def axes_of(pipeline: Pipeline) -> Axes:
     return (grid.y_m, grid.x_m) if pipeline.source.mirrored else (grid.x_m, grid.y_m)
 
 
-def imaged(data: Path, config: Path | None, bands: int = 1) -> tuple[Pipeline, Images]:
+def imaged(data: Path, settings: Settings = DEFAULT) -> tuple[Pipeline, Images]:
     """Process a recorded scan of any layout up to its images. Raises PolysightError."""
-    pipeline = all_rows(open_source(data, config, dropped=True), data, bands=bands)
+    pipeline = processed_rows(open_source(data, settings.path("config"), dropped=True), data, settings)
     return pipeline, pipeline.form_images()
 
 
-def truth_of(data: Path) -> tuple[TruthPlate, ...]:
+def truth_of(data: Path) -> Plates:
     """Read the plates of truth.json beside the data; none, with a note on stderr, if it is not a truth file."""
     plates, note = find_truth(data)
     if note:
@@ -98,21 +96,23 @@ def truth_of(data: Path) -> tuple[TruthPlate, ...]:
     return plates
 
 
-def check_options(options: Options, rig: Instrument, axes_m: Axes) -> int | None:
-    """Check library, model and drawn boxes before the work begins; note on stderr if nothing will be named.
+def check_inputs(settings: Settings, inputs: Inputs, calibration: Calibration, rig: Instrument, axes_m: Axes) -> None:
+    """Check library, model, drawn boxes and metal plate before the work begins; note if nothing will be named.
 
-    `rig` is that of the images, as calibrated, `axes_m` are their x and y. Returns the number of the drawn box that is
-    the metal reference, or None.
+    `rig` is that of the images, as calibrated, `axes_m` are their x and y.
 
     Raises
     ------
     DataError
-        when the library cannot be read or fitted, or a box holds no pixel.
+        when the library cannot be read or fitted, a box holds no pixel, or the plate was imaged otherwise.
     """
-    metal = options.drawn(*axes_m).metal
-    if options.classifier(rig) is None and options.model != "none":
-        sys.stderr.write(f"note: {options.unnamed(rig).replace('was', 'will be', 1)}\n")
-    return metal
+    boxes = boxes_as_patches(settings, inputs, *axes_m)
+    if load_classifier(settings, rig) is None and settings.model != "none":
+        sys.stderr.write(f"note: {why_unnamed(settings, rig).replace('was', 'will be', 1)}\n")
+    in_scene = boxes.metal is not None or settings.metal_box_mm is not None
+    plate = calibration.metal_plane(rig, inputs.reference, in_scene, settings.bands)
+    if plate is not None:
+        plate.check_axes(*axes_m)
 
 
 def publish_images(pipeline: Pipeline, out: Path) -> None:
@@ -129,7 +129,7 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
         sys.stderr.write(f"image: {out / IMAGE}\n")
 
 
-def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple[TruthPlate, ...]) -> Products:
+def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
     """Write all products, replacing those in `out`; show the current step on stderr.
 
     When the metal that was given is none, the images alone do, unless `out` holds a report; the error says where they
@@ -138,7 +138,7 @@ def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple
     with making_products(out, pipeline.source.scan_id) as new, current_step("image") as progress:
         _check_dropped(pipeline, out)  # `out` is locked; `drop-raw` may have run since the rows were added
         try:
-            return replace(pipeline.finish(new, options, plates, progress), folder=out)
+            return replace(pipeline.finish(new, plates, progress), folder=out)
         except DataError as e:
             if not (new / IMAGE).exists():
                 raise
@@ -173,43 +173,86 @@ def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> 
     PolysightError
         when the scan cannot be read, or shows no metal plate.
     """
-    pipeline, images = imaged(folder, config, bands)
+    pipeline, images = imaged(folder, Settings(config=path_text(config), bands=bands))
     parts = tuple(plane_of(pipeline, band) for band in pipeline.sub_bands.finish(pipeline.source.mirrored))
     return replace(plane_of(pipeline, images), bands=parts)
 
 
-def load_options(request: ProcessRequest) -> Options:
-    """Load the options of a request: read its label file, process its reference scan. Raises PolysightError."""
-    reference = None
-    if request.reference is not None:
-        config = None if request.config is None else Path(request.config)
-        reference = load_reference(Path(request.reference), config, request.bands)
-    return Options(
-        metal_box_mm=request.metal_box_mm,
-        library=None if request.library is None else Path(request.library),
-        model=request.model,
-        reference=reference,
-        bands=request.bands,
-        incidence=request.incidence,
-        labels=None if request.labels is None else read_labels(Path(request.labels)),
+def load_inputs(settings: Settings) -> Inputs:
+    """Read the label file of the settings, and process their scan of a metal plate. Raises PolysightError."""
+    labels = settings.path("labels")
+    plate = settings.path("reference")
+    return Inputs(
+        labels=None if labels is None else read_labels(labels),
+        reference=None if plate is None else load_reference(plate, settings.path("config"), settings.bands),
     )
 
 
-def process(request: ProcessRequest, threads: int | None = None) -> int:
+def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | None = None) -> int:
     """Make images, materials and report of one scan on `threads` (None: all cores); return the exit status.
 
     Raises PolysightError.
     """
-    options, data, out = load_options(request), Path(request.data), Path(request.out)
-    source = open_source(data, None if request.config is None else Path(request.config), dropped=True)
+    inputs = load_inputs(settings)
+    source = open_source(data, settings.path("config"), dropped=True)
     plates = truth_of(data)
     check_products_folder(out, source.scan_id)
-    pipeline = all_rows(source, data, bands=options.bands, options=options, threads=threads)
+    pipeline = Pipeline(source, settings, inputs, samples="keep")
+    check_inputs(settings, inputs, pipeline.calibration, pipeline.rig, axes_of(pipeline))
+    add_rows(pipeline, data, threads)
     _check_dropped(pipeline, out)
     publish_images(pipeline, out)
-    products = make_products(pipeline, out, options, plates)
+    products = make_products(pipeline, out, plates)
     sys.stdout.write(products.summary())
     return products.exit_status
+
+
+class LiveProcessing:
+    """Processes a scan while it runs: its rows as they are committed, the images and products after the last one.
+
+    Raises PolysightError if a file that the settings name cannot be used.
+    """
+
+    def __init__(self, folder: Path, settings: Settings) -> None:
+        self._folder = folder
+        self._settings = settings
+        self._inputs = load_inputs(settings)
+        self._source: ScanFolder | None = None
+        self._pipeline: Pipeline | None = None
+
+    def check_new(self, rig: Instrument, truth: Path | None) -> None:
+        """Check before the rig moves that a new scan can be processed after its end. Raises PolysightError."""
+        self._check(rig, calibration_of_rig(rig))
+        if truth is not None:
+            read_truth(truth)
+
+    def check_resumed(self, source: ScanFolder) -> None:
+        """Check the same for a scan that is resumed. Raises PolysightError."""
+        self._check(source.instrument, calibration_of_scan(source))
+        check_products_folder(self._folder / PRODUCTS, source.scan_id)
+
+    def _check(self, rig: Instrument, calibration: Calibration) -> None:
+        placed = calibration.rig(rig)
+        grid = image_grid(placed)
+        check_inputs(self._settings, self._inputs, calibration, placed, (grid.x_m, grid.y_m))
+
+    def add_row(self, row: int) -> None:
+        """Process one committed row; the pipeline is made with the first one."""
+        if self._source is None or self._pipeline is None:
+            self._source = ScanFolder.load(self._folder)
+            self._pipeline = Pipeline(self._source, self._settings, self._inputs, live=True, samples="keep")
+        self._source.reload()
+        self._pipeline.add_row(row)
+        if self._source.complete:
+            publish_images(self._pipeline, self._folder / PRODUCTS)
+
+    def finish(self) -> int:
+        """Write the products, and print their summary; return the exit status."""
+        if self._pipeline is None:
+            return 0
+        products = make_products(self._pipeline, self._folder / PRODUCTS, truth_of(self._folder))
+        sys.stdout.write(products.summary())
+        return products.exit_status
 
 
 def _check_dropped(pipeline: Pipeline, out: Path) -> None:
@@ -230,13 +273,13 @@ def _check_dropped(pipeline: Pipeline, out: Path) -> None:
         )
 
 
-def image(data: Path, out: Path, config: Path | None, view: View = AS_IN_RIG_FILE) -> int:
+def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
     """Make image.npz and quality.json only; return the exit status. Raises PolysightError."""
-    source = open_source(data, config, dropped=True)
+    source = open_source(data, settings.path("config"), dropped=True)
     check_products_folder(out, source.scan_id)
     if isinstance(source, ScanFolder) and raw_dropped(out):
         require_raw(source)  # products in `out` may be all that is left of it
-    pipeline = all_rows(source, data, depth_m=PLANE_REACH_M if view == AS_IN_RIG_FILE else 0.0, view=view)
+    pipeline = processed_rows(source, data, settings)
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:
         save_images(new, source, pipeline.rig, images, pipeline.quality)
@@ -261,7 +304,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
 
     source = open_source(data, config, dropped=True)
     out.mkdir(parents=True, exist_ok=True)
-    pipeline = all_rows(source, data, max(depth_mm / 1e3, PLANE_REACH_M))
+    pipeline = processed_rows(source, data, Settings(depth_range_mm=max(depth_mm, 1e3 * PLANE_REACH_M)))
     builder = pipeline.images
     say("images, and the plane of the plates")
     images = pipeline.form_images()

@@ -20,9 +20,8 @@ import numpy as np
 from polysight.imaging import Images
 from polysight.jobs.demo import check_scenes, run_simulator
 from polysight.jobs.output import print_lines, steps
-from polysight.jobs.process import all_rows
+from polysight.jobs.process import processed_rows
 from polysight.materials import (
-    TRUTH,
     KnownScene,
     Labels,
     Library,
@@ -39,7 +38,7 @@ from polysight.materials import (
     specimen_seed,
 )
 from polysight.polarimetry import incidence_choice
-from polysight.process import Options
+from polysight.process import Inputs
 from polysight.products import (
     IMAGE,
     LABELS,
@@ -51,7 +50,8 @@ from polysight.products import (
     read_products,
     scan_folder_of,
 )
-from polysight.store import open_source, versions
+from polysight.settings import Settings
+from polysight.store import TRUTH, open_source, versions
 from polysight_shared.errors import ConfigError, DataError, ScanError
 
 EDGE_MM = 9.0
@@ -122,13 +122,13 @@ def _products_without_rows(data: Path, scan: Path) -> SavedProducts | None:
 def _from_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
     """Process a labelled scan from its rows, as `polysight process --labels`."""
     source = open_source(data, config)
-    pipeline = all_rows(source, data)
+    pipeline = processed_rows(source, data, Settings(model="none"))
     images = pipeline.form_images()
     checked = check_labels(labels, images.x_m, images.y_m, images.valid)
-    options = Options(labels=checked, model="none")
-    if checked.metal is None and pipeline.metal_plane(options) is None:
+    if checked.metal is None and pipeline.calibration.reference() is None:
         raise _no_metal(data)
-    findings = pipeline.examine(images, options)
+    pipeline.inputs = Inputs(labels=checked)
+    findings = pipeline.examine(images)
     if not findings.verdict.usable:
         raise findings.verdict.error("no library was written")
     return _labelled(source.scan_id, findings.found, source.simulated, checked)
@@ -186,7 +186,7 @@ def _from_truth(data: Path, config: Path) -> TrainingScan:
     metal = next((t for t in plates if t.metal), None)
     if metal is None:
         raise DataError(f"{data}: no metal plate in {TRUTH}", "features are relative to metal", "add one to the scene")
-    pipeline = all_rows(source, data)
+    pipeline = processed_rows(source, data)
     images = pipeline.form_images()
     known, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
     found = pipeline.find_materials(images, MetalChoice(metal.box_mm), KnownScene(known, plates))

@@ -31,7 +31,6 @@ from polysight.materials.discriminant import REJECTED
 from polysight.materials.labels import (
     METALS,
     SPECIMEN,
-    TRUTH,
     Labels,
     Plates,
     TruthPlate,
@@ -125,7 +124,6 @@ __all__ = [
     "SHORT",
     "SIMULATED_LIBRARY",
     "SPECIMEN",
-    "TRUTH",
     "UNKNOWN",
     "UNKNOWN_SCENE",
     "Box",

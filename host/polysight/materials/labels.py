@@ -23,11 +23,10 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.materials.segment import Box, Mask, Patch, Segmentation, axis_mm, box_mask, make_patch
+from polysight.store import TRUTH
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 from polysight_shared.files import read_json
-
-TRUTH = "truth.json"
 
 
 @dataclass(frozen=True)

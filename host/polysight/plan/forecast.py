@@ -27,8 +27,9 @@ from polysight.imaging import (
 )
 from polysight.plan.field import FieldLimits, PhaseSlope, field_limits
 from polysight.plan.timing import ROW_OVERHEAD_S, ScanTime, scan_time, tail_s, whole_packets
-from polysight.process import Options
+from polysight.process import why_unnamed
 from polysight.radar import constraints
+from polysight.settings import DEFAULT
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError
 from polysight_shared.raster import burst_duration_s, check_burst_fits, plan_raster
@@ -225,7 +226,7 @@ def find_warnings(
     if phase > _PUBLISHED_PHASE_RAD:
         text = f"standard deviation of the direct path's phase {phase:.3f} rad (published rig after all stages:"
         found.append(PlanWarning("noise", f"{text} {_PUBLISHED_PHASE_RAD}): use more pulses a position"))
-    if text := Options().unnamed(rig):
+    if text := why_unnamed(DEFAULT, rig):
         found.append(PlanWarning("library", text.replace("was named", "will be named", 1)))
     return tuple(sorted(found, key=lambda w: not w.refused))
 

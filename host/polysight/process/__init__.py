@@ -1,16 +1,16 @@
-"""Processing of one scan: its request and options, kept samples, quality figures, verdict and products.
+"""Processing of one scan: what its settings name, kept samples, quality figures, verdict and products.
 
-A `ProcessRequest` is the command line as plain data; `Options` are the same settings with their files loaded.
+`Inputs` are the contents of the files that `polysight.settings.Settings` names.
 `map_rows` processes rows on several threads. For each row, `Quality` collects quality figures and `KeptSamples` stores
 the reduced samples in the scan folder, so that images can be formed again without raw data. `judge` gives the verdict
 on the result; `save_images` and `save_materials` write the products. `polysight/pipeline.py` calls them in this order.
 """
 
+from polysight.process.inputs import NO_INPUTS, Inputs, boxes_as_patches, load_classifier, why_unnamed
 from polysight.process.judge import judge
 from polysight.process.parallel import cores, map_boards, map_rows
 from polysight.process.quality import Quality, masked_runs
-from polysight.process.request import Options, ProcessRequest
-from polysight.process.samples import Choices, KeptSamples
+from polysight.process.samples import KeptSamples, Use
 from polysight.process.save import (
     Findings,
     Products,
@@ -23,16 +23,18 @@ from polysight.process.save import (
 )
 
 __all__ = [
-    "Choices",
+    "NO_INPUTS",
     "Findings",
+    "Inputs",
     "KeptSamples",
-    "Options",
-    "ProcessRequest",
     "Products",
     "Progress",
     "Quality",
+    "Use",
+    "boxes_as_patches",
     "cores",
     "judge",
+    "load_classifier",
     "map_boards",
     "map_rows",
     "masked_runs",
@@ -41,4 +43,5 @@ __all__ = [
     "quality_content",
     "save_images",
     "save_materials",
+    "why_unnamed",
 ]

@@ -16,7 +16,7 @@ import threading
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypedDict, Unpack
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -34,6 +34,7 @@ from polysight.imaging import (
     reduction,
 )
 from polysight.process.quality import Quality
+from polysight.settings import DEFAULT, Settings
 from polysight.store import (
     SAMPLE_ROWS,
     SAMPLES,
@@ -64,30 +65,6 @@ Gate = tuple[float, float]
 Count = Annotated[int, msgspec.Meta(ge=0)]
 _FIGURES = ("direct_hz", "direct_snr")  # of a row's quality figures: one number a position
 _log = logging.getLogger(__name__)
-
-
-class Choices(TypedDict, total=False):
-    """Settings of imaging a scan.
-
-    Attributes
-    ----------
-    live
-        Keep running sums, so that images can be formed after every row.
-    depth_m
-        The range gate keeps echoes from planes up to this much nearer or farther than the rig file's (default 15 mm).
-    bands
-        Number of sub-bands to image; 1 (default): none.
-    view
-        Another plane or other pixels than the rig file's.
-    samples
-        Kept samples: "none" (default) ignores them, "read" restores rows, "keep" also saves missing rows.
-    """
-
-    live: bool
-    depth_m: float
-    bands: int
-    view: View
-    samples: Use
 
 
 def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
@@ -133,8 +110,12 @@ class KeptSamples:
         Its calibrated rig, and its receivers' filters by board name; None: as the chirp profile programs them.
     quality
         Quality figures: restored rows are added to it, saved rows are read from it.
-    choices
-        See :class:`Choices`.
+    settings
+        Plane, pixels and sub-bands of the images, and range of planes.
+    live
+        Keep running sums, so that images can be formed after every row.
+    samples
+        "none" ignores kept samples, "read" restores rows, "keep" also saves missing rows.
 
     Attributes
     ----------
@@ -144,22 +125,33 @@ class KeptSamples:
     """
 
     def __init__(
-        self, source: Source, rig: Instrument, filters: Filters, quality: Quality, **choices: Unpack[Choices]
+        self,
+        source: Source,
+        rig: Instrument,
+        filters: Filters,
+        quality: Quality,
+        settings: Settings = DEFAULT,
+        *,
+        live: bool = False,
+        samples: Use = "none",
     ) -> None:
-        use, depth_m = choices.get("samples", "none"), choices.get("depth_m", PLANE_REACH_M)
-        self._scan = source if isinstance(source, ScanFolder) and use != "none" else None
+        view = View(settings.depth_mm, settings.columns, settings.rows, settings.pixel_mm)
+        depth_m = PLANE_REACH_M if view == AS_IN_RIG_FILE else 0.0
+        if settings.depth_range_mm is not None:
+            depth_m = settings.depth_range_mm / 1e3
+        self._scan = source if isinstance(source, ScanFolder) and samples != "none" else None
         self._folder = Path() if self._scan is None else self._scan.path / SAMPLES
         self._plan, self._made, self._quality = source.plan, made_with(rig, filters), quality
-        self._bands, self._keep = choices.get("bands", 1), use == "keep"
+        self._bands, self._keep = settings.bands, samples == "keep"
         self._lines: dict[int, dict[str, Any]] = {}
         self._read_bytes = 0
         self._rows: int | None = None  # file descriptor of rows.jsonl, locked, while rows are written
         self._arrays: dict[str, NDArray[Any]] = {}
         self._lock = threading.Lock()
         self._head = self._read_head()
-        viewed = choices.get("view", AS_IN_RIG_FILE).of(rig, source.mirrored)
+        viewed = view.of(rig, source.mirrored)
         gate = self._gate_m(rig, needed_gate_m(viewed, depth_m), needed_gate_m(rig, PLANE_REACH_M))
-        self.images = ImageBuilder(viewed, live=choices.get("live", False), gate_m=gate)
+        self.images = ImageBuilder(viewed, live=live, gate_m=gate)
         self.sub_bands = SubBandImages(viewed, self._bands, gate)
         self._builders = {"samples": self.images}
         self._builders |= {f"band_{k}": builder for k, builder in enumerate(self.sub_bands.builders)}

@@ -45,6 +45,7 @@ from polysight.store.sample_rows import (
 from polysight.store.scan_folder import (
     EVENTS,
     PART,
+    TRUTH,
     ScanFolder,
     check_same_scan,
     connection_of,
@@ -67,6 +68,7 @@ __all__ = [
     "PART",
     "SAMPLES",
     "SAMPLE_ROWS",
+    "TRUTH",
     "BoardRow",
     "CubeRow",
     "Digests",

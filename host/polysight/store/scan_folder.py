@@ -54,6 +54,7 @@ SERIAL = ("port", "baud")
 """Keys of the stage that are not compared: the Pi has its own. Nor is calibration, of which a scan keeps copies."""
 FORMAT = 1
 EVENTS = "events.msgpack"
+TRUTH = "truth.json"  # of a simulated scene: its plates
 PART = ".part"  # suffix of a row during reception
 
 

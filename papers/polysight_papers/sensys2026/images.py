@@ -24,7 +24,6 @@ from matplotlib.patheffects import withStroke
 from polysight.jobs.demo import run_simulator
 from polysight.jobs.train import EDGE_MM
 from polysight.materials import (
-    TRUTH,
     KnownScene,
     MaterialsResult,
     MetalChoice,
@@ -35,7 +34,7 @@ from polysight.materials import (
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import ratio_from_permittivity
 from polysight.report import INK, ReportContext, context_of, draw_channel, extent_mm
-from polysight.store import RawSource, ScanFolder
+from polysight.store import TRUTH, RawSource, ScanFolder
 from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, table2
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError

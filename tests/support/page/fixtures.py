@@ -12,7 +12,6 @@ import pytest
 
 from polysight.jobs.process import process
 from polysight.page.watch import Watch
-from polysight.process import ProcessRequest
 from polysight_simulators.scene import decode_scene, simulate
 from tests.support.page.chromium import Browser, find_chromium
 from tests.support.page.live_view import GrowingScan
@@ -87,6 +86,6 @@ def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for name, seed in (("one", 3), ("two", 7)):
             folder = simulate(published_rig(), scene, root / name, seed=seed)
             with unrendered():
-                assert process(ProcessRequest(data=str(folder), out=str(folder / "products")), threads=1) == 0
+                assert process(folder, folder / "products", threads=1) == 0
 
     return made_once(tmp_path_factory, "processed", make)

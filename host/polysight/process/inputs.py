@@ -1,0 +1,94 @@
+"""What the settings name: boxes drawn by hand, the scan of a metal plate, the library that names patches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy.typing as npt
+
+from polysight.materials import (
+    SAME_ANGLE_DEG,
+    SIMULATED_LIBRARY,
+    Classifier,
+    Labels,
+    Library,
+    Segmentation,
+    check_labels,
+)
+from polysight.polarimetry import PlaneReference
+from polysight.settings import Settings
+from polysight_shared.config import Instrument
+from polysight_shared.geometry import incidence_deg
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Content of the files that settings name: the label file, and the processed scan of a metal plate."""
+
+    labels: Labels | None = None
+    reference: PlaneReference | None = None
+
+
+NO_INPUTS = Inputs()
+
+
+class DrawnBoxes(NamedTuple):
+    """Boxes drawn by hand as patches, their names by patch number, and the number of the metal reference."""
+
+    segmentation: Segmentation | None = None
+    names: Mapping[int, str] = MappingProxyType({})
+    metal: int | None = None
+
+
+def boxes_as_patches(settings: Settings, inputs: Inputs, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> DrawnBoxes:
+    """Return the boxes drawn by hand as patches of an image with axes `x_m`, `y_m`; empty without labels.
+
+    A drawn box is the metal reference if neither a box nor a scan of a plate is given as one.
+    Raises DataError if a box holds no pixel, or too few to be used.
+    """
+    labels = inputs.labels
+    if labels is None:
+        return DrawnBoxes()
+    if labels.by_hand:
+        labels = check_labels(labels, x_m, y_m)
+    patches, names = labels.patches(x_m, y_m)
+    if inputs.reference is not None or settings.metal_box_mm is not None:
+        return DrawnBoxes(patches, names)
+    return DrawnBoxes(patches, names, next((number for number, name in names.items() if labels.is_metal(name)), None))
+
+
+def why_unnamed(settings: Settings, rig: Instrument) -> str:
+    """Return the reason why nothing will be named in scans of a rig, as a sentence; "" if names are given.
+
+    Raises DataError if the library cannot be loaded.
+    """
+    if settings.model == "none":
+        return "Nothing was named: naming was left out (--model none)."
+    path = library_path(settings)
+    angle = incidence_deg(rig, rig.receivers[0])
+    known_angles = Library.load(path).angles_deg
+    # Classifier refuses an empty library.
+    if not known_angles or any(abs(known - angle) <= SAME_ANGLE_DEG for known in known_angles):
+        return ""
+    return (
+        f"Nothing was named: the scan looks at {angle:.1f} degrees of incidence, and {path.name} holds"
+        f" {' and '.join(f'{known:g}' for known in known_angles)} degrees only (|P| changes by a tenth in a degree)."
+        " Train a library at this angle, and process the scan again with --library."
+    )
+
+
+def load_classifier(settings: Settings, rig: Instrument) -> Classifier | None:
+    """Return the classifier for scans of a rig; None without naming, see :func:`why_unnamed`. Raises DataError."""
+    if why_unnamed(settings, rig):
+        return None
+    angle = incidence_deg(rig, rig.receivers[0])
+    return Classifier(Library.load(library_path(settings)), model=settings.model, angles_deg=[angle])
+
+
+def library_path(settings: Settings) -> Path:
+    """Return the reference library of the settings."""
+    return settings.path("library") or SIMULATED_LIBRARY

@@ -25,8 +25,7 @@ os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 pytest.register_assert_rewrite("tests.support")  # before the first import of it: its asserts show their values
 
 from tests.support.rigs import published_rig  # noqa: E402
-from tests.support.suite.costs import Costs  # noqa: E402
-from tests.support.suite.scheduling import ByFile, longest_first  # noqa: E402
+from tests.support.suite import ByFile, Costs, longest_first  # noqa: E402
 
 # A shell that starts the tests in the background has Ctrl-C ignored, and so would every program the tests start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

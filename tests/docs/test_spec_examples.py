@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from docs.check.pages import ROOT, read_page
+from tests.support.radar.boards import native_rig
 
 from polysight.capture import dca1000
 from polysight.capture.card import EepromSettings
@@ -18,7 +19,7 @@ from polysight.radar import commands, events
 from polysight.radar.commands import DEVICE_CONFIGURATION, Command, program
 from polysight.radar.messages import Direction, Kind, SubBlock, decode
 from polysight_shared import messages, stage_line
-from polysight_shared.config import NativeRadar, Radar, load_instrument
+from polysight_shared.config import load_instrument
 
 SPEC = ROOT / "docs/spec"
 
@@ -167,16 +168,8 @@ def test_data_packet_headers():
 # --- radar link -------------------------------------------------------------------------------------------------------
 
 
-def published_rig():
-    """The published rig under native control, with the start offset that the page tells."""
-    rig = load_instrument(ROOT / "instrument.toml")
-    boards = tuple(b if b.role == "transmit" else msgspec.structs.replace(b, start_offset_hz=790e3) for b in rig.boards)
-    radar = Radar(control="native", native={b.name: NativeRadar(usb_serial=b.name) for b in boards})
-    return msgspec.structs.replace(rig, boards=boards, radar=radar)
-
-
 def test_sub_blocks_are_those_of_the_published_rig():
-    rig = published_rig()
+    rig = native_rig()
     made = program(rig, rig.by_name("RH"))
     sent: list[Command] = [DEVICE_CONFIGURATION, *made.basic, *made.waveform, *made.frames(rig.grid.columns * 16)]
     table = {row[0]: row[3] for row in rows("mmwavelink.md", "Sub-blocks")}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 from tests.support.paths import REPO
-from tests.support.suite.scheduling import FIRST, ROOMS, TOGETHER, ByFile, longest_first
+from tests.support.suite import FIRST, ROOMS, TOGETHER, ByFile, longest_first
 
 
 class _Worker:

@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import tomli_w
+from tests.support.radar.boards import with_radar
 
 from polysight.cli.main import main
 from polysight.radar.commands import program
@@ -218,7 +219,7 @@ def test_a_trace_has_both_directions_and_every_change_of_a_line(rig_file, tmp_pa
 def test_a_replay_with_another_rig_file_reports_the_first_different_line(rig, rig_file, capsys, tmp_path):
     trace = str(tmp_path / "day.jsonl")
     assert run(rig_file(), "check", "RH", "--trace", trace) == 0
-    path = rig_file(msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, rx_gain_db=40)))
+    path = rig_file(with_radar(rig, rx_gain_db=40))
     assert run(path, "replay", trace) == 1
     assert re.search(r"line \d+ of the trace", capsys.readouterr().out)
 
@@ -263,7 +264,7 @@ def test_devices_pipes_folders_and_huge_files_are_refused_unread(rig, rig_file, 
         with path.open("wb") as file:
             file.truncate(3 * 2**30)
     text = "bytes" if kind == "sparse" else "not a regular file"
-    with_it = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, firmware=str(path)))
+    with_it = with_radar(rig, firmware=str(path))
     here = rig_file()
     for file, args in ((here, ("firmware", "RH", str(path))), (here, ("replay", str(path)))):
         assert run(file, *args) == 3

@@ -1,4 +1,4 @@
-"""The byte stream for the FT4232H, and a board behind it."""
+"""The byte stream for the FT4232H."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.support.refusals import refused
 
-from polysight.radar.board import RadarBoard, State
-from polysight.radar.commands import program
 from polysight.radar.usb import UsbWords, read_words, set_up_spi, write_words
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.radars import UsbChip
@@ -63,23 +61,6 @@ def test_an_invalid_stream_is_detected(chip, byte):
     stream[byte] ^= 0x09
     chip.take("A", bytes(stream))
     assert chip.errors or chip.words_written != [0x1234, 0x5678]
-
-
-def test_two_words_under_one_chip_select_are_detected(chip):
-    chip.take("A", bytes.fromhex("80c04b 1101001234 1101005678"))
-    assert "two words under one chip select" in chip.errors
-
-
-def test_a_board_runs_its_frames_behind_usb(rig, board, chip, usb, clock):
-    radar = RadarBoard("RH", usb, clock, program(rig, rig.by_name("RH")))
-    radar.configure()
-    radar.arm(4)
-    for _ in range(4):
-        board.trigger()
-        clock.sleep(1.5e-3)
-    assert radar.poll() is State.DONE
-    assert chip.errors == []
-    radar.close()
 
 
 def test_the_reset_is_released_in_functional_mode_only(board, chip):

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import msgspec
 import pytest
-from tests.support.radar.boards import BoardWords
+from tests.support.radar.boards import BoardWords, with_radar
 from tests.support.refusals import refused
 
 from polysight.radar import board as boards
@@ -121,13 +120,6 @@ def test_a_board_that_missed_a_pulse_is_not_done(radars, usb):
     assert radars.wait_done(3.0) == []
 
 
-def test_a_board_in_fault_is_not_done(radars, usb):
-    radars.arm(FRAMES)
-    usb.boards["FTRH"].say(0x1002, bytes(4))
-    usb.pulses(FRAMES)
-    assert radars.wait_done(3.0) == ["RH"]
-
-
 def test_two_names_for_one_board_are_refused(rig, usb, clock):
     usb.boards["FTRV"].cores.die = 2
     with refused(ErrorCode.VALUES_CONFLICT, "RH and RV"):
@@ -137,7 +129,7 @@ def test_two_names_for_one_board_are_refused(rig, usb, clock):
 def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock, tmp_path):
     for board in usb.boards.values():
         board.cores.die = 0
-    kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, calibration_dir=str(tmp_path)))
+    kept = with_radar(rig, calibration_dir=str(tmp_path))
     with NativeRadars(kept, usb.open, clock):
         assert list(tmp_path.iterdir()) == []
 
@@ -180,7 +172,7 @@ def test_a_broken_constraint_is_refused_before_anything_is_sent(rig, usb, clock)
     def never(serial: str) -> BoardWords:
         raise AssertionError(f"{serial} was opened")
 
-    wrong = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, rx_gain_db=31))
+    wrong = with_radar(rig, rx_gain_db=31)
     with refused(ErrorCode.VALUE_INVALID, "RX gain step"):
         NativeRadars(wrong, never, clock)
     with NativeRadars(rig, usb.open, clock) as made, refused(ErrorCode.VALUE_INVALID, "frames"):
@@ -244,7 +236,7 @@ def test_a_link_that_cannot_be_reopened_is_a_fault_of_that_board_only(radars, us
 
 
 def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
-    kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, trace_dir=str(tmp_path / "traces")))
+    kept = with_radar(rig, trace_dir=str(tmp_path / "traces"))
     with NativeRadars(kept, usb.open, clock) as radars:
         assert run_row(radars, usb) == ALL_DONE
         usb.unplug(0.0)
@@ -264,7 +256,7 @@ def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
 
 def test_a_full_disk_ends_a_trace_but_no_row(rig, usb, clock, tmp_path, monkeypatch):
     monkeypatch.setattr("polysight.radar.control.new_trace", lambda *_: Path("/dev/full"))
-    kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, trace_dir=str(tmp_path)))
+    kept = with_radar(rig, trace_dir=str(tmp_path))
     with NativeRadars(kept, usb.open, clock) as radars:
         assert run_row(radars, usb) == ALL_DONE
         result = traces(radars)

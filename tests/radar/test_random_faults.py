@@ -1,16 +1,231 @@
-"""Random faults at random times: no hang, no traceback, no false success, and the right cause in the error."""
+"""Random faults at random times: no hang, no traceback, no false success, and the right cause in the error.
+
+A case is one fault at a random time of a board's bring-up or row, and the cause that the error must name.
+"""
 
 from __future__ import annotations
 
 import random
 import re
+import struct
 from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import pytest
-from tests.support.radar.faults import FRAMES, Case, Outcome, draw, run
+from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
 
-from polysight.radar.board import State
+from polysight.radar.board import RadarBoard, State
+from polysight.radar.commands import program
+from polysight.radar.firmware import Image, check_image
+from polysight_shared.errors import DeviceError
+from polysight_simulators.radars import Fault, make_image
 from polysight_simulators.radars import RadarBoard as Simulated
+
+RIG = native_rig()
+IMAGE = check_image(make_image(), "image.bin")
+FRAMES = 4
+NOISE = r"disturbed|CRC|checksum|sync word"
+SILENT = r"no power|does not report|did not report"
+
+
+class FaultyWords(BoardWords):
+    """A word link that calls `act` when transfer number `at` begins (words, reads of the line, and resets count)."""
+
+    def __init__(self, board: Simulated, clock: VirtualClock, at: int, act: Callable[[FaultyWords], None]) -> None:
+        super().__init__(board, clock)
+        self.at, self.act, self.count = at, act, 0
+        self.flip: Callable[[int], int] = lambda word: word
+        self.stuck: bool | None = None
+        self.begun: float | None = None
+        self.dead: int | None = None
+
+    def _next(self) -> None:
+        self.count += 1
+        if self.count == self.at:
+            self.begun = self.clock.time
+            self.act(self)
+
+    def write(self, words: Sequence[int]) -> None:
+        for word in words:
+            self._next()
+            super().write([self.flip(word)])
+
+    def read(self, count: int) -> list[int]:
+        found = []
+        for _ in range(count):
+            self._next()
+            (word,) = super().read(1)
+            found.append(self.flip(word) if self.dead is None else self.dead)
+        return found
+
+    def interrupt(self) -> bool:
+        self._next()
+        found = super().interrupt()
+        return found if self.stuck is None else self.stuck
+
+    def reset(self, held: bool) -> None:
+        self._next()
+        super().reset(held)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A fault: name, action, and the pattern of an error with the right cause."""
+
+    name: str
+    cause: str
+    act: Callable[[FaultyWords], None] = FaultyWords.close
+    flash: bytes = IMAGE.data
+    firmware: Image | None = None
+    die_id: str = ""
+    jumpers: bool = True
+    supply: bool = True
+
+
+def _flip_once(rng: random.Random) -> Case:
+    mask = 1 << rng.randrange(16)
+
+    def act(words: FaultyWords) -> None:
+        def flip(word: int) -> int:
+            words.flip = lambda w: w
+            return word ^ mask
+
+        words.flip = flip
+
+    return Case("one flipped bit", NOISE, act)
+
+
+def _noise(rng: random.Random) -> Case:
+    own = random.Random(rng.random())
+    share = rng.choice((0.01, 0.05, 0.3))
+    return Case(
+        "noise from here on",
+        NOISE + "|MISO",
+        lambda words: setattr(words, "flip", lambda w: w ^ (1 << own.randrange(16) if own.random() < share else 0)),
+    )
+
+
+def _event(rng: random.Random) -> Case:
+    number, data, cause = rng.choice(
+        (
+            (0x1002, struct.pack("<BBH", rng.randrange(7), rng.randrange(9), 100) + bytes(28), "RF core fault"),
+            (0x1003, struct.pack("<II", 0, 1 << rng.randrange(32)), "RF core error signal"),
+            (0x1010, struct.pack("<BBHII", 1, 0, 0, 1 << rng.randrange(4), 0), "analog supply fault"),
+            (0x5003, struct.pack("<II", 0, 1 << rng.randrange(32)), "main core error signal"),
+            (0x5008, struct.pack("<II", rng.choice((1, 2, 4)), 0), "RF core error"),
+            (0x5002, struct.pack("<BBH", rng.randrange(7), 0, 0) + bytes(28), "main core fault"),
+            (0x1012, bytes(20), "-"),
+            (0x5006, bytes(8), "-"),
+            (rng.randrange(0x1000, 0x6000), rng.randbytes(rng.randrange(40)), "."),
+        )
+    )
+    return Case(f"event 0x{number:04X}", cause, lambda words: words.board.say(number, data))
+
+
+def _flood(rng: random.Random) -> Case:
+    count = rng.choice((50, 500))
+
+    def act(words: FaultyWords) -> None:
+        for _ in range(count):
+            words.board.say(0x1012, bytes(20))
+
+    return Case("events without a pause", r"without a pause|did not report|no valid answer", act)
+
+
+def draw(rng: random.Random) -> tuple[Case, int]:
+    """Draw a fault and the transfer at which it happens."""
+    at = round(10 ** rng.uniform(0.0, 3.7))
+    once = [f for f in Fault if f is not Fault.REFUSE and f is not Fault.REFUSE_BARE]
+    made = {
+        "flip": lambda: _flip_once(rng),
+        "noise": lambda: _noise(rng),
+        "event": lambda: _event(rng),
+        "flood": lambda: _flood(rng),
+        "unplug": lambda: Case("unplugged", "unplugged", lambda w: setattr(w.board, "plugged", False)),
+        "power": lambda: Case("power lost", SILENT, lambda w: w.board.power(False)),
+        "brown-out": lambda: Case("brown-out", "restarted", lambda w: (w.board.power(False), w.board.power(True))),
+        "ram brown-out": lambda: Case(
+            "new board, brown-out",
+            "restarted",
+            lambda w: (w.board.power(False), w.board.power(True)),
+            b"",
+            IMAGE,
+        ),
+        "low": lambda: Case("interrupt stuck low", "interrupt line", lambda w: setattr(w, "stuck", False)),
+        "high": lambda: Case(
+            "interrupt stuck high", "interrupt.*(stays high|stuck)|MISO", lambda w: setattr(w, "stuck", True)
+        ),
+        "dead": lambda: Case("MISO open", "MISO", lambda w: setattr(w, "dead", rng.choice((0xFFFF, 0)))),
+        "hang": lambda: Case("hangs", "hangs", lambda w: setattr(w.board.cores, "destroyed", True)),
+        "refuse": lambda: Case("refuses", "refuses", lambda w: w.board.inject(Fault.REFUSE)),
+        "bare": lambda: Case("refuses, bare", "refuses", lambda w: w.board.inject(Fault.REFUSE_BARE)),
+        "once": lambda: (lambda f: Case(f.name, NOISE + "|" + SILENT, lambda w: w.board.inject(f)))(rng.choice(once)),
+        "lasting": lambda: (
+            lambda f: Case(f"{f.name} always", NOISE + "|" + SILENT, lambda w: w.board.inject(*[f] * 99))
+        )(rng.choice([f for f in once if f is not Fault.EVENT_BETWEEN])),
+        "empty": lambda: Case("flash empty", "no patch", flash=b""),
+        "broken": lambda: Case("flash broken", "no patch", flash=IMAGE.data[: rng.randrange(4, len(IMAGE.data))]),
+        "swapped": lambda: Case("another board", "die id", die_id="5eed0002-00000d1e-000008c3-00000002"),
+        "jumpers": lambda: Case("jumpers for mmWave Studio", "SOP0 set", jumpers=False),
+        "off": lambda: Case("no supply", "no power", supply=False),
+        "ram": lambda: Case("new board", "-", flash=b"", firmware=IMAGE),
+        "ram flip": lambda: (lambda c: Case("new board, " + c.name, c.cause, c.act, b"", IMAGE))(_flip_once(rng)),
+        "ram unplug": lambda: Case(
+            "new board, unplugged", "unplugged", lambda w: setattr(w.board, "plugged", False), b"", IMAGE
+        ),
+    }
+    return made[rng.choice(list(made))](), at
+
+
+@dataclass
+class Outcome:
+    """Result of a run."""
+
+    case: Case
+    at: int
+    error: DeviceError | None
+    seconds: float
+    struck: bool
+    radar: RadarBoard
+    board: Simulated
+    words: FaultyWords
+
+    def heal(self) -> None:
+        """Repair the faults between host and board: plugged in, powered, undisturbed lines."""
+        self.words.flip, self.words.stuck, self.words.dead = (lambda word: word), None, None
+        self.board.plugged, self.board.cores.destroyed = True, False
+        self.board.inject()
+        if not self.board.powered:
+            self.board.power(True)
+
+
+def run(case: Case, at: int) -> Outcome:
+    """Configure, arm, and run a row of pulses; check that all frames ended. Only DeviceError is caught."""
+    clock = VirtualClock()
+    board = Simulated(lambda: clock.time, flash=case.flash, functional_jumpers=case.jumpers)
+    board.power(case.supply)
+    words = FaultyWords(board, clock, at, case.act)
+    radar = RadarBoard("RH", words, clock, program(RIG, RIG.by_name("RH")), case.firmware, case.die_id)
+    error = None
+    try:
+        radar.configure()
+        radar.arm(FRAMES)
+        radar.pulses_begin()
+        for _ in range(FRAMES):
+            board.trigger()
+            clock.sleep(1.5e-3)
+        until = clock.time + 3.0
+        while radar.poll() is not State.DONE and clock.time < until:
+            if radar.state is State.FAULT:
+                raise DeviceError(radar.reason)
+            clock.sleep(0.005)
+        if radar.state is not State.DONE:
+            raise DeviceError("the radar did not report its frames' end", "; ".join(radar.warnings), "")
+    except DeviceError as e:
+        error = e
+    return Outcome(case, at, error, clock.time, words.begun is not None, radar, board, words)
+
 
 LONGEST_S = 45.0  # of virtual time: a bring-up whose every command is sent three times would be given up long before
 NAMED = 0.95

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.support.radar.boards import native_rig
+from tests.support.radar.boards import native_rig, with_radar
 from tests.support.refusals import refused
 
 from polysight.radar.commands import constraints, direct_if_hz, program, require
@@ -98,7 +98,7 @@ def test_76_ghz_is_inside_the_band_to_the_code(rig):
 
 def test_only_simulated_radars_may_have_no_filters(rig):
     native = {n: NativeRadar(usb_serial=f"tcp://127.0.{k}.1:2000") for k, n in enumerate(rig.radar.native)}
-    served = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, native=native))
+    served = with_radar(rig, native=native)
     assert broken(changed(served, "chirp", hpf1_khz=0.0, hpf2_khz=0.0)) == set()
 
 
@@ -162,7 +162,7 @@ def test_the_chirp_spacing_must_be_that_of_the_radar(rig, chirp_us, holds):
     assert ("chirp spacing" not in broken(many)) is holds
     result = next(c for c in constraints(many, FRAMES) if c.name == "chirp spacing")
     idle = float(result.remedy.split()[3].strip(","))
-    mended = msgspec.structs.replace(many, radar=msgspec.structs.replace(rig.radar, idle_us=idle))
+    mended = with_radar(many, idle_us=idle)
     assert "chirp spacing" not in broken(mended)
 
 
@@ -175,14 +175,14 @@ def test_a_frame_of_many_chirps_needs_a_longer_period(rig):
 
 def test_a_usb_path_does_not_acknowledge_ldo_bypass(rig):
     native = {**rig.radar.native, "RH": NativeRadar(usb_path="1-4.2", ldo_bypass=True)}
-    wrong = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, native=native))
+    wrong = with_radar(rig, native=native)
     assert broken(wrong) == {"LDO bypass of RH"}
 
 
 def test_ldo_bypass_needs_this_boards_serial(rig):
     def with_bypass(acknowledged: str) -> Instrument:
         native = {**rig.radar.native, "RH": NativeRadar("FTRH", True, acknowledged)}
-        return msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, native=native))
+        return with_radar(rig, native=native)
 
     assert broken(with_bypass("")) == broken(with_bypass("FTRV")) == {"LDO bypass of RH"}
     assert broken(with_bypass("FTRH")) == set()

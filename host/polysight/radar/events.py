@@ -260,7 +260,7 @@ def _analog(data: bytes) -> _Read:
 def _boot(data: bytes) -> _Read:
     """Decode power-up time and status: 20 bytes, or 16 from the ROM of a first-generation device with empty flash.
 
-    The short form has status, time, tests, as in a message that was received (tests/support/radar/received.py).
+    The short form has status, time, tests, as in a message that was received (tests/radar/test_received.py).
     """
     if len(data) < 20:
         boot, ticks, tests = struct.unpack_from("<IIQ", data)

@@ -19,7 +19,7 @@ from tests.support.products import unrendered
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, PET, scene_of
 from tests.support.store.small_scan import Samples, SmallScan
-from tests.support.suite.once import made_once
+from tests.support.suite import made_once
 
 
 @pytest.fixture(scope="session")

@@ -75,3 +75,8 @@ def native_rig() -> Instrument:
     boards = tuple(b if b.role == "transmit" else msgspec.structs.replace(b, start_offset_hz=790e3) for b in rig.boards)
     radar = Radar(control="native", native={b.name: NativeRadar(usb_serial=f"FT{b.name}") for b in boards})
     return msgspec.structs.replace(rig, boards=boards, radar=radar)
+
+
+def with_radar(rig: Instrument, **values: object) -> Instrument:
+    """The rig with other values in its table [radar]."""
+    return msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, **values))

@@ -76,13 +76,13 @@ def test_without_a_result_nothing_is_told_of_materials(tmp_path):
 def test_a_scan_does_not_differ_from_itself(processed):
     found = compare(processed / "one", processed / "one")
     assert np.nanmax(np.abs(found.p)) == 0
-    assert found.figures().significant_share == 0
-    assert all(pair.sigmas == 0 for pair in found.patches if pair.difference)
+    assert found.figures.significant_share == 0
+    assert all(pair.sigmas == 0 for pair in found.figures.patches if pair.difference)
 
 
 def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed):
     found = compare(processed / "one", processed / "two")
-    answer = [pair.sigmas for pair in found.patches if pair.sigmas is not None]
+    answer = [pair.sigmas for pair in found.figures.patches if pair.sigmas is not None]
     assert answer
     assert max(answer) < 3
     assert (found.sigmas > 5).mean() < 0.05  # few pixels that are independent of each other
@@ -108,8 +108,8 @@ def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
     write_image(tmp_path / "changed" / "image.npz", replace(saved.image, v=v, p=p))
     found = compare(processed / "one", tmp_path / "changed")
     answer = np.nan_to_num(found.sigmas)
-    assert found.scatter == 0.1  # a copy, which shares its errors
-    expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.p_sigma) / found.scatter
+    assert found.figures.scatter == 0.1  # a copy, which shares its errors
+    expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.p_sigma) / 0.1
     assert np.allclose(answer[inside], expected[inside], rtol=1e-4)
     assert answer[inside].min() > 0.5
     answer[inside] = 0

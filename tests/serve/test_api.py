@@ -45,8 +45,13 @@ def view(scans: Path) -> Iterator[Served]:
     ("path", "body", "code", "values"),
     [
         ("/api/start", {"nmae": "x"}, ErrorCode.KEY_UNKNOWN, ("nmae", "did you mean 'name'")),
-        ("/api/start", {"name": "x", "rows": "three"}, ErrorCode.TYPE_WRONG, ("rows", "three", "whole number")),
-        ("/api/start", {"name": "x", "rows": 0}, ErrorCode.VALUE_INVALID, ("rows", "0", "1")),
+        (
+            "/api/start",
+            {"name": "x", "plan": {"rows": "three"}},
+            ErrorCode.TYPE_WRONG,
+            ("rows", "three", "whole number"),
+        ),
+        ("/api/start", {"plan": {"rows": 0}}, ErrorCode.VALUE_INVALID, ("rows", "0", "1")),
         ("/api/train", {"scans": ["one"]}, ErrorCode.KEY_MISSING, ("name",)),
         ("/api/notes?scan=one", {"tags": "oak"}, ErrorCode.TYPE_WRONG, ("tags", "a list")),
         ("/api/notes?scan=one", b"{", ErrorCode.MESSAGE_INVALID, ()),

@@ -106,12 +106,15 @@ def test_a_scan_may_begin_beside_its_program_and_its_notes(tmp_path):
 def test_a_scan_starts_with_its_plan_and_without_a_pi_says_why(tmp_path):
     with served_folder(tmp_path, TOKEN, config=RIG_FILE) as view:
         wrong = [
-            {"name": "a"} | more for more in ({"rows": 0}, {"x": 1}, {"columns": 1999}, {"rows": 3, "library": "no"})
+            {"name": "a"} | more
+            for more in ({"plan": {"rows": 0}}, {"x": 1}, {"plan": {"columns": 1999}}, {"library": "no"})
         ]
         for body, status in [({"name": "../out"}, 404), ({"name": ".hidden"}, 404), *((body, 400) for body in wrong)]:
             assert post(view, "/api/start", body)[0] == status, body
         assert [p.name for p in tmp_path.iterdir()] == []
-        assert post(view, "/api/start", {"name": "week/one", "rows": 3, "notes": "n", "tags": ["t"]})[0] == 200
+        assert (
+            post(view, "/api/start", {"name": "week/one", "plan": {"rows": 3}, "notes": "n", "tags": ["t"]})[0] == 200
+        )
         folder = tmp_path / "week" / "one"
         rig = tomllib.loads((folder / PROGRAM / "instrument.toml").read_text())
         assert rig["grid"]["rows"] == 3

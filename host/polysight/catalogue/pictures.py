@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -167,27 +168,30 @@ class Values:
     colours: str = AMPLITUDE
 
 
-@dataclass(frozen=True)
-class Map:
-    """Title and colours of a picture of a processed scan."""
+class Map(msgspec.Struct, frozen=True):
+    """A picture of a processed scan; some need a reference of metal."""
 
+    name: str
     title: str
     colours: str = AMPLITUDE
+    needs_metal: bool = False
 
 
 MAPS = {
-    "h_amplitude": Map("|H|, s-polarised"),
-    "v_amplitude": Map("|V|, p-polarised"),
-    "p_amplitude": Map("|P| = |H / V|"),
-    "h_phase": Map("phase of H", PHASE),
-    "v_phase": Map("phase of V", PHASE),
-    "p_phase": Map("phase of P", PHASE),
-    "p_sigma": Map("standard deviation of P"),
-    "permittivity": Map("permittivity, real part"),
-    "loss": Map("permittivity, loss"),
+    drawn.name: drawn
+    for drawn in (
+        Map("h_amplitude", "|H|, s-polarised"),
+        Map("v_amplitude", "|V|, p-polarised"),
+        Map("p_amplitude", "|P| = |H / V|"),
+        Map("h_phase", "phase of H", PHASE),
+        Map("v_phase", "phase of V", PHASE),
+        Map("p_phase", "phase of P", PHASE),
+        Map("p_sigma", "standard deviation of P", needs_metal=True),
+        Map("permittivity", "permittivity, real part", needs_metal=True),
+        Map("loss", "permittivity, loss", needs_metal=True),
+    )
 }
-"""Pictures of a processed scan by name; the last three need a reference of metal."""
-NEED_METAL = ("p_sigma", "permittivity", "loss")
+"""Pictures of a processed scan by name."""
 
 
 def draw(images: Images) -> dict[str, Picture]:
@@ -208,7 +212,7 @@ def draw_products(pixels: Pixels, name: str, limits: Limits | None = None) -> Pi
             f"no picture is called {name[:40]!r}", "the name is wrong", f"one of {', '.join(MAPS)}",
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
-    values = _derived_values(pixels, name) if name in NEED_METAL else _channel_values(pixels)[name]
+    values = _derived_values(pixels, name) if MAPS[name].needs_metal else _channel_values(pixels)[name]
     return draw_values(values if limits is None else replace(values, limits=limits))
 
 

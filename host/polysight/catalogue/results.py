@@ -11,7 +11,7 @@ import numpy as np
 import skimage
 from numpy.typing import NDArray
 
-from polysight.catalogue.pictures import MAPS, NEED_METAL, Picture, Pixels, draw_values, mask_values
+from polysight.catalogue.pictures import MAPS, Map, Picture, Pixels, draw_values, mask_values
 from polysight.materials import PATCHES, SIMULATED_LIBRARY, Library, is_metal
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import permittivity_from_ratio
@@ -55,14 +55,6 @@ NEAR_MM = 15.0
 # --- all of it ---
 
 
-class NamedMap(msgspec.Struct, frozen=True):
-    """A picture that can be drawn."""
-
-    name: str
-    title: str
-    colours: str
-
-
 class DrawnLabels(msgspec.Struct, frozen=True):
     """Boxes drawn by hand, in millimetres (x0, y0, x1, y1), or the `problem` of their file."""
 
@@ -85,7 +77,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 
     processed_utc: str
     extent_mm: tuple[float, float, float, float]
-    pictures: list[NamedMap]
+    pictures: list[Map]
     metal: str
     verdict: Verdict | None
     patches: list[PatchFigures]
@@ -102,12 +94,11 @@ def result_of(folder: Path) -> Result:
         if there are none, or one is damaged.
     """
     pixels = Pixels(read_products(folder).folder)
-    maps = {name: map_ for name, map_ in MAPS.items() if pixels.referenced or name not in NEED_METAL}
     source = None if pixels.results is None else pixels.results.metal_reference
     return Result(
         processed_utc=pixels.scan.get("processed_utc", ""),
         extent_mm=pixels.extent_mm,
-        pictures=[NamedMap(name, map_.title, map_.colours) for name, map_ in maps.items()],
+        pictures=[drawn for drawn in MAPS.values() if pixels.referenced or not drawn.needs_metal],
         metal=source.how if source else "",
         verdict=pixels.verdict,
         patches=pixels.figures,
@@ -354,11 +345,23 @@ class PatchPair(msgspec.Struct, frozen=True, kw_only=True):
     sigmas: float | None = None
 
 
-class ComparisonFigures(msgspec.Struct, frozen=True):
-    """A comparison without its maps: the share of `compared` pixels that differs significantly, and the pairs."""
+class ComparisonFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """A comparison without its maps.
 
-    patches: tuple[PatchPair, ...]
-    notes: tuple[str, ...]
+    Attributes
+    ----------
+    patches
+        Pairs of patches at one place.
+    notes
+        Reasons why the two are hard to compare.
+    compared, significant_share
+        Number of pixels, and the share of them that differs by more than `significant_sigmas`; None: not known.
+    scatter
+        Scatter of unchanged pixels in stated errors, :func:`scatter_of`; None if the errors are not known.
+    """
+
+    patches: list[PatchPair]
+    notes: list[str]
     extent_mm: tuple[float, float, float, float]
     compared: int
     significant_share: float | None
@@ -376,34 +379,12 @@ class Comparison:
         complex128; nan where one of the scans has no value.
     sigmas
         float64: |difference of P| in standard deviations of such differences; nan where the error is not known.
-    scatter
-        Those standard deviations in stated errors, :func:`scatter_of`; nan if the errors are not known.
-    patches
-        For each pair of patches at one place: names, permittivities, difference.
-    notes
-        Reasons why the two are hard to compare.
     """
 
-    first: Pixels
-    second: Pixels
     p: NDArray[np.complex128]
     permittivity: NDArray[np.complex128]
     sigmas: Real
-    scatter: float
-    patches: tuple[PatchPair, ...]
-    notes: tuple[str, ...]
-
-    def figures(self) -> ComparisonFigures:
-        """The comparison without the maps."""
-        judged = self.sigmas[np.isfinite(self.sigmas)]
-        return ComparisonFigures(
-            self.patches,
-            self.notes,
-            self.first.extent_mm,
-            compared=int(np.isfinite(self.p).sum()),
-            significant_share=float((judged > SIGNIFICANT).mean()) if judged.size else None,
-            scatter=None if np.isnan(self.scatter) else round(self.scatter, 3),
-        )
+    figures: ComparisonFigures
 
 
 def compare(first: Path, second: Path) -> Comparison:
@@ -435,8 +416,17 @@ def compare(first: Path, second: Path) -> Comparison:
     with np.errstate(invalid="ignore", divide="ignore"):
         stated = np.abs(p) / np.hypot(a.p_std, b.p_std[same_place])
     scatter = scatter_of(stated)
-    pairs = tuple(_pair_patches(a.figures, b.figures))
-    return Comparison(a, b, p, eps, stated / scatter, scatter, pairs, tuple(_notes(a, b, scatter)))
+    sigmas = stated / scatter
+    judged = sigmas[np.isfinite(sigmas)]
+    figures = ComparisonFigures(
+        patches=_pair_patches(a.figures, b.figures),
+        notes=_notes(a, b, scatter),
+        extent_mm=a.extent_mm,
+        compared=int(np.isfinite(p).sum()),
+        significant_share=float((judged > SIGNIFICANT).mean()) if judged.size else None,
+        scatter=None if np.isnan(scatter) else round(scatter, 3),
+    )
+    return Comparison(p, eps, sigmas, figures)
 
 
 def scatter_of(differences: Real) -> float:

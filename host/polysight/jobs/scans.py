@@ -115,7 +115,7 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
 def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool) -> int:
     """Print the differences of two processed scans; returns 0. Raises DataError."""
     found = compare(first, second)
-    values = found.figures()
+    values = found.figures
     if picture is not None:
         from polysight.catalogue import draw_comparison
 

@@ -58,14 +58,7 @@ class PlanRequest(Body, frozen=True):
 
     def changes(self) -> Changes:
         """The same as changes of a plan."""
-        return Changes(
-            columns=self.columns,
-            rows=self.rows,
-            step_x_mm=self.step_x_mm,
-            step_y_mm=self.step_y_mm,
-            speed_mm_s=self.speed_mm_s,
-            pulses=self.pulses,
-        )
+        return Changes(**msgspec.structs.asdict(self))
 
     def apply(self, config: Path) -> Instrument:
         """The rig file with these numbers. Raises ConfigError."""
@@ -78,10 +71,11 @@ class PlanRequest(Body, frozen=True):
         return rig
 
 
-class StartRequest(PlanRequest, frozen=True):
+class StartRequest(Body, frozen=True):
     """A new scan: its name, its plan, and how it is processed."""
 
     name: Text = ""
+    plan: PlanRequest = PlanRequest()
     metal: Box | None = None
     library: Text = ""
     keep_incomplete: bool = False
@@ -227,7 +221,7 @@ async def _start(site: Site, request: Request, body: StartRequest) -> dict[str, 
     programs = site.programs
     if not body.name:
         raise ConfigError("the scan has no name", "`name` is empty", "give it one", code=ErrorCode.KEY_MISSING)
-    rig = body.apply(config)
+    rig = body.plan.apply(config)
 
     def start() -> None:
         folder = site.scans.folder(body.name, new=True)
@@ -241,7 +235,7 @@ async def _start(site: Site, request: Request, body: StartRequest) -> dict[str, 
             words.append("--keep-incomplete")
         with site.rig:
             _check_free(site)
-            words += ["--config", config.absolute() if body.changes() == Changes() else _write_rig(folder, rig)]
+            words += ["--config", config.absolute() if body.plan == PlanRequest() else _write_rig(folder, rig)]
             if body.notes or body.tags:
                 folder.mkdir(parents=True, exist_ok=True)
                 write_notes(folder, Notes(body.notes, body.tags))

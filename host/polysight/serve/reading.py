@@ -278,7 +278,7 @@ async def _use_comparison(site: Site, request: Request, use: Callable[[Compariso
 
 
 async def _compare(site: Site, request: Request) -> Response:
-    return json_answer(await _use_comparison(site, request, Comparison.figures))
+    return json_answer(await _use_comparison(site, request, lambda both: both.figures))
 
 
 async def _compare_map(site: Site, request: Request) -> Response:

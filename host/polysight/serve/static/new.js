@@ -66,7 +66,7 @@ async function start() {
   complain("told");
   const metal = by("metal").value.trim();
   const body = {
-    ...changes(), name: by("name").value.trim(), library: by("library").value, keep_incomplete: by("keep_incomplete").checked,
+    plan: changes(), name: by("name").value.trim(), library: by("library").value, keep_incomplete: by("keep_incomplete").checked,
     metal: metal ? metal.split(",").map(Number) : null, notes: by("notes").value, tags: by("tags").value.split(",").map((t) => t.trim()).filter(Boolean),
   };
   by("start").disabled = confirmed = true;

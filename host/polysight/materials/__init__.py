@@ -61,7 +61,6 @@ from polysight.materials.library import (
     Library,
     Model,
     Samples,
-    SceneErrors,
     by_angle,
     feature_matrix,
 )
@@ -99,7 +98,6 @@ from polysight.materials.sub_bands import (
 from polysight.materials.train import (
     Score,
     TrainingScan,
-    best_model,
     calibration_error,
     fit_library,
     make_library,
@@ -147,7 +145,6 @@ __all__ = [
     "Plates",
     "Samples",
     "ScanPatches",
-    "SceneErrors",
     "Score",
     "SegmentSettings",
     "Segmentation",
@@ -156,7 +153,6 @@ __all__ = [
     "analyse",
     "angle_in_text",
     "axis_mm",
-    "best_model",
     "box_mask",
     "box_name",
     "by_angle",

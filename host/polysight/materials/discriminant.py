@@ -36,7 +36,16 @@ import numpy.typing as npt
 import scipy
 
 from polysight.materials.library import Model, NamedScan, Real, Samples, SceneErrors, by_angle
-from polysight.materials.specimens import apparent_permittivity, cost_of_none, effect, fit_spread, relative, without
+from polysight.materials.specimens import (
+    METAL_SPECIMENS,
+    METAL_WITHOUT_ERROR,
+    apparent_permittivity,
+    cost_of_none,
+    effect,
+    fit_spread,
+    relative,
+    without,
+)
 
 _ROUNDS, _FIRST_ROUNDS = 30, 3
 _TURNS = 2  # alternations of the error and the likelihood of none of the materials
@@ -210,8 +219,6 @@ REJECTED = 0.02
 """Share of the known materials' pixels, and of their patches, that are called unknown."""
 NONE = 0.02
 """Prior probability that a patch is none of the library's materials."""
-METAL_LIKE = 0.25
-"""|1/P - 1| below which a patch is metal, which has no error of its own and gives no information on errors."""
 _TWO_WAY_ROUNDS = 30
 _BEYOND = 1.001  # least distance of unknown patches
 _LN_2PI = float(np.log(2 * np.pi))
@@ -286,8 +293,9 @@ class ErrorDiscriminant(Model):
         """Material to permittivity of the half space with its ratio; without metals; empty if angles are not known."""
         if not len(self.angles_rad):
             return {}
-        kinds = zip(self.names, self._anchor_t, strict=True)
-        return {str(n): apparent_permittivity(t, self.angles_rad) for n, t in kinds if bool((abs(t - 1) > 0.1).all())}
+        dielectric = (abs(self._anchor_t - 1) > METAL_SPECIMENS).all(axis=1)
+        kinds = zip(self.names[dielectric], self._anchor_t[dielectric], strict=True)
+        return {str(name): apparent_permittivity(t, self.angles_rad) for name, t in kinds}
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Classify each pixel independently: return its name, and its distance over the threshold."""
@@ -437,7 +445,7 @@ class ErrorDiscriminant(Model):
         q = by_angle(x)[2]
         parts = [q[patch == i] for i in range(patch.max() + 1)]
         middle = np.stack([np.median(p.real, axis=0) + 1j * np.median(p.imag, axis=0) for p in parts])
-        return np.asarray((np.abs(middle - 1) < METAL_LIKE).all(axis=1), np.bool_)
+        return np.asarray((np.abs(middle - 1) < METAL_WITHOUT_ERROR).all(axis=1), np.bool_)
 
     def _independent(self, covariance: Real) -> Real:
         """Remove correlations between angles: errors of their scans are independent (effects of specimens are not)."""

@@ -33,6 +33,12 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from polysight.materials.specimens import (
+    METAL_PIECE,
+    METAL_UNLIKE,
+    METAL_WITHOUT_BRIGHTNESS,
+    METAL_WITHOUT_PERMITTIVITY,
+)
 from polysight.polarimetry import fresnel, permittivity_from_ratio, ratio_from_permittivity
 
 Real = npt.NDArray[np.float64]
@@ -44,8 +50,6 @@ BRIGHTNESS_FREEDOM = 4.0
 """Weight of that prior against the patches' own scatter, in number of patches."""
 OUTLIER = 3.0
 """Standard deviations of brightness beyond which a patch (a thin sheet, a shadow) loses weight (Cauchy)."""
-METAL_LIKE = 0.25
-"""|t - 1| below which no permittivity is given: it grows as 4 / |t - 1|^2, and so does its error."""
 LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "brightness")
@@ -218,7 +222,7 @@ class _Model:
         self.std = np.maximum(np.array([s.std for s in seen], np.float64), _LEAST_STD)
         level = np.array([np.nan if s.brightness is None else s.brightness for s in seen], np.float64)
         # Metal-like patches have |H| = 1 with any leakage: they give no information on it.
-        self.bright = np.isfinite(level) & (level > 0) & (np.abs(self.q - 1) > METAL_LIKE)
+        self.bright = np.isfinite(level) & (level > 0) & (np.abs(self.q - 1) > METAL_WITHOUT_BRIGHTNESS)
         self.log_level = np.log(np.where(self.bright, level, 1.0))
         self.start = true_ratio(self.q, *prior.leakage)
         self.theta = np.array([s.theta_rad for s in seen], np.float64)
@@ -327,7 +331,7 @@ def _estimate(model: _Model, x: Real, jac: Real, covariance: Real, i: int, t: co
     unit = model.std[i]
     of_ratio = unit**2 * covariance[np.ix_(at, at)]
     distance = min(abs(t - 1), abs(1 / t - 1) if t else np.inf)
-    if not distance >= max(METAL_LIKE, LEAST_DISTANCE * np.sqrt(np.trace(of_ratio) / 2)):
+    if not distance >= max(METAL_WITHOUT_PERMITTIVITY, LEAST_DISTANCE * np.sqrt(np.trace(of_ratio) / 2)):
         return PatchEstimate(t, of_ratio, None, None, {})
     value = complex(permittivity_from_ratio(t, theta))
     by_t = complex(slope(t, theta)) * unit
@@ -392,9 +396,7 @@ CHANNEL_RATIO_STD_DB = 2.5
 SURE_SCORE = 3.5
 WEAK_V_DB = -3.0
 """V / H relative to the direct path below which a patch is hardly metal: metal has 0 dB, bare water -4 dB."""
-_UNLIKE = 0.2
 _LARGEST = 10.0  # |eps| of common materials; larger values are penalised
-_NEAR_METAL = 0.12  # |t - 1| of further pieces of metal, which need not be possible dielectrics
 _STARTS = [
     complex(real, -real * loss) for real in (2.0, 2.6, 3.2, 4.0, 5.0, 7.0, 10.0) for loss in (0.01, 0.15, 0.4, 1.2)
 ]
@@ -467,7 +469,7 @@ def metal_evidence(seen: list[PatchMeasurement], prior: RigPrior, channel_ratio:
     starts = np.array([[0.0] * 8 + [np.log(e.real), np.log(-e.imag)] for e in _STARTS])
     starts = starts[np.argsort(np.sum(metal.residuals(starts) ** 2, axis=-1), kind="stable")]
     as_dielectric = min(_best(metal, x) for x in starts[:_REFINED])
-    unlike = sum(abs(s.inverse_ratio - 1) > _UNLIKE for s in seen)
+    unlike = sum(abs(s.inverse_ratio - 1) > METAL_UNLIKE for s in seen)
     return MetalEvidence(as_dielectric - as_metal, unlike, level)
 
 
@@ -520,7 +522,7 @@ class _Explanation:
                 np.maximum(0.0, eps_of.imag - 0.02) / (0.1 + 0.1 * size),
                 np.maximum(0.0, np.log(size / _LARGEST)) / 0.5,
             ]
-        metal, slack = np.abs(t - 1) < _NEAR_METAL, 1 + 10 * self.loose
+        metal, slack = np.abs(t - 1) < METAL_PIECE, 1 + 10 * self.loose
         patches = [brightness, *(np.where(metal, 0.0, part) / slack for part in impossible)]
         channel = [] if self.level_db is None else [(self._level(own, a, b) - self.level_db) / CHANNEL_RATIO_STD_DB]
         return np.concatenate([x[..., :8], _robust(np.concatenate(patches, -1)), *channel, *bounds], -1)

@@ -21,7 +21,8 @@ from polysight.materials.inversion import (
     slope,
 )
 from polysight.materials.segment import Box, Mask, Patch, Segmentation, box_mask
-from polysight.polarimetry import permittivity_from_ratio
+from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY
+from polysight.polarimetry import inverse_spread, permittivity_from_ratio
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -189,14 +190,6 @@ def ratio_sigma(
     return np.where(np.isfinite(sigma) & np.isfinite(h) & np.isfinite(v), sigma, np.nan).astype(np.float32)
 
 
-METAL_LIKE = 0.25
-"""|P - 1| below which no permittivity is given.
-
-A relative error d of P changes eps by about 4 d / |P - 1/P|: at |P - 1| = 0.25 the usual 3 % of P are already a quarter
-of the permittivity, and the error grows without bound towards P = 1.
-"""
-
-
 @dataclass(frozen=True)
 class Permittivity:
     """Permittivity of one patch.
@@ -224,17 +217,28 @@ class Permittivity:
         Source of error to its share of that covariance's trace.
     """
 
-    value: complex | None
-    real_range: tuple[float, float] | None
-    imag_range: tuple[float, float] | None
-    real_std: float | None
-    loss_std: float | None
-    ratio: complex
-    inverse_std: float
-    metal_distance: float
-    pixels: int
+    value: complex | None = None
+    real_range: tuple[float, float] | None = None
+    imag_range: tuple[float, float] | None = None
+    real_std: float | None = None
+    loss_std: float | None = None
+    ratio: complex = complex(np.nan, np.nan)
+    inverse_std: float = float("nan")
+    metal_distance: float = float("nan")
+    pixels: int = 0
     covariance: npt.NDArray[np.float64] | None = None
     shares: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def not_estimated(
+        cls,
+        ratio: complex = complex(np.nan, np.nan),
+        inverse_std: float = float("nan"),
+        metal_distance: float = float("nan"),
+        pixels: int = 0,
+    ) -> Permittivity:
+        """Return the entry of a patch without a permittivity: metal-like, or without a result."""
+        return cls(ratio=ratio, inverse_std=inverse_std, metal_distance=metal_distance, pixels=pixels)
 
     @property
     def dominated_by(self) -> str | None:
@@ -244,7 +248,7 @@ class Permittivity:
     @property
     def metal_like(self) -> bool:
         """True if P is known and too close to 1 for a permittivity."""
-        return bool(np.isfinite(self.ratio)) and not self.metal_distance >= METAL_LIKE
+        return bool(np.isfinite(self.ratio)) and not self.metal_distance >= METAL_WITHOUT_PERMITTIVITY
 
 
 def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
@@ -263,10 +267,6 @@ def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
     return f"{real:{width}.{digits}f} {'+' if imag > 0 else '-'} j{abs(imag):.{digits}f}"
 
 
-NOTHING = Permittivity(None, None, None, None, None, complex(np.nan, np.nan), float("nan"), float("nan"), 0)
-"""Permittivity of a patch without a result."""
-
-
 def median_ratio(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating]) -> complex:
     """Return a robust mean of P = H / V over pixels: the reciprocal of the median of V / H; NaN without usable pixels.
 
@@ -280,16 +280,6 @@ def median_ratio(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfl
     inverse = v[good].astype(np.complex128) / h[good]
     middle = complex(np.median(inverse.real), np.median(inverse.imag))
     return 1 / middle if middle != 0 else complex(np.inf, 0.0)
-
-
-def inverse_spread(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating]) -> float:
-    """Return the standard deviation of V / H over pixels, of the real part and of the imaginary part (1.48 MAD)."""
-    good = np.isfinite(h) & np.isfinite(v) & (h != 0)
-    if not good.any():
-        return float("nan")
-    inverse = v[good].astype(np.complex128) / h[good]
-    parts = np.concatenate([inverse.real - np.median(inverse.real), inverse.imag - np.median(inverse.imag)])
-    return float(1.4826 * np.median(np.abs(parts)))
 
 
 def estimate_permittivity(
@@ -321,8 +311,8 @@ def estimate_permittivity(
     n = int(good.sum())
     inverse = 1 / ratio if ratio != 0 else complex(np.inf, 0.0)
     inverse_std = inverse_spread(h, v)
-    if not distance >= METAL_LIKE:  # also when it is not a number
-        return Permittivity(None, None, None, None, None, ratio, inverse_std, float(distance), n)
+    if not distance >= METAL_WITHOUT_PERMITTIVITY:  # also when it is not a number
+        return Permittivity.not_estimated(ratio, inverse_std, float(distance), n)
     theta = np.broadcast_to(np.asarray(theta_rad, np.float64), h.shape)[good]
     value = complex(permittivity_from_ratio(ratio, float(theta.mean())))
     pixels = permittivity_from_ratio(v[good].astype(np.complex128) / h[good], theta)
@@ -330,15 +320,15 @@ def estimate_permittivity(
     re, im = (np.percentile(part, [30, 70]) for part in (pixels.real, pixels.imag))
     std = float(abs(slope(inverse, float(theta.mean()))) * inverse_std)
     return Permittivity(
-        value,
-        (float(re[0]), float(re[1])),
-        (float(im[0]), float(im[1])),
-        std,
-        std,
-        ratio,
-        inverse_std,
-        float(distance),
-        n,
+        value=value,
+        real_range=(float(re[0]), float(re[1])),
+        imag_range=(float(im[0]), float(im[1])),
+        real_std=std,
+        loss_std=std,
+        ratio=ratio,
+        inverse_std=inverse_std,
+        metal_distance=float(distance),
+        pixels=n,
     )
 
 
@@ -361,7 +351,7 @@ def permittivity_of_patch(
     """
     alone = estimate_permittivity(h, v, theta_rad)
     if estimate is None or estimate.permittivity is None or estimate.covariance is None:
-        return replace(alone, value=None, real_range=None, imag_range=None, real_std=None, loss_std=None)
+        return Permittivity.not_estimated(alone.ratio, alone.inverse_std, alone.metal_distance, alone.pixels)
     ratio = 1 / estimate.inverse_ratio if estimate.inverse_ratio else complex(np.inf, 0.0)
     real_std, loss_std = (float(s) for s in np.sqrt(np.diag(estimate.covariance)))
     own = estimate.inverse_ratio_covariance

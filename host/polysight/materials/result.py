@@ -24,7 +24,7 @@ from polysight.materials.classify import NamedPatch, PatchName, features_of
 from polysight.materials.inversion import Inversion, RigPrior, ratio_error
 from polysight.materials.labels import Labels, TruthPlate
 from polysight.materials.library import Real, SceneErrors
-from polysight.materials.measure import NOTHING, MetalReference, Permittivity, Refused, background, ratio_sigma
+from polysight.materials.measure import MetalReference, Permittivity, Refused, background, ratio_sigma
 from polysight.materials.segment import Box, Patch, Segmentation, axis_mm
 from polysight.store import open_npz
 from polysight_shared.error_codes import ErrorCode
@@ -151,7 +151,7 @@ class MaterialsResult:
 
     def without_result(self) -> MaterialsResult:
         """Return the same patches without names, ratios, permittivities and metal reference."""
-        patches = tuple(replace(r, permittivity=NOTHING, named=None) for r in self.patches)
+        patches = tuple(replace(r, permittivity=Permittivity.not_estimated(), named=None) for r in self.patches)
         metal = replace(self.metal, label=None, given=False, how=f"none ({self.metal.how})")
         return replace(self, patches=patches, metal=metal, bands={}, withheld=True)
 

@@ -28,13 +28,28 @@ PRIOR_FREEDOM = 4.0
 """Weight of that prior, in number of specimens."""
 OWN_FREEDOM = 20.0
 """Weight of the mean of all materials in one material's own spread, in number of specimens."""
+METAL_WITHOUT_PERMITTIVITY = 0.25
+"""|P - 1| or |1/P - 1|, the smaller, below which a patch gets no permittivity.
+
+A relative error d of P changes eps by about 4 d / |P - 1/P|: at 0.25 the usual 3 % of P are already a quarter of the
+permittivity, and the error grows without bound towards P = 1.
+"""
+METAL_WITHOUT_BRIGHTNESS = 0.25
+"""Measured |V/H - 1| below which |H| tells nothing about leakage: metal has |H| = 1 with any leakage."""
+METAL_WITHOUT_ERROR = 0.25
+"""Median |V/H - 1| of a patch below which it has no error of its own, and gives no information on common errors."""
+METAL_UNLIKE = 0.2
+"""|V/H - 1| above which a patch is evidence for the metal beside it; metal looks like water beside water."""
+METAL_PIECE = 0.12
+"""|V/H - 1| below which another patch may be a second piece of metal, and need not be a possible dielectric."""
+METAL_SPECIMENS = 0.1
+"""|V/H - 1| below which a material is metal, whose specimens do not differ."""
 SOFT = 0.05
 """|V / H| below which its errors are additive (leakage, noise) instead of relative (gain, phase)."""
 _STEP = 1e-4
 _ROUNDS = 300
 _SETTLED = 1e-3
 _LEAST_LOSS = 1e-3
-_METAL = 0.1  # |t - 1| below which a material is metal; specimens of metal do not differ
 
 
 def softened(t: npt.ArrayLike) -> Real:
@@ -63,7 +78,7 @@ def effect(t: Complex, angles_rad: Sequence[float]) -> Real:
     -------
     Zero for metal, and if the angles are not known.
     """
-    if len(angles_rad) != len(t) or not np.isfinite(t).all() or bool((np.abs(t - 1) < _METAL).any()):
+    if len(angles_rad) != len(t) or not np.isfinite(t).all() or bool((np.abs(t - 1) < METAL_SPECIMENS).any()):
         return np.zeros((3 * len(t), 2))
     eps = apparent_permittivity(t, angles_rad)
     here_h, here_t = features(eps, angles_rad)

@@ -22,9 +22,9 @@ from polysight.imaging import Image, Images, SubBand
 from polysight.materials.analyse import Optics, level, reference_spread, smooth_inside, to_metal
 from polysight.materials.inversion import ratio_slopes
 from polysight.materials.layers import METAL, THICKNESS_RANGE_M, Bands, Layer, LayerFit, Spectrum, fit_layer
-from polysight.materials.measure import NOT_PASSIVE, inverse_spread, measure_patch, median_ratio
+from polysight.materials.measure import NOT_PASSIVE, measure_patch, median_ratio
 from polysight.materials.result import MaterialsResult
-from polysight.polarimetry import PlaneReference, remove_leakage
+from polysight.polarimetry import PlaneReference, inverse_spread, remove_leakage
 from polysight_shared.config import Chirp
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError

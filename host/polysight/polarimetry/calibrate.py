@@ -55,6 +55,16 @@ def ratio(h: Image, v: Image) -> Image:
     return out
 
 
+def inverse_spread(h: Image, v: Image) -> float:
+    """Return the standard deviation of V / H over pixels, of the real part and of the imaginary part (1.48 MAD)."""
+    good = np.isfinite(h) & np.isfinite(v) & (h != 0)
+    if not good.any():
+        return float("nan")
+    inverse = v[good].astype(np.complex128) / h[good]
+    parts = np.concatenate([inverse.real - np.median(inverse.real), inverse.imag - np.median(inverse.imag)])
+    return float(1.4826 * np.median(np.abs(parts)))
+
+
 def with_ratio(images: Images) -> Images:
     """Return the images with p = h / v."""
     return replace(images, p=ratio(images.h, images.v))
@@ -323,18 +333,10 @@ def plane_reference(
     cross = smooth(cut_h * np.conj(cut_v), smooth_px)
     metal_h = np.where(inside, level_h * np.exp(1j * np.angle(cross)), np.nan).astype(np.result_type(h, np.complex64))
     metal_v = np.where(inside, level_v, np.nan).astype(metal_h.dtype)
-    spread = _spread(h[inside] / metal_h[inside], v[inside] / metal_v[inside])
+    spread = inverse_spread(h[inside] / metal_h[inside], v[inside] / metal_v[inside])
     share = 100 * float(inside.mean())
     how = f"a metal plate scanned on its own{f' ({name})' if name else ''}, by position on {share:.0f} % of the image"
     return PlaneReference(metal_h, metal_v, inside, images.x_m, images.y_m, spread, how)
-
-
-def _spread(h: Image, v: Image) -> float:
-    """Return the standard deviation of the real and the imaginary part of V / H (median absolute deviation)."""
-    q = ratio(v, h)
-    q = q[np.isfinite(q)]
-    parts = np.concatenate([q.real - np.median(q.real), q.imag - np.median(q.imag)])
-    return 1.4826 * float(np.median(np.abs(parts - np.median(parts))))
 
 
 def _disk(radius: int) -> npt.NDArray[np.bool_]:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.store.facts import typed
 
 from polysight.page.watch import EventTail, ManifestTail
-from polysight.store import ScanEnded, manifest
+from polysight.store import manifest
 from polysight.store.events import read_events
 from polysight.store.scan_folder import EVENTS, MANIFEST
 
@@ -67,17 +65,3 @@ def test_another_and_longer_file_is_found_after_a_single_look(finished, tmp_path
     (tmp_path / "new").rename(path)
     assert tail.look() == [typed(fact) for fact in others]
     assert tail.file.replaced
-
-
-def test_a_line_that_is_torn_waits_for_its_rest(tmp_path):
-    path = tmp_path / MANIFEST
-    line = manifest.encode_line({"fact": "scan_ended", "reason": "x" * 50})
-    path.write_bytes(line[:20])
-    tail = ManifestTail(path)
-    assert tail.look() == []
-    path.write_bytes(line)
-    assert tail.look() == [ScanEnded(reason="x" * 50)]
-
-
-def test_nothing_there_is_nothing_new(tmp_path):
-    assert ManifestTail(Path(tmp_path / "no" / MANIFEST)).look() == []

@@ -99,12 +99,6 @@ def test_pages_of_a_scan_without_a_name_lead_to_the_list(view, page):
     assert (status, headers["location"]) == (307, "/")
 
 
-def test_the_icon_is_found_where_browsers_look(view):
-    status, body, headers = ask(view, "/favicon.ico")
-    assert (status, headers["content-type"]) == (200, "image/svg+xml")
-    assert body.startswith(b"<svg")
-
-
 def test_a_pair_is_compared_once_for_all_its_maps(view, scans, monkeypatch):
     done: list[tuple[Path, Path]] = []
     real = site.compare
@@ -198,11 +192,6 @@ def test_a_client_that_hangs_up_is_no_fault_of_the_server(view, capfd):
     assert get(view, "/api/scans")
     time.sleep(0.2)
     assert "Traceback" not in capfd.readouterr().err
-
-
-@pytest.mark.parametrize("line", ["/api/scan?scan=" + "a" * 20_000, "/" + "b" * 20_000])
-def test_a_long_request_line_is_refused(view, line):
-    assert ask(view, line)[0] in (400, 431)
 
 
 def test_the_last_box_can_be_removed(view):

@@ -61,6 +61,12 @@ def test_other_sites_may_not_ask(scans):
         for where in ("cross-site", "same-site"):  # same-site: another port of this machine
             assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Sec_Fetch_Site=where)[0] == 403
             assert ask(view, "/api/scans", Sec_Fetch_Site=where)[0] == 403
+        for path, expected in (("/", 200), ("/api/scans", 403), ("/api/bar/phase", 403)):
+            status, _, headers = ask(view, path, Origin="https://evil.example")
+            assert status == expected
+            assert not [name for name in headers if name.startswith("access-control")]
+            assert "default-src 'self'" in headers["content-security-policy"]
+            assert "unsafe" not in headers["content-security-policy"]
         assert digest_of(scans) == before
         assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=f"{own}:{view.port}")[0] == 200
 

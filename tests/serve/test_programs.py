@@ -38,7 +38,6 @@ def ended(folder: Path, kind: str) -> None:
 
 def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
     programs.start(tmp_path, "export", ["--version"])
-    ended(tmp_path, "export")
     wait_for(lambda: program_of(tmp_path, "export").status is not None, "its status")
     found = program_of(tmp_path, "export")
     assert (found.status, found.words, found.log.split()[0]) == (0, ("polysight", "--version"), "polysight")

@@ -19,6 +19,7 @@ from polysight.cli.main import build_parser
 from polysight.serve.control import Format
 from polysight.serve.guard import TOKEN_HEADER
 from polysight.serve.server import STATIC, Place
+from polysight_shared.error_codes import ErrorCode
 
 
 class Page:
@@ -52,35 +53,20 @@ def desk(growing):
         yield growing.path, stop
 
 
-@pytest.mark.parametrize("given", [{}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN + "s"}, {TOKEN_HEADER: TOKEN[:-1]}])
-def test_without_the_token_nothing_is_asked(desk, watching, given):
+def test_only_a_post_with_the_token_asks(desk, watching):
     folder, stop = desk
     with served(watching(folder, control=True), TOKEN) as view:
-        for command in ScanCommand:
-            status, body, _ = ask(view, f"/api/control/{command}?token={TOKEN}", "POST", **given)
-            assert status == 403
-            assert "token" in json.loads(body)["what"]
-    assert not stop.after_row
-    assert not stop.paused
-
-
-def test_with_the_token_the_scan_hears(desk, watching):
-    folder, stop = desk
-    with served(watching(folder, control=True), TOKEN) as view:
+        for given in ({}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN + "s"}, {TOKEN_HEADER: TOKEN[:-1]}):
+            for command in ScanCommand:
+                status, body, _ = ask(view, f"/api/control/{command}?token={TOKEN}", "POST", **given)
+                assert (status, "token" in json.loads(body)["what"]) == (403, True)
+        for method in ("GET", "HEAD", "PUT", "DELETE", "OPTIONS", "TRACE", "PATCH"):
+            assert ask(view, "/api/control/abort", method, **{TOKEN_HEADER: TOKEN})[0] == 405
+        assert (stop.after_row, stop.paused) == (False, False)
         for command, holds in ((ScanCommand.PAUSE, True), (ScanCommand.CONTINUE, False)):
             assert ask(view, f"/api/control/{command}", "POST", **{TOKEN_HEADER: TOKEN})[0] == 200
             assert stop.paused is holds
-        assert ask(view, "/api/control/abort", "POST", **{TOKEN_HEADER: TOKEN})[0] == 200
-        assert stop.now
         assert ask(view, "/api/control/destroy", "POST", **{TOKEN_HEADER: TOKEN})[0] == 400
-
-
-def test_only_post_asks(desk, watching):
-    folder, stop = desk
-    with served(watching(folder, control=True), TOKEN) as view:
-        for method in ("GET", "HEAD", "PUT", "DELETE", "OPTIONS", "TRACE", "PATCH"):
-            assert ask(view, "/api/control/abort", method, **{TOKEN_HEADER: TOKEN})[0] == 405
-    assert not stop.after_row
 
 
 def test_a_view_is_read_only_unless_told_otherwise(desk, watching):
@@ -89,8 +75,7 @@ def test_a_view_is_read_only_unless_told_otherwise(desk, watching):
     with served(watch) as view:
         for given in ({}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN}):
             status, body, _ = ask(view, "/api/control/abort", "POST", **given)
-            assert status == 403
-            assert "read-only" in json.loads(body)["what"]
+            assert (status, json.loads(body)["code"]) == (403, ErrorCode.READ_ONLY)
     assert json.loads(watch.state.data)["control"] is False
     assert not stop.after_row
 
@@ -115,17 +100,6 @@ def test_loopback_is_the_default():
     assert (args.host, args.port, args.control) == ("127.0.0.1", 8080, False)
     assert all(Place(host).loopback for host in (args.host, "localhost", "::1", "127.3.2.1"))
     assert not any(Place(host).loopback for host in ("0.0.0.0", "::", "192.168.33.30", "pi.lab"))
-
-
-def test_other_sites_get_no_permission(finished, watching):
-    with served(watching(finished)) as view:
-        for path, expected in (("/", 307), ("/watch", 200), ("/api/state", 403), ("/api/bar/phase", 403)):
-            status, _, headers = ask(view, path, Origin="https://evil.example")
-            assert status == expected
-            assert not [h for h in headers if h.lower().startswith("access-control")]
-            policy = headers["content-security-policy"]
-            assert "default-src 'self'" in policy
-            assert "unsafe" not in policy
 
 
 def test_the_page_needs_nothing_from_elsewhere():

@@ -88,8 +88,12 @@ def test_notes_and_names_of_a_dead_folder_hold_nobody_up(dead, view):
     assert get(view, "/api/scan?scan=alive")["processed"]
 
 
-def test_a_list_shows_a_folder_that_does_not_answer(dead, root):
+def test_a_list_shows_a_folder_that_does_not_answer_and_what_it_knew_of_it(dead, root):
+    known = Scans(root)
+    before = known.list()
     dead.stop(scans, "is_scan")
+    assert [s.name for s in known.list()] == [s.name for s in before]
+    assert {s.name: s.state for s in known.list()}["dead"] == "silent"
     listed, threads = Scans(root), threading.active_count()
     for _ in range(3):
         found = {s.name: s.state for s in listed.list()}
@@ -97,14 +101,6 @@ def test_a_list_shows_a_folder_that_does_not_answer(dead, root):
     assert threading.active_count() - threads <= 1  # of the folder that hangs, however often it is listed
     dead.back.set()
     wait_for(lambda: {s.state for s in listed.list()} == {"products"}, "that the folder is listed again")
-
-
-def test_a_list_keeps_what_it_knew_of_a_folder_that_does_not_answer(dead, root):
-    listed = Scans(root)
-    before = listed.list()
-    dead.stop(scans, "is_scan")
-    assert [s.name for s in listed.list()] == [s.name for s in before]
-    assert {s.name: s.state for s in listed.list()}["dead"] == "silent"
 
 
 def test_a_dead_folder_stops_no_other_live_view(dead, view):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
+import zmq.utils.z85
 from zmq.auth import create_certificates, load_certificate
 
 from polysight_shared.error_codes import ErrorCode
@@ -31,18 +32,14 @@ class AllowedKeys:
         with suppress(OSError, ValueError):
             self._names = read_allowed(folder)
 
-    def callback(self, domain: str, key: bytes) -> bool:  # noqa: ARG002 - the interface of zmq.auth
-        """Return True if the client with this public key (Z85) may connect. In the thread of zmq.auth."""
-        return bool(self.name_of(key.decode("ascii")))
-
-    def name_of(self, key: str) -> str:
-        """Return the name of the client with this public key (Z85), or "" if it is not allowed."""
+    def name_of(self, key: bytes) -> str:
+        """Return the name of the client with this public key (32 bytes), or "" if it is not allowed."""
         with suppress(OSError, ValueError):  # missing or unreadable: keep the last list
             stat = (self._folder / ALLOWED).stat()
             if self._seen != (stat.st_mtime_ns, stat.st_size):
                 self._names = read_allowed(self._folder)
                 self._seen = (stat.st_mtime_ns, stat.st_size)
-        return self._names.get(key, "")
+        return self._names.get(zmq.utils.z85.encode(key).decode("ascii"), "") if len(key) == 32 else ""
 
 
 def read_allowed(folder: Path) -> dict[str, str]:

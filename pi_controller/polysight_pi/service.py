@@ -34,7 +34,7 @@ from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError, PolysightError, ProtocolError, VersionError
 from polysight_shared.faults import PiFault
-from polysight_shared.sockets import EVENT_TOPIC, is_loopback, publisher, replier
+from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, publisher, replier
 
 LINGER_MS = 200
 END_TIMEOUT_S = 0.8
@@ -50,14 +50,12 @@ class Server:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._allowed = AllowedKeys(key_dir)
         self._secret = not is_loopback(command_address)
-        self._authenticator: Any = None
         try:
-            if self._secret or not is_loopback(event_address):
-                self._authenticate_clients()  # before the others are bound: it authenticates their connections
+            self._zap = authenticator(self._context)  # before the others are bound: it authenticates their connections
             self._commands = replier(self._context, command_address, key_dir)
             self._events = publisher(self._context, event_address, key_dir)
         except PolysightError:
-            self._close_sockets(linger_ms=0)
+            self._context.destroy(linger=0)
             raise
         self.command_address = self._commands.getsockopt_string(zmq.LAST_ENDPOINT)
         self.event_address = self._events.getsockopt_string(zmq.LAST_ENDPOINT)
@@ -65,13 +63,6 @@ class Server:
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._out: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
         self._stop = False
-
-    def _authenticate_clients(self) -> None:
-        from zmq.auth.thread import ThreadAuthenticator  # loads asyncio, which a service on loopback does not need
-
-        self._authenticator = ThreadAuthenticator(self._context)
-        self._authenticator.start()
-        self._authenticator.configure_curve_callback(credentials_provider=self._allowed)
 
     def publish(self, events: list[bytes]) -> None:
         """Queue packed events, in order. From any thread; returns at once."""
@@ -92,6 +83,7 @@ class Server:
         poller = zmq.Poller()
         poller.register(self._wake, zmq.POLLIN)
         poller.register(self._commands, zmq.POLLIN)
+        poller.register(self._zap, zmq.POLLIN)
         next_beat = time.monotonic()
         while not self._stop and executor.crash is None:
             now = time.monotonic()
@@ -102,6 +94,8 @@ class Server:
             if self._wake in ready:
                 os.eventfd_read(self._wake)
                 self.drain()
+            if self._zap in ready:
+                self._authenticate()
             if self._commands in ready:
                 self._receive(executor)
 
@@ -117,6 +111,23 @@ class Server:
             else:
                 self._events.send_multipart([EVENT_TOPIC, raw])
 
+    def _authenticate(self) -> None:
+        """Answer an authentication request of ZeroMQ (ZAP, RFC 27): a client with an allowed public key may connect.
+
+        In this thread: pyzmq's own authenticator is a second one with asyncio, whose death nobody notices, and which
+        waits for ever when it is closed then.
+        """
+        version, number, _, _, _, mechanism, *credentials = self._zap.recv_multipart()
+        key = b""
+        if mechanism == b"CURVE" and credentials:
+            key = bytes(credentials[0])
+        code = b"400"
+        text = b"this key is not allowed"
+        if self._allowed.name_of(key):
+            code = b"200"
+            text = b"OK"
+        self._zap.send_multipart([version, number, code, text, key.hex().encode(), b""])
+
     def _receive(self, executor: Executor) -> None:
         """Answer one command: its envelope (routing frames up to the empty one) and one frame of content."""
         frames = self._commands.recv_multipart(copy=False)
@@ -125,7 +136,7 @@ class Server:
             return  # no REQ framing: no client waits for a reply
         end = parts.index(b"", 1) + 1
         envelope = tuple(parts[:end])
-        if self._secret and not self._allowed.name_of(str(frames[-1].get("User-Id"))):
+        if self._secret and not self._allowed.name_of(bytes.fromhex(str(frames[-1].get("User-Id")))):
             reply = refused(PiFault.NOT_OWNER, "this client's key was revoked", "see `polysight-pi keys --list`")
         else:
             reply = self._answer(b"".join(parts[end:]), envelope, executor)
@@ -140,13 +151,8 @@ class Server:
 
     def close(self) -> None:
         """Close the sockets after a moment for messages already sent."""
-        self._close_sockets(LINGER_MS)
+        self._context.destroy(linger=LINGER_MS)
         os.close(self._wake)
-
-    def _close_sockets(self, linger_ms: int) -> None:
-        if self._authenticator is not None:
-            self._authenticator.stop()
-        self._context.destroy(linger=linger_ms)
 
     def _answer(self, raw: bytes, envelope: Envelope, executor: Executor) -> m.AnyReply | None:
         """Return the reply to a command, or None if the executor replies later. No message can end the program."""

@@ -51,8 +51,8 @@ def is_loopback(address: str) -> bool:
 def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
     """Enable CURVE on a socket whose address is not loopback. Raises ConfigError without usable keys.
 
-    `key_dir` has PI_KEYS or HOST_KEYS in the format of zmq.auth, whose authenticator decides which clients the server
-    accepts.
+    `key_dir` has PI_KEYS or HOST_KEYS in the format of zmq.auth. The server's `authenticator` decides which clients
+    are accepted.
     """
     if is_loopback(address):
         return
@@ -125,6 +125,13 @@ def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     options: dict[int, int | bytes] = {zmq.MAXMSGSIZE: MAX_COMMAND_BYTES, zmq.ROUTER_MANDATORY: 1}
     options[zmq.HANDSHAKE_IVL] = HANDSHAKE_TIMEOUT_MS
     return _make(context, zmq.ROUTER, address, key_dir, bind=True, options=options)
+
+
+def authenticator(context: zmq.Context[Any]) -> Socket:
+    """Create the REP socket to which ZeroMQ sends each CURVE client of this context for approval (ZAP, RFC 27)."""
+    socket: Socket = context.socket(zmq.REP)
+    socket.bind("inproc://zeromq.zap.01")
+    return socket
 
 
 def subscriber(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:

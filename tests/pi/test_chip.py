@@ -278,20 +278,24 @@ def test_a_killed_program_leaves_the_line_low(spi_rig, homed, hub, wires, stage)
 
 
 @pytest.mark.slow
-def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_rig, write_config):
+def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_rig, write_config, hub, wires):
     """With the line low all the time; a busy computer may need several attempts."""
 
-    def findings(spi_rig, **settings):
-        environment = gpio.environment(spi_rig.pi.gpio_chip, spi=spi_rig.pi.spi_device, **settings)
-        found = run("check", "--json", "--config", write_config(spi_rig), **environment).stdout
-        return {f["name"]: f for f in json.loads(found)}
+    def findings(rig, **settings):
+        environment = gpio.environment(rig.pi.gpio_chip, hub, spi=rig.pi.spi_device, **settings)
+        printed = run("check", "--json", "--config", write_config(rig), **environment).stdout
+        return {f["name"]: f for f in json.loads(printed)}
 
-    found = next(f for _ in range(20) if (f := findings(spi_rig))["pulse width"]["verdict"] == "ok")
-    assert found["SYNC_IN line 10"]["verdict"] == "ok"
-    longer = msgspec.structs.replace(spi_rig, burst=msgspec.structs.replace(spi_rig.burst, pulses=16))
-    found = findings(longer, bufsiz="512")
-    assert "512 bytes" in found["SYNC_IN line 10"]["found"]
-    assert "options spidev bufsiz=4096" in found["pulse width"]["remedy"]
+    whole = next(f for _ in range(20) if (f := findings(spi_rig))["pulse width"]["verdict"] == "ok")
+    assert whole["SYNC_IN line 10"]["verdict"] == "ok"
+    for actual in ("400e6", "150e6"):
+        wrong = findings(spi_rig, core_hz=f"250e6,{actual}")["pulse width"]
+        assert (wrong["verdict"], "core_freq" in wrong["remedy"]) == ("fail", True)
+    longer = replace(spi_rig, burst=replace(spi_rig.burst, pulses=16))
+    small = findings(longer, bufsiz="512")
+    assert "512 bytes" in small["SYNC_IN line 10"]["found"]
+    assert "options spidev bufsiz=4096" in small["pulse width"]["remedy"]
+    assert not wires.rises(MOSI)
 
 
 @pytest.mark.slow

@@ -117,12 +117,3 @@ def test_pulse_reports_faults(command, config, monkeypatch):
     monkeypatch.setattr("polysight_pi.system.prepare_thread", list)
     status, _, err = command("pulse", "--config", config, "--count", 3)
     assert (status, "fault 106 in 2 of 3 bursts" in err, "do:" in err) == (1, True, True)
-
-
-def test_an_error_of_the_system_is_a_message(command, config, monkeypatch):
-    def refuse(_):
-        raise PermissionError(13, "Permission denied", "/dev/gpiochip0")
-
-    monkeypatch.setattr("polysight_pi.client.refuse_beside_service", refuse)
-    status, _, err = command("jog", "--config", config)
-    assert (status, "/dev/gpiochip0: Permission denied" in err, "do: " in err) == (5, True, True)

@@ -108,33 +108,6 @@ class Bench:
         return [e for e in self.journal.events if isinstance(e, kind)]
 
 
-def test_a_row_passes_every_state(monkeypatch):
-    bench = Bench()
-    machine, seen = bench.machine, []
-    enter = machine._enter
-    monkeypatch.setattr(machine, "_enter", lambda state: (seen.append(state), enter(state)))
-    machine.command("Home")
-    bench.run_posted()
-    bench.stage_says(Reply("ok", bench.stage.number))
-    bench.stage_says(Reply("done", bench.stage.number))
-    assert machine.state == "homed", "no run is begun"
-    machine.command("BeginRun", 0)
-    bench.start()
-    machine.command("Hold")
-    machine.command("Resume")
-    bench.edge()
-    bench.edge()
-    bench.stage_says(Reply("done", bench.row_number, fields={"points": "3"}))
-    bench.edge()
-    bench.start()
-    machine.command("Abort", "enough")
-    bench.stage_says(Reply("alarm", number=StageError.STOPPED))
-    machine.command("EndRun")
-    row = ["running", "held", "running", "done", "ending", "ready", "running", "stopping", "ending", "ready"]
-    assert seen == ["homing", "homed", "ready", *row, "homed"]
-    assert [e.status for e in bench.of(m.RowFinished)] == ["done", "aborted"]
-
-
 def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
     bench = Bench().homed()
     bench.start()

@@ -25,20 +25,23 @@ MAX_BYTES = 2 << 30
 def inside(folder: Path, name: str, within: str = "") -> Path:
     """Return the path of a file that a manifest names, relative to the scan folder and inside its folder `within`.
 
+    Only the name is foreign: `folder` is the user's own path, in whatever form.
+
     Raises
     ------
     DataError
         if the path, with links followed, is elsewhere.
     """
-    path, home = folder / name, folder.resolve()
+    path = folder / name
+    home = folder.resolve()
     root = (folder / within).resolve() if within else home
     try:
-        found = path.resolve()
-        there = ".." not in path.parts and found.is_relative_to(home / within)
-        there = there and found != root and root.is_relative_to(home)
+        target = path.resolve()
+        is_inside = ".." not in Path(name).parts and target.is_relative_to(home / within)
+        is_inside = is_inside and target != root and root.is_relative_to(home)
     except (OSError, ValueError):  # a name that no file can have
-        there = False
-    if not there:
+        is_inside = False
+    if not is_inside:
         raise DataError(
             f"{folder}: its manifest names {name!r}, which lies outside {folder / within}",
             "the manifest was made by another program or changed, or a link leads out of the scan",

@@ -1,0 +1,45 @@
+"""The folder that a user names: every form of its path means the same to scan, resume, validate and process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from tests.support.rigs import published_rig
+from tests.support.scenes import COPPER, scene_of
+
+from polysight.acquisition import StopRequest, resume_scan, run_scan
+from polysight.cli.main import main
+from polysight.store import ScanFolder
+from polysight_simulators.scene import decode_scene, simulate
+
+FORMS = ["../out/a scan", "./../out/./a scan", "a scan/../a scan/", "../out/link/a scan", "{tmp}/out/../out/a scan"]
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch) -> Path:
+    """The folder in which commands are run, with a link to it beside `a scan`."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "link").symlink_to(out)
+    monkeypatch.chdir(out)
+    return out
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_scan_is_recorded_resumed_and_validated(rig, home, tmp_path, form):
+    if "/../a scan" in form:
+        (home / "a scan").mkdir()
+    path = Path(form.format(tmp=tmp_path))
+    stop = StopRequest()
+    assert run_scan(rig.instrument, path, stop=stop, on_row=lambda _: stop.request()).exit_status == "abort"
+    assert resume_scan(path).exit_status == "success"
+    assert main(["validate", form.format(tmp=tmp_path)]) == 0
+    assert list(ScanFolder.load(home / "a scan").rows()) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_scan_is_processed(home, tmp_path, form):
+    scene = decode_scene(scene_of(COPPER, columns=4, rows=4), "t")
+    simulate(published_rig(), scene, home / "a scan")
+    assert main(["image", form.format(tmp=tmp_path), "--out", str(tmp_path / "made")]) == 0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import zmq
 
@@ -17,7 +18,6 @@ from polysight.acquisition.pi_client import PiClient
 from polysight.acquisition.progress import OnProgress, OnRow, ScanProgress, ScanResult
 from polysight.acquisition.ready import check_same_stage, describe_pi, stage_differences
 from polysight.acquisition.scan_loop import RunningScan
-from polysight.calibration import copy_into_scan
 from polysight.radar import RadarControl, radar_control
 from polysight.store import (
     ManifestWriter,
@@ -35,6 +35,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError
 from polysight_shared.messages import HelloReply, is_simulated
 from polysight_shared.raster import check_burst_fits, plan_raster
+from polysight_shared.tables import to_builtins
 
 
 def run_scan(
@@ -84,7 +85,7 @@ def run_scan(
             simulated=simulated,
             scan_id=new_scan_id(),
             pi=describe_pi(hello),
-            calibration=copy_into_scan(instrument, folder, simulated),
+            calibration=_copy_calibration(instrument, folder, simulated),
         )
         writer = stack.enter_context(scan.writer())
         radars = stack.enter_context(radars or radar_control(instrument))
@@ -155,6 +156,16 @@ def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProg
         writer.append(RowWithdrawn(row=row, take=rows[row].take, reasons=reasons, withdrawn_utc=utc_now()))
     scan.reload()
     return [f"row {row} is taken again: {'; '.join(reasons)}" for row, reasons in damaged.items()]
+
+
+def _copy_calibration(instrument: Instrument, folder: Path, simulated: bool) -> dict[str, Any]:
+    """Copy the calibration files that the rig file names into the scan; return their entry for the manifest."""
+    if not any(to_builtins(instrument.calibration).values()):
+        return {}
+    # Here, because checking them loads imaging and polarimetry.
+    from polysight.calibration import copy_into_scan
+
+    return copy_into_scan(instrument, folder, simulated)
 
 
 def _connect(

@@ -1,0 +1,49 @@
+"""A scan that is only recorded loads and runs nothing of the processing."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tomli_w
+
+from polysight.store import validate
+from polysight_shared.tables import to_builtins
+
+PROCESSING = (
+    "api calibration catalogue imaging materials page pipeline plan polarimetry process products report results"
+)
+NOT_LOADED = {*PROCESSING.split(), "serve", "sync", "verdict"}
+PROGRAM = """
+import json, sys
+from polysight.cli.main import main
+status = main(sys.argv[2:])
+loaded = [name for name, module in sys.modules.items() if "polysight" in (getattr(module, "__file__", "") or "")]
+open(sys.argv[1], "w").write(json.dumps([status, loaded]))
+"""
+
+
+def modules_after(*words: object, note: Path) -> list[str]:
+    """Run a command of `polysight` in a process of its own; return the modules of ours that it loaded."""
+    command = [sys.executable, "-c", PROGRAM, str(note), *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    status, loaded = json.loads(note.read_text())
+    assert status == 0, done.stderr
+    return loaded
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_recorded_scan_loads_nothing_of_the_processing(rig, tmp_path, resumed):
+    config = tmp_path / "rig.toml"
+    config.write_text(tomli_w.dumps(to_builtins(rig.instrument)))
+    out = tmp_path / "scan"
+    loaded = modules_after("scan", "--config", config, "--out", out, "--no-process", note=tmp_path / "note")
+    if resumed:
+        loaded = modules_after("resume", out, "--no-process", note=tmp_path / "note")
+    rooms = {name.split(".")[1] for name in loaded if name.startswith("polysight.")}
+    assert "acquisition" in rooms
+    assert rooms & NOT_LOADED == set()
+    assert validate(out) == []

@@ -282,8 +282,8 @@ STARTER = """
 import sys
 from pathlib import Path
 from polysight.jobs import batch
-child = "from polysight.jobs import batch_worker as w, batch; import os, sys, time;" \
-    "w.end_with(os.environ[batch.ALIVE]); open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
+child = "from polysight.jobs import batch; import os, sys, time;" \
+    "batch.end_with(os.environ[batch.ALIVE]); open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
 batch.PROGRAM = (sys.executable, "-c", child, sys.argv[2])
 batch.run_scan(batch.make_jobs([(Path(sys.argv[1]), batch.Settings())], Path(sys.argv[1] + "-out"))[0])
 """

@@ -44,8 +44,8 @@ def opened(words, clock, monkeypatch):
         places.append((place, slow))
         return words
 
-    monkeypatch.setattr("polysight.jobs.radar.open_board", open_board)
-    monkeypatch.setattr("polysight.jobs.radar.SystemClock", lambda: clock)
+    monkeypatch.setattr("polysight.jobs.devices.open_board", open_board)
+    monkeypatch.setattr("polysight.jobs.devices.SystemClock", lambda: clock)
     return places
 
 

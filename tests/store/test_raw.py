@@ -19,9 +19,9 @@ from tests.support.store.facts import facts_of
 from tests.support.store.plain_scan import errors
 
 from polysight.cli.main import main
-from polysight.jobs.drop_raw import drop_raw, processed_digests
 from polysight.jobs.live_scan import resume
 from polysight.jobs.process import make_products, process, processed_rows
+from polysight.jobs.scans import drop_raw, processed_digests
 from polysight.products import REPORT, making_products
 from polysight.results import NoResult
 from polysight.settings import DEFAULT

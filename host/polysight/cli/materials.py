@@ -51,7 +51,7 @@ def _concentration(args: argparse.Namespace) -> int:
 
 
 def _classify(args: argparse.Namespace) -> int:
-    from polysight.jobs.classify import classify
+    from polysight.jobs.materials import classify
 
     return classify(args.data, args.library, args.model, args.json)
 
@@ -226,12 +226,6 @@ _FORMATS = {
 
 def _export(args: argparse.Namespace) -> int:
     formats = [name for name in _FORMATS if getattr(args, name)]
-    if args.cphd:
-        from polysight.jobs.phase_history import export_cphd
-
-        export_cphd(args.products, args.out)
-        if not formats:
-            return 0
     from polysight.report import export
 
     return export(args.products, formats, args.out)
@@ -241,18 +235,13 @@ def _add_export(add: Add) -> None:
     sub = add(
         "export",
         _export,
-        "export a processed scan to HDF5, NetCDF, Zarr, MATLAB, CSV or CPHD",
+        "export a processed scan to HDF5, NetCDF, Zarr, MATLAB or CSV",
         "polysight export out/one --hdf5 --csv",
         ("--csv", "--hdf5", "--netcdf"),
     )
     sub.add_argument("products", type=Path, metavar="DIR", help="folder of products, or a scan folder")
     for name, text in _FORMATS.items():
         sub.add_argument(f"--{name}", action="store_true", help=text)
-    sub.add_argument(
-        "--cphd",
-        action="store_true",
-        help="phase-history.cphd: the rows as bistatic phase history, for SAR processors (needs sarkit)",
-    )
     sub.add_argument("--out", type=Path, metavar="DIR", help="folder to write into (default: DIR-export beside it)")
 
 

@@ -138,19 +138,19 @@ def _add_doctor(add: Add) -> None:
 
 def _card(args: argparse.Namespace) -> int:
     """`polysight card` without an action."""
-    from polysight.jobs.cards import show_cards
+    from polysight.jobs.devices import show_cards
 
     return show_cards(args.config, args.listen, args.json)
 
 
 def _card_program(args: argparse.Namespace) -> int:
-    from polysight.jobs.cards import program_card
+    from polysight.jobs.devices import program_card
 
     return program_card(args.config, args.board, args.mac, args.at, args.yes, args.wait)
 
 
 def _card_reset(args: argparse.Namespace) -> int:
-    from polysight.jobs.cards import reset_card
+    from polysight.jobs.devices import reset_card
 
     return reset_card(args.config, args.board, args.radar)
 
@@ -242,25 +242,25 @@ def _add_inspect(add: Add) -> None:
 
 
 def _radar_plan(args: argparse.Namespace) -> int:
-    from polysight.jobs.radar import plan_radars
+    from polysight.jobs.devices import plan_radars
 
     return plan_radars(args.config)
 
 
 def _radar_check(args: argparse.Namespace) -> int:
-    from polysight.jobs.radar import check_radar
+    from polysight.jobs.devices import check_radar
 
     return check_radar(args.config, args.board, args.trace, args.slow, args.json)
 
 
 def _radar_firmware(args: argparse.Namespace) -> int:
-    from polysight.jobs.radar import load_firmware
+    from polysight.jobs.devices import load_firmware
 
     return load_firmware(args.config, args.board, args.image, args.flash, args.trace, args.slow)
 
 
 def _radar_replay(args: argparse.Namespace) -> int:
-    from polysight.jobs.radar import replay_radar
+    from polysight.jobs.devices import replay_radar
 
     return replay_radar(args.config, args.trace, args.json)
 

@@ -30,7 +30,7 @@ def _validate(args: argparse.Namespace) -> int:
 
 
 def _drop_raw(args: argparse.Namespace) -> int:
-    from polysight.jobs.drop_raw import drop_raw
+    from polysight.jobs.scans import drop_raw
 
     return drop_raw(args.folder, args.products, args.yes)
 

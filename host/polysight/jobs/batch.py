@@ -9,8 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import resource
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -23,8 +25,10 @@ from typing import Any, Literal
 import msgspec
 
 from polysight.calibration import calibration_of_scan
+from polysight.jobs.process import process
 from polysight.process import cores
 from polysight.products import FINISHED, SavedProducts, write_json
+from polysight.results import NoResult
 from polysight.settings import Settings
 from polysight.store import (
     COLLECTION,
@@ -44,7 +48,7 @@ from polysight_shared.files import read_json
 SUMMARY = "processed.json"
 Status = Literal["done", "skipped", "failed", "stopped"]
 _PRODUCTS = ("image.npz", "quality.json")
-PROGRAM = (sys.executable, "-m", "polysight.jobs.batch_worker")
+PROGRAM = (sys.executable, "-m", "polysight.jobs.batch")
 """Module that processes the job on its standard input."""
 ALIVE = "POLYSIGHT_PARENT_ALIVE"
 """Environment of the program: number of a pipe that ends with the program that started it."""
@@ -401,3 +405,45 @@ def _results(products: Path) -> tuple[str, str, str]:
     if verdict is None or verdict.level == "good":
         return masked, patches, ""
     return masked, patches, f"{verdict.text}: {verdict.reasons[0].what}" if verdict.reasons else verdict.text
+
+
+# --- the program of one scan: `python -m polysight.jobs.batch` ---
+
+
+def end_with(pipe: str | None) -> None:
+    """Exit when the other end of a pipe closes, so that a killed worker leaves nothing running."""
+    if pipe is None:
+        return
+
+    def wait() -> None:
+        os.read(int(pipe), 1)
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def main() -> int:
+    """Process one job; returns the exit status. Output goes to stdout and stderr."""
+    end_with(os.environ.get(ALIVE))
+    job = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=Job)
+    began = time.monotonic()
+    try:
+        (job.out / FINISHED).unlink(missing_ok=True)
+        status = process(Path(job.data), job.out, job.settings, job.threads)
+    except PolysightError as e:
+        sys.stderr.write(f"{e}\n")
+        return e.exit_status
+    except OSError as e:
+        sys.stderr.write(f"{e.filename or job.out}: {e.strerror or e}\n")
+        return 1
+    if status == NoResult.exit_status:
+        status = 0  # the scan is processed: its products say that nothing can be named
+    if status == 0:
+        used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+        seconds = round(time.monotonic() - began, 1)
+        write_json(job.out / FINISHED, {"made_with": job.made_with, "seconds": seconds, "memory_gb": used / 1e9})
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -73,3 +73,13 @@ def current_step(first: str) -> Iterator[Progress]:
     else:
         say(first)
         yield say
+
+
+def confirm(what: str, word: str, yes: bool) -> str:
+    """Print the planned action and return the typed answer; with `yes` return `word` without asking."""
+    sys.stdout.write(f"{what}\n")
+    if yes:
+        return word
+    sys.stdout.write(f"type {word} to do it: ")
+    sys.stdout.flush()
+    return sys.stdin.readline().strip()

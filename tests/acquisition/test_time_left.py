@@ -5,13 +5,14 @@ from __future__ import annotations
 import statistics
 
 import pytest
-from tests.support.store.facts import facts_of, typed
+from tests.support.page.live_view import add_fact, begin_history
+from tests.support.store.facts import facts_of
 
 from polysight.acquisition import scan_loop as running
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.progress import time_left, typical_row_s
 from polysight.acquisition.scan import run_scan
-from polysight.page.history import ScanHistory, seconds
+from polysight.page.history import seconds
 from polysight.page.status import remaining
 
 ROW_S, PAUSE_S, HOMING_S = 12.0, 7200.0, 240.0
@@ -74,14 +75,12 @@ def test_the_page_has_the_same_time_left(rig, tmp_path):
     """Facts of a scan with changed times: rows a minute apart, a pause of a day before the last."""
     run_scan(rig.instrument, tmp_path / "s")
     utc = "2026-05-{:02d}T02:{:02d}:00.000+00:00"
-    history: ScanHistory | None = None
-    for fact in facts_of(tmp_path / "s"):
-        if history is None:
-            history = ScanHistory(typed(fact | {"started_utc": utc.format(1, 0)}))
-        elif fact["fact"] == "row_committed" and fact["row"] < 3:
-            history.add_fact(typed(fact | {"committed_utc": utc.format(1, fact["row"] + 1)}))
-    assert history is not None
-    history.add_fact(typed({"fact": "scan_paused", "paused_utc": utc.format(1, 3)}))
-    history.add_fact(typed({"fact": "scan_continued", "continued_utc": utc.format(2, 3)}))
+    started, *facts = facts_of(tmp_path / "s")
+    history = begin_history(started | {"started_utc": utc.format(1, 0)})
+    for fact in facts:
+        if fact["fact"] == "row_committed" and fact["row"] < 3:
+            add_fact(history, fact | {"committed_utc": utc.format(1, fact["row"] + 1)})
+    add_fact(history, {"fact": "scan_paused", "paused_utc": utc.format(1, 3)})
+    add_fact(history, {"fact": "scan_continued", "continued_utc": utc.format(2, 3)})
     left, _ = remaining(history, seconds(utc.format(2, 3)) + 20)
     assert left == pytest.approx(time_left(1, 60.0, 20.0))

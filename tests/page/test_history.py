@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from tests.support.store.facts import facts_of, typed
+from tests.support.page.live_view import add_fact, begin_history
+from tests.support.store.facts import facts_of
 
-from polysight.page.history import ScanHistory, seconds
+from polysight.page.history import seconds
 from polysight.page.status import remaining
 from polysight.store.events import read_events
 from polysight.store.scan_folder import EVENTS, ScanFolder
@@ -15,9 +16,9 @@ UTC = "2026-05-01T02:{:02d}:{:02d}.000+00:00"
 
 
 def answer(facts):
-    history = ScanHistory(typed(facts[0]))
+    history = begin_history(facts[0])
     for fact in facts[1:]:
-        history.add_fact(typed(fact))
+        add_fact(history, fact)
     return history
 
 
@@ -26,9 +27,9 @@ def begun(finished):
     """A history whose scan began at 02:00 and has committed rows 0 and 1 at 02:01 and 02:02."""
     facts = facts_of(finished)
     rows = [f for f in facts if f["fact"] == "row_committed"]
-    history = ScanHistory(typed(facts[0] | {"started_utc": UTC.format(0, 0), "simulated": False}))
+    history = begin_history(facts[0] | {"started_utc": UTC.format(0, 0), "simulated": False})
     for minute, row in enumerate(rows[:2], 1):
-        history.add_fact(typed(row | {"committed_utc": UTC.format(minute, 0)}))
+        add_fact(history, row | {"committed_utc": UTC.format(minute, 0)})
     return history, rows[2]
 
 
@@ -65,26 +66,26 @@ def test_time_left_is_what_rows_took(begun):
     history, last = begun
     now = seconds(UTC.format(2, 20))
     assert remaining(history, now) == (40, "measured")
-    history.add_fact(typed(last | {"committed_utc": UTC.format(3, 0)}))
+    add_fact(history, last | {"committed_utc": UTC.format(3, 0)})
     assert remaining(history, seconds(UTC.format(9, 0))) == (0, "measured")
 
 
 def test_a_pause_is_no_time_of_a_row(begun):
     history, last = begun
-    history.add_fact(typed({"fact": "scan_paused", "paused_utc": UTC.format(2, 0)}))
+    add_fact(history, {"fact": "scan_paused", "paused_utc": UTC.format(2, 0)})
     assert history.paused
     assert remaining(history, seconds(UTC.format(30, 0))) == (60, "measured")
-    history.add_fact(typed({"fact": "scan_continued", "continued_utc": UTC.format(40, 0)}))
+    add_fact(history, {"fact": "scan_continued", "continued_utc": UTC.format(40, 0)})
     assert not history.paused
-    history.add_fact(typed(last | {"committed_utc": UTC.format(41, 0)}))
+    add_fact(history, last | {"committed_utc": UTC.format(41, 0)})
     assert history.row_seconds == (60.0, "measured")
 
 
 def test_time_left_before_the_first_row_is_the_plan_s(finished):
     started = facts_of(finished)[0]
     real, simulated = (
-        ScanHistory(typed(started | {"simulated": False})),
-        ScanHistory(typed(started | {"simulated": True})),
+        begin_history(started | {"simulated": False}),
+        begin_history(started | {"simulated": True}),
     )
     row_s = real.row_seconds
     assert row_s is not None
@@ -95,32 +96,32 @@ def test_time_left_before_the_first_row_is_the_plan_s(finished):
 
 def test_rejected_then_committed_leaves_a_warning(begun):
     history, last = begun
-    history.add_fact(typed({"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {},
-         "faults": [{"kind": "no_data", "board": "RV"}], "rejected_utc": UTC.format(2, 30)}))  # fmt: skip
+    add_fact(history, {"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {},
+         "faults": [{"kind": "no_data", "board": "RV"}], "rejected_utc": UTC.format(2, 30)})  # fmt: skip
     assert history.marks[2] == "rejected"
     assert {board.name: board.retaken for board in history.boards} == {"RV": 1, "RH": 0}
     assert "polysight card" in history.notices[-1].do
-    history.add_fact(typed(last))
+    add_fact(history, last)
     assert history.marks[2] == "committed"
     assert len(history.notices) == 1
 
 
 def test_rejections_of_earlier_releases_are_told_without_a_cause(begun):
     history, _ = begun
-    history.add_fact(typed({"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {}}))
+    add_fact(history, {"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {}})
     assert (history.marks[2], history.notices[-1].facts["detail"]) == ("rejected", "RV: no data")
     assert (history.notices[-1].why, [b.retaken for b in history.boards if b.name == "RV"]) == ("", [1])
 
 
 def test_withdrawn_is_missing_until_taken_again(begun):
     history, _ = begun
-    history.add_fact(typed({"fact": "row_withdrawn", "row": 1, "take": 1, "reasons": ["short"]}))
+    add_fact(history, {"fact": "row_withdrawn", "row": 1, "take": 1, "reasons": ["short"]})
     assert (set(history.takes), 1 in history.marks) == ({0}, False)
 
 
 def test_resumed_is_not_ended(finished):
     history = answer(facts_of(finished))
-    history.add_fact(typed({"fact": "scan_resumed", "resumed_utc": UTC.format(5, 0), "rows_missing": 0}))
+    add_fact(history, {"fact": "scan_resumed", "resumed_utc": UTC.format(5, 0), "rows_missing": 0})
     assert history.ended is None
 
 
@@ -128,5 +129,5 @@ def test_facts_of_newer_releases_are_passed_over(begun):
     history, _ = begun
     before = dict(vars(history))
     for name in ("takes", "boards", "rows", "ended", "something_new"):
-        history.add_fact(typed({"fact": name}))
+        add_fact(history, {"fact": name})
     assert vars(history) == before

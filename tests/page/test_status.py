@@ -6,10 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tests.support.store.facts import facts_of, typed
+from tests.support.page.live_view import add_fact, begin_history
+from tests.support.store.facts import facts_of
 
 from polysight.acquisition.control import ScanCommand
-from polysight.page.history import PiState, ScanHistory, notice_of_fault
+from polysight.page.history import PiState, notice_of_fault
 from polysight.page.images import RowSync, Shown
 from polysight.page.status import Inputs, LifeSigns, judge, no_scan
 from polysight_shared.faults import EXPLANATIONS, PiFault
@@ -27,8 +28,8 @@ REJECTED["faults"] = [{"kind": "no_data", "board": "RV"}]
 def history(finished):
     """One of three rows is committed."""
     facts = facts_of(finished)
-    history = ScanHistory(typed(facts[0]))
-    history.add_fact(typed(next(f for f in facts if f["fact"] == "row_committed")))
+    history = begin_history(facts[0])
+    add_fact(history, next(f for f in facts if f["fact"] == "row_committed"))
     return history
 
 
@@ -48,7 +49,7 @@ def test_a_dead_program_outranks_everything_but_the_end(history):
     assert (s.level, s.headline) == ("bad", "The scan program has ended")
     assert f"polysight resume {FOLDER}" in s.do
     assert "1 of 3 rows are safe" in s.detail
-    history.add_fact(typed({"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request"}))
+    add_fact(history, {"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request"})
     assert status(history, gone).headline == "Stopped on request"
 
 
@@ -62,7 +63,7 @@ def test_a_dead_program_outranks_everything_but_the_end(history):
     ],
 )
 def test_trouble_says_why_and_what_to_do(history, signs, heard, word):
-    history.add_fact(typed(ROW | {"row": 0, "committed_utc": "2026-01-01T00:00:00Z"}))
+    add_fact(history, ROW | {"row": 0, "committed_utc": "2026-01-01T00:00:00Z"})
     history._row_seconds = [20.0]
     s = status(history, signs, heard)
     assert word in s.headline
@@ -84,16 +85,16 @@ def test_every_fault_of_the_pi_has_words(history, number):
 
 
 def test_a_row_taken_again_is_a_warning_for_a_while(history):
-    history.add_fact(typed(REJECTED))
+    add_fact(history, REJECTED)
     s = status(history, heard=replace(RUNNING, take=2))
     assert s.level == "warn"
     assert "Row 1 is retaken" in s.headline
     assert "polysight card" in s.do
     row = ROW
     for n in (1, 2):
-        history.add_fact(typed(row | {"row": n}))
+        add_fact(history, row | {"row": n})
         assert status(history).level == "warn"
-    history.add_fact(typed(row | {"row": 0}))
+    add_fact(history, row | {"row": 0})
     assert status(history).level == "good"
 
 
@@ -107,7 +108,7 @@ def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, le
 
 def test_wishes_are_said_until_they_come_to_pass(history):
     assert status(history, asked=ScanCommand.PAUSE).headline == "Pausing after this row"
-    history.add_fact(typed({"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"}))
+    add_fact(history, {"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"})
     assert status(history, asked=ScanCommand.PAUSE).headline == "Paused"
     assert status(history, asked=ScanCommand.STOP).headline == "Stopping after this row"
     assert status(history, asked=ScanCommand.ABORT).headline == "Stopping now"
@@ -115,14 +116,14 @@ def test_wishes_are_said_until_they_come_to_pass(history):
 
 def test_ends_say_how(history):
     ended = {"fact": "scan_ended", "exit_status": "fail", "reason": "the Pi did not answer"}
-    history.add_fact(typed(ended | {"why": "it is off", "remedy": "switch it on"}))
+    add_fact(history, ended | {"why": "it is off", "remedy": "switch it on"})
     s = status(history)
     assert (s.level, s.detail, s.why, s.do) == ("bad", "The Pi did not answer", "It is off", "Switch it on")
-    history.add_fact(typed(ended))
+    add_fact(history, ended)
     assert f"polysight resume {FOLDER}" in status(history).do
     for row in (1, 2):
-        history.add_fact(typed(ROW | {"row": row}))
-    history.add_fact(typed(ended | {"exit_status": "success", "reason": "every row is committed"}))
+        add_fact(history, ROW | {"row": row})
+    add_fact(history, ended | {"exit_status": "success", "reason": "every row is committed"})
     assert (status(history).level, status(history).do) == ("done", "")
 
 

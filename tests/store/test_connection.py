@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 import tomli_w
+from tests.support.page.live_view import add_fact, begin_history
 from tests.support.rigs import rig_table
-from tests.support.store.facts import facts_of, typed
+from tests.support.store.facts import facts_of
 
 from polysight.acquisition.scan import resume_scan
 from polysight.cli.main import main
-from polysight.page.history import ScanHistory
 from polysight.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, with_connection
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError
@@ -101,9 +101,9 @@ def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
     started, (first, second) = facts_of(scan, "scan_started")[0], facts_of(scan, "scan_resumed")
     assert decode(started["instrument"], Instrument, "begun") == begun
     assert (first["rig"], "rig" in second) == (connection_of(now), False)
-    story = ScanHistory(typed(started))
+    story = begin_history(started)
     for fact in (first, second):
-        story.add_fact(typed(fact))
+        add_fact(story, fact)
     assert story.instrument == now
     assert small.rows() == undisturbed.digests
     assert small.image() == undisturbed.final_image

@@ -17,6 +17,7 @@ from polysight.acquisition import FaultKind, typical_row_s
 from polysight.plan import scan_time
 from polysight.store import (
     Fact,
+    Manifest,
     RowCommitted,
     RowFault,
     RowRejected,
@@ -80,7 +81,7 @@ CAUSES: dict[FaultKind, tuple[str, str]] = {
 }
 """Likely cause and remedy by kind of fault. Those of the Pi are in shared/polysight_shared/faults.py."""
 RowMark = Literal["committed", "kept", "rejected"]
-_RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
+RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
 
 
 def sentence(text: str) -> str:
@@ -194,74 +195,111 @@ class ScanHistory:
 
     Attributes
     ----------
+    content
+        The manifest, of which the first fact has been read.
     instrument, plan
-        Of the scan; the manifest's first fact has them.
-    takes
-        Committed rows and the take that counts, in the order they were committed.
-    marks
-        Outcome of each row so far.
-    ended
-        Last fact of a run that ended; None while it goes on, or if it was killed.
-    paused
-        True while the scan is paused on request.
+        Of the scan.
+    notices
+        Faults in the order of the facts and events.
+    run_started_s, last_commit_s
+        Times of the last run and the last row, seconds since 1970; without pauses.
+    rows_since_trouble
+        Rows committed whole since one was rejected or kept with gaps.
+    trigger
+        The worst of all bursts; None before the first.
     """
 
-    def __init__(self, started: ScanStarted) -> None:
-        self.started = started
+    def __init__(self, content: Manifest, started: ScanStarted) -> None:
+        self.content = content
         self.instrument: Instrument = decode_config(started.instrument, Instrument, "the manifest's instrument")
         self.plan: RasterPlan = plan_raster(self.instrument.grid)
         self.scan_id = started.scan_id
         self.simulated = started.simulated
-        self.takes: dict[int, int] = {}
-        self.marks: dict[int, RowMark] = {}
         self.notices: list[Finding] = []
-        self.ended: ScanEnded | None = None
-        self.paused = False
         self.run_started_s = seconds(started.started_utc or "1970-01-01T00:00:00+00:00")
         self.last_commit_s = 0.0
-        self.trigger: TriggerHealth | None = None
-        # Rows committed whole since one was rejected or kept with gaps.
         self.rows_since_trouble = 0
-        self._rows: dict[int, RowCommitted] = {}
-        self._rejected: dict[str, int] = {b.name: 0 for b in self.instrument.recorded}
+        self.trigger: TriggerHealth | None = None
         self._row_seconds: list[float] = []
         self._paused_at = 0.0
         self._fault_seqs: set[int] = set()
 
     # --- the manifest ---
 
+    @property
+    def ended(self) -> ScanEnded | None:
+        """Last fact of a run that ended; None while it goes on, or if it was killed."""
+        return self.content.ended
+
+    @property
+    def paused(self) -> bool:
+        """True while the scan is paused on request."""
+        return self.content.paused
+
+    @property
+    def takes(self) -> dict[int, int]:
+        """Committed rows and the take that counts, in the order they were committed."""
+        return {row: fact.take for row, fact in self.content.rows.items()}
+
+    @property
+    def marks(self) -> dict[int, RowMark]:
+        """Outcome of each row so far."""
+        marks: dict[int, RowMark] = {fact.row: "rejected" for fact in self.content.rejected}
+        for row, fact in self.content.rows.items():
+            marks[row] = "kept" if fact.kept_incomplete else "committed"
+        return marks
+
+    @property
+    def boards(self) -> list[BoardCounts]:
+        """Counts of each board over the committed rows, and of rejected takes."""
+        totals = {board.name: BoardCounts(board.name) for board in self.instrument.recorded}
+        for rejected in self.content.rejected:
+            for name, total in totals.items():
+                if rejected.faults:
+                    total.retaken += any(fault.board == name for fault in rejected.faults)
+                else:
+                    # Older scans.
+                    total.retaken += any(reason.startswith(f"{name}:") for reason in rejected.reasons)
+        for row in self.content.rows.values():
+            for name, part in row.boards.items():
+                total = totals.setdefault(name, BoardCounts(name))
+                total.frames_expected += part.frames_expected
+                total.frames_received += part.frames_received
+                for kind in RECEPTION:
+                    count = getattr(part, kind)
+                    if count is not None:
+                        total.counts[kind] = total.counts.get(kind, 0) + count
+        return list(totals.values())
+
     def add_fact(self, fact: Fact) -> None:
-        """Add the next fact; other kinds are ignored. Raises ValueError for a time of another form."""
+        """Add times and notices of the next fact of `content`. Raises ValueError for a time of another form."""
         if isinstance(fact, RowCommitted):
             self._row_committed(fact)
         elif isinstance(fact, RowRejected):
-            self._row_rejected(fact)
+            self.rows_since_trouble = 0
+            self.notices.append(notice_of_rejection(fact.row, fact.take, fact.reasons, fact.faults, fact.rejected_utc))
         elif isinstance(fact, RowWithdrawn):
-            self._row_withdrawn(fact)
+            what = f"Row {fact.row} on the disk differs from what was committed"
+            why_do = ("The disk is faulty, or the file was changed", "Nothing: the row is retaken")
+            self.notices.append(_row_notice(fact.row, what, why_do, fact.reasons, fact.withdrawn_utc))
         elif isinstance(fact, ScanResumed):
-            self._scan_resumed(fact)
+            self.run_started_s = seconds(fact.resumed_utc)
+            if fact.rig:
+                # The Pi has another address from now on.
+                self.instrument = with_connection(self.instrument, fact.rig)
         elif isinstance(fact, ScanPaused):
-            self.paused = True
             self._paused_at = seconds(fact.paused_utc)
-        elif isinstance(fact, ScanContinued):
-            self.paused = False
-            if self.last_commit_s:
-                # A pause does not count.
-                self.last_commit_s += seconds(fact.continued_utc) - self._paused_at
-        elif isinstance(fact, ScanEnded):
-            self.ended = fact
-            self.paused = False
+        elif isinstance(fact, ScanContinued) and self.last_commit_s:
+            # A pause does not count.
+            self.last_commit_s += seconds(fact.continued_utc) - self._paused_at
 
     def _row_committed(self, fact: RowCommitted) -> None:
-        kept = fact.kept_incomplete
-        self.takes.pop(fact.row, None)
-        self.takes[fact.row] = fact.take
-        self.marks[fact.row] = "kept" if kept else "committed"
-        self._rows[fact.row] = fact
-        self.rows_since_trouble = 0 if kept else self.rows_since_trouble + 1
-        if kept:
+        self.rows_since_trouble += 1
+        if fact.kept_incomplete:
+            self.rows_since_trouble = 0
             what = f"Row {fact.row} is kept with gaps, which are masked"
-            self.notices.append(_row_notice(fact.row, what, _cause(fact.faults), kept, fact.committed_utc))
+            notice = _row_notice(fact.row, what, _cause(fact.faults), fact.kept_incomplete, fact.committed_utc)
+            self.notices.append(notice)
         if not fact.committed_utc:
             # Made in one step, by `polysight simulate`.
             return
@@ -269,34 +307,6 @@ class ScanHistory:
         if self.last_commit_s > self.run_started_s:
             self._row_seconds.append(at - self.last_commit_s)
         self.last_commit_s = at
-
-    def _row_rejected(self, fact: RowRejected) -> None:
-        self.marks[fact.row] = "rejected"
-        self.rows_since_trouble = 0
-        for name in self._rejected:
-            if fact.faults:
-                blamed = any(fault.board == name for fault in fact.faults)
-            else:
-                # Older scans.
-                blamed = any(reason.startswith(f"{name}:") for reason in fact.reasons)
-            self._rejected[name] += blamed
-        self.notices.append(notice_of_rejection(fact.row, fact.take, fact.reasons, fact.faults, fact.rejected_utc))
-
-    def _row_withdrawn(self, fact: RowWithdrawn) -> None:
-        self.takes.pop(fact.row, None)
-        self._rows.pop(fact.row, None)
-        self.marks.pop(fact.row, None)
-        what = f"Row {fact.row} on the disk differs from what was committed"
-        why_do = ("The disk is faulty, or the file was changed", "Nothing: the row is retaken")
-        self.notices.append(_row_notice(fact.row, what, why_do, fact.reasons, fact.withdrawn_utc))
-
-    def _scan_resumed(self, fact: ScanResumed) -> None:
-        self.ended = None
-        self.paused = False
-        self.run_started_s = seconds(fact.resumed_utc)
-        if fact.rig:
-            # The Pi has another address from now on.
-            self.instrument = with_connection(self.instrument, fact.rig)
 
     # --- the Pi's events ---
 
@@ -310,23 +320,6 @@ class ScanHistory:
             elif isinstance(event, Fault) and event.seq not in self._fault_seqs:
                 self._fault_seqs.add(event.seq)
                 self.notices.append(notice_of_fault(event))
-
-    # --- derived ---
-
-    @property
-    def boards(self) -> list[BoardCounts]:
-        """Counts over the committed rows of each board."""
-        totals = {name: BoardCounts(name, retaken=rejected) for name, rejected in self._rejected.items()}
-        for row in self._rows.values():
-            for name, part in row.boards.items():
-                total = totals.setdefault(name, BoardCounts(name))
-                total.frames_expected += part.frames_expected
-                total.frames_received += part.frames_received
-                for kind in _RECEPTION:
-                    count = getattr(part, kind)
-                    if count is not None:
-                        total.counts[kind] = total.counts.get(kind, 0) + count
-        return list(totals.values())
 
     @property
     def row_seconds(self) -> tuple[float, str] | None:

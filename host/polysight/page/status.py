@@ -159,6 +159,7 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
         status = _unreadable(inputs) if inputs.problem else no_scan(inputs.folder)
         return Snapshot(status=status, notices=_notices(inputs), control=inputs.control)
     plan = history.plan
+    marks = history.marks
     boards = history.boards
     for board in boards:
         board.masked = sum(sync.masked for sync in shown.sync.get(board.name, {}).values())
@@ -183,7 +184,7 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
             step_y_mm=plan.step_y_mm,
             receivers=[board.name for board in history.instrument.receivers],
             committed=len(history.takes),
-            marks="".join(MARKS.get(history.marks.get(row, ""), ".") for row in range(plan.rows)),
+            marks="".join(MARKS.get(marks.get(row, ""), ".") for row in range(plan.rows)),
             pulses=len(history.takes) * plan.columns * history.instrument.burst.pulses,
             pulse_limit_us=WIDTH_US[1],
         ),

@@ -337,7 +337,7 @@ class Watch:
         for fact in facts:
             try:
                 if self._history is None and isinstance(fact, ScanStarted):
-                    self._history = ScanHistory(fact)
+                    self._history = ScanHistory(self._manifest.content, fact)
                 elif isinstance(fact, OtherFact) and fact.problem:
                     self._problem = f"{self.folder / MANIFEST}: unreadable {fact.kind}: {fact.problem}"
                 elif self._history is not None:

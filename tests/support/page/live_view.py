@@ -11,6 +11,7 @@ from typing import Any
 
 from polysight.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
 from polysight.catalogue import Scans
+from polysight.page.history import ScanHistory
 from polysight.page.watch import Watch
 from polysight.serve.guard import Access
 from polysight.serve.programs import Programs
@@ -19,6 +20,19 @@ from polysight.serve.site import Site, Watches
 from polysight.store import EVENTS, MANIFEST, manifest, utc_now
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.store.facts import facts_of
+
+
+def begin_history(started: dict[str, Any]) -> ScanHistory:
+    """A history of which only the first fact is there."""
+    content = manifest.parse(manifest.encode_line(started))
+    assert content.started is not None
+    return ScanHistory(content, content.started)
+
+
+def add_fact(history: ScanHistory, fact: dict[str, Any]) -> None:
+    """Write a further fact, as the history reads it."""
+    for new in history.content.feed(manifest.encode_line(fact)):
+        history.add_fact(new)
 
 
 class GrowingScan:

@@ -268,7 +268,9 @@ class BringUp:
             ("main", "main_firmware", c.GET_MAIN_VERSION),
         ):
             v = self._board.ask(question, 16)
-            hardware, release, patch = v[:3], v[3:7], (*v[10:12], v[15] >> 4, v[15] & 15)
+            hardware = v[:3]
+            release = v[3:7]
+            patch = (*v[10:12], v[15] >> 4, v[15] & 15)
             self._board.facts[key] = ".".join(map(str, release)) + " patch " + ".".join(map(str, patch))
             self._board.facts["hardware"] = ".".join(map(str, hardware))
             require_family(self._board.name, core, v)

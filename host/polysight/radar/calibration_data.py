@@ -21,7 +21,9 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.files import read_bounded
 
-PARTS, PART_BYTES = 3, 224  # ICD 70
+# ICD 70
+PARTS = 3
+PART_BYTES = 224
 RESTORED = 0x14E0  # ADC offset, both filters, RX gain, I/Q: recommended by TI (ICD 72)
 ALL = 0x1FF0  # calibrations of the RF init (ICD 63)
 NO_DIE = "-".join(["00000000"] * 4)  # a die id that does not identify a board
@@ -73,7 +75,8 @@ class CalibrationFiles:
     """A folder with one file for each die and each set of rig settings (a digest in the file's name)."""
 
     def __init__(self, folder: Path, settings: bytes) -> None:
-        self._folder, self._digest = folder, f"{zlib.crc32(settings):08x}"
+        self._folder = folder
+        self._digest = f"{zlib.crc32(settings):08x}"
 
     def path(self, die_id: str) -> Path:
         """Return the file of a die."""
@@ -90,7 +93,8 @@ class CalibrationFiles:
             sound = content["die_id"] == die_id and len(data) == PARTS * PART_BYTES
             sound = sound and zlib.crc32(data) == content["crc32"]
         except (ValueError, KeyError, TypeError, RecursionError):
-            sound, data = False, b""
+            sound = False
+            data = b""
         if not sound:
             raise ConfigError(
                 f"{path}: is not the calibration data of {die_id}",

@@ -24,9 +24,15 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 START_HZ_PER_CODE = 3.6e9 / 2**26  # ICD 81
 SLOPE_HZ_PER_S_PER_CODE = 3.6e9 * 900 / 2**26 * 1e6  # ICD 83: 48.279 kHz/us
-CHIRP_TICK_US, FRAME_TICK_US = 0.01, 0.005
-STOP_AT_FRAME_END, START, STOP_WHILE_WAITING = 0, 1, 4  # ICD 178
-SOFTWARE_TRIGGER, HARDWARE_TRIGGER = 1, 2  # ICD 92
+CHIRP_TICK_US = 0.01
+FRAME_TICK_US = 0.005
+# ICD 178
+STOP_AT_FRAME_END = 0
+START = 1
+STOP_WHILE_WAITING = 4
+# ICD 92
+SOFTWARE_TRIGGER = 1
+HARDWARE_TRIGGER = 2
 IfMode = Literal["complex1x", "complex2x"]
 
 
@@ -336,7 +342,8 @@ def tx_mask(rig: Instrument, board: Board) -> int:
 
 def program(rig: Instrument, board: Board) -> Program:
     """Return the commands for a board. Raises ValueError if a value exceeds its field."""
-    chirp, tx = rig.chirp, tx_mask(rig, board)
+    chirp = rig.chirp
+    tx = tx_mask(rig, board)
     native = rig.radar.native[board.name]
     rx = (1 << len(rig.antennas.rx_mm)) - 1
     commands = Program(
@@ -399,10 +406,10 @@ class Constraint(NamedTuple):
     name: str
     formula: str
     value: float
-    low: float | None
-    high: float | None
     unit: str
     remedy: str
+    low: float | None = None
+    high: float | None = None
 
     @property
     def holds(self) -> bool:
@@ -458,106 +465,110 @@ def _finite(rig: Instrument) -> Iterator[Constraint]:
         for key in part.__struct_fields__:
             value = getattr(part, key)
             if isinstance(value, int | float) and not -_LARGEST <= value <= _LARGEST:
-                name, shown = f"{table}.{key}", value if isinstance(value, float) else inf
-                yield Constraint(name, "a number", shown, -_LARGEST, _LARGEST, "", f"give a number in {name}")
+                name = f"{table}.{key}"
+                shown = value if isinstance(value, float) else inf
+                yield Constraint(name, "a number", shown, "", f"give a number in {name}", low=-_LARGEST, high=_LARGEST)
 
 
 def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
-    period, chirps = frame_period_us(rig), chirp_us(rig)
-    longer_period = "raise burst.period_us"
-    yield Constraint("frames", "frames of a row", frames, 1, 65535, "", "reduce the points or pulses of a row")
-    yield Constraint("frame period", "frame period", period, *FRAME_PERIOD_US, "us", longer_period)
-    yield Constraint(
-        "chirps", "chirps of a frame", rig.burst.chirps, 1, 255, "", "set burst.chirps to 1..255"
-    )  # ICD 91
-    if rig.burst.chirps > 1:
-        apart = f"set radar.idle_us to {rig.burst.chirp_us - chirps + rig.radar.idle_us:g}, or burst.chirp_us"
-        yield Constraint(
-            "chirp spacing", "idle + ramp - chirp_us", chirps - rig.burst.chirp_us, -0.006, 0.006, "us", apart
-        )
-    rest = period - rig.burst.chirps * chirps
-    yield Constraint(
-        "inter-frame time", "frame period - chirps", rest, INTER_FRAME_US, None, "us", longer_period
-    )  # ICD 91
-    gap = rig.burst.period_us - period
-    yield Constraint(
-        "pulse gap", "pulse period - frame period", gap, AFTER_FRAME_US, None, "us", longer_period
-    )  # ICD 93
-    yield Constraint("pulse width", "SYNC_IN pulse", rig.burst.width_us, *WIDTH_US, "us", "set burst.width_us")
+    burst = rig.burst
+    period = frame_period_us(rig)
+    chirp = chirp_us(rig)
+    longer = "raise burst.period_us"
+    yield Constraint("frames", "frames of a row", frames, "", "reduce the points or pulses of a row", low=1, high=65535)
+    low, high = FRAME_PERIOD_US
+    yield Constraint("frame period", "frame period", period, "us", longer, low=low, high=high)
+    # ICD 91
+    yield Constraint("chirps", "chirps of a frame", burst.chirps, "", "set burst.chirps to 1..255", low=1, high=255)
+    if burst.chirps > 1:
+        apart = f"set radar.idle_us to {burst.chirp_us - chirp + rig.radar.idle_us:g}, or burst.chirp_us"
+        excess = chirp - burst.chirp_us
+        yield Constraint("chirp spacing", "idle + ramp - chirp_us", excess, "us", apart, low=-0.006, high=0.006)
+    # ICD 91
+    rest = period - burst.chirps * chirp
+    yield Constraint("inter-frame time", "frame period - chirps", rest, "us", longer, low=INTER_FRAME_US)
+    # ICD 93
+    gap = burst.period_us - period
+    yield Constraint("pulse gap", "pulse period - frame period", gap, "us", longer, low=AFTER_FRAME_US)
+    low, high = WIDTH_US
+    yield Constraint("pulse width", "SYNC_IN pulse", burst.width_us, "us", "set burst.width_us", low=low, high=high)
 
 
 def _chirp(rig: Instrument) -> Iterator[Constraint]:
     c = rig.chirp
     end = c.adc_start_us + (c.samples / c.sample_rate_hz * 1e6 if c.sample_rate_hz else inf)
-    yield Constraint(
-        "ADC window", "ADC start + samples / rate", end, None, c.ramp_end_us, "us", "raise chirp.ramp_end_us"
-    )
+    longer = "raise chirp.ramp_end_us"
+    yield Constraint("ADC window", "ADC start + samples / rate", end, "us", longer, high=c.ramp_end_us)
     memory = c.samples * len(rig.antennas.rx_mm) * 4
-    yield Constraint(
-        "sample memory", "samples x RX x 4", memory, None, SAMPLE_MEMORY_BYTES, "bytes", "lower chirp.samples"
-    )
-    yield Constraint("samples", "words a chirp", 2 * c.samples, 64, 8192, "", "set chirp.samples")  # error 1023
+    fewer = "lower chirp.samples"
+    yield Constraint("sample memory", "samples x RX x 4", memory, "bytes", fewer, high=SAMPLE_MEMORY_BYTES)
+    # Error 1023
+    yield Constraint("samples", "words a chirp", 2 * c.samples, "", "set chirp.samples", low=64, high=8192)
     limit = MAX_RATE_HZ[c.if_mode]
-    yield Constraint("sample rate", "rate", c.sample_rate_hz, 2e6, limit, "Hz", "set chirp.sample_rate_hz")
+    yield Constraint("sample rate", "rate", c.sample_rate_hz, "Hz", "set chirp.sample_rate_hz", low=2e6, high=limit)
     remainder = abs(c.sample_rate_hz / 1e3 - round(c.sample_rate_hz / 1e3)) * 1e3
-    yield Constraint(
-        "sample rate step", "distance to whole kHz", remainder, None, 1e-3, "Hz", "give whole kHz in sample_rate_hz"
-    )
+    whole = "give whole kHz in sample_rate_hz"
+    yield Constraint("sample rate step", "distance to whole kHz", remainder, "Hz", whole, high=1e-3)
     slope = slope_code(c.slope_hz_per_s)
-    yield Constraint("slope", "code of the slope", slope, 1, MAX_SLOPE_CODE, "", "lower chirp.slope_hz_per_s")
-    yield Constraint("ADC start", "ADC start", c.adc_start_us, 0, 40.95, "us", "lower chirp.adc_start_us")
-    yield Constraint("ramp", "ramp end", c.ramp_end_us, 0, 5000, "us", "lower chirp.ramp_end_us")
-    yield Constraint("idle", "idle time", rig.radar.idle_us, 0, 5242.87, "us", "lower radar.idle_us")
+    yield Constraint("slope", "code of the slope", slope, "", "lower chirp.slope_hz_per_s", low=1, high=MAX_SLOPE_CODE)
+    yield Constraint("ADC start", "ADC start", c.adc_start_us, "us", "lower chirp.adc_start_us", low=0, high=40.95)
+    yield Constraint("ramp", "ramp end", c.ramp_end_us, "us", "lower chirp.ramp_end_us", low=0, high=5000)
+    yield Constraint("idle", "idle time", rig.radar.idle_us, "us", "lower radar.idle_us", low=0, high=5242.87)
     simulated = all(n.place.startswith("tcp://127.") for n in rig.radar.native.values())
-    if not simulated or (c.hpf1_khz and c.hpf2_khz):  # only simulated radars work without filters
+    # Only simulated radars work without filters.
+    if not simulated or (c.hpf1_khz and c.hpf2_khz):
         lowest = min(c.hpf1_khz, c.hpf2_khz)
         corner = "set corners of the devices: chirp.hpf1_khz of at least 175 and hpf2_khz of at least 350"
-        yield Constraint("high-pass filters", "lower corner", lowest, HPF_FIRST_KHZ[0], None, "kHz", corner)
+        yield Constraint("high-pass filters", "lower corner", lowest, "kHz", corner, low=HPF_FIRST_KHZ[0])
     gain = rig.radar.rx_gain_db
     # ICD table 5.24; the 24..52 dB of error 52 are not reached at every temperature and RF target.
-    yield Constraint("RX gain", "RX gain", gain, 32, 52, "dB", "set radar.rx_gain_db to 32..52, even")
-    yield Constraint("RX gain step", "RX gain modulo 2", gain % 2, None, 0, "dB", "set an even radar.rx_gain_db")
-    yield Constraint("TX back-off", "back-off", rig.radar.tx_backoff_db, 0, 20, "dB", "lower radar.tx_backoff_db")
+    yield Constraint("RX gain", "RX gain", gain, "dB", "set radar.rx_gain_db to 32..52, even", low=32, high=52)
+    yield Constraint("RX gain step", "RX gain modulo 2", gain % 2, "dB", "set an even radar.rx_gain_db", high=0)
+    back_off = rig.radar.tx_backoff_db
+    yield Constraint("TX back-off", "back-off", back_off, "dB", "lower radar.tx_backoff_db", low=0, high=20)
 
 
 def _of_board(rig: Instrument, board: Board) -> Iterator[Constraint]:
-    c, here = rig.chirp, f" of {board.name}"
+    c = rig.chirp
+    of_board = f" of {board.name}"
     start = start_code(c.start_hz + board.start_offset_hz) * START_HZ_PER_CODE
     top = start + slope_code(c.slope_hz_per_s) * SLOPE_HZ_PER_S_PER_CODE * c.ramp_end_us * 1e-6
-    offset = f"change start_offset_hz{here}, or the chirp"
-    yield Constraint(f"start frequency{here}", "start + offset", start, *BAND_HZ, "Hz", offset)
-    yield Constraint(f"sweep{here}", "start + offset + slope x ramp end", top, *BAND_HZ, "Hz", offset)
+    offset = f"change start_offset_hz{of_board}, or the chirp"
+    low, high = BAND_HZ
+    yield Constraint(f"start frequency{of_board}", "start + offset", start, "Hz", offset, low=low, high=high)
+    sweep = "start + offset + slope x ramp end"
+    yield Constraint(f"sweep{of_board}", sweep, top, "Hz", offset, low=low, high=high)
     if board.name in rig.radar.native:
         native = rig.radar.native[board.name]
-        named = (
-            native.usb_serial and native.ldo_bypass_acknowledged == native.usb_serial
-        )  # a USB path does not identify a board
-        unacknowledged = native.ldo_bypass and not named
+        # A USB path does not identify a board.
+        acknowledged = native.usb_serial and native.ldo_bypass_acknowledged == native.usb_serial
         yield Constraint(
-            f"LDO bypass{here}",
+            f"LDO bypass{of_board}",
             "bypass without this board's acknowledgement",
-            int(unacknowledged),
-            None,
-            0,
+            int(native.ldo_bypass and not acknowledged),
             "",
-            f"disable ldo_bypass{here}: with the 1.3 V RF supplies of most TI boards it may destroy the device. Only if"
-            " you measured 1.0 V, write the board's USB serial number into ldo_bypass_acknowledged",
+            f"disable ldo_bypass{of_board}: with the 1.3 V RF supplies of most TI boards it may destroy the device."
+            " Only if you measured 1.0 V, write the board's USB serial number into ldo_bypass_acknowledged",
+            high=0,
         )
-    if board.role == "transmit":
-        return
-    found, spread = direct_if_hz(rig, board), c.slope_hz_per_s * TRIGGER_UNCERTAINTY_S
-    low, high = (
-        (0.0, PASSBAND * c.sample_rate_hz)
-        if c.if_mode == "complex1x"
-        else (-PASSBAND / 2 * c.sample_rate_hz, PASSBAND / 2 * c.sample_rate_hz)
-    )
-    better = board.start_offset_hz + (low + high) / 2 - found
-    yield Constraint(
-        f"IF budget{here}",
+    if board.role != "transmit":
+        yield _if_budget(rig, board)
+
+
+def _if_budget(rig: Instrument, board: Board) -> Constraint:
+    """Return the rule that the direct path lies in the IF band, also with the trigger's uncertainty."""
+    c = rig.chirp
+    direct_hz = direct_if_hz(rig, board)
+    spread = c.slope_hz_per_s * TRIGGER_UNCERTAINTY_S
+    width = PASSBAND * c.sample_rate_hz
+    low = 0.0 if c.if_mode == "complex1x" else -width / 2
+    centred = board.start_offset_hz + low + width / 2 - direct_hz
+    return Constraint(
+        f"IF budget of {board.name}",
         "slope x direct path / c + start offsets, with +-5 ns of trigger",
-        found,
-        low + spread,
-        high - spread,
+        direct_hz,
         "Hz",
-        f"set start_offset_hz{here}; with {better:.0f} its direct path is in the middle of the band",
+        f"set start_offset_hz of {board.name}; with {centred:.0f} its direct path is in the middle of the band",
+        low=low + spread,
+        high=low + width - spread,
     )

@@ -213,7 +213,8 @@ class NativeRadars(RadarControl):
     def __init__(
         self, rig: Instrument, open_words: Callable[[str], WordLink] | None = None, clock: Clock | None = None
     ) -> None:
-        self._rig, self._clock = rig, clock or SystemClock()
+        self._rig = rig
+        self._clock = clock or SystemClock()
         self._open_words = open_words or partial(open_board, slow=rig.radar.slow_spi)
         frames = rig.grid.columns * rig.burst.pulses
         require(rig, frames)
@@ -262,7 +263,8 @@ class NativeRadars(RadarControl):
             found[die] = name
 
     def _open(self, name: str) -> WordLink:
-        words, folder = self._open_words(self._rig.radar.native[name].place), self._rig.radar.trace_dir
+        words = self._open_words(self._rig.radar.native[name].place)
+        folder = self._rig.radar.trace_dir
         if not folder:
             return words
         try:

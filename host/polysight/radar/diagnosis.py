@@ -125,7 +125,8 @@ def _power(board: RadarBoard) -> Row:
 
 
 FORM = 1
-INTERRUPT, RESET = "HOST_INTR", "NRST"
+INTERRUPT = "HOST_INTR"
+RESET = "NRST"
 MAX_BYTES = 2**26  # a scan of some thousand rows
 _MAX_S = 1e7
 
@@ -149,11 +150,14 @@ class TracedWords:
     """
 
     def __init__(self, words: WordLink, clock: Clock, file: Path, facts: dict[str, object]) -> None:
-        self._words, self._clock, self._began = words, clock, clock.now()
+        self._words = words
+        self._clock = clock
+        self._began = clock.now()
         self._file = file.open("w", encoding="utf-8")
         self._level: bool | None = None
         self._looks = 0  # queries of the interrupt without a change since the last line
-        self.file, self.ended = file, ""
+        self.file = file
+        self.ended = ""
         self._write({"trace": FORM, **facts})
 
     def write(self, words: Sequence[int]) -> None:
@@ -216,7 +220,8 @@ class TracedWords:
 
 def traced(words: WordLink, clock: Clock, file: Path, rig: Instrument, board: str) -> TracedWords:
     """Log a board's link to `file`, whose first line has board, place, rig, version and time."""
-    place, now = rig.radar.native[board].place, round(time.time(), 3)
+    place = rig.radar.native[board].place
+    now = round(time.time(), 3)
     facts = {"board": board, "place": place, "rig": rig.name, "polysight": __version__, "unix_s": now}
     return TracedWords(words, clock, file, facts)
 

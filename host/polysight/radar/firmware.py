@@ -32,9 +32,14 @@ FAMILIES = {  # by major ROM version
 }
 _CORES = ("main", "RF")  # an image has a part for each
 
-_MAGIC, _END, _PART = b"MSTR", b"MEND", b"RPRC"
-_LENGTH_AT, _HEADER_BYTES = 20, 128
-_ROM_AT, _PATCH_AT = 0x38, 0x48  # offsets in a part: version, then year, month, day
+_MAGIC = b"MSTR"
+_END = b"MEND"
+_PART = b"RPRC"
+_LENGTH_AT = 20
+_HEADER_BYTES = 128
+# Offsets in a part: version, then year, month, day
+_ROM_AT = 0x38
+_PATCH_AT = 0x48
 _REMEDY = "copy xwr22xx_metaImage.bin from TI's mmWave DFP 2.2 again, and compare its size with TI's"
 
 
@@ -84,7 +89,8 @@ def check_image(data: bytes, name: str) -> Image:
         raise _refused(
             name, f"{len(data)} bytes, its header has {length + 4}", "an interrupted copy, or another format"
         )
-    found, expected = zlib.crc32(data[:-4]), int.from_bytes(data[-4:], "little")
+    found = zlib.crc32(data[:-4])
+    expected = int.from_bytes(data[-4:], "little")
     if found != expected:
         raise _refused(name, f"CRC-32 {found:08x} instead of {expected:08x}", "damaged during the copy")
     begins = [at for at in range(_HEADER_BYTES, len(data) - _PATCH_AT - 8, 4) if data[at : at + 4] == _PART]

@@ -23,11 +23,14 @@ CRC_BYTES = 4
 MESSAGE_LIMIT = 256  # with the sync word
 BODY_LIMIT = 232  # of one sub-block; the chunk size that TI recommends over SPI (ICD 20)
 BLOCKS_PER_MESSAGE_ID = 32
-ERROR_MESSAGE, ERROR_BLOCK = 0, 0x0000
+ERROR_MESSAGE = 0
+ERROR_BLOCK = 0x0000
 _HEADER = struct.Struct("<6H")
 _BLOCK = struct.Struct("<2H")
 _PAD = b"\xff"
-_RETRY, _NO_CRC, _CRC32 = 0x0003, 0x0300, 0x0400
+_RETRY = 0x0003
+_NO_CRC = 0x0300
+_CRC32 = 0x0400
 _WHY = "noise on the SPI lines, or a device out of step"
 _DO = "retried automatically; check the 60-pin connector and the USB cable if it happens again"
 
@@ -216,7 +219,8 @@ def crc(data: bytes, size: int) -> bytes:
 
 
 def _blocks(body: bytes, count: int) -> tuple[SubBlock, ...]:
-    blocks, at = [], 0
+    blocks = []
+    at = 0
     for _ in range(count):
         if at + _BLOCK.size > len(body):
             raise ProtocolError(f"{count} sub-blocks announced, {len(blocks)} found", _WHY, _DO)

@@ -19,7 +19,8 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 
 # The FT4232H over USB.
-VENDOR, PRODUCT = 0x0451, 0xFD03
+VENDOR = 0x0451
+PRODUCT = 0xFD03
 PATH = "usb:"  # prefix of a USB path, "usb:1-4.2"; without it, a serial number
 _READ_TIMEOUT_S = 0.5
 _LATENCY_MS = 1
@@ -32,20 +33,35 @@ _TIMEOUT_S = 30.0
 
 # Pins and MPSSE commands.
 SPI_DIRECTION = 0b0100_1011  # clock, data out, chip select, PMIC reset are outputs
-SELECTED_WRITE, SELECTED_READ, IDLE = 0xC0, 0xC2, 0xC8
+SELECTED_WRITE = 0xC0
+SELECTED_READ = 0xC2
+IDLE = 0xC8
 INTERRUPT_DIRECTION = 0b0101_1011  # bit 5, the interrupt, is an input
 INTERRUPT_IDLE = 0b0001_0011
 INTERRUPT_BIT = 5
-RESET_DIRECTION, RESET_PIN, WARM_RESET_PIN = 0b1111_1001, 6, 7
-SENSE_DIRECTION, FUNCTIONAL_MODE = 0b1111_1111, 0b0001_0000  # D4 = 1, D3 = D2 = 0
+RESET_DIRECTION = 0b1111_1001
+RESET_PIN = 6
+WARM_RESET_PIN = 7
+SENSE_DIRECTION = 0b1111_1111
+# D4 = 1, D3 = D2 = 0
+FUNCTIONAL_MODE = 0b0001_0000
 # Directions of channels A to D, and True for bit-bang mode.
 _CHANNELS = ((SPI_DIRECTION, False), (INTERRUPT_DIRECTION, False), (RESET_DIRECTION, True), (SENSE_DIRECTION, True))
-_PINS, _READ_PINS, _WRITE_BYTES, _READ_BYTES, _NOW = 0x80, 0x81, 0x11, 0x20, 0x87
-_FULL_SPEED, _NO_ADAPTIVE, _NO_THREE_PHASE, _THREE_PHASE, _DIVISOR = 0x8A, 0x97, 0x8D, 0x8C, 0x86
+_PINS = 0x80
+_READ_PINS = 0x81
+_WRITE_BYTES = 0x11
+_READ_BYTES = 0x20
+_NOW = 0x87
+_FULL_SPEED = 0x8A
+_NO_ADAPTIVE = 0x97
+_NO_THREE_PHASE = 0x8D
+_THREE_PHASE = 0x8C
+_DIVISOR = 0x86
 _NO_LOOPBACK = 0x85
 SPI_DIVISOR, SLOW_DIVISOR = 2, 29  # 60 MHz / (2 x (2 + 1)) = 10 MHz; 1 MHz
 # One pin command holds its pins for 0.2 us (FTDI AN_114), two clocks at 10 MHz; ICD 3.2.4 wants two at least.
-_SELECT_COMMANDS, _IDLE_COMMANDS = 2, 3
+_SELECT_COMMANDS = 2
+_IDLE_COMMANDS = 3
 _SLOW_GAP_S = 100e-6
 _DESELECT = bytes((_PINS, IDLE, SPI_DIRECTION)) * _IDLE_COMMANDS
 _RESET_S = 0.01
@@ -385,7 +401,9 @@ class _TcpPort:
     """One channel over TCP; all four share a connection."""
 
     def __init__(self, address: str, connection: socket.socket, channel: bytes) -> None:
-        self._address, self._connection, self._channel = address, connection, channel
+        self._address = address
+        self._connection = connection
+        self._channel = channel
 
     def write(self, data: bytes) -> None:
         """Send bytes. Raises DeviceError."""

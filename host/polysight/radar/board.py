@@ -191,7 +191,7 @@ class BringUp:
 
     def _boot_from_ram(self, image: Image) -> None:
         try:
-            booted = self._booted()
+            booted = self._wait_for_boot()
         except NotReportedError as error:
             self._ignored.append(f"no event 0x{e.BOOT_STATUS:04X} after the download")
             self._board.log_event(error.what)
@@ -206,7 +206,7 @@ class BringUp:
                 code=ErrorCode.REFUSED_BY_PEER,
             )
 
-    def _booted(self) -> e.Event:
+    def _wait_for_boot(self) -> e.Event:
         """Wait for the event at the end of a download to RAM (ICD 6.1); a power-up event alone is another start."""
         self._link.may_start = True
         event = self._link.wait_for((e.BOOT_STATUS, e.MAIN_POWER_UP), _BOOT_TIMEOUT_S, self.note)
@@ -248,10 +248,10 @@ class BringUp:
         """Warn if the RF core's patch, which is known only when that core runs, is not the file's."""
         if patch != image.patches[1]:
             update = f"`polysight radar firmware {self._board.name} {image.name} --flash` writes both cores"
-            self._link.warnings.append(
-                f"{self._board.name}: its RF core reports patch {patch}, {image.name} contains {image.patches[1]}"
-                + (f": it runs from the flash; {update}" if self._from_flash else "")
-            )
+            warning = f"{self._board.name}: its RF core reports patch {patch}, {image.name} contains {image.patches[1]}"
+            if self._from_flash:
+                warning += f": it runs from the flash; {update}"
+            self._link.warnings.append(warning)
 
     def _rf_up(self) -> str:
         self._link.call(c.DEVICE_CONFIGURATION)
@@ -311,8 +311,8 @@ class BringUp:
         self._link.call(c.RF_INIT)
         event = self._link.wait_for((e.RF_INIT_DONE,), _CALIBRATION_TIMEOUT_S, self.note)
         self._board.facts["calibration"] = dict(event.values)
-        asked = ALL & ~RESTORED if restored else ALL
-        if failed := e.failed_calibrations(event, self._board.program.transmits, asked):
+        requested = ALL & ~RESTORED if restored else ALL
+        if failed := e.failed_calibrations(event, self._board.program.transmits, requested):
             raise DeviceError(
                 f"{self._board.name}: RF init failed: {', '.join(failed)} ({event})",
                 "no reference clock, an RF supply out of range, or a damaged RF part",
@@ -520,11 +520,11 @@ class RadarBoard:
         commands = (*self.program.waveform, *self._sent_frames)
         sent = {command.ID: command.block().data for command in commands}
         differences = []
-        for question, of in ((c.READ_PROFILE, 0x0100), (c.READ_CHIRP, 0x0101), (c.READ_FRAME, 0x0102)):
+        for question, setting in ((c.READ_PROFILE, 0x0100), (c.READ_CHIRP, 0x0101), (c.READ_FRAME, 0x0102)):
             blocks = self.link.call(question).blocks
             read = blocks[0].data if blocks else b""
-            if read != sent[of]:
-                differences.append(f"0x{of:04X}: sent {sent[of].hex()}, read back {read.hex()}")
+            if read != sent[setting]:
+                differences.append(f"0x{setting:04X}: sent {sent[setting].hex()}, read back {read.hex()}")
         return differences
 
     def reconnect(self, words: WordLink) -> None:

@@ -120,10 +120,10 @@ def radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmw
     """Create a board of a rig with its word link and firmware."""
     native = rig.radar.native[name]
     commands = program(rig, rig.by_name(name))
-    settings = b"".join(one.block().data for one in (*commands.basic, *commands.waveform))
+    settings = b"".join(command.block().data for command in (*commands.basic, *commands.waveform))
     folder = rig.radar.calibration_dir
     calibration = CalibrationFiles(Path(folder), settings) if folder else None
-    return RadarBoard(name, words, clock, commands, firmware, native.die_id, calibration)
+    return RadarBoard(name, words, clock, commands, firmware=firmware, die_id=native.die_id, calibration=calibration)
 
 
 def plan_lines(rig: Instrument) -> tuple[list[str], bool]:
@@ -132,11 +132,9 @@ def plan_lines(rig: Instrument) -> tuple[list[str], bool]:
     Power-up, RF init, queries and the start of frames are not among the commands.
     """
     frames = rig.grid.columns * rig.burst.pulses
-    found = constraints(rig, frames)
-    lines = [
-        f"{'holds ' if c.holds else 'BROKEN'}  {c}" + ("" if c.holds else f"\n        do: {c.remedy}") for c in found
-    ]
-    if not all(c.holds for c in found):
+    checked = constraints(rig, frames)
+    lines = [f"holds   {c}" if c.holds else f"BROKEN  {c}\n        do: {c.remedy}" for c in checked]
+    if not all(c.holds for c in checked):
         return [*lines, "\nnothing would be sent"], False
     for board in rig.boards:
         lines.append(f"\n{board.name}, its settings, with sequence numbers as if only they were sent:")
@@ -250,17 +248,17 @@ class NativeRadars(RadarControl):
 
     def _check_distinct(self) -> None:
         """Raise DeviceError if two boards have the same die id, so that two names refer to one board."""
-        found: dict[object, str] = {}
+        names_by_die: dict[object, str] = {}
         for name, board in self._boards.items():
             die = board.facts.get("die_id", name)
-            if die != NO_DIE and die in found:
+            if die != NO_DIE and die in names_by_die:
                 raise DeviceError(
-                    f"{found[die]} and {name} have the same die id {die}",
+                    f"{names_by_die[die]} and {name} have the same die id {die}",
                     "both names in radar.native refer to one board",
                     "correct usb_serial or usb_path of one of them",
                     code=ErrorCode.VALUES_CONFLICT,
                 )
-            found[die] = name
+            names_by_die[die] = name
 
     def _open(self, name: str) -> WordLink:
         words = self._open_words(self._rig.radar.native[name].place)
@@ -268,11 +266,11 @@ class NativeRadars(RadarControl):
         if not folder:
             return words
         try:
-            found = traced(words, self._clock, new_trace(Path(folder), name), self._rig, name)
+            log = traced(words, self._clock, new_trace(Path(folder), name), self._rig, name)
         except OSError:  # such as a full disk: continue without a trace
             return words
-        self._traces.append(found)
-        return found
+        self._traces.append(log)
+        return log
 
     def _reopen(self, board: RadarBoard) -> bool:
         """Reopen a failed board's link; return False after the timeout."""
@@ -305,13 +303,13 @@ class NativeRadars(RadarControl):
 
     def states(self) -> dict[str, BoardState]:
         """Return the states by name, without boards that are not armed; a lost link is a fault."""
-        found = {}
+        states = {}
         for name, board in self._boards.items():
             state = board.poll()
             if state in _STATES:
                 detail = board.reason if state is State.FAULT else state.value
-                found[name] = BoardState(_STATES[state], detail)
-        return found
+                states[name] = BoardState(_STATES[state], detail)
+        return states
 
     def report(self) -> dict[str, object]:
         """Return checked constraints, and the report of each board since the last call, for the manifest."""
@@ -388,15 +386,15 @@ class LineServers(RadarControl):
 
     def states(self) -> dict[str, BoardState]:
         """Return `FAULT` for boards whose server reset the connection, otherwise `UNKNOWN` with its address."""
-        found = {}
+        states = {}
         for board, address in self._servers.items():
             self._is_closed(board)
-            found[board] = (
+            states[board] = (
                 BoardState(RadarState.FAULT, f"its control server at {address} reset the connection")
                 if board in self._reset
                 else BoardState(RadarState.UNKNOWN, f"re-armed through {address}, which never replies")
             )
-        return found
+        return states
 
     def close(self) -> None:
         """Close the connections."""

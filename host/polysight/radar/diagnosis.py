@@ -73,16 +73,16 @@ def check_board(
     board = make_board(words)
     done: list[Step] = []
 
-    def on_step(step: Step, found: str) -> None:
+    def on_step(step: Step, outcome: str) -> None:
         done.append(step)
-        on_row(Row(step.name, True, step.expected, found))
+        on_row(Row(step.name, True, step.expected, outcome))
         if step.name == "reset":
-            on_row(_power(board))
+            on_row(_judge_supplies(board))
 
     try:
         board.configure(on_step)
     except PolysightError as error:
-        on_row(_failed(board.steps[len(done)] if len(done) < len(board.steps) else None, error))
+        on_row(_row_of_failure(board.steps[len(done)] if len(done) < len(board.steps) else None, error))
         return board
     _frame_and_read_back(board, transmits, on_row)
     return board
@@ -97,31 +97,33 @@ def _frame_and_read_back(board: RadarBoard, transmits: bool, on_row: Callable[[R
         return
     expected = "profile, chirp and frame as sent"
     try:
-        found = board.read_back()
-        remedy = (
-            "compare the fields with docs/spec/mmwavelink.md; a reserved field that differs is harmless"
-            if found
-            else ""
-        )
-        on_row(Row("read back", not found, expected, "; ".join(found) or "as sent", remedy))
+        differences = board.read_back()
+        if differences:
+            remedy = "compare the fields with docs/spec/mmwavelink.md; a reserved field that differs is harmless"
+            on_row(Row("read back", False, expected, "; ".join(differences), remedy))
+        else:
+            on_row(Row("read back", True, expected, "as sent"))
     except PolysightError as error:
         on_row(Row("read back", False, expected, error.what, f"{error.why}; {error.remedy}"))
 
 
-def _failed(step: Step | None, error: PolysightError) -> Row:
-    name, expected, remedy = (step.name, step.expected, step.remedy) if step else ("bring-up", "", "")
-    picture = f"\n{JUMPERS}" if name == "reset" else ""
-    return Row(name, False, expected, error.what, f"{error.why}; {error.remedy or remedy}{picture}")
+def _row_of_failure(step: Step | None, error: PolysightError) -> Row:
+    if step is None:
+        return Row("bring-up", False, "", error.what, f"{error.why}; {error.remedy}")
+    picture = f"\n{JUMPERS}" if step.name == "reset" else ""
+    return Row(step.name, False, step.expected, error.what, f"{error.why}; {error.remedy or step.remedy}{picture}")
 
 
-def _power(board: RadarBoard) -> Row:
+def _judge_supplies(board: RadarBoard) -> Row:
     """Judge the supplies by the main core's power-up and the report of its voltage monitor."""
     boot = board.facts.get("boot")
     errors = boot.get("boot_errors", 0) if isinstance(boot, dict) else 0
     monitor = bool(isinstance(errors, int) and errors >> 57 & 1)
-    found = "the main core runs; " + ("its voltage monitor reports an error" if monitor else "no error reported")
-    remedy = "measure the RF supplies (1.3 V or 1.0 V), 1.8 V and 3.3 V" if monitor else ""
-    return Row("power rails", not monitor, "the core runs, no error of the voltage monitor", found, remedy)
+    expected = "the core runs, no error of the voltage monitor"
+    if monitor:
+        remedy = "measure the RF supplies (1.3 V or 1.0 V), 1.8 V and 3.3 V"
+        return Row("power rails", False, expected, "the main core runs; its voltage monitor reports an error", remedy)
+    return Row("power rails", True, expected, "the main core runs; no error reported")
 
 
 FORM = 1

@@ -52,7 +52,7 @@ INIT_BITS = {  # ICD 217, where 0 is "fail"
     11: InitBit("TX phase", of_transmitter=True),
     12: InitBit("RX I/Q"),
 }
-_INIT_NAMES = {bit: one.name for bit, one in INIT_BITS.items()}
+_INIT_NAMES = {bit: calibration.name for bit, calibration in INIT_BITS.items()}
 
 
 def failed_calibrations(event: Event, transmits: bool, run: int) -> list[str]:
@@ -64,8 +64,8 @@ def failed_calibrations(event: Event, transmits: bool, run: int) -> list[str]:
     if not isinstance(passed, int):
         return ["unreadable report"]
     requested = run | 0b1110
-    needed = {bit: one.name for bit, one in INIT_BITS.items() if transmits or not one.of_transmitter}
-    return [name for bit, name in needed.items() if requested >> bit & 1 and not passed >> bit & 1]
+    failed = [c for bit, c in INIT_BITS.items() if requested >> bit & 1 and not passed >> bit & 1]
+    return [calibration.name for calibration in failed if transmits or not calibration.of_transmitter]
 
 
 _CPU_FAULTS = (  # ICD 212, 317
@@ -206,10 +206,10 @@ def describe_refusal(number: int | None, block: int | None) -> str:
 
 def decode_event(block: SubBlock) -> Event:
     """Decode an event; an unknown or truncated one keeps its bytes. A truncated fault is fatal."""
-    known = _EVENTS.get(block.id)
-    if known is None:
+    decoder = _EVENTS.get(block.id)
+    if decoder is None:
         return Event(block.id, f"event 0x{block.id:04X}", block.data.hex())
-    name, read = known
+    name, read = decoder
     try:
         detail, fatal, values = read(block.data)
     except (struct.error, IndexError):
@@ -218,7 +218,7 @@ def decode_event(block: SubBlock) -> Event:
     return Event(block.id, name, detail, fatal, values)
 
 
-def _plain(data: bytes) -> _Read:
+def _read_nothing(data: bytes) -> _Read:
     del data
     return "", False, {}
 
@@ -247,9 +247,9 @@ def _cpu(codes: tuple[str, ...]) -> Callable[[bytes], _Read]:
 
 def _esm(fatal_in_group1: int) -> Callable[[bytes], _Read]:
     def read(data: bytes) -> _Read:
-        one, two = struct.unpack_from("<II", data)
-        fatal = bool(two or one & fatal_in_group1)
-        return f"group 1 0x{one:08X}, group 2 0x{two:08X}", fatal, {"group1": one, "group2": two}
+        group1, group2 = struct.unpack_from("<II", data)
+        fatal = bool(group2 or group1 & fatal_in_group1)
+        return f"group 1 0x{group1:08X}, group 2 0x{group2:08X}", fatal, {"group1": group1, "group2": group2}
 
     return read
 
@@ -278,8 +278,12 @@ def _boot(data: bytes) -> _Read:
     parts = [_bits(_BOOT_BITS, boot, "bit")] if boot else []
     if tests:
         parts.append(f"self-tests failed 0x{tests:X}")
-    hardware, flash = (any(boot >> bit & 1 for bit in bits) for bits in (_HARDWARE_BITS, _FLASH_BITS))
-    cure = "hardware" if hardware else "firmware" if flash else ""
+    if any(boot >> bit & 1 for bit in _HARDWARE_BITS):
+        cure = "hardware"
+    elif any(boot >> bit & 1 for bit in _FLASH_BITS):
+        cure = "firmware"
+    else:
+        cure = ""
     values = {"power_up_us": ticks * 0.005, "boot_errors": boot, "tests_failed": tests, "cure": cure}
     return "; ".join(parts), False, values
 
@@ -287,7 +291,11 @@ def _boot(data: bytes) -> _Read:
 def _rf_power_up(data: bytes) -> _Read:
     passed, ticks = struct.unpack_from("<II", data)
     failed = _RF_TESTS & ~passed
-    text = f"self-tests failed 0x{failed:07X}" + (", all of them" if failed == _RF_TESTS else "") if failed else ""
+    text = ""
+    if failed:
+        text = f"self-tests failed 0x{failed:07X}"
+    if failed == _RF_TESTS:
+        text += ", all of them"
     return text, False, {"tests_passed": passed, "power_up_us": ticks * 0.005}
 
 
@@ -301,11 +309,11 @@ _EVENTS: dict[int, tuple[str, Callable[[bytes], _Read]]] = {
     RF_CPU_FAULT: ("RF core fault", _cpu(_RF_CODES)),
     RF_ESM_FAULT: ("RF core error signal", _esm(_RF_GROUP1_FATAL)),
     RF_INIT_DONE: ("RF calibrated", _init_done),
-    TRIGGER_READY: ("ready for triggers", _plain),
-    FRAME_END: ("frames ended", _plain),
+    TRIGGER_READY: ("ready for triggers", _read_nothing),
+    FRAME_END: ("frames ended", _read_nothing),
     ANALOG_FAULT: ("analog supply fault", _analog),
-    TIMING_FAILURE: ("calibrations do not fit the frame", _plain),
-    CALIBRATION_REPORT: ("run-time calibration", _plain),
+    TIMING_FAILURE: ("calibrations do not fit the frame", _read_nothing),
+    CALIBRATION_REPORT: ("run-time calibration", _read_nothing),
     MAIN_POWER_UP: ("main core is up", _boot),
     RF_POWER_UP_DONE: ("RF core is up", _rf_power_up),
     MAIN_CPU_FAULT: ("main core fault", _cpu(())),

@@ -79,35 +79,37 @@ def check_image(data: bytes, name: str) -> Image:
     """Check the bytes of a file. Raises ConfigError if they are not a complete, undamaged image for an AWR2243."""
     if data[:4] != _MAGIC:
         begin = data[:12].decode("latin-1") if data else "nothing"
-        raise _refused(name, f"begins with {begin!r} instead of {_MAGIC.decode()!r}", "another file, or an empty one")
+        raise _file_error(
+            name, f"begins with {begin!r} instead of {_MAGIC.decode()!r}", "another file, or an empty one"
+        )
     if len(data) < _HEADER_BYTES:
-        raise _refused(name, f"{len(data)} bytes are too few for its header", "an interrupted copy")
+        raise _file_error(name, f"{len(data)} bytes are too few for its header", "an interrupted copy")
     length = int.from_bytes(data[_LENGTH_AT : _LENGTH_AT + 4], "little")
     if len(data) == length:
-        raise _refused(name, "its CRC is missing", "made from TI's .h file, which has no CRC")
+        raise _file_error(name, "its CRC is missing", "made from TI's .h file, which has no CRC")
     if len(data) != length + 4 or len(data) > MAX_BYTES:
-        raise _refused(
+        raise _file_error(
             name, f"{len(data)} bytes, its header has {length + 4}", "an interrupted copy, or another format"
         )
-    found = zlib.crc32(data[:-4])
+    actual = zlib.crc32(data[:-4])
     expected = int.from_bytes(data[-4:], "little")
-    if found != expected:
-        raise _refused(name, f"CRC-32 {found:08x} instead of {expected:08x}", "damaged during the copy")
+    if actual != expected:
+        raise _file_error(name, f"CRC-32 {actual:08x} instead of {expected:08x}", "damaged during the copy")
     begins = [at for at in range(_HEADER_BYTES, len(data) - _PATCH_AT - 8, 4) if data[at : at + 4] == _PART]
     if _END not in data[:_HEADER_BYTES] or not begins or begins[0] != _HEADER_BYTES:
-        raise _refused(name, "no program part after its header", "an image of another kind")
+        raise _file_error(name, "no program part after its header", "an image of another kind")
     if len(begins) != len(_CORES):
-        raise _refused(name, f"{len(begins)} program parts, an AWR2243 has two cores", "an image of another kind")
+        raise _file_error(name, f"{len(begins)} program parts, an AWR2243 has two cores", "an image of another kind")
     roms = [tuple(data[at + _ROM_AT : at + _ROM_AT + 4]) for at in begins]
     if others := [rom[0] for rom in roms if rom[0] != GENERATION]:
-        raise _refused(
+        raise _file_error(
             name,
             f"for devices of generation {others[0]} ({_family(others[0])}); an AWR2243 has generation {GENERATION}",
             "an image for another device",
         )
     patches = tuple(describe_patch(*data[at + _PATCH_AT : at + _PATCH_AT + 4]) for at in begins)
     if others := [p for p in patches if not p.startswith(f"{GENERATION}.")]:
-        raise _refused(name, f"its patches are {', '.join(others)}, those of an AWR2243 2.x", "an image for xWR6243")
+        raise _file_error(name, f"its patches are {', '.join(others)}, those of an AWR2243 2.x", "an image for xWR6243")
     return Image(name, data, roms[0], patches)
 
 
@@ -135,9 +137,9 @@ def require_rom(name: str, version: bytes, image: Image) -> None:
     """Raise ConfigError if the image is for another ROM than that of the version answer."""
     require_family(name, _CORES[0], version)
     if tuple(version[3:7]) != image.rom:
-        found, expected = (".".join(map(str, rom)) for rom in (version[3:7], image.rom))
+        actual, expected = (".".join(map(str, rom)) for rom in (version[3:7], image.rom))
         raise ConfigError(
-            f"{name}: its main core's ROM is {found}, {image.name} is for ROM {expected}; nothing was sent",
+            f"{name}: its main core's ROM is {actual}, {image.name} is for ROM {expected}; nothing was sent",
             "another version of the device, or an image for another one",
             "use the image of this device's DFP",
             code=ErrorCode.MISMATCH,
@@ -151,8 +153,8 @@ def file_chunks(image: bytes, file_type: int = TO_FLASH) -> list[tuple[FileChunk
     """
     if not image:
         raise ValueError("the firmware image is empty")
-    whole = struct.pack("<II", file_type, len(image)) + image
-    parts = [whole[at : at + BODY_LIMIT] for at in range(0, len(whole), BODY_LIMIT)]
+    content = struct.pack("<II", file_type, len(image)) + image
+    parts = [content[start : start + BODY_LIMIT] for start in range(0, len(content), BODY_LIMIT)]
     return [(FileChunk(part), len(parts) - 1 - n) for n, part in enumerate(parts)]
 
 
@@ -179,7 +181,7 @@ def send_image(
         progress(n + 1, len(parts))
 
 
-def _refused(name: str, what: str, why: str) -> ConfigError:
+def _file_error(name: str, what: str, why: str) -> ConfigError:
     return ConfigError(
         f"{name} is no firmware for an AWR2243: {what}; nothing was sent", why, _REMEDY, code=ErrorCode.FILE_FOREIGN
     )

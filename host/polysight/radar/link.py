@@ -224,7 +224,7 @@ class Link:
             else:
                 parts.append(message)
                 if message.remaining_chunks == 0:
-                    return _joined(parts), problem
+                    return _join_chunks(parts), problem
         return None, _lost_message("parts of the answer are missing", _DISTURBED) if parts else problem
 
     def _receive(self) -> tuple[Message | None, Finding]:
@@ -312,6 +312,6 @@ def _answers(message: Message, request: Message) -> bool:
     return same_command and message.sequence == request.sequence
 
 
-def _joined(parts: Sequence[Message]) -> Message:
+def _join_chunks(parts: Sequence[Message]) -> Message:
     """Join the chunks of an answer (ICD 2.3.2, REMCHUNKS)."""
-    return parts[0] if len(parts) == 1 else replace(parts[-1], blocks=tuple(b for p in parts for b in p.blocks))
+    return replace(parts[-1], blocks=tuple(block for part in parts for block in part.blocks))

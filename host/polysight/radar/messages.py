@@ -220,15 +220,15 @@ def crc(data: bytes, size: int) -> bytes:
 
 def _blocks(body: bytes, count: int) -> tuple[SubBlock, ...]:
     blocks = []
-    at = 0
+    start = 0
     for _ in range(count):
-        if at + _BLOCK.size > len(body):
+        if start + _BLOCK.size > len(body):
             raise ProtocolError(f"{count} sub-blocks announced, {len(blocks)} found", _WHY, _DO)
-        number, length = _BLOCK.unpack_from(body, at)
-        if length < _BLOCK.size or at + length > len(body):
+        number, length = _BLOCK.unpack_from(body, start)
+        if length < _BLOCK.size or start + length > len(body):
             raise ProtocolError(f"sub-block 0x{number:04X} with a length of {length} bytes", _WHY, _DO)
-        blocks.append(SubBlock(number, body[at + _BLOCK.size : at + length]))
-        at += length
-    if len(body) - at >= 4:
-        raise ProtocolError(f"{len(body) - at} bytes after the last of {count} sub-blocks", _WHY, _DO)
+        blocks.append(SubBlock(number, body[start + _BLOCK.size : start + length]))
+        start += length
+    if len(body) - start >= 4:
+        raise ProtocolError(f"{len(body) - start} bytes after the last of {count} sub-blocks", _WHY, _DO)
     return tuple(blocks)

@@ -193,7 +193,7 @@ class UsbWords:
         for part in [1] * count if self._slow else [count]:
             self._spi.write(read_words(part))
             data = _read_exactly(self._spi, 2 * part)
-            words += [int.from_bytes(data[at : at + 2], "big") for at in range(0, 2 * part, 2)]
+            words += struct.unpack(f">{part}H", data)
             self._pause()
         return words
 

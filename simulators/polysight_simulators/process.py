@@ -41,15 +41,10 @@ def announce_ready(text: str = "") -> None:
     sys.stdout.flush()
 
 
-def run_until_stopped(run: Callable[[threading.Event], object]) -> int:
-    """Run a simulator until SIGTERM, SIGINT or the end of the parent process; return the exit status.
-
-    `run` gets an event that is set by the signals. An error is one message on stderr.
-    """
-    stop = stop_requested()
-    die_with_parent()
+def exit_status_of(run: Callable[[], object]) -> int:
+    """Run a program; return its exit status. An error is one message on stderr."""
     try:
-        run(stop)
+        run()
     except PolysightError as e:
         sys.stderr.write(f"error: {e}\n")
         return e.exit_status
@@ -57,7 +52,19 @@ def run_until_stopped(run: Callable[[threading.Event], object]) -> int:
         error = os_error(e)
         sys.stderr.write(f"error: {error}\n")
         return error.exit_status
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
     return 0
+
+
+def run_until_stopped(run: Callable[[threading.Event], object]) -> int:
+    """Run a simulator until SIGTERM, SIGINT or the end of the parent process; return the exit status.
+
+    `run` gets an event that is set by the signals.
+    """
+    stop = stop_requested()
+    die_with_parent()
+    return exit_status_of(lambda: run(stop))
 
 
 def stop_requested() -> threading.Event:

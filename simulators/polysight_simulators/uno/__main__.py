@@ -6,13 +6,14 @@ times per heartbeat allows 2, and a machine that cannot keep up slows the simula
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 from pathlib import Path
 
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import PolysightError
-from polysight_simulators.process import command_line, die_with_parent
+from polysight_simulators.process import command_line, die_with_parent, exit_status_of
 from polysight_simulators.stage import homing_zero
 from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
@@ -29,20 +30,23 @@ def main(argv: list[str] | None = None) -> int:
     if not args.time_scale > 0:
         p.error("--time-scale must be positive")
     die_with_parent()
+    return exit_status_of(lambda: _run(args))
+
+
+def _run(args: argparse.Namespace) -> None:
     if lacking := missing():
-        sys.stderr.write(f"uno: not installed: {' '.join(lacking)}. Do: {ENABLING_COMMAND}\n")
-        return 1
-    try:
-        rig = load_instrument(args.config)
-        zero = homing_zero()
-        program = str(emulator())
-        command = [program, "--pty", str(args.link), "--speed", repr(args.time_scale), "--boot-ms", str(args.boot_ms)]
-        command += ["--zero", f"{zero},{zero}", "--um-per-step", repr(1000.0 / rig.stage.steps_per_mm)]
-        command += ["--line", str(rig.pi.trigger_in), *(["--wires", str(args.wires)] if args.wires else [])]
-        os.execv(program, [*command, str(firmware())])
-    except PolysightError as e:
-        sys.stderr.write(f"uno: {e}\n")
-        return e.exit_status
+        raise ConfigError(
+            f"not installed: {' '.join(lacking)}", "the emulated board is compiled here", ENABLING_COMMAND
+        )
+    rig = load_instrument(args.config)
+    zero = homing_zero()
+    program = str(emulator())
+    command = [program, "--pty", str(args.link), "--speed", repr(args.time_scale), "--boot-ms", str(args.boot_ms)]
+    command += ["--zero", f"{zero},{zero}", "--um-per-step", repr(1000.0 / rig.stage.steps_per_mm)]
+    command += ["--line", str(rig.pi.trigger_in)]
+    if args.wires:
+        command += ["--wires", str(args.wires)]
+    os.execv(program, [*command, str(firmware())])
 
 
 if __name__ == "__main__":

@@ -112,18 +112,9 @@ def jitter_hz(rig: Instrument) -> float:
 def find_direct(
     rig: Instrument, board: Board, words: NDArray[Any], valid: NDArray[np.bool_], setup: BoardSetup | None = None
 ) -> DirectSignal:
-    """Find the direct path in bursts.
+    """Find the direct path in bursts: words int16 [frame, sample, 2, rx], `valid` bool [frame] those received whole.
 
-    Parameters
-    ----------
-    rig, board
-        The rig file, and one of its receiving boards.
-    words
-        int16 [frame, sample, 2, rx], whole bursts.
-    valid
-        bool [frame]: frames received whole.
-    setup
-        Setup of the board, if it exists already.
+    `setup` is that of the board, if it exists already.
     """
     setup, chirp = setup or BoardSetup.of(rig, board), rig.chirp
     shape = (len(words) // setup.pulses, setup.pulses)
@@ -176,10 +167,7 @@ def _power(
 def fit_start(source: RawSource, board_name: str) -> BoardStart:
     """Estimate the start offset of a board from the IF of its direct path.
 
-    Raises
-    ------
-    DataError
-        if too few chirps have a direct path; the error gives the offset from geometry alone.
+    Raises DataError if too few chirps have a direct path; the error gives the offset from geometry alone.
     """
     rig = source.instrument
     board = rig.by_name(board_name)
@@ -223,19 +211,9 @@ MIN_SNR = 20.0  # per bin, power ratio
 
 
 def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
-    """Fit the high-pass filter of a board to a sweep of start frequencies.
+    """Fit the high-pass filter of a receiving board to scans of one scene at different start frequencies.
 
-    Parameters
-    ----------
-    scans
-        Scans of the same scene at different start frequencies of the receivers.
-    board_name
-        A receiving board.
-
-    Raises
-    ------
-    DataError
-        if the direct path is not found, or the sweep does not determine the corners.
+    Raises DataError if the direct path is not found, or the sweep does not determine the corners.
     """
     setups: dict[str, BoardSetup] = {}
     found = [_power_of_scan(scan, scan.instrument.by_name(board_name), setups) for scan in scans]

@@ -186,10 +186,7 @@ def places_crc32(rig: Instrument) -> str:
 def write_calibration(file: CalibrationFile, out: Path) -> Path:
     """Write a file with a dated name, `<kind>-<time>.toml`, and return its path. Never overwrites a file.
 
-    Raises
-    ------
-    DeviceError
-        if the file cannot be written.
+    Raises DeviceError if the file cannot be written.
     """
     stamp = datetime.fromisoformat(file.made_utc).strftime("%Y%m%dT%H%M%SZ")
     try:
@@ -215,10 +212,7 @@ def write_calibration(file: CalibrationFile, out: Path) -> Path:
 def read_calibration(path: Path, kind: type[F], name: str) -> F:
     """Read a calibration file of the kind `name`.
 
-    Raises
-    ------
-    ConfigError
-        if it is missing, of another kind, or of a later format.
+    Raises ConfigError if it is missing, of another kind, or of a later format.
     """
     table = read_toml(path)
     if table.get("kind") != name:
@@ -295,10 +289,7 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
 def read_metal(file: MetalFile, images: Path) -> PlaneReference:
     """Read the metal reference from a calibration file and its images, with sub-bands.
 
-    Raises
-    ------
-    DataError
-        if the images are missing or do not belong to the file.
+    Raises DataError if the images are missing or do not belong to the file.
     """
     if not images.is_file() or f"{zlib.crc32(images.read_bytes()):08x}" != file.images_crc32:
         raise DataError(
@@ -325,7 +316,6 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
 
 
 FOLDER = "calibration"
-FACT = "calibration"
 
 
 @dataclass(frozen=True)
@@ -340,10 +330,8 @@ class Calibration:
     def rig(self, rig: Instrument) -> Instrument:
         """Return the rig with boards and object plane at their measured positions.
 
-        Raises
-        ------
-        ConfigError
-            if mounts, antennas, object distance or filters of the rig file have changed since the calibration.
+        Raises ConfigError if mounts, antennas, object distance or filters of the rig file have changed since the
+        calibration.
         """
         self._check_filters(rig)
         if self.places is None:
@@ -400,21 +388,9 @@ class Calibration:
 
         Order of precedence: `chosen`, metal in the scene, the calibrated metal reference.
 
-        Parameters
-        ----------
-        rig
-            Calibrated rig of the images.
-        chosen
-            Reference that the user gave.
-        in_scene
-            The user gave the position of metal in the scene.
-        bands
-            Number of imaged sub-bands.
+        `rig` is the calibrated rig of the images; `in_scene`: the user gave the position of metal in the scene.
 
-        Raises
-        ------
-        DataError
-            if the metal plate was imaged with another rig, or without these sub-bands.
+        Raises DataError if the metal plate was imaged with another rig, or without these sub-bands.
         """
         plane, name = chosen, "the metal reference"
         if plane is None and not in_scene:
@@ -472,10 +448,7 @@ def calibration_of_rig(rig: Instrument) -> Calibration:
 def calibration_of_scan(scan: Source) -> Calibration:
     """Load the calibration of a scan: its own copies, or without copies the files that its rig file names.
 
-    Raises
-    ------
-    ConfigError, DataError
-        if a file is invalid, or a copy is missing or was changed.
+    Raises ConfigError or DataError if a file is invalid, or a copy is missing or was changed.
     """
     if not isinstance(scan, ScanFolder):
         return calibration_of_rig(scan.instrument)
@@ -512,10 +485,8 @@ def _recorded(scan: ScanFolder, recorded: Any) -> dict[str, dict[str, str]]:
 def checked_calibration(rig: Instrument, simulated: bool) -> Calibration:
     """Load the calibration files that a rig file names, and check that they can be used for a new scan.
 
-    Raises
-    ------
-    ConfigError, DataError
-        if a file is invalid, belongs to another rig, or comes from simulated data while the scan is not `simulated`.
+    Raises ConfigError or DataError if a file is invalid, belongs to another rig, or comes from simulated data while the
+    scan is not `simulated`.
     """
     calibration = calibration_of_rig(rig)
     placed, reference = calibration.rig(rig), calibration.reference()

@@ -135,18 +135,9 @@ def load_echoes(
 def fit_places(
     echoes: dict[str, BoardEchoes], rig: Instrument, points: list[TargetPoint], prior: Prior = Prior()
 ) -> PlacesFit:
-    """Estimate the positions of boards, plane and target.
+    """Estimate the positions of boards, plane and target, starting from the rig file's, of standard deviation `prior`.
 
-    Parameters
-    ----------
-    echoes
-        From :func:`load_echoes`.
-    rig
-        Positions by the rig file, the starting point.
-    points
-        Points of the target.
-    prior
-        Standard deviations of the rig file's positions.
+    `echoes` are those of :func:`load_echoes`.
     """
     mm = np.array([p.position_mm for p in points])
     centre = np.array(specular_midpoint_m(rig, rig.receivers[0]))

@@ -190,10 +190,7 @@ def analyse(
 
     A scene without patches or without metal is no error; see `metal` and `refused` of the result.
 
-    Raises
-    ------
-    DataError
-        if the image has no valid pixel, or the given metal box or patch number does not exist.
+    Raises DataError if the image has no valid pixel, or the given metal box or patch number does not exist.
     """
     plane = metal.plane
     if plane is not None:

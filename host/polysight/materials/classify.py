@@ -139,14 +139,8 @@ class Voters:
 class PaperKnn(Model):
     """The paper's classifier.
 
-    Parameters
-    ----------
-    channels
-        One of `CHANNELS`; a single channel has no weight to fit.
-    weights
-        Fixed weights; None: they are fitted.
-    thresholds
-        Largest distance of known pixels by material; without an entry there is no limit.
+    Weights are fitted unless they are given; a single one of `CHANNELS` has no weight to fit. `thresholds` are the
+    largest distances of known pixels by material; without an entry there is no limit.
     """
 
     def __init__(
@@ -231,19 +225,10 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     """Fit the paper's three weights and the measure of P.
 
     Every combination of the grid is judged on scans left out; among the combinations within half a percent of the best
-    the one with the most even weights is taken, because extreme weights discard information.
+    the one with the most even weights is taken, because extreme weights discard information. With `channels` "P" only
+    the measure is fitted.
 
-    Parameters
-    ----------
-    samples
-        Pixels of at least two scans.
-    channels
-        "P": only the measure is fitted.
-
-    Raises
-    ------
-    DataError
-        if no material is in two scans: a split by pixel would be too optimistic.
+    Raises DataError if no material is in two scans: a split by pixel would be too optimistic.
     """
     if not samples.shared.any():
         raise DataError(
@@ -398,10 +383,7 @@ class Classifier:
         Incidence angle of the scan, or of several scans of the same patches in their order; required if the library
         has more than one.
 
-    Raises
-    ------
-    DataError
-        if the library is empty, has no patch at an angle, or its fit cannot be read.
+    Raises DataError if the library is empty, has no patch at an angle, or its fit cannot be read.
     """
 
     def __init__(
@@ -454,13 +436,8 @@ class Classifier:
     def scan(self, patches: Sequence[Real], errors: SceneErrors | None = None) -> list[NamedPatch]:
         """Name the patches of one scan, or of several scans of the same patches, together.
 
-        Parameters
-        ----------
-        patches
-            Features of each patch's pixels, [n, 4 * angles] (:func:`polysight.materials.library.feature_matrix`);
-            pixels that are not finite are unknown.
-        errors
-            Errors of the patches by the scan's error budget; None: no errors.
+        `patches` are the features of each patch's pixels, [n, 4 * angles] (:func:`feature_matrix`); pixels that are not
+        finite are unknown. `errors` are those of the patches by the scan's error budget.
         """
         good = [usable(x) for x in patches]
         some = [i for i, g in enumerate(good) if g.any()]
@@ -529,14 +506,8 @@ def add_explanation(
 ) -> NamedPatch:
     """Return the patch with the reason of its name, one sentence for a reader who knows materials.
 
-    Parameters
-    ----------
-    named
-        Result of the classifier.
-    permittivity, covariance
-        eps' - j eps'' of the patch, and [2, 2] of its real and imaginary part; None if it has none.
-    classifier
-        Gives the library's permittivities.
+    `permittivity` is eps' - j eps'' of the patch, `covariance` [2, 2] that of its real and imaginary part; None if it
+    has none. The classifier gives the library's permittivities.
     """
     name = named.verdict
     known, found = classifier.permittivities, _estimate(permittivity, covariance)

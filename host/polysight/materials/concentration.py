@@ -134,19 +134,10 @@ def fit_concentration(
 ) -> ConcentrationResult:
     """Fit a line through a library's patches of known concentration, and judge it with each one left out.
 
-    Parameters
-    ----------
-    library
-        Patches; the concentration is in their names (``"sugar (3.8%)"``) or in `given` (``{"water": 0.0}``).
-    given
-        Name to concentration, percent by weight.
-    confidence
-        Confidence of the intervals.
+    The concentration is in the names of the patches (``"sugar (3.8%)"``) or in `given`, name to percent by weight
+    (``{"water": 0.0}``). `confidence` is that of the intervals.
 
-    Raises
-    ------
-    DataError
-        with fewer than three known concentrations, or patches of several incidence angles.
+    Raises DataError with fewer than three known concentrations, or patches of several incidence angles.
     """
     known = concentrations(library.names, given)
     entries = [e for e in library.entries if e.name in known]
@@ -173,8 +164,7 @@ def fit_concentration(
         test = y == value
         line = Line.through(x[~test], y[~test])
         low, high = line.interval(x[test], confidence)
-        for i, (found, lo, hi) in zip(
-            np.flatnonzero(test), zip(line.percent(x[test]), low, high, strict=True), strict=True
-        ):
-            rows.append(LeftOut(entries[i].name, value, float(found), float(lo), float(hi)))
+        names = [entries[i].name for i in np.flatnonzero(test)]
+        estimates = zip(names, line.percent(x[test]), low, high, strict=True)
+        rows += [LeftOut(name, value, float(percent), float(lo), float(hi)) for name, percent, lo, hi in estimates]
     return ConcentrationResult(Line.through(x, y), tuple(rows))

@@ -225,13 +225,7 @@ _LN_2PI = float(np.log(2 * np.pi))
 
 
 class ErrorDiscriminant(Model):
-    """The discriminant of error sources, see the module's docstring.
-
-    Parameters
-    ----------
-    channels
-        One of `CHANNELS`.
-    """
+    """The discriminant of error sources, see the module's docstring; `channels` is one of `CHANNELS`."""
 
     knows_scans = True
 
@@ -302,11 +296,6 @@ class ErrorDiscriminant(Model):
         q, cost = costs(self._deviations(x) - self.level, self._pixel_covariances())
         best = cost.argmin(axis=1)
         return self.names[best], np.sqrt(q[np.arange(len(x)), best] / self.pixel_level)
-
-    def distance(self, x: Real, names: npt.NDArray) -> Real:
-        """Return the distance of each pixel to the material `names` [n] of any classifier, over the threshold."""
-        q, _ = costs(self._deviations(x) - self.level, self._pixel_covariances())
-        return np.sqrt(q[np.arange(len(x)), np.searchsorted(self.names, names)] / self.pixel_level)
 
     def by_scan(
         self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None

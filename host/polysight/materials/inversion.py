@@ -275,16 +275,7 @@ def invert(seen: Sequence[PatchMeasurement], prior: RigPrior) -> Inversion:
     The standard deviation of brightness is estimated in two steps: the patches' scatter about the first solution
     corrects its prior (mean of a scaled inverse chi-square; Gelman et al., Bayesian Data Analysis, section 2.6).
 
-    Parameters
-    ----------
-    seen
-        The patches without the metal reference.
-    prior
-        Prior of the rig's errors.
-
-    Returns
-    -------
-    Inversion
+    `seen` are the patches without the metal reference.
     """
     first = _Model(seen, prior, prior.brightness_std)
     start = _least_squares(first, np.zeros(_NUISANCES + 2 * first.n))
@@ -430,7 +421,11 @@ class MetalEvidence:
         Limits are from random scenes with and without metal, of common and of very lossy materials
         (see tests/materials/test_metal_evidence.py).
         """
-        return np.inf if self.others == 0 else 1.5 if self.others == 1 else 0.5 if self.others < 6 else -2.0
+        if self.others == 0:
+            return np.inf
+        if self.others == 1:
+            return 1.5
+        return 0.5 if self.others < 6 else -2.0
 
     @property
     def sure(self) -> bool:
@@ -452,14 +447,8 @@ class MetalEvidence:
 def metal_evidence(seen: list[PatchMeasurement], prior: RigPrior, channel_ratio: complex | None) -> MetalEvidence:
     """Compare the explanations of a patch as metal and as a dielectric.
 
-    Parameters
-    ----------
-    seen
-        The other patches, relative to the judged one.
-    prior
-        Prior of the rig.
-    channel_ratio
-        V / H of the patch itself in images referenced to the direct path; None for other images.
+    `seen` are the other patches, relative to the judged one; `channel_ratio` is V / H of the patch itself in images
+    referenced to the direct path, None for other images.
     """
     level = None if channel_ratio is None or not abs(channel_ratio) > 0 else 20 * float(np.log10(abs(channel_ratio)))
     if not seen:

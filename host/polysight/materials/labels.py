@@ -22,7 +22,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from polysight.materials.segment import Box, Mask, Patch, Segmentation, axis_mm, box_mask, make_patch
+from polysight.imaging import Mask
+from polysight.materials.segment import Box, Patch, Segmentation, axis_mm, box_mask, make_patch
 from polysight.store import TRUTH
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -51,10 +52,7 @@ class TruthPlate:
 def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
     """Return the plates in the content of truth.json: name, centre_mm, size_mm, and permittivity or metal each.
 
-    Raises
-    ------
-    DataError
-        if the content is invalid.
+    Raises DataError if the content is invalid.
     """
     try:
         return tuple(_plate(p) for p in truth["plates"])
@@ -97,10 +95,7 @@ def specimen_seed(path: Path) -> int | None:
 def find_truth(folder: Path) -> tuple[Plates, str]:
     """Read the plates of a scan folder's truth.json, if there is one.
 
-    Returns
-    -------
-    plates, note
-        No plates without the file; no plates and the reason, in one line, if the file is invalid.
+    If the file is invalid there are no plates, and the note gives the reason in one line.
     """
     path = folder / TRUTH
     if not path.exists():
@@ -221,10 +216,7 @@ class Labels:
 def read_labels(path: Path) -> Labels:
     """Read a label file; names and boxes are not checked, see :func:`check_labels`.
 
-    Raises
-    ------
-    DataError
-        if the file is missing, not JSON, an entry is not four numbers, or a key is invalid.
+    Raises DataError if the file is missing, not JSON, an entry is not four numbers, or a key is invalid.
     """
     remedy = "correct it, or draw the boxes again: polysight label SCAN"
     try:
@@ -284,7 +276,7 @@ def patches_from_plates(
 ) -> tuple[Segmentation, dict[int, str]]:
     """Return patches at the known plates, and label to name; several plates may have the same name.
 
-    Parameters as of :func:`patches_from_labels`. Raises DataError if a plate has no pixel.
+    Raises DataError if a plate has no pixel.
     """
     boxes = {f"{plate.name} ({n})": plate.box_mm for n, plate in enumerate(plates, 1)}
     found, _ = patches_from_labels(boxes, x_m, y_m, unit="mm", margin_mm=margin_mm)
@@ -298,28 +290,12 @@ def patches_from_labels(
     unit: Literal["pixel", "mm"] = "pixel",
     margin_mm: float = 0.0,
 ) -> tuple[Segmentation, dict[int, str]]:
-    """Make patches of boxes drawn by hand.
+    """Make patches of boxes drawn by hand; return them, and label to name.
 
-    Parameters
-    ----------
-    boxes
-        Name to (x0, y0, x1, y1): pixel indices (end excluded), or millimetres from the image centre.
-    x_m, y_m
-        Pixel centres in metres.
-    unit
-        Unit of the boxes.
-    margin_mm
-        Margin inside the box; hand-drawn boxes usually lie inside the material already.
+    `boxes` are name to (x0, y0, x1, y1): pixel indices (end excluded), or millimetres from the image centre. The
+    margin is inside the box; hand-drawn boxes usually lie inside the material already.
 
-    Returns
-    -------
-    segmentation, names
-        Patches, and label to name.
-
-    Raises
-    ------
-    DataError
-        if a box has no pixel.
+    Raises DataError if a box has no pixel.
     """
     x, y = axis_mm(x_m), axis_mm(y_m)
     labels = np.zeros((y.size, x.size), np.int32)
@@ -354,10 +330,8 @@ _HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]
 def clean_name(text: str, kind: str = "name") -> str:
     """Return a name in Unicode form NFC, with trimmed spaces; `kind` is its description in errors.
 
-    Raises
-    ------
-    DataError
-        if it is empty, longer than `LONGEST_NAME`, has control characters, is a plain number or a reserved word.
+    Raises DataError if it is empty, longer than `LONGEST_NAME`, has control characters, is a plain number or a reserved
+    word.
     """
     name = re.sub(" +", " ", unicodedata.normalize("NFC", text).strip())
     shown = name if len(name) <= 40 else f"{name[:40]}..."
@@ -398,20 +372,10 @@ def image_extent_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Box:
 def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: Mask | None = None) -> Labels:
     """Check labels for training; return them in millimetres, with clean names and the metal box.
 
-    Parameters
-    ----------
-    labels
-        Boxes of an image.
-    x_m, y_m
-        Its axes.
-    valid
-        bool [ny, nx], illuminated pixels; None: all.
+    `x_m` and `y_m` are the axes of the image, `valid` bool [ny, nx] its illuminated pixels (None: all).
 
-    Raises
-    ------
-    DataError
-        if a box is empty, not finite, outside the image or without a valid pixel; if two boxes overlap; if a name is
-        invalid or used twice; if there are several boxes and the metal reference is not known.
+    Raises DataError if a box is empty, not finite, outside the image or without a valid pixel; if two boxes overlap; if
+    a name is invalid or used twice; if there are several boxes and the metal reference is not known.
     """
     given = labels.in_mm(x_m, y_m)
     boxes, extent = {}, image_extent_mm(x_m, y_m)

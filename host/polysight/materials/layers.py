@@ -172,28 +172,13 @@ class Layer:
 
 
 def predict(stack: Sequence[Layer], spectrum: Spectrum, theta_rad: float) -> tuple[Complex, Real]:
-    """Return V / H and |H| of a known stack in each sub-band, relative to metal.
+    """Return V / H complex128 [K] and |H| float64 [K] of a known stack in K sub-bands, relative to metal.
 
     A sub-band's image is the weighted coherent sum over its frequencies: r_s and r_p are averaged before their ratio.
+    Layers stand in the order the wave meets them; air follows the last unless it is a half space. `theta_rad` is the
+    incidence angle in air.
 
-    Parameters
-    ----------
-    stack
-        Layers in the order the wave meets them; air follows the last unless it is a half space.
-    spectrum
-        Frequencies of K sub-bands.
-    theta_rad
-        Incidence angle in air.
-
-    Returns
-    -------
-    inverse_ratio : complex128 [K]
-    amplitude_h : float64 [K]
-
-    Raises
-    ------
-    PolysightError
-        if a layer is unknown, or one before the last has no thickness.
+    Raises PolysightError if a layer is unknown, or one before the last has no thickness.
     """
     unknown = [layer.name for layer in stack if layer.permittivity is None]
     if unknown:
@@ -342,21 +327,8 @@ def fit_layer(
 ) -> LayerFit:
     """Fit the permittivity of the one layer whose permittivity is None, and its thickness if a range is given.
 
-    Parameters
-    ----------
-    bands
-        The measurement.
-    stack
-        Layers in the order the wave meets them, exactly one of unknown permittivity.
-    theta_rad
-        Incidence angle in air.
-    thickness_range_m
-        Range for fitting the unknown layer's thickness; None: the layer's own `thickness_m` or `thickness_range_m`.
-
-    Returns
-    -------
-    LayerFit
-        The best solution with its error bars; see `ambiguous`, `rivals` and `warnings()`.
+    The result is the best solution with its error bars; see its `ambiguous`, `rivals` and `warnings()`. `theta_rad` is
+    the incidence angle in air; `thickness_range_m` replaces the layer's own `thickness_m` or `thickness_range_m`.
 
     Raises
     ------

@@ -12,7 +12,7 @@ import json
 import os
 import zipfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -131,23 +131,6 @@ class Library:
         """True if any entry was simulated."""
         return any(e.simulated for e in self.entries)
 
-    def select(self, scans: Iterable[str]) -> Library:
-        """Return the entries of these scans, without the fit."""
-        wanted = set(scans)
-        return Library(tuple(e for e in self.entries if e.scan in wanted), {}, self.note)
-
-    def pixels(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.complex128]]:
-        """Return |H|, |V| and P of all pixels, [n] each, entry after entry."""
-        return (
-            np.concatenate([e.h for e in self.entries]).astype(np.float64),
-            np.concatenate([e.v for e in self.entries]).astype(np.float64),
-            np.concatenate([e.p for e in self.entries]).astype(np.complex128),
-        )
-
-    def of_pixels(self, key: str) -> npt.NDArray:
-        """Return an attribute of each pixel's entry (`name` or `scan`), [n]."""
-        return np.concatenate([np.full(e.h.size, getattr(e, key)) for e in self.entries])
-
     def save(self, path: Path) -> None:
         """Write the library; an existing file is replaced once the new one is complete."""
         entries = [
@@ -174,10 +157,7 @@ class Library:
     def load(path: Path) -> Library:
         """Read a library.
 
-        Raises
-        ------
-        DataError
-            if the file is missing, no library, of another format version, damaged, or has pickled objects.
+        Raises DataError if the file is missing, no library, of another format version, damaged, or has pickled objects.
         """
         bad = f"{path}: not a material library"
         try:

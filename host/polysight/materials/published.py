@@ -44,15 +44,12 @@ _ALLOWED = {
     ("numpy", "dtype"),
     ("builtins", "complex"),
     ("_codecs", "encode"),
-    *(
-        (module, name)
-        for module, names in {
-            "multiarray": ("_reconstruct", "scalar"),
-            "numeric": ("_frombuffer",),
-        }.items()
-        for name in names
-        for module in (f"numpy.core.{module}", f"numpy._core.{module}")
-    ),
+    ("numpy.core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy.core.multiarray", "scalar"),
+    ("numpy._core.multiarray", "scalar"),
+    ("numpy.core.numeric", "_frombuffer"),
+    ("numpy._core.numeric", "_frombuffer"),
 }
 
 
@@ -106,10 +103,7 @@ class LabelledScan:
 def read_labelled_scan(folder: Path) -> LabelledScan:
     """Read `labels/<scan>`.
 
-    Raises
-    ------
-    DataError
-        if a file is missing or invalid.
+    Raises DataError if a file is missing or invalid.
     """
     file = folder / f"{folder.name}.json"
     if not file.exists():
@@ -170,17 +164,9 @@ def image_orientation(scans: Sequence[LabelledScan]) -> str:
 def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
     """Return library entries of a labelled scan, each box relative to the scan's metal; leakage is not removed.
 
-    Parameters
-    ----------
-    scan
-        In the right orientation.
-    angle_deg
-        Incidence angle.
+    The scan is in the right orientation.
 
-    Raises
-    ------
-    DataError
-        if no box is of metal, or a box holds no pixel.
+    Raises DataError if no box is of metal, or a box holds no pixel.
     """
     if scan.metal is None:
         raise DataError(
@@ -244,10 +230,7 @@ class _Restricted(pickle.Unpickler):
 def read_pickle(path: Path) -> Any:
     """Read a pickle of arrays and plain types.
 
-    Raises
-    ------
-    DataError
-        if the file is missing, damaged, or would call anything but numpy's array constructors.
+    Raises DataError if the file is missing, damaged, or would call anything but numpy's array constructors.
     """
     try:
         return _Restricted(io.BytesIO(read_bounded(path, _MAX_BYTES))).load()
@@ -278,10 +261,7 @@ def read_material(path: Path) -> Entry:
     `values` and `ref_values` are [P, H, V]; P is divided by the reference's mean P, H and V by the root mean square
     of its amplitudes (Eq. 8 and 9 of the paper).
 
-    Raises
-    ------
-    DataError
-        as :func:`read_pickle`, or if keys are missing or arrays are invalid.
+    Raises DataError as :func:`read_pickle`, or if keys are missing or arrays are invalid.
     """
     raw, most = read_pickle(path), path.stat().st_size
     try:

@@ -16,11 +16,11 @@ import numpy.typing as npt
 import scipy
 import skimage
 
-from polysight.imaging import Images
+from polysight.imaging import Image, Images, Mask
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
-Mask = npt.NDArray[np.bool_]
+Real = npt.NDArray[np.float64]
 Box = tuple[float, float, float, float]
 _LEAST_WEIGHT = 0.1  # dB
 _TURNS = 3  # thresholds: metal, dielectrics, the dimmest
@@ -80,7 +80,7 @@ class Patch:
 
     label: int
     box_mm: Box
-    outline_mm: npt.NDArray[np.float64]
+    outline_mm: Real
     pixels: int
     mask: Mask
     interior: Mask
@@ -100,7 +100,7 @@ class Segmentation:
     patches: tuple[Patch, ...]
 
 
-def axis_mm(axis_m: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def axis_mm(axis_m: npt.ArrayLike) -> Real:
     """Convert an image axis to millimetres from the image centre."""
     a = np.asarray(axis_m, np.float64)
     return (a - (a[0] + a[-1]) / 2) * 1e3
@@ -138,7 +138,7 @@ def make_patch(
     return Patch(label, box, skimage.measure.approximate_polygon(outline, pixel / 2), int(mask.sum()), mask, interior)
 
 
-def level_db(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating], usable: Mask, smooth_px: float):
+def level_db(h: Image, v: Image, usable: Mask, smooth_px: float) -> Real:
     """Return the smoothed level of the stronger channel, dB below that channel's brightest, float64 [ny, nx].
 
     Each channel is scaled by its brightest part, so that an unknown gain between H and V has no effect. The larger of
@@ -154,8 +154,8 @@ def level_db(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloati
 
 
 def segment(
-    h: npt.NDArray[np.complexfloating],
-    v: npt.NDArray[np.complexfloating],
+    h: Image,
+    v: Image,
     x_m: npt.ArrayLike,
     y_m: npt.ArrayLike,
     valid: Mask | None = None,
@@ -168,26 +168,10 @@ def segment(
     so that a dim plate touching the skirt of a bright one is found. All is repeated on the pixels away from the found
     patches until bright and dark cannot be separated.
 
-    Parameters
-    ----------
-    h, v
-        complex [ny, nx], footprint-flattened; their gains may differ.
-    x_m, y_m
-        Pixel centres in metres, evenly spaced.
-    valid
-        bool [ny, nx], pixels to use; None: all finite ones.
-    settings
-        None: the defaults.
+    `h` and `v` complex [ny, nx] are flattened by the footprint; their gains may differ. `valid` bool [ny, nx] are the
+    pixels to use, None all finite ones. The result has no patches if bright and dark cannot be separated.
 
-    Returns
-    -------
-    Segmentation
-        without patches if bright and dark cannot be separated.
-
-    Raises
-    ------
-    DataError
-        if shapes differ or no pixel is valid.
+    Raises DataError if shapes differ or no pixel is valid.
     """
     cfg = settings or SegmentSettings()
     if h.shape != v.shape or h.shape != (np.size(y_m), np.size(x_m)):
@@ -212,7 +196,7 @@ def segment(
     return Segmentation(labels, tuple(patches))
 
 
-def _reading_order(mask: Mask, y_mm: npt.NDArray[np.float64], row_pitch_mm: float) -> tuple[float, float]:
+def _reading_order(mask: Mask, y_mm: Real, row_pitch_mm: float) -> tuple[float, float]:
     """Sort key of a patch: top row first, then from left to right."""
     rows, cols = np.nonzero(mask)
     return -round(float(y_mm[rows].mean()) / row_pitch_mm), float(cols.mean())
@@ -231,15 +215,13 @@ def whole_plane(usable: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm:
     return Segmentation(usable.astype(np.int32), (patch,))
 
 
-def _without_speckle(
-    level: npt.NDArray[np.float64], usable: Mask, cfg: SegmentSettings, pixel_mm: float
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _without_speckle(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> tuple[Real, Real]:
     """Return the level after total variation, dB: with the weight for the bright plates' speckle, and a medium weight.
 
     The second is for the remaining dim plates: they have more speckle than bright ones, and no bright neighbour.
     """
 
-    def even(weight: float) -> npt.NDArray[np.float64]:
+    def even(weight: float) -> Real:
         return np.asarray(skimage.restoration.denoise_tv_chambolle(level, weight=weight, max_num_iter=100))
 
     strongest = even(cfg.speckle_db)
@@ -255,9 +237,7 @@ def _without_speckle(
     return even(min(cfg.speckle_db, max(speckle, _LEAST_WEIGHT))), even(cfg.speckle_db / 2)
 
 
-def _regions(
-    levels: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]], usable: Mask, cfg: SegmentSettings, pixel_mm: float
-) -> list[Mask]:
+def _regions(levels: tuple[Real, Real], usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> list[Mask]:
     """Return the masks of all patches, bright ones first."""
     radius = max(1, round((cfg.smallest_mm / pixel_mm - 1) / 2))
     around = np.asarray(skimage.morphology.disk(max(1, round(cfg.margin_mm / pixel_mm))), bool)
@@ -280,7 +260,7 @@ def _regions(
     return found
 
 
-def _separate(level: npt.NDArray[np.float64], bright: Mask, least_contrast_db: float) -> bool:
+def _separate(level: Real, bright: Mask, least_contrast_db: float) -> bool:
     """Return true if bright and dark are two classes, far enough apart, and not one class cut in two.
 
     Otsu also splits a single normal distribution, with 2/pi = 0.64 of the variance between the halves. One small patch
@@ -292,7 +272,7 @@ def _separate(level: npt.NDArray[np.float64], bright: Mask, least_contrast_db: f
     return gap >= least_contrast_db and two
 
 
-def _cut(amplitude: npt.NDArray[np.float64], mask: Mask, radius: int) -> list[Mask]:
+def _cut(amplitude: Real, mask: Mask, radius: int) -> list[Mask]:
     """Return the connected regions of a mask, each cut at half of its own amplitude."""
     disk = np.asarray(skimage.morphology.disk(radius), bool)
     skirt = np.asarray(skimage.morphology.disk(radius + 1), bool)

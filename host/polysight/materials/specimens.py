@@ -67,16 +67,7 @@ def features(permittivity: npt.ArrayLike, angles_rad: Sequence[float]) -> tuple[
 def effect(t: Complex, angles_rad: Sequence[float]) -> Real:
     """Return the derivatives of ln|H|, ln|V| and arg P of a material by ln eps' and ln eps'', [3 * angles, 2].
 
-    Parameters
-    ----------
-    t
-        complex128 [angles], V / H of the material.
-    angles_rad
-        Its incidence angles.
-
-    Returns
-    -------
-    Zero for metal, and if the angles are not known.
+    `t` complex128 [angles] is its V / H. Zero for metal, and if the angles are not known.
     """
     if len(angles_rad) != len(t) or not np.isfinite(t).all() or bool((np.abs(t - 1) < METAL_SPECIMENS).any()):
         return np.zeros((3 * len(t), 2))
@@ -122,25 +113,14 @@ def fit_spread(
 
     A patch's residual is `F_m s + u`: s is the specimen's deviation, equal in all its patches, u the placement's.
 
-    Parameters
-    ----------
-    residuals
-        float64 [patches, d]: patch means minus their material's mean.
-    material, specimen
-        Numbers for each patch; specimens are numbered over all materials.
-    effects
-        float64 [materials, d, 2], of :func:`effect`.
-    noise
-        float64 [d, d], covariance to start from.
-    gains_alike
-        True if the features are ln|H|, ln|V|, arg P of each angle, with equal gain errors of H and V (:func:`alike`).
+    `residuals` [patches, d] are patch means minus their material's mean, `material` and `specimen` the numbers of each
+    patch (specimens are numbered over all materials), `effects` [materials, d, 2] those of :func:`effect`, `noise`
+    [d, d] the covariance to start from. With `gains_alike` the features are ln|H|, ln|V|, arg P of each angle, with
+    equal gain errors of H and V (:func:`alike`).
 
-    Returns
-    -------
-    spread : float64 [materials, 2], variances of ln eps' and ln eps''
-        The spread of all materials together, with the published spread as prior, corrected by each material's own. A
-        material with a single specimen is ignored.
-    placement : float64 [d, d]
+    Return the variances of ln eps' and ln eps'' of each material, [materials, 2], and the covariance of placements,
+    [d, d]. The spread is that of all materials together, with the published spread as prior, corrected by each
+    material's own. A material with a single specimen is ignored.
     """
     one = np.array([np.unique(specimen[material == k]).size < 2 for k in range(len(effects))])
     telling = ~one & (np.abs(effects).max(axis=(1, 2), initial=0) > 0)
@@ -206,14 +186,8 @@ _PRIOR = 1 / (np.log(REAL_RANGE[1] / REAL_RANGE[0]) * np.arcsinh(LOSS_RANGE[1] /
 def cost_of_none(log_h: Real, t: Complex, covariances: Real, angles_rad: Sequence[float]) -> Real:
     """Return minus twice the log likelihood of each patch as any half space.
 
-    Parameters
-    ----------
-    log_h, t
-        ln|H| and V / H of the patches, [patch, angles].
-    covariances
-        float64 [patch, 3 * angles, 3 * angles] of their ln|H|, ln|V|, arg P, without the specimens' spread.
-    angles_rad
-        Incidence angles.
+    `log_h` and `t` [patch, angles] are ln|H| and V / H of the patches, `covariances` [patch, 3 * angles, 3 * angles]
+    those of their ln|H|, ln|V|, arg P, without the specimens' spread.
     """
     inverse = np.asarray(np.linalg.inv(covariances), np.float64)
     constant = np.linalg.slogdet(covariances)[1] + covariances.shape[1] * np.log(2 * np.pi)

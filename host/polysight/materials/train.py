@@ -97,10 +97,7 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
 
     Every group is a fold of its own if `folds` could put all groups of a material into one fold.
 
-    Raises
-    ------
-    DataError
-        with fewer than two groups, or without a material in two groups.
+    Raises DataError with fewer than two groups, or without a material in two groups.
     """
     from sklearn.model_selection import GroupKFold, StratifiedKFold
 
@@ -133,21 +130,10 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
 def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool = False, folds: int = FOLDS) -> Score:
     """Judge a model by cross-validation.
 
-    Parameters
-    ----------
-    samples
-        Pixels.
-    model, channels
-        A key of `MODELS`, one of `CHANNELS`.
-    by_pixel
-        Split by pixel instead of by group: optimistic, see the module's docstring.
-    folds
-        Largest number of folds.
+    `model` is a key of `MODELS`, `channels` one of `CHANNELS`. With `by_pixel` the split is by pixel instead of by
+    group: optimistic, see the module's docstring. `folds` is the largest number of folds.
 
-    Raises
-    ------
-    DataError
-        with fewer than two groups, or without a material in two groups.
+    Raises DataError with fewer than two groups, or without a material in two groups.
     """
     alone, in_scan, of_patch = (np.empty_like(samples.names) for _ in range(3))
     unknown, learnt = np.zeros((2, samples.names.size), bool)
@@ -195,15 +181,6 @@ def _confusion(true: npt.NDArray, found: npt.NDArray, names: npt.NDArray) -> Rea
     return table / np.maximum(table.sum(axis=1, keepdims=True), 1)
 
 
-def best_model(samples: Samples) -> tuple[str, tuple[Score, ...]]:
-    """Return the name of the best model with whole groups left out, and the scores of all models.
-
-    The criterion is the mean of the pixels' and of the patches' share.
-    """
-    scores = tuple(score(samples, model) for model in MODELS)
-    return max(scores, key=lambda s: s.pixels + s.patches).model, scores
-
-
 def score_unseen_materials(samples: Samples, model: str) -> dict[str, float]:
     """Return the share of each material's patches that are called unknown if it is left out of the training data.
 
@@ -228,10 +205,7 @@ def score_unseen_materials(samples: Samples, model: str) -> dict[str, float]:
 def fit_library(library: Library) -> Library:
     """Return the library with its fit, for each incidence angle and for all together.
 
-    Raises
-    ------
-    DataError
-        with fewer than two scans of an angle: a split by pixel would be too optimistic.
+    Raises DataError with fewer than two scans of an angle: a split by pixel would be too optimistic.
     """
     samples = {f"{angle:g}": Samples.of(library.at(angle), PIXELS) for angle in library.angles_deg}
     fits = {angle: fit_samples(of) for angle, of in samples.items()}
@@ -336,10 +310,7 @@ def entries_of(scan: TrainingScan) -> list[Entry]:
 def make_library(scans: Iterable[TrainingScan], note: str = "") -> Library:
     """Make a library of several scans, with its fit.
 
-    Raises
-    ------
-    DataError
-        with no patch of known material, or fewer than two scans with one.
+    Raises DataError with no patch of known material, or fewer than two scans with one.
     """
     entries = [e for scan in scans for e in entries_of(scan)]
     if not entries:

@@ -78,17 +78,7 @@ def metal_gains(h: Image, v: Image, metal_mask: Mask) -> tuple[complex, complex]
     The gain of V is real: only the phase of the ratio is referenced, for the phase of H and V alone is that of the
     distance (Eq. 7).
 
-    Parameters
-    ----------
-    h, v
-        complex [ny, nx], the two channels.
-    metal_mask
-        bool [ny, nx], the inside of a metal region.
-
-    Raises
-    ------
-    DataError
-        if the region is empty, not finite or dark.
+    `metal_mask` bool [ny, nx] is the inside of a metal region. Raises DataError if it is empty, not finite or dark.
     """
     if metal_mask.shape != h.shape or h.shape != v.shape:
         raise DataError(
@@ -145,10 +135,7 @@ def correct_leakage(h: Image, v: Image, leak_hv: complex, leak_vh: complex) -> t
         Amplitude of p in H and of s in V, complex or real; the published rig has about 0.05 to 0.1.
         `leak_hv = leak_vh = axial ratio` is the one-parameter correction of the paper's authors.
 
-    Raises
-    ------
-    PolysightError
-        if |leakage| is not below 1.
+    Raises PolysightError if |leakage| is not below 1.
     """
     a, b = leak_hv, leak_vh
     if not (abs(a) < 1 and abs(b) < 1):
@@ -296,21 +283,10 @@ def plane_reference(
     Amplitudes and H conj(V) are averaged over a Gaussian window, so a common phase of both channels (distance and tilt
     of the plate) has no influence. A pixel is valid if both channels exceed `floor_db` within two widths of the window.
 
-    Parameters
-    ----------
-    images
-        Both channels, flattened by the footprint.
-    smooth_mm
-        Width (standard deviation) of the window, millimetres; the gains vary slowly, speckle does not.
-    floor_db
-        Lowest level relative to the plate's 90th percentile, in each channel.
-    name
-        Name of the scan, for the report.
+    The window has the width (standard deviation) `smooth_mm`: the gains vary slowly, speckle does not. `floor_db` is
+    the lowest level relative to the plate's 90th percentile, in each channel; `name` is the scan, for the report.
 
-    Raises
-    ------
-    DataError
-        if the image shows no metal.
+    Raises DataError if the image shows no metal.
     """
     h, v, usable = images.h, images.v, images.usable
     smooth_px = smooth_mm / 1e3 / abs(float(images.x_m[1] - images.x_m[0]))
@@ -398,10 +374,7 @@ def strips_wave(psi_rad: float, theta_rad: float) -> Wave:
     With the signs of Eq. 2: -w (w_s + w_p) / |w|^2 with w = (cos psi, sin psi cos theta), so that strips along the
     field reflect like a plate.
 
-    Raises
-    ------
-    PolysightError
-        if TX's field is across the strips (w_s = -w_p), which then reflect nothing.
+    Raises PolysightError if TX's field is across the strips (w_s = -w_p), which then reflect nothing.
     """
     w = np.array([np.cos(psi_rad), np.sin(psi_rad) * np.cos(theta_rad)])
     total = float(w.sum())
@@ -421,10 +394,7 @@ def common_direction(h: Image, v: Image, mask: Mask | None = None) -> Wave:
 
     A common phase or amplitude of both channels may vary from pixel to pixel.
 
-    Raises
-    ------
-    DataError
-        if there is no signal.
+    Raises DataError if there is no signal.
     """
     at = np.isfinite(h) & np.isfinite(v) & (True if mask is None else mask)
     m = np.stack([h[at], v[at]]).astype(np.complex128)
@@ -443,10 +413,7 @@ def common_direction(h: Image, v: Image, mask: Mask | None = None) -> Wave:
 def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
     """Estimate leakage of both boards and gain imbalance from three or more metal standards.
 
-    Raises
-    ------
-    DataError
-        if there are fewer than three, or their waves are too similar.
+    Raises DataError if there are fewer than three, or their waves are too similar.
     """
     if len(standards) < 3:
         raise DataError(
@@ -518,10 +485,7 @@ def leakage_from_images(
     Leakage
         The imbalance is that of the plate's mean.
 
-    Raises
-    ------
-    DataError
-        as :func:`estimate_leakage`.
+    Raises DataError as :func:`estimate_leakage`.
     """
     gain_h, gain_v = plate
     relative = [

@@ -188,11 +188,8 @@ def multilayer(
     r_s, r_p
         complex128, broadcast shape, phase referred to the front surface, signs of Eq. 2.
 
-    Raises
-    ------
-    PolysightError
-        if the numbers of permittivities and thicknesses do not fit, or a thickness is negative, or infinite before the
-        last medium.
+    Raises PolysightError if the numbers of permittivities and thicknesses do not fit, or a thickness is negative, or
+    infinite before the last medium.
     """
     media, layers = _stack(eps, thickness_m)
     theta = np.asarray(theta_rad, np.float64)

@@ -12,19 +12,19 @@ from tests.support.rigs import programmed_rig
 from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
 from polysight.capture.network import route_interface
 from polysight.cli.main import main
-from polysight.doctor import checks, kernel
+from polysight.doctor import checks, machine
 from polysight.doctor.check_capture import check_network
 from polysight.doctor.check_host import (
     check_calibration,
     check_disk,
     check_host_clock,
+    check_keys,
     check_receivers,
     check_time,
 )
-from polysight.doctor.check_pi import check_keys
 from polysight.doctor.checks import CHECKS, run_checks
 from polysight.doctor.context import CheckContext, DoctorOptions, System, error, ok
-from polysight.doctor.receiver_load import LoadResult, measure_receivers
+from polysight.doctor.machine import LoadResult, measure_receivers
 from polysight_shared.messages import GPIOD, WIRES, HelloReply
 from polysight_shared.sockets import HOST_KEYS
 from polysight_shared.tables import to_builtins
@@ -49,11 +49,11 @@ def test_a_burst_that_does_not_fit_between_two_points(tmp_path):
     path.write_text(tomli_w.dumps(to_builtins(programmed_rig(stage={"speed_mm_s": 200.0, "accel_mm_s2": 2000.0}))))
     with CheckContext(DoctorOptions(path), QUICK) as context:
         found = next(run_checks(context))
-    assert (found.check, found.verdict) == ("config", "error")
+    assert (found.where, found.level) == ("config", "error")
 
 
 def verdict_of(context, name):
-    return checks._run_check(next(c for c in CHECKS if c.name == name), context, None).verdict
+    return checks._run_check(next(c for c in CHECKS if c.name == name), context, None).level
 
 
 def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
@@ -61,7 +61,7 @@ def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
     file = FilterFile(**header("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board, "RV": board})
     context = context_of(programmed_rig(calibration={"hpf": str(write_calibration(file, tmp_path))}))
     hello = HelloReply(pi_release="", firmware="", backend=WIRES, state="homed", scan_id="", last_seq=0)
-    assert check_calibration(dataclasses.replace(context, hello=hello)).verdict == "ok"
+    assert check_calibration(dataclasses.replace(context, hello=hello)).level == "ok"
     real = msgspec.structs.replace(hello, backend=GPIOD)
     assert verdict_of(dataclasses.replace(context, hello=real), "calibration") == "error"
     assert verdict_of(context_of(programmed_rig(calibration={"hpf": "/nowhere.toml"})), "calibration") == "error"
@@ -76,7 +76,7 @@ def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
     ],
 )
 def test_a_lost_clock_is_an_error_and_an_unsynchronised_one_a_warning(system, verdict):
-    assert check_host_clock(context_of(system=system)).verdict == verdict
+    assert check_host_clock(context_of(system=system)).level == verdict
 
 
 @pytest.mark.parametrize(("mode", "verdict"), [(0o600, "ok"), (0o640, "warning"), (None, "error")])
@@ -85,25 +85,25 @@ def test_the_secret_key_must_be_there_and_for_its_user_alone(tmp_path, mode, ver
         (tmp_path / name).touch(mode)
         (tmp_path / name).chmod(mode)
     addresses = {"command_address": "tcp://192.0.2.1:5601", "event_address": "tcp://192.0.2.1:5602"}
-    assert check_keys(context_of(programmed_rig(pi=addresses | {"key_dir": str(tmp_path)}))).verdict == verdict
+    assert check_keys(context_of(programmed_rig(pi=addresses | {"key_dir": str(tmp_path)}))).level == verdict
 
 
 def test_the_kernel_reports_if_its_clock_is_synchronised():
-    assert kernel.clock_is_synchronised() in (True, False, None)
+    assert machine.clock_is_synchronised() in (True, False, None)
 
 
 def test_a_full_disk_and_a_slow_one(tmp_path):
-    assert check_disk(context_of(programmed_rig(limits={"free_disk_bytes": 1 << 60}), tmp_path)).verdict == "error"
+    assert check_disk(context_of(programmed_rig(limits={"free_disk_bytes": 1 << 60}), tmp_path)).level == "error"
     small = programmed_rig(limits={"free_disk_bytes": 0}, grid={"rows": 2})
     rate = check_disk(context_of(small, tmp_path)).facts["scan_bytes_s"]
     for factor, verdict in ((0.5, "error"), (1.5, "warning"), (3.0, "ok")):
         system = System(write_speed=lambda _folder, speed=factor * rate: speed)
-        assert check_disk(context_of(small, tmp_path / "not" / "yet", system)).verdict == verdict
+        assert check_disk(context_of(small, tmp_path / "not" / "yet", system)).level == verdict
 
 
 def test_the_disk_probe_leaves_nothing_behind(tmp_path, monkeypatch):
-    monkeypatch.setattr(kernel, "_PROBE_BYTES", 2 << 20)
-    assert kernel.write_speed(tmp_path) > 0
+    monkeypatch.setattr(machine, "_PROBE_BYTES", 2 << 20)
+    assert machine.write_speed(tmp_path) > 0
     assert list(tmp_path.iterdir()) == []
 
 
@@ -139,8 +139,8 @@ def kernel_root(tmp_path, mtu=1500, speed=1000, lost=0):
 )
 def test_an_unsuitable_network_interface_is_a_warning_and_unknown_values_are_ok(tmp_path, interface, verdict):
     found = check_network(context_of(RIG, system=kernel_root(tmp_path, **interface)), RIG.by_name("RH"))
-    assert found.verdict == verdict
-    assert "eth7" in found.found
+    assert found.level == verdict
+    assert "eth7" in found.what
 
 
 def test_every_need_is_a_check_before_it():
@@ -176,9 +176,9 @@ def simulated_checks(failing):
 )
 def test_only_checks_that_depend_on_a_failed_one_are_skipped(monkeypatch, failing, skipped):
     monkeypatch.setattr(checks, "CHECKS", simulated_checks(failing))
-    findings = {f.check: f for f in run_checks(CheckContext(DoctorOptions(Path("x"))))}
-    assert {name for name, f in findings.items() if f.verdict == "not checked"} == skipped
-    assert all(failing in findings[name].found for name in skipped)
+    findings = {f.where: f for f in run_checks(CheckContext(DoctorOptions(Path("x"))))}
+    assert {name for name, f in findings.items() if f.level == "note"} == skipped
+    assert all(failing in findings[name].what for name in skipped)
 
 
 @pytest.mark.parametrize(("lost", "verdict"), [((0, 0, 0), "ok"), ((0, 0, 50), "ok"), ((0, 5, 50), "warning")])
@@ -189,8 +189,8 @@ def test_receivers_must_keep_up_with_the_configured_rate_of_the_cards(tmp_path, 
         return [LoadResult(r, r, 100, n) for r, n in zip(rates, lost, strict=True)], "nice -5"
 
     finding = check_receivers(context_of(programmed_rig(), tmp_path, System(measure_receivers=measure)))
-    assert finding.verdict == verdict
-    assert ("50.0 %" in finding.found) == bool(lost[2])
+    assert finding.level == verdict
+    assert ("50.0 %" in finding.what) == bool(lost[2])
 
 
 def test_the_receivers_are_measured_with_packets_at_each_rate():

@@ -36,13 +36,13 @@ def with_frames(words, **row):
 def test_a_direct_path_at_the_expected_if_is_ok():
     for name in ("RH", "RV"):
         found = judged(name)
-        assert found.verdict == "ok", found
+        assert found.level == "ok", found
         assert found.facts["heard"] == FRAMES
 
 
 def test_a_missing_direct_path_is_an_error():
     found = judged(direct_loss_db=60.0)
-    assert found.verdict == "error"
+    assert found.level == "error"
     assert "if_hz" not in found.facts
 
 
@@ -50,7 +50,7 @@ def test_a_missing_direct_path_is_an_error():
 def test_a_direct_path_beyond_the_band_is_an_error_with_a_better_start_offset(offset_hz):
     rig = programmed_rig(offset_hz)
     found = judged("RH", rig)
-    assert found.verdict == "error"
+    assert found.level == "error"
     unshifted = programmed_rig(0.0)
     middle = 0.45 * RIG.chirp.sample_rate_hz - direct_if_hz(unshifted, unshifted.by_name("RH"))
     assert offset_in(found) == pytest.approx(middle, abs=1e3)
@@ -58,19 +58,19 @@ def test_a_direct_path_beyond_the_band_is_an_error_with_a_better_start_offset(of
 
 def offset_in(finding):
     """The start_offset_hz that the remedy gives."""
-    return float(finding.remedy.split("= ")[1].split(" ")[0])
+    return float(finding.do.split("= ")[1].split(" ")[0])
 
 
 def test_a_direct_path_at_the_edge_of_the_band_is_an_error():
     found = judged("RH", RIG, if_offset_hz=-850e3)
-    assert found.verdict == "error"
+    assert found.level == "error"
     assert offset_in(found) == pytest.approx(RIG.by_name("RH").start_offset_hz + 850e3, abs=100e3)
 
 
 def test_another_start_frequency_than_in_the_rig_file_is_recovered():
     """The board was programmed 490 kHz higher than the rig file says; its crystal's share is removed."""
     found = judged("RH", programmed_rig(300e3), if_offset_hz=490e3, crystal_ppm={"receive_h": 1.5})
-    assert found.verdict == "warning"
+    assert found.level == "warning"
     assert offset_in(found) == pytest.approx(790e3, abs=5 * 2.1e-9 / 32**0.5 * 38.8e12)
 
 
@@ -79,7 +79,7 @@ def test_trigger_skew_between_the_boards_is_recovered(skew_ns, verdict):
     skew = {"sync_skew_ns": {"receive_h": 1.0 - skew_ns / 2, "receive_v": 1.0 + skew_ns / 2}}
     found = judge_skew(RIG, {name: signal_of(name, **skew) for name in ("RH", "RV")})
     assert found.facts["skew_ns"] == pytest.approx(skew_ns, abs=5 * found.facts["standard_error_ns"])
-    assert found.verdict == verdict
+    assert found.level == verdict
     assert found.facts["later_ns"]["RH"] == pytest.approx(1.0 - skew_ns / 2, abs=2.5)
 
 
@@ -92,19 +92,19 @@ def test_a_crystal_and_a_late_trigger_are_distinguished(ppm):
 
 
 def test_clipped_chirps_are_an_error_and_a_few_a_warning():
-    assert check_level(with_frames(frames_of("RH", adc_full_scale=1.2)), RIG.by_name("RH")).verdict == "error"
+    assert check_level(with_frames(frames_of("RH", adc_full_scale=1.2)), RIG.by_name("RH")).level == "error"
     words = np.repeat(frames_of("RH"), 8, axis=0)
-    assert check_level(with_frames(words), RIG.by_name("RH")).verdict == "ok"
+    assert check_level(with_frames(words), RIG.by_name("RH")).level == "ok"
     words[3, 5, 0, 1] = 32767  # one chirp of 256
     found = check_level(with_frames(words), RIG.by_name("RH"))
-    assert (found.verdict, found.facts["clipped_chirps"]) == ("warning", 1)
+    assert (found.level, found.facts["clipped_chirps"]) == ("warning", 1)
 
 
 def test_an_rx_without_a_signal_is_an_error():
     words = frames_of("RH")
     words[..., 2] = 0
     found = check_level(with_frames(words), RIG.by_name("RH"))
-    assert (found.verdict, found.facts["rms"][2]) == ("error", 0)
+    assert (found.level, found.facts["rms"][2]) == ("error", 0)
 
 
 @pytest.mark.parametrize(
@@ -121,8 +121,8 @@ def test_an_rx_without_a_signal_is_an_error():
     ids=["complete", "silent", "another card's packets", "missed pulses", "lost packets", "full card", "two cards"],
 )
 def test_frames_that_are_missing_are_an_error_and_lost_packets_a_warning(row, verdict):
-    assert check_radar(with_frames(frames_of("RH"), **row), RIG.by_name("RH")).verdict == verdict
+    assert check_radar(with_frames(frames_of("RH"), **row), RIG.by_name("RH")).level == verdict
 
 
 def test_the_transmitter_has_no_direct_path():
-    assert check_direct_path(context_of(), RIG.by_name("LS")).verdict == "not checked"
+    assert check_direct_path(context_of(), RIG.by_name("LS")).level == "note"

@@ -17,12 +17,13 @@ from dataclasses import asdict
 from importlib.metadata import distributions
 from pathlib import Path
 
-from polysight.doctor.context import DoctorOptions, Finding
-from polysight.doctor.kernel import read_interface
+from polysight.doctor.context import DoctorOptions, finding_facts
+from polysight.doctor.machine import read_interface
 from polysight.store import MANIFEST, utc_now, versions
 from polysight_shared.config import Instrument
 from polysight_shared.errors import DataError, DeviceError
 from polysight_shared.files import open_to_write, read_bounded
+from polysight_shared.findings import Finding
 
 README = """Findings of `polysight doctor --bundle`, {utc}.
 
@@ -110,7 +111,7 @@ def _contents(
     about = {"utc": utc_now(), "lines": _LINES, "scans": _SCANS, "kilobytes": _TAIL_BYTES >> 10, "traces": _TRACES}
     yield "README.txt", README.format(hidden=HIDDEN, **about)
     yield "findings.txt", text
-    yield "findings.json", json.dumps([asdict(f) for f in findings], indent=1)
+    yield "findings.json", json.dumps([finding_facts(f) for f in findings], indent=1)
     yield "versions.json", json.dumps(_versions(), indent=1)
     yield "kernel.txt", _kernel(root)
     yield "network.json", json.dumps(_network(root), indent=1)

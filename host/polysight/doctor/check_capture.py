@@ -6,8 +6,7 @@ tens of milliseconds.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+import msgspec
 import numpy as np
 
 from polysight.acquisition import RefusedError
@@ -15,7 +14,6 @@ from polysight.calibration import FULL_SCALE, DirectSignal, band_hz, find_direct
 from polysight.capture import RowCapture, route_interface, silent_radar
 from polysight.doctor.context import (
     CheckContext,
-    Finding,
     capture_frames,
     error,
     not_checked,
@@ -23,11 +21,11 @@ from polysight.doctor.context import (
     warning,
     with_boards,
 )
-from polysight.doctor.kernel import NetworkInterface, read_interface
+from polysight.doctor.machine import NetworkInterface, read_interface
 from polysight.radar import RadarState
 from polysight_shared.config import Board, Instrument
 from polysight_shared.faults import PiFault, explain
-from polysight_shared.findings import Finding as HopFinding
+from polysight_shared.findings import Finding
 from polysight_shared.messages import MAX_PULSES_AT_REST, MAX_PULSES_AT_REST_S
 
 _CARD_HOPS = ("host", "route", "link", "card")  # of the network survey
@@ -45,7 +43,7 @@ def check_card(context: CheckContext, board: Board) -> Finding:
     survey = context.surveys[board.name]
     for hop in survey.hops:
         if hop.where in _CARD_HOPS and hop.level == "error":
-            return _finding(hop)
+            return hop
     return ok(
         f"{board.card_address}:{board.command_port} answers, FPGA {survey.version}; data to"
         f" {board.host_address}:{board.data_port}",
@@ -65,7 +63,7 @@ def check_network(context: CheckContext, board: Board) -> Finding:
             f"`ip address add {board.host_address}/24 dev <interface>`",
         )
     interface = read_interface(name, context.system.root)
-    return replace(_judge_interface(interface), facts=vars(interface))
+    return msgspec.structs.replace(_judge_interface(interface), facts=vars(interface))
 
 
 def _judge_interface(interface: NetworkInterface) -> Finding:
@@ -99,16 +97,12 @@ def check_buffer(context: CheckContext, board: Board) -> Finding:
     """Check that the receiving process starts and that the kernel grants its receive buffer."""
     hops = {h.where: h for h in context.surveys[board.name].hops}
     receiver, buffer = hops["receiver"], hops["buffer"]
-    for verdict in ("error", "warning"):
+    for level in ("error", "warning"):
         for hop in (buffer, receiver):
-            if hop.level == verdict:
-                return _finding(hop)
+            if hop.level == level:
+                return hop
     context.usable_cards.add(board.name)
     return ok(f"{buffer.what}; {receiver.what}")
-
-
-def _finding(hop: HopFinding) -> Finding:
-    return error(hop.what, hop.why, hop.do) if hop.level == "error" else warning(hop.what, hop.why, hop.do)
 
 
 def check_pulses(context: CheckContext) -> Finding:
@@ -154,7 +148,7 @@ def check_radar(context: CheckContext, board: Board) -> Finding:
         found = f"the radar stopped: {captured.radar.detail}"
         return error(found, "the radar reported a fault", "`polysight radar check BOARD`", **facts)
     text = f"{complete} of {frames} frames, {captured.row.packets} packets"
-    return replace(_judge_frames(board, captured.row, text), facts=facts)
+    return msgspec.structs.replace(_judge_frames(board, captured.row, text), facts=facts)
 
 
 def _judge_frames(board: Board, row: RowCapture, found: str) -> Finding:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+
+import msgspec
 
 from polysight.doctor.bundle import write_bundle
 from polysight.doctor.check_capture import (
@@ -20,19 +22,25 @@ from polysight.doctor.check_capture import (
     check_skew,
 )
 from polysight.doctor.check_host import (
+    SIMULATED,
     check_calibration,
     check_config,
     check_disk,
+    check_free,
     check_host_clock,
+    check_keys,
     check_library,
+    check_pi,
     check_pi_clock,
     check_receivers,
+    check_stage,
     check_time,
+    check_trigger,
 )
-from polysight.doctor.check_pi import SIMULATED, check_free, check_keys, check_pi, check_stage, check_trigger
-from polysight.doctor.context import CheckContext, DoctorOptions, Finding, System, error, not_checked
+from polysight.doctor.context import CheckContext, DoctorOptions, System, finding_facts, not_checked, verdict
 from polysight_shared.config import Board
 from polysight_shared.errors import PolysightError, no_such, os_error
+from polysight_shared.findings import Finding
 from polysight_shared.messages import is_simulated
 
 _VERDICT_WIDTH, _NAME_WIDTH = 12, 16  # the operator's page parses these columns
@@ -90,9 +98,9 @@ def run_checks(context: CheckContext) -> Iterator[Finding]:
                 blocked[key], finding = failed, not_checked(f"{failed} failed")
             else:
                 finding = _run_check(check, context, board)
-                if finding.verdict == "error":
+                if finding.level == "error":
                     blocked[key] = title
-            yield replace(finding, check=title)
+            yield msgspec.structs.replace(finding, where=title)
 
 
 def _failed_prerequisite(check: Check, board: Board | None, blocked: dict[tuple[str, str], str]) -> str:
@@ -111,10 +119,9 @@ def _run_check(check: Check, context: CheckContext, board: Board | None) -> Find
     try:
         return check.run(context) if board is None else check.run(context, board)
     except PolysightError as e:
-        return error(e.what, e.why, e.remedy)
+        return Finding.of_error(e)
     except OSError as e:
-        e = os_error(e)
-        return error(e.what, e.why, e.remedy)
+        return Finding.of_error(os_error(e))
 
 
 def run_doctor(
@@ -141,11 +148,11 @@ def run_doctor(
             if not as_json:
                 sys.stdout.write(_lines(finding))
                 sys.stdout.flush()
-    failed = [f.check for f in findings if f.verdict == "error"]
+    failed = [f.where for f in findings if f.level == "error"]
     simulated = context.hello is not None and is_simulated(context.hello.backend)
     summary = _summary(findings, failed) + (f" ({SIMULATED})" if simulated else "") + "\n"
     if as_json:
-        document = {"ok": not failed, "simulated": simulated, "findings": [asdict(f) for f in findings]}
+        document = {"ok": not failed, "simulated": simulated, "findings": [finding_facts(f) for f in findings]}
         sys.stdout.write(json.dumps(document, indent=1) + "\n")
     else:
         sys.stdout.write(summary)
@@ -157,12 +164,15 @@ def run_doctor(
 
 
 def _lines(finding: Finding) -> str:
-    head = f"{finding.verdict:{_VERDICT_WIDTH}}{finding.check:{_NAME_WIDTH}} {finding.found}".rstrip() + "\n"
-    more = (("why", finding.why), ("do", finding.remedy))
+    head = f"{verdict(finding):{_VERDICT_WIDTH}}{finding.where:{_NAME_WIDTH}} {finding.what}".rstrip() + "\n"
+    more = (("why", finding.why), ("do", finding.do))
     return head + "".join(f"{'':{_VERDICT_WIDTH + _NAME_WIDTH}} {word}: {text}\n" for word, text in more if text)
 
 
 def _summary(findings: list[Finding], failed: list[str]) -> str:
-    count = {v: sum(f.verdict == v for f in findings) for v in ("ok", "warning", "not checked")}
-    text = f"{count['ok']} ok, {count['warning']} warnings, {len(failed)} errors, {count['not checked']} not checked"
-    return f"{text}: begin with {failed[0]}" if failed else text
+    verdicts = [verdict(finding) for finding in findings]
+    counts = (
+        f"{verdicts.count('ok')} ok, {verdicts.count('warning')} warnings, {len(failed)} errors,"
+        f" {verdicts.count('not checked')} not checked"
+    )
+    return f"{counts}: begin with {failed[0]}" if failed else counts

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -18,51 +18,55 @@ from numpy.typing import NDArray
 
 from polysight.acquisition import CaptureRig, PiClient
 from polysight.capture import CardSurvey, RowCapture, row_words, survey_cards
-from polysight.doctor.kernel import clock_is_synchronised, write_speed
-from polysight.doctor.receiver_load import LoadResult, measure_receivers
+from polysight.doctor.machine import LoadResult, clock_is_synchronised, measure_receivers, write_speed
 from polysight.radar import BoardState, radar_control
 from polysight.store import PART
 from polysight_shared.config import Instrument
+from polysight_shared.findings import Finding
 from polysight_shared.messages import HelloReply, Pulsed
 
 if TYPE_CHECKING:
     from polysight.calibration import DirectSignal
 
-Verdict = Literal["ok", "warning", "error", "not checked"]
 _LAST_PACKET_S = 2.5  # a card sends its short last packet two seconds after the last data
 _POLL_S = 0.05
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Result of one check. `facts`: the numbers behind it, for programs; `check`: its name, set by `run_checks`."""
-
-    verdict: Verdict
-    found: str
-    why: str = ""
-    remedy: str = ""
-    facts: dict[str, Any] = field(default_factory=dict)
-    check: str = ""
-
-
-def ok(found: str, **facts: Any) -> Finding:
+def ok(what: str, **facts: Any) -> Finding:
     """Return a finding without a fault."""
-    return Finding("ok", found, facts=facts)
+    return Finding("ok", what, facts=facts)
 
 
-def warning(found: str, why: str, remedy: str, **facts: Any) -> Finding:
+def warning(what: str, why: str, do: str, **facts: Any) -> Finding:
     """Return a fault that still allows a scan."""
-    return Finding("warning", found, why, remedy, facts)
+    return Finding("warning", what, why, do, facts=facts)
 
 
-def error(found: str, why: str, remedy: str, **facts: Any) -> Finding:
+def error(what: str, why: str, do: str, **facts: Any) -> Finding:
     """Return a fault that would make a scan fail or its data useless."""
-    return Finding("error", found, why, remedy, facts)
+    return Finding("error", what, why, do, facts=facts)
 
 
-def not_checked(found: str, remedy: str = "") -> Finding:
-    """Return the finding of a check that was skipped, by option or because data is missing."""
-    return Finding("not checked", found, remedy=remedy)
+def verdict(finding: Finding) -> str:
+    """Return the word of a finding for people and for `--json`: a check that was skipped is a note here."""
+    return "not checked" if finding.level == "note" else finding.level
+
+
+def finding_facts(finding: Finding) -> dict[str, Any]:
+    """Return a finding as `doctor --json` prints it."""
+    return {
+        "verdict": verdict(finding),
+        "found": finding.what,
+        "why": finding.why,
+        "remedy": finding.do,
+        "facts": finding.facts,
+        "check": finding.where,
+    }
+
+
+def not_checked(what: str, do: str = "") -> Finding:
+    """Return the finding of a check that was skipped, by option or because data is missing: a note."""
+    return Finding("note", what, do=do)
 
 
 @dataclass(frozen=True)

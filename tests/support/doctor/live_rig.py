@@ -18,9 +18,10 @@ import zmq
 
 from polysight.acquisition.pi_client import PiClient
 from polysight.doctor.checks import run_checks
-from polysight.doctor.context import CheckContext, DoctorOptions, Finding, System
+from polysight.doctor.context import CheckContext, DoctorOptions, System
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.findings import Finding
 from polysight_shared.tables import to_builtins
 from tests.support.doctor.case import QUICK
 from tests.support.processes import LIMIT_S, wait_for
@@ -74,7 +75,7 @@ class LiveRig:
     ) -> dict[str, Finding]:
         """Run the checks; return the findings by name, in order."""
         with CheckContext(DoctorOptions(config or self.config, self.folder, move, pulse), system) as context:
-            return {f.check: f for f in run_checks(context)}
+            return {f.where: f for f in run_checks(context)}
 
     @contextmanager
     def pi(self) -> Iterator[PiClient]:

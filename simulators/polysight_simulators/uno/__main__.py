@@ -35,9 +35,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(args: argparse.Namespace) -> None:
     if lacking := missing():
-        raise ConfigError(
-            f"not installed: {' '.join(lacking)}", "the emulated board is compiled here", ENABLING_COMMAND
-        )
+        what = f"not installed: {' '.join(lacking)}"
+        raise PolysightError(what, "the emulated board is compiled here", ENABLING_COMMAND)
     rig = load_instrument(args.config)
     zero = homing_zero()
     program = str(emulator())

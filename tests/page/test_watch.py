@@ -6,13 +6,20 @@ import json
 import shutil
 
 import pytest
-from tests.support.page.live_view import GrowingScan
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.support.page.chromium import DESK, PHONE
+from tests.support.page.live_view import GrowingScan, served
 from tests.support.processes import LIMIT_S, wait_for
+from tests.support.products import REASON, judged_products
+from tests.support.store.facts import typed
 
 from polysight.page.images import draw
-from polysight.page.watch import Watch
+from polysight.page.watch import EventTail, ManifestTail, ProductsTail, Watch
 from polysight.pipeline import Pipeline
-from polysight.store.scan_folder import ScanFolder
+from polysight.store import manifest
+from polysight.store.events import read_events
+from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
 
 
 def answer(watch: Watch) -> dict:
@@ -138,3 +145,102 @@ def test_a_manifest_of_another_release_is_not_taken_for_none(growing, watching):
     status = answer(watch)["status"]
     assert (status["level"], status["headline"]) == ("bad", "This scan cannot be shown")
     assert "polysight validate" in status["do"]
+
+
+# --- files as they grow ---
+
+CUTS = st.lists(st.floats(0, 1), max_size=12)
+
+
+@pytest.mark.parametrize(("name", "tail"), [(MANIFEST, ManifestTail), (EVENTS, EventTail)])
+def test_any_pieces_give_the_whole(finished, tmp_path_factory, name, tail):
+    raw = (finished / name).read_bytes()
+    whole = manifest.parse(raw).facts if name == MANIFEST else read_events(finished / name).events
+    assert len(whole) > 4
+
+    @settings(max_examples=20)
+    @given(CUTS)
+    def pieces(cuts: list[float]) -> None:
+        path = tmp_path_factory.mktemp("pieces") / name
+        tailing, found = tail(path), []
+        ends = sorted({int(c * len(raw)) for c in cuts} | {len(raw)})
+        for before, end in zip([0, *ends], ends, strict=False):
+            with path.open("ab") as f:
+                f.write(raw[before:end])
+            found += tailing.look()
+            assert found == whole[: len(found)]
+        assert found == whole
+        assert tailing.look() == []
+
+    pieces()
+
+
+def test_another_file_in_its_place_is_read_from_the_beginning(finished, tmp_path):
+    path = tmp_path / MANIFEST
+    raw = (finished / MANIFEST).read_bytes()
+    path.write_bytes(raw)
+    tail = ManifestTail(path)
+    first = tail.look()
+    path.unlink()
+    assert tail.look() == []
+    first_line = raw.splitlines(keepends=True)[0]
+    (tmp_path / "new").write_bytes(first_line)
+    (tmp_path / "new").rename(path)
+    assert tail.look() == first[:1]
+    assert tail.file.replaced
+
+
+def test_another_and_longer_file_is_found_after_a_single_look(finished, tmp_path):
+    """Before anything else was appended to the one that was read."""
+    path = tmp_path / MANIFEST
+    raw = (finished / MANIFEST).read_bytes()
+    others = [{"fact": "scan_ended", "reason": "another scan" * 50} for _ in raw.splitlines()]
+    path.write_bytes(raw)
+    tail = ManifestTail(path)
+    assert len(tail.look()) == len(others)
+    (tmp_path / "new").write_bytes(b"".join(map(manifest.encode_line, others)))
+    (tmp_path / "new").rename(path)
+    assert tail.look() == [typed(fact) for fact in others]
+    assert tail.file.replaced
+
+
+# --- the verdict ---
+
+
+def test_the_verdict_follows_the_products(tmp_path):
+    tail = ProductsTail(tmp_path)
+    assert tail.look() is None
+    for level in ("care", "none", None, "good"):
+        shutil.rmtree(tmp_path / "products", ignore_errors=True)
+        judged_products(tmp_path / "products", level)
+        found = tail.look()
+        assert (found.level if found else None) == level
+    (tmp_path / "products" / "materials.json").write_text("{", encoding="utf-8")
+    assert tail.look() is None
+
+
+def test_it_is_shown_when_the_scan_has_ended(growing: GrowingScan, watching):
+    growing.grow_to("row_committed")
+    judged_products(growing.path / "products", "care")
+    watch = watching(growing.path)
+    assert watch.wait_for(lambda s: s["scan"] is not None, LIMIT_S)
+    assert json.loads(watch.state.data)["verdict"] is None  # of an earlier run of the scan
+    growing.grow_to("scan_ended")
+    assert watch.wait_for(lambda s: s["verdict"] is not None, LIMIT_S)
+    answer = json.loads(watch.state.data)["verdict"]
+    assert answer["level"] == "care"
+    assert [{key: r[key] for key in REASON} for r in answer["reasons"]] == [REASON]
+
+
+def test_the_page_shows_it(browser, finished, watching, tmp_path):
+    scan = shutil.copytree(finished, tmp_path / "scan")
+    judged_products(scan / "products", "none")
+    watch = watching(scan)
+    assert watch.wait_for(lambda s: bool(s.get("verdict")), LIMIT_S)
+    with served(watch) as view:
+        for size in (DESK, PHONE):
+            browser.visit(view.address + "/", size)
+            browser.wait("document.getElementById('result-level')?.textContent.length > 0", "the verdict")
+            assert browser.text("result-level") == "no result"
+            assert REASON["do"] in browser.text("reasons")
+            browser.check_whole(view.address)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hmac
-import http.client
 import json
 import re
 import socket
@@ -20,29 +19,6 @@ from polysight.serve.control import Format
 from polysight.serve.guard import TOKEN_HEADER
 from polysight.serve.server import STATIC, Place
 from polysight_shared.error_codes import ErrorCode
-
-
-class Page:
-    """A page's event stream."""
-
-    def __init__(self, view) -> None:
-        self._connection = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
-        self._connection.request("GET", "/api/events")
-        self._reply = self._connection.getresponse()
-
-    def next(self, kind: str) -> bytes:
-        """The data of the next event of a kind."""
-        while True:
-            lines = {}
-            while (line := self._reply.readline().rstrip(b"\n")) != b"":
-                name, _, value = line.partition(b": ")
-                lines[name] = value
-            if lines.get(b"event") == kind.encode():
-                return lines[b"data"]
-
-    def close(self) -> None:
-        self._reply.close()
-        self._connection.close()
 
 
 @pytest.fixture
@@ -109,25 +85,6 @@ def test_the_page_needs_nothing_from_elsewhere():
     assert 'src="' in (STATIC / "watch.html").read_text()
 
 
-def test_late_pages_are_told_what_early_ones_are(growing, watching):
-    watch = watching(growing.path, lapse_s=1e6)
-    growing.live()
-    with served(watch) as view:
-        early = Page(view)
-        heard = early.next("state")
-        for fact in ("scan_started", "row_committed", "row_committed"):
-            growing.grow_to(fact)
-        assert watch.wait_for(lambda s: (s.get("pictures") or {}).get("rows") == 2, LIMIT_S)
-        while (json.loads(heard).get("pictures") or {}).get("rows") != 2:
-            heard = early.next("state")
-        late = Page(view)
-        now = json.loads(late.next("state"))
-        assert now == json.loads(ask(view, "/api/state")[1])
-        assert json.loads(heard) | {"status": now["status"]} == now
-        early.close()
-        late.close()
-
-
 def test_a_page_that_never_reads_holds_nobody_up(growing, watching):
     watch = watching(growing.path, lapse_s=1e6)
     growing.live()
@@ -145,16 +102,6 @@ def test_a_page_that_never_reads_holds_nobody_up(growing, watching):
             assert json.loads(ask(view, "/api/state")[1])["pictures"]["rows"] == rows + 1
         for one in deaf:
             one.close()
-
-
-def test_pictures_are_served_as_they_are_shown(finished, watching):
-    watch = watching(finished)
-    assert watch.wait_for(lambda s: s["pictures"]["rows"] == 3, LIMIT_S)
-    with served(watch) as view:
-        for name, picture in watch.shown.pictures.items():
-            assert ask(view, f"/api/picture/{name}")[1] == picture.png
-        assert ask(view, "/api/picture/../../etc/passwd")[0] == 404
-        assert ask(view, "/api/picture/nothing")[0] == 404
 
 
 def test_the_page_offers_every_format_of_exports():

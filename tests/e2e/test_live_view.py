@@ -88,12 +88,12 @@ def test_a_scan_is_followed_paused_lost_and_stopped(slow_rig):
     state = view.wait(lambda s: shown(s) >= 1, "the first row's image")
     assert priority(view.pid) > priority(scan.process.pid)  # the scan goes first
     assert state["scan"]["simulated"] is True
-    assert state["marks"].startswith("c")
-    assert state["control"] == {"enabled": True, "running": True, "paused": False, "asked": None}
+    assert state["scan"]["marks"].startswith("c")
+    assert [state[key] for key in ("control", "running", "paused", "asked")] == [True, True, False, None]
 
     view.ask("pause")
     paused = view.wait_headline("Paused")
-    rows = paused["progress"]["committed"]
+    rows = paused["scan"]["committed"]
     assert 1 <= rows < ROWS
     assert rig.committed() == rows
     view.ask("continue")
@@ -104,12 +104,12 @@ def test_a_scan_is_followed_paused_lost_and_stopped(slow_rig):
     assert "polysight resume" in gone["status"]["do"]
 
     again = rig.start("polysight", "resume", rig.folder / "scan", "--no-process")
-    view.wait(lambda s: s["control"]["running"], "that the scan goes on is seen")
-    view.wait(lambda s: s["progress"]["committed"] > gone["progress"]["committed"], "rows after the kill")
+    view.wait(lambda s: s["running"], "that the scan goes on is seen")
+    view.wait(lambda s: s["scan"]["committed"] > gone["scan"]["committed"], "rows after the kill")
     view.ask("abort")
     ended = view.wait_headline("Stopped on request")
-    assert ended["progress"]["committed"] < ROWS
+    assert ended["scan"]["committed"] < ROWS
     assert again.wait().status != 0
     assert [f for f in validate(rig.folder / "scan") if f.level == "error"] == []
-    state = view.wait(lambda s: shown(s) == s["progress"]["committed"], "every row's image")
-    assert state["boards"][0]["frames_lost"] == 0
+    state = view.wait(lambda s: shown(s) == s["scan"]["committed"], "every row's image")
+    assert state["boards"][0]["frames_received"] == state["boards"][0]["frames_expected"]

@@ -23,6 +23,7 @@ from polysight.plan import Changes, forecast, forecast_values
 from polysight.products import find_labels, label_folder, read_products
 from polysight.serve.guard import BODY_BYTES, cookie_name, refused_body
 from polysight.serve.programs import program_of
+from polysight.serve.reading import json_answer
 from polysight.serve.site import LIBRARIES, Site
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
@@ -127,9 +128,8 @@ class ExportRequest(Body, frozen=True):
     formats: Annotated[tuple[Format, ...], msgspec.Meta(min_length=1)]
 
 
-Answer = Callable[[Site, Request, Any], Awaitable[dict[str, Any]]]
+Answer = Callable[[Site, Request, Any], Awaitable[object]]
 Words = list[str | Path]
-STARTED = {"what": "started"}
 
 
 def control_routes(site: Site) -> list[Route]:
@@ -142,7 +142,7 @@ def control_routes(site: Site) -> list[Route]:
                 content += chunk
                 if len(content) > BODY_BYTES:
                     return refused_body()
-            return JSONResponse(await answer(site, request, _decode_body(bytes(content), kind)))
+            return json_answer(await answer(site, request, _decode_body(bytes(content), kind)))
 
         return Route(f"/api/{path}", endpoint, methods=["POST"])
 
@@ -179,7 +179,7 @@ def _decode_body(body: bytes, kind: type[Body]) -> Body:
     return decode(table, kind, "the request", "send what the page sends")
 
 
-async def _control(site: Site, request: Request, body: Body) -> dict[str, Any]:
+async def _control(site: Site, request: Request, body: Body) -> None:
     """Pause, continue, stop or abort: behind no read, and whatever else is open."""
     del body
     name = site.name(request)
@@ -190,7 +190,6 @@ async def _control(site: Site, request: Request, body: Body) -> dict[str, Any]:
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     await site.act(lambda: site.watches.ask(name, site.scans.folder(name), ScanCommand(command)))
-    return {"what": "asked"}
 
 
 async def _plan(site: Site, request: Request, body: PlanRequest) -> dict[str, Any]:
@@ -201,7 +200,7 @@ async def _plan(site: Site, request: Request, body: PlanRequest) -> dict[str, An
     return plan | {"rig": rig.name, "config": str(config), "begun_with": to_builtins(rig)["grid"]}
 
 
-async def _doctor(site: Site, request: Request, body: Body) -> dict[str, Any]:
+async def _doctor(site: Site, request: Request, body: Body) -> None:
     del request, body
     words: Words = ["doctor", "--config", site.config, "--out", site.scans.root]
 
@@ -212,10 +211,9 @@ async def _doctor(site: Site, request: Request, body: Body) -> dict[str, Any]:
             site.programs.start(site.logs, "doctor", words)
 
     await site.act(start)
-    return STARTED
 
 
-async def _start(site: Site, request: Request, body: StartRequest) -> dict[str, Any]:
+async def _start(site: Site, request: Request, body: StartRequest) -> None:
     del request
     config = site.config
     programs = site.programs
@@ -242,7 +240,6 @@ async def _start(site: Site, request: Request, body: StartRequest) -> dict[str, 
             programs.start(folder, "scan", words)
 
     await site.act(start)
-    return STARTED | {"scan": body.name}
 
 
 def _check_free(site: Site) -> None:
@@ -276,7 +273,7 @@ def _write_rig(folder: Path, rig: Instrument) -> Path:
     return path
 
 
-async def _resume(site: Site, request: Request, body: ResumeRequest) -> dict[str, Any]:
+async def _resume(site: Site, request: Request, body: ResumeRequest) -> None:
     def start(folder: Path) -> None:
         words: Words = ["resume", folder.absolute(), *_processing_words(site, body.library, None)]
         if body.keep_incomplete:
@@ -286,10 +283,9 @@ async def _resume(site: Site, request: Request, body: ResumeRequest) -> dict[str
             site.programs.start(folder, "scan", words)
 
     await site.read_scan(request, start)
-    return STARTED
 
 
-async def _process(site: Site, request: Request, body: ProcessRequest) -> dict[str, Any]:
+async def _process(site: Site, request: Request, body: ProcessRequest) -> None:
     def start(folder: Path) -> None:
         words: Words = ["process", folder.absolute(), "--out", folder.absolute() / "products"]
         words += _processing_words(site, body.library, body.metal)
@@ -304,30 +300,36 @@ async def _process(site: Site, request: Request, body: ProcessRequest) -> dict[s
         site.programs.start(folder, "process", words)
 
     await site.read_scan(request, start)
-    return STARTED
 
 
-async def _labels(site: Site, request: Request, body: LabelRequest) -> dict[str, Any]:
+class SavedLabels(msgspec.Struct, frozen=True):
+    """The file of boxes drawn by hand, "" if there are none any more, and what was noticed about them."""
+
+    file: str
+    notes: list[str] = []
+
+
+async def _labels(site: Site, request: Request, body: LabelRequest) -> SavedLabels:
     labels = Labels(body.boxes, "mm", body.metal or None, body.specimens, by_hand=True)
 
-    def save(folder: Path) -> dict[str, Any]:
+    def save(folder: Path) -> SavedLabels:
         if not labels.boxes:
-            return {"what": "removed", "file": str(remove_labels(folder)), "metal": None, "notes": []}
+            remove_labels(folder)
+            return SavedLabels("")
         products = read_products(folder)
         place = label_folder(products.folder)
-        checked, notes = save_labels(place, products, labels)
-        return {"what": "saved", "file": str(place / "labels.json"), "metal": checked.metal, "notes": notes}
+        _, notes = save_labels(place, products, labels)
+        return SavedLabels(str(place / "labels.json"), notes)
 
     return await site.read_scan(request, save)
 
 
-async def _notes(site: Site, request: Request, body: NotesRequest) -> dict[str, Any]:
+async def _notes(site: Site, request: Request, body: NotesRequest) -> Notes:
     notes = Notes(body.notes, body.tags)
-    written = await site.read_scan(request, lambda folder: write_notes(folder, notes, body.base))
-    return {"what": "saved", "notes": written.notes, "tags": list(written.tags)}
+    return await site.read_scan(request, lambda folder: write_notes(folder, notes, body.base))
 
 
-async def _train(site: Site, request: Request, body: TrainRequest) -> dict[str, Any]:
+async def _train(site: Site, request: Request, body: TrainRequest) -> None:
     del request
 
     def start() -> None:
@@ -338,10 +340,9 @@ async def _train(site: Site, request: Request, body: TrainRequest) -> dict[str, 
         site.programs.start(site.logs, "train", ["train", *folders, "--out", out / f"{body.name}.npz"])
 
     await site.act(start)
-    return STARTED
 
 
-async def _export(site: Site, request: Request, body: ExportRequest) -> dict[str, Any]:
+async def _export(site: Site, request: Request, body: ExportRequest) -> None:
     def start(folder: Path) -> None:
         out = folder.absolute() / "export"
         if not out.resolve().is_relative_to(folder.resolve()):
@@ -353,7 +354,6 @@ async def _export(site: Site, request: Request, body: ExportRequest) -> dict[str
         site.programs.start(folder, "export", ["export", folder.absolute(), *options, "--out", out])
 
     await site.read_scan(request, start)
-    return STARTED
 
 
 def _processing_words(site: Site, library: str, metal: Box | None) -> Words:

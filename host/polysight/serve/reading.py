@@ -9,11 +9,12 @@ import os
 import shutil
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 from urllib.parse import quote
 
 import anyio
 import msgspec
+from msgspec.structs import asdict
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
@@ -26,6 +27,7 @@ from polysight.catalogue import (
     PHASE,
     Comparison,
     Picture,
+    Summary,
     colour_bar,
     draw_comparison,
     files_of,
@@ -36,9 +38,8 @@ from polysight.catalogue import (
 from polysight.page import Watch
 from polysight.products import REPORT, read_products
 from polysight.serve.guard import refused
-from polysight.serve.programs import program_of, programs_of
+from polysight.serve.programs import Program, program_of, programs_of
 from polysight.serve.site import THUMBNAIL, Site, compare_products, draw_map
-from polysight_shared import __version__
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -78,7 +79,7 @@ def reading_routes(site: Site) -> list[Route]:
     return [make_route(path, answer) for path, answer in endpoints.items()]
 
 
-def json_answer(content: Any) -> Response:
+def json_answer(content: object) -> Response:
     """Structs, dataclasses or plain data as JSON; numbers that are not finite become null."""
     return Response(msgspec.json.encode(content), media_type="application/json")
 
@@ -86,31 +87,52 @@ def json_answer(content: Any) -> Response:
 # --- lists ---
 
 
+class ListedScan(Summary, frozen=True, kw_only=True):
+    """A line of the list with the scan's size, None while it is being counted."""
+
+    bytes: int | None
+
+
+class ScanList(msgspec.Struct, frozen=True):
+    """The scans under the folder, and names in it that are not shown."""
+
+    scans: list[ListedScan]
+    free_bytes: int | None
+    libraries: list[str]
+    left_out: list[str]
+
+
+class ScanDetails(ListedScan, frozen=True, kw_only=True):
+    """One scan, with its folder and the programs that were started for it, the newest first."""
+
+    folder: str
+    programs: list[Program]
+
+
+class PageFacts(msgspec.Struct, frozen=True):
+    """What a page may show; `known`: its token is right, or not needed."""
+
+    control: bool
+    starts: bool
+    known: bool
+    only: str | None
+
+
 async def _page(site: Site, request: Request) -> Response:
     access = site.access
     may_read = not access.token or access.loopback or access.has_session(request.scope)
-    facts = {
-        "version": __version__,
-        "control": access.control,
-        "starts": site.starts,
-        "known": may_read or access.has_token(request.headers),
-        "only": site.scans.only,
-        "folder": str(site.scans.root) if may_read else "",
-    }
-    return json_answer(facts)
+    known = may_read or access.has_token(request.headers)
+    return json_answer(PageFacts(access.control, site.starts, known, site.scans.only))
 
 
 async def _scans(site: Site, request: Request) -> Response:
     del request
     root = site.scans.root
 
-    def list_scans() -> dict[str, Any]:
-        return {
-            "scans": [msgspec.to_builtins(s) | {"bytes": site.size(s.name)} for s in site.scans.list()],
-            "free_bytes": shutil.disk_usage(root).free if root.is_dir() else None,
-            "libraries": list(site.libraries()),
-            "left_out": site.scans.left_out(),
-        }
+    def list_scans() -> ScanList:
+        scans = [ListedScan(**asdict(s), bytes=site.size(s.name)) for s in site.scans.list()]
+        free_bytes = shutil.disk_usage(root).free if root.is_dir() else None
+        return ScanList(scans, free_bytes, list(site.libraries()), site.scans.left_out())
 
     return json_answer(await site.read("", list_scans))
 
@@ -118,12 +140,12 @@ async def _scans(site: Site, request: Request) -> Response:
 async def _scan(site: Site, request: Request) -> Response:
     name = site.name(request)
 
-    def read_summary(folder: Path) -> dict[str, Any]:
-        facts = msgspec.to_builtins(site.scans.summary(name)) | msgspec.to_builtins(read_notes(folder))
-        programs = programs_of(folder)
-        return facts | {"bytes": site.size(name), "folder": str(folder.absolute()), "programs": programs}
+    def read_details(folder: Path) -> ScanDetails:
+        facts = asdict(site.scans.summary(name)) | asdict(read_notes(folder))
+        place = str(folder.absolute())
+        return ScanDetails(**facts, bytes=site.size(name), folder=place, programs=programs_of(folder))
 
-    return json_answer(await site.read_scan(request, read_summary))
+    return json_answer(await site.read_scan(request, read_details))
 
 
 async def _thumbnail(site: Site, request: Request) -> Response:

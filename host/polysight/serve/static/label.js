@@ -89,7 +89,7 @@ export class Labels {
     try {
       const told = await post("labels", this.scan, { boxes, metal: this.boxes.find((b) => b.metal)?.name.trim() ?? null, specimens });
       this.touched = false;
-      const left = told.what === "saved";
+      const left = Boolean(told.file);
       const done = left ? "Saved. Process again to use them." : "No box is left: the saved ones are deleted.";
       by("label-told").textContent = [done, ...told.notes.map((n) => `Note: ${n}.`)].join(" ");
       by("use-labels").disabled = !left;

@@ -42,7 +42,8 @@ def _noise(rng: np.random.Generator, shape: tuple[int, ...], snr_db: float) -> C
 
 def _paths(rig: Instrument, board: Board, cycles_away: float = 0.0) -> tuple[Complex, Complex]:
     """Direct path and echo of the mirror point, each of amplitude one: complex [rx, sample]."""
-    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    tx = np.array(tx_position_m(rig))
+    rx = np.array(rx_positions_m(rig, board))
     point = np.array(specular_midpoint_m(rig, board))
     f = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(rig.chirp.samples)
     direct = np.linalg.norm(rx - tx, axis=1)
@@ -76,7 +77,9 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
     A gross error is one of more than half an FFT bin of the linear samples. Division's rms is without its gross errors.
     """
     rng = np.random.default_rng([SEED, round(10 * snr_db)])
-    board, chirp, pulses = rig.receivers[0], rig.chirp, rig.burst.pulses
+    board = rig.receivers[0]
+    chirp = rig.chirp
+    pulses = rig.burst.pulses
     a, b = chirp.linear_samples
     direct, _ = _paths(rig, board)
     n = np.arange(chirp.samples)
@@ -105,7 +108,8 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
 def one_tone(snr_db: float, trials: int = 4000, samples: int = 192) -> tuple[float, float]:
     """Rms error over Cramer-Rao bound of frequency and of phase (at the record's centre), one tone in noise."""
     rng = np.random.default_rng([SEED, 1, round(10 * snr_db)])
-    frequency, phase = rng.uniform(-0.4, 0.4, trials), rng.uniform(-np.pi, np.pi, trials)
+    frequency = rng.uniform(-0.4, 0.4, trials)
+    phase = rng.uniform(-np.pi, np.pi, trials)
     t = np.arange(samples) - (samples - 1) / 2
     z = np.exp(1j * (2 * np.pi * frequency[:, None] * t + phase[:, None])) + _noise(rng, (trials, samples), snr_db)
     tone = estimate_tone(z.astype(np.complex64))
@@ -127,7 +131,8 @@ def at_bins(rig: Instrument, board: Board, bins: float) -> Instrument:
 
     def bins_at(z_mm: float) -> float:
         there = moved(z_mm)
-        tx, rx = np.array(tx_position_m(there)), np.array(rx_positions_m(there, board)[0])
+        tx = np.array(tx_position_m(there))
+        rx = np.array(rx_positions_m(there, board)[0])
         point = np.array(specular_midpoint_m(there, board))
         excess = np.linalg.norm(point - tx) + np.linalg.norm(rx - point) - np.linalg.norm(rx - tx)
         return float(excess * rig.chirp.hz_per_sample * samples / SPEED_OF_LIGHT_M_S)
@@ -163,7 +168,8 @@ def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials:
 def _phase_bound(direct: Complex, echo: Complex, between: float, linear: tuple[int, int], snr_db: float) -> float:
     """Cramer-Rao bound of the direct path's phase, variance in rad^2; inverse of the Fisher information (Kay 1993)."""
     inside = slice(*linear)
-    d, e = direct[:, inside], echo[:, inside] * np.exp(1j * between)
+    d = direct[:, inside]
+    e = echo[:, inside] * np.exp(1j * between)
     t = np.arange(d.shape[1]) - (d.shape[1] - 1) / 2
     slopes = np.stack([s.ravel() for s in (d, 1j * d, 1j * t * d, e, 1j * e, 1j * t * e)], axis=1)
     fisher = 2 * 10 ** (snr_db / 10) * (slopes.conj().T @ slopes).real
@@ -171,7 +177,9 @@ def _phase_bound(direct: Complex, echo: Complex, between: float, linear: tuple[i
 
 
 IMAGE_SEED = 7
-POINTS, POSITIONS, PIXELS = 9, 2000, 60
+POINTS = 9
+POSITIONS = 2000
+PIXELS = 60
 
 
 def image_error(rig: Instrument, board: Board) -> float:
@@ -183,7 +191,9 @@ def image_error(rig: Instrument, board: Board) -> float:
     """
     rng = np.random.default_rng(IMAGE_SEED)
     builder = ImageBuilder(rig)
-    grid, plan, chirp = builder.grid, plan_raster(rig.grid), rig.chirp
+    grid = builder.grid
+    plan = plan_raster(rig.grid)
+    chirp = rig.chirp
     antennas = Antennas.of(rig, board)
     margin = 0.02
     points = np.column_stack(
@@ -192,7 +202,8 @@ def image_error(rig: Instrument, board: Board) -> float:
     )
     sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples, dtype=float)
     used = rng.random((plan.rows, plan.columns)) < POSITIONS / plan.positions
-    samples, shifts = [], []
+    samples = []
+    shifts = []
     for row in plan:
         valid = used[row.index]
         received = np.zeros((len(antennas.rx_m), plan.columns, chirp.samples), np.complex64)
@@ -252,7 +263,8 @@ def _matched(
 __all__ = ["add_arguments", "run"]
 ALIGN_SNR_DB = (0.0, 2.5, 5.0)
 TONE_SNR_DB = (7.0, 16.0, 22.0, 30.0)
-BINS, TWO_TONE_SNR_DB = 2.5, 16.0
+BINS = 2.5
+TWO_TONE_SNR_DB = 16.0
 
 
 def run(args: argparse.Namespace) -> int:
@@ -272,7 +284,8 @@ def run(args: argparse.Namespace) -> int:
 def _alignment_lines(aligned: Sequence[Alignment]) -> list[Line]:
     ratios = [a.ours_hz / a.division_hz for a in aligned]
     chirps = sum(a.chirps for a in aligned)
-    gross, theirs = sum(a.ours_gross for a in aligned), sum(a.division_gross for a in aligned)
+    gross = sum(a.ours_gross for a in aligned)
+    theirs = sum(a.division_gross for a in aligned)
     return [
         Line(
             "alignment at 0-5 dB: frequency error over division's",

@@ -43,7 +43,8 @@ def images(
     scene = scene.with_disturbances(ideal=True)
     scene = msgspec.structs.replace(scene, disturbances=msgspec.structs.replace(scene.disturbances, **still))
     rig = apply_scene(load_instrument(RIG), scene)
-    radar, board = SimulatedRig(rig, scene), rig.receivers[0]
+    radar = SimulatedRig(rig, scene)
+    board = rig.receivers[0]
     setup = BoardSetup.of(rig, board, compensate_filter=False)
     kept = {name: ImageBuilder(rig).boards[board.name] for name in TREATMENTS}
     travel_m = mean_burst_travel_mm(rig.burst, rig.stage) / 1e3

@@ -36,7 +36,9 @@ class Cards:
 
     def __init__(self, rig: Instrument, config: Path, folder: Path, stack: ExitStack) -> None:
         subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
-        self.rig, self.folder, self.buffer_bytes = rig, folder, rig.card.receive_buffer_bytes
+        self.rig = rig
+        self.folder = folder
+        self.buffer_bytes = rig.card.receive_buffer_bytes
         self.boards: list[Board] = [
             replace_addresses(b, f"{subnet}.{180 + k}", f"{subnet}.30") for k, b in enumerate(rig.receivers)
         ]
@@ -140,7 +142,8 @@ class Receivers:
         rows = -(-in_all // ROW_BLOCKS)
         blocks = round(in_all / rows)
         packets = blocks * PACKETS
-        before, cpu = ask(beside), [cpu_s(r.pid) for r in self._receivers]
+        before = ask(beside)
+        cpu = [cpu_s(r.pid) for r in self._receivers]
         trial = Trial(rate, 0, 0, 0, 0, 0, True, [], 0, 0, 0, 0)
         began = time.perf_counter()
         ended = 0.0
@@ -210,7 +213,8 @@ class PlainLoops:
 
     def try_rate(self, rate: float, seconds: float, beside: Child | None) -> Trial:
         packets = max(1, round(rate / len(self._loops) * seconds / PACKETS)) * PACKETS
-        before, began = ask(beside), time.perf_counter()
+        before = ask(beside)
+        began = time.perf_counter()
         for loop in self._loops:
             loop.say(packets)
         self._cards.start_sending(packets, rate)

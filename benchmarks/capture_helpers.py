@@ -109,7 +109,8 @@ class Sender:
                 if at == 0:
                     number(self._packets, self._next)
                 n = self._call(at, min(due - sent, PACKETS - at))
-                sent, self._next = sent + n, self._next + n
+                sent = sent + n
+                self._next = self._next + n
             ahead = began + (sent / rate) - time.perf_counter()
             if ahead > 0 and sent < total:
                 time.sleep(max(ahead, TURN_S))

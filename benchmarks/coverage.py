@@ -58,7 +58,8 @@ KINDS = ("full", "no metal", "no direct path", "noise", "empty", "named", "sheet
 """Kinds of scenes; "sheet" is "full" with one thin sheet in air that is not declared."""
 WHOLE = ("full", "sheet")
 SURE = (0.0, 0.5, 0.8, 0.95, 1.01)
-CHI2_68, CHI2_95 = 2.279, 5.991
+CHI2_68 = 2.279
+CHI2_95 = 5.991
 
 
 @dataclass(frozen=True)
@@ -81,12 +82,16 @@ class PatchFigures:
 class Cubes:
     """A scene as a source of rows that were synchronised already, in memory."""
 
-    mirrored, synchronised, manifest_faults, simulated = False, True, (), True
+    mirrored = False
+    synchronised = True
+    manifest_faults = ()
+    simulated = True
 
     def __init__(self, rig: Instrument, scene: Scene, drop_rows: int = 0, seed: int | None = None) -> None:
         self.instrument: Instrument = apply_scene(rig, scene)
         self.plan: RasterPlan = plan_raster(self.instrument.grid)
-        self.scan_id, self._drop = scene.name, drop_rows
+        self.scan_id = scene.name
+        self._drop = drop_rows
         self._cubes = {b.name: synced_cube(rig, scene, b.name, seed=seed) for b in self.instrument.receivers}
 
     def rows(self) -> Iterator[int]:
@@ -109,7 +114,8 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
     materials = KNOWN if kind == "named" else MATERIALS
     names = rng.choice(list(materials), len(PLACES), replace=False).tolist()
     metal = None if kind == "no metal" or (kind in WHOLE and rng.random() < 0.25) else int(rng.integers(len(PLACES)))
-    tilted, plates = rng.random() < 0.5, []
+    tilted = rng.random() < 0.5
+    plates = []
     for i, (x, y) in enumerate(PLACES):
         place = {"centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [46.0, 46.0]}
         relief = {"height_mm": rng.uniform(-0.5, 0.5), "tilt_deg": (rng.uniform(-1, 1, 2) * tilted).tolist()}
@@ -158,7 +164,8 @@ def _imaged(source: Any, model: str | None = "none", inputs: Inputs = NO_INPUTS)
 
 def judged(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Instrument, Findings, PlaneEstimate]:
     """One scene, drawn, simulated and judged."""
-    rig, scene = load_instrument(packaged(Path("instrument.toml"))), draw_scene(seed, kind)
+    rig = load_instrument(packaged(Path("instrument.toml")))
+    scene = draw_scene(seed, kind)
     model = None if kind == "named" else "none"
     inputs = NO_INPUTS
     if kind in WHOLE and not any(p.metal for p in scene.plates):
@@ -177,14 +184,18 @@ def judged(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Ins
 def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigures]:
     """Judged patches of one scene: the sample from which coverage is counted."""
     scene, rig, findings, _ = judged(seed, kind, raw)
-    plates, found = truth_plates(truth(rig, scene, scene.seed)), findings.found
-    true, out = match_truth([r.patch for r in found.patches], plates), []
+    plates = truth_plates(truth(rig, scene, scene.seed))
+    found = findings.found
+    true = match_truth([r.patch for r in found.patches], plates)
+    out = []
     for r in found.patches:
-        e, plate = r.permittivity, true.get(r.patch.label)
+        e = r.permittivity
+        plate = true.get(r.patch.label)
         if plate is None or plate.permittivity is None or e.value is None or e.covariance is None or r.refused:
             continue
         away = np.array([(e.value - plate.permittivity).real, (e.value - plate.permittivity).imag])
-        size, tangent = abs(plate.permittivity), -plate.permittivity.imag / plate.permittivity.real
+        size = abs(plate.permittivity)
+        tangent = -plate.permittivity.imag / plate.permittivity.real
         values = np.linalg.eigvalsh(e.covariance)
         out.append(
             PatchFigures(
@@ -223,7 +234,8 @@ def _one(job: tuple[int, str, bool]) -> list[PatchFigures]:
 def _names(seed: int) -> list[tuple[float, bool]]:
     """Probability beside each name of one scene, and whether the name is right."""
     scene, rig, findings, _ = judged(seed, "named")
-    plates, found = truth_plates(truth(rig, scene, scene.seed)), findings.found
+    plates = truth_plates(truth(rig, scene, scene.seed))
+    found = findings.found
     true = match_truth([r.patch for r in found.patches], plates)
     named = [(r.verdict, true[r.patch.label]) for r in found.patches if r.patch.label in true]
     return [(v.confidence, v.name == plate.name) for v, plate in named if v is not None and v.name != UNKNOWN]

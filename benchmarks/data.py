@@ -55,7 +55,8 @@ def temporary(parent: Path | None) -> Iterator[Path]:
 
 def recorded_rows(rig: Instrument, scene: Scene, count: int = DISTINCT) -> dict[str, list[NDArray[np.int16]]]:
     """Rows about the middle of the grid as both receivers record them: int16 [frame, sample, 8] for each board."""
-    radar, plan = SimulatedRig(rig, scene), plan_raster(rig.grid)
+    radar = SimulatedRig(rig, scene)
+    plan = plan_raster(rig.grid)
     first = (plan.rows - count) // 4 * 2
     rows: dict[str, list[NDArray[np.int16]]] = {b.name: [] for b in rig.receivers}
     for row in itertools.islice(plan, first, first + count):
@@ -112,7 +113,8 @@ def _repeated(path: Path, wanted: int, size: int) -> Iterator[NDArray[np.uint8]]
     memory = np.empty(min(size, wanted) or wanted, np.uint8)
     with path.open("rb") as file:
         while wanted:
-            piece, filled = memory[:wanted], 0
+            piece = memory[:wanted]
+            filled = 0
             while filled < piece.size:
                 filled += file.readinto(piece[filled:].data)
                 if filled < piece.size:
@@ -145,7 +147,9 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
 
     The points' echoes are made at a few frequencies and interpolated, which is good to 1e-6.
     """
-    grid, chirp, plan = image_grid(rig), rig.chirp, plan_raster(rig.grid)
+    grid = image_grid(rig)
+    chirp = rig.chirp
+    plan = plan_raster(rig.grid)
     antennas = Antennas.of(rig, board)
     quarters = [np.linspace(axis[0], axis[-1], 5)[1:-1] for axis in (grid.x_m, grid.y_m)]
     points = np.array([(x, y, float(np.mean(grid.z_m))) for x in quarters[0] for y in quarters[1]])

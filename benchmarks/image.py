@@ -40,7 +40,9 @@ class Bench:
     """One board's cube on disk, and the ways to its image."""
 
     def __init__(self, rig: Instrument, board: Board, path: Path) -> None:
-        self.rig, self.board, self.path = rig, board, path
+        self.rig = rig
+        self.board = board
+        self.path = path
 
     def ours(self, live: bool = False) -> Image:
         """From disk to pixels: all rows, then the image; or an image that every row updates."""
@@ -63,10 +65,12 @@ class Bench:
 
     def reduced(self, window: str) -> tuple[Aperture, NDArray[np.complex64]]:
         """The cube through the range gate alone, complex64 [rx, frequency, row, column], and its aperture."""
-        plan, grid = plan_raster(self.rig.grid), image_grid(self.rig)
+        plan = plan_raster(self.rig.grid)
+        grid = image_grid(self.rig)
         antennas = Antennas.of(self.rig, self.board)
         gate = reduction(self.rig.chirp, scene_gate_m((antennas,), plan, grid), window)
-        maps, cube = gate.matrix.astype(np.complex64), np.load(self.path, mmap_mode="r")
+        maps = gate.matrix.astype(np.complex64)
+        cube = np.load(self.path, mmap_mode="r")
         samples = np.stack([np.matmul(maps, cube[:, row].mT) for row in range(plan.rows)], axis=2)
         return Aperture(antennas, scan_offsets_m(self.rig), gate.frequencies_hz, grid), samples
 
@@ -120,7 +124,8 @@ def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, 
         with once.timed():
             image = bench.theirs(points)
         settings[points] = {"cpu_s": once.cpu[0], "rms_error": rms(image, exact)}
-    theirs, tuned = took["published"].median, took["published, tuned"].median
+    theirs = took["published"].median
+    tuned = took["published, tuned"].median
     finer = (f"{n} points {s['cpu_s']:.1f} s, {100 * s['rms_error']:.2g} %" for n, s in settings.items())
     lines = []
     for name, at_least, aim in (("warm", 18, 30), ("cold", 9, 13)):
@@ -153,7 +158,8 @@ def against_time_domain(bench: Bench, rounds: int) -> tuple[list[Line], dict[str
             found = peer.form(aperture, samples, peer.every)
             took.setdefault(peer.name, []).append(found.seconds)
             images[peer.name] = found.image
-    ours, lines = statistics.median(took["ours"]), []
+    ours = statistics.median(took["ours"])
+    lines = []
     for peer in beside:
         theirs = statistics.median(took[peer.name])
         part = np.zeros_like(samples)
@@ -201,8 +207,10 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
         ("the cube on disk", "rows from disk", "batch from disk", (5.0, 3.0)),
         ("reduced samples", "rows", "batch", (None, None)),  # without the steps both share: for information
     ):
-        ours, theirs = took[rows].median, took[batch].median
-        name, note = f"all row updates in batch images, both from {where}", f"{1e3 * ours / len(starts):.2f} ms a row"
+        ours = took[rows].median
+        theirs = took[batch].median
+        name = f"all row updates in batch images, both from {where}"
+        note = f"{1e3 * ours / len(starts):.2f} ms a row"
         lines.append(Line(name, f"{ours:.3f} s", f"{theirs:.3f} s", ours / theirs, *limits, False, note))
     difference = max(worst(kept["rows"], kept["batch"]), worst(kept["live"], kept["whole"]))
     lines.append(Line("row by row against batch, of the peak", f"{difference:.1e}", "", difference, 2e-6, 5e-7, False))

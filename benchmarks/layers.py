@@ -86,7 +86,8 @@ class Case:
 
 def draw_scene(seed: int) -> Scene:
     """Six stacks on the places of a coverage scene."""
-    own, rng = np.random.default_rng([20261123, seed // A_RIG]), np.random.default_rng([20261124, seed])
+    own = np.random.default_rng([20261123, seed // A_RIG])
+    rng = np.random.default_rng([20261124, seed])
     leak = [complex(0.1 * own.random() * np.exp(2j * np.pi * own.random())) for _ in range(2)]
     plates: list[dict[str, Any]] = []
     kinds = iter(rng.permutation([*KINDS[:2] * 2, KINDS[2], KINDS[seed % 2]]).tolist())
@@ -95,7 +96,8 @@ def draw_scene(seed: int) -> Scene:
             "centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [SIDE_MM, SIDE_MM],
             "height_mm": rng.uniform(-0.3, 0.3), "rough_mm": rng.uniform(0, 0.1),
         }  # fmt: skip
-        kind, real = next(kinds), rng.uniform(2, 7)
+        kind = next(kinds)
+        real = rng.uniform(2, 7)
         sheet = {"permittivity": [real, real * rng.uniform(0, 0.1)], "thickness_mm": rng.uniform(0.5, 5)}
         layers = [sheet]
         if kind == KINDS[1]:
@@ -160,7 +162,8 @@ def judged(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -> C
     """The fit of one plate beside its truth."""
     kind = next(k for k in KINDS if plate.name.startswith(k))
     layer = plate.layers[1] if kind == KINDS[2] else plate.layers[0]
-    true, size_mm = layer.permittivity, layer.thickness_mm or 0.0
+    true = layer.permittivity
+    size_mm = layer.thickness_mm or 0.0
     if fit is None or fit.covariance is None:
         return Case(seed, kind, setting, true, size_mm)
     away = np.array([fit.permittivity.real - true[0], -fit.permittivity.imag - true[1]])
@@ -175,7 +178,8 @@ def judged(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -> C
 
 def cases(seeds: Sequence[int]) -> list[Case]:
     """All stacks of the scenes of one rig."""
-    rig, out = load_instrument(packaged(Path("instrument.toml"))), list[Case]()
+    rig = load_instrument(packaged(Path("instrument.toml")))
+    out = list[Case]()
     metal = metal_scan(rig, draw_scene(seeds[0]))
     for seed in seeds:
         scene = draw_scene(seed)

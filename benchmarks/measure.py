@@ -55,7 +55,8 @@ class Seconds:
     @contextmanager
     def timed(self) -> Iterator[None]:
         """Time a block, and append it."""
-        wall, cpu = time.perf_counter(), time.process_time()
+        wall = time.perf_counter()
+        cpu = time.process_time()
         yield
         self.cpu.append(time.process_time() - cpu)
         self.wall.append(time.perf_counter() - wall)

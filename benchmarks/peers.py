@@ -63,10 +63,12 @@ def fastsar_image(aperture: Aperture, samples: NDArray[np.complex64], every: int
     import fastsar
 
     chosen, offsets = _chosen(aperture, samples, every)
-    f, antennas = aperture.frequencies_hz, aperture.antennas
+    f = aperture.frequencies_hz
+    antennas = aperture.antennas
 
     def form(count: int) -> NDArray[np.complex64]:
-        shift, rx = offsets[:count], range(len(antennas.rx_m))
+        shift = offsets[:count]
+        rx = range(len(antennas.rx_m))
         image = fastsar.backproject(
             chosen[:, :count].conj().reshape(-1, f.size),
             np.concatenate([antennas.tx_m + shift for _ in rx]),

@@ -29,7 +29,8 @@ from polysight_simulators import gpio
 
 RIG = Path(__file__).parents[1] / "instrument.toml"
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
-CPU_AT_MOST, MEMORY_AT_MOST_MB = 0.15, 60.0
+CPU_AT_MOST = 0.15
+MEMORY_AT_MOST_MB = 60.0
 LIMIT_S = 60.0
 ROW_POINTS = 35  # short rows: a machine that is busy with other things ends some of them with a fault
 
@@ -55,7 +56,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _rig(folder: Path, points: int) -> Instrument:
-    rig, replace = load_instrument(RIG), msgspec.structs.replace
+    rig = load_instrument(RIG)
+    replace = msgspec.structs.replace
     stage = replace(rig.stage, port=str(folder / "tty"), centre_x_mm=points + 5.0, centre_y_mm=2.0)
     pi = replace(
         rig.pi, gpio_chip=str(folder / "chip"), one_shot=True, journal_dir=str(folder / "journal"),
@@ -77,7 +79,8 @@ def _start(stack: ExitStack, module: str, *args: object, **environment: str) -> 
 
 
 def _measure(rig: Instrument, points: int, folder: Path, stack: ExitStack) -> dict[str, Any]:
-    config, hub = folder / "rig.toml", folder / "wires"
+    config = folder / "rig.toml"
+    hub = folder / "wires"
     config.write_text(tomli_w.dumps(to_builtins(rig)), encoding="utf-8")
     _start(stack, "polysight_simulators.wires", "--socket", hub)
     _start(stack, "polysight_simulators.stage", "--config", config, "--wires", hub, "--link", rig.stage.port)
@@ -116,8 +119,12 @@ class _Rows:
     """Run rows one after another and record their edges on the wires."""
 
     def __init__(self, client: PiClient, rig: Instrument, wires: WireClient, pid: int) -> None:
-        self._client, self._wires, self._pid = client, wires, pid
-        self.rows, self.cpu_s, self.wall_s = 0, 0.0, 0.0
+        self._client = client
+        self._wires = wires
+        self._pid = pid
+        self.rows = 0
+        self.cpu_s = 0.0
+        self.wall_s = 0.0
         self.faults: list[int] = []
         self.bursts: list[tuple[Capture, list[WireEdge]]] = []  # whole ones, with their edges on SYNC_IN
         client.follow("benchmark", 0, lambda _: None)
@@ -140,7 +147,8 @@ class _Rows:
         edges: list[WireEdge] = []
         captures: list[Capture] = []
         cpu = began = 0.0
-        finished, deadline = None, time.monotonic() + LIMIT_S
+        finished = None
+        deadline = time.monotonic() + LIMIT_S
         while finished is None:
             if time.monotonic() > deadline:
                 raise SystemExit("a row does not end")
@@ -149,7 +157,8 @@ class _Rows:
             for event in self._client.events():
                 if isinstance(event, Capture):
                     if not captures:
-                        cpu, began = _cpu_s(self._pid), time.monotonic()
+                        cpu = _cpu_s(self._pid)
+                        began = time.monotonic()
                     captures.append(event)
                 finished = event if isinstance(event, RowFinished) else finished
         if captures:

@@ -52,8 +52,10 @@ HEAD = (
 
 def as_scanned(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilder]:
     """Simulate, synchronise and reduce every row: bursts in their true places, and taken to lie at their triggers."""
-    radar, plan = SimulatedRig(rig, scene), plan_raster(rig.grid)
-    true, nominal = ImageBuilder(rig), ImageBuilder(rig)
+    radar = SimulatedRig(rig, scene)
+    plan = plan_raster(rig.grid)
+    true = ImageBuilder(rig)
+    nominal = ImageBuilder(rig)
     for board in rig.receivers:
         setup = BoardSetup.of(rig, board)
         for row in plan:
@@ -132,7 +134,8 @@ def measure(
         for r, t in pairs
         if r.permittivity.value is not None and t.permittivity is not None
     ]
-    b, g = rig.burst, scanned.grid
+    b = rig.burst
+    g = scanned.grid
     plan = f"{rig.stage.speed_mm_s:g} mm/s, {b.pulses} x {b.period_us / 1e3:g} ms, {g.step_x_mm:g} x {g.step_y_mm:g} mm"
     off = 100 * float(np.median(errors)) if errors else float("nan")
     print(

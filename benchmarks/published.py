@@ -42,10 +42,12 @@ class Synchroniser:
     """
 
     def __init__(self, rig: Instrument, board: Board, tuned: bool = False) -> None:
-        chirp, self._tuned = rig.chirp, tuned
+        chirp = rig.chirp
+        self._tuned = tuned
         self._samples, (self._a, self._b) = chirp.samples, chirp.linear_samples
         middle = chirp.first_sample_hz + chirp.hz_per_sample * chirp.samples / 2
-        tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+        tx = np.array(tx_position_m(rig))
+        rx = np.array(rx_positions_m(rig, board))
         path = np.linalg.norm(rx - tx, axis=-1)
         self._beam = np.exp(-2j * np.pi * middle / SPEED_OF_LIGHT_M_S * (path - path[0])).astype(np.complex64)
         self._n = np.arange(chirp.samples)
@@ -78,7 +80,8 @@ class Synchroniser:
         if self._tuned:
             turns = np.float32(2 * np.pi) * frequency.astype(np.float32) * self._n_single + phase.astype(np.float32)
             turn = np.empty(turns.shape, np.complex64)
-            turn.real, turn.imag = np.cos(turns), -np.sin(turns)
+            turn.real = np.cos(turns)
+            turn.imag = -np.sin(turns)
             return (chirps * turn).mean(axis=1)
         out = np.empty_like(chirps)
         for rx, channel in enumerate(chirps):  # each makes the same factors again, in double precision
@@ -184,7 +187,8 @@ def form_image(
     full = rows + y.size - 1, columns + x.size - 1
     shape = tuple(int(scipy.fft.next_fast_len(n) or n) for n in full) if tuned else full
     seen = slice(rows - 1, rows - 1 + ny), slice(columns - 1, columns - 1 + nx)
-    image, total = np.zeros((ny, nx), np.complex64), np.zeros(shape, np.complex64)
+    image = np.zeros((ny, nx), np.complex64)
+    total = np.zeros(shape, np.complex64)
     for rx in range(n_rx):
         spectrum = np.asarray(scipy.fft.fft(cube[rx, :, :, a:b], points))
         bins = np.round(excess[rx] / SPEED_OF_LIGHT_M_S * chirp.hz_per_sample * points).astype(int)

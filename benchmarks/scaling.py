@@ -45,7 +45,8 @@ def run(args: argparse.Namespace) -> int:
             chain = Chain(folder, "batch", {"files": files, "grid": grid})
             figures = chain.run()
             memory = chain.end()
-            positions, last = columns * count * len(files), statistics.median(figures["last_row_cpu_s"])
+            positions = columns * count * len(files)
+            last = statistics.median(figures["last_row_cpu_s"])
             found.append({"size": size, **grid, "memory_bytes": memory, **figures})
             print(
                 f"{size:7.2f} {columns:8d} {count:5d} {step_x:6.0f} x {step_y:.0f} {positions:10d}"

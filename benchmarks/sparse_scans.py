@@ -48,7 +48,8 @@ def patterns(rows: int, columns: int) -> Iterator[tuple[str, np.ndarray, float]]
 
 def scan_minutes(rig: Instrument) -> float:
     """Time of the whole scan: rows at constant speed, with run-up, run-out and the step to the next row."""
-    stage, grid = rig.stage, rig.grid
+    stage = rig.stage
+    grid = rig.grid
     length = (grid.columns - 1) * grid.step_x_mm
     ramp = stage.speed_mm_s / stage.accel_mm_s2
     row = length / stage.speed_mm_s + 2 * ramp + grid.step_y_mm / stage.travel_speed_mm_s
@@ -72,7 +73,8 @@ def measure(folder: Path, iterations: int) -> list[tuple[str, float, float, floa
     valid = [b.valid.copy() for b in boards]
     whole = [b.image()[0] for b in boards]
     weights = [b.weights for b in boards]
-    minutes, out = scan_minutes(pipeline.source.instrument), []
+    minutes = scan_minutes(pipeline.source.instrument)
+    out = []
     rows, columns = valid[0].shape
     for name, kept, share in patterns(rows, columns):
         errors = []
@@ -94,7 +96,8 @@ def main() -> int:
     parser.add_argument("--scenes", nargs="*", default=SCENES)
     parser.add_argument("--keep", type=Path, default=None, help="folder where simulated scans stay")
     args = parser.parse_args()
-    rig, results = load_instrument(ROOT / "instrument.toml"), {}
+    rig = load_instrument(ROOT / "instrument.toml")
+    results = {}
     with tempfile.TemporaryDirectory() as temporary:
         for scene in args.scenes:
             folder = (args.keep or Path(temporary)) / f"ideal-{scene}"

@@ -33,7 +33,8 @@ def run(out: Path, positions: int, board_name: str, snr_db: float = SNR_DB) -> s
     """Simulate, synchronise and report; returns the text."""
     rig = load_instrument(Path(__file__).parents[1] / "instrument.toml")
     radar = SimulatedRig(rig, decode_scene(SCENE, "static_chirps").with_disturbances(direct_snr_db=snr_db))
-    board, chirp = radar.rig.by_name(board_name), radar.rig.chirp
+    board = radar.rig.by_name(board_name)
+    chirp = radar.rig.chirp
     row = 350
     setup = replace(BoardSetup.of(radar.rig, board), examined=row)
     report = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))

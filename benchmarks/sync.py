@@ -59,7 +59,8 @@ class Ours:
 
     def row(self) -> tuple[float, float]:
         """One row from its files: CPU seconds of reading, decoding and aligning, and of the direct path."""
-        whole, inner = Seconds(), Seconds()
+        whole = Seconds()
+        inner = Seconds()
         with whole.timed(), direct_path_timed(inner):
             self._pipeline.add_row(0)
         return whole.cpu[0] - sum(inner.cpu), sum(inner.cpu)
@@ -77,7 +78,8 @@ class Theirs:
         """The chosen positions of each board one after another: CPU seconds as of :class:`Ours`."""
         pulses = self._rig.burst.pulses
         size = pulses * self._rig.frame_bytes
-        first, second = Seconds(), Seconds()
+        first = Seconds()
+        second = Seconds()
         for method, path in self._boards:
             aligned = []
             with first.timed():

@@ -39,19 +39,24 @@ def _sum(
     cycles_per_m: np.float32,
     image: NDArray[np.float32],  # [2, y, x]
 ) -> None:
-    one, half, pi = np.float32(1), np.float32(0.5), np.float32(math.pi)
+    one = np.float32(1)
+    half = np.float32(0.5)
+    pi = np.float32(math.pi)
     dz_t = (z - tx[2]) ** 2
     for begin in range(0, offset_x.size, BLOCK):
         count = min(BLOCK, offset_x.size - begin)
         for r in range(rx.shape[0]):
             dz_r = (z - rx[r, 2]) ** 2
-            here, there = real[r, begin * bins :], imag[r, begin * bins :]
-            u, v = offset_x[begin : begin + count], offset_y[begin : begin + count]
+            here = real[r, begin * bins :]
+            there = imag[r, begin * bins :]
+            u = offset_x[begin : begin + count]
+            v = offset_y[begin : begin + count]
             for i in range(y.size):
                 for j in range(x.size):
                     sum_re = sum_im = np.float32(0)
                     for p in range(count):
-                        dx, dy = x[j] - u[p], y[i] - v[p]
+                        dx = x[j] - u[p]
+                        dy = y[i] - v[p]
                         to_tx = np.sqrt((dx - tx[0]) ** 2 + (dy - tx[1]) ** 2 + dz_t)
                         d = to_tx + np.sqrt((dx - rx[r, 0]) ** 2 + (dy - rx[r, 1]) ** 2 + dz_r) - direct[r]
                         place = (d - first_m) * bins_per_m
@@ -67,7 +72,8 @@ def _sum(
                         s = a * (one + q * (np.float32(-1 / 6) + q * (np.float32(1 / 120) + q * s)))
                         c = np.float32(-1 / 720) + q * np.float32(1 / 40320)
                         c = one + q * (-half + q * (np.float32(1 / 24) + q * c))
-                        cos, sin = one - np.float32(2) * s * s, np.float32(2) * s * c
+                        cos = one - np.float32(2) * s * s
+                        sin = np.float32(2) * s * c
                         sum_re += re * cos - im * sin
                         sum_im += re * sin + im * cos
                     image[0, i, j] += sum_re

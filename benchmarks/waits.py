@@ -34,7 +34,8 @@ COMMANDS = {  # at most so many CPU seconds; {made} is a folder of products
 def rows_then_products(scan: Path, out: Path) -> dict[str, float]:
     """Wall seconds behind a scan's last row, as beside a running scan: to the written images, to the report."""
     source = ScanFolder.load(scan)
-    pipeline, rows = Pipeline(source, live=True, samples="keep"), list(source.rows())
+    pipeline = Pipeline(source, live=True, samples="keep")
+    rows = list(source.rows())
     for row in rows[:-1]:
         pipeline.add_row(row)
     began = time.perf_counter()
@@ -48,11 +49,13 @@ def rows_then_products(scan: Path, out: Path) -> dict[str, float]:
 
 def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
     """All rows read back and both images made: of the rig file's plane, and of another, each in a new pipeline."""
-    same, other = Seconds(), Seconds()
+    same = Seconds()
+    other = Seconds()
     for _ in range(repeats + 1):
         for took, depth_mm in ((same, 0.0), (other, 5.0)):
             source = ScanFolder.load(scan)
-            pipeline, rows = Pipeline(source, Settings(depth_mm=depth_mm), samples="read"), list(source.rows())
+            pipeline = Pipeline(source, Settings(depth_mm=depth_mm), samples="read")
+            rows = list(source.rows())
             if not all(pipeline.samples.is_kept(row) for row in rows):
                 raise RuntimeError("samples were not kept")
             with took.timed():
@@ -69,7 +72,8 @@ def listed(scan: Path, made: Path, root: Path, count: int) -> tuple[Seconds, Sec
     for n in range(count):
         shutil.copytree(made, root / f"scan-{n}" / "products", ignore=shutil.ignore_patterns("report.html", "figures"))
         shutil.copy(scan / MANIFEST, root / f"scan-{n}")
-    first, again = Seconds(), Seconds()
+    first = Seconds()
+    again = Seconds()
     for _ in range(REPEATS):
         scans = Scans(root)
         for took in (first, again):
@@ -81,9 +85,11 @@ def listed(scan: Path, made: Path, root: Path, count: int) -> tuple[Seconds, Sec
 
 def command(words: list[str]) -> tuple[float, float]:
     """CPU and wall seconds of a command in a process of its own. Raises RuntimeError when it fails."""
-    before, began = os.times(), time.perf_counter()
+    before = os.times()
+    began = time.perf_counter()
     done = subprocess.run([sys.executable, "-m", "polysight", *words], cwd=ROOT, capture_output=True, check=False)
-    wall, after = time.perf_counter() - began, os.times()
+    wall = time.perf_counter() - began
+    after = os.times()
     if done.returncode:
         raise RuntimeError(f"polysight {' '.join(words)}: {done.stderr.decode()}")
     return after.children_user + after.children_system - before.children_user - before.children_system, wall
@@ -122,7 +128,8 @@ def run(args: argparse.Namespace) -> int:
 
 def small_products(folder: Path) -> Path:
     """Products of a small scan, to ask commands about."""
-    scan, made = folder / "small", folder / "made"
+    scan = folder / "small"
+    made = folder / "made"
     rig = ["--config", str(ROOT / "instrument.toml")]
     small = (SCENE.parent / "own-scene.toml") if (SCENE.parent / "own-scene.toml").exists() else SCENE
     subprocess.run(

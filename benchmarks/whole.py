@@ -45,10 +45,13 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
     else:
         rig, _ = published(**source["grid"])
         scan = RepeatedRows(rig, {name: [Path(f) for f in files] for name, files in source["files"].items()})
-    whole, once, last = Seconds(), Seconds(), Seconds()
+    whole = Seconds()
+    once = Seconds()
+    last = Seconds()
     with whole.timed():
         with once.timed():
-            pipeline, rows = Pipeline(scan, live=live), list(scan.rows())
+            pipeline = Pipeline(scan, live=live)
+            rows = list(scan.rows())
         for row in rows:
             pipeline.add_row(row)
         with once.timed():
@@ -109,7 +112,9 @@ class Published:
     """Scale a part of the published method's time to the whole scan: every position and every board cost the same."""
 
     def __init__(self, rig: Instrument, files: dict[str, Path], tuned: bool) -> None:
-        self._rig, self._tuned, self._grid = rig, tuned, image_grid(rig)
+        self._rig = rig
+        self._tuned = tuned
+        self._grid = image_grid(rig)
         self._row = sync.Theirs(rig, files, tuned, 35)
         shape = len(rig.antennas.rx_mm), rig.grid.rows, rig.grid.columns, rig.chirp.samples
         self._cube = np.broadcast_to(np.ones(shape[1:], np.complex64), shape)
@@ -134,7 +139,9 @@ def run(args: argparse.Namespace) -> int:
         del rows
         plain, tuned = (Published(rig, files, t) for t in (False, True))
         batch, live = (Chain(folder, how, {"scan": str(scan)}) for how in ("batch", "live"))
-        ours, theirs, theirs_tuned = [], [], []
+        ours = []
+        theirs = []
+        theirs_tuned = []
         for _ in range(1 if args.quick else args.repeats):
             ours.append(batch.run())
             theirs.append(plain.run())

@@ -48,7 +48,8 @@ def _draws(quick: bool) -> int:
 def task_samples(task: str, seed: int, quick: bool) -> Samples:
     """Return the pixels of a task of Fig. 18, under one angle, or under both for the task of two angles."""
     name, _, two = task.partition(", ")
-    group, errors = groups()[name], calibrated_errors(name, _draws(quick))
+    group = groups()[name]
+    errors = calibrated_errors(name, _draws(quick))
     one = draw(group.materials, group.angle_deg, errors, seed).samples()
     if not two:
         return one
@@ -220,7 +221,9 @@ def fig18(run: Run) -> Item:
 
 def fig20(run: Run) -> Item:
     """H, V, P alone and together: the paper's KNN under both splits."""
-    printed, rows, data = published()["channels_percent"], [], {}
+    printed = published()["channels_percent"]
+    rows = []
+    data = {}
     tasks = ("solids", "liquids", "powders")
     weight = [len(groups()[t].materials) for t in tasks]
     fig = new_figure(8.4, 4.2)
@@ -335,14 +338,16 @@ def pixel_bound(
     """
     eps = np.array([m.permittivity for m in materials])
     variance = errors.shared * (2 if reference else 1) + (1 - errors.shared) / pixels
-    columns, std = [], []
+    columns = []
+    std = []
     for angle in angles_deg:
         r_s, r_p = fresnel(eps, np.radians(angle))
         p = r_s / r_p
         columns += [np.log(np.abs(r_s)), np.log(np.abs(r_p)), p / np.abs(p)]
         std += [errors.amplitude, errors.amplitude, errors.phase_rad * np.sqrt(2)]
     mean = np.stack(columns, axis=1)
-    rng, right = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    right = []
     for k in range(len(materials)):
         cost = np.zeros((TRIALS, len(materials)))
         for c, s in enumerate(std):

@@ -42,7 +42,9 @@ from polysight_shared.geometry import incidence_deg
 T = TypeVar("T")
 SAME_ANGLE_DEG = 2.5
 """Largest difference of a scan's incidence angle from the paper's angles, 55 and 60 degrees."""
-MATERIALS, LABELS, IMAGES = "materials/", "labels/", "images made here"
+MATERIALS = "materials/"
+LABELS = "labels/"
+IMAGES = "images made here"
 _ALIKE = 0.35  # least correlation of two images of one scan
 
 # Names of materials.
@@ -116,7 +118,9 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
             "give the folder with materials/",
             code=ErrorCode.FILE_MISSING,
         )
-    base, notices, found = load_instrument(config), [], {}
+    base = load_instrument(config)
+    notices = []
+    found = {}
     if pickles := sorted((folder / "materials").glob("*.pkl")):
         found[MATERIALS] = _readable(read_material, pickles, notices)
     scans = _readable(read_labelled_scan, label_folders(folder / "labels"), notices)
@@ -182,7 +186,9 @@ def _imaged_here(scan: LabelledScan, images: Path, notices: list[str]) -> Labell
     file = images / scan.scan / "image.npz"
     try:
         with open_npz(file) as z:
-            h, v, valid = z["h"], z["v"], z["valid"]
+            h = z["h"]
+            v = z["v"]
+            valid = z["valid"]
     except (OSError, ValueError, KeyError, zipfile.BadZipFile, DataError) as e:
         notices.append(f"{scan.scan}: no image made here: {e}")
         return None
@@ -203,7 +209,8 @@ def _imaged_here(scan: LabelledScan, images: Path, notices: list[str]) -> Labell
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    a, b = a - a.mean(), b - b.mean()
+    a = a - a.mean()
+    b = b - b.mean()
     return float((a * b).sum() / max(float(np.sqrt((a**2).sum() * (b**2).sum())), 1e-30))
 
 
@@ -213,7 +220,8 @@ def _named(
     """Rename the entries as in Table 2; entries of unknown names are skipped and listed in the notices."""
     rows = rows_of(((e.name, e.thickness_mm) for entries in found.values() for e in entries), given)
     titles = {m.number: m.name for m in table2()}
-    sources, unknown = {}, set()
+    sources = {}
+    unknown = set()
     for source, entries in found.items():
         kept = []
         for e in entries:
@@ -334,7 +342,8 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
 
 def authors_library(data: AuthorsData) -> Library:
     """Return the patches of all sources except our own images, without leakage and without duplicates."""
-    a, b = complex(*data.base.polarimetry.leakage_h), complex(*data.base.polarimetry.leakage_v)
+    a = complex(*data.base.polarimetry.leakage_h)
+    b = complex(*data.base.polarimetry.leakage_v)
     kept: dict[tuple[str, str, int], list[Entry]] = {}
     for source, library in data.sources.items():
         if source == IMAGES:

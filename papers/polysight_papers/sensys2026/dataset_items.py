@@ -55,7 +55,8 @@ from polysight_shared.errors import ConfigError, DataError
 
 SECOND_ANGLE_DEG = 55.0
 TASKS = ("solids", "solids, two angles", "liquids", "powders")
-ALL, AT_LEAST = 1500, 6
+ALL = 1500
+AT_LEAST = 6
 """Pixels of a task, and least number of pixels of a patch."""
 LEFT_OUT = "scans left out"
 OPTIMISTIC = "by pixel (optimistic)"
@@ -166,14 +167,18 @@ class Judgements:
 
 def authors_fig18(judge: Judgements) -> Item:
     """Accuracy of the paper's KNN and of the discriminant, with confusion matrices. Raises DataError."""
-    printed, rows, content, pictures = published()["classification"], [], {}, {}
+    printed = published()["classification"]
+    rows = []
+    content = {}
+    pictures = {}
     for source, task, samples in judge.found(TASKS):
         name, _, two = task.partition(", ")
         paper = printed[name]["two_angles_percent" if two else "all_percent"] / 100
         several = repeated(samples)
         scores = [s for m in (PAPER, DISCRIMINANT) for s in judge.judged(source, task, m)]
         h_only = judge.judged(source, task, PAPER, "H")
-        names, held = np.unique(samples.names), 0 if several is None else np.unique(several.names).size
+        names = np.unique(samples.names)
+        held = 0 if several is None else np.unique(several.names).size
         rows.append((
             f"{names.size} {task}", source, str(np.unique(samples.groups).size),
             "–" if two else percent(printed[name]["h_percent"] / 100), *(_share(s) for s in h_only), percent(paper),
@@ -222,7 +227,10 @@ def authors_fig18(judge: Judgements) -> Item:
 
 def authors_fig20(judge: Judgements) -> Item:
     """H, V, P alone and together by the paper's KNN. Raises DataError."""
-    printed, tasks, rows, content = published()["channels_percent"], ("solids", "liquids", "powders"), [], {}
+    printed = published()["channels_percent"]
+    tasks = ("solids", "liquids", "powders")
+    rows = []
+    content = {}
     found = judge.found(tasks)
     sources = list(dict.fromkeys(s for s, _, _ in found))
     fig = new_figure(8.4, 4.2)
@@ -274,7 +282,10 @@ def authors_fig20(judge: Judgements) -> Item:
 def authors_fig21(data: AuthorsData) -> Item:
     """Concentration of sugar by a line through the other concentrations. Raises DataError."""
     printed = published()["sugar_median_error_percent"]
-    tables, content, plots, why = [], {}, [], []
+    tables = []
+    content = {}
+    plots = []
+    why = []
     for source, library in data.sources.items():
         known = concentrations(library.names, {WATER_IN_GLASS: 0.0})
         angles = [e.incidence_deg for e in library.entries if e.name in known]
@@ -366,7 +377,9 @@ MAKERS: dict[str, Callable[[Judgements], Item]] = {
     "fig20": authors_fig20,
     "fig21": lambda judge: authors_fig21(judge.data),
 }
-AXIAL_RATIO, METAL_FACTOR, PERCENTILES = 0.05, 1 / 0.8, (30, 70)
+AXIAL_RATIO = 0.05
+METAL_FACTOR = 1 / 0.8
+PERCENTILES = (30, 70)
 """Corrections of the authors before Eq. 3: leakage, a factor on |P| relative to metal, percentiles of |P| to keep."""
 
 
@@ -566,14 +579,16 @@ def _estimates(data: AuthorsData, source: str, leakage: float) -> list[Estimate]
         if seen is None or not seen[0].size:
             continue
         p, angle, scans = seen
-        one, theta = np.ones(p.size, np.complex128), np.radians(angle)
+        one = np.ones(p.size, np.complex128)
+        theta = np.radians(angle)
         as_is, clean = (estimate_permittivity(x, one, theta) for x in (p, without_leakage(p, leakage)))
         found.append(Estimate(m, angle, scans, p.size, as_is, clean, authors_recipe(p, angle)))
     return found
 
 
 def _row(e: Estimate) -> tuple[str, ...]:
-    m, std = e.material, e.clean.real_std
+    m = e.material
+    std = e.clean.real_std
     return (
         str(m.number), m.name, f"{e.angle_deg:.0f}°", str(e.scans), str(e.pixels), f"{m.permittivity.real:.4g}",
         "–" if m.number == 23 else f"{-m.permittivity.imag:.4g}", *_cells(e.as_is.value), *_cells(e.clean.value),

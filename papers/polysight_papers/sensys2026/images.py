@@ -60,7 +60,8 @@ def scanned(
     """
     content = {"name": name, "seed": seed, "object_distance_mm": 499.0, "grid": GRID, "plates": list(plates)} | more
     with tempfile.TemporaryDirectory(prefix="polysight-reproduce-") as temporary:
-        file, folder = Path(temporary) / "scene.toml", Path(temporary) / "scan"
+        file = Path(temporary) / "scene.toml"
+        folder = Path(temporary) / "scan"
         file.write_text(tomli_w.dumps(content), encoding="utf-8")
         if run_simulator(["simulate", str(file), "--config", str(config), "--out", str(folder)]):
             raise ScanError(f"the scene {name!r} could not be simulated", "see above", code=ErrorCode.VALUE_INVALID)
@@ -261,7 +262,8 @@ def fig14(run: Run) -> Item:
     fig = new_figure(11.5, 3.4)
     channels = {"H": view.result.calibrated.h, "V": view.result.calibrated.v, "P": view.result.calibrated.p}
     patches = {p.truth.name: p for p in view.result.patches if p.truth is not None and p.truth.name in shown}
-    rows, data = [], {}
+    rows = []
+    data = {}
     inside = np.any([p.patch.interior for p in patches.values()], axis=0)
     for ax, (channel, values) in zip(fig.subplots(1, 3), channels.items(), strict=True):
         metal = np.mean(values[patches["copper"].patch.interior])

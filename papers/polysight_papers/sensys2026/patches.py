@@ -40,7 +40,8 @@ from polysight.polarimetry import fresnel
 from polysight_papers.sensys2026.item import Published, Table, percent, published, table2
 
 Complex = npt.NDArray[np.complex128]
-SCANS, PIXELS = 8, 12
+SCANS = 8
+PIXELS = 12
 """Placements of Fig. 17; with 12 pixels each a material has 96, the paper's "about 80 to 120"."""
 
 
@@ -138,7 +139,8 @@ def draw(
 ) -> Pixels:
     """Draw pixels of every material in every scan; the same seed gives the same errors up to their size."""
     rng = np.random.default_rng([seed, round(angle_deg * 100)])
-    own, common = np.sqrt(1 - errors.shared), np.sqrt(errors.shared)
+    own = np.sqrt(1 - errors.shared)
+    common = np.sqrt(errors.shared)
 
     def channel(r: Complex) -> Complex:
         one = (scans, len(materials), 1)
@@ -167,7 +169,8 @@ def calibrated_errors(group_name: str, draws: int = 3, shared: float = 0.5) -> E
 
     Bisection over the logarithm of the amplitude error, on draws that no result is made from.
     """
-    group, target = groups()[group_name], published()["classification"][group_name]["h_percent"] / 100
+    group = groups()[group_name]
+    target = published()["classification"][group_name]["h_percent"] / 100
     seeds = tuple(range(1000, 1000 + draws))
     start = Errors(0.0, published()["phase_std_rad"], shared)
 
@@ -248,7 +251,8 @@ def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool
     mean = _features(
         specimens(materials, errors.spread, np.broadcast_to(nodes, (2, z.size**2, len(materials)))), angles_deg
     )
-    rng, right = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    right = []
     trials = 40 if quick else 250
     for k in range(len(materials)):
         eps = specimens(materials, errors.spread, rng.standard_normal((2, trials, len(materials))))[:, k]
@@ -274,7 +278,8 @@ def strangers_named(taught: Samples, test: Samples, quick: bool) -> tuple[int, i
 
     Returns the two pairs (named, of how many).
     """
-    named, outside = [], []
+    named = []
+    outside = []
     scans = np.unique(test.groups)[: 2 if quick else 6]
     for name in np.unique(test.names):
         others = taught.take(taught.names != name)

@@ -50,7 +50,8 @@ WATER = Published(0, "Water (without glass, 75 GHz)", 9.37 - 18.0j, None, "liter
 LINES = ("-", "--", "-.", ":")
 # Fig. 17.
 PLACEMENTS = 8
-REACH_MM, APART_MM = 60.0, 60.0
+REACH_MM = 60.0
+APART_MM = 60.0
 MATERIALS = {"PET": 6, "ceramic": 12}
 """Rows of Table 2."""
 
@@ -66,7 +67,8 @@ def fig3(run: Run) -> Item:
     angle = np.arange(0.0, 90.0, 0.25)
     fig = new_figure(11.5, 4.4)
     axes = fig.subplots(1, 3)
-    rows, curves = [], {}
+    rows = []
+    curves = {}
     for i, m in enumerate(materials):
         r_s, r_p = fresnel(m.permittivity, np.radians(angle))
         p = ratio_from_permittivity(m.permittivity, np.radians(angle))
@@ -158,7 +160,8 @@ def fig16(run: Run) -> Item:
 
 def table2_item(run: Run) -> Item:
     """Estimate Table 2 by Eq. 3 from pixels drawn at the published permittivities."""
-    rows, data = [], []
+    rows = []
+    data = []
     fig = new_figure(10.5, 4.6)
     axes = fig.subplots(1, 2)
     for colour, (name, group) in zip((PALETTE[0], PALETTE[6], PALETTE[3]), groups().items(), strict=True):
@@ -167,7 +170,8 @@ def table2_item(run: Run) -> Item:
         found: list[tuple[complex, complex, float]] = []
         for j, m in enumerate(group.materials):
             e = estimate_permittivity(seen.h[:, j].ravel(), seen.v[:, j].ravel(), np.radians(group.angle_deg))
-            true, row = m.permittivity, {"number": m.number, "name": m.name, "angle_deg": group.angle_deg}
+            true = m.permittivity
+            row = {"number": m.number, "name": m.name, "angle_deg": group.angle_deg}
             printed = (f"{true.real:.2f}", "–" if m.number == 23 else f"{-true.imag:.2f}")
             if e.value is None or e.real_std is None:
                 rows.append((str(m.number), m.name, "metal", "metal", "metal-like", "", "", ""))
@@ -249,7 +253,8 @@ def fig17(run: Run) -> Item:
 
 def _item(true: dict[str, complex], pixels: dict[str, list[Complex]], centres: list[dict[str, Any]]) -> Item:
     fig = new_figure(11.5, 4.6)
-    rows, data = [], {}
+    rows = []
+    data = {}
     for ax, (name, eps) in zip(fig.subplots(1, 2), true.items(), strict=True):
         for i, values in enumerate(pixels[name]):
             ax.plot(values.real, -values.imag, MARKERS[i % 10], ms=3, color=PALETTE[i], label=f"placement {i + 1}")

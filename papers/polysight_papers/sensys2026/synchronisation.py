@@ -71,11 +71,15 @@ def sync_scan(run: Run) -> SyncScan:
     plates = [plate("copper", None, 0.0, 0.0), plate("left", None, -60.0, 40.0), plate("right", None, 60.0, -40.0)]
     with scanned("three metal plates", plates, run.config, seed=1200) as (source, _):
         rig = source.instrument
-        chirp, board = rig.chirp, rig.receivers[0].name
+        chirp = rig.chirp
+        board = rig.receivers[0].name
         setups = {b.name: BoardSetup.of(rig, b) for b in rig.receivers}
         reports = {n: SyncReport(chirp.sample_rate_hz, chirp.linear_samples, 4) for n in setups}
-        before, after = ImageBuilder(rig), ImageBuilder(rig)
-        middle, shown, carrier = source.plan.rows // 2, {}, None
+        before = ImageBuilder(rig)
+        after = ImageBuilder(rig)
+        middle = source.plan.rows // 2
+        shown = {}
+        carrier = None
         for row in source.rows():
             for name, setup in setups.items():
                 data = source.read_row(name, row)
@@ -243,7 +247,8 @@ def skirt_db(
 
 def _sweep(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
     """IF (Hz) and amplitude of the direct path over all start frequencies, and the chirps of the usual one."""
-    swept, shown = [], np.zeros((1, 1, chirp.samples), np.complex64)
+    swept = []
+    shown = np.zeros((1, 1, chirp.samples), np.complex64)
     for offset in OFFSETS_HZ:
         disturbances = {"if_offset_hz": offset}
         with scanned("direct path", (), run.config, 900, grid=GRID, disturbances=disturbances) as (source, _):
@@ -262,7 +267,8 @@ def _draw_spectrogram(ax: Axes, one: Complex, chirp: Chirp) -> None:
     f, t, power = scipy.signal.spectrogram(
         one, chirp.sample_rate_hz, nperseg=48, noverlap=44, nfft=256, return_onesided=False
     )
-    f, power = np.fft.fftshift(f % chirp.sample_rate_hz), np.fft.fftshift(power, axes=0)
+    f = np.fft.fftshift(f % chirp.sample_rate_hz)
+    power = np.fft.fftshift(power, axes=0)
     order = np.argsort(f)
     level = 10 * np.log10(power[order] / power.max())
     picture = ax.pcolormesh(t * 1e6, f[order] / 1e6, level, cmap="cividis", vmin=-35, vmax=0, rasterized=True)
@@ -303,7 +309,8 @@ def fig9(run: Run) -> Item:
     """The direct path alone, received at ten start frequencies of the receiver."""
     chirp = load_instrument(run.config).chirp
     if_hz, amplitude, shown = _sweep(run, chirp)
-    fitted, programmed = fit_high_pass(if_hz, amplitude), high_pass(chirp)
+    fitted = fit_high_pass(if_hz, amplitude)
+    programmed = high_pass(chirp)
     amplitude = amplitude / np.exp(np.mean(np.log(amplitude / np.abs(fitted.response(if_hz)))))
 
     fig = new_figure(11.5, 4.2)

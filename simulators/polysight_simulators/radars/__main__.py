@@ -15,7 +15,8 @@ from pathlib import Path
 from polysight_simulators.radars.board import FUNCTIONAL, RadarBoard
 from polysight_simulators.radars.cores import make_image
 
-_STEP_S, _TIMEOUT_S = 1e-4, 15.0
+_STEP_S = 1e-4
+_TIMEOUT_S = 15.0
 
 
 class _Time:
@@ -29,7 +30,8 @@ class _Time:
 def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> list[str]:
     """Return a line for each different answer of the board. Raises OSError, ValueError."""
     time = _Time()
-    board, differences = make(time.now), []
+    board = make(time.now)
+    differences = []
     if not trace.is_file():
         raise ValueError("not a regular file")
     lines = trace.read_text(encoding="utf-8").splitlines()

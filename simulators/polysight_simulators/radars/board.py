@@ -30,7 +30,8 @@ from polysight_simulators.radars.cores import (
 )
 
 FUNCTIONAL = 4  # sense-on-power mode
-ANSWER_S, DATA_S = 1e-4, 1e-3
+ANSWER_S = 1e-4
+DATA_S = 1e-3
 
 
 class Fault(Enum):
@@ -96,8 +97,11 @@ class RadarBoard:
         first_generation: bool = False,
         answers_32_bit: bool = False,
     ) -> None:
-        self.now, self._dead_s, self._fault_pulses = now, dead_s, fault_pulses
-        self.functional_jumpers, self._answers_32_bit = functional_jumpers, answers_32_bit
+        self.now = now
+        self._dead_s = dead_s
+        self._fault_pulses = fault_pulses
+        self.functional_jumpers = functional_jumpers
+        self._answers_32_bit = answers_32_bit
         self.cores = Cores(
             now, self._event, flash, die=die, supply_v=supply_v, erase_s=erase_s, fault_at=fault_at,
             first_generation=first_generation,
@@ -106,7 +110,8 @@ class RadarBoard:
         self.powered = True
         self._faults: deque[Fault] = deque()
         self._pulses_seen = 0
-        self._held, self._mode = True, 0
+        self._held = True
+        self._mode = 0
         self._forget()
 
     @property
@@ -130,12 +135,15 @@ class RadarBoard:
         return self.cores.destroyed
 
     def _forget(self) -> None:
-        self._in, self._out = bytearray(), bytearray()
+        self._in = bytearray()
+        self._out = bytearray()
         self._waiting: deque[bytes] = deque()  # messages not read by the host yet
         self._later: list[tuple[float, bytes]] = []
-        self._offered, self._ready_at = False, 0.0
+        self._offered = False
+        self._ready_at = 0.0
         self._last: tuple[int, bytes] = (-1, b"")
-        self._pulse_s, self._busy_until = float("-inf"), -1.0
+        self._pulse_s = float("-inf")
+        self._busy_until = -1.0
         self.cores.forget()
 
     def inject(self, *faults: Fault) -> None:
@@ -189,7 +197,8 @@ class RadarBoard:
         self._pulses_seen += 1
         if not self.ready_for_triggers:
             return False
-        cores, at = self.cores, self.now() if pulse_s is None else pulse_s
+        cores = self.cores
+        at = self.now() if pulse_s is None else pulse_s
         period = cores.period_s()
         too_soon = abs(at - self._pulse_s) < (period if self._dead_s is None else self._dead_s) - 1e-9
         if too_soon or self._pulses_seen - 1 in self._fault_pulses:
@@ -270,15 +279,21 @@ class RadarBoard:
         fault = self._faults.popleft() if self._faults else None
         if fault is Fault.NO_ANSWER or self.destroyed or not self.powered or self.now() < self._busy_until:
             return
-        direction, number, sequence, wide = (opcode & 15) + 1, opcode >> 6, flags >> 12, self._answers_32_bit
+        direction = (opcode & 15) + 1
+        number = opcode >> 6
+        sequence = flags >> 12
+        wide = self._answers_32_bit
         if fault is Fault.NACK or zlib.crc32(raw[: length - 4]) != int.from_bytes(raw[length - 4 :], "little"):
             self._send(frame(direction, NACK, number, b"", 0, sequence, wide), 0.0)
             return
         if flags & 3 == 3 and self._last[0] == sequence and self._last[1]:
             self._send(self._last[1], 0.0)  # a retry: repeat the answer, without executing the command again
             return
-        delay, error = ANSWER_S, 0
-        body, blocks, block = raw[12 : length - 4], b"", 0
+        delay = ANSWER_S
+        error = 0
+        body = raw[12 : length - 4]
+        blocks = b""
+        block = 0
         for _ in range(count):
             block, size = struct.unpack_from("<HH", body)
             refused = fault in (Fault.REFUSE, Fault.REFUSE_BARE)

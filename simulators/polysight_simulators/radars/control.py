@@ -26,7 +26,9 @@ from polysight_shared.errors import DeviceError
 from polysight_simulators.faults import Faults
 from polysight_simulators.radars.board import RadarBoard
 
-_CLOCK, _OUT, _SELECT = 1 << 0, 1 << 1, 1 << 3
+_CLOCK = 1 << 0
+_OUT = 1 << 1
+_SELECT = 1 << 3
 _BARE = (0x85, 0x87, 0x8A, 0x8C, 0x8D, 0x97)
 _CHANNELS = "ABCD"
 _PIN_S = 0.2e-6  # duration of a pin command (FTDI AN_114)
@@ -44,8 +46,12 @@ class UsbChip:
         self.errors: list[str] = []
         self.words_written: list[int] = []
         self.spi_hz = 0.0
-        self._fast, self._pins, self._latched = False, 0, 0
-        self._high_s, self._low_s = float("inf"), 0.0  # time since the last change of chip select
+        self._fast = False
+        self._pins = 0
+        self._latched = 0
+        # Time since the last change of chip select
+        self._high_s = float("inf")
+        self._low_s = 0.0
         self._answers = {name: bytearray() for name in _CHANNELS}
         self._pending = {name: bytearray() for name in _CHANNELS}
         self._sense = 0
@@ -122,7 +128,8 @@ class UsbChip:
     def _set_pins(self, data: bytearray) -> int:
         if len(data) < 3:
             return 0
-        pins, direction = data[1], data[2]
+        pins = data[1]
+        direction = data[2]
         if direction & (_CLOCK | _OUT | _SELECT) != _CLOCK | _OUT | _SELECT:
             self.errors.append(f"clock, data or chip select is not driven (direction {direction:08b})")
         if pins & _CLOCK:
@@ -163,7 +170,8 @@ class UsbChannel:
     """Port of one channel."""
 
     def __init__(self, chip: UsbChip, name: str) -> None:
-        self._chip, self._name = chip, name
+        self._chip = chip
+        self._name = name
         self.closed = False
 
     def write(self, data: bytes) -> None:
@@ -272,7 +280,8 @@ class LineServer(_Server):
 
     def __init__(self, address: str, rearm: Callable[[], None], faults: Faults) -> None:
         super().__init__(address, "simulated control server")
-        self._rearm, self._faults = rearm, faults
+        self._rearm = rearm
+        self._faults = faults
         self.lines = 0
         self.unknown_lines = 0
 
@@ -282,7 +291,8 @@ class LineServer(_Server):
             if line.strip() != LINE:
                 self.unknown_lines += 1
                 continue
-            number, self.lines = self.lines, self.lines + 1
+            number = self.lines
+            self.lines = self.lines + 1
             if number in self._faults.retrigger_resets:
                 client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _NO_LINGER)
                 raise ConnectionResetError

@@ -17,8 +17,12 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-TO_DEVICE, READY, FROM_DEVICE = bytes.fromhex("34122143"), bytes.fromhex("78566587"), bytes.fromhex("badccdab")
-RESPONSE, NACK, EVENT = 1, 2, 3
+TO_DEVICE = bytes.fromhex("34122143")
+READY = bytes.fromhex("78566587")
+FROM_DEVICE = bytes.fromhex("badccdab")
+RESPONSE = 1
+NACK = 2
+EVENT = 3
 
 # Received from real devices (TI E2E forum, threads 670135, 752121, 1267477).
 FAULT_DATA = bytes.fromhex("05000000800000fe") + bytes(16) + b"\xff" * 6 + bytes(2)
@@ -45,10 +49,15 @@ def frame(direction: int, kind: int, number: int, body: bytes, count: int, seque
     return FROM_DEVICE + head + body + crc
 
 
-METAHEADER_NOT_FOUND, METAHEADER_CRC_FAILURE, MSSIMAGE_NOT_FOUND = 1 << 6, 1 << 30, 1 << 28  # ICD table 7.3
+# ICD table 7.3
+METAHEADER_NOT_FOUND = 1 << 6
+METAHEADER_CRC_FAILURE = 1 << 30
+MSSIMAGE_NOT_FOUND = 1 << 28
 _ROM = bytes((2, 2, 1, 7, 20, 3, 17))
-_MAIN_PATCH, _RF_PATCH = bytes((2, 2, 2, 0, 20, 7, 29)), bytes((2, 2, 4, 0, 22, 7, 6))
-_MAIN_AT, _RF_AT = 0x80, 0x880
+_MAIN_PATCH = bytes((2, 2, 2, 0, 20, 7, 29))
+_RF_PATCH = bytes((2, 2, 4, 0, 22, 7, 6))
+_MAIN_AT = 0x80
+_RF_AT = 0x880
 
 
 def make_image(size: int = 7940, *, rom: bytes = _ROM) -> bytes:
@@ -80,11 +89,28 @@ def patch_of(image: bytes, main: bool) -> bytes:
     return bytes((major, minor, *date, build << 4 | debug))
 
 
-BOOT_S, RF_UP_S, RF_INIT_S, ERASE_S, READY_S = 0.05, 0.02, 0.3, 4.0, 1e-3
-UP_MAIN, UP_RF, MAIN_FAULT, BOOTED = 0x5000, 0x5001, 0x5002, 0x5005
-CALIBRATED, TRIGGER_READY, FRAME_END, RF_FAULT = 0x1004, 0x100B, 0x100F, 0x1002
-PROFILE, CHIRP, FRAME, STREAM_SET, STREAM = 0x0100, 0x0101, 0x0102, 0x0103, 0x0104
-SAVE, RESTORE, CHUNK_BYTES, CHUNKS = 0x00AB, 0x008B, 224, 3
+BOOT_S = 0.05
+RF_UP_S = 0.02
+RF_INIT_S = 0.3
+ERASE_S = 4.0
+READY_S = 1e-3
+UP_MAIN = 0x5000
+UP_RF = 0x5001
+MAIN_FAULT = 0x5002
+BOOTED = 0x5005
+CALIBRATED = 0x1004
+TRIGGER_READY = 0x100B
+FRAME_END = 0x100F
+RF_FAULT = 0x1002
+PROFILE = 0x0100
+CHIRP = 0x0101
+FRAME = 0x0102
+STREAM_SET = 0x0103
+STREAM = 0x0104
+SAVE = 0x00AB
+RESTORE = 0x008B
+CHUNK_BYTES = 224
+CHUNKS = 3
 SIZES = {  # data bytes of each sub-block
     0x0080: 8, 0x0082: 8, 0x0083: 4, 0x0085: 4, 0x0086: 12, 0x0089: 12, RESTORE: 228, 0x008D: 16, SAVE: 4, 0x00C0: 0,
     PROFILE: 44, CHIRP: 20, FRAME: 24, STREAM_SET: 20, STREAM: 4, 0x0120: 4, 0x0121: 4, 0x0122: 0, 0x0140: 4,
@@ -127,7 +153,9 @@ class Cores:
         """Reset: clear RAM and settings, keep the flash."""
         self.ram = self._booted = b""
         self.main_up = self.rf_up = self.calibrated = self.crc32_events = False
-        self.frames_left, self.armed, self.frame_ends = 0, False, -1.0
+        self.frames_left = 0
+        self.armed = False
+        self.frame_ends = -1.0
         self._file: tuple[int, int] | None = None  # file type, missing bytes
         self._restored: dict[int, bytes] = {}
         self._part = b""
@@ -273,10 +301,13 @@ class Cores:
         if not self.calibrated or any(n not in self.settings for n in (*_BEFORE_FRAMES, FRAME, 0x40C0)):
             return 22
         _, _, _, _, frames, _, period, trigger = struct.unpack_from("<6HIH", self.settings[FRAME])
-        self.frames_left, self.armed, self.frame_ends = frames or -1, True, -1.0
+        self.frames_left = frames or -1
+        self.armed = True
+        self.frame_ends = -1.0
         self.armings += 1
         if trigger == 1:  # software trigger: they run at once (ICD table 5.27)
-            self.armed, self.frames_left = False, 0
+            self.armed = False
+            self.frames_left = 0
             self.event(FRAME_END, b"", frames * period * 5e-9)
         else:
             self.event(TRIGGER_READY, b"", READY_S)
@@ -295,7 +326,9 @@ class Cores:
             kind, length = struct.unpack_from("<II", data)
             if kind not in (0, 4, 5, 6, 7):
                 return 8, b"", 0.0
-            self._file, self._part, data = (kind, length), b"", data[8:]
+            self._file = (kind, length)
+            self._part = b""
+            data = data[8:]
             if kind:
                 self.flash = b""
             if self.fault_at == "download":

@@ -95,13 +95,16 @@ def synced_cube(
     -------
     complex64 [rx, row, column, frequency]; column 0 is the smallest x. Amplitudes are relative to the free direct path.
     """
-    rig, seed = apply_scene(rig, scene), scene.seed if seed is None else seed
-    board, d = rig.by_name(board_name), scene.disturbances
+    rig = apply_scene(rig, scene)
+    seed = scene.seed if seed is None else seed
+    board = rig.by_name(board_name)
+    d = scene.disturbances
     f = sample_frequencies_hz(rig) if frequencies_hz is None else np.asarray(frequencies_hz, np.float64)
     channels = list(range(len(rig.antennas.rx_mm))) if rx is None else list(rx)
     field = build_field(rig, scene, board, f, cache_dir, channels)
     all_m = antennas(rig, board).direct_m
-    direct_m, gains = all_m[channels], power_on(rig, scene, board, seed).gains[channels]
+    direct_m = all_m[channels]
+    gains = power_on(rig, scene, board, seed).gains[channels]
     cube = _read(field, rig, f, field.centre_path_m - direct_m, gains, d.backlash_mm)
     if direct:
         level = direct_factor(board, scene) * d.direct_gain * all_m[0] / direct_m
@@ -117,7 +120,8 @@ def synced_cube(
 
 def _burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int, echo_m: float) -> float:
     """Return the RMS noise of an averaged sample; compensating the high-pass filter divides by its gain at the IF."""
-    d, chirp = scene.disturbances, rig.chirp
+    d = scene.disturbances
+    chirp = rig.chirp
     if d.direct_snr_db is None:
         return 0.0
     averaged = 10.0 ** (-d.direct_snr_db / 20) / np.sqrt(rig.burst.chirps_a_position)
@@ -135,7 +139,8 @@ def _read(
     base = np.eye(len(f)) if np.array_equal(field.nodes_hz, f) else node_matrix(field, f)[0]
     turn = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(away_m, f)) * gains[:, None]
     expand = (base * turn[:, None]).astype(np.complex64)
-    plan, travel = plan_raster(rig.grid), mean_burst_travel_mm(rig.burst, rig.stage)
+    plan = plan_raster(rig.grid)
+    travel = mean_burst_travel_mm(rig.burst, rig.stage)
     cube = np.empty((len(away_m), plan.rows, plan.columns, len(f)), dtype=np.complex64)
     for row in plan:
         x = np.array(row.x_mm) + row.direction * travel + (backlash_mm if row.direction < 0 else 0.0)

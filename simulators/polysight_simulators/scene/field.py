@@ -150,7 +150,8 @@ def _angle_series(
     scene: Scene, reflect: Reflectivity, nodes_hz: Real, theta: tuple[float, float]
 ) -> NDArray[np.complexfloating]:
     """Return the Chebyshev coefficients of r(theta) for each plate and node, [plate, node, order]."""
-    centre, half = (theta[0] + theta[1]) / 2, max((theta[1] - theta[0]) / 2, 1e-9)
+    centre = (theta[0] + theta[1]) / 2
+    half = max((theta[1] - theta[0]) / 2, 1e-9)
     many = 16
     x = cheb_nodes(many)
     to_series = chebyshev.chebvander(x, many - 1).T * (2.0 / many)
@@ -243,7 +244,8 @@ class _Plane:
 
     def levels(self, rx: Sequence[int], top_hz: float) -> list[_Level]:
         """Group plates and points by height; at least one level, also for an empty scene."""
-        plates, points = self.scene.plates, self.scene.points
+        plates = self.scene.plates
+        points = self.scene.points
         heights = np.array([p.height_mm for p in (*plates, *points)])
         groups: list[list[float]] = []
         for height in np.unique(heights) if len(heights) else [0.0]:
@@ -261,7 +263,8 @@ class _Plane:
     def _level(
         self, height_mm: float, members: tuple[list[int], list[int]], rx: Sequence[int], top_hz: float
     ) -> _Level:
-        z, centre = self.ant.plane_z_m + height_mm / 1e3, self.ant.centre_m
+        z = self.ant.plane_z_m + height_mm / 1e3
+        centre = self.ant.centre_m
         wx, wy = np.meshgrid(self.x.w, self.y.w)
         legs = [self.ant.legs(wx, wy, r, z) for r in rx]
         lifts = [
@@ -275,7 +278,8 @@ class _Plane:
             relief = max(relief, abs(lift) + tilted + float(np.abs(self.surfaces[i].height_m).max()))
         low, high = _range(legs)
         half = (high - low) / 2
-        reach, n = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S * relief * half, 1
+        reach = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S * relief * half
+        n = 1
         # Remainder of Chebyshev interpolation of exp(j reach x), -1 <= x <= 1.
         while reach**n / (2.0 ** (n - 1) * math.factorial(n)) > _RELIEF_TOLERANCE:
             n += 1
@@ -289,7 +293,8 @@ class _Plane:
         """Return the spectra of a level's plates by order of the local angle, with the phases of C_m."""
         if not level.plates:
             return []
-        wave, ant = 2 * np.pi * f / SPEED_OF_LIGHT_M_S, self.ant
+        wave = 2 * np.pi * f / SPEED_OF_LIGHT_M_S
+        ant = self.ant
         plates = [self.scene.plates[i] for i in level.plates]
         table = np.array([(*p.centre_mm, *p.size_mm) for p in plates]) / 1e3
         turn = wave * level.steepness[m] * np.array([slopes(p) for p in plates])
@@ -338,7 +343,8 @@ def compute(
     rig: Instrument, scene: Scene, board: Board, samples_hz: Real, rx: Sequence[int]
 ) -> tuple[NDArray[np.complex64], tuple[float, float], tuple[float, float], Real, float]:
     """Return the fields of :class:`polysight_simulators.scene.field.ObjectField` for a scene of drawn specimens."""
-    ant, reflect = antennas(rig, board), board_reflectivity(board, scene)
+    ant = antennas(rig, board)
+    reflect = board_reflectivity(board, scene)
     ax, ay = spectral_axes(rig, scene, ant, float(samples_hz[-1]))
     amplitudes = sampled(np.array([complex(*p.amplitude) for p in scene.points])) * point_scale(ant)
     surfaces = tuple(facets(p, i, scene.seed) for i, p in enumerate(scene.plates))
@@ -347,7 +353,8 @@ def compute(
     legs = [leg for level in levels for leg in level.legs]
     nodes_hz, centre = _frequencies(scene.plates, ax, ay, legs, samples_hz)
 
-    low, high = min(leg[2].min() for leg in legs), max(leg[2].max() for leg in legs)
+    low = min(leg[2].min() for leg in legs)
+    high = max(leg[2].max() for leg in legs)
     series = _angle_series(scene, reflect, nodes_hz, (low, high))
     kernels = [(level, *_factors(level, low, high, series.shape[2])) for level in levels]
     values = np.empty((ay.outputs, ax.outputs, len(rx), len(nodes_hz)), dtype=np.complex64)
@@ -402,7 +409,8 @@ def _add_level(
         phase = np.exp(2j * np.pi * f / SPEED_OF_LIGHT_M_S * (r1 + r2 - centre_m))
         bases.append(phase * (fade / (r1 * r2)))
     for m in range(len(level.steepness)):
-        maps, point_map = plane.plate_maps(level, series, f, m), plane.point_map(level, f, m)
+        maps = plane.plate_maps(level, series, f, m)
+        point_map = plane.point_map(level, f, m)
         for r, whole in enumerate(bases):
             part = shares[r]
             base = whole if part is None else whole * part[m]
@@ -419,7 +427,8 @@ def _oversampled(spectrum: NDArray[np.complex64], axis: Axis, along: int) -> NDA
     shape = list(spectrum.shape)
     shape[along] = n * OVERSAMPLING
     padded = np.zeros(shape, dtype=np.complex64)
-    head, tail = (n + 1) // 2, n // 2
+    head = (n + 1) // 2
+    tail = n // 2
     lead = (slice(None),) * along
     padded[(*lead, slice(0, head))] = spectrum[(*lead, slice(0, head))]
     padded[(*lead, slice(-tail, None))] = spectrum[(*lead, slice(n - tail, n))]
@@ -469,7 +478,8 @@ class ObjectField:
         for y in np.unique(y_m):
             iy, wy = self._taps(np.array([y]), 1)
             on = np.flatnonzero(y_m == y)
-            low, high = ix[on].min(), ix[on].max() + 1
+            low = ix[on].min()
+            high = ix[on].max() + 1
             line = np.einsum("t,tx...->x...", wy[0], self.values[iy[0], low:high])
             out[on] = np.einsum("nt,nt...->n...", wx[on], line[ix[on] - low])
         return out
@@ -484,8 +494,10 @@ class ObjectField:
 
     def _reach(self, axis: int) -> tuple[float, float]:
         """Return the first and last offset with all taps inside the grid, metres; 0 = x, 1 = y."""
-        first, step = self.start_m[axis], self.step_m[axis]
-        half, n = TAPS // 2, self.values.shape[1 - axis]
+        first = self.start_m[axis]
+        step = self.step_m[axis]
+        half = TAPS // 2
+        n = self.values.shape[1 - axis]
         return first + (half - 1) * step, first + (n - half - 1) * step
 
     def _taps(self, u: Real, axis: int) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
@@ -513,7 +525,8 @@ def node_matrix(field: ObjectField, frequencies_hz: Real) -> tuple[Real, Real]:
     It uses the discrete orthogonality of the Chebyshev polynomials on their nodes.
     """
     q = len(field.nodes_hz)
-    low, high = frequencies_hz[0], frequencies_hz[-1]
+    low = frequencies_hz[0]
+    high = frequencies_hz[-1]
     scale = 2.0 / (high - low)
     x = (frequencies_hz - low) * scale - 1.0
     at_nodes = chebyshev.chebvander(cheb_nodes(q), q - 1) * (2.0 / q)
@@ -563,7 +576,8 @@ def build_field(
     if path.exists():
         try:
             with np.load(path, allow_pickle=False) as f:
-                sx, sy = f["start_m"], f["step_m"]
+                sx = f["start_m"]
+                sy = f["step_m"]
                 return ObjectField(
                     f["values"], (sx[0], sx[1]), (sy[0], sy[1]), f["nodes_hz"], float(f["centre_path_m"])
                 )

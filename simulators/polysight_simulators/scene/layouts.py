@@ -86,7 +86,8 @@ def _calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, s
     for kind, name in to_builtins(rig.calibration).items():
         if not name:
             continue
-        source, copy = Path(name), Path("calibration") / f"{kind}-{Path(name).name}"
+        source = Path(name)
+        copy = Path("calibration") / f"{kind}-{Path(name).name}"
         try:
             (path / copy).parent.mkdir(exist_ok=True)
             (path / copy).write_bytes(source.read_bytes())
@@ -109,10 +110,16 @@ class OwnLayout:
     """Writer of a scan folder: manifest.jsonl, events.msgpack, raw/<board>/<row>.bin and .idx."""
 
     def __init__(self, path: Path, rig: Instrument, plan: RasterPlan, scan_id: str, started_utc: str) -> None:
-        self._path, self._rig, self._plan = path, rig, plan
-        self._scan_id, self._started_utc = scan_id, started_utc
-        self._seq, self._now_ns = 0, NS_PER_S
-        self._lines, self._digest, self._rows = 0, "", 0
+        self._path = path
+        self._rig = rig
+        self._plan = plan
+        self._scan_id = scan_id
+        self._started_utc = started_utc
+        self._seq = 0
+        self._now_ns = NS_PER_S
+        self._lines = 0
+        self._digest = ""
+        self._rows = 0
 
     def start(self) -> None:
         """Create the folder, start manifest and events. Raises DataError if it is not empty."""
@@ -179,7 +186,8 @@ class OwnLayout:
         path = self._path / "manifest.jsonl"
         with named(path), path.open("a", encoding="utf-8") as f:
             f.write(line + "\n")
-        self._lines, self._digest = self._lines + 1, sha256(line.encode()).hexdigest()[:16]
+        self._lines = self._lines + 1
+        self._digest = sha256(line.encode()).hexdigest()[:16]
 
     def _event(self, *events: AnyEvent) -> None:
         path = self._path / "events.msgpack"
@@ -191,7 +199,8 @@ class OwnLayout:
         return {"scan_id": self._scan_id, "seq": self._seq, "t_mono_ns": self._now_ns}
 
     def _row_events(self, row: Row) -> None:
-        burst, stage = self._rig.burst, self._rig.stage
+        burst = self._rig.burst
+        stage = self._rig.stage
         events: list[AnyEvent] = [RowStarted(row=row, take=1, **self._stamp())]
         between_ns = round(abs(row.step_mm) / stage.speed_mm_s * NS_PER_S)
         first_ns = self._now_ns + NS_PER_S
@@ -267,8 +276,11 @@ class AuthorsLayout:
         skipped: Skipped | None = None,
     ) -> None:
         self.folder = path / "unsynced" / scan_id
-        self._rig, self._by_columns, self._skipped = rig, by_columns, skipped or {}
-        self._now_s, self._zero_filling = started_s, zero_filling
+        self._rig = rig
+        self._by_columns = by_columns
+        self._skipped = skipped or {}
+        self._now_s = started_s
+        self._zero_filling = zero_filling
 
     def start(self) -> None:
         """Create the folder and write the three JSON files. Raises DataError if it is not empty."""
@@ -306,8 +318,10 @@ class AuthorsLayout:
 
         The last, incomplete packet is late, for the card sends it after a timeout; the authors' decoder needs that.
         """
-        full, frame = packet_payload_bytes(self._rig), self._rig.frame_bytes
-        pulses, period_s = self._rig.burst.pulses, self._rig.burst.period_us * 1e-6
+        full = packet_payload_bytes(self._rig)
+        frame = self._rig.frame_bytes
+        pulses = self._rig.burst.pulses
+        period_s = self._rig.burst.period_us * 1e-6
         gone = {start // full for a, b in lost for start in range(a - a % full, b, full)}
         lines = []
         for k, start in enumerate(range(0, size, full)):

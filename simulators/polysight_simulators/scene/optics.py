@@ -83,16 +83,19 @@ def layered(
     r_s, r_p : complex128, shape of theta_rad
     """
     theta = np.asarray(theta_rad, dtype=np.float64)
-    cos, sin = np.cos(theta), np.sin(theta)
+    cos = np.cos(theta)
+    sin = np.sin(theta)
     media = [(x.epsilon, x.thickness_mm) for x in layers]
     if media[-1][1] is not None:
         media.append((1.0 + 0j, None))
     z_s = z_p = np.zeros(theta.shape, np.complex128)
     for epsilon, thickness_mm in reversed(media):
         q: Complex = np.sqrt(np.asarray(epsilon - sin**2, dtype=np.complex128))
-        own_s, own_p = 1 / q, q / epsilon
+        own_s = 1 / q
+        own_p = q / epsilon
         if thickness_mm is None:
-            z_s, z_p = own_s, own_p
+            z_s = own_s
+            z_p = own_p
             continue
         t = np.tan(2 * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S * thickness_mm / 1e3 * q)
         z_s = own_s * (z_s + 1j * own_s * t) / (own_s + 1j * z_s * t)
@@ -111,7 +114,9 @@ def strips(psi_rad: float, theta_rad: NDArray[np.floating] | float) -> tuple[Com
     -------
     r_s, r_p : complex128, shape of theta_rad
     """
-    cos, u_x, u_y = np.cos(np.asarray(theta_rad, dtype=np.float64)), np.sin(psi_rad), np.cos(psi_rad)
+    cos = np.cos(np.asarray(theta_rad, dtype=np.float64))
+    u_x = np.sin(psi_rad)
+    u_y = np.cos(psi_rad)
     incident = u_y + u_x * cos  # tangential: E_y = 1, E_x = cos(theta)
     current = incident / (u_y**2 / (2 * cos) + u_x**2 * cos / 2)
     r_s = -current * u_y / (2 * cos)
@@ -158,18 +163,25 @@ class Antennas:
         directions to the surface's normal, times the surface's area per dx dy.
         """
         z = self.plane_z_m if z_m is None else z_m
-        ax, ay, az = x_m - self.tx_m[0], y_m - self.tx_m[1], z - self.tx_m[2]
-        bx, by, bz = x_m - self.rx_m[rx, 0], y_m - self.rx_m[rx, 1], z - self.rx_m[rx, 2]
-        r1, r2 = np.sqrt(ax**2 + ay**2 + az**2), np.sqrt(bx**2 + by**2 + bz**2)
+        ax = x_m - self.tx_m[0]
+        ay = y_m - self.tx_m[1]
+        az = z - self.tx_m[2]
+        bx = x_m - self.rx_m[rx, 0]
+        by = y_m - self.rx_m[rx, 1]
+        bz = z - self.rx_m[rx, 2]
+        r1 = np.sqrt(ax**2 + ay**2 + az**2)
+        r2 = np.sqrt(bx**2 + by**2 + bz**2)
         theta = 0.5 * np.arccos(np.clip((ax * bx + ay * by + az * bz) / (r1 * r2), -1.0, 1.0))
         if any(slope):
-            az, bz = az - slope[0] * ax - slope[1] * ay, bz - slope[0] * bx - slope[1] * by
+            az = az - slope[0] * ax - slope[1] * ay
+            bz = bz - slope[0] * bx - slope[1] * by
         return r1, r2, theta, 0.5 * (az / r1 + bz / r2)
 
 
 def antennas(rig: Instrument, board: Board) -> Antennas:
     """Return the antenna positions of the transmitter and a receiving board."""
-    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    tx = np.array(tx_position_m(rig))
+    rx = np.array(rx_positions_m(rig, board))
     centre = np.array(specular_midpoint_m(rig, rig.by_role("receive_h")))
     return Antennas(tx, rx, rig.geometry.object_distance_mm / 1e3, centre)
 
@@ -184,7 +196,8 @@ def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
 
     H: r_s + leak_h r_p. V: r_p + leak_v r_s. TX is rotated by 45 degrees and sends both polarisations equally.
     """
-    leak_h, leak_v = complex(*scene.disturbances.leakage_h), complex(*scene.disturbances.leakage_v)
+    leak_h = complex(*scene.disturbances.leakage_h)
+    leak_v = complex(*scene.disturbances.leakage_v)
 
     def h(plate: Plate, frequency_hz: float, theta: Real) -> Complex:
         s, p = plate_reflection(plate, frequency_hz, theta)
@@ -242,15 +255,18 @@ def field_exact(
     -------
     complex128 [n, k], amplitude relative to the direct path, phase +2 pi f (r1 + r2) / c.
     """
-    ant, reflect = antennas(rig, board), board_reflectivity(board, scene)
+    ant = antennas(rig, board)
+    reflect = board_reflectivity(board, scene)
     scene = draw_specimens(scene)
     out = np.zeros((len(offsets_m), len(frequencies_hz)), dtype=np.complex128)
     for i, plate in enumerate(scene.plates):
         cx, cy = ant.centre_m[:2] + np.array(plate.centre_mm) / 1e3
-        slope, parts = slopes(plate), facets(plate, i, scene.seed)
+        slope = slopes(plate)
+        parts = facets(plate, i, scene.seed)
         x, y, area = _quadrature(parts.size_m, float(np.max(frequencies_hz)))
         for row, column in np.ndindex(parts.height_m.shape):
-            px, py = x + parts.x_m[column], y + parts.y_m[row]
+            px = x + parts.x_m[column]
+            py = y + parts.y_m[row]
             z = ant.plane_z_m + plate.height_mm / 1e3 + slope[0] * px + slope[1] * py + parts.height_m[row, column]
             for n, (ox, oy) in enumerate(offsets_m):
                 r1, r2, theta, oblique = ant.legs(cx + px - ox, cy + py - oy, rx, z, slope)

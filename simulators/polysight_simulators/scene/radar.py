@@ -51,7 +51,8 @@ def high_pass(if_hz: Real, chirp: Chirp) -> tuple[Complex, Complex]:
     Two first-order sections, H = prod 1 / (1 - j f_c / f): -3 dB and +45 degrees at each section's corner.
     """
     f = np.where(np.abs(if_hz) < 1e-3, 1e-3, if_hz)
-    h, log_slope = np.ones(np.shape(f), np.complex128), np.zeros(np.shape(f), np.complex128)
+    h = np.ones(np.shape(f), np.complex128)
+    log_slope = np.zeros(np.shape(f), np.complex128)
     for corner in (chirp.hpf1_khz * 1e3, chirp.hpf2_khz * 1e3):
         u = corner / f
         section = np.empty(np.shape(f), np.complex128)  # 1 / (1 - j u), without a complex division
@@ -86,7 +87,8 @@ class Receiver:
 
 def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver:
     """Return a receiving board after power-up, with gains and chirp shape from the seed and the board's name."""
-    d, chirp = scene.disturbances, rig.chirp
+    d = scene.disturbances
+    chirp = rig.chirp
     rng = np.random.default_rng(stream_key(seed, "power", board.name))
     spread_db = rng.uniform(-1, 1, len(rig.antennas.rx_mm)) * d.rx_gain_spread_db
     spread_rad = np.radians(rng.uniform(-1, 1, len(rig.antennas.rx_mm)) * d.rx_phase_spread_deg)
@@ -130,7 +132,8 @@ def per_chirp(receiver: Receiver, delay_s: Real, phase_rad: Real, hpf: bool) -> 
     turns -= np.rint(turns)
     factor = np.empty(turns.shape, np.complex64)
     angle = (2 * np.pi * turns).astype(np.float32)  # less than a turn: single precision is enough
-    factor.real, factor.imag = np.cos(angle), np.sin(angle)
+    factor.real = np.cos(angle)
+    factor.imag = np.sin(angle)
     shift = receiver.if_error_hz - chirp.slope_hz_per_s * delay_s[:, None]
     return factor, shift if hpf else np.zeros_like(shift)
 
@@ -151,7 +154,8 @@ class _ReceivingBoard:
         f = sample_frequencies_hz(rig)
         self.field: ObjectField = build_field(rig, scene, board, f, cache_dir)
         ant = antennas(rig, board)
-        tau, centre = ant.direct_m / SPEED_OF_LIGHT_M_S, self.field.centre_path_m / SPEED_OF_LIGHT_M_S
+        tau = ant.direct_m / SPEED_OF_LIGHT_M_S
+        centre = self.field.centre_path_m / SPEED_OF_LIGHT_M_S
         self.middle_hz = float(chirp.slope_hz_per_s * (tau.mean() + centre) / 2)
         amplitude = direct_factor(board, scene) * ant.direct_m[0] / ant.direct_m
         amplitude = amplitude * scene.disturbances.direct_gain
@@ -282,7 +286,9 @@ class SimulatedRig:
         Without burst motion every pulse is at the mean position of the burst. With backlash, rows towards -x are
         shifted along +x.
         """
-        burst, stage, d = self.rig.burst, self.rig.stage, self.scene.disturbances
+        burst = self.rig.burst
+        stage = self.rig.stage
+        d = self.scene.disturbances
         lost = d.backlash_mm if direction < 0 else 0.0
         if not d.burst_motion:
             return np.full(burst.chirps_a_position, direction * mean_burst_travel_mm(burst, stage) + lost)
@@ -303,7 +309,9 @@ class SimulatedRig:
         pulses: NDArray[np.int64],
         out: NDArray[np.complex64],
     ) -> None:
-        d, own, chirp = self.scene.disturbances, self._receiving(board.name), self.rig.chirp
+        d = self.scene.disturbances
+        own = self._receiving(board.name)
+        chirp = self.rig.chirp
         frames = pulses // self.rig.burst.chirps  # all chirps of a frame start with one pulse
         delay = sync_delay_s(d, self.seed, board, frames) - sync_delay_s(d, self.seed, self.rig.transmitter, frames)
         turns = pulse_uniform(stream_key(self.seed, "phase", board.name), pulses) if d.random_phase else 0.0 * delay

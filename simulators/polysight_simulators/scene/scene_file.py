@@ -355,7 +355,8 @@ def apply_scene(rig: Instrument, scene: Scene) -> Instrument:
 
 def _known_leakage(scene: Scene) -> dict[str, Any]:
     """Return the keys of the rig file's [polarimetry] that a scene sets: measured leakage, or zero."""
-    d, parts = scene.disturbances, ("leakage_h", "leakage_v")
+    d = scene.disturbances
+    parts = ("leakage_h", "leakage_v")
     if d.leakage_measured is not None:
         rng = np.random.default_rng(stream_key(scene.seed, "leakage"))
         error = rng.standard_normal((2, 2)) * d.leakage_measured

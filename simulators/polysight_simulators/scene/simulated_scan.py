@@ -40,7 +40,8 @@ def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
     [eps', eps''], or null (metal, layers), with the nominal one of the scene file. Tilt and height are relative to the
     plane of the rig file and include those of the true plane.
     """
-    centre, actual = specular_midpoint_m(rig, rig.by_role("receive_h")), draw_specimens(scene)
+    centre = specular_midpoint_m(rig, rig.by_role("receive_h"))
+    actual = draw_specimens(scene)
     plates = [_plate_truth(p, n, centre) for p, n in zip(actual.plates, scene.plates, strict=True)]
     points = [
         {
@@ -108,7 +109,8 @@ def lost_bytes(radar: SimulatedRig, board_name: str, row: Row) -> Gaps:
     rng = np.random.default_rng([stream_key(radar.seed, "loss", board_name), row.index])
     gaps: Gaps = []
     for k in np.flatnonzero(rng.random(-(-size // full)) < loss):
-        start, stop = int(k) * full, min((int(k) + 1) * full, size)
+        start = int(k) * full
+        stop = min((int(k) + 1) * full, size)
         if gaps and gaps[-1][1] == start:
             gaps[-1] = (gaps[-1][0], stop)
         else:

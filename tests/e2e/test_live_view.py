@@ -13,11 +13,11 @@ from urllib.error import URLError
 from urllib.request import Request, urlopen
 
 import pytest
+from tests.support.processes import LIMIT_S, idle_s
 from tests.support.scenes import small_scene
 
 from polysight.store.validation import validate
 
-LIMIT_S = 120.0
 ROWS = 40
 SCENE = small_scene(10, ROWS, step_mm=(10.0, 5.0))
 
@@ -39,22 +39,22 @@ class View:
 
     def state(self) -> dict[str, Any]:
         """What a page is told."""
-        with suppress(URLError), urlopen(f"{self._address}/api/state", timeout=LIMIT_S) as reply:
+        with suppress(URLError), urlopen(f"{self._address}/api/state") as reply:
             return json.load(reply)
         return {"status": {"headline": "not there yet"}}
 
     def ask(self, command: str) -> None:
         """What a button does."""
         headers = {"X-Polysight-Token": self._token}
-        with urlopen(Request(f"{self._address}/api/control/{command}", b"", headers), timeout=LIMIT_S) as reply:
+        with urlopen(Request(f"{self._address}/api/control/{command}", b"", headers)) as reply:
             assert reply.status == 200
 
     def wait(self, condition: Callable[[dict[str, Any]], object], what: str) -> dict[str, Any]:
         """The first state that meets a condition."""
-        deadline = time.monotonic() + LIMIT_S
+        deadline = idle_s() + LIMIT_S
         while not condition(state := self.state()):
             assert self._program.process.poll() is None, self._program.err
-            assert time.monotonic() < deadline, f"not within {LIMIT_S:g} s: {what}; the view says {state}"
+            assert idle_s() < deadline, f"not within {LIMIT_S:g} s: {what}; the view says {state}"
             time.sleep(0.2)  # what looks on here costs the scan time
         return state
 

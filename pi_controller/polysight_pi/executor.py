@@ -47,7 +47,7 @@ class Request(NamedTuple):
     answer: Callable[[m.AnyReply], None]
 
 
-def refused(number: int, what: str, why: str = "", remedy: str = "") -> m.Refused:
+def make_refusal(number: int, what: str, why: str = "", remedy: str = "") -> m.Refused:
     """Return a refusal, with texts of limited length; missing ones are those of shared/polysight_shared/faults.py."""
     table = explain(number)
     return m.Refused(
@@ -113,9 +113,9 @@ class Executor:
         """Answer `Alive`, a heartbeat of the run's host. From any thread; does not wait for the executor."""
         run = self._run
         if run is None or run.scan_id != scan_id:
-            return refused(PiFault.NOT_READY, f"run {scan_id} is not begun", remedy="BeginRun")
+            return make_refusal(PiFault.NOT_READY, f"run {scan_id} is not begun", remedy="BeginRun")
         if run.owner != owner:
-            return refused(PiFault.NOT_OWNER, f"run {scan_id} is another program's")
+            return make_refusal(PiFault.NOT_OWNER, f"run {scan_id} is another program's")
         self._machine.note_host_alive()
         return m.Accepted(state=self.status.state)
 
@@ -176,7 +176,7 @@ class Executor:
             self._answer_pulses(item)
         elif isinstance(item, LoopFault):
             machine.on_loop_fault(item)
-            self._answer_pulses(refused(item.number, item.detail))
+            self._answer_pulses(make_refusal(item.number, item.detail))
         elif isinstance(item, Reply):
             machine.on_stage(item)
         elif isinstance(item, StageLost):
@@ -197,13 +197,13 @@ class Executor:
         try:
             reply = self._on_command(request)
         except PolysightError as e:
-            reply = refused(getattr(e, "number", PiFault.BAD_REQUEST), e.what, e.why, e.remedy)
+            reply = make_refusal(getattr(e, "number", PiFault.BAD_REQUEST), e.what, e.why, e.remedy)
         except OSError as e:
             why = "the operating system refused it"
-            reply = refused(PiFault.BAD_REQUEST, os_error(e).what, why, "check the Pi's disk")
+            reply = make_refusal(PiFault.BAD_REQUEST, os_error(e).what, why, "check the Pi's disk")
         except Exception as e:  # noqa: BLE001 - reported to the client and in the log
             traceback.print_exc()
-            reply = refused(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
+            reply = make_refusal(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
         self._count_as_heartbeat(request.command)  # before the deadlines are checked: it may have taken long
         if reply is not None:
             self._replies.append((request, reply))
@@ -260,7 +260,7 @@ class Executor:
         self._machine.require("Pulse")
         if not self._loop.alive:
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
-        spec = burst_of(command)
+        spec = read_burst(command)
         if spec.pulses * spec.period_ns > m.MAX_PULSES_AT_REST_S * 1e9:
             what = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MAX_PULSES_AT_REST_S:g} s"
             raise RefusedError(PiFault.NOT_READY, what, "the lines are busy meanwhile", "ask for fewer pulses")
@@ -270,7 +270,7 @@ class Executor:
     def _postpone(self, request: Request, run: m.BeginRun) -> bool:
         """Check a run; return True if a row has to be aborted before it can begin. Raises RefusedError."""
         check_run(run, self._machine.stage.config)
-        self._loop.check(burst_of(run))
+        self._loop.check(read_burst(run))
         active = self._run
         replaces = active is not None and (run.scan_id, run.owner) != (active.scan_id, active.owner)
         if active is not None and replaces and self._machine.host_lives:
@@ -329,7 +329,7 @@ class Executor:
             return self._accept()
         self._machine.require("RunRow")
         _require(command.row_index < run.plan.rows, f"row {command.row_index} is not in the plan of {run.plan.rows}")
-        return self._accept("RunRow", run.plan.row(command.row_index), command.take, burst_of(run), run.speed_mm_s)
+        return self._accept("RunRow", run.plan.row(command.row_index), command.take, read_burst(run), run.speed_mm_s)
 
     def _row_ended(self, row: tuple[int, int]) -> None:
         self._last_row = row
@@ -368,7 +368,7 @@ class Executor:
 # --- limits of this rig and the radars --------------------------------------------------------------------------------
 
 
-def burst_of(asked: m.BeginRun | m.Pulse) -> BurstSpec:
+def read_burst(asked: m.BeginRun | m.Pulse) -> BurstSpec:
     """Return the requested burst. Raises RefusedError (PERIOD_TOO_SHORT, PULSE_TOO_LONG) if radars cannot accept it."""
     spec = BurstSpec(asked.pulses, us_to_ns(asked.period_us), us_to_ns(asked.width_us))
     if spec.period_ns < MIN_PERIOD_NS:
@@ -381,7 +381,7 @@ def burst_of(asked: m.BeginRun | m.Pulse) -> BurstSpec:
 def check_run(run: m.BeginRun, stage: Stage) -> None:
     """Check that this rig can execute a run. Raises RefusedError with the conflicting values."""
     plan = run.plan
-    spec = burst_of(run)
+    spec = read_burst(run)
     _require(plan.columns >= 1 and plan.rows >= 1, f"plan of {plan.columns} x {plan.rows} points is empty")
     _require(plan.step_x_mm > 0 and plan.step_y_mm > 0, "steps of the plan must be positive")
     fastest = max(stage.speed_mm_s, stage.travel_speed_mm_s)

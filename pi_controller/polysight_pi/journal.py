@@ -238,7 +238,7 @@ class Journal:
         """Sequence number of the newest event of the current scan."""
         return self._file.last_seq + self._pending if self._file else 0
 
-    def path_of(self, scan_id: str) -> Path:
+    def journal_path(self, scan_id: str) -> Path:
         """Return the path of a scan's journal file."""
         return self.folder / f"{scan_id}.journal"
 
@@ -264,11 +264,11 @@ class Journal:
         self.check_room(scan_id, plan.positions)
         file = self._file
         if file is None or self.scan_id != scan_id:
-            file = JournalFile(self.path_of(scan_id))
+            file = JournalFile(self.journal_path(scan_id))
             if file.damage:
                 self._warn(file.damage)
         try:
-            begun = _plan_of(file)
+            begun = _read_plan(file)
             if begun is not None and begun != plan:
                 raise DataError(
                     f"scan {scan_id} was begun with another plan: {begun}",
@@ -289,7 +289,7 @@ class Journal:
 
     def check_room(self, scan_id: str, positions: int) -> None:
         """Raise JournalFullError if the disk has no space for the rest of the scan's journal."""
-        path = self.path_of(scan_id)
+        path = self.journal_path(scan_id)
         try:
             written = path.stat().st_size if path.exists() else 0
             free = shutil.disk_usage(self.folder).free
@@ -340,7 +340,7 @@ class Journal:
             return self._file.read(from_seq, limit), self.last_seq
         payloads = []
         last = 0
-        with suppress(FileNotFoundError), self.path_of(scan_id).open("rb") as file:
+        with suppress(FileNotFoundError), self.journal_path(scan_id).open("rb") as file:
             for _, last, payload in records(file):
                 if last >= from_seq and len(payloads) < limit:
                     payloads.append(payload)
@@ -356,7 +356,7 @@ class Journal:
             os.close(self._lock)
 
 
-def _plan_of(file: JournalFile) -> RasterPlan | None:
+def _read_plan(file: JournalFile) -> RasterPlan | None:
     """Return the plan of the first event, or None if there is no event yet."""
     for packed in file.read(1, 1):
         event = m.unpack_event(packed)

@@ -32,7 +32,7 @@ class AllowedKeys:
         with suppress(OSError, ValueError):
             self._names = read_allowed(folder)
 
-    def name_of(self, key: bytes) -> str:
+    def client_name(self, key: bytes) -> str:
         """Return the name of the client with this public key (32 bytes), or "" if it is not allowed."""
         with suppress(OSError, ValueError):  # missing or unreadable: keep the last list
             stat = (self._folder / ALLOWED).stat()

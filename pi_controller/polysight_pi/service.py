@@ -23,7 +23,7 @@ import msgspec
 import zmq
 
 from polysight_pi import system
-from polysight_pi.executor import HUNG_S, Executor, refused
+from polysight_pi.executor import HUNG_S, Executor, make_refusal
 from polysight_pi.journal import Journal, JournalFullError
 from polysight_pi.keys import AllowedKeys
 from polysight_pi.lines import open_lines
@@ -123,7 +123,7 @@ class Server:
             key = bytes(credentials[0])
         code = b"400"
         text = b"this key is not allowed"
-        if self._allowed.name_of(key):
+        if self._allowed.client_name(key):
             code = b"200"
             text = b"OK"
         self._zap.send_multipart([version, number, code, text, key.hex().encode(), b""])
@@ -136,8 +136,8 @@ class Server:
             return  # no REQ framing: no client waits for a reply
         end = parts.index(b"", 1) + 1
         envelope = tuple(parts[:end])
-        if self._secret and not self._allowed.name_of(bytes.fromhex(str(frames[-1].get("User-Id")))):
-            reply = refused(PiFault.NOT_OWNER, "this client's key was revoked", "see `polysight-pi keys --list`")
+        if self._secret and not self._allowed.client_name(bytes.fromhex(str(frames[-1].get("User-Id")))):
+            reply = make_refusal(PiFault.NOT_OWNER, "this client's key was revoked", "see `polysight-pi keys --list`")
         else:
             reply = self._answer(b"".join(parts[end:]), envelope, executor)
         if reply is not None:
@@ -160,12 +160,14 @@ class Server:
             command = m.unpack_command(raw)
         except ProtocolError as e:
             number = PiFault.VERSION if isinstance(e, VersionError) else PiFault.BAD_REQUEST
-            return refused(number, e.what, e.why, e.remedy)
+            return make_refusal(number, e.what, e.why, e.remedy)
         except Exception as e:  # noqa: BLE001 - reported to the client and in the log
             traceback.print_exc()
-            return refused(PiFault.BAD_REQUEST, f"a command of {len(raw)} bytes cannot be read: {type(e).__name__}")
+            return make_refusal(
+                PiFault.BAD_REQUEST, f"a command of {len(raw)} bytes cannot be read: {type(e).__name__}"
+            )
         if executor.unresponsive_s > HUNG_S:
-            return refused(PiFault.PROGRAM, f"the executor has hung for {executor.unresponsive_s:.0f} s")
+            return make_refusal(PiFault.PROGRAM, f"the executor has hung for {executor.unresponsive_s:.0f} s")
         if isinstance(command, m.Hello):
             return msgspec.structs.replace(executor.hello, t_unix_ns=time.time_ns())
         if isinstance(command, m.Status):
@@ -174,7 +176,7 @@ class Server:
             return executor.host_alive(command.scan_id, command.owner)
         if executor.submit(command, lambda reply: self._queue((envelope, m.pack(reply)))):
             return None
-        return refused(PiFault.NOT_READY, "too many commands are waiting", "", "wait for replies")
+        return make_refusal(PiFault.NOT_READY, "too many commands are waiting", "", "wait for replies")
 
     def _beat(self, executor: Executor) -> None:
         """Publish a heartbeat, unless the executor hangs."""

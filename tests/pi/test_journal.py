@@ -204,7 +204,7 @@ def test_a_damaged_journal_is_logged(tmp_path):
     journal = Journal(tmp_path, warn=said.append)
     journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
     journal.close()
-    path = journal.path_of("s")
+    path = journal.journal_path("s")
     raw = written(path, [b"one", b"two", b"three"]).replace(b"one", b"0ne")
     path.write_bytes(raw)
     journal = Journal(tmp_path, warn=said.append)
@@ -222,7 +222,7 @@ def test_no_scan_begins_without_space_for_its_journal(tmp_path, monkeypatch):
     folder.check_room("scan", 70_000)
     with refused(ErrorCode.DISK_FULL, "26.6 MB free", "26.6 MB needed", 70_001):
         folder.check_room("scan", 70_001)
-    folder.path_of("there").write_bytes(bytes(69_000 * CAPTURE_BYTES))
+    folder.journal_path("there").write_bytes(bytes(69_000 * CAPTURE_BYTES))
     free = SPARE_BYTES + 1_000 * CAPTURE_BYTES
     folder.check_room("there", 70_000)  # only the rest needs space
     with refused(ErrorCode.DISK_FULL):

@@ -16,7 +16,7 @@ from tests.support.pi.fakes import FakeDriver, FakeLines
 from tests.support.rigs import published_rig
 
 from polysight.plan.timing import row_motion_s
-from polysight_pi.executor import burst_of, check_run
+from polysight_pi.executor import check_run, read_burst
 from polysight_pi.machine import RULES, TIMEOUTS_S, WIRE_STATE, Machine, RefusedError, State
 from polysight_pi.stage import STATUS_PER_HEARTBEAT, StatusWatch
 from polysight_pi.trigger import LOOK_UP_S, BurstSent, BurstSpec, Edge, LoopFault, TriggerLoop, TriggerWatch
@@ -382,7 +382,7 @@ def test_the_run_up_is_what_the_host_counts_with():
 def test_the_pi_sends_the_pulses_that_the_rig_file_may_hold(period, width):
     def sent() -> bool:
         try:
-            return bool(burst_of(m.Pulse(pulses=1, period_us=period, width_us=width)))
+            return bool(read_burst(m.Pulse(pulses=1, period_us=period, width_us=width)))
         except RefusedError:
             return False
 

@@ -111,7 +111,7 @@ def machine() -> dict[str, Any]:
     """What the figures were measured on."""
     info = Path("/proc/cpuinfo")
     models = [row.split(":")[1] for row in info.read_text().splitlines() if row.startswith("model name")]
-    packages = {p: version(p) for p in ("numpy", "scipy", "numba", "fastsar") if importlib.util.find_spec(p)}
+    packages = {p: version(p) for p in ("numpy", "scipy", "numba") if importlib.util.find_spec(p)}
     return {
         "cpu": models[0].strip() if models else platform.processor(),
         "cores": os.cpu_count(),

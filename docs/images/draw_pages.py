@@ -4,7 +4,7 @@
 ADDRESS is the one that `polysight preview SCAN --control` prints, such as http://127.0.0.1:8080/#token=..., while
 `polysight scan` runs on a simulated rig.
 
-`python docs/images/draw_pages.py serve ADDRESS SCAN` takes serve.png: a scan's result on the operator's page. ADDRESS is
+`python docs/images/draw_pages.py serve ADDRESS SCAN` takes serve.png: a result on the operator's page. ADDRESS is
 the one that `polysight serve` prints, SCAN the name of a processed scan.
 """
 

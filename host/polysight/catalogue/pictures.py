@@ -27,7 +27,6 @@ Limits = tuple[float, float]
 AMPLITUDE = "cividis"
 PHASE = "twilight"
 RANGE_DB = 35.0
-RATIO_PERCENTILES = (5.0, 95.0)
 # Relative to the brightest: fainter pixels are noise; up to the second level phases fade out.
 FAINT_DB = -26.0
 CLEAR_DB = -18.0
@@ -64,8 +63,7 @@ class Pixels(SavedProducts):
         clear = self.valid & np.isfinite(self.h) & np.isfinite(self.v)
         for channel in (self.h, self.v):
             amplitude = np.abs(channel)
-            brightest = float(np.percentile(amplitude[clear], 99.5)) if clear.any() else 0.0
-            clear = clear & (amplitude > brightest * 10 ** (FAINT_DB / 20))
+            clear = clear & (amplitude > percentile(amplitude, clear, 99.5) * 10 ** (FAINT_DB / 20))
         return clear
 
     @cached_property
@@ -234,10 +232,10 @@ def _channel_values(images: Images | Pixels) -> dict[str, Values]:
     fainter = np.minimum(_below_brightest(images.h, visible), _below_brightest(images.v, visible))
     opacity = _fade(fainter) * visible
     level = _db(ratio)
-    clear = level[opacity > 0.5]
-    low, high = np.percentile(clear, RATIO_PERCENTILES) if clear.size else (-10.0, 10.0)
-    middle = float(low + high) / 2
-    half = max(float(high - low) / 2, 3.0)
+    low = percentile(level, opacity > 0.5, 5, -10.0)
+    high = percentile(level, opacity > 0.5, 95, 10.0)
+    middle = (low + high) / 2
+    half = max((high - low) / 2, 3.0)
     values["p_amplitude"] = Values(level, opacity, (middle - half, middle + half), "dB")
     values["p_phase"] = _phase(ratio, opacity)
     return values
@@ -256,7 +254,7 @@ def _derived_values(pixels: Pixels, name: str) -> Values:
     if name != "p_sigma":
         visible &= ~pixels.metal_like
     # Edges of plates have any value.
-    high = float(np.percentile(values[visible], 85)) if visible.any() else 1.0
+    high = percentile(values, visible, 85, 1.0)
     low = 1.0 if name == "permittivity" else 0.0
     return mask_values(values, visible, (low, max(1.3 * high, low + 1e-3)))
 
@@ -268,7 +266,7 @@ def mask_values(values: NDArray[Any], visible: NDArray[np.bool_], limits: Limits
 
 def _amplitude(channel: NDArray[np.complex64], visible: NDArray[np.bool_]) -> Values:
     level = _db(channel)
-    brightest = float(np.percentile(level[visible], 99.8)) if visible.any() else 0.0
+    brightest = percentile(level, visible, 99.8)
     return Values(level, visible.astype(float), (brightest - RANGE_DB, brightest), "dB")
 
 
@@ -284,7 +282,12 @@ def _db(channel: NDArray[np.complex64]) -> Real:
 def _below_brightest(channel: NDArray[np.complex64], visible: NDArray[np.bool_]) -> Real:
     """Level relative to the brightest visible pixels, dB."""
     level = _db(channel)
-    return level - (float(np.percentile(level[visible], 99.5)) if visible.any() else 0.0)
+    return level - percentile(level, visible, 99.5)
+
+
+def percentile(values: Real, mask: NDArray[np.bool_], percent: float, default: float = 0.0) -> float:
+    """A percentile of the values under a mask; `default` if it is empty."""
+    return float(np.percentile(values[mask], percent)) if mask.any() else default
 
 
 def _fade(level_db: Real) -> Real:

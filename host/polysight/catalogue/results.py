@@ -11,7 +11,7 @@ import numpy as np
 import skimage
 from numpy.typing import NDArray
 
-from polysight.catalogue.pictures import MAPS, Map, Picture, Pixels, draw_values, mask_values
+from polysight.catalogue.pictures import MAPS, Map, Picture, Pixels, draw_values, mask_values, percentile
 from polysight.materials import PATCHES, SIMULATED_LIBRARY, Library, is_metal
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import permittivity_from_ratio
@@ -534,9 +534,7 @@ def draw_comparison(comparison: Comparison, name: str) -> Picture:
     values = maps[name]
     visible = np.isfinite(values)
     is_signed = name in ("permittivity", "loss")
-    reach = 1.0
-    if visible.any():
-        reach = max(float(np.percentile(np.abs(values[visible]), 95 if is_signed else 98)), 1e-3)
+    reach = max(percentile(np.abs(values), visible, 95 if is_signed else 98, 1.0), 1e-3)
     if name == "sigmas":
         reach = max(reach, 2 * SIGNIFICANT)
     if is_signed:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from dataclasses import dataclass, field
@@ -167,9 +168,9 @@ class RowViewer:
         self._done[row] = take
         for name, board in pipeline.quality.boards.items():
             record = board.rows[row]
-            stages = record["stages"]
-            object_rad = float(stages["referenced"][1]) if "referenced" in stages else float("nan")
-            direct_rad = float(stages["averaged"][1]) if "averaged" in stages else float("nan")
+            phases = {stage: float(residuals[1]) for stage, residuals in record["stages"].items()}
+            object_rad = phases.get("referenced", math.nan)
+            direct_rad = phases.get("averaged", math.nan)
             sync = RowSync(object_rad, direct_rad, int(record["positions_masked"]))
             self._sync.setdefault(name, {})[row] = sync
         if draws or time.monotonic() - self._drawn_at > PICTURE_INTERVAL_S:

@@ -68,8 +68,7 @@ class Pipeline:
     def find_materials(
         self,
         images: imaging.Images,
-        metal: materials.MetalChoice = materials.FOUND,
-        known: materials.KnownScene = materials.UNKNOWN_SCENE,
+        known: materials.KnownScene | None = None,
         classifier: materials.Classifier | None = None,
     ) -> materials.MaterialsResult:
         """Find patches (unless known), metal reference, permittivities and names; in sub-bands too, if imaged."""
@@ -77,25 +76,25 @@ class Pipeline:
             rig, std = self.plane.applied_to(self.rig), self.plane.incidence_std_rad(self.rig)
             angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, self.settings.incidence)
             optics = materials.Optics.of(self.rig, angles, std, self.synchroniser.direct_path_known)
-            found = materials.analyse(images, optics, metal, known, classifier)
-            self.quality.note_materials(found, angles, images.valid, metal.plane)
+            found = materials.analyse(images, optics, known, classifier)
+            plane = None if known is None else known.plane
+            self.quality.note_materials(found, angles, images.valid, plane)
         with self.quality.timed("sub-bands"):
             moved = self.plane.offset_m if self.plane.worth_moving else 0.0
             parts = self.sub_bands.finish(self.source.mirrored, moved)
-            return materials.with_bands(found, self.sub_bands.bands, parts, optics, metal.plane)
+            return materials.with_bands(found, self.sub_bands.bands, parts, optics, plane)
 
     def examine(self, images: imaging.Images, plates: materials.Plates = ()) -> process.Findings:
         """Find plane and materials, and judge them; a verdict "no result" removes names and permittivities."""
         classifier = process.load_classifier(self.settings, self.rig)
-        boxes = process.boxes_as_patches(self.settings, self.inputs, images.x_m, images.y_m)
-        in_scene = boxes.metal is not None or self.settings.metal_box_mm is not None
+        known = process.boxes_as_patches(self.settings, self.inputs, images.x_m, images.y_m)
+        in_scene = known.metal is not None
         plane = self.calibration.metal_plane(self.rig, self.inputs.reference, in_scene, self.settings.bands)
         images = self.place_plane(images)
         if plane is not None:
             images = images.within(plane.valid_on(images.x_m, images.y_m))
-        metal = materials.MetalChoice(self.settings.metal_box_mm, boxes.metal, plane)
-        known = materials.KnownScene(boxes.segmentation, plates)
-        found = replace(self.find_materials(images, metal, known, classifier), boxes=boxes.names)
+            known = replace(known, metal=plane)
+        found = self.find_materials(images, replace(known, plates=plates), classifier)
         verdict = process.judge(self.quality, found, self.plane, classifier)
         shown = found if verdict.usable else found.without_result()
         return process.Findings(images, shown, verdict, self.plane, classifier, plates)

@@ -12,7 +12,7 @@ from polysight.calibration.files import checked_calibration, load_calibration, w
 from polysight.cli.main import main
 from polysight.imaging import ImagedWith
 from polysight.jobs.calibrate import load_reference
-from polysight.materials import MetalChoice
+from polysight.materials import KnownScene
 from polysight.pipeline import Pipeline
 from polysight.settings import Settings
 from polysight.store import ScanFolder
@@ -209,7 +209,7 @@ def test_metal_is_one_in_the_whole_sweep_and_in_every_sub_band(banded, taken_wit
     for row in pipeline.source.rows():
         pipeline.add_row(row)
     reference = metal_plane(pipeline, BANDS)
-    (found,) = pipeline.find_materials(pipeline.form_images(), MetalChoice(plane=reference)).rows()
+    (found,) = pipeline.find_materials(pipeline.form_images(), KnownScene(metal=reference)).rows()
     assert len(found["bands"]) == BANDS
     for ratio in (found["ratio"], *(band["ratio"] for band in found["bands"])):
         assert complex(*ratio.values()) == pytest.approx(1.0, abs=0.02)

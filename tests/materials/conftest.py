@@ -11,7 +11,8 @@ from scipy import ndimage
 
 from polysight.imaging import Images
 from polysight.materials import Library, TrainingScan, TruthPlate, make_library
-from polysight.materials.analyse import FOUND, KnownScene, Optics, analyse
+from polysight.materials.analyse import KnownScene, Optics, analyse
+from polysight.materials.inversion import RigPrior
 
 THETA = np.radians(55.0)
 NINE = {
@@ -40,9 +41,10 @@ class Synthetic:
     def pair(self):
         return Images(self.h, self.v, self.x_m, self.y_m, np.ones(self.h.shape, bool))
 
-    def analyse(self, leakage=(0.0, 0.0), metal=FOUND, segmentation=None, classifier=None, pair=None):
-        known = KnownScene(segmentation, self.plates)
-        return analyse(pair or self.pair, Optics(self.theta, leakage), metal, known, classifier)
+    def analyse(self, leakage=(0.0, 0.0), metal=None, segmentation=None, classifier=None, pair=None):
+        known = KnownScene(segmentation, metal, plates=self.plates)
+        prior = RigPrior(1e-3, leakage, 0.003, leakage_measured=True)
+        return analyse(pair or self.pair, Optics(self.theta, prior), known, classifier)
 
 
 def smooth_field(rng, shape, correlation_px):

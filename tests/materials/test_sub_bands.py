@@ -8,7 +8,6 @@ from tests.support.rigs import published_rig
 
 from polysight.imaging import Images
 from polysight.imaging.builder import SubBand
-from polysight.materials.analyse import MetalChoice
 from polysight.materials.layers import Bands, Layer, fit_layer
 from polysight.materials.sub_bands import band_rows, bands_of_row
 from polysight.polarimetry import fresnel, ratio_from_permittivity
@@ -79,7 +78,7 @@ def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, found)
     cut = replace(scene, h=np.where(valid, scene.h, 0), v=np.where(valid, scene.v, 0))
     label = found.metal.label
     whole, part = (
-        s.analyse(metal=MetalChoice(label=label), segmentation=found.segmentation, pair=s.pair.within(at))
+        s.analyse(metal=label, segmentation=found.segmentation, pair=s.pair.within(at))
         for s, at in ((scene, np.ones_like(valid)), (cut, valid))
     )
     for before, after in zip(whole.rows(), part.rows(), strict=True):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from polysight.imaging import Images
-from polysight.materials.analyse import KnownScene, MetalChoice, Optics, analyse, smooth_inside
+from polysight.materials.analyse import KnownScene, Optics, analyse, smooth_inside
 from polysight.materials.labels import TruthPlate, patches_from_labels, patches_from_plates
 from polysight.polarimetry import fresnel
 
@@ -38,7 +38,7 @@ def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
     valid[:, :12] = valid[:, 58:] = False
     h[~valid] = v[~valid] = 0  # as images have it
     pair, optics = Images(h, v, X_M, Y_M, valid), Optics(THETA, smooth_px=1.0)
-    result = analyse(pair, optics, MetalChoice(label=labels["metal"]), KnownScene(found))
+    result = analyse(pair, optics, KnownScene(found, labels["metal"]))
     rows = {r["label"]: r for r in result.rows()}
     left, nowhere = rows[labels["left"]], rows[labels["nowhere"]]
     assert abs(left["amplitude_h"] - abs(complex(fresnel(LEFT, THETA)[0]))) < 1e-5

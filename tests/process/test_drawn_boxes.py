@@ -1,11 +1,12 @@
 """Boxes drawn by hand instead of patches that are found."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from polysight.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library, MetalChoice
+from polysight.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library
 from polysight.materials.labels import pack_labels, read_labels
 from polysight.materials.result import labels_of
 from polysight.process import Inputs, boxes_as_patches
@@ -22,10 +23,9 @@ def found(imaged):
 
 def again(scan, path, plates=()):
     inputs = Inputs(labels=read_labels(path))
-    boxes, names, metal = boxes_as_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m)
+    known = replace(boxes_as_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m), plates=plates)
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
-    known = KnownScene(boxes, plates)
-    return scan.pipeline.find_materials(scan.images, MetalChoice(label=metal), known, classifier), names
+    return scan.pipeline.find_materials(scan.images, known, classifier), known.names
 
 
 def test_labels_of_products_give_the_same_materials_again(imaged, found, tmp_path):

@@ -11,10 +11,11 @@ import pytest
 from tests.support.calibration import remaining
 
 from polysight.cli.main import main
+from polysight.imaging import Images
 from polysight.jobs.calibrate import load_reference
 from polysight.jobs.process import imaged
 from polysight.materials import parse_layer, read_truth
-from polysight.materials.analyse import KnownScene, MetalChoice
+from polysight.materials.analyse import KnownScene
 from polysight.materials.layers import fit_layer
 from polysight.materials.sub_bands import bands_of_row
 from polysight.polarimetry import Leakage, PlaneReference
@@ -99,7 +100,7 @@ def test_layers_are_recovered_where_a_half_space_is_wrong(scan, reference, rig, 
     """Water behind 3 mm of glass within 10 % in both parts; thin sheets within 5 %; Eq. 3 is beside in every row."""
     layers, truth = STACKS[name]
     pipeline, images = imaged(scan(name), Settings(bands=BANDS, incidence="pixel"))
-    (row,) = pipeline.find_materials(images, MetalChoice(plane=reference)).rows()
+    (row,) = pipeline.find_materials(images, KnownScene(metal=reference)).rows()
     bands = bands_of_row(row, rig.chirp, BANDS)
     assert bands is not None
     fit = fit_layer(bands, [parse_layer(layer) for layer in layers], np.radians(row["incidence_deg"]))
@@ -158,7 +159,8 @@ def test_the_reference_is_valid_after_a_power_cycle(scan, reference):
     again = load_reference(scan("plate", hv_gain_db=-2.0))
     at = reference.valid & again.valid
     assert at.sum() > 200
-    p = again.apply(reference.h, reference.v).p[at]
+    plate = Images(reference.h, reference.v, reference.x_m, reference.y_m, reference.valid)
+    p = again.apply(plate).p[at]
     assert np.abs(p - 1).max() < 0.06
     assert np.abs(p.mean() - 1) < 0.01
 

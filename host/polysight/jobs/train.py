@@ -26,7 +26,6 @@ from polysight.materials import (
     Labels,
     Library,
     MaterialsResult,
-    MetalChoice,
     Optics,
     TrainingScan,
     analyse,
@@ -144,7 +143,7 @@ def _from_images(saved: SavedProducts, labels: Labels) -> TrainingScan:
     if metal is None:
         raise _no_metal(saved.folder)
     pair = Images(saved.h, saved.v, saved.x_m, saved.y_m, saved.valid)
-    found = analyse(pair, _optics_of(saved), MetalChoice(label=metal), KnownScene(segmentation))
+    found = analyse(pair, _optics_of(saved), KnownScene(segmentation, metal))
     return _labelled(saved.scan_id, found, saved.simulated is not False, checked)
 
 
@@ -161,10 +160,13 @@ def _optics_of(saved: SavedProducts) -> Optics:
     return replace(
         optics,
         theta_rad=float(np.radians(angle["deg"])),
-        theta_std_rad=float(np.radians(angle["std_deg"])),
-        leakage=(0j, 0j),
-        leakage_std=float(np.max(leakage["std"])),
-        leakage_measured=True,
+        prior=replace(
+            optics.prior,
+            theta_std_rad=float(np.radians(angle["std_deg"])),
+            leakage=(0j, 0j),
+            leakage_std=float(np.max(leakage["std"])),
+            leakage_measured=True,
+        ),
     )
 
 
@@ -189,7 +191,7 @@ def _from_truth(data: Path, config: Path) -> TrainingScan:
     pipeline = processed_rows(source, data)
     images = pipeline.form_images()
     known, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
-    found = pipeline.find_materials(images, MetalChoice(metal.box_mm), KnownScene(known, plates))
+    found = pipeline.find_materials(images, KnownScene(known, metal.box_mm, plates=plates))
     drawn = specimen_seed(data / TRUTH)
     specimens = {} if drawn is None else {n: f"{source.scan_id}/{drawn}/{n}" for n in names}
     return TrainingScan(source.scan_id, found, source.simulated, versions=versions(), names=names, specimens=specimens)

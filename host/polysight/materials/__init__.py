@@ -1,7 +1,7 @@
 """Materials: find patches in the two images, estimate their permittivities, and name them.
 
-`analyse` takes an `ImagePair`, the `Optics`, the choice of the metal reference (`MetalChoice`) and known facts of the
-scene (`KnownScene`); it returns a `MaterialsResult`. On the way: `segment.py` finds patches, `measure.py` measures
+`analyse` takes the images, the `Optics` and known facts of the scene (`KnownScene`, the metal reference among them); it
+returns a `MaterialsResult`. On the way: `segment.py` finds patches, `measure.py` measures
 them, `inversion.py` solves for all permittivities and the rig's errors together, `classify.py` names patches by a
 `Library`, with the materials' distributions of `discriminant.py`. `sub_bands.py` and `layers.py` fit thin layers.
 `make_library` makes a library of scans, `fit_concentration` a line through solutions. `labels.py` reads boxes with
@@ -9,10 +9,7 @@ names and true plates, `published.py` the published data set.
 """
 
 from polysight.materials.analyse import (
-    FOUND,
-    UNKNOWN_SCENE,
     KnownScene,
-    MetalChoice,
     Optics,
     analyse,
     expected_pixel_accuracy,
@@ -109,7 +106,6 @@ __all__ = [
     "AMPLITUDE_ERROR",
     "CHANNELS",
     "DISCRIMINANT",
-    "FOUND",
     "LAYER_FORMS",
     "METAL",
     "METALS",
@@ -123,7 +119,6 @@ __all__ = [
     "SIMULATED_LIBRARY",
     "SPECIMEN",
     "UNKNOWN",
-    "UNKNOWN_SCENE",
     "Box",
     "Classifier",
     "ConcentrationResult",
@@ -136,7 +131,6 @@ __all__ = [
     "Library",
     "MatchedPatch",
     "MaterialsResult",
-    "MetalChoice",
     "Model",
     "NamedPatch",
     "Optics",

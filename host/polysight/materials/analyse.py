@@ -1,13 +1,13 @@
 """Find and name the patches of two images: segmentation, metal reference, joint inversion, classification.
 
-`analyse` takes an `ImagePair`, the `Optics`, the choice of the metal reference (`MetalChoice`) and known facts of the
-scene (`KnownScene`). `level` corrects the images for the tilts of the plates.
+`analyse` takes the images, the `Optics`, and known facts of the scene (`KnownScene`, the metal reference among them).
+`level` corrects the images for the tilts of the plates.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -55,107 +55,78 @@ from polysight_shared.errors import DataError
 
 LEAST_LEAKAGE_STD = 5e-4
 """Least standard deviation of the leakage, whatever the rig file says."""
+MEASURED_RIG = RigPrior(theta_std_rad=1e-3, leakage_std=0.003, leakage_measured=True)
+"""Prior of a rig whose leakage was measured and found to be zero."""
 
 
 @dataclass(frozen=True)
 class Optics:
-    """Quantities that turn images into permittivity, with their standard deviations.
+    """Quantities that turn images into permittivity.
 
     Attributes
     ----------
     theta_rad
         Incidence angle, a number or [ny, nx].
-    leakage
-        Cross-polar leakage (p in H, s in V): as measured, or zero.
+    prior
+        Prior of the rig's errors; `analyse` replaces its `reference_std` by the measured one.
     smooth_px
         Width (standard deviation, pixels) of the filter against speckle before permittivity and classification,
         inside each patch.
-    theta_std_rad
-        Standard deviation of the angle's error, equal for all pixels.
-    leakage_std
-        Standard deviation of each part of the leakage: as measured, or that of the mount's prior.
-    leakage_measured
-        True if it was measured.
-    channel_ratio_known
-        True if V / H of the images is referenced to the direct path, which reaches both boards with equal strength.
     """
 
     theta_rad: npt.ArrayLike
-    leakage: tuple[complex, complex] = (0.0, 0.0)
+    prior: RigPrior = MEASURED_RIG
     smooth_px: float = 2.0
-    theta_std_rad: float = 1e-3
-    leakage_std: float = 0.003
-    leakage_measured: bool = True
-    channel_ratio_known: bool = False
 
     @classmethod
     def of(
-        cls, rig: Instrument, angles: IncidenceChoice, theta_std_rad: float = 1e-3, channel_ratio_known: bool = False
+        cls, rig: Instrument, angles: IncidenceChoice, theta_std_rad: float = 1e-3, channels_known: bool = False
     ) -> Optics:
         """Return the optics of a rig under the chosen incidence angles.
 
         Leakage without a `leakage_std` in the rig file was not measured: it is not subtracted, its mean is zero.
         """
         p = rig.polarimetry
-        measured = p.leakage_std is not None
-        leakage = (complex(*p.leakage_h), complex(*p.leakage_v)) if measured else (0j, 0j)
-        std = p.leakage_prior / np.sqrt(2) if p.leakage_std is None else p.leakage_std
-        least = max(float(std), LEAST_LEAKAGE_STD)
-        return cls(angles.used_rad, leakage, p.smooth_px, theta_std_rad, least, measured, channel_ratio_known)
-
-    def prior(self, reference_std: float) -> RigPrior:
-        """Return the prior of the joint inversion."""
-        return RigPrior(
-            self.theta_std_rad,
-            self.leakage,
-            self.leakage_std,
-            self.leakage_measured,
-            self.channel_ratio_known,
-            reference_std,
+        leakage, leakage_std = (0j, 0j), float(p.leakage_prior / np.sqrt(2))
+        if p.leakage_std is not None:
+            leakage, leakage_std = (complex(*p.leakage_h), complex(*p.leakage_v)), p.leakage_std
+        prior = RigPrior(
+            theta_std_rad=theta_std_rad,
+            leakage=leakage,
+            leakage_std=max(leakage_std, LEAST_LEAKAGE_STD),
+            leakage_measured=p.leakage_std is not None,
+            channels_known=channels_known,
         )
-
-
-@dataclass(frozen=True)
-class MetalChoice:
-    """The metal reference: a box, a known patch, or a plate scanned separately; none of them: it is searched for.
-
-    Attributes
-    ----------
-    box_mm
-        x0, y0, x1, y1 in millimetres from the image centre.
-    label
-        Number of one of the known patches.
-    plane
-        A metal plate over the whole plane, scanned separately; pixels where it is invalid are ignored.
-    """
-
-    box_mm: Box | None = None
-    label: int | None = None
-    plane: PlaneReference | None = None
+        return cls(angles.used_rad, prior, p.smooth_px)
 
 
 @dataclass(frozen=True)
 class KnownScene:
-    """Known facts of the scene.
+    """Facts of the scene that are known before its analysis.
 
     Attributes
     ----------
     segmentation
-        Known patches (boxes drawn by hand); None: patches are searched for.
+        Patches, for example boxes drawn by hand; None: they are searched for.
+    metal
+        The metal reference: a box (x0, y0, x1, y1 in millimetres from the image centre), the number of one of the
+        patches, or a plate over the whole plane that was scanned separately (pixels where it is invalid are ignored).
+        None: it is searched for.
+    names
+        Patch number to the name of the box drawn by hand.
     plates
-        The truth, if known: copied to the results, never used for them.
-    settings
-        Settings of the segmentation.
+        The truth: copied to the results, never used for them.
     """
 
     segmentation: Segmentation | None = None
+    metal: Box | int | PlaneReference | None = None
+    names: Mapping[int, str] = field(default_factory=dict)
     plates: Sequence[TruthPlate] = ()
-    settings: SegmentSettings | None = None
 
-
-FOUND = MetalChoice()
-"""Search for the metal reference in the scene."""
-UNKNOWN_SCENE = KnownScene()
+    @property
+    def plane(self) -> PlaneReference | None:
+        """The metal plate that was scanned separately; None without one."""
+        return self.metal if isinstance(self.metal, PlaneReference) else None
 
 
 def level(images: Images, found: Segmentation, tilts: Tilts | None = None) -> tuple[Images, Tilts]:
@@ -180,11 +151,7 @@ ACTIVE = 2.0
 
 
 def analyse(
-    images: Images,
-    optics: Optics,
-    metal: MetalChoice = FOUND,
-    known: KnownScene = UNKNOWN_SCENE,
-    classifier: Classifier | None = None,
+    images: Images, optics: Optics, known: KnownScene | None = None, classifier: Classifier | None = None
 ) -> MaterialsResult:
     """Find the patches of the images, estimate their permittivities, and name them if there is a classifier.
 
@@ -192,24 +159,25 @@ def analyse(
 
     Raises DataError if the image has no valid pixel, or the given metal box or patch number does not exist.
     """
-    plane = metal.plane
+    known = known or KnownScene()
+    plane = known.plane
     if plane is not None:
         plane.check_axes(images.x_m, images.y_m)
         images = images.within(plane.valid)
-    found = _patches(images, plane, known)
+    found = _patches(images, known)
     images, tilts = level(images, found)
-    reference = _reference(images, metal, found)
+    reference = _reference(images, known, found)
     raw = to_metal(images, reference, plane)
     rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
     refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
     std = reference_std(reference_spread(rh, rv, reference, plane))
     common, local = (std, 0.0) if plane is None else (LEAST_STD, std)
-    prior = optics.prior(common)
+    prior = replace(optics.prior, reference_std=common)
     judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
     measured = [measure_patch(p, rh, rv, _angle(theta, p), local) for p in judged]
     if plane is None:
-        channel = _channel_ratio(images, reference) if optics.channel_ratio_known else None
+        channel = _channel_ratio(images, reference) if prior.channels_known else None
         reference = replace(reference, evidence=metal_evidence(measured, prior, channel))
     inversion = invert(measured, prior)
     calibrated = remove_leakage(raw, inversion.leakage)
@@ -232,7 +200,7 @@ def analyse(
     )
     return MaterialsResult(
         calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, tilts=tilts,
-        library=() if classifier is None else classifier.library.names,
+        boxes=dict(known.names), library=() if classifier is None else classifier.library.names,
         brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
         errors=None if errors is None else (tuple(labels), errors),
     )  # fmt: skip
@@ -296,29 +264,27 @@ def _channel_ratio(images: Images, metal: MetalReference) -> complex | None:
     return complex(np.vdot(h.astype(np.complex128), v)) / power if power > 0 else None
 
 
-def _patches(images: Images, plane: PlaneReference | None, known: KnownScene) -> Segmentation:
+def _patches(images: Images, known: KnownScene) -> Segmentation:
     """Return the known patches, cut to the valid pixels, or else find them."""
-    given = _within(known.segmentation, images.valid)
-    if given:
-        return given
-    if plane is None:
-        return segment(images.h, images.v, images.x_m, images.y_m, images.valid, known.settings)
-    even = plane.apply(images)
-    found = segment(even.h, even.v, images.x_m, images.y_m, images.valid, known.settings)
-    if not found.patches and float(np.median(np.abs(even.h[images.valid]))) > FILLED:
-        margin_mm = (known.settings or SegmentSettings()).margin_mm
-        return whole_plane(images.valid, images.x_m, images.y_m, margin_mm)
+    if known.segmentation is not None:
+        cut = tuple(replace(p, interior=p.interior & images.valid) for p in known.segmentation.patches)
+        return replace(known.segmentation, patches=cut)
+    even = images if known.plane is None else known.plane.apply(images)
+    found = segment(even.h, even.v, images.x_m, images.y_m, images.valid)
+    filled = known.plane is not None and float(np.median(np.abs(even.h[images.valid]))) > FILLED
+    if not found.patches and filled:
+        return whole_plane(images.valid, images.x_m, images.y_m, SegmentSettings().margin_mm)
     return found
 
 
-def _reference(images: Images, metal: MetalChoice, found: Segmentation) -> MetalReference:
-    """Return the chosen metal reference, or else the brightest patch; none without patches."""
-    if metal.plane is not None:
-        return MetalReference(metal.plane.valid, None, metal.plane.how, given=True)
-    if metal.box_mm is not None:
-        return metal_in_box(metal.box_mm, found, images.x_m, images.y_m, images.valid)
-    if metal.label is not None:
-        return metal_by_label(metal.label, found)
+def _reference(images: Images, known: KnownScene, found: Segmentation) -> MetalReference:
+    """Return the given metal reference, or else the brightest patch; none without patches."""
+    if isinstance(known.metal, PlaneReference):
+        return MetalReference(known.metal.valid, None, known.metal.how, given=True)
+    if isinstance(known.metal, int):
+        return metal_by_label(known.metal, found)
+    if known.metal is not None:
+        return metal_in_box(known.metal, found, images.x_m, images.y_m, images.valid)
     return find_metal(images.h, images.v, found) or no_metal(images.usable)
 
 
@@ -341,13 +307,6 @@ def reference_spread(h: Image, v: Image, metal: MetalReference, reference: Plane
     """Return the relative spread of the metal's pixels."""
     spread = inverse_spread(h[metal.mask], v[metal.mask]) if reference is None else reference.spread
     return spread if np.isfinite(spread) else 0.0
-
-
-def _within(found: Segmentation | None, valid: npt.NDArray[np.bool_]) -> Segmentation | None:
-    """Cut the interiors of patches to the valid pixels."""
-    if found is None:
-        return None
-    return replace(found, patches=tuple(replace(p, interior=p.interior & valid) for p in found.patches))
 
 
 def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:

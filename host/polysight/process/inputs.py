@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy.typing as npt
 
@@ -14,9 +11,9 @@ from polysight.materials import (
     SAME_ANGLE_DEG,
     SIMULATED_LIBRARY,
     Classifier,
+    KnownScene,
     Labels,
     Library,
-    Segmentation,
     check_labels,
 )
 from polysight.polarimetry import PlaneReference
@@ -36,29 +33,22 @@ class Inputs:
 NO_INPUTS = Inputs()
 
 
-class DrawnBoxes(NamedTuple):
-    """Boxes drawn by hand as patches, their names by patch number, and the number of the metal reference."""
-
-    segmentation: Segmentation | None = None
-    names: Mapping[int, str] = MappingProxyType({})
-    metal: int | None = None
-
-
-def boxes_as_patches(settings: Settings, inputs: Inputs, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> DrawnBoxes:
-    """Return the boxes drawn by hand as patches of an image with axes `x_m`, `y_m`; empty without labels.
+def boxes_as_patches(settings: Settings, inputs: Inputs, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> KnownScene:
+    """Return the boxes drawn by hand as patches of an image with axes `x_m`, `y_m`, and the metal in the scene.
 
     A drawn box is the metal reference if neither a box nor a scan of a plate is given as one.
     Raises DataError if a box holds no pixel, or too few to be used.
     """
     labels = inputs.labels
     if labels is None:
-        return DrawnBoxes()
+        return KnownScene(metal=settings.metal_box_mm)
     if labels.by_hand:
         labels = check_labels(labels, x_m, y_m)
     patches, names = labels.patches(x_m, y_m)
     if inputs.reference is not None or settings.metal_box_mm is not None:
-        return DrawnBoxes(patches, names)
-    return DrawnBoxes(patches, names, next((number for number, name in names.items() if labels.is_metal(name)), None))
+        return KnownScene(patches, settings.metal_box_mm, names)
+    metal = next((number for number, name in names.items() if labels.is_metal(name)), None)
+    return KnownScene(patches, metal, names)
 
 
 def why_unnamed(settings: Settings, rig: Instrument) -> str:

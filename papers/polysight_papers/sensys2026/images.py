@@ -26,7 +26,6 @@ from polysight.jobs.train import EDGE_MM
 from polysight.materials import (
     KnownScene,
     MaterialsResult,
-    MetalChoice,
     TruthPlate,
     patches_from_plates,
     read_truth,
@@ -85,7 +84,7 @@ def imaged(source: RawSource, plates: tuple[TruthPlate, ...]) -> Imaged:
     images = pipeline.form_images()
     metal = next(p for p in plates if p.metal)
     known, _ = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
-    result = pipeline.find_materials(images, MetalChoice(metal.box_mm), KnownScene(known, plates))
+    result = pipeline.find_materials(images, KnownScene(known, metal.box_mm, plates=plates))
     return Imaged(result, images.x_m, images.y_m)
 
 

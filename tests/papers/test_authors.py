@@ -5,6 +5,7 @@ import os
 import pickle
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,10 +25,9 @@ from polysight_papers.sensys2026.dataset_items import (
     paired,
     repeated,
     task_samples,
-    text_of,
     without_leakage,
 )
-from polysight_papers.sensys2026.item import Table, table2
+from polysight_papers.sensys2026.item import table2
 from polysight_shared.error_codes import ErrorCode
 
 CHOSEN = (1, 3, 12, 15, 27, 28, 30, 32, 34, 36)
@@ -188,13 +188,10 @@ def test_pairs_of_scans_share_no_scan_and_both_angles_are_seen(dataset):
     assert paired(one, second)[0].scans == (f"{first.scans[0]} and {second.scans[0]}",)
 
 
-def test_what_is_judged_is_kept(dataset):
-    judge = Judgements(read_authors(dataset, RIG_FILE))
-    judge.data.sources.pop(LABELS)
-    a = judge.judged(MATERIALS, "powders", "weighted KNN (paper)", "H")
-    assert judge.judged(MATERIALS, "powders", "weighted KNN (paper)", "H") is a
+def test_nothing_to_classify_is_refused(dataset):
+    data = read_authors(dataset, RIG_FILE)
     with refused(ErrorCode.NO_DATA):
-        authors_fig20(Judgements(type(judge.data)(judge.data.folder, judge.data.base, {}, {}, ())))
+        authors_fig20(Judgements(replace(data, sources={})))
 
 
 def test_leakage_is_taken_out_exactly_and_the_recipe_undoes_its_own_constants():
@@ -229,11 +226,3 @@ def test_refusals(dataset, tmp_path, capsys):
     assert main(["reproduce", "--authors", str(tmp_path), "--out", str(tmp_path / "a")]) == 3
     assert "neither materials/" in capsys.readouterr().err
     assert main(["reproduce", "--names", "x.json", "--out", str(tmp_path / "a")]) == 2
-
-
-def test_a_table_for_the_terminal_keeps_every_cell():
-    text = text_of(Table("numbers", ("what", "a long heading of many words"), (("one", "1"), ("three", "22.5 %"))))
-    assert text.splitlines()[0] == "numbers"
-    assert "three" in text
-    assert "22.5 %" in text
-    assert "heading" in text

@@ -8,7 +8,7 @@ from tests.support.rigs import published_rig
 
 from polysight.polarimetry import specular_incidence_rad
 from polysight_papers.sensys2026 import run as catalogue
-from polysight_papers.sensys2026.images import FIG13_DISTANCE_MM, PLACES_MM, front_on, plate, scanned
+from polysight_papers.sensys2026.images import FIG13_DISTANCE_MM, front_on, plate, scanned
 from polysight_papers.sensys2026.item import Run
 from polysight_papers.sensys2026.permittivities import APART_MM, REACH_MM, places
 from polysight_papers.sensys2026.synchronisation import tones
@@ -22,15 +22,6 @@ def test_random_places_never_overlap_and_stay_on_the_plane(seed):
     assert all(abs(c) <= REACH_MM for xy in at for c in xy)
     for i, a in enumerate(at):
         assert all(max(abs(a[0] - b[0]), abs(a[1] - b[1])) >= APART_MM for b in at[:i])
-
-
-def test_placements_differ_and_come_again():
-    assert places(1) == places(1)
-    assert places(1) != places(2)
-
-
-def test_nine_places_are_nine():
-    assert len(set(PLACES_MM)) == 9
 
 
 def test_the_rig_side_by_side_sees_the_plane_front_on(tmp_path):

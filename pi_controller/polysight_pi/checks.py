@@ -59,7 +59,8 @@ def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Fi
 
 def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
     """Run every check, in the order of bring-up."""
-    pi, keys = instrument.pi, Path(instrument.pi.key_dir)
+    pi = instrument.pi
+    keys = Path(pi.key_dir)
     yield attempt("plan", _plan, instrument)
     if wires is not None:
         yield attempt("simulated wires", _wires, instrument, wires)

@@ -113,8 +113,8 @@ def _home(args: argparse.Namespace, instrument: Instrument) -> int:
         with BenchStage(instrument.stage) as stage:
             return _print_position(args, stage.home())
     if status.lost_x_mm or status.lost_y_mm:
-        lost = f"{status.lost_x_mm:.3f} mm in x, {status.lost_y_mm:.3f} mm in y"
-        sys.stderr.write(f"polysight-pi: steps were lost since the previous homing: {lost}; check the drive\n")
+        error_mm = f"{status.lost_x_mm:.3f} mm in x, {status.lost_y_mm:.3f} mm in y"
+        sys.stderr.write(f"polysight-pi: steps were lost since the previous homing: {error_mm}; check the drive\n")
     return _print_position(args, status)
 
 
@@ -185,11 +185,12 @@ def _option(*names: str, **how: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
 
 def _rig(args: argparse.Namespace) -> Instrument:
     """Load the rig file, with the values given on the command line."""
-    rig, given = load_instrument(args.config), {k: v for k, v in vars(args).items() if v is not None}
-    replaced = {k: given[k] for k in ("journal_dir", "command_address", "event_address") if k in given}
-    stage = {"port": given["stage_port"]} if "stage_port" in given else {}
+    rig = load_instrument(args.config)
+    given = {key: value for key, value in vars(args).items() if value is not None}
+    pi_values = {key: given[key] for key in ("journal_dir", "command_address", "event_address") if key in given}
+    stage_values = {"port": given["stage_port"]} if "stage_port" in given else {}
     replace = msgspec.structs.replace
-    return replace(rig, pi=replace(rig.pi, **replaced), stage=replace(rig.stage, **stage))
+    return replace(rig, pi=replace(rig.pi, **pi_values), stage=replace(rig.stage, **stage_values))
 
 
 WIRES = _option("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")

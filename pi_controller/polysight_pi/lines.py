@@ -35,8 +35,10 @@ SET_VALUES = 0xC010B40F  # GPIO_V2_LINE_SET_VALUES_IOCTL, with the argument (bit
 _VALUES = struct.Struct("=QQ")
 BUFSIZ = Path("/sys/module/spidev/parameters/bufsiz")
 # _IOW('k', 0, struct spi_ioc_transfer[1]), _IOW('k', 1, __u8): mode 0, without chip select where the driver supports it
-MESSAGE, WRITE_MODE = 0x40206B00, 0x40016B01
-MODE_NO_CS, MODE_0 = 0x40, 0x00
+MESSAGE = 0x40206B00
+WRITE_MODE = 0x40016B01
+MODE_NO_CS = 0x40
+MODE_0 = 0x00
 _TRANSFER = struct.Struct("=QQIIHBBBBBB")  # tx, rx, len, speed_hz, delay_us, bits, cs_change, tx_nbits, rx_nbits, ...
 _RIGHTS = "60-polysight.rules sets the device's group (udev), `sudo usermod -aG gpio,spi USER` adds the user to it"
 _REASONS = {

@@ -180,11 +180,11 @@ class Machine:
         """Apply the rule of this event in the current state; return False if there is none."""
         if (self.state, event) not in self._rules:
             return False
-        before = self.state
-        next_states, action = self._rules[before, event]
+        state_before = self.state
+        next_states, action = self._rules[state_before, event]
         state: Any = action(*args) or next_states[0]
         if state not in next_states:
-            raise RuntimeError(f"{event} in state {before} does not lead to {state}")
+            raise RuntimeError(f"{event} in state {state_before} does not lead to {state}")
         if state != "same":
             self._enter(state)
         return True

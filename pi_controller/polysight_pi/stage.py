@@ -57,9 +57,9 @@ class StageRefusedError(DeviceError):
     """The stage answered a line with `error:<number>`."""
 
     def __init__(self, verb: str, number: int) -> None:
-        what, why, remedy = explain(number)
-        what = f"stage refused {verb}: error {number}, {what}"
-        super().__init__(what, why, remedy, code=ErrorCode.REFUSED_BY_PEER)
+        e = explain(number)
+        what = f"stage refused {verb}: error {number}, {e.what}"
+        super().__init__(what, e.why, e.remedy, code=ErrorCode.REFUSED_BY_PEER)
         self.number = number
 
 

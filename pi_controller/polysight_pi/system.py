@@ -99,16 +99,17 @@ class MemoryWatch(threading.Thread):
     def run(self) -> None:
         """Check the memory regularly until :meth:`stop`."""
         while not self._ended.wait(LOOK_S):
-            held = self.resident_bytes()
-            if held <= self._most_bytes:
+            held_bytes = self.resident_bytes()
+            if held_bytes <= self._most_bytes:
                 continue
             with suppress(OSError):  # no descriptor left: retried at the next check
                 cut = self._cut_connections()
                 self._ended.wait(SETTLE_S)
                 ctypes.CDLL(None).malloc_trim(0)
-                left = self.resident_bytes()
-                self._most_bytes = max(MAX_BYTES, left + SPARE_BYTES)
-                self._warn(f"{held >> 20} MiB in memory: {cut} connections were cut, {left >> 20} MiB are left")
+                left_bytes = self.resident_bytes()
+                self._most_bytes = max(MAX_BYTES, left_bytes + SPARE_BYTES)
+                held_mib = held_bytes >> 20
+                self._warn(f"{held_mib} MiB in memory: {cut} connections were cut, {left_bytes >> 20} MiB are left")
 
     def _cut_connections(self) -> int:
         """Shut down the TCP connections at the ports (ZeroMQ closes them). Return their number."""

@@ -44,13 +44,13 @@ def test_a_calibration_is_saved_and_restored_at_the_next_start(made, board, tmp_
     files = CalibrationFiles(tmp_path / "kept", b"settings")
     first = made(files)
     first.configure()
-    assert first.facts["calibration_restored"] is False
+    assert first.facts.calibration_restored is False
     (file,) = (tmp_path / "kept").iterdir()
-    assert json.loads(file.read_text())["die_id"] == first.facts["die_id"]
+    assert json.loads(file.read_text())["die_id"] == first.facts.die_id
     board.executed.clear()
     again = made(files)
     again.configure()
-    assert again.facts["calibration_restored"] is True
+    assert again.facts.calibration_restored is True
     assert board.executed.count(RestoreCalibration.ID) == 3
     mask = struct.unpack_from("<I", board.settings[InitCalibrations.ID])[0]
     assert mask & RESTORED == 0

@@ -194,7 +194,7 @@ def test_failed_self_tests_of_the_rf_core_are_reported(board, clock, tests, text
     result = []
     radar.configure(lambda step, came: result.append(came) if step.name == "RF power-up" else None)
     assert (text in result[0]) if text else result == ["RF core is up"]
-    assert radar.facts["rf_tests_passed"] == tests
+    assert radar.facts.rf_tests_passed == tests
 
 
 @pytest.mark.parametrize("rom", [(1, 2, 0, 5), (2, 0, 0, 3), (2, 2, 1, 6), (6, 2, 1, 7), (0, 0, 0, 0), (255,) * 4])

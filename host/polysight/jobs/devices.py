@@ -240,7 +240,7 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
         else:
             board.configure()
             sys.stdout.write(
-                f"{name}: runs {board.facts['main_firmware']} from RAM, until its next reset; its flash was not"
+                f"{name}: runs {board.facts.main_firmware} from RAM, until its next reset; its flash was not"
                 f' written. Set radar.firmware = "{image}" to have it at each start, or use --flash\n'
             )
     finally:

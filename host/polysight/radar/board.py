@@ -8,11 +8,13 @@ errors that healthy boards report at power-up and that are ignored. Not run on h
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
 from functools import partial
 from typing import Any, NamedTuple
+
+import msgspec
 
 from polysight.radar import commands as c
 from polysight.radar import events as e
@@ -55,6 +57,24 @@ class State(Enum):
     RUNNING = "pulses have begun"
     DONE = "frames ended"
     FAULT = "has failed, needs a reset"
+
+
+class BoardFacts(msgspec.Struct, omit_defaults=True):
+    """What a board reported about itself since its last bring-up began; the keys of its entry in the manifest.
+
+    `boot` and `calibration` are values of events (`events.Event`).
+    """
+
+    boot: Mapping[str, object] | None = None
+    rf_tests_passed: object = None
+    hardware: str = ""
+    rf_firmware: str = ""
+    main_firmware: str = ""
+    die_id: str = ""
+    calibration: Mapping[str, object] | None = None
+    calibration_restored: bool | None = None
+    temperatures_c: dict[str, int] | None = None
+    device_ms: int | None = None
 
 
 class Step(NamedTuple):
@@ -156,7 +176,7 @@ class BringUp:
         return str(up)
 
     def _boot_status(self, event: e.Event) -> None:
-        self._board.facts["boot"] = dict(event.values)
+        self._board.facts.boot = dict(event.values)
         self._cure = str(event.values.get("cure", ""))
         if event.detail:
             self._ignored.append(str(event))
@@ -257,26 +277,28 @@ class BringUp:
         self._link.call(c.DEVICE_CONFIGURATION)
         self._link.call(c.RF_POWER_UP)
         up = self._link.wait_for((e.RF_POWER_UP_DONE,), POWER_UP_TIMEOUT_S, self.note)
-        self._board.facts["rf_tests_passed"] = up.values.get("tests_passed", 0)
+        self._board.facts.rf_tests_passed = up.values.get("tests_passed", 0)
         if up.detail:
             self._ignored.append(str(up))
         return str(up)
 
     def _check_versions(self) -> str:
-        for core, key, question in (
-            ("RF", "rf_firmware", c.GET_RF_VERSION),
-            ("main", "main_firmware", c.GET_MAIN_VERSION),
-        ):
+        facts = self._board.facts
+        for core, question in (("RF", c.GET_RF_VERSION), ("main", c.GET_MAIN_VERSION)):
             v = self._board.ask(question, 16)
             hardware = v[:3]
             release = v[3:7]
             patch = (*v[10:12], v[15] >> 4, v[15] & 15)
-            self._board.facts[key] = ".".join(map(str, release)) + " patch " + ".".join(map(str, patch))
-            self._board.facts["hardware"] = ".".join(map(str, hardware))
+            version = ".".join(map(str, release)) + " patch " + ".".join(map(str, patch))
+            facts.hardware = ".".join(map(str, hardware))
+            if core == "RF":
+                facts.rf_firmware = version
+            else:
+                facts.main_firmware = version
             require_family(self._board.name, core, v)
             if not any(patch):
                 raise DeviceError(
-                    f"{self._board.name}: its {key.replace('_', ' ')} has no patch (version {self._board.facts[key]})",
+                    f"{self._board.name}: its {core} firmware has no patch (version {version})",
                     "the flash of this board contains no firmware, and none was downloaded",
                     _FIRMWARE,
                     code=ErrorCode.RADAR_NO_FIRMWARE,
@@ -287,7 +309,7 @@ class BringUp:
                 self._verify(_patch(v), self._flash_patch, self._board.firmware)
         if self._board.die_id:
             self._read_die()  # before the RF part of a wrong board is powered
-        return f"RF {self._board.facts['rf_firmware']}, main {self._board.facts['main_firmware']}"
+        return f"RF {facts.rf_firmware}, main {facts.main_firmware}"
 
     def _send(self, commands: Sequence[c.Command]) -> str:
         for command in commands:
@@ -310,7 +332,7 @@ class BringUp:
             )
         self._link.call(c.RF_INIT)
         event = self._link.wait_for((e.RF_INIT_DONE,), _CALIBRATION_TIMEOUT_S, self.note)
-        self._board.facts["calibration"] = dict(event.values)
+        self._board.facts.calibration = dict(event.values)
         requested = ALL & ~RESTORED if restored else ALL
         if failed := e.failed_calibrations(event, self._board.program.transmits, requested):
             raise DeviceError(
@@ -321,7 +343,7 @@ class BringUp:
             )
         if self._board.calibration is not None and saved is None and die != NO_DIE:
             self._board.calibration.save(die, read_calibration(self._link, self._board.name))
-        self._board.facts["calibration_restored"] = bool(restored)
+        self._board.facts.calibration_restored = bool(restored)
         return str(event) + restored
 
     def _check_die(self) -> str:
@@ -339,7 +361,7 @@ class BringUp:
             self._board.log_event(error.what)  # a firmware without this command
             return "unknown"
         die = "-".join(f"{word:08x}" for word in struct.unpack_from("<4I", data))
-        self._board.facts["die_id"] = die
+        self._board.facts.die_id = die
         if self._board.die_id and die != self._board.die_id:
             raise DeviceError(
                 f"{self._board.name}: this board has die id {die}, the rig file {self._board.die_id}",
@@ -420,7 +442,7 @@ class RadarBoard:
         self._state = State.OFF
         self._frames = 0
         self.reason = ""
-        self.facts: dict[str, object] = {}
+        self.facts = BoardFacts()
         self.steps: list[Step] = []
         self._sent_frames: tuple[c.Command, ...] = ()
         self._log: list[str] = []
@@ -469,7 +491,7 @@ class RadarBoard:
         self._state = State.OFF
         self.reason = ""
         self._frames = 0
-        self.facts.clear()
+        self.facts = BoardFacts()
         return BringUp(self)
 
     def arm(self, frames: int) -> None:
@@ -565,14 +587,14 @@ class RadarBoard:
     def read_temperatures(self) -> None:
         """Read the temperatures into `facts`. Raises DeviceError."""
         stamp, *degrees = struct.unpack_from("<I9h", self.ask(c.GET_TEMPERATURES, 24))
-        self.facts["temperatures_c"] = dict(zip(_SENSORS, degrees, strict=True))
-        self.facts["device_ms"] = stamp
+        self.facts.temperatures_c = dict(zip(_SENSORS, degrees, strict=True))
+        self.facts.device_ms = stamp
 
     def report(self) -> dict[str, Any]:
         """Return facts, bytes sent, events and warnings since the last report, for the manifest."""
         report: dict[str, Any] = {
             "state": self._state.name.lower(),
-            **self.facts,
+            **msgspec.to_builtins(self.facts),
             "sent": [raw.hex() for raw in self._sent],
             "events": self._log[:],
             "warnings": self.link.warnings[:],

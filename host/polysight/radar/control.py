@@ -250,7 +250,7 @@ class NativeRadars(RadarControl):
         """Raise DeviceError if two boards have the same die id, so that two names refer to one board."""
         names_by_die: dict[object, str] = {}
         for name, board in self._boards.items():
-            die = board.facts.get("die_id", name)
+            die = board.facts.die_id or name
             if die != NO_DIE and die in names_by_die:
                 raise DeviceError(
                     f"{names_by_die[die]} and {name} have the same die id {die}",

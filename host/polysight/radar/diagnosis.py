@@ -116,8 +116,7 @@ def _row_of_failure(step: Step | None, error: PolysightError) -> Row:
 
 def _judge_supplies(board: RadarBoard) -> Row:
     """Judge the supplies by the main core's power-up and the report of its voltage monitor."""
-    boot = board.facts.get("boot")
-    errors = boot.get("boot_errors", 0) if isinstance(boot, dict) else 0
+    errors = (board.facts.boot or {}).get("boot_errors", 0)
     monitor = bool(isinstance(errors, int) and errors >> 57 & 1)
     expected = "the core runs, no error of the voltage monitor"
     if monitor:

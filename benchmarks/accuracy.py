@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from benchmarks.data import as_synced, point_row, published
 from benchmarks.measure import Line, add_arguments, one_core, show, write
 from benchmarks.published import Synchroniser
-from polysight.capture.decode import raw_words
+from polysight.capture.dca1000 import raw_words
 from polysight.imaging import ImageBuilder, backproject
 from polysight.imaging.geometry import Antennas, row_offsets_m
 from polysight.imaging.reduce import reduction, scene_gate_m

@@ -18,8 +18,7 @@ import msgspec
 from benchmarks.capture_helpers import PACKETS, make_block
 from benchmarks.measure import ROOT, Child, ask, cpu_s
 from polysight.capture.dca1000 import MAX_PAYLOAD_BYTES
-from polysight.capture.receiver import ReceiverProcess
-from polysight.capture.scheduling import receiver_cores
+from polysight.capture.receiver import ReceiverProcess, receiver_cores
 from polysight_shared.config import Board, Instrument, load_instrument
 
 RIG = ROOT / "instrument.toml"

@@ -31,10 +31,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.capture.dca1000 import MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES
-from polysight.capture.decode import decode_row
+from polysight.capture.dca1000 import MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES, decode_row
 from polysight.capture.network import _Header, _IoVec, _Message, bind_udp, enlarge_receive_buffer, kernel_drops
-from polysight.capture.scheduling import take_priority
+from polysight.capture.receiver import take_priority
 from polysight.sync.chain import BoardSetup, synchronise_row
 from polysight_shared.config import Instrument, load_instrument
 

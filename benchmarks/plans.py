@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.data import RIG, SCENE
 from benchmarks.sparse_scans import predicted
-from polysight.capture.decode import row_words
+from polysight.capture.dca1000 import row_words
 from polysight.imaging import ImageBuilder, Images
 from polysight.imaging.sparse import reconstruct
 from polysight.materials import (

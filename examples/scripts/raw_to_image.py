@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from polysight.capture.decode import row_words
+from polysight.capture.dca1000 import row_words
 from polysight.imaging import ImageBuilder
 from polysight.store.scan_folder import ScanFolder
 from polysight.sync import BoardSetup, synchronise_row

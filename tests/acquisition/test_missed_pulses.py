@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.acquisition.arrival_model import MS, PAYLOAD, US, Load, pulse_times, receive
 
-from polysight.acquisition.missed_pulses import PlacedFrames, place_frames, slipped_frames
-from polysight.acquisition.slipped_row import describe, rewrite_row
-from polysight.capture.segment import read_index, write_index
+from polysight.acquisition.missed_pulses import PlacedFrames, describe, place_frames, rewrite_row, slipped_frames
+from polysight.capture.row_files import read_index, write_index
 
 FRAME = 4096
 BURSTS, PULSES = 12, 16

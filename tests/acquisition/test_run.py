@@ -20,8 +20,7 @@ from tests.support.store.facts import facts_of
 from tests.support.store.plain_scan import errors
 
 from polysight.acquisition.control import StopRequest
-from polysight.acquisition.scan import resume_scan, run_scan
-from polysight.acquisition.scan_loop import takes_so_far
+from polysight.acquisition.scan import resume_scan, run_scan, takes_so_far
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared.error_codes import ErrorCode

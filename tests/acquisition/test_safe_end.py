@@ -19,7 +19,7 @@ from tests.support.acquisition.receivers import receiver_of
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 
-from polysight.acquisition import scan_loop as running
+from polysight.acquisition import scan as running
 from polysight.acquisition.control import StopRequest, ignore_hangup
 from polysight.acquisition.pi_client import PiClient
 from polysight.acquisition.ready import make_ready

@@ -9,8 +9,8 @@ from tests.support.paths import REPO
 from tests.support.store.facts import facts_of
 
 from polysight.acquisition.control import StopRequest
+from polysight.acquisition.row import ON_REQUEST, FaultKind, TakeFault
 from polysight.acquisition.scan import run_scan
-from polysight.acquisition.take import ON_REQUEST, FaultKind, TakeFault
 from polysight.capture.dca1000 import Status
 from polysight.page.history import CAUSES, notice_of_rejection
 from polysight.store import RowFault

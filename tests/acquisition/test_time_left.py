@@ -8,10 +8,9 @@ import pytest
 from tests.support.page.live_view import add_fact, begin_history
 from tests.support.store.facts import facts_of
 
-from polysight.acquisition import scan_loop as running
+from polysight.acquisition import scan as running
 from polysight.acquisition.control import StopRequest
-from polysight.acquisition.progress import time_left, typical_row_s
-from polysight.acquisition.scan import run_scan
+from polysight.acquisition.scan import run_scan, time_left, typical_row_s
 from polysight.page.history import seconds
 from polysight.page.status import remaining
 

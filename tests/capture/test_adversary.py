@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 from tests.support.capture.records import FULL, mask_of
 
-from polysight.capture.earlier_records import Past
-from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Placed, place_record
+from polysight.capture.record_search import PacketLog, Past
 from polysight_simulators.cards import KINDS, Adversary, Sent
 
 STEPS = 20

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.support.refusals import refused
 
-from polysight.capture.decode import decode_row, decode_two_lane
+from polysight.capture.dca1000 import decode_row, decode_two_lane
 from polysight_shared.error_codes import ErrorCode
 
 

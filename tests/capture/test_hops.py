@@ -101,7 +101,7 @@ try() { "$PYTHON" - "$1" <<'END'
 import sys
 from pathlib import Path
 import msgspec
-from polysight.capture.survey import survey_cards
+from polysight.capture.card import survey_cards
 from polysight_shared.config import load_instrument
 rig = load_instrument(Path("instrument.toml"))
 limits = msgspec.structs.replace(rig.limits, command_timeout_s=0.15)

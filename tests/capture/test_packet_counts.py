@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tests.support.capture.records import FULL, Card, encode_packet, is_original_or_masked, place
 
 from polysight.capture.dca1000 import decode_packet_header
-from polysight.capture.packet_counts import PacketCounts
+from polysight.capture.placement import PacketCounts
 
 GRIDS = [(4096, 62), (4096, 91), (64, 910), (512, 30), (1456, 7)]  # bytes of a frame, frames of a row
 STARTS = [(0, 1), (145_600_000, 100_001), (5_000, 5), (2**48 - 20_000, 2**32 - 7)]  # counters of the first record

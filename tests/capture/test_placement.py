@@ -20,8 +20,8 @@ from tests.support.capture.records import (
 )
 
 from polysight.capture.dca1000 import Counters
-from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Losses
+from polysight.capture.record_search import PacketLog
 
 SLOW = [HealthCheck.too_slow]  # a busy machine is no fault
 COUNT, SEQUENCE = 1 << 48, 1 << 32

@@ -17,7 +17,7 @@ from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 
 from polysight.capture.receiver import ReceiverProcess
-from polysight.store.events import EventWriter
+from polysight.store.logs import EventWriter
 from polysight.store.manifest import ManifestWriter
 from polysight_pi.journal import JournalFile
 from polysight_shared.messages import Capture, RunStopped, pack

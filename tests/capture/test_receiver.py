@@ -22,7 +22,7 @@ from polysight.acquisition.capture_rig import record_ended
 from polysight.capture.dca1000 import Status
 from polysight.capture.network import BatchReceiver, bind_udp
 from polysight.capture.receiver import Progress, ReceiverProcess
-from polysight.capture.segment import read_index
+from polysight.capture.row_files import read_index
 from polysight_shared.config import Board
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError

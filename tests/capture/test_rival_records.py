@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from tests.support.capture.records import FULL, Card, Record, is_original_or_masked, place
 
-from polysight.capture.earlier_records import Past
+from polysight.capture.record_search import Past
 
 FRAME = 4096
 FULL_ENDS = 91 * FRAME

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from tests.support.capture.records import FULL, Record, is_original_or_masked, log_of, place
 
-from polysight.capture.earlier_records import Past
 from polysight.capture.placement import place_record
+from polysight.capture.record_search import Past
 
 FRAME = 4096
 FULL_ENDS = 91 * 16 * FRAME  # 91 columns of 16 pulses: 4096 full packets

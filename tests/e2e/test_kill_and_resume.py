@@ -10,7 +10,7 @@ import resource
 
 import pytest
 
-from polysight.store.events import read_events
+from polysight.store.logs import read_events
 from polysight.store.scan_folder import ScanFolder
 from polysight_shared.messages import RowStarted
 

@@ -27,7 +27,7 @@ from tests.support.store.facts import facts_of
 
 from polysight.pipeline import Pipeline
 from polysight.store import manifest
-from polysight.store.events import read_events
+from polysight.store.logs import read_events
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared.messages import RowStarted

@@ -8,7 +8,7 @@ from tests.support.store.facts import facts_of
 
 from polysight.page.history import seconds
 from polysight.page.status import remaining
-from polysight.store.events import read_events
+from polysight.store.logs import read_events
 from polysight.store.scan_folder import EVENTS, ScanFolder
 from polysight_shared.messages import Capture, Fault
 

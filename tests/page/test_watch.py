@@ -18,7 +18,7 @@ from polysight.page.images import draw
 from polysight.page.watch import EventTail, ManifestTail, ProductsTail, Watch
 from polysight.pipeline import Pipeline
 from polysight.store import manifest
-from polysight.store.events import read_events
+from polysight.store.logs import read_events
 from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
 
 

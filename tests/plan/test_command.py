@@ -16,7 +16,7 @@ from polysight.plan import Changes, row_motion_s
 from polysight.plan.plan_command import measure_noise
 from polysight.plan.timing import tail_s, turn_s
 from polysight.store import manifest
-from polysight.store.events import EventWriter
+from polysight.store.logs import EventWriter
 from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.messages import Capture

@@ -11,8 +11,8 @@ from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 from polysight.cli.main import main
-from polysight.store.sources.open import open_source
-from polysight.store.sources.published import PublishedCubes
+from polysight.store.open import open_source
+from polysight.store.published import PublishedCubes
 from polysight.sync.cubes import detect_form
 from polysight_shared.config import Image
 from polysight_shared.error_codes import ErrorCode

@@ -10,7 +10,7 @@ from tests.support.processes import output_of
 from tests.support.rigs import rig_with
 from tests.support.scenes import COPPER, PET, scene_of
 
-from polysight.store.sources.open import open_source
+from polysight.store.open import open_source
 from polysight_shared.files import read_json
 from polysight_shared.tables import to_builtins
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from tests.support.rigs import published_rig
 
-from polysight.store.sources.open import open_source
+from polysight.store.open import open_source
 from polysight_simulators.scene import decode_scene, simulate
 
 RIG = published_rig()

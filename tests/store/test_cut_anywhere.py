@@ -14,7 +14,7 @@ from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 from tests.support.store.small_scan import SmallScan
 
-from polysight.store.events import read_events
+from polysight.store.logs import read_events
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import to_text, validate
 from polysight_pi.journal import records

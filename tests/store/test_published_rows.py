@@ -6,9 +6,8 @@ import pytest
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
-from polysight.store.sources.open import open_source
-from polysight.store.sources.published import RowLosses
-from polysight.store.sources.published_settings import mirrored
+from polysight.store.open import open_source
+from polysight.store.published import RowLosses, mirrored
 from polysight_shared.config import Burst, Grid
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m

@@ -7,8 +7,8 @@ import pytest
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
-from polysight.store.sources.open import open_source
-from polysight.store.sources.published import PublishedCubes
+from polysight.store.open import open_source
+from polysight.store.published import PublishedCubes
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.geometry import rx_positions_m, tx_position_m
 

@@ -26,9 +26,9 @@ from polysight.products import REPORT, making_products
 from polysight.results import NoResult
 from polysight.settings import DEFAULT
 from polysight.store import locked_samples
-from polysight.store.append_only import AppendFile
-from polysight.store.raw import drop, droppable, dropped_files, require_raw
-from polysight.store.scan_folder import MANIFEST, ScanFolder
+from polysight.store.logs import AppendFile
+from polysight.store.raw import drop, droppable, require_raw
+from polysight.store.scan_folder import MANIFEST, ScanFolder, dropped_files
 from polysight.store.validation import damaged_rows
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, ScanError

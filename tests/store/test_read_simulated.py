@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from tests.support.rigs import published_rig
 
+from polysight.store.open import open_source
 from polysight.store.scan_folder import ScanFolder
-from polysight.store.sources.open import open_source
 from polysight.store.validation import validate
 from polysight_simulators.scene import SimulatedRig, decode_scene, lost_bytes, simulate
 

@@ -15,10 +15,10 @@ from tests.support.store.faulty_disk import FaultyDisk, Killed
 from tests.support.store.plain_scan import errors
 
 from polysight.capture import PACKETS, Evidence, place_record, read_packets, write_index, write_packets
-from polysight.capture.earlier_records import Past
+from polysight.capture.record_search import Past
 from polysight.jobs.recordings import inspect_placement, replace_folder
 from polysight.store import ManifestWriter, ScanFolder, replace_rows
-from polysight.store.append_only import crc32
+from polysight.store.logs import crc32
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.raster import plan_raster
 

@@ -15,8 +15,7 @@ from tests.support.store.facts import facts_of, typed
 from tests.support.store.plain_scan import write_scan
 
 from polysight.store import manifest
-from polysight.store.append_only import crc32
-from polysight.store.events import EventWriter, read_events
+from polysight.store.logs import EventWriter, crc32, read_events
 from polysight.store.manifest import ManifestWriter, ScanResumed, encode_line, parse
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.source import RawSource, pieces_of

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from tests.support.refusals import refused
 
-from polysight.store import append_only as appending
+from polysight.store import logs as appending
 from polysight.store import validation as validate
 from polysight.store.manifest import ManifestWriter
 from polysight.store.scan_folder import ScanFolder

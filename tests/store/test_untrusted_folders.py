@@ -19,8 +19,7 @@ from tests.support.store.facts import facts_of
 
 from polysight.calibration import calibration_of_scan
 from polysight.capture import read_index, read_packets
-from polysight.capture.packet_file import PACKETS, RUN
-from polysight.capture.segment import write_durably
+from polysight.capture.row_files import PACKETS, RUN, write_durably
 from polysight.cli.main import main
 from polysight.materials.labels import read_labels, read_truth
 from polysight.materials.library import Library
@@ -30,9 +29,9 @@ from polysight.products.dataset_files import read_netcdf
 from polysight.products.files import SavedProducts, read_image, write_atomically
 from polysight.products.folder import making_products
 from polysight.store import manifest
+from polysight.store.published import read_json as read_settings_json
 from polysight.store.raw import drop, droppable
 from polysight.store.scan_folder import ScanFolder
-from polysight.store.sources.published_settings import read_json as read_settings_json
 from polysight.store.validation import validate
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from polysight.capture.decode import raw_words
+from polysight.capture.dca1000 import raw_words
 from polysight.sync.align import AlignedRow, align_row
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.pi_client import MOVING, PiClient
-from polysight.acquisition.take import ON_REQUEST
+from polysight.acquisition.row import ON_REQUEST
 from polysight.store import PiDescription
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode

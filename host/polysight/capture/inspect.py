@@ -19,11 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.capture import dca1000
-from polysight.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Code, Status
-from polysight.capture.decode import decode_row, decode_two_lane
-from polysight.capture.earlier_records import counter_differences
-from polysight.capture.packet_log import PacketLog
+from polysight.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Code, Status, decode_row, decode_two_lane
 from polysight.capture.placement import Placed, place_record
+from polysight.capture.record_search import PacketLog, counter_differences
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, ProtocolError
 from polysight_shared.files import read_bounded

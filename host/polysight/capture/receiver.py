@@ -1,4 +1,4 @@
-"""Start and control the receiver process of one card; the messages between host and process.
+"""Start and control the receiver process of one card; the messages between host and process; priority and cores.
 
 Requests and answers are msgpack structs on an inherited connection. For each row: `BeginRow` with the file to write,
 `Progress` during reception, `EndRow`, and a `RowCapture` with the result. The process itself is `receiver_process.py`.
@@ -6,21 +6,82 @@ Requests and answers are msgpack structs on an inherited connection. For each ro
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
 from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, Status
-from polysight.capture.scheduling import Core
 from polysight_shared.config import Board
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
+
+REAL_TIME = 5  # below the kernel's threads, and below the Pi's pulses if both run on one machine
+NICE = -5
+PRIORITY_REMEDY = (
+    "`sudo host/rights.sh USER` (USER: the user who scans), then log out and in again, or restart the machine"
+    " (docs/how-to/install.md); without it a busy machine may lose packets, which are counted and their row retaken"
+)
+
+
+class Core(NamedTuple):
+    """A core for a receiver; `own` if no other receiver shares it."""
+
+    number: int
+    own: bool
+
+
+def receiver_cores(receivers: int, cores: list[int] | None = None) -> list[Core | None]:
+    """Choose a core for each receiver, from the last one down; the first is the host's. None if there is only one.
+
+    `cores` are the usable cores (default: those of this process).
+    """
+    if cores is None:
+        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    usable = cores[1:][::-1]
+    own = len(usable) >= receivers
+    return [Core(usable[k % len(usable)], own) if usable else None for k in range(receivers)]
+
+
+def take_core(core: int | None, own: bool = True, urgent: bool = True) -> tuple[int | None, str]:
+    """Pin this process to a core; return the core (None: any) and a warning ("" if there is none).
+
+    A core shared with other receivers (`own` False) is used only with real-time priority (`urgent`): ordinary processes
+    pinned to one core lose far more packets than processes that the kernel may move.
+    """
+    if core is None or not (own or urgent):
+        return None, ""
+    try:
+        os.sched_setaffinity(0, {core})
+    except (AttributeError, OSError) as e:
+        return None, f"not pinned to core {core}: {e}"
+    return core, ""
+
+
+def take_priority(real_time: int = REAL_TIME, nice: int = NICE) -> tuple[str, str]:
+    """Give this process real-time priority, or else a lower nice value; return the priority and what was not permitted.
+
+    Real time (round robin) and negative nice values need CAP_SYS_NICE. A receiver sleeps for a millisecond between
+    batches, so it never occupies a whole core.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(real_time))
+    except (AttributeError, OSError) as e:
+        refused = f"no real-time priority: {e.strerror if isinstance(e, OSError) else e}"
+    else:
+        return f"real-time priority {real_time}", ""
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, nice)
+    except OSError as e:
+        return f"nice {os.getpriority(os.PRIO_PROCESS, 0)}", f"{refused}; nice {nice}: {e.strerror}"
+    return f"nice {nice}", refused
+
 
 _START_TIMEOUT_S = 30.0
 _ANSWER_TIMEOUT_S = 60.0  # ending a row waits for the disk
@@ -200,7 +261,7 @@ class ReceiverProcess:
     buffer_bytes
         Requested receive buffer.
     core
-        Core to pin the process to, as chosen by :func:`polysight.capture.scheduling.receiver_cores`; None: any. A
+        Core to pin the process to, as chosen by :func:`receiver_cores`; None: any. A
         shared core is used only with real-time priority.
 
     Raises

@@ -21,13 +21,11 @@ from numpy.typing import NDArray
 
 from polysight.capture import receiver as messages
 from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, Status
-from polysight.capture.earlier_records import Past
 from polysight.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
-from polysight.capture.packet_file import PACKETS, Evidence, write_packets
-from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Preview, place_record, preview
-from polysight.capture.scheduling import take_core, take_priority
-from polysight.capture.segment import Segment, write_index
+from polysight.capture.receiver import take_core, take_priority
+from polysight.capture.record_search import PacketLog, Past
+from polysight.capture.row_files import PACKETS, Evidence, Segment, write_index, write_packets
 from polysight_shared.errors import DeviceError, PolysightError
 
 _MAX_BATCHES = 64  # batches fetched before requests are checked again

@@ -1,24 +1,286 @@
-"""Find a row's record among its packets: its start, and the packets that belong to it.
+"""The packets of a row, the record among them, and what is known of earlier and later records (docs/spec/placement.md).
 
-The model and the errors of each decision: docs/spec/placement.md. Within a record all packets but the last are full, so
+`PacketLog` collects packets as they arrive. Within a record all packets but the last are full, so
 `byte count - full x sequence` is constant: the record's *line*. Packets of other records are on other lines, or on the
-same line at other counts. The start is certain if the counters of earlier records leave one possibility, or if the
-record's end proves it. Otherwise the record is not located.
+same line at other counts. The start is certain if the counters of earlier records (`Past`) leave one possibility, or if
+the record's end proves it. Otherwise the record is not located. `past_after` is the knowledge for the next.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.capture.dca1000 import Counters
-from polysight.capture.earlier_records import CounterView, Past, full_payload, line_of
-from polysight.capture.packet_log import PacketLog
+from polysight.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES, SEQUENCE_BITS, Counters
 
+Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+
+
+_SPARE_BYTES = 1 << 20  # of payload beyond the row, for left-over packets
+_MAX_ROWS = 4  # of payload that is kept; two network paths double it
+
+
+class PacketLog:
+    """The packets of one row of `expected` bytes in the order of their arrival.
+
+    `memory`, uint8, is reused for the payload if it is large enough.
+
+    Attributes
+    ----------
+    count
+        Packets logged.
+    malformed
+        Packets without payload, or longer than the card's: counted, not logged.
+    payload
+        uint8: payload of the first `kept` packets, one after another.
+    kept
+        Packets with stored payload: all, unless far more came than the row has.
+    payload_bytes
+        Bytes of payload received.
+    """
+
+    def __init__(self, expected: int, memory: Bytes | None = None) -> None:
+        self.expected = expected
+        if memory is None or memory.size < expected + _SPARE_BYTES:
+            memory = np.empty(expected + _SPARE_BYTES, dtype=np.uint8)
+        memory[:expected].fill(0)  # allocate the pages before the first packet
+        self.payload = memory
+        packets = 2 * expected // MAX_PAYLOAD_BYTES + 256
+        self._heads = np.zeros((packets, PACKET_HEADER_BYTES), dtype=np.uint8)
+        self._sizes = np.zeros(packets, dtype=np.uint16)
+        self._batches = np.zeros((packets, 2), dtype=np.int64)
+        self.count = self.kept = self.malformed = self.payload_bytes = 0
+        self._filled = self._noted = 0
+        self._quiet_ns = 0  # last time since the last batch at which the socket was empty
+
+    def add(self, packets: Bytes, lengths: NDArray[np.integer], t_ns: int) -> None:
+        """Log packets in the order of their arrival.
+
+        `packets` is uint8 [n, >= longest length] with header and payload, `lengths` integer [n] bytes, `t_ns` the time
+        of reception, monotonic clock.
+        """
+        sizes = lengths.astype(np.int64) - PACKET_HEADER_BYTES
+        good = (sizes > 0) & (sizes <= MAX_PAYLOAD_BYTES)
+        if not good.all():
+            self.malformed += int((~good).sum())
+            packets, sizes = packets[good], sizes[good]
+        n = len(sizes)
+        if n == 0:
+            return
+        if self.count + n > len(self._sizes):
+            self._heads, self._sizes = _doubled(self._heads, n), _doubled(self._sizes, n)
+        self._heads[self.count : self.count + n] = packets[:, :PACKET_HEADER_BYTES]
+        self._sizes[self.count : self.count + n] = sizes
+        total = int(sizes.sum())
+        if self.kept == self.count and self._room_for(total):
+            self._copy(packets, sizes)
+            self.kept += n
+        self.count += n
+        self.payload_bytes += total
+        self._note(t_ns)
+
+    def note_quiet(self, t_ns: int) -> None:
+        """Record that the socket was empty at this time."""
+        self._quiet_ns = t_ns
+
+    def _copy(self, packets: Bytes, sizes: Counts) -> None:
+        bounds = np.flatnonzero(np.diff(sizes)) + 1
+        for i, j in zip([0, *bounds.tolist()], [*bounds.tolist(), len(sizes)], strict=True):
+            size = int(sizes[i])
+            to = self.payload[self._filled : self._filled + (j - i) * size].reshape(j - i, size)
+            to[:] = packets[i:j, PACKET_HEADER_BYTES : PACKET_HEADER_BYTES + size]
+            self._filled += to.size
+
+    def _room_for(self, more: int) -> bool:
+        """True if `more` bytes of payload can be kept; memory grows up to `_MAX_ROWS` rows."""
+        if self._filled + more <= self.payload.size:
+            return True
+        size = min(2 * self.payload.size + more, self.max_kept_bytes(self.expected))
+        if self._filled + more > size:
+            return False
+        grown = np.empty(size, dtype=np.uint8)
+        grown[: self._filled] = self.payload[: self._filled]
+        self.payload = grown
+        return True
+
+    @staticmethod
+    def max_kept_bytes(expected: int) -> int:
+        """Return the largest payload that is kept of a row of `expected` bytes."""
+        return _MAX_ROWS * (expected + _SPARE_BYTES)
+
+    def _note(self, t_ns: int) -> None:
+        if self._noted + 2 > len(self._batches):
+            self._batches = _doubled(self._batches, 2)
+        if self._quiet_ns and self._noted:
+            self._batches[self._noted] = self._quiet_ns, self._batches[self._noted - 1, 1]
+            self._noted += 1
+        self._quiet_ns = 0
+        self._batches[self._noted] = t_ns, self.count
+        self._noted += 1
+
+    @property
+    def batches(self) -> Counts:
+        """int64 [n, 2]: time (monotonic, ns), packets received by then; without growth, the socket was empty."""
+        return self._batches[: self._noted]
+
+    @property
+    def sequences(self) -> Counts:
+        """int64 [packet]."""
+        return self._heads[: self.count, 0:4].copy().view("<u4")[:, 0].astype(np.int64)
+
+    @property
+    def byte_counts(self) -> Counts:
+        """int64 [packet]: the card's byte count, 48 bits."""
+        wide = np.zeros((self.count, 8), dtype=np.uint8)
+        wide[:, :6] = self._heads[: self.count, 4:10]
+        return wide.view("<i8")[:, 0]
+
+    @property
+    def sizes(self) -> Counts:
+        """int64 [packet]: bytes of payload."""
+        return self._sizes[: self.count].astype(np.int64)
+
+    @property
+    def arrivals_ns(self) -> Counts:
+        """int64 [packet]: latest possible arrival time of each."""
+        return np.repeat(self.batches[:, 0], np.diff(self.batches[:, 1], prepend=0))
+
+    @property
+    def last_is_short(self) -> bool:
+        """True if the last packet is smaller than the one before it: a record may have ended."""
+        return self.count > 1 and bool(self._sizes[self.count - 1] < self._sizes[self.count - 2])
+
+    @property
+    def last_arrival_ns(self) -> int:
+        """Arrival time of the last batch; 0 before the first."""
+        return int(self._batches[self._noted - 1, 0]) if self._noted else 0
+
+    @staticmethod
+    def restore(
+        expected: int, sequences: Counts, byte_counts: Counts, sizes: Counts, batches: Counts, payload: Bytes
+    ) -> PacketLog:
+        """Restore a log from a file; arrays as of the properties."""
+        log = PacketLog(0, payload if payload.size >= _SPARE_BYTES else None)
+        log.expected, log.count, log.kept = expected, len(sizes), len(sizes)
+        log._heads = np.zeros((len(sizes), PACKET_HEADER_BYTES), dtype=np.uint8)
+        log._heads[:, 0:4] = (sequences % (1 << SEQUENCE_BITS)).astype("<u4")[:, None].view(np.uint8)
+        log._heads[:, 4:10] = (byte_counts % (1 << BYTE_COUNT_BITS)).astype("<i8")[:, None].view(np.uint8)[:, :6]
+        log._sizes = sizes.astype(np.uint16)
+        log._batches, log._noted = batches, len(batches)
+        log.payload, log._filled, log.payload_bytes = payload, payload.size, int(sizes.sum())
+        return log
+
+
+def _doubled(array: NDArray[Any], more: int) -> NDArray[Any]:
+    """Return the array with space for twice as many entries, and `more`."""
+    return np.concatenate([array, np.zeros((len(array) + more, *array.shape[1:]), dtype=array.dtype)])
+
+
+@dataclass(frozen=True)
+class Span:
+    """Counters of an earlier record: packets with these counters are left over."""
+
+    start: Counters
+    size: int
+    sure: bool = True  # packets of the record came, or its place is certain; otherwise perhaps never sent
+    missing: tuple[tuple[int, int], ...] | None = None  # byte ranges still missing; None: any of it may still come
+
+
+@dataclass(frozen=True)
+class Past:
+    """Knowledge about the record of a row from the records before it."""
+
+    base: Counters | None = None  # start of the previous record, if certain
+    ends: tuple[int, ...] = ()  # its possible sizes, bytes; this record starts behind one of them
+    spans: tuple[Span, ...] = ()  # counters of earlier records
+    joint: Counters | None = None  # end of a complete record with a doubtful start
+    joined: int = 0  # number of doubtful records that followed each other without a gap
+    unseen: bool = False  # a record may have been sent, at an unknown place, of which nothing came
+    guessed: bool = False  # `base` is uncertain, only the end of its record is known
+    anew: int = 0  # number of consecutive complete records with the first counters of a card just switched on
+
+    def starts_after(self, strays: PacketLog) -> Past:
+        """Return the knowledge after packets between two records, which may be of an unknown record."""
+        if strays.count == 0 or self.base is None or self._knows(strays):
+            return self
+        return replace(self, base=None, ends=())
+
+    def _knows(self, strays: PacketLog) -> bool:
+        full = full_payload(strays)
+        packets = CounterView(strays, self.base or Counters(0, 0), full)
+        known = packets.inside(self.spans, sure=True)
+        if len(self.ends) == 1:
+            known |= (packets.line == line_of(self.ends[0], full)) & (packets.ahead < self.ends[0])
+        return bool(known.all())
+
+
+class CounterView:
+    """Counters of all packets relative to a reference. Attributes are int64 [packet]."""
+
+    def __init__(self, log: PacketLog, reference: Counters, full: int) -> None:
+        self.reference, self.full, self.sizes = reference, full, log.sizes
+        self._counts, self._sequences = log.byte_counts, log.sequences
+        self.ahead = counter_differences(self._counts, reference.byte_count, BYTE_COUNT_BITS)
+        self.steps = counter_differences(self._sequences, reference.sequence, SEQUENCE_BITS)
+        self.line = self.ahead - full * self.steps
+
+    def inside(self, spans: tuple[Span, ...], sure: bool) -> Flags:
+        """Bool [packet], True for counters of one of these records."""
+        found = np.zeros(self.sizes.size, dtype=np.bool_)
+        for span in spans:
+            if span.sure is sure:
+                found |= self._of(span)[0]
+        return found
+
+    def came_before(self, spans: tuple[Span, ...]) -> Flags:
+        """Bool [packet], True for counters that came already: a late copy, or the card has restarted."""
+        found = np.zeros(self.sizes.size, dtype=np.bool_)
+        for span in spans:
+            if span.sure and span.missing is not None:
+                inside, ahead = self._of(span)
+                for start, stop in span.missing:
+                    inside &= (ahead + self.sizes <= start) | (ahead >= stop)
+                found |= inside
+        return found
+
+    def _of(self, span: Span) -> tuple[Flags, Counts]:
+        """Bool [packet], True for counters of a record; int64 [packet], bytes behind that record's start."""
+        ahead = counter_differences(self._counts, span.start.byte_count, BYTE_COUNT_BITS)
+        steps = counter_differences(self._sequences, span.start.sequence, SEQUENCE_BITS)
+        return (ahead >= 0) & (ahead < span.size) & (ahead == self.full * steps), ahead
+
+    def at(self, base: int, line: int) -> Counters:
+        """Return the counters `base` bytes behind the reference, on a line."""
+        return self.reference.after(base, (base - line) // self.full)
+
+
+def line_of(end: int, full: int) -> int:
+    """Return the line of a record that follows a record of `end` bytes, relative to the start of that record."""
+    return end - full * -(-end // full)
+
+
+def full_payload(log: PacketLog) -> int:
+    """Return the payload of a full packet: the card's default, unless the packets of a longer row show another."""
+    sizes = log.sizes
+    if log.expected < MAX_PAYLOAD_BYTES or sizes.size == 0 or (sizes == MAX_PAYLOAD_BYTES).any():
+        return MAX_PAYLOAD_BYTES
+    _, one = np.unique(log.byte_counts, return_index=True)  # without duplicates
+    values, counts = np.unique(sizes[one], return_counts=True)
+    return int(values[counts == counts.max()].max()) if counts.max() > 2 else MAX_PAYLOAD_BYTES
+
+
+def counter_differences(counters: Counts, origin: int, bits: int) -> Counts:
+    """Return `counters - origin`, int64 [n], of counters that wrap after `bits` bits; nearest to zero."""
+    spare = 64 - bits
+    wrapped = (counters.astype(np.uint64) - np.uint64(origin)) << np.uint64(spare)  # the counter's top bit is the sign
+    return wrapped.view(np.int64) >> np.int64(spare)
+
+
 SMALL_RECORD = 16  # packets: a record of this size may be delayed as a whole
 _NEAR = 64  # records
 SWITCHED_ON = Counters(0, 1)  # of the first packet after a reset
@@ -321,3 +583,77 @@ def _before_pulses(log: PacketLog, not_before_ns: int) -> tuple[Flags, int]:
     jumps = int((np.diff(log.batches[:, 0]) < 0).sum())
     early = log.arrivals_ns < not_before_ns
     return (np.zeros_like(early) if jumps else early), jumps
+
+
+_REMEMBERED = 4  # earlier records whose counters are kept
+_GAPS = 64  # largest number of gaps of a record that are kept
+
+
+def past_after(past: Past, found: Found, log: PacketLog, located: bool, frame_bytes: int) -> Past:
+    """Return the knowledge for the next record.
+
+    `located` is also False if the card reported dropped data: then only a short last packet marks the record's end.
+    """
+    e, full = log.expected, found.full
+    if found.base is None:
+        return _after_nothing(past, e, full, frame_bytes)
+    base, ends = found.base, (found.offsets + log.sizes)[found.own]
+    stop = int(ends.max())
+    more = _more_records(found, stop, e)
+    if located and not more:
+        sure = tuple(span for span in past.spans if span.sure)
+        anew = past.anew + 1 if base == SWITCHED_ON and past.spans else 0
+        return Past(base, (e,), _remember(sure, Span(base, e, missing=_outstanding(found, log))), anew=anew)
+    first = int(found.offsets[found.own].min())
+    short = bool((log.sizes[found.own][ends == stop] < full).all())
+    if found.restarted:
+        return Past(base, tuple(sorted({stop, e})), _remember(past.spans, Span(base, e)))
+    if more:  # the end of the last of them is unknown
+        return Past(spans=_remember(past.spans, Span(base, max(stop, e))), unseen=True)
+    if found.certain:
+        frames = range(-(-stop // frame_bytes) * frame_bytes, e + 1, frame_bytes) if frame_bytes > 1 else range(0)
+        return Past(base, tuple(sorted({*frames, *([stop] if short else [])})), _remember(past.spans, Span(base, e)))
+    back = -(-max(0, first - (stop - e)) // full)  # packets that may be lost before the first
+    low, high = first - back * full, max(stop, first + e) if e % full else stop
+    spans = _remember(past.spans, Span(base.after(low, low // full), high - low))
+    end, joined = base.after(stop, -(-stop // full)), 0
+    if found.doubtful:
+        joined = past.joined + 1 if past.joint == base else 1
+        spans = (*spans, Span(end, e, sure=False))
+    elif e % full == 0 and first + e > stop:
+        spans = (*spans, Span(end, first + e - stop, sure=False))
+    anew = past.anew + 1 if found.doubtful and base == SWITCHED_ON else 0
+    known = Past(spans=spans, joint=end if joined else None, joined=joined, unseen=past.unseen, anew=anew)
+    # A short packet ends its record, wherever that began. One truncated on the way leads to a line without packets.
+    return replace(known, base=base, ends=(stop,), guessed=True) if short and not found.doubtful else known
+
+
+def _outstanding(found: Found, log: PacketLog) -> tuple[tuple[int, int], ...] | None:
+    """Return the missing byte ranges of a located record; None if they are too many to keep."""
+    came = (found.own | found.old) & (found.offsets >= 0) & (found.offsets < log.expected)
+    starts, stops = found.offsets[came], (found.offsets + log.sizes)[came]
+    order = np.argsort(starts, kind="stable")
+    a = np.append(starts[order], log.expected)
+    b = np.maximum.accumulate(np.append(0, stops[order]))
+    gaps = tuple((int(b[k]), int(a[k])) for k in np.flatnonzero(a > b).tolist())
+    return gaps if len(gaps) <= _GAPS else None
+
+
+def _more_records(found: Found, stop: int, expected: int) -> bool:
+    """True if packets have counters behind the record's end: another record of unknown size, or the card restarted."""
+    return bool(later_packets(found, ~(found.own | found.early | found.old), stop, expected).any())
+
+
+def _after_nothing(past: Past, expected: int, full: int, frame_bytes: int) -> Past:
+    """Return the knowledge after a row without packets, whose record may have been sent or not."""
+    if past.base is None or len(past.ends) != 1 or past.guessed:
+        return Past(spans=past.spans, unseen=True)
+    end = past.ends[0]
+    base = past.base.after(end, -(-end // full))
+    spans = _remember(past.spans, Span(base, expected, sure=False))
+    step = frame_bytes if frame_bytes > 1 else max(1, expected)
+    return Past(base, tuple(range(0, expected + 1, step)), spans, unseen=True)
+
+
+def _remember(spans: tuple[Span, ...], span: Span) -> tuple[Span, ...]:
+    return (*spans, span)[-_REMEMBERED:]

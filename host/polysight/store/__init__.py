@@ -8,13 +8,11 @@ data, `read_row`, and facts about the recording. `raw_source` requires a source 
 """
 
 from polysight.store import manifest
-from polysight.store.append_only import crc32, sync_folder
-from polysight.store.events import EventWriter, read_events
+from polysight.store.logs import EventWriter, LogDigest, crc32, read_events, sync_folder
 from polysight.store.manifest import (
     MANIFEST,
     BoardRow,
     Fact,
-    LogDigest,
     Manifest,
     ManifestWriter,
     OtherFact,
@@ -30,8 +28,18 @@ from polysight.store.manifest import (
     ScanResumed,
     ScanStarted,
 )
-from polysight.store.raw import Digests, drop, droppable, dropped_rows, require_raw
-from polysight.store.replace import PlacedAgain, Replaced, place_again, replace_rows
+from polysight.store.open import is_source, open_source
+from polysight.store.published import COLLECTION, mirrored, read_settings, rig_of
+from polysight.store.raw import (
+    Digests,
+    PlacedAgain,
+    Replaced,
+    drop,
+    droppable,
+    place_again,
+    replace_rows,
+    require_raw,
+)
 from polysight.store.sample_rows import (
     SAMPLE_ROWS,
     SAMPLES,
@@ -49,14 +57,13 @@ from polysight.store.scan_folder import (
     ScanFolder,
     check_same_scan,
     connection_of,
+    dropped_rows,
     new_scan_id,
     utc_now,
     versions,
     with_connection,
 )
 from polysight.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
-from polysight.store.sources.open import is_source, open_source
-from polysight.store.sources.published_settings import COLLECTION, mirrored, read_settings, rig_of
 from polysight.store.untrusted import MAX_BYTES, check_links, inside, open_npz
 from polysight.store.validation import damage_of, damaged_rows, to_json, to_text, validate
 

@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeVar
 
 import msgspec
 
-from polysight.store.append_only import AppendFile
+from polysight.store.logs import AppendFile, LogDigest
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError, PolysightError, no_such
 from polysight_shared.files import MAX_JSON_BYTES, read_bounded
@@ -110,13 +110,6 @@ class BoardRow(Reception, frozen=True, kw_only=True, omit_defaults=True):
     crc32: str
     index_crc32: str = ""
     packets_crc32: str = ""
-
-
-class LogDigest(msgspec.Struct, frozen=True):
-    """Length and CRC-32 of the event log at a commit."""
-
-    bytes: int
-    crc32: str
 
 
 class RowCommitted(Fact, frozen=True, kw_only=True, tag="row_committed"):

@@ -1,17 +1,35 @@
-"""Delete raw data of processed rows on request; the manifest keeps the digests.
+"""Delete raw data of processed rows, or place rows again from their stored packets, on request.
 
-A row's `raw_dropped` line is written before its files are deleted. After a crash in between, files listed as dropped
-may still exist; dropping again deletes them. Files that are not listed always exist.
+A `raw_dropped` line, which keeps the digests, is written before its files are deleted. After a crash in between, files
+listed as dropped may still exist; dropping again deletes them. Files that are not listed always exist. A row that is
+placed again with a different result is written to new files and committed with a new line; the old files are deleted
+afterwards. A crash at any moment leaves either the old or the new row.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from polysight.store.append_only import crc32, sync_folder
-from polysight.store.manifest import DroppedFile, RawDropped, RowCommitted, RowWithdrawn
-from polysight.store.scan_folder import ScanFolder, utc_now
+import msgspec
+import numpy as np
+
+from polysight.capture import (
+    PACKETS,
+    Evidence,
+    Placed,
+    place_record,
+    read_index,
+    read_packets,
+    valid_frames,
+    write_durably,
+    write_index,
+    write_packets,
+)
+from polysight.store.logs import crc32, sync_folder
+from polysight.store.manifest import BoardRow, DroppedFile, ManifestWriter, RawDropped, RowCommitted
+from polysight.store.scan_folder import ScanFolder, dropped_files, utc_now
+from polysight.store.validation import board_faults, to_text
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError, ScanError
 
@@ -26,22 +44,6 @@ class Droppable:
     files: dict[int, dict[str, Path]]  # by row and board
     bytes: int
     kept: list[str] = field(default_factory=list)  # files that must be kept, with the reason
-
-
-def dropped_files(scan: ScanFolder) -> dict[str, RawDropped]:
-    """Return the payload files (relative to the scan folder) that were dropped, each with its fact."""
-    files: dict[str, RawDropped] = {}
-    for fact in scan.content.facts:
-        if isinstance(fact, RowCommitted | RowWithdrawn):  # taken again, with new files
-            files = {file: dropped for file, dropped in files.items() if dropped.row != fact.row}
-        elif isinstance(fact, RawDropped):
-            files |= {board.file: fact for board in fact.boards.values()}
-    return files
-
-
-def dropped_rows(scan: ScanFolder) -> set[int]:
-    """Return the rows of which a dropped file is gone."""
-    return {fact.row for file, fact in dropped_files(scan).items() if not (scan.path / file).exists()}
 
 
 def require_raw(scan: ScanFolder) -> None:
@@ -135,3 +137,136 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
 def _fact(row: RowCommitted, boards: list[str], products: str) -> RawDropped:
     files = {n: DroppedFile(b.file, b.bytes, b.crc32) for n, b in row.boards.items() if n in boards}
     return RawDropped(row=row.row, take=row.take, boards=files, products=products, dropped_utc=utc_now())
+
+
+@dataclass(frozen=True)
+class Replaced:
+    """Result for one board's row."""
+
+    row: int
+    board: str
+    before: int  # missing bytes as committed
+    after: int  # missing bytes now
+    left: str = ""  # why the row was left unchanged
+    changed: bool = False
+    damaged: bool = False  # left unchanged because its files differ from the commit or are unreadable
+
+
+@dataclass(frozen=True)
+class PlacedAgain:
+    """A row placed again from its packets."""
+
+    evidence: Evidence
+    placed: Placed
+    out: np.ndarray  # uint8, the payload
+    missing: list[tuple[int, int]]  # the committed gaps
+    moved: bool  # the committed frames were moved to their pulses: the row is left unchanged
+
+
+def place_again(path: Path) -> PlacedAgain:
+    """Place a row again; `path` is its file, with `.idx` and `.pkt` beside it. Raises DataError."""
+    try:
+        row = np.fromfile(path, dtype=np.uint8)
+    except OSError as e:
+        why = "the path is wrong, or the raw data was dropped"
+        what, remedy = f"{path}: cannot be read: {e.strerror}", "give SCAN/raw/BOARD/ROW.bin"
+        raise DataError(what, why, remedy, code=ErrorCode.FILE_UNREADABLE) from None
+    facts, _ = read_index(path.with_suffix(".idx"))
+    evidence, log = read_packets(path.with_suffix(PACKETS), row)
+    e = evidence
+    placed, out = place_record(log, e.frame_bytes, e.past, e.not_before_ns, e.dropped_by_card)
+    missing = [(int(a), int(b)) for a, b in facts.get("missing", [])]
+    return PlacedAgain(evidence, placed, out, missing, moved="frames" in facts)
+
+
+def replace_rows(scan: ScanFolder) -> list[Replaced]:
+    """Place every committed row again, and commit those with a different result.
+
+    Raises
+    ------
+    DeviceError
+        if the scan is in use, or the disk fails; the remaining rows are unchanged.
+    """
+    found = []
+    with scan.writer() as writer:
+        scan.reload()
+        for row in scan.committed().values():
+            boards = {name: _place(scan, row, board) for name, board in row.boards.items()}
+            found += [report for report, _ in boards.values()]
+            changed = {name: again for name, (report, again) in boards.items() if report.changed and again is not None}
+            if changed:
+                _commit(scan, writer, row, changed)
+    scan.reload()
+    return found
+
+
+def _place(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
+    name, path = Path(board.file).parent.name, scan.path / board.file
+    unchanged = Replaced(row.row, name, board.missing_bytes, board.missing_bytes)
+    if not board.packets_crc32:
+        return replace(unchanged, left="its packets were not kept"), None
+    try:
+        if faults := board_faults(scan, board, row.pulses):
+            return replace(unchanged, left="; ".join(map(to_text, faults)), damaged=True), None
+        again = place_again(path)
+    except DataError as e:
+        return replace(unchanged, left=str(e), damaged=True), None
+    if again.moved:
+        return replace(unchanged, left="its frames were placed by their pulses"), None
+    after = sum(b - a for a, b in again.placed.missing)
+    same = again.missing == again.placed.missing and f"{crc32(again.out.tobytes()):08x}" == board.crc32
+    return replace(unchanged, after=after, changed=not same), again
+
+
+def _commit(scan: ScanFolder, writer: ManifestWriter, row: RowCommitted, changed: dict[str, PlacedAgain]) -> None:
+    """Write the new files, then the line, then delete the old files."""
+    boards = dict(row.boards)
+    old_files: list[Path] = []
+    for name, again in changed.items():
+        path = scan.path / boards[name].file
+        old_files += [path.with_suffix(suffix) for suffix in (".bin", ".idx", PACKETS)]
+        boards[name] = _write(scan, boards[name], again)
+    kept, faults = row.kept_incomplete, row.faults
+    if all(board.missing_bytes == 0 for board in boards.values()):
+        kept, faults = [], []
+    elif not kept:
+        kept = ["placed again: some bytes are not certain"]
+    new = msgspec.structs.replace(row, boards=boards, kept_incomplete=kept, faults=faults, replaced_utc=utc_now())
+    writer.append(new)
+    for path in old_files:
+        path.unlink(missing_ok=True)
+
+
+def _write(scan: ScanFolder, board: BoardRow, again: PlacedAgain) -> BoardRow:
+    """Write a row's new files durably; return their entry for the manifest."""
+    placed = again.placed
+    frame = scan.instrument.frame_bytes
+    path = scan.path / board.file
+    facts, _ = read_index(path.with_suffix(".idx"))
+    _, log = read_packets(path.with_suffix(PACKETS), np.fromfile(path, dtype=np.uint8))
+    new = _free_name(path)
+    crc = write_durably(new, again.out.tobytes())
+    index_crc = write_index(new.with_suffix(".idx"), {**facts, **placed.facts()}, placed.arrivals)
+    packets_crc = write_packets(new.with_suffix(PACKETS), log, again.evidence, placed)
+    sync_folder(new.parent)
+    frames = placed.expected // frame
+    return msgspec.structs.replace(
+        board,
+        file=str(new.relative_to(scan.path)),
+        frames_received=int(valid_frames(placed.missing, frames, frame).sum()),
+        missing_bytes=sum(b - a for a, b in placed.missing),
+        crc32=f"{crc:08x}",
+        index_crc32=f"{index_crc:08x}",
+        packets_crc32=f"{packets_crc:08x}",
+        located=placed.located,
+        received_bytes=placed.received,
+        **vars(placed.losses),
+    )
+
+
+def _free_name(path: Path) -> Path:
+    """`0003-1.bin` for `0003.bin`, or the next number that is free."""
+    stem, number = path.stem.split("-")[0], 1
+    while (new := path.with_name(f"{stem}-{number}.bin")).exists():
+        number += 1
+    return new

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.store import manifest
-from polysight.store.append_only import crc32
+from polysight.store.logs import crc32
 from polysight.store.manifest import BoardRow
 from polysight.store.scan_folder import ScanFolder
 from polysight_shared.error_codes import ErrorCode

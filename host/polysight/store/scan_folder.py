@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from polysight.capture import read_index
 from polysight.store import manifest
-from polysight.store.append_only import crc32, sync_folder
+from polysight.store.logs import crc32, sync_folder
 from polysight.store.manifest import (
     MANIFEST,
     BoardRow,
@@ -31,7 +31,9 @@ from polysight.store.manifest import (
     ManifestWriter,
     OtherFact,
     PiDescription,
+    RawDropped,
     RowCommitted,
+    RowWithdrawn,
     ScanEnded,
     ScanResumed,
     ScanStarted,
@@ -362,6 +364,22 @@ class ScanFolder:
             f"restore it from a copy, or `polysight resume {self.path}` takes its row again;"
             f" `polysight validate {self.path}` names every damaged file"
         )
+
+
+def dropped_files(scan: ScanFolder) -> dict[str, RawDropped]:
+    """Return the payload files (relative to the scan folder) that were dropped, each with its fact."""
+    files: dict[str, RawDropped] = {}
+    for fact in scan.content.facts:
+        if isinstance(fact, RowCommitted | RowWithdrawn):  # taken again, with new files
+            files = {file: dropped for file, dropped in files.items() if dropped.row != fact.row}
+        elif isinstance(fact, RawDropped):
+            files |= {board.file: fact for board in fact.boards.values()}
+    return files
+
+
+def dropped_rows(scan: ScanFolder) -> set[int]:
+    """Return the rows of which a dropped file is gone."""
+    return {fact.row for file, fact in dropped_files(scan).items() if not (scan.path / file).exists()}
 
 
 def _make_folder(folder: Path) -> None:

@@ -10,12 +10,10 @@ import msgspec
 
 from polysight.capture import PACKETS, read_index
 from polysight.store import manifest
-from polysight.store.append_only import crc32
-from polysight.store.events import read_events
+from polysight.store.logs import crc32, read_events
 from polysight.store.manifest import MANIFEST, BoardRow, RowCommitted, ScanEnded
-from polysight.store.raw import dropped_files, dropped_rows
 from polysight.store.sample_rows import SAMPLES, damaged_samples
-from polysight.store.scan_folder import EVENTS, PART, ScanFolder
+from polysight.store.scan_folder import EVENTS, PART, ScanFolder, dropped_files, dropped_rows
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, PolysightError
 from polysight_shared.findings import Finding

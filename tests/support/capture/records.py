@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from polysight.capture.dca1000 import Counters
-from polysight.capture.earlier_records import Past
-from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Placed, place_record
+from polysight.capture.record_search import PacketLog, Past
 
 FULL = 1456  # bytes of samples in a full packet
 

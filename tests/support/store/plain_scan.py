@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from polysight.capture.segment import write_index
-from polysight.store.events import EventWriter
+from polysight.capture.row_files import write_index
+from polysight.store.logs import EventWriter
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import to_text, validate
 from polysight_shared.messages import Fault, RunStarted

@@ -18,11 +18,10 @@ import pytest
 
 from polysight.acquisition import scan as host_run
 from polysight.acquisition.scan import ScanProgress, ScanResult, resume_scan, run_scan
-from polysight.capture.packet_file import PACKETS, Evidence, write_packets
-from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import place_record
 from polysight.capture.receiver import RowCapture
-from polysight.capture.segment import Segment, write_index
+from polysight.capture.record_search import PacketLog
+from polysight.capture.row_files import PACKETS, Evidence, Segment, write_index, write_packets
 from polysight.store import manifest
 from polysight.store.scan_folder import MANIFEST, PART, ScanFolder
 from polysight_pi.journal import Journal, JournalFullError

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from polysight.store.manifest import MANIFEST
+from polysight.store.published import COLLECTION, SYNCED, PublishedCubes, PublishedScan
 from polysight.store.raw import require_raw
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.source import Source
-from polysight.store.sources.published import SYNCED, PublishedCubes, PublishedScan
-from polysight.store.sources.published_settings import COLLECTION
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, no_such

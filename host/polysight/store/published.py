@@ -1,0 +1,649 @@
+"""Read the published data set as scans: `unsynced/<scan>` (raw rows) and `raw/<scan>` (synchronised cubes).
+
+The JSON settings become a rig: grid, burst, chirp, distances and mount angles. Rows are files named by the grid index
+of their start, `<x>_<y>.bin`, each with a log of its packets. Lost packets are zeros in the file or missing from it
+(`packet_zero_filling`); positions at which a radar did not start are missing. A scan recorded column by column is read
+as a row scan of the rig mirrored in x = y (`mirrored`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.store.source import CubeRow, RowData, pieces_of
+from polysight_shared import files
+from polysight_shared.config import Board, Instrument, MountStep
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+from polysight_shared.findings import Finding
+from polysight_shared.raster import RasterPlan, plan_raster
+from polysight_shared.tables import decode
+
+COLLECTION, DEVICES = "data_collection_cfg.json", "devices_comm_cfg.json"
+
+
+class ChirpConfig(msgspec.Struct, frozen=True):
+    """One of `chirp_configs`, in SI or in the units of TI's tools (GHz, MHz/us, us, ksps)."""
+
+    f0: float
+    slope: float
+    ramp_time: float
+    adc_start_time: float
+    num_adc: int
+    Fs: float
+
+
+class Collection(msgspec.Struct, frozen=True):
+    """The keys of the JSON files that are used. Lengths in mm, times in ms, angles in degrees, `board_dist` in m."""
+
+    dx: float
+    dy: float
+    total_x: int
+    total_y: int
+    num_trigger: int
+    period_frame: float
+    num_adc: int
+    object_distance: float
+    board_dist: float | None = None
+    txboard_angle_y: float | None = None
+    rxboard_v_angle_y: float | None = None
+    rxboard_angle_y: float | None = None
+    rxboard_angle_z: float | None = None
+    rxboard_tilt_offset: tuple[float, float, float] | None = None
+    moving_direction: str = "row"
+    num_chirp: int = 1
+    packet_zero_filling: bool = True
+    description: str = ""
+    chirp_configs: tuple[ChirpConfig, ...] = ()
+
+    @property
+    def by_columns(self) -> bool:
+        """True if the stage ran along y, column after column."""
+        return self.moving_direction == "col"
+
+
+class Rig(NamedTuple):
+    """The rig of a scan, x from TX to RX, and notices on how the settings were read."""
+
+    instrument: Instrument
+    notices: tuple[str, ...]
+
+
+def read_json(path: Path, missing_ok: bool = False) -> dict[str, Any]:
+    """Read a JSON object from a file; with `missing_ok`, {} for a missing file. Raises DataError."""
+    if missing_ok and not path.exists():
+        return {}
+    why, remedy = "the download is not complete", "fetch the file again"
+    try:
+        content = files.read_json(path)
+    except (OSError, ValueError) as e:
+        raise DataError(f"{path}: not JSON: {e}", why, remedy, code=ErrorCode.FILE_DAMAGED) from None
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: not a JSON object", why, remedy, code=ErrorCode.FILE_FOREIGN)
+    return content
+
+
+def read_settings(path: Path) -> Collection:
+    """Read the settings of an `unsynced/<scan>` or `raw/<scan>` folder. Raises DataError or ConfigError."""
+    content = {**read_json(path / DEVICES, missing_ok=True), **read_json(path / COLLECTION)}
+    s = decode(content, Collection, str(path / COLLECTION))
+    if s.moving_direction not in ("row", "col") or not s.chirp_configs or s.num_chirp != 1:
+        raise DataError(
+            f"{path}: moving_direction {s.moving_direction!r}, {len(s.chirp_configs)} chirp configs,"
+            f" {s.num_chirp} chirps a frame",
+            "only scans by row or by column with one chirp a frame are read",
+            "this scan cannot be processed",
+            code=ErrorCode.VALUE_INVALID,
+        )
+    return s
+
+
+def rig_of(s: Collection, base: Instrument, path: Path) -> Rig:
+    """Return the base rig with the scan's settings; values missing in the JSON stay the base's. Raises ConfigError."""
+    c = s.chirp_configs[0]
+    grid = {"columns": s.total_x, "rows": s.total_y, "step_x_mm": s.dx, "step_y_mm": s.dy}
+    travel = (  # the grid was within their stage's travel
+        max(base.stage.travel_x_mm, s.total_x * s.dx + 2 * base.stage.run_up_mm(s.dx)),
+        max(base.stage.travel_y_mm, s.total_y * s.dy + 2 * base.stage.run_up_mm(s.dy)),
+    )
+    table = msgspec.to_builtins(base)
+    table["grid"] = grid
+    table["stage"] |= {"travel_x_mm": travel[0], "travel_y_mm": travel[1]}
+    table["stage"] |= {"centre_x_mm": travel[0] / 2, "centre_y_mm": travel[1] / 2}
+    table["burst"] |= {"pulses": s.num_trigger, "period_us": s.period_frame * 1e3}
+    table["geometry"]["object_distance_mm"] = s.object_distance
+    table["chirp"] |= {
+        "start_hz": c.f0 if c.f0 > 1e6 else c.f0 * 1e9,
+        "slope_hz_per_s": c.slope if c.slope > 1e6 else c.slope * 1e12,
+        "ramp_end_us": c.ramp_time * 1e6 if c.ramp_time < 1 else c.ramp_time,
+        "adc_start_us": c.adc_start_time * 1e6 if c.adc_start_time < 1e-2 else c.adc_start_time,
+        "samples": c.num_adc,
+        "sample_rate_hz": c.Fs if c.Fs > 1e5 else c.Fs * 1e3,
+        "linear_samples": [min(n, c.num_adc) for n in base.chirp.linear_samples],
+    }
+    rig = decode(table, Instrument, str(path))
+    notices: list[str] = []
+    boards = tuple(msgspec.structs.replace(b, mount=_mount(b, s, notices)) for b in rig.boards)
+    return Rig(msgspec.structs.replace(rig, boards=boards), tuple(notices))
+
+
+def _mount(board: Board, s: Collection, notices: list[str]) -> tuple[MountStep, ...]:
+    """Replace the angles and offsets of the base rig's mount by the scan's.
+
+    The last turn about y points the board at the object, the last about z tilts the receivers, and the shift between
+    them is the tilt's offset; the V board has another turn about y before. The last shift is half the distance between
+    the board origins.
+    """
+    steps = list(board.mount)
+    tx = board.role == "transmit"
+    facing = s.txboard_angle_y if tx else s.rxboard_angle_y
+    if facing is not None and (at := _turns(steps, "y")):
+        if facing * (1 if tx else -1) < 0:  # its normal, (sin a, 0, cos a), would point away from the other boards
+            key = "txboard_angle_y" if tx else "rxboard_angle_y"
+            notices.append(
+                f"{board.name}: {key} = {facing:g} would turn the board away from the object;"
+                f" read with the other sense of rotation, {-facing:g}"
+            )
+            facing = -facing
+        steps[at[-1]] = MountStep(turn_deg=facing, about="y")
+    if not tx:
+        if s.rxboard_angle_z is not None and (at := _turns(steps, "z")):
+            steps[at[-1]] = MountStep(turn_deg=s.rxboard_angle_z, about="z")
+        own = _turns(steps, "y")
+        if board.role == "receive_v" and s.rxboard_v_angle_y is not None and len(own) > 1:
+            steps[own[0]] = MountStep(turn_deg=s.rxboard_v_angle_y, about="y")
+        shifts = _shifts(steps)
+        if s.rxboard_tilt_offset is not None and len(shifts) > 1:
+            steps[shifts[-2]] = MountStep(shift_mm=s.rxboard_tilt_offset)
+    last = steps[-1].shift_mm if steps else None
+    if s.board_dist is not None and last is not None:
+        side = -0.5 if tx else 0.5
+        steps[-1] = MountStep(shift_mm=(side * s.board_dist * 1e3, last[1], last[2]))
+    return tuple(steps)
+
+
+def _turns(steps: list[MountStep], axis: str) -> list[int]:
+    return [i for i, step in enumerate(steps) if step.about == axis]
+
+
+def _shifts(steps: list[MountStep]) -> list[int]:
+    return [i for i, step in enumerate(steps) if step.shift_mm is not None]
+
+
+def mirrored(rig: Instrument) -> Instrument:
+    """Mirror the rig in x = y; mirroring twice gives the rig itself.
+
+    The mirrored rig records row by row the same path lengths as the rig column by column. A turn about an axis becomes
+    the opposite turn about the swapped axis.
+    """
+    stage, grid, image = rig.stage, rig.grid, rig.image
+    replace = msgspec.structs.replace
+    return replace(
+        rig,
+        grid=replace(grid, columns=grid.rows, rows=grid.columns, step_x_mm=grid.step_y_mm, step_y_mm=grid.step_x_mm),
+        image=replace(image, columns=image.rows, rows=image.columns),
+        stage=replace(
+            stage,
+            travel_x_mm=stage.travel_y_mm,
+            travel_y_mm=stage.travel_x_mm,
+            centre_x_mm=stage.centre_y_mm,
+            centre_y_mm=stage.centre_x_mm,
+        ),
+        antennas=replace(
+            rig.antennas,
+            rx_mm=tuple((y, x, z) for x, y, z in rig.antennas.rx_mm),
+            tx_mm=tuple((y, x, z) for x, y, z in rig.antennas.tx_mm),
+        ),
+        boards=tuple(replace(b, mount=tuple(_mirrored_step(s) for s in b.mount)) for b in rig.boards),
+    )
+
+
+def _mirrored_step(step: MountStep) -> MountStep:
+    if step.shift_mm is not None:
+        x, y, z = step.shift_mm
+        return MountStep(shift_mm=(y, x, z))
+    axes: dict[str, Literal["x", "y", "z"]] = {"x": "y", "y": "x", "z": "z"}
+    return MountStep(turn_deg=-(step.turn_deg or 0.0), about=axes[step.about or "z"])
+
+
+Gaps = list[tuple[int, int]]
+PACKET_BYTES = 1456  # payload of a full packet, if there is no log
+_UNEVEN = 0.25  # of the period between positions: largest deviation of a pause from a whole number of periods
+
+
+class PacketLog(NamedTuple):
+    """Packets that arrived, in order of their sequence number, without duplicates: payload bytes, unix seconds."""
+
+    sequence: NDArray[np.int64]
+    size: NDArray[np.int64]
+    at_s: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RowShape:
+    """Size of a complete row of one board: positions, pulses of a burst, bytes of a frame."""
+
+    positions: int
+    pulses: int
+    frame_bytes: int
+
+    @property
+    def burst_bytes(self) -> int:
+        """Bytes of one position."""
+        return self.pulses * self.frame_bytes
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the row."""
+        return self.positions * self.burst_bytes
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Data that the card sent in one row."""
+
+    data: NDArray[np.uint8]  # [n], zero where lost
+    lost: Gaps  # byte ranges that never arrived
+    packets_lost: int
+    start: NDArray[np.int64]  # offset of each packet that arrived; empty without a log
+    at_s: NDArray[np.float64]  # its arrival time
+    packet_bytes: int  # payload of a full packet
+
+
+class Bursts(NamedTuple):
+    """Bursts of a stream: byte ranges [burst, 2], and when each began to arrive (unix seconds)."""
+
+    ranges: NDArray[np.int64]
+    at_s: NDArray[np.float64]
+
+
+def read_log(path: Path) -> PacketLog | None:
+    """Read a row's packet log; None if there is none. A header line is skipped.
+
+    A last packet that is not full gets the arrival time of the one before it: the card delays it by 2 s, and it would
+    look like another position.
+
+    Raises
+    ------
+    DataError
+        with the first value that is not a number.
+    """
+    if not path.exists():
+        return None
+    lines = [line for line in path.read_text("ascii", "replace").replace(";", ",").split("\n") if line.strip()]
+    if lines and not lines[0].lstrip()[0].isdigit():  # a header
+        del lines[0]
+    if not lines:
+        return None
+    try:
+        table = np.loadtxt(lines, delimiter=",", usecols=(0, 1, 2), ndmin=2)
+    except ValueError as e:
+        raise DataError(f"{path}: not a packet log: {e}", "a damaged file", code=ErrorCode.FILE_DAMAGED) from None
+    sequence, first = np.unique(table[:, 0].astype(np.int64), return_index=True)
+    size, at_s = table[first, 1].astype(np.int64), table[first, 2]
+    if size[-1] < size.max():
+        at_s[-1] = at_s[-2]
+    return PacketLog(sequence, size, at_s)
+
+
+_MAX_ROWS = 16  # that a stream may span: what is missing is filled with zeros
+
+
+def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled: bool) -> Stream:
+    """Read a row's stream from its file and its log.
+
+    In a zero-filled file every packet of zeros is a lost one, regardless of the log: real samples have noise.
+
+    Raises
+    ------
+    DataError
+        if file and log are not of one recording.
+    """
+    raw = np.fromfile(file, np.uint8)
+    none = np.zeros(0, np.int64)
+    if log is None:
+        silent = _silent(raw, PACKET_BYTES) if zero_filled else np.zeros(0, bool)
+        return Stream(raw, _ranges(silent, PACKET_BYTES, raw.size), int(silent.sum()), none, np.zeros(0), PACKET_BYTES)
+    full = int(log.size.max())
+    first = _first_sequence(log, shape, full, raw if zero_filled else None)
+    start = (log.sequence - first) * full
+    end = int(start[-1] + log.size[-1])
+    if end > _MAX_ROWS * (shape.bytes + raw.size):
+        raise DataError(
+            f"{file}: its packet log spans {end} bytes, a row has {shape.bytes}",
+            "the numbers of its packets jump: a damaged log, or one of several rows",
+            "fetch both again",
+            code=ErrorCode.FILE_DAMAGED,
+        )
+    if not zero_filled and raw.size != log.size.sum():
+        raise DataError(
+            f"{file}: {raw.size} bytes, its packet log says {log.size.sum()}",
+            "file and log are not of one recording, or one of them was cut",
+            "fetch both again",
+            code=ErrorCode.MISMATCH,
+        )
+    if zero_filled:
+        end = max(end, raw.size)
+        data = raw if end == raw.size else np.concatenate([raw, np.zeros(end - raw.size, np.uint8)])
+    else:
+        data = raw if end == raw.size else _spread(raw, start, log.size, end)
+    count = -(-end // full)
+    there = np.zeros(count, bool)
+    there[start // full] = True
+    if zero_filled:
+        there &= ~_silent(data, full)
+        there[-(-raw.size // full) :] = False
+    arrived = there[start // full]
+    lost = _ranges(~there, full, end)
+    return Stream(data, lost, int(count - there.sum()), start[arrived], log.at_s[arrived], full)
+
+
+def _spread(raw: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64], end: int) -> NDArray[np.uint8]:
+    """Move the packets of a file without the lost ones to their offsets."""
+    data = np.zeros(end, np.uint8)
+    source = np.concatenate([[0], np.cumsum(size)])
+    breaks = np.flatnonzero(start[1:] != start[:-1] + size[:-1]) + 1  # runs of packets without a loss
+    for a, b in zip([0, *breaks], [*breaks, start.size], strict=True):
+        data[start[a] : start[b - 1] + size[b - 1]] = raw[source[a] : source[b]]
+    return data
+
+
+def _silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
+    """Packets that are all zero, bool [packet]."""
+    whole = data.size // packet
+    rows = data[: whole * packet].reshape(whole, packet)
+    wide = rows.view(np.uint64) if packet % 8 == 0 and data.ctypes.data % 8 == 0 else rows
+    tail = [not data[whole * packet :].any()] if data.size % packet else []
+    return np.append(~np.any(wide, axis=1), np.array(tail, bool))
+
+
+def _first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDArray[np.uint8] | None) -> int:
+    """Return the sequence number of the row's first packet, which may be lost.
+
+    With zero filling: the first packet that arrived, minus the packets of zeros at the file's beginning. Without:
+    counted back from a short last packet if no position is missing, otherwise the first packet that arrived. If the
+    result is neither 0 nor 1 but the numbers fit a record from 1, return 1: cards count from 1, a log may from 0.
+    """
+    expected, first, last = -(-shape.bytes // full), int(log.sequence[0]), int(log.sequence[-1])
+    begin = first
+    if zero_filled is not None:
+        begin -= int(np.argmin(np.append(_silent(zero_filled, full), False)))
+    elif log.size[-1] < full and _pauses(log.at_s, shape.positions - 1).size == shape.positions - 1:
+        begin = min(first, last - expected + 1)
+    return begin if last > expected or begin in (0, 1) else 1
+
+
+def _pauses(at_s: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Return the indices of the packets behind a pause between bursts, of which about `count` are expected.
+
+    Most of the `count` longest pauses are those between neighbouring positions; the threshold is half of their first
+    quartile.
+    """
+    steps = np.diff(at_s)
+    if count < 1 or steps.size < count:
+        return np.zeros(0, np.int64)
+    typical = np.sort(steps)[-count:][count // 4]
+    return np.flatnonzero(steps > typical / 2) + 1
+
+
+def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
+    """Find the bursts of a stream; None without a log."""
+    if not stream.at_s.size:
+        return None
+    frame, end = shape.frame_bytes, stream.data.size
+    after = _pauses(stream.at_s, -(-end // shape.burst_bytes) - 1)
+    ends = np.zeros(after.size, np.int64)
+    before_end = np.minimum(stream.start[after - 1] + stream.packet_bytes, end)
+    for i, (low, high) in enumerate(zip(before_end, stream.start[after] + stream.packet_bytes, strict=True)):
+        # The burst ends in the packet that straddles the pause: a whole number of bursts if one fits, else of frames.
+        begun = ends[i - 1] if i else 0
+        whole = begun + -(-(low - begun) // shape.burst_bytes) * shape.burst_bytes
+        ends[i] = whole if whole < high else -(-low // frame) * frame
+    edges = np.concatenate([[0], ends, [-(-end // frame) * frame]])
+    return Bursts(np.stack([edges[:-1], edges[1:]], axis=1), stream.at_s[np.concatenate([[0], after])])
+
+
+def period_s(bursts: Bursts) -> float | None:
+    """Return the time between positions (most must follow one another); None for fewer than two bursts."""
+    return float(np.quantile(np.diff(bursts.at_s), 0.25)) if bursts.at_s.size > 1 else None
+
+
+def positions_of(own: Bursts, others: list[Bursts], positions: int, period: float | None) -> NDArray[np.int64] | None:
+    """Return the position of each burst; None if undetermined.
+
+    Positions are evenly spaced in time, so a step of two periods is a position at which no radar started. The boards
+    share triggers and clock: the first position is known only if all boards together span the row.
+    """
+    times = np.sort(np.concatenate([b.at_s for b in (own, *others)]))
+    if period is None or period <= 0 or positions < 2:
+        return None
+    events = times[np.concatenate([[True], np.diff(times) > period / 2])]
+    steps = np.diff(events) / period
+    if np.any(np.abs(steps - np.round(steps)) > _UNEVEN):
+        return None
+    index = np.concatenate([[0], np.cumsum(np.round(steps).astype(np.int64))])
+    at = index[np.searchsorted(events, own.at_s, side="right") - 1]
+    return at if index[-1] == positions - 1 and np.all(np.diff(at) > 0) else None
+
+
+def _ranges(missing: NDArray[np.bool_], unit: int, end: int) -> Gaps:
+    """Runs of True, each `unit` bytes, as (start, stop) up to `end`."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
+    return [(int(a) * unit, min(int(b) * unit, end)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+_ROW_FILE = re.compile(r"(\d+)_(\d+)\.bin")
+SYNCED = "_synced.npy"
+
+
+@dataclass(frozen=True)
+class RowLosses:
+    """Losses of one board's recording of one row."""
+
+    packets_lost: int = 0  # sent by the card and not received
+    positions_missing: int = 0  # at which the radar did not start
+    positions_short: int = 0  # with fewer frames than pulses; masked, because the missed pulse is unknown
+    rows_not_placed: int = 0  # 1 if unknown positions are missing: the whole row is masked
+
+
+class _Published:
+    """Common properties of both kinds of the authors' folders."""
+
+    synchronised = False
+    manifest_faults: tuple[Finding, ...] = ()
+
+    def __init__(self, path: Path, base: Instrument) -> None:
+        self.path = path
+        self._settings = read_settings(path)
+        rig, self.notices = rig_of(self._settings, base, path)
+        self.mirrored = self._settings.by_columns
+        self._instrument = mirrored(rig) if self.mirrored else rig
+        self._plan = plan_raster(self._instrument.grid)
+
+    @property
+    def instrument(self) -> Instrument:
+        """The base rig with this scan's grid, burst, chirp, distances and angles; mirrored for a scan by columns."""
+        return self._instrument
+
+    @property
+    def plan(self) -> RasterPlan:
+        """The plan of positions; the rows of a scan by columns are its columns."""
+        return self._plan
+
+    @property
+    def simulated(self) -> bool:
+        """True if the description contains "simulated"."""
+        return "simulated" in self._settings.description.lower()
+
+    @property
+    def scan_id(self) -> str:
+        """The folder's name."""
+        return self.path.name
+
+
+class PublishedScan(_Published):
+    """An `unsynced/<scan>` folder as a source. Raises DataError if the files are not of that form."""
+
+    def __init__(self, path: Path, base: Instrument) -> None:
+        super().__init__(path, base)
+        burst = self._instrument.burst
+        self._shape = RowShape(self._plan.columns, burst.pulses, self._instrument.frame_bytes)
+        self._losses: dict[str, dict[int, RowLosses]] = {b.name: {} for b in base.receivers}
+        self._files: dict[str, dict[int, Path]] = {b.name: self._row_files(b.name) for b in base.boards}
+
+    def _row_files(self, board_name: str) -> dict[int, Path]:
+        found = {}
+        for file in (self.path / board_name).glob("*.bin"):
+            match = _ROW_FILE.fullmatch(file.name)
+            if match is None:
+                continue
+            start, row = (int(match[2 if self.mirrored else 1]), int(match[1 if self.mirrored else 2]))
+            if row < self._plan.rows:
+                self._check_start(file, start, row)
+                found[row] = file
+        return found
+
+    def _check_start(self, file: Path, start: int, row: int) -> None:
+        expected = self._plan.row(row).column(0)
+        if start != expected:
+            row_name, column_name = ("column", "row") if self.mirrored else ("row", "column")
+            raise DataError(
+                f"{file}: {row_name} {row} starts at {column_name} {start}; in a serpentine from {column_name} 0 it"
+                f" starts at {expected}",
+                "another order than the published scans'",
+                "this scan cannot be processed",
+                code=ErrorCode.FILE_FOREIGN,
+            )
+
+    def rows(self) -> Iterator[int]:
+        """Rows of which both receiving boards have data, ascending."""
+        h, v = (set(self._files[b.name]) for b in self._instrument.receivers)
+        yield from sorted(h & v)
+
+    def read_row(self, board_name: str, row: int) -> RowData:
+        """Read one board's recording of one row, with its gaps located by the packet logs.
+
+        Raises
+        ------
+        DataError
+            if the row is missing, or file and log contradict each other.
+        """
+        stream = self._stream(board_name, row)
+        if stream is None:
+            what = f"{self.path}: no row {row} of board {board_name}"
+            raise DataError(what, "the download is not complete", code=ErrorCode.NO_DATA)
+        shape, frames = self._shape, self._shape.positions * self._shape.pulses
+        lost = stream.packets_lost
+        if stream.data.size >= shape.bytes:  # nothing slipped
+            self._note(board_name, row, RowLosses(lost))
+            gaps = [(a, min(b, shape.bytes)) for a, b in stream.lost if a < shape.bytes]
+            return RowData(pieces_of(stream.data[: shape.bytes]), gaps, frames)
+        bursts = find_bursts(stream, shape)
+        at = None
+        if bursts is not None:
+            others = self._others(board_name, row)
+            periods = [p for p in (self._period_s, *map(period_s, (bursts, *others))) if p]
+            at = positions_of(bursts, others, shape.positions, min(periods, default=None))
+        if bursts is None or at is None:
+            self._note(board_name, row, RowLosses(lost, rows_not_placed=1))
+            return RowData(pieces_of(np.zeros(shape.bytes, np.uint8)), [(0, shape.bytes)], frames)
+        payload, there, short = _place(stream, bursts, at, shape)
+        self._note(board_name, row, RowLosses(lost, shape.positions - at.size, short))
+        edges = np.flatnonzero(np.diff(np.concatenate([[1], there, [1]]).astype(np.int8)))
+        gaps = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        return RowData(pieces_of(payload), gaps, frames)
+
+    def _stream(self, board_name: str, row: int) -> Stream | None:
+        file = self._files.get(board_name, {}).get(row)
+        if file is None:
+            return None
+        log = read_log(file.with_name(file.stem + "_log.csv"))
+        return read_stream(file, log, self._shape, self._settings.packet_zero_filling)
+
+    def _others(self, board_name: str, row: int) -> list[Bursts]:
+        """Return the bursts of the same row from the other boards."""
+        streams = [self._stream(name, row) for name in self._files if name != board_name]
+        return [b for s in streams if s is not None and (b := find_bursts(s, self._shape)) is not None]
+
+    @cached_property
+    def _period_s(self) -> float | None:
+        """Time from one position to the next in the first complete row; None if there is none."""
+        for board in self._instrument.receivers:
+            for row in sorted(self._files[board.name]):
+                stream = self._stream(board.name, row)
+                if stream is not None and stream.data.size >= self._shape.bytes and stream.at_s.size:
+                    bursts = find_bursts(stream, self._shape)
+                    return None if bursts is None else period_s(bursts)
+        return None
+
+    def _note(self, board_name: str, row: int, losses: RowLosses) -> None:
+        self._losses.setdefault(board_name, {})[row] = losses
+
+    def recording_facts(self) -> dict[str, Any]:
+        """Return the losses of the rows read so far and the number of missing rows, by board."""
+        boards = {}
+        for board in self._instrument.receivers:
+            rows = [asdict(r) for r in self._losses[board.name].values()]
+            total = {key: sum(r[key] for r in rows) for key in asdict(RowLosses())}
+            boards[board.name] = {**total, "rows_absent": self._plan.rows - len(self._files[board.name])}
+        how = {"direction": self._settings.moving_direction, "boards": boards, "notices": list(self.notices)}
+        return {"recording": how}
+
+
+def _place(
+    stream: Stream, bursts: Bursts, positions: NDArray[np.int64], shape: RowShape
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_], int]:
+    """Return the row's payload, a mask of bytes that arrived, and the number of positions with a wrong frame count."""
+    size, burst, short = stream.data.size, shape.burst_bytes, 0
+    payload, there = np.zeros(shape.bytes, np.uint8), np.zeros(shape.bytes, bool)
+    arrived = np.ones(size, bool)
+    for a, b in stream.lost:
+        arrived[a:b] = False
+    for (a, b), at in zip(bursts.ranges, positions * burst, strict=True):
+        if b - a != burst:
+            short += 1
+            continue
+        stop = min(b, size)
+        payload[at : at + stop - a] = stream.data[a:stop]
+        there[at : at + stop - a] = arrived[a:stop]
+    payload[~there] = 0
+    return payload, there, short
+
+
+class PublishedCubes(_Published):
+    """A `raw/<scan>` folder with cubes that the authors have synchronised."""
+
+    synchronised = True
+
+    def rows(self) -> Iterator[int]:
+        """All rows of the plan."""
+        yield from range(self._plan.rows)
+
+    def read_row(self, board_name: str, row: int) -> CubeRow:
+        """Read one board's row with the authors' reference. Raises DataError if it is missing or of a wrong shape."""
+        file = self.path / f"{board_name}{SYNCED}"
+        try:
+            cube = np.load(file, mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError) as e:
+            what = f"{file}: not a cube: {e}"
+            raise DataError(what, "the download is not complete", code=ErrorCode.FILE_DAMAGED) from None
+        rig, s = self._instrument, self._settings
+        shape = (len(rig.antennas.rx_mm), s.total_y, s.total_x, rig.chirp.samples)
+        if cube.shape != shape:
+            what = f"{file}: shape {cube.shape}, {shape} in its settings"
+            raise DataError(what, "not the settings of this scan", code=ErrorCode.MISMATCH)
+        ascending = cube[:, :, row] if self.mirrored else cube[:, row]  # from the smallest x (y) on
+        return CubeRow(np.array(ascending[:, :: self._plan.row(row).direction], np.complex64))
+
+    def recording_facts(self) -> dict[str, Any]:
+        """Return the direction and the notices."""
+        return {"recording": {"direction": self._settings.moving_direction, "notices": list(self.notices)}}

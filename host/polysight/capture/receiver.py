@@ -161,7 +161,7 @@ class RowCapture(_Message, frozen=True):
 
     `bytes` counts placed bytes, `missing` are the other byte ranges (the whole row if `located` is False). Arrival
     times are of the host's monotonic clock, 0 without packets. Packet counts as in
-    :class:`polysight.capture.packet_counts.PacketCounts`, lost bytes as in
+    :class:`polysight.capture.placement.PacketCounts`, lost bytes as in
     :class:`polysight.capture.placement.Losses`, `holes` and `slipped` as in
     :class:`polysight.capture.placement.Placed`. `card_status` are the bits the card reported during the row.
     """

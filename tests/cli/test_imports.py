@@ -72,6 +72,13 @@ def test_a_scan_is_validated_without_scipy(tmp_path):
     assert loaded_by("validate", tmp_path / "scan") & (SCIPY | HEAVY) == set()
 
 
+def test_images_are_made_without_report_and_figures(tmp_path):
+    (tmp_path / "scene.toml").write_text(small_scene(6, 3))
+    simulate(published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
+    loaded = loaded_by("image", tmp_path / "scan", "--out", tmp_path / "out")
+    assert loaded & {"jinja2", "matplotlib", "polysight.report", "sklearn"} == set()
+
+
 def test_a_plan_is_made_without_scipys_parts():
     assert loaded_by("plan", "--config", RIG_FILE) & HEAVY == set()
 

@@ -174,10 +174,7 @@ def test_a_scan_has_the_priority_of_a_terminals_not_of_the_servers(lab):
     lab.browser.wait("document.querySelector('.time')", "the plan")
     lab.fill(name="fifth")
     lab.click("start")
-    lab.browser.wait(
-        "document.getElementById('told').innerText.includes('fourth is being scanned')",
-        "the refusal",
-    )
+    lab.browser.wait("document.getElementById('told').innerText.includes('fourth is being scanned')", "the refusal")
     assert not (lab.scans / "fifth").exists()
     lab.browser.errors.clear()  # the refused request
     lab.open("/watch?scan=fourth")

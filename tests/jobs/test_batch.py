@@ -15,7 +15,7 @@ from tests.support.store.plain_scan import write_scan
 
 from polysight.cli.main import main
 from polysight.jobs import batch as many
-from polysight.jobs.batch import Outcome, at_once, finished, make_jobs, memory_bytes, process_many, scans_of, table
+from polysight.jobs.batch import Outcome, at_once, find_scans, finished, make_jobs, memory_bytes, process_many, table
 from polysight.process import cores
 from polysight.products.files import FINISHED
 from polysight.settings import Settings
@@ -75,7 +75,7 @@ def job_of(data, out, **options):
 
 
 def jobs(folder, *names):
-    found = scans_of([folder])
+    found = find_scans([folder])
     assert sorted(p.name for p in found) == sorted(names)
     return make_jobs([(data, Settings()) for data in found], folder.parent / "out")
 
@@ -201,9 +201,9 @@ def test_names_folders_and_what_is_a_scan(tmp_path):
     raw = tmp_path / "raw" / "s1"
     raw.mkdir(parents=True)
     (raw / "RH_synced.npy").touch()
-    assert scans_of([tmp_path / "unsynced"]) == found
-    assert scans_of([raw, found[1]]) == [raw, found[1]]
-    assert scans_of([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
+    assert find_scans([tmp_path / "unsynced"]) == found
+    assert find_scans([raw, found[1]]) == [raw, found[1]]
+    assert find_scans([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
     with refused(ErrorCode.NAME_TAKEN, "s1"):
         make_jobs([(found[0], Settings()), (raw, Settings())], tmp_path / "out")
 

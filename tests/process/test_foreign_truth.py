@@ -10,7 +10,7 @@ from tests.support.paths import RIG_FILE
 
 from polysight import open_scan
 from polysight.cli.main import main
-from polysight.jobs.process import truth_of
+from polysight.jobs.process import find_plates
 from polysight.materials import read_truth
 from polysight_shared.errors import DataError
 from polysight_shared.files import read_json
@@ -37,7 +37,7 @@ FOREIGN = {
 @pytest.mark.parametrize("kind", FOREIGN)
 def test_a_foreign_truth_gives_one_note_and_no_plates(tmp_path, capsys, kind):
     (tmp_path / "truth.json").write_bytes(FOREIGN[kind])
-    assert truth_of(tmp_path) == ()
+    assert find_plates(tmp_path) == ()
     (note,) = capsys.readouterr().err.splitlines()
     assert str(tmp_path / "truth.json") in note
     with pytest.raises(DataError) as caught:
@@ -46,10 +46,10 @@ def test_a_foreign_truth_gives_one_note_and_no_plates(tmp_path, capsys, kind):
 
 
 def test_a_folder_of_that_name_gives_a_note_and_no_file_none(tmp_path, capsys):
-    assert truth_of(tmp_path) == ()
+    assert find_plates(tmp_path) == ()
     assert capsys.readouterr().err == ""
     (tmp_path / "truth.json").mkdir()
-    assert truth_of(tmp_path) == ()
+    assert find_plates(tmp_path) == ()
     assert "truth.json" in capsys.readouterr().err
 
 

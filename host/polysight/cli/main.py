@@ -41,11 +41,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=CommandParser)
 
     def add(
-        name: str,
-        run: Callable[[argparse.Namespace], int],
-        text: str,
-        example: str,
-        most_used: tuple[str, ...] = (),
+        name: str, run: Callable[[argparse.Namespace], int], text: str, example: str, most_used: tuple[str, ...] = ()
     ) -> CommandParser:
         sub = commands.add_parser(name, help=text)
         describe(sub, text, example)

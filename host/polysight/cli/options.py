@@ -62,7 +62,8 @@ class CommandParser(argparse.ArgumentParser):
 
 def describe(sub: argparse.ArgumentParser, text: str, example: str) -> None:
     """Set the description and the example of a command's help."""
-    sub.description, sub.epilog = f"{text[0].upper()}{text[1:]}.", f"example:\n  {example}"
+    sub.description = f"{text[0].upper()}{text[1:]}."
+    sub.epilog = f"example:\n  {example}"
     sub.formatter_class = argparse.RawDescriptionHelpFormatter
 
 

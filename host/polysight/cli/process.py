@@ -8,18 +8,11 @@ from pathlib import Path
 
 import msgspec
 
-from polysight.cli.options import (
-    Add,
-    add_material_options,
-    count,
-    material_settings,
-    positive,
-    rig_file,
-)
+from polysight.cli.options import Add, add_material_options, count, material_settings, positive, rig_file
 from polysight.settings import Settings, path_text
 
 
-def settings_of(args: argparse.Namespace, data: Path) -> Settings:
+def process_settings(args: argparse.Namespace, data: Path) -> Settings:
     """The settings of `polysight process` for one scan. Raises ConfigError."""
     return msgspec.structs.replace(
         material_settings(args),
@@ -31,13 +24,13 @@ def settings_of(args: argparse.Namespace, data: Path) -> Settings:
 
 
 def _process(args: argparse.Namespace) -> int:
-    from polysight.jobs.batch import process_several, scans_of
+    from polysight.jobs.batch import find_scans, process_several
     from polysight.jobs.process import process
 
-    scans = scans_of(args.data)
+    scans = find_scans(args.data)
     if len(args.data) == 1 and scans == args.data and args.dask is None:
-        return process(args.data[0], args.out, settings_of(args, args.data[0]))
-    several = [(data, settings_of(args, data.absolute())) for data in scans]
+        return process(args.data[0], args.out, process_settings(args, args.data[0]))
+    several = [(data, process_settings(args, data.absolute())) for data in scans]
     return process_several(several, args.out, args.jobs, args.dask, args.again)
 
 

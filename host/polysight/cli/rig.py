@@ -272,10 +272,7 @@ def _add_link(sub: argparse.ArgumentParser) -> None:
 
 def _add_radar(add: Add) -> None:
     radar = add(
-        "radar",
-        _radar_plan,
-        "check one radar board, load its firmware, or replay a trace",
-        "polysight radar check RH",
+        "radar", _radar_plan, "check one radar board, load its firmware, or replay a trace", "polysight radar check RH"
     )
     add_config_option(radar)
     actions = radar.add_subparsers(dest="action", metavar="ACTION")

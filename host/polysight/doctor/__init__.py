@@ -10,7 +10,4 @@ logs for somebody who helps from afar.
 from polysight.doctor.checks import run_doctor
 from polysight.doctor.context import DoctorOptions
 
-__all__ = [
-    "DoctorOptions",
-    "run_doctor",
-]
+__all__ = ["DoctorOptions", "run_doctor"]

@@ -41,8 +41,14 @@ Not included: raw data, images, labels, keys. Words from files in pi.key_dir, an
 this computer.
 """
 HIDDEN = "[removed]"
-_LINES, _SCANS, _LOGS, _TRACES = 60, 3, 20, 6
-_TAIL_BYTES, _TRACE_BYTES, _KEY_BYTES, _MANIFEST_BYTES = 64 << 10, 4 << 20, 64 << 10, 64 << 20
+_LINES = 60
+_SCANS = 3
+_LOGS = 20
+_TRACES = 6
+_TAIL_BYTES = 64 << 10
+_TRACE_BYTES = 4 << 20
+_KEY_BYTES = 64 << 10
+_MANIFEST_BYTES = 64 << 20
 _KERNEL = ("proc/version", "proc/sys/net/core/rmem_max", "proc/sys/net/core/rmem_default", "proc/loadavg",
            "proc/meminfo", "proc/net/udp", "proc/net/snmp")  # fmt: skip
 _NAMED = re.compile(

@@ -12,15 +12,7 @@ import numpy as np
 from polysight.acquisition import RefusedError
 from polysight.calibration import FULL_SCALE, DirectSignal, band_hz, find_direct, jitter_hz, unwrapped
 from polysight.capture import RowCapture, route_interface, silent_radar
-from polysight.doctor.context import (
-    CheckContext,
-    capture_frames,
-    error,
-    not_checked,
-    ok,
-    warning,
-    with_boards,
-)
+from polysight.doctor.context import CheckContext, capture_frames, error, not_checked, ok, warning, with_boards
 from polysight.doctor.machine import NetworkInterface, read_interface
 from polysight.radar import RadarState
 from polysight_shared.config import Board, Instrument
@@ -29,12 +21,15 @@ from polysight_shared.findings import Finding
 from polysight_shared.messages import MAX_PULSES_AT_REST, MAX_PULSES_AT_REST_S
 
 _CARD_HOPS = ("host", "route", "link", "card")  # of the network survey
-_MIN_MTU, _MIN_SPEED_MBIT, _MIN_RING = 1500, 1000, 512
+_MIN_MTU = 1500
+_MIN_SPEED_MBIT = 1000
+_MIN_RING = 512
 _MAX_CLIPPED = 0.01  # of the chirps
 _MIN_RMS = 4.0  # counts
 _MIN_DETECTED = 0.9  # of the chirps, for the direct path
 _MAX_DELAY_S = 10e-9  # 5 ns trigger clock and some ppm of the crystals
-_SKEW_WARNING_S, _SKEW_ERROR_S = 10e-9, 20e-9
+_SKEW_WARNING_S = 10e-9
+_SKEW_ERROR_S = 20e-9
 _MAX_JITTER_S = 4e-9  # two trigger clocks of 5 ns give a standard deviation of 2 ns
 
 
@@ -67,7 +62,8 @@ def check_network(context: CheckContext, board: Board) -> Finding:
 
 
 def _judge_interface(interface: NetworkInterface) -> Finding:
-    name, ring = interface.name, interface.ring
+    name = interface.name
+    ring = interface.ring
     found = f"{name}: MTU {interface.mtu or 'unknown'}, {interface.speed_mbit or 'unknown'} Mbit/s"
     found += f", ring {ring} of {interface.ring_max}" if ring is not None else ""
     if interface.mtu is not None and interface.mtu < _MIN_MTU:
@@ -96,7 +92,8 @@ def _judge_interface(interface: NetworkInterface) -> Finding:
 def check_buffer(context: CheckContext, board: Board) -> Finding:
     """Check that the receiving process starts and that the kernel grants its receive buffer."""
     hops = {h.where: h for h in context.surveys[board.name].hops}
-    receiver, buffer = hops["receiver"], hops["buffer"]
+    receiver = hops["receiver"]
+    buffer = hops["buffer"]
     for level in ("error", "warning"):
         for hop in (buffer, receiver):
             if hop.level == level:
@@ -111,7 +108,8 @@ def check_pulses(context: CheckContext) -> Finding:
         return not_checked("--no-pulse: no SYNC_IN pulse is sent", "omit --no-pulse; nothing moves")
     if not context.usable_cards:
         return not_checked("no capture card is usable")
-    rig, burst = with_boards(context.rig, context.usable_cards), context.rig.burst
+    rig = with_boards(context.rig, context.usable_cards)
+    burst = context.rig.burst
     burst_s = burst.pulses * burst.period_us * 1e-6
     bursts = min(context.options.bursts, MAX_PULSES_AT_REST // burst.pulses, int(MAX_PULSES_AT_REST_S / burst_s))
     if not bursts:
@@ -141,7 +139,8 @@ def check_radar(context: CheckContext, board: Board) -> Finding:
     captured = context.captured.get(board.name)
     if captured is None:
         return not_checked("nothing was captured")
-    frames, complete = len(captured.valid), int(captured.valid.sum())
+    frames = len(captured.valid)
+    complete = int(captured.valid.sum())
     facts = {"frames_expected": frames, "frames": complete, "bytes": captured.row.bytes}
     facts["packets"] = captured.row.packets
     if captured.radar is not None and captured.radar.state is RadarState.FAULT:
@@ -241,8 +240,10 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
             " frequencies of both boards",
             **facts,
         )
-    if_hz, spread = unwrapped(signal.if_hz, rig), jitter_hz(rig)
-    median, std = float(np.median(if_hz)), float(if_hz.std())
+    if_hz = unwrapped(signal.if_hz, rig)
+    spread = jitter_hz(rig)
+    median = float(np.median(if_hz))
+    std = float(if_hz.std())
     found = f"at {median / 1e3:.0f} kHz, std {std / 1e3:.0f} kHz, {signal.if_hz.size} of {signal.chirps} chirps"
     facts |= {"if_hz": median, "std_hz": std, "amplitude": float(np.sqrt(np.median(signal.power)))}
     if outside:

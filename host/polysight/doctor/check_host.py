@@ -91,7 +91,8 @@ def check_calibration(context: CheckContext) -> Finding:
 
 def check_library(context: CheckContext) -> Finding:
     """Compare the rig's incidence angle with those of the default library; without a match no material is named."""
-    angle, angles = incidence_deg(context.rig, context.rig.receivers[0]), Library.load(SIMULATED_LIBRARY).angles_deg
+    angle = incidence_deg(context.rig, context.rig.receivers[0])
+    angles = Library.load(SIMULATED_LIBRARY).angles_deg
     known = " and ".join(f"{a:g}" for a in angles)
     facts = {"incidence_deg": angle, "library_deg": list(angles)}
     found = f"incidence angle of the rig {angle:.1f} degrees, of {SIMULATED_LIBRARY.name} {known} degrees"
@@ -124,13 +125,17 @@ def check_receivers(context: CheckContext) -> Finding:
 
 def check_disk(context: CheckContext) -> Finding:
     """Check free space for a scan and the reserve, and for twice the scan's data rate."""
-    rig, folder = context.rig, _nearest_existing(context.options.out)
-    need, reserve, free = rig.scan_bytes, rig.limits.free_disk_bytes, shutil.disk_usage(folder).free
+    rig = context.rig
+    folder = _nearest_existing(context.options.out)
+    need = rig.scan_bytes
+    reserve = rig.limits.free_disk_bytes
+    free = shutil.disk_usage(folder).free
     found = f"{folder}: {free / 1e9:.1f} GB free, a scan needs {need / 1e9:.2f} GB and {reserve / 1e9:.1f} GB reserve"
     facts: dict[str, float] = {"free_bytes": free, "need_bytes": need}
     if free < need + reserve:
         return error(found, "the disk is too full for a scan", "free space, or give another --out", **facts)
-    speed, rate = context.system.write_speed(folder), need / scan_time(rig).total_s
+    speed = context.system.write_speed(folder)
+    rate = need / scan_time(rig).total_s
     found += f"; durable write speed {speed / 1e6:.0f} MB/s, data rate of a scan {rate / 1e6:.2f} MB/s"
     facts |= {"write_bytes_s": speed, "scan_bytes_s": rate}
     if speed < rate:
@@ -151,7 +156,8 @@ def _nearest_existing(folder: Path) -> Path:
 
 def check_time(context: CheckContext) -> Finding:
     """Estimate the duration of a scan of the configured grid."""
-    rig, seconds = context.rig, scan_time(context.rig).total_s
+    rig = context.rig
+    seconds = scan_time(context.rig).total_s
     hours, minutes = divmod(round(seconds / 60), 60)
     duration = f"{hours} h {minutes:02d} min" if hours else f"{seconds / 60:.1f} min"
     return ok(
@@ -196,7 +202,9 @@ def check_pi(context: CheckContext) -> Finding:
     before = context.system.wall_ns()
     hello = context.pi.hello()
     after = context.system.wall_ns()
-    context.hello, context.hello_at_ns, context.hello_took_ns = hello, (before + after) // 2, after - before
+    context.hello = hello
+    context.hello_at_ns = (before + after) // 2
+    context.hello_took_ns = after - before
     backend = SIMULATED if is_simulated(hello.backend) else f"GPIO backend {hello.backend}"
     found = f"{context.rig.pi.command_address} answers: release {hello.pi_release}, {backend}, state {hello.state}"
     facts = {"release": hello.pi_release, "backend": hello.backend, "state": hello.state}
@@ -262,7 +270,8 @@ def check_trigger(context: CheckContext) -> Finding:
 
 def _run_row(context: CheckContext) -> RowFinished:
     """Run one row of `_POINTS` points in a run of its own and return its end event."""
-    rig, pi = context.rig, context.pi
+    rig = context.rig
+    pi = context.pi
     plan = RasterPlan(_POINTS, 1, rig.grid.step_x_mm, rig.grid.step_y_mm)
     scan_id = f"doctor-{new_scan_id()}"
     burst = rig.burst
@@ -314,7 +323,8 @@ def check_stage(context: CheckContext) -> Finding:
         )
     firmware = context.hello.firmware if context.hello is not None else ""
     where = f"at {status.x_mm:.1f}, {status.y_mm:.1f} mm" if status.homed else "not homed yet"
-    found, facts = f"answers, sketch {firmware or 'unknown'}, {where}", {"firmware": firmware, "homed": status.homed}
+    found = f"answers, sketch {firmware or 'unknown'}, {where}"
+    facts = {"firmware": firmware, "homed": status.homed}
     if firmware != __version__:
         return error(
             found,

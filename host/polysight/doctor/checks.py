@@ -95,7 +95,8 @@ def run_checks(context: CheckContext) -> Iterator[Finding]:
             key = (check.name, board.name if board is not None else "")
             title = " ".join(key).rstrip()
             if failed := _failed_prerequisite(check, board, blocked):
-                blocked[key], finding = failed, not_checked(f"{failed} failed")
+                blocked[key] = failed
+                finding = not_checked(f"{failed} failed")
             else:
                 finding = _run_check(check, context, board)
                 if finding.level == "error":

@@ -191,7 +191,8 @@ def capture_frames(rig: Instrument, pi: PiClient, bursts: int) -> tuple[dict[str
         while not cards.complete and time.monotonic() < deadline:
             cards.statuses()
             time.sleep(_POLL_S)
-        rows, states = cards.end_row(), radars.states()
+        rows = cards.end_row()
+        states = radars.states()
         captured = {}
         for name, row in rows.items():
             payload = np.fromfile(Path(folder) / "raw" / name / f"0000{PART}", np.uint8)

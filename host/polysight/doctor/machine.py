@@ -23,9 +23,11 @@ from polysight.capture import CARD_SOURCE_PORT, MAX_PAYLOAD_BYTES, ReceiverProce
 from polysight_shared.config import Instrument
 
 _STA_UNSYNC = 0x40  # struct timex, adjtimex(2)
-_SIOCETHTOOL, _ETHTOOL_GRINGPARAM = 0x8946, 0x10
+_SIOCETHTOOL = 0x8946
+_ETHTOOL_GRINGPARAM = 0x10
 _DROP_COUNTERS = ("rx_missed_errors", "rx_fifo_errors", "rx_dropped")
-_PROBE_BYTES, _PROBE_S = 64 << 20, 2.0
+_PROBE_BYTES = 64 << 20
+_PROBE_S = 2.0
 
 
 def clock_is_synchronised() -> bool | None:
@@ -85,7 +87,8 @@ def write_speed(folder: Path) -> float:
     """
     block = os.urandom(1 << 20)
     with tempfile.TemporaryFile(dir=folder) as file:
-        began, written = time.perf_counter(), 0
+        began = time.perf_counter()
+        written = 0
         while written < _PROBE_BYTES and time.perf_counter() - began < _PROBE_S:
             file.write(block)
             file.flush()
@@ -142,7 +145,8 @@ def measure_receivers(rig: Instrument, rates: list[float], seconds: float = _RAT
         for _ in range(os.cpu_count() or 1):
             busy = stack.enter_context(subprocess.Popen([sys.executable, "-c", _BUSY_LOOP], start_new_session=True))
             stack.callback(busy.kill)
-        results, sent = [], 0
+        results = []
+        sent = 0
         for rate in rates:
             packets = max(2, round(rate * seconds))
             results.append(_measure_rate(rate, sent, packets, receivers, folder))
@@ -156,7 +160,8 @@ def _measure_rate(rate: float, first: int, packets: int, receivers: list[Receive
         r.begin_row(0, 1, packets * MAX_PAYLOAD_BYTES, 1, folder / f"{r.board.name}.part")
     senders = []
     for r in receivers:
-        card, host = (r.board.card_address, CARD_SOURCE_PORT), (r.board.host_address, r.board.data_port)
+        card = (r.board.card_address, CARD_SOURCE_PORT)
+        host = (r.board.host_address, r.board.data_port)
         words = map(str, (*card, *host, first, packets, rate, MAX_PAYLOAD_BYTES))
         command = [sys.executable, "-I", str(_SENDER), *words]
         senders.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))

@@ -87,7 +87,7 @@ class Outcome:
     message: str = ""
 
 
-def scans_of(paths: Sequence[Path]) -> list[Path]:
+def find_scans(paths: Sequence[Path]) -> list[Path]:
     """Return the scans at paths: scan folders themselves, and the scans in other folders."""
     out: list[Path] = []
     for path in paths:
@@ -399,7 +399,9 @@ def _results(products: Path) -> tuple[str, str, str]:
         absent = saved.quality.get("coverage", {}).get("positions_absent", 0)  # of each board
         lost = sum(b["positions_masked"] + absent for b in boards)
         share = lost / max(1, sum(b["positions"] + absent for b in boards))
-        masked, patches, verdict = f"{100 * share:.2g} %", str(len(saved.materials["segments"])), saved.verdict
+        masked = f"{100 * share:.2g} %"
+        patches = str(len(saved.materials["segments"]))
+        verdict = saved.verdict
     except (PolysightError, AttributeError, KeyError, TypeError):
         return "", "", ""
     if verdict is None or verdict.level == "good":

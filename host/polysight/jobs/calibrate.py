@@ -26,11 +26,7 @@ from polysight.calibration import (
 from polysight.imaging import Image, Mask
 from polysight.jobs.output import print_json, say, steps
 from polysight.jobs.process import imaged, load_reference, plane_of
-from polysight.polarimetry import (
-    Leakage,
-    leakage_from_images,
-    specular_incidence_rad,
-)
+from polysight.polarimetry import Leakage, leakage_from_images, specular_incidence_rad
 from polysight.settings import Settings, path_text
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.errors import ConfigError, DataError
@@ -165,7 +161,8 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
     boards = {name: fit_start(source, name) for name in steps(names, [f"direct path of {name}" for name in names])}
     file = StartFile(**header("start_frequency", [source_scan(source, scan)]), boards=boards)
     path = write_calibration(file, out)
-    lines, what_to_set = [], []
+    lines = []
+    what_to_set = []
     rate_khz = source.instrument.chirp.sample_rate_hz / 1e3
     for name, b in boards.items():
         line = f"{name}: direct path at {b.direct_if_hz / 1e3:.1f} +- {b.direct_if_standard_error_hz / 1e3:.1f} kHz"
@@ -210,7 +207,9 @@ def leakage_of_scans(
     pipeline, images = imaged(plate, settings)
     whole = plane_of(pipeline, images)
     theta = specular_incidence_rad(pipeline.rig)
-    mask, turned, names = whole.valid & images.valid, [], [pipeline.source.scan_id]
+    mask = whole.valid & images.valid
+    turned = []
+    names = [pipeline.source.scan_id]
     simulated = pipeline.source.simulated
     for degrees, folder in strips:
         other, seen = imaged(folder, settings)

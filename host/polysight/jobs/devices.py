@@ -159,7 +159,8 @@ def _seen_again(board: Board, wait_s: float, same_place: bool) -> str:
     """Return the FPGA version that the card reports at its new address."""
     sys.stdout.write(f"{board.name}: looking for it at {board.card_address} for at most {wait_s:g} s\n")
     sys.stdout.flush()
-    deadline, was_off = time.monotonic() + wait_s, not same_place
+    deadline = time.monotonic() + wait_s
+    was_off = not same_place
     while time.monotonic() < deadline:
         try:
             with CardClient(board, _ASK_S) as card:
@@ -229,7 +230,8 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
     Raises ConfigError, DeviceError, OSError.
     """
     rig = _checked(config, name)
-    checked, clock = read_image(image), SystemClock()
+    checked = read_image(image)
+    clock = SystemClock()
     sys.stdout.write(f"{image.name}: whole, for an AWR2243, patches {' and '.join(checked.patches)}\n")
     _fresh(trace)
     words = _open(rig, name, clock, trace, slow)

@@ -1,7 +1,7 @@
 """`polysight label`: boxes of a scan drawn or taken from its patches, named, and saved for training.
 
-`edited` applies options to boxes, `asked` asks a person at a terminal. What results is checked as a whole before
-anything is written.
+`apply_edits` applies options to boxes, `ask_for_names` asks a person at a terminal. What results is checked as a whole
+before anything is written.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ from polysight.report import label_figure
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 
-METAL, REFERENCE = "metal", "the metal reference"
+METAL = "metal"
+REFERENCE = "the metal reference"
 FEW = 16
 """Largest number of pixels of a box that a library uses; with fewer it would learn speckle."""
 _LARGEST_MARGIN = 0.3  # of a patch's side
@@ -104,7 +105,8 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
             f"polysight process {folder} --out {out}; or give the folder of its products",
             code=ErrorCode.FILE_MISSING,
         )
-    there, found = find_labels(folder), found_patches(products)
+    there = find_labels(folder)
+    found = found_patches(products)
     if edits.given and list_only:
         raise ConfigError(
             "--list with other options would not do them", "it writes nothing", "leave --list out",
@@ -112,7 +114,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
         )  # fmt: skip
     labels = there[1].in_mm(products.x_m, products.y_m) if there else Labels({}, "mm")
     if edits.given:
-        labels, left_out = edited(labels, found, edits)
+        labels, left_out = apply_edits(labels, found, edits)
     elif list_only or ask is None:
         sys.stdout.write(_listing(folder, products, there, found))
         return 0
@@ -123,7 +125,8 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
                 "nothing was changed", "yes was asked for", "options edit boxes: polysight label --help",
                 code=ErrorCode.VALUE_INVALID,
             )  # fmt: skip
-        labels, left_out = asked(found, ask), []
+        labels = ask_for_names(found, ask)
+        left_out = []
     place = label_folder(products.folder)
     checked, notes = save_labels(place, products, labels)
     print_lines(_table(checked))
@@ -158,7 +161,7 @@ def save_labels(place: Path, products: SavedProducts, labels: Labels) -> tuple[L
     masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked.boxes.items()}
     few = [name for name, mask in masks.items() if (mask & products.valid).sum() < FEW]
     notes = [f"fewer than {FEW} pixels: {', '.join(few)}; speckle decides what is learnt of so few"] if few else []
-    if dark := _dark(products, masks):
+    if dark := _find_dark_boxes(products, masks):
         notes.append(f"dark, as where nothing lies: {', '.join(dark)}; look at the picture")
     if checked.metal is None:
         notes.append("no box is metal; train then needs a rig with `polysight calibrate metal`")
@@ -182,7 +185,7 @@ def remove_labels(folder: Path) -> Path:
     return path
 
 
-def _dark(products: SavedProducts, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
+def _find_dark_boxes(products: SavedProducts, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
     """Names of boxes too dark in both channels to be detected as plates automatically."""
     power = np.where(products.valid, np.abs(products.h) ** 2 + np.abs(products.v) ** 2, np.nan)
     if not np.isfinite(power).any():
@@ -194,7 +197,8 @@ def _dark(products: SavedProducts, masks: Mapping[str, npt.NDArray[np.bool_]]) -
 
 def found_patches(products: SavedProducts) -> list[FoundPatch]:
     """Patches of materials.json, each with a box inside it that avoids its edges if it is wide enough."""
-    margin_mm, out = SegmentSettings().margin_mm, []
+    margin_mm = SegmentSettings().margin_mm
+    out = []
     for row in products.segments:
         x0, y0, x1, y1 = row["box_mm"]
         mx, my = (min(margin_mm, _LARGEST_MARGIN * (b - a)) for a, b in ((x0, x1), (y0, y1)))
@@ -206,7 +210,7 @@ def found_patches(products: SavedProducts) -> list[FoundPatch]:
     return out
 
 
-def edited(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tuple[Labels, list[str]]:
+def apply_edits(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tuple[Labels, list[str]]:
     """Return boxes after the edits, and the numbers of unnamed patches.
 
     Raises
@@ -214,13 +218,17 @@ def edited(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tuple[L
     DataError
         when a name is not there, is there twice, or cannot be used.
     """
-    boxes, specimens, metal = dict(labels.boxes), dict(labels.specimens), labels.metal
+    boxes = dict(labels.boxes)
+    specimens = dict(labels.specimens)
+    metal = labels.metal
     if edits.from_patches:
         if not found:
             raise DataError("no patch was found", "only images were made, or nothing is in them", "draw it: --box")
-        boxes, specimens, metal = {str(f.number): f.box for f in found}, {}, None
+        boxes = {str(f.number): f.box for f in found}
+        specimens = {}
+        metal = None
     names = {name: name for name in boxes}  # as it was to as it is
-    for name in (_known(n, boxes) for n in edits.removed):
+    for name in (_find_box(n, boxes) for n in edits.removed):
         del boxes[name], names[name]
         specimens.pop(name, None)
         metal = None if name == metal else metal
@@ -230,8 +238,9 @@ def edited(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tuple[L
     for text in edits.renames:
         old, new = _split(text, boxes)
         names[old] = box_name(new)
-    boxes = _renamed(boxes, names)
-    specimens, metal = {names[n]: s for n, s in specimens.items()}, names.get(metal or "")
+    boxes = _rename_boxes(boxes, names)
+    specimens = {names[n]: s for n, s in specimens.items()}
+    metal = names.get(metal or "")
     for name, box in edits.boxes:
         clean = box_name(name)
         _refuse_twin(clean, boxes)
@@ -243,11 +252,11 @@ def edited(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tuple[L
         specimens[name] = clean_name(which, "specimen")
     if edits.metal is not None:
         metal = names.get(edits.metal) if edits.from_patches and edits.metal in names else None
-        metal = metal or _known(edits.metal, boxes)
+        metal = metal or _find_box(edits.metal, boxes)
     return Labels(boxes, "mm", metal, specimens), left_out
 
 
-def _renamed(boxes: Mapping[str, Box], names: Mapping[str, str]) -> dict[str, Box]:
+def _rename_boxes(boxes: Mapping[str, Box], names: Mapping[str, str]) -> dict[str, Box]:
     out: dict[str, Box] = {}
     for old, box in boxes.items():
         _refuse_twin(names[old], out)
@@ -260,7 +269,7 @@ def _refuse_twin(name: str, boxes: Mapping[str, Box]) -> None:
         raise name_taken(name, twin)
 
 
-def _known(name: str, boxes: Mapping[str, Box]) -> str:
+def _find_box(name: str, boxes: Mapping[str, Box]) -> str:
     """Find the box that an option names. Raises DataError if there is none."""
     if name in boxes:
         return name
@@ -278,10 +287,10 @@ def _split(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
         if name in boxes:
             return name, "=".join(parts[at:])
     name, _, rest = text.partition("=")
-    return _known(name, boxes), rest
+    return _find_box(name, boxes), rest
 
 
-def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
+def ask_for_names(found: Sequence[FoundPatch], ask: Ask) -> Labels:
     """Ask for the names of patches. Raises DataError without patches, ConfigError when the input ends."""
     if not found:
         raise DataError("no patch was found", "only images were made, or nothing is in them", "draw it: --box")
@@ -291,12 +300,12 @@ def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
     try:
         for patch in found:
             question = f"patch {patch.number}, {format_box(patch.box)}, {patch.description}: "
-            name, is_metal = _asked_name(question, boxes, ask, metal is None)
+            name, is_metal = _ask_for_name(question, boxes, ask, metal is None)
             if name:
                 boxes[name] = patch.box
                 metal = name if is_metal else metal
         if len(boxes) > 1 and metal is None:
-            metal = _asked_metal(boxes, ask)
+            metal = _ask_for_metal(boxes, ask)
     except EOFError:
         raise ConfigError(
             "nothing was written: the answers ended", "the input was closed", "give options instead",
@@ -305,7 +314,7 @@ def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
     return Labels(boxes, "mm", metal)
 
 
-def _asked_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missing: bool) -> tuple[str, bool]:
+def _ask_for_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missing: bool) -> tuple[str, bool]:
     """Ask until the answer is a valid new name or empty; return it, and True if it is the metal."""
     while True:
         answer = ask(question).strip()
@@ -326,11 +335,11 @@ def _asked_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missing
             sys.stdout.write(f"  {e.what}: {e.why}\n")
 
 
-def _asked_metal(boxes: Mapping[str, Box], ask: Ask) -> str | None:
+def _ask_for_metal(boxes: Mapping[str, Box], ask: Ask) -> str | None:
     """Return the metal box; None if no option names it."""
     while answer := ask("which of them is the metal reference (Enter: the one with a metal's name): ").strip():
         try:
-            return _known(answer, boxes)
+            return _find_box(answer, boxes)
         except DataError as e:
             sys.stdout.write(f"  {e.what}; {e.why}\n")
     return None

@@ -150,7 +150,7 @@ def permittivity(
 
 
 def _line(row: Mapping[str, Any]) -> str:
-    head = f"{row['label']:>3}  {_padded(row['name'] or '')}"
+    head = f"{row['label']:>3}  {_pad_name(row['name'] or '')}"
     single = row["single_interface"]
     if row.get("refused"):
         text = f"{head} not judged: {refused_text(row)}"
@@ -158,10 +158,10 @@ def _line(row: Mapping[str, Any]) -> str:
         text = f"{head} metal-like: no permittivity"
     else:
         text = f"{head} one interface {_estimate(single)}"
-    return (text + _in_the_stack(row.get("layer"))).rstrip() + "\n"
+    return (text + _layer_text(row.get("layer"))).rstrip() + "\n"
 
 
-def _in_the_stack(layer: Mapping[str, Any] | None) -> str:
+def _layer_text(layer: Mapping[str, Any] | None) -> str:
     """The fit of a layer as text, with a line for each note."""
     if layer is None:
         return ""
@@ -253,10 +253,10 @@ def _patch_line(row: dict[str, Any]) -> str:
     e = row.get("permittivity")
     value = _estimate(e) if e is not None else "metal-like" if row.get("metal_like") else "-"
     why = f"\n     {row['why']}" if row.get("why") else ""
-    return f"{row['label']:>3}  {_padded(name)} {sure:>5s}  {value}{drawn}".rstrip() + f"{why}\n"
+    return f"{row['label']:>3}  {_pad_name(name)} {sure:>5s}  {value}{drawn}".rstrip() + f"{why}\n"
 
 
-def _padded(name: str, width: int = 24) -> str:
+def _pad_name(name: str, width: int = 24) -> str:
     """A name as wide as a column of a terminal; Chinese characters take two places each."""
     return name + " " * max(0, width - cell_len(name))
 
@@ -464,7 +464,8 @@ def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
             f"{len(strange)} patches of materials that the library lacks, {unknown} of them named unknown\n"
         )
     if known:
-        right, share = sum(r["name"] == r["truth"] for r in known), np.mean([r["pixels_right"] for r in known])
+        right = sum(r["name"] == r["truth"] for r in known)
+        share = np.mean([r["pixels_right"] for r in known])
         sys.stdout.write(f"{right} of {len(known)} patches named right, {share:.1%} of their pixels\n")
 
 

@@ -53,11 +53,13 @@ def counted(things: Iterable[T], total: int, name: str) -> Iterator[T]:
         yield from track(things, name, total=total, console=console)
         return
     say(f"{total} {name}")
-    printed, tenth = monotonic(), 0
+    printed = monotonic()
+    tenth = 0
     for done, thing in enumerate(things, 1):
         yield thing
         if 10 * done // total > tenth and monotonic() - printed > _LINE_S:
-            printed, tenth = monotonic(), 10 * done // total
+            printed = monotonic()
+            tenth = 10 * done // total
             say(f"{done} of {total} {name}")
 
 

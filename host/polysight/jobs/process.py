@@ -11,21 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.calibration import Calibration, calibration_of_rig, calibration_of_scan
-from polysight.imaging import (
-    PLANE_REACH_M,
-    Focus,
-    Images,
-    PlaneEstimate,
-    focus_sweep,
-    image_grid,
-)
+from polysight.imaging import PLANE_REACH_M, Focus, Images, PlaneEstimate, focus_sweep, image_grid
 from polysight.jobs.output import counted, current_step, print_lines, say
-from polysight.materials import (
-    Plates,
-    find_truth,
-    read_labels,
-    read_truth,
-)
+from polysight.materials import Plates, find_truth, read_labels, read_truth
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference, plane_reference
 from polysight.process import (
@@ -76,7 +64,7 @@ def processed_rows(source: Source, data: Path, settings: Settings = DEFAULT) -> 
     return pipeline
 
 
-def axes_of(pipeline: Pipeline) -> Axes:
+def pixel_axes(pipeline: Pipeline) -> Axes:
     """Pixel centres of the images, x and y, ascending."""
     grid = pipeline.images.grid
     return (grid.y_m, grid.x_m) if pipeline.source.mirrored else (grid.x_m, grid.y_m)
@@ -88,7 +76,7 @@ def imaged(data: Path, settings: Settings = DEFAULT) -> tuple[Pipeline, Images]:
     return pipeline, pipeline.form_images()
 
 
-def truth_of(data: Path) -> Plates:
+def find_plates(data: Path) -> Plates:
     """Read the plates of truth.json beside the data; none, with a note on stderr, if it is not a truth file."""
     plates, note = find_truth(data)
     if note:
@@ -195,10 +183,10 @@ def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | 
     """
     inputs = load_inputs(settings)
     source = open_source(data, settings.path("config"), dropped=True)
-    plates = truth_of(data)
+    plates = find_plates(data)
     check_products_folder(out, source.scan_id)
     pipeline = Pipeline(source, settings, inputs, samples="keep")
-    check_inputs(settings, inputs, pipeline.calibration, pipeline.rig, axes_of(pipeline))
+    check_inputs(settings, inputs, pipeline.calibration, pipeline.rig, pixel_axes(pipeline))
     add_rows(pipeline, data, threads)
     _check_dropped(pipeline, out)
     publish_images(pipeline, out)
@@ -250,7 +238,7 @@ class LiveProcessing:
         """Write the products, and print their summary; return the exit status."""
         if self._pipeline is None:
             return 0
-        products = make_products(self._pipeline, self._folder / PRODUCTS, truth_of(self._folder))
+        products = make_products(self._pipeline, self._folder / PRODUCTS, find_plates(self._folder))
         sys.stdout.write(products.summary())
         return products.exit_status
 
@@ -313,13 +301,16 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     say("the plane at which the image is sharpest")
     found = focus_sweep(builder, depth_m=depth_mm / 1e3)
     depth_m = plates.offset_m if plates.known else found.depth_mm / 1e3
-    grid, board = builder.grid, builder.boards[source.instrument.receivers[0].name]
+    grid = builder.grid
+    board = builder.boards[source.instrument.receivers[0].name]
     pictures = (board.image()[0], board.image(replace(grid, z_m=grid.z_m + depth_m))[0])
     if source.mirrored:  # the builder's image is that of the mirrored rig
-        found, plates, pictures = found.transposed(), plates.transposed(), (pictures[0].T, pictures[1].T)
+        found = found.transposed()
+        plates = plates.transposed()
+        pictures = (pictures[0].T, pictures[1].T)
     sweep = found.to_dict() | {"plates": plates.to_dict()}
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
-    (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *axes_of(pipeline), source.simulated))
+    (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *pixel_axes(pipeline), source.simulated))
     head = f"{'simulated ' if source.simulated else ''}scan {source.scan_id}"
     at = pipeline.rig.geometry.object_distance_mm
     print_lines(_focus_lines(head, at, found, plates))
@@ -331,8 +322,10 @@ def _focus_lines(head: str, distance_mm: float, found: Focus, plates: PlaneEstim
     """Text of `focus`: the plane by the plates, if there are any, and by sharpness."""
     lines = []
     if plates.known:
-        mm, std = 1e3 * plates.offset_m, 1e3 * plates.offset_std_m
-        tilt, tilt_std = np.degrees(plates.tilt_rad), np.degrees(plates.tilt_std_rad)
+        mm = 1e3 * plates.offset_m
+        std = 1e3 * plates.offset_std_m
+        tilt = np.degrees(plates.tilt_rad)
+        tilt_std = np.degrees(plates.tilt_std_rad)
         how = "the phase of their echoes" if plates.by_phase else "the range of their echoes"
         lines += [
             f"{head}: {plates.plates} flat plates lie {mm:+.2f} +- {std:.2f} mm from the rig file's plane, by {how}:"
@@ -364,7 +357,8 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
     source = raw_source(open_source(data, config), data)
     calibration = calibration_of_scan(source)
     rig = calibration.rig(source.instrument)
-    chirp, reports = rig.chirp, {}
+    chirp = rig.chirp
+    reports = {}
     for board in rig.receivers:
         setup = BoardSetup.of(rig, board, model=calibration.high_pass(board.name))
         report = reports[board.name] = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))

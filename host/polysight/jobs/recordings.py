@@ -189,7 +189,8 @@ def inspect_placement(file: Path, as_json: bool) -> int:
     row = file.with_suffix(".bin")
     if scan := scan_of(row):
         if strange := damage_of(scan, row):
-            why, remedy = "a damaged file, or one of another row", "`polysight validate SCAN`"
+            why = "a damaged file, or one of another row"
+            remedy = "`polysight validate SCAN`"
             raise DataError(f"{row}: {strange}", why, remedy, code=ErrorCode.FILE_DAMAGED)
         if not row.with_suffix(PACKETS).exists():
             why = "the scan was simulated without cards, or recorded by an older release"
@@ -206,7 +207,8 @@ def inspect_placement(file: Path, as_json: bool) -> int:
 
 
 def _placement_lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
-    p, e = again.placed, again.evidence
+    p = again.placed
+    e = again.evidence
     counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in vars(p.counts).items() if n)
     if e.past.base is None:
         start = "not known from the records before"

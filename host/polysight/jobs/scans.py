@@ -24,16 +24,7 @@ from polysight.jobs.output import confirm, print_json
 from polysight.materials import UNKNOWN
 from polysight.products import QUALITY, RAW_DROPPED, REPORT, products_locked, read_products, write_json
 from polysight.results import ComplexNumber, plain
-from polysight.store import (
-    Digests,
-    ScanFolder,
-    damaged_samples,
-    drop,
-    droppable,
-    dropped_rows,
-    locked_samples,
-    utc_now,
-)
+from polysight.store import Digests, ScanFolder, damaged_samples, drop, droppable, dropped_rows, locked_samples, utc_now
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, no_such
 
@@ -45,10 +36,11 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
     """Print the scans under a folder, the newest first; returns 0. Raises DataError when there is no such folder."""
     if not root.is_dir():
         raise no_such(root)
-    catalogue, odd = Scans(root), ""
+    catalogue = Scans(root)
+    odd = ""
     if left_out := catalogue.left_out():
         odd = f"; not listed, because they are links or have unprintable names: {', '.join(left_out)}"
-    found = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _searched(s)]
+    found = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _searchable_text(s)]
     if as_json:
         rows = [msgspec.to_builtins(s) | {"bytes": _bytes_of(root, s)} for s in found]
         print_json({"scans": rows})
@@ -68,13 +60,13 @@ def _bytes_of(root: Path, s: Summary) -> int:
 def _line(s: Summary) -> str:
     """State, rows, verdict, materials and tags of a scan."""
     parts = [s.state, f"{s.committed}/{s.rows} rows" if s.rows else "", s.verdict]
-    parts += ["images only" if s.images_only else "", ", ".join(map(_called, s.materials))]
+    parts += ["images only" if s.images_only else "", ", ".join(map(_shown_name, s.materials))]
     parts += ["simulated" if s.simulated else "", " ".join(f"#{tag}" for tag in s.tags)]
     parts.append(s.reason if s.state == "failed" and not s.rows else "")
     return "  ".join(part for part in parts if part)
 
 
-def _searched(s: Summary) -> str:
+def _searchable_text(s: Summary) -> str:
     return " ".join((s.name, s.scan_id, s.rig, s.state, s.notes, *s.tags, *s.materials)).casefold()
 
 
@@ -117,7 +109,7 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
     else:
         lines.append(f"no permittivity: {found.why}")
     if found.patch is not None:
-        lines.append(f"in patch {found.patch.label}: {_called(found.patch.name)}")
+        lines.append(f"in patch {found.patch.label}: {_shown_name(found.patch.name)}")
     lines += [f"  {n.sigmas:g} standard deviations from {n.name}" for n in found.nearest]
     lines.append(found.profile_why or "range profile: --json")
     sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
@@ -143,7 +135,7 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
         share = f"{100 * values.significant_share:.1f} %"
         lines.append(f"P differs by more than {values.significant_sigmas:g} standard deviations in {share} of them")
     for pair in values.patches:
-        names = " and ".join(map(_called, pair.names))
+        names = " and ".join(map(_shown_name, pair.names))
         place = f"x {pair.place_mm[0]:g}, y {pair.place_mm[1]:g} mm ({names})"
         if pair.difference is None:
             lines.append(f"{place}: no permittivity in one of them")
@@ -154,7 +146,7 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
     return 0
 
 
-def _called(name: str | None) -> str:
+def _shown_name(name: str | None) -> str:
     """A material's name as people read it."""
     return "not in the library" if name == UNKNOWN else name or "not named"
 

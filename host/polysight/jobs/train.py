@@ -149,14 +149,16 @@ def _from_images(saved: SavedProducts, labels: Labels) -> TrainingScan:
 
 def _optics_of(saved: SavedProducts) -> Optics:
     """Return incidence angle and leakage of saved images; leakage that processing removed is zero here."""
-    rig, path = saved.rig, saved.folder / SCAN
+    rig = saved.rig
+    path = saved.folder / SCAN
     if rig is None:
         raise DataError(f"{path}: names no rig", "an earlier release processed the scan", "process the scan again")
     optics = Optics.of(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
     budget = saved.materials.get("error_budget") or {}
     if not budget:
         return optics
-    angle, leakage = budget["incidence"], budget["leakage"]
+    angle = budget["incidence"]
+    leakage = budget["leakage"]
     return replace(
         optics,
         theta_rad=float(np.radians(angle["deg"])),
@@ -215,7 +217,8 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
     PolysightError
         if a file is wrong (checked before anything is simulated), or a scan cannot be used.
     """
-    data, files = list(data), [] if scenes is None else sorted(scenes.glob("*.toml"))
+    data = list(data)
+    files = [] if scenes is None else sorted(scenes.glob("*.toml"))
     if not data and scenes is None:
         raise ConfigError(
             "no scans to train on",

@@ -199,7 +199,10 @@ def test_nothing_in_a_report_can_act(scans):
         assert "default-src 'none'" in policy
         assert headers["x-content-type-options"] == "nosniff"
         for name in ("image.npz", "materials.json"):
-            found = ask(view, f"/api/file/{name}?scan=one")[2]
+            content = (scans / "one" / "products" / name).read_bytes()
+            assert ask(view, f"/api/file/{name}?scan=one")[1] == content
+            found = ask(view, f"/api/file/{name}?scan=one", "HEAD")[2]
+            assert int(found["content-length"]) == len(content)
             assert found["content-disposition"].startswith("attachment")
             assert found["content-type"] == "application/octet-stream"
 

@@ -26,7 +26,7 @@ from polysight.products import (
     read_products,
     scan_folder_of,
 )
-from polysight.results import ComplexNumber, PatchFigures, PermittivityFigures, Verdict
+from polysight.results import ComplexNumber, PatchFigures, PermittivityFigures, ScanFacts, Verdict
 from polysight.store import MANIFEST, ScanFolder
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError
@@ -96,7 +96,7 @@ def result_of(folder: Path) -> Result:
     pixels = Pixels(read_products(folder).folder)
     source = None if pixels.results is None else pixels.results.metal_reference
     return Result(
-        processed_utc=pixels.scan.get("processed_utc", ""),
+        processed_utc=ScanFacts.read(pixels.folder / SCAN).processed_utc or "",
         extent_mm=pixels.extent_mm,
         pictures=[drawn for drawn in MAPS.values() if pixels.referenced or not drawn.needs_metal],
         metal=source.how if source else "",

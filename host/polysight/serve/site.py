@@ -6,7 +6,7 @@ import asyncio
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -333,7 +333,7 @@ class Watches:
             )  # fmt: skip
 
     @contextmanager
-    def _count_stream(self, name: str):
+    def _count_stream(self, name: str) -> Iterator[None]:
         opened = self._open.get(name)
         if opened is None:
             yield

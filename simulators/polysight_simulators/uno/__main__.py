@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 from polysight_shared.config import load_instrument
+from polysight_shared.errors import PolysightError
 from polysight_simulators.process import command_line, die_with_parent, exit_status_of
 from polysight_simulators.stage import homing_zero
 from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing

@@ -257,7 +257,7 @@ def words(name: str) -> frozenset[str]:
     return frozenset(out)
 
 
-def _alike(theirs: frozenset[str], row: Published) -> float:
+def _share_of_common_words(theirs: frozenset[str], row: Published) -> float:
     """Return the share of common words and numbers; the container of a row is optional."""
     ours = words(row.name)
     optional = ours & _CONTAINERS if " with " in row.name or "(with" in row.name else frozenset()
@@ -273,7 +273,9 @@ def row_of(name: str, thickness_mm: float | None = None) -> int | None:
     tries = [theirs]
     if thickness_mm is not None:
         tries.insert(0, theirs | {f"{thickness_mm:g}"})
-    best = sorted(((max(_alike(t, row) for t in tries), row.number) for row in table2()), key=lambda b: -b[0])
+    best = sorted(
+        ((max(_share_of_common_words(t, row) for t in tries), row.number) for row in table2()), key=lambda b: -b[0]
+    )
     (first, number), (second, _) = best[:2]
     return number if first >= _ENOUGH and first > second else None
 

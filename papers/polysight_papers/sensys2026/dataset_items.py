@@ -116,7 +116,7 @@ def repeated(samples: Samples) -> Samples | None:
     return kept if np.unique(kept.names).size > 1 and np.unique(kept.groups).size > 2 else None
 
 
-def _halved(samples: Samples) -> Samples:
+def _split_one_scan(samples: Samples) -> Samples:
     """Pixels of one scan as if of two, every other pixel each: only for the split by pixel, which is no better."""
     if np.unique(samples.groups).size > 1:
         return samples
@@ -157,7 +157,7 @@ class Judgements:
             raise DataError(f"{source} has no {task}", code=ErrorCode.NO_DATA)
         if key not in self._scores:
             several = repeated(samples)
-            mixed = score(_halved(samples), model, channels, by_pixel=True)
+            mixed = score(_split_one_scan(samples), model, channels, by_pixel=True)
             self._scores[key] = (
                 mixed,
                 (None if several is None else score(several, model, channels, folds=np.unique(several.groups).size)),
@@ -508,7 +508,7 @@ def authors_recipe(p: Complex, angle_deg: float) -> complex:
     return complex(np.mean(eps[np.isfinite(eps)]))
 
 
-def _seen(data: AuthorsData, source: str, m: Published) -> tuple[Complex, float, int] | None:
+def _pixels_of_material(data: AuthorsData, source: str, m: Published) -> tuple[Complex, float, int] | None:
     """Ratios of a material's pixels, their angle, and how many scans: at the paper's angle, or else the first."""
     paper = next(g.angle_deg for g in groups().values() if m in g.materials)
     entries = list(data.at(source, range(m.number, m.number + 1), paper).entries)
@@ -575,7 +575,7 @@ def _estimates(data: AuthorsData, source: str, leakage: float) -> list[Estimate]
     """Estimate all materials of Table 2 in a source; `leakage` is still in its ratios."""
     found = []
     for m in table2():
-        seen = _seen(data, source, m)
+        seen = _pixels_of_material(data, source, m)
         if seen is None or not seen[0].size:
             continue
         p, angle, scans = seen

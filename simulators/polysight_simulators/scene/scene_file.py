@@ -269,11 +269,11 @@ class Scene(_Table, frozen=True):
         base = msgspec.to_builtins(self.disturbances)
         if changes.pop("ideal", False):
             base = dict(OFF, bend_us=base["bend_us"], ripple_us=base["ripple_us"])
-        table = decode(_switched({**base, **changes}, "with_disturbances"), Disturbances, "with_disturbances")
+        table = decode(_apply_switches({**base, **changes}, "with_disturbances"), Disturbances, "with_disturbances")
         return msgspec.structs.replace(self, disturbances=table)
 
 
-def _switched(table: Any, source: str) -> Any:
+def _apply_switches(table: Any, source: str) -> Any:
     """Replace `ideal = true` and "off"/"on" (or false/true) in a [disturbances] table by plain values."""
     if not isinstance(table, dict):
         return table
@@ -315,7 +315,7 @@ def decode_scene(raw: dict[str, Any], source: str) -> Scene:
         with `source`, the key, its value and the violated rule.
     """
     if "disturbances" in raw:
-        raw = {**raw, "disturbances": _switched(raw["disturbances"], source)}
+        raw = {**raw, "disturbances": _apply_switches(raw["disturbances"], source)}
     return decode(raw, Scene, source, "docs/spec/scene-file.md lists all keys of a scene")
 
 
@@ -396,7 +396,7 @@ def draw_specimens(scene: Scene) -> Scene:
     from a log-normal one, around the nominal values; a layer of air stays air. Shift and tilt of the plane are added to
     those of each plate and point.
     """
-    plates = tuple(_placed(_drawn(p, i, scene), scene) for i, p in enumerate(scene.plates))
+    plates = tuple(_move_with_plane(_draw_permittivities(p, i, scene), scene) for i, p in enumerate(scene.plates))
     points = tuple(
         msgspec.structs.replace(p, height_mm=p.height_mm + _plane_height_mm(scene, p.position_mm)) for p in scene.points
     )
@@ -435,7 +435,7 @@ def _plane_height_mm(scene: Scene, at_mm: Pair) -> float:
     return scene.plane_shift_mm + sum(along)
 
 
-def _placed(plate: Plate, scene: Scene) -> Plate:
+def _move_with_plane(plate: Plate, scene: Scene) -> Plate:
     """Return the plate with shift and tilt of the plane added."""
     tilt = plate.tilt_deg
     if any(scene.plane_tilt_deg):
@@ -448,7 +448,7 @@ def _placed(plate: Plate, scene: Scene) -> Plate:
     return msgspec.structs.replace(plate, tilt_deg=tilt, height_mm=height_mm)
 
 
-def _drawn(plate: Plate, index: int, scene: Scene) -> Plate:
+def _draw_permittivities(plate: Plate, index: int, scene: Scene) -> Plate:
     """Return the plate with drawn permittivities."""
     if not any(scene.specimen_spread) or plate.metal:
         return plate

@@ -1,14 +1,14 @@
 """Scan folders (append-only, self-validating, resumable), and a common `Source` protocol for all recorded layouts.
 
-`ScanFolder` reads and writes our own scans: `manifest` is the log of facts, `events` the Pi's event log, `raw` deletes
-raw data of processed rows, `sample_rows` checks kept samples, `replace` places rows again from their packets,
-`validation` checks a folder.
-`open_source` opens any known layout (our own, and the published data in `sources`) as a `Source`: rig, plan, rows with
-data, `read_row`, and facts about the recording. `raw_source` requires a source that contains the chirps.
+`ScanFolder` reads and writes our own scans: `manifest` is the log of facts and its one reader, `logs` has the event log
+of the Pi, `raw` deletes raw data of processed rows and places rows again from their packets, `sample_rows` checks kept
+samples, `validation` checks a folder, `untrusted` the names and links in it.
+`open_source` opens any known layout (our own, and the `published` data) as a `Source`: rig, plan, rows with data,
+`read_row`, and facts about the recording. `raw_source` requires a source that contains the chirps.
 """
 
 from polysight.store import manifest
-from polysight.store.logs import EventWriter, LogDigest, crc32, read_events, sync_folder
+from polysight.store.logs import EventWriter, LogDigest, read_events, sync_folder
 from polysight.store.manifest import (
     MANIFEST,
     BoardRow,
@@ -29,7 +29,7 @@ from polysight.store.manifest import (
     ScanStarted,
 )
 from polysight.store.open import is_source, open_source
-from polysight.store.published import COLLECTION, mirrored, read_settings, rig_of
+from polysight.store.published import COLLECTION, read_settings, rig_of
 from polysight.store.raw import (
     Digests,
     PlacedAgain,
@@ -64,7 +64,7 @@ from polysight.store.scan_folder import (
     with_connection,
 )
 from polysight.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
-from polysight.store.untrusted import MAX_BYTES, check_links, inside, open_npz
+from polysight.store.untrusted import MAX_BYTES, inside, open_npz
 from polysight.store.validation import damage_of, damaged_rows, to_json, to_text, validate
 
 __all__ = [
@@ -103,10 +103,8 @@ __all__ = [
     "ScanResumed",
     "ScanStarted",
     "Source",
-    "check_links",
     "check_same_scan",
     "connection_of",
-    "crc32",
     "damage_of",
     "damaged_rows",
     "damaged_samples",
@@ -117,7 +115,6 @@ __all__ = [
     "is_source",
     "locked_samples",
     "manifest",
-    "mirrored",
     "new_scan_id",
     "open_npz",
     "open_records",

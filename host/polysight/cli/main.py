@@ -19,8 +19,7 @@ from polysight_shared.errors import PolysightError, os_error
 
 FAMILIES = {
     "simulated": ("demo", "simulate", "reproduce"),
-    "rig": ("plan", "doctor", "card", "inspect", "radar"),
-    "scan": ("scan", "resume", "validate", "drop-raw"),
+    "rig": ("plan", "doctor", "card", "inspect", "radar", "scan", "resume", "validate", "drop-raw"),
     "serve": ("serve", "preview", "scans", "note", "ask", "probe", "compare"),
     "process": ("process", "image", "focus", "sync-report"),
     "materials": ("materials", "report", "permittivity", "concentration", "classify", "train", "export", "label"),

@@ -258,7 +258,7 @@ def _without(job: tuple[int, str]) -> tuple[str, int, str, int, str]:
     seed, kind = job
     _, _, findings, _ = judged(seed, kind)
     rows = findings.found.rows()
-    said = sum(r["name"] is not None or r["permittivity"] is not None for r in rows)
+    said = sum(r.name is not None or r.permittivity is not None for r in rows)
     reason = findings.verdict.reasons[0].what if findings.verdict.reasons else ""
     return kind, seed, findings.verdict.level, said, reason
 

@@ -30,6 +30,7 @@ from polysight.materials import METAL, Layer, LayerFit, fit_row, match_truth, tr
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference
 from polysight.process import Inputs
+from polysight.results import PatchFigures
 from polysight.settings import Settings
 from polysight_shared.config import Instrument, load_instrument
 from polysight_simulators.scene import decode_scene
@@ -136,14 +137,14 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     return replace(plane_of(pipeline, pipeline.form_images()), bands=parts)
 
 
-def rows_of(seed: int, rig: Instrument, scene: Scene, metal: PlaneReference) -> tuple[dict[str, dict[str, Any]], float]:
+def rows_of(seed: int, rig: Instrument, scene: Scene, metal: PlaneReference) -> tuple[dict[str, PatchFigures], float]:
     """One scene, simulated and processed: a row of materials.json for each plate found; the angle's deviation, rad."""
     pipeline = _imaged(rig, scene)
     pipeline.inputs = Inputs(reference=metal)
     findings = pipeline.examine(pipeline.form_images())
     found = findings.found
     plates = match_truth([r.patch for r in found.patches], truth_plates(truth(apply_scene(rig, scene), scene, seed)))
-    rows = {plates[row["label"]].name: row for row in found.rows() if row["label"] in plates}
+    rows = {plates[row.label].name: row for row in found.rows() if row.label in plates}
     return rows, found.prior.theta_std_rad
 
 

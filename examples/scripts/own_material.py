@@ -14,8 +14,7 @@ from msgspec.structs import replace
 from polysight.jobs.train import train
 from polysight.materials import Library
 from polysight.polarimetry import fresnel
-from polysight.products.files import read_products
-from polysight.report.exports import material_columns
+from polysight.products import read_products
 from polysight_shared.config import load_instrument
 from polysight_shared.geometry import incidence_deg
 from polysight_simulators.scene import load_scene, simulate
@@ -29,9 +28,8 @@ expected = r_s / r_p
 print(f"expected: |P| {abs(expected):.2f}, phase of P {np.degrees(np.angle(expected)):.1f} degrees")
 
 # %%
-table = material_columns(read_products(Path("out/own-products")))
-for name in ("true_name", "p_abs_db", "p_phase_deg", "permittivity_real", "permittivity_real_standard_error"):
-    print(name, table[name])
+for patch in read_products(Path("out/own-products")).segments:
+    print(patch.true_name, patch.p_abs_db, patch.p_phase_deg, patch.permittivity_real, patch.permittivity_real_std)
 
 # %%
 scene = load_scene(ROOT / "examples" / "own-scene.toml")

@@ -102,11 +102,12 @@ class Pipeline:
     def finish(self, out: Path, plates: materials.Plates = (), progress: Progress = no_progress) -> process.Products:
         """Write all products into `out`: images first, so that they stay if a later step fails."""
         images = self.form_images()
-        process.save_images(out, self.source, self.rig, images, self.quality)
+        process.save_images(out, process.imaged_scan(out, self.source, self.rig, images, self.quality))
         progress("point response")
         self.quality.note_imaging(self.images, images)
         progress("materials")
         findings = self.examine(images, plates)
         progress("figures and report")
         unnamed = process.why_unnamed(self.settings, self.rig)
-        return process.save_materials(out, self.source, self.rig, findings, unnamed, self.quality)
+        scan = process.processed_scan(out, self.source, self.rig, findings, self.quality, unnamed)
+        return process.save_materials(out, scan, findings.found, unnamed)

@@ -105,7 +105,7 @@ def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
     v[inside] *= 1.3
     with np.errstate(invalid="ignore", divide="ignore"):
         p = saved.h / v
-    write_image(tmp_path / "changed" / "image.npz", replace(saved.image, v=v, p=p))
+    write_image(tmp_path / "changed" / "image.npz", replace(saved.images, v=v, p=p))
     found = compare(processed / "one", tmp_path / "changed")
     answer = np.nan_to_num(found.sigmas)
     assert found.figures.scatter == 0.1  # a copy, which shares its errors

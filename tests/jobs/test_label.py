@@ -79,7 +79,7 @@ def test_a_patch_told_to_be_metal_is_called_so(products):
 def test_a_box_where_nothing_shines_is_pointed_out(products, capsys):
     found = find_products(products)
     dim = np.where(found.x_m > 0.02, 0.01, 1.0).astype(np.float32)  # -40 dB
-    write_image(products / "image.npz", replace(found.image, h=found.h * dim, v=found.v * dim, p_sigma=None))
+    write_image(products / "image.npz", replace(found.images, h=found.h * dim, v=found.v * dim, p_sigma=None))
     assert main(["label", str(products), "--box", "oak=-40,-10,-20,10", "--metal", "oak"]) == 0
     assert "note: dark" not in capsys.readouterr().out
     assert main(["label", str(products), "--box", "nothing=30,-10,50,10"]) == 0

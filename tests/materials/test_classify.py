@@ -11,10 +11,9 @@ from tests.support.refusals import refused
 
 from polysight.cli.main import main
 from polysight.materials import UNKNOWN, Classifier, Library, TrainingScan, fit_library
-from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER
+from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, classifier_sentence
 from polysight.materials.result import PATCHES, match_patches, pack_patches, read_patches
 from polysight.materials.train import entries_of
-from polysight.report.context import classifier_sentence
 from polysight_papers.sensys2026.patches import Errors, draw, groups
 from polysight_shared.error_codes import ErrorCode
 

@@ -6,11 +6,10 @@ from tests.support.refusals import refused
 
 from polysight.cli.main import main
 from polysight.materials import Classifier, Entry, Library
-from polysight.materials.classify import DISCRIMINANT, PAPER, fit_weights
+from polysight.materials.classify import DISCRIMINANT, PAPER, classifier_sentence, fit_weights
 from polysight.materials.discriminant import REJECTED, ErrorDiscriminant
 from polysight.materials.library import Samples, feature_matrix
 from polysight.materials.train import fit_samples, score, score_unseen_materials
-from polysight.report.context import classifier_sentence
 from polysight_shared.error_codes import ErrorCode
 
 MEANS = np.array([[-0.6, -2.0, 0.1], [-0.55, -1.9, 0.2], [-0.5, -2.2, 3.1], [-0.4, -1.5, -3.1], [-0.3, -1.2, 0.5]])

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from msgspec import structs
 from tests.support.paths import RIG_FILE
 from tests.support.rigs import published_rig
 
@@ -13,6 +14,7 @@ from polysight.imaging import sub_bands
 from polysight.materials import METAL, Layer, LayerFit, parse_layer
 from polysight.materials.layers import Bands, Spectrum, fit_layer, predict
 from polysight.materials.sub_bands import bands_of_row
+from polysight.results import ScanMaterials
 
 THETA = np.radians(55.0)
 CHIRP = published_rig().chirp
@@ -178,9 +180,10 @@ def test_a_sheet_on_metal_as_typed(folder, capsys):
 
 
 def test_products_that_do_not_say_what_bands_share_know_no_more_than_one(folder):
-    row = json.loads((folder / "materials.json").read_text())["segments"][0]
+    row = ScanMaterials.read(folder / "materials.json").segments[0]
     new = bands_of_row(row, CHIRP, 4)
-    old = bands_of_row(row | {"bands": [b | {"covariance": None} for b in row["bands"]]}, CHIRP, 4)
+    bands = [structs.replace(band, covariance=None) for band in row.bands]
+    old = bands_of_row(structs.replace(row, bands=bands), CHIRP, 4)
     assert old.covariance is None
     np.testing.assert_allclose(old.sigma, 2 * COMMON)
     assert new.covariance.shape == (8, 8)

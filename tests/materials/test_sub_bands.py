@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from tests.support.rigs import published_rig
@@ -11,6 +12,7 @@ from polysight.imaging.builder import SubBand
 from polysight.materials.layers import Bands, Layer, fit_layer
 from polysight.materials.sub_bands import band_rows, bands_of_row
 from polysight.polarimetry import fresnel, ratio_from_permittivity
+from polysight.results import PatchFigures, plain
 
 THETA = np.radians(55.0)
 BAND = SubBand((0, 96), 76.3e9, 78.0e9)
@@ -49,8 +51,8 @@ def test_metal_that_a_sub_band_does_not_show_is_no_part_of_its_reference(scene, 
     whole, cut = (band_rows(found, [BAND], [channels(scene, at)], (0, 0), 1.5) for at in (everywhere, without))
     for patch in found.patches:
         (before,), (after,) = whole[patch.patch.label], cut[patch.patch.label]
-        assert after["amplitude_h"] == pytest.approx(before["amplitude_h"], rel=0.02)
-        assert complex(*after["ratio"].values()) == pytest.approx(complex(*before["ratio"].values()), rel=0.03)
+        assert after.amplitude_h == pytest.approx(before.amplitude_h, rel=0.02)
+        assert after.ratio.value == pytest.approx(before.ratio.value, rel=0.03)
 
 
 def test_a_patch_that_is_shown_in_part_is_not_darkened_by_the_rest(scene, found):
@@ -59,7 +61,7 @@ def test_a_patch_that_is_shown_in_part_is_not_darkened_by_the_rest(scene, found)
     without = everywhere & ~half_of(other.patch.interior)
     rows = [band_rows(found, [BAND], [channels(scene, at)], (0, 0), 1.5) for at in (everywhere, without)]
     (before,), (after,) = (r[other.patch.label] for r in rows)
-    assert after["amplitude_h"] == pytest.approx(before["amplitude_h"], rel=0.02)
+    assert after.amplitude_h == pytest.approx(before.amplitude_h, rel=0.02)
 
 
 def test_a_sub_band_without_metal_is_null_and_the_others_stay(scene, found):
@@ -68,8 +70,8 @@ def test_a_sub_band_without_metal_is_null_and_the_others_stay(scene, found):
     rows = band_rows(found, [BAND, BAND], images, (0, 0), 1.5)
     for patch in found.patches:
         there, gone = rows[patch.patch.label]
-        assert there["ratio"] is not None
-        assert (gone["ratio"], gone["inverse_ratio_std"], gone["amplitude_h"]) == (None, None, None)
+        assert there.ratio is not None
+        assert (gone.ratio, gone.inverse_ratio_std, gone.amplitude_h) == (None, None, None)
 
 
 def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, found):
@@ -82,17 +84,19 @@ def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, found)
         for s, at in ((scene, np.ones_like(valid)), (cut, valid))
     )
     for before, after in zip(whole.rows(), part.rows(), strict=True):
-        assert after["amplitude_h"] == pytest.approx(before["amplitude_h"], rel=0.02)
+        assert after.amplitude_h == pytest.approx(before.amplitude_h, rel=0.02)
 
 
 def row_of(ratio, parts):
     """A segment of materials.json whose every part of the sweep says the same: a thick plate's."""
     one = {
+        "first_hz": 0.0,
+        "last_hz": 1.0,
         "ratio": {"real": ratio.real, "imag": ratio.imag},
         "inverse_ratio_std": INVERSE_STD,
         "amplitude_h": abs(fresnel(THICK, THETA)[0]),
     }
-    return {"label": 1, **one, "bands": [one] * parts}
+    return msgspec.convert(plain({"label": 1, **one, "bands": [one] * parts}), PatchFigures)
 
 
 def bands_of(ratio, parts) -> Bands:

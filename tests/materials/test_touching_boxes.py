@@ -39,13 +39,13 @@ def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
     h[~valid] = v[~valid] = 0  # as images have it
     pair, optics = Images(h, v, X_M, Y_M, valid), Optics(THETA, smooth_px=1.0)
     result = analyse(pair, optics, KnownScene(found, labels["metal"]))
-    rows = {r["label"]: r for r in result.rows()}
+    rows = {r.label: r for r in result.rows()}
     left, nowhere = rows[labels["left"]], rows[labels["nowhere"]]
-    assert abs(left["amplitude_h"] - abs(complex(fresnel(LEFT, THETA)[0]))) < 1e-5
-    assert abs(complex(left["permittivity"]["real"], left["permittivity"]["imag"]) - LEFT) < 1e-3
-    assert nowhere["interior_pixels"] == 0
-    assert not nowhere["metal_like"]
-    assert nowhere["permittivity"] is None
+    assert abs(left.amplitude_h - abs(complex(fresnel(LEFT, THETA)[0]))) < 1e-5
+    assert abs(left.permittivity.value - LEFT) < 1e-3
+    assert nowhere.interior_pixels == 0
+    assert not nowhere.metal_like
+    assert nowhere.permittivity is None
 
 
 def test_plates_of_one_name_are_patches_each():

@@ -80,7 +80,7 @@ def test_a_synchronised_cube_of_any_convention_makes_the_same_image(quiet, tmp_p
     for channel in ("h", "v"):
         assert correlation(made, quiet, channel) > 0.999
     assert set(pipeline.quality.notes["recording"]["cubes"]) == {"RH", "RV"}
-    assert pipeline.quality.to_dict()["boards"]["RH"]["positions_masked"] == 0
+    assert pipeline.quality.result().boards["RH"].positions_masked == 0
 
 
 def test_a_cube_without_reference_is_referenced_to_the_direct_path_and_its_zeros_are_masked(quiet, tmp_path):
@@ -98,7 +98,7 @@ def test_a_cube_without_reference_is_referenced_to_the_direct_path_and_its_zeros
     made, pipeline = images(folder)
     for channel in ("h", "v"):
         assert correlation(made, quiet, channel) > 0.99
-    assert pipeline.quality.to_dict()["boards"]["RH"]["positions_masked"] == 2
+    assert pipeline.quality.result().boards["RH"].positions_masked == 2
 
 
 def test_an_empty_cube_is_an_error(tmp_path):

@@ -11,8 +11,10 @@ from tests.support.pipelines import pipeline_of
 from tests.support.processes import output_of
 from tests.support.scenes import EVERYWHERE, scene_of
 
-from polysight.report.context import ReportContext
-from polysight.report.tables import masked_positions
+from polysight.imaging import Images
+from polysight.products import ProcessedScan
+from polysight.report.figures import masked_positions
+from polysight.results import ScanFacts
 from polysight.store import RowData, ScanFolder
 from polysight.store.scan_folder import MANIFEST
 from polysight_shared.files import read_json
@@ -84,17 +86,18 @@ class Lossy:
 def test_lost_positions_of_odd_rows_are_counted_by_column(scan_of, tmp_path):
     scene = scene_of(EVERYWHERE, columns=7, rows=4, pulses=PULSES)
     source = Lossy(ScanFolder.load(scan_of(tmp_path / "scan", scene)))
-    quality = pipeline_of(source).quality.to_dict()
-    for board in quality["boards"].values():
-        assert board["masked_columns"] == {0: [[0, 2], [4, 5]], 1: [[2, 3], [5, 7]], 3: [[0, 1]]}
-        assert board["positions_masked"] == 7
-        assert board["frames_masked"] == 7 * PULSES
+    quality = pipeline_of(source).quality.result()
+    for board in quality.boards.values():
+        assert board.masked_columns == {0: [[0, 2], [4, 5]], 1: [[2, 3], [5, 7]], 3: [[0, 1]]}
+        assert board.positions_masked == 7
+        assert board.frames_masked == 7 * PULSES
     expected = np.zeros((4, 7), bool)
     for index, points in LOST.items():
         row = source.plan.row(index)
         columns = np.round((np.array(row.x_mm)[points] - min(row.x_mm)) / source.plan.step_x_mm).astype(int)
         expected[index, columns] = True
     nothing, axis = np.zeros((1, 1), np.complex64), np.zeros(1)
-    context = ReportContext("", True, axis, axis, nothing, nothing, nothing, quality=quality, plan=source.plan)
-    for masked in masked_positions(context).values():
+    images = Images(nothing, nothing, axis, axis, nothing.astype(bool), nothing)
+    scan = ProcessedScan.computed(Path(), images=images, quality=quality, facts=ScanFacts(), plan=source.plan)
+    for masked in masked_positions(scan).values():
         np.testing.assert_array_equal(masked, expected)

@@ -49,11 +49,11 @@ def test_synchronisation_undoes_every_disturbance(imaged):
 @pytest.mark.parametrize("board", ["RH", "RV"])
 def test_each_stage_of_synchronisation_shrinks_the_offsets(imaged, board):
     """From received chirps to the averaged burst; residuals are measured in each stage."""
-    stages = imaged("nine-materials").pipeline.quality.to_dict()["boards"][board]["synchronisation"]
-    assert stages["received"]["frequency_std_hz"] > 10e3
-    assert stages["received"]["phase_std_rad"] > 1.0
+    stages = imaged("nine-materials").pipeline.quality.result().boards[board].synchronisation
+    assert stages["received"].frequency_std_hz > 10e3
+    assert stages["received"].phase_std_rad > 1.0
     for key, paper in (("frequency_std_hz", 138), ("phase_std_rad", 0.022)):
-        received, aligned, averaged = (stages[name][key] for name in ("received", "aligned", "averaged"))
+        received, aligned, averaged = (getattr(stages[name], key) for name in ("received", "aligned", "averaged"))
         assert averaged < aligned < received / 50
         assert aligned < paper  # the paper's figure after all stages
 

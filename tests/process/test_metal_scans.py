@@ -103,12 +103,12 @@ def test_layers_are_recovered_where_a_half_space_is_wrong(scan, reference, rig, 
     (row,) = pipeline.find_materials(images, KnownScene(metal=reference)).rows()
     bands = bands_of_row(row, rig.chirp, BANDS)
     assert bands is not None
-    fit = fit_layer(bands, [parse_layer(layer) for layer in layers], np.radians(row["incidence_deg"]))
+    fit = fit_layer(bands, [parse_layer(layer) for layer in layers], np.radians(row.incidence_deg))
     if name == "water":
         assert fit.permittivity.real == pytest.approx(truth.real, rel=0.1)
         assert fit.permittivity.imag == pytest.approx(truth.imag, rel=0.1)
-        single = row["permittivity"]  # wrong by a factor, or not physical
-        assert single is None or single["real"] < truth.real / 5
+        single = row.permittivity  # wrong by a factor, or not physical
+        assert single is None or single.real < truth.real / 5
     else:
         assert abs(fit.permittivity - truth) < 0.05 * abs(truth)
     assert not fit.ambiguous
@@ -197,13 +197,13 @@ def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytes
     found = pipeline.find_materials(images, known=KnownScene(plates=read_truth(folder / "truth.json")))
     assert len(found.patches) == 6
     for row in found.rows():
-        name = row["truth"]["name"]
-        assert row["metal_reference"] == (name == "copper")
+        name = row.truth.name
+        assert row.metal_reference == (name == "copper")
         if name == "copper":
             continue
         layers, truth = SIX_STACKS[name]
         bands = bands_of_row(row, rig.chirp, BANDS)
         assert bands is not None
-        fit = fit_layer(bands, [parse_layer(layer) for layer in layers], np.radians(row["incidence_deg"]))
+        fit = fit_layer(bands, [parse_layer(layer) for layer in layers], np.radians(row.incidence_deg))
         assert abs(fit.permittivity - truth) < 0.05 * abs(truth), name
         assert not fit.ambiguous, name

@@ -93,7 +93,7 @@ def test_another_plane_and_grid_from_the_command_line(scan: Path, tmp_path: Path
     assert products.h.shape == (30, 60)
     np.testing.assert_allclose(np.diff(products.x_m), 2.5e-3)
     distance = ScanFolder.load(scan).instrument.geometry.object_distance_mm
-    assert products.scan["instrument"]["geometry"]["object_distance_mm"] == distance + 4
+    assert products.facts.instrument["geometry"]["object_distance_mm"] == distance + 4
 
 
 @pytest.mark.parametrize("grid", ["60", "60x30", "0x30@2", "60x30@0", "60x30@two", "60x30@2@3"])

@@ -70,7 +70,7 @@ def reasons(findings):
 
 
 def silent(findings):
-    return all(r["name"] is None and r["permittivity"] is None and r["ratio"] is None for r in findings.found.rows())
+    return all(r.name is None and r.permittivity is None and r.ratio is None for r in findings.found.rows())
 
 
 def test_a_measured_rig_and_a_plain_scene_are_good(examine):
@@ -79,8 +79,8 @@ def test_a_measured_rig_and_a_plain_scene_are_good(examine):
     assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
     assert sum(r.verdict is not None and r.verdict.name.startswith(true[r.patch.label].name)
                for r in findings.found.patches) >= 4  # fmt: skip
-    (reference,) = [r for r in findings.found.rows() if r["metal_reference"]]
-    assert reference["name"] is None  # never judged by itself
+    (reference,) = [r for r in findings.found.rows() if r.metal_reference]
+    assert reference.name is None  # never judged by itself
 
 
 def test_an_undeclared_thin_sheet_is_reported_and_affects_no_other_patch(examine):

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from polysight.imaging import Images
-from polysight.products import plain, read_image, write_atomically, write_image, write_json
+from polysight.products import write_atomically, write_image, write_json
+from polysight.products.files import read_image
+from polysight.results import plain
 from polysight_shared.errors import DataError
 
 

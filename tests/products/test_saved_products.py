@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -15,21 +14,13 @@ import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig, rig_with
+from tests.support.rigs import published_rig
 
 from polysight.cli.main import main
 from polysight.imaging import Images, sub_bands
 from polysight.materials import parse_layer
 from polysight.materials.layers import Layer, Spectrum, predict
-from polysight.products import write_json
-from polysight.products.files import (
-    MATERIALS,
-    SCAN,
-    SavedProducts,
-    read_products,
-    write_atomically,
-    write_scan_facts,
-)
+from polysight.products import MATERIALS, ProcessedScan, read_products, rx_gains, write_atomically, write_json
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, os_error
 from polysight_shared.tables import to_builtins
@@ -118,8 +109,8 @@ def test_damaged_products_are_named(folder, capsys, name, content):
 def test_missing_products_are_named(tmp_path):
     with refused(ErrorCode.FILE_MISSING, tmp_path, MATERIALS):
         read_products(tmp_path, MATERIALS)
-    assert SavedProducts(tmp_path).materials == {}
-    assert SavedProducts(tmp_path).rig is None
+    assert ProcessedScan(tmp_path).materials is None
+    assert ProcessedScan(tmp_path).rig is None
 
 
 def test_a_full_disk_is_reported_with_the_path(tmp_path, monkeypatch):
@@ -133,18 +124,13 @@ def test_a_full_disk_is_reported_with_the_path(tmp_path, monkeypatch):
     assert str(tmp_path) in str(os_error(e.value))
 
 
-def test_scan_json_has_gains_relative_to_each_boards_first_rx_and_the_rig_of_the_images(tmp_path):
-    placed = rig_with(geometry={"object_distance_mm": 501.25})
+def test_gains_are_relative_to_each_boards_first_rx():
     none, axis = np.zeros((1, 1), np.complex64), np.zeros(1)
     gains = {
         "RH": np.array([2.0, 20.0, 2.0j, -0.2], np.complex128),
         "RV": np.array([5j, 5j], np.complex128),
     }
     images = Images(none, none, axis, axis, np.ones((1, 1), bool), rx_gains=gains)
-    write_scan_facts(tmp_path, SimpleNamespace(scan_id="s", simulated=True, instrument=HERE), placed, images)
-    facts = json.loads((tmp_path / SCAN).read_text(encoding="utf-8"))
-    assert (facts["scan_id"], facts["simulated"]) == ("s", True)
-    found = {name: [(g["gain_db"], g["phase_deg"]) for g in board] for name, board in facts["rx_gains"].items()}
+    found = {name: [(g.gain_db, g.phase_deg) for g in board] for name, board in rx_gains(images).items()}
     assert found["RH"] == [pytest.approx(g) for g in ((0.0, 0.0), (20.0, 0.0), (0.0, 90.0), (-20.0, 180.0))]
     assert found["RV"] == [pytest.approx((0.0, 0.0))] * 2
-    assert facts["instrument"]["geometry"]["object_distance_mm"] == 501.25

@@ -1,4 +1,4 @@
-"""NetCDF and Zarr of a folder of products, read back by xarray."""
+"""NetCDF of a folder of products, read back by xarray."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import xarray
 
 from polysight.cli.main import main
 from polysight.imaging import Images
-from polysight.products import dataset_files, write_image, write_json
-from polysight.products.dataset_files import join_complex, read_netcdf, split_complex
+from polysight.products import datasets, write_image, write_json
+from polysight.products.datasets import join_complex, read_netcdf, split_complex
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import DataError
 from polysight_shared.tables import to_builtins
@@ -45,53 +45,53 @@ def folder(tmp_path):
     return made
 
 
-def both(folder: Path) -> list[xarray.Dataset]:
-    """The two files of a folder of products, read."""
+def exported(folder: Path) -> xarray.Dataset:
+    """The NetCDF file of a folder of products, read."""
     out = folder.parent / "out"
-    assert main(["export", str(folder), "--netcdf", "--zarr", "--out", str(out)]) == 0
-    return [read_netcdf(out / "image.nc"), xarray.open_zarr(out / "image.zarr").load()]
+    assert main(["export", str(folder), "--netcdf", "--out", str(out)]) == 0
+    return read_netcdf(out / "image.nc")
 
 
-def test_the_files_hold_the_products(folder):
+def test_the_file_holds_the_products(folder):
+    dataset = exported(folder)
     with np.load(folder / "image.npz") as saved:
-        for dataset in both(folder):
-            for name in ("h", "v", "p", "valid"):
-                np.testing.assert_array_equal(dataset[name], saved[name])
-                assert dataset[name].dtype == saved[name].dtype
-                assert dataset[name].dims == ("y", "x")
-            for axis in "xy":
-                np.testing.assert_array_equal(dataset[axis], saved[f"{axis}_m"])
-                assert dataset[axis].attrs["units"] == "m"
+        for name in ("h", "v", "p", "valid"):
+            np.testing.assert_array_equal(dataset[name], saved[name])
+            assert dataset[name].dtype == saved[name].dtype
+            assert dataset[name].dims == ("y", "x")
+        for axis in "xy":
+            np.testing.assert_array_equal(dataset[axis], saved[f"{axis}_m"])
+            assert dataset[axis].attrs["units"] == "m"
 
 
 def test_the_table_is_that_of_the_materials_in_si_units(folder):
-    for dataset in both(folder):
-        pet, metal = dataset.sel(patch=4), dataset.sel(patch=5)
-        assert (pet["name"], pet["runner_up"], metal["name"]) == ("PET", "glass", "")
-        assert (pet["confidence"], pet["runner_up_share"]) == (0.75, 0.2)
-        assert complex(pet["permittivity"]) == 3.5 - 0.25j
-        assert (pet["permittivity_real_standard_error"], pet["permittivity_loss_standard_error"]) == (0.0625, 0.125)
-        assert complex(pet["ratio"]) == 10j
-        assert np.isnan(metal["permittivity"])
-        assert float(pet["centre_x"]) == pytest.approx(0.01)
-        assert float(pet["centre_y"]) == pytest.approx(0.1)
-        assert float(pet["width"]) == pytest.approx(0.08)
-        assert dataset["label"].dtype == np.int32
-        inside = dataset["label"].sel(x=pet["centre_x"], y=pet["centre_y"], method="nearest")
-        assert (inside, dataset["label"].sel(x=-0.1, y=0.1, method="nearest")) == (4, 5)
+    dataset = exported(folder)
+    pet, metal = dataset.sel(patch=4), dataset.sel(patch=5)
+    assert (pet["name"], pet["runner_up"], metal["name"]) == ("PET", "glass", "")
+    assert (pet["confidence"], pet["runner_up_share"]) == (0.75, 0.2)
+    assert complex(pet["permittivity"]) == 3.5 - 0.25j
+    assert (pet["permittivity_real_standard_error"], pet["permittivity_loss_standard_error"]) == (0.0625, 0.125)
+    assert complex(pet["ratio"]) == 10j
+    assert np.isnan(metal["permittivity"])
+    assert float(pet["centre_x"]) == pytest.approx(0.01)
+    assert float(pet["centre_y"]) == pytest.approx(0.1)
+    assert float(pet["width"]) == pytest.approx(0.08)
+    assert dataset["label"].dtype == np.int32
+    inside = dataset["label"].sel(x=pet["centre_x"], y=pet["centre_y"], method="nearest")
+    assert (inside, dataset["label"].sel(x=-0.1, y=0.1, method="nearest")) == (4, 5)
 
 
 def test_the_attributes_say_where_it_comes_from(folder):
-    for dataset in both(folder):
-        assert dataset.attrs["scan_id"] == "s"
-        assert dataset.attrs["simulated"] is True
-        assert dataset.attrs["rows_missing"].startswith("2-4, 6-")
-        assert dataset.attrs["positions_masked"] == "RH 2 of 9"
-        assert '"columns"' in dataset.attrs["instrument"]
+    attributes = exported(folder).attrs
+    assert attributes["scan_id"] == "s"
+    assert attributes["simulated"] is True
+    assert attributes["rows_missing"].startswith("2-4, 6-")
+    assert attributes["positions_masked"] == "RH 2 of 9"
+    assert '"columns"' in attributes["instrument"]
 
 
 def test_netcdf_has_no_complex_variables(folder):
-    both(folder)
+    exported(folder)
     with h5py.File(folder.parent / "out" / "image.nc") as f:
         assert {"h_real", "h_imag", "p_real", "p_imag", "permittivity_real", "permittivity_imag"} <= set(f)
         assert not {"h", "permittivity"} & set(f)
@@ -120,23 +120,22 @@ def test_splitting_and_joining_is_the_identity():
 def test_images_alone_export_too(folder):
     for name in ("materials.json", "scan.json", "quality.json"):
         (folder / name).unlink()
-    for dataset in both(folder):
-        assert set(dataset.dims) == {"y", "x"}
-        assert dataset.attrs["simulated"] == "unknown"
-        assert dataset.attrs["metal_reference"].startswith("none")
+    dataset = exported(folder)
+    assert set(dataset.dims) == {"y", "x"}
+    assert dataset.attrs["simulated"] == "unknown"
+    assert dataset.attrs["metal_reference"].startswith("none")
 
 
-@pytest.mark.parametrize(("option", "package"), [("--netcdf", "h5netcdf"), ("--zarr", "zarr")])
-def test_a_missing_package_is_named_with_its_extra(folder, monkeypatch, capsys, option, package):
+def test_a_missing_package_is_named_with_its_extra(folder, monkeypatch, capsys):
     def absent(name):
         raise ImportError(name)
 
-    monkeypatch.setattr(dataset_files, "import_module", absent)
+    monkeypatch.setattr(datasets, "import_module", absent)
     out = folder.parent / "out"
-    assert main(["export", str(folder), option, "--out", str(out)]) == 2
-    said = capsys.readouterr().err
-    assert "pip install 'polysight[export]'" in said
-    assert package in said
+    assert main(["export", str(folder), "--netcdf", "--out", str(out)]) == 2
+    message = capsys.readouterr().err
+    assert "pip install 'polysight[export]'" in message
+    assert "h5netcdf" in message
     assert not list(out.iterdir())
 
 

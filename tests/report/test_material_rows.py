@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 
-import h5py
 import numpy as np
 import pytest
 import scipy.io
@@ -65,7 +64,7 @@ def exported(tmp_path):
     axes = (np.array([-0.1, 0.0, 0.1]), np.array([0.0, 0.1]))
     write_image(products / "image.npz", Images(ones, ones, *axes, np.ones((2, 3), bool), ones))
     write_json(products / "materials.json", {"scan_id": "s", "simulated": True, "segments": [PATCH, METAL]})
-    assert main(["export", str(products), "--csv", "--hdf5", "--mat", "--out", str(tmp_path / "out")]) == 0
+    assert main(["export", str(products), "--csv", "--mat", "--out", str(tmp_path / "out")]) == 0
     return tmp_path / "out"
 
 
@@ -82,15 +81,6 @@ def same(values, expected) -> bool:
     if any(isinstance(e, str) for e in expected):
         return ["" if np.size(v) == 0 else v for v in values] == ["" if e is None else e for e in expected]
     return np.array_equal(np.asarray(values, float), [np.nan if e is None else e for e in expected], equal_nan=True)
-
-
-def test_hdf5(exported):
-    with h5py.File(exported / "image.h5") as f:
-        found = {name: f[f"materials/{name}"][()] for name in f["materials"]}
-    assert set(found) == set(EXPECTED)
-    for name, expected in EXPECTED.items():
-        values = [v.decode() if isinstance(v, bytes) else v for v in found[name]]
-        assert same(values, expected), name
 
 
 def test_matlab(exported):

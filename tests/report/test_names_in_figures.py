@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from html import unescape
 
 import numpy as np
 import pytest
 from matplotlib.font_manager import findfont, get_font
+from tests.support.products import computed
 
+from polysight.imaging import Images
+from polysight.materials import TruthPlate
+from polysight.products import ProcessedScan
 from polysight.report import style
-from polysight.report.context import ReportContext
 from polysight.report.figures import figures
 from polysight.report.report import render, write_report
 from polysight.report.style import figure_label, font_families, is_drawable
+from polysight.results import ScanFacts
 
 NAMES = ["木板", "ガラス", "유리 3", "стекло", "Plexiglas®", "\U0001f9f1 brick", "tab\there", "a $b$ c_{", "زجاج"]
 PERMITTIVITY = {"real": 3.9, "imag": -0.6, "real_p30_p70": [3.8, 4.0], "imag_p30_p70": [-0.7, -0.5]}
@@ -29,15 +32,16 @@ def row(label: int, name: str, truth: str) -> dict:
     }  # fmt: skip
 
 
-def context(names: list[str]) -> ReportContext:
+def context(names: list[str]) -> ProcessedScan:
     image = np.full((12, 12), 0.5 + 0.1j, np.complex64)
     axis = np.linspace(-0.05, 0.05, 12)
-    return ReportContext(
-        title=" ".join(names), simulated=True, x_m=axis, y_m=axis, h=image, v=image / 2, p=image * 2,
-        valid=np.ones((12, 12), bool), segments=np.ones((12, 12), np.int32),
-        materials=[row(k, name, name) for k, name in enumerate(names, 1)],
-        truth=[{"name": name, "box_mm": (-20, -20, 20, 20), "permittivity": 4 - 0.4j} for name in names],
-    )  # fmt: skip
+    return computed(
+        Images(image, image / 2, axis, axis, np.ones((12, 12), bool), image * 2),
+        {"segments": [row(k, name, name) for k, name in enumerate(names, 1)]},
+        {},
+        facts=ScanFacts(scan_id=" ".join(names), simulated=True),
+        plates=tuple(TruthPlate(name, (-20, -20, 20, 20), 4 - 0.4j) for name in names),
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -84,7 +88,7 @@ def test_an_installed_font_that_has_the_glyph_draws_the_name(monkeypatch):
         assert font_families() == (style.OWN, "STIXGeneral")
         assert figure_label(glyph, "patch 1") == glyph
         drawn = figures(context([glyph]))["materials"]
-        assert drawn != figures(replace(context(["?"]), title=glyph))["materials"]
+        assert drawn != figures(context(["?"]))["materials"]
     finally:
         for cached in caches:
             cached.cache_clear()

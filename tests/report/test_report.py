@@ -2,20 +2,22 @@
 
 import base64
 import re
-from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from matplotlib import colormaps
-from tests.support.products import unrendered
+from tests.support.products import changed, computed, unrendered
+from tests.support.rigs import rig_table
 
-from polysight.process import masked_runs
-from polysight.report import ReportContext, write_report
-from polysight.report.maps import coverage_figure
-from polysight.report.report import render
+from polysight.imaging import Images
+from polysight.materials import TruthPlate
+from polysight.process.quality import masked_runs
+from polysight.report import write_report
+from polysight.report.figures import coverage_figure, masked_positions
+from polysight.report.report import imaging_table, pretty, quality_tables, render, text
 from polysight.report.style import colours_of, png
-from polysight.report.tables import imaging_table, masked_positions, pretty, quality_tables, text
+from polysight.results import RxGain, ScanFacts, ScanQuality
 from polysight_shared.raster import RasterPlan
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -62,11 +64,11 @@ MATERIALS = [
         "truth": {"name": "acrylic", "metal": False, "permittivity": {"real": 4.0, "imag": -0.4}},
     },
 ]  # fmt: skip
-TRUTH = [
-    {"name": "copper", "box_mm": (-50, -20, -10, 20), "permittivity": None},
-    {"name": "acrylic", "box_mm": (10, -20, 50, 20), "permittivity": 4 - 0.4j},
-    {"name": "cork", "box_mm": (-10, 30, 10, 50), "permittivity": 10.6 - 0j},
-]
+TRUTH = (
+    TruthPlate("copper", (-50, -20, -10, 20), None),
+    TruthPlate("acrylic", (10, -20, 50, 20), 4 - 0.4j),
+    TruthPlate("cork", (-10, 30, 10, 50), 10.6 - 0j),
+)
 QUALITY = {
     "boards": {
         "RH": {
@@ -76,7 +78,7 @@ QUALITY = {
             "synchronisation": {"averaged": {"frequency_std_hz": 31.0, "phase_std_rad": 0.005}},
         }
     },
-    "rows_retaken": [3],
+    "rows_retaken": 3,
     "seconds_per_stage": {"align": 2.0, "image": 0.5},
 }
 
@@ -97,40 +99,31 @@ def two_plates():
 
 
 @pytest.fixture(scope="module")
-def ctx():
+def scan():
     """Two plates, one of them named wrong, and a third that was not found."""
     h, v, p, segments = two_plates()
     x = np.linspace(-0.06, 0.06, 61)
     interior = np.zeros((61, 61), bool)
     interior[25:35, 40:50] = True
-    return ReportContext(
-        title="Two <plates> & more",
-        simulated=True,
-        x_m=x,
-        y_m=x + 0.1,
-        h=h,
-        v=v,
-        p=p,
-        valid=np.ones((61, 61), bool),
-        materials=MATERIALS,
-        segments=segments,
+    return computed(
+        Images(h, v, x, x + 0.1, np.ones((61, 61), bool), p),
+        {
+            "segments": MATERIALS, "pixel_accuracy": 0.5, "library": "a library.", "model": "knn",
+            "metal_reference": {"how": "given as patch 1"},
+        },
+        QUALITY,
+        facts=ScanFacts(scan_id="of two <plates> & more", simulated=True, processed_utc="2026-11-23T10:00:00+00:00"),
+        labels=segments,
         pixel_names={2: (np.array(["PET <b>", "unknown"] * 50), interior)},
-        truth=TRUTH,
-        metal_how="given as patch 1",
-        pixel_accuracy=0.5,
+        plates=TRUTH,
         expected_accuracy=0.96,
-        library_note="a library.",
-        quality=QUALITY,
-        config={"grid": "140 x 120"},
-        provenance={"scan": "abc"},
-        notes=["Never ran on hardware."],
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def page(ctx, tmp_path_factory):
+def page(scan, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
-    path = write_report(out, ctx)
+    path = write_report(out, scan)
     return out, path.read_text(encoding="utf-8")
 
 
@@ -166,15 +159,15 @@ def test_images_are_embedded_and_lie_beside_it(page):
 def test_simulated_is_said_everywhere(page):
     _, html = page
     words = Page(html).words
-    assert words.startswith("SIMULATED: Two")
+    assert words.startswith("SIMULATED: Scan of two")
     assert words.count("SIMULATED") >= 3 + html.count("<figure") + html.count("<caption")
     for alt in re.findall(r'alt="([^"]*)"', html):
         assert "simulated" in alt
 
 
-def test_measured_data_is_not_called_simulated(ctx, tmp_path):
+def test_measured_data_is_not_called_simulated(scan, tmp_path):
     with unrendered():
-        html = write_report(tmp_path, replace(ctx, simulated=False)).read_text(encoding="utf-8")
+        html = write_report(tmp_path, changed(scan, facts=ScanFacts(simulated=False))).read_text(encoding="utf-8")
     assert "simulated" not in Page(html).words.lower()
 
 
@@ -194,34 +187,32 @@ def test_results_stand_beside_the_truth(page):
     assert "frames masked 2" in words
     assert "averaged 31 0.005" in words
     assert "rows retaken" in words
-    assert "Never ran on hardware." in words
+    assert "Nothing of this instrument has run on hardware yet." in words
 
 
 def test_names_cannot_break_the_page(page):
     _, html = page
     assert "PET <b>" not in html
     assert "PET &lt;b&gt;" in html
-    assert "Two &lt;plates&gt; &amp; more" in html
+    assert "two &lt;plates&gt; &amp; more" in html
 
 
-def test_bare_images_make_a_report_too(ctx, tmp_path):
-    bare = ReportContext("Bare", False, ctx.x_m, ctx.y_m, ctx.h, ctx.v, ctx.p, metal_referenced=False)
+def test_bare_images_make_a_report_too(scan, tmp_path):
+    bare = computed(scan.images, None, {})
     words = Page(write_report(tmp_path, bare).read_text(encoding="utf-8")).words
     assert "Images" in words
     assert "Materials" not in words
     assert "Quality" not in words
 
 
-def test_dark_and_invalid_images_do_not_fail(ctx, tmp_path):
-    zero = np.zeros_like(ctx.h)
-    nothing = ReportContext(
-        "Dark", True, ctx.x_m, ctx.y_m, zero, zero, zero * np.complex64(np.nan), valid=np.zeros(zero.shape, bool)
-    )
-    assert write_report(tmp_path, nothing).exists()
+def test_dark_and_invalid_images_do_not_fail(scan, tmp_path):
+    zero = np.zeros_like(scan.h)
+    dark = Images(zero, zero, scan.x_m, scan.y_m, np.zeros(zero.shape, bool), zero * np.complex64(np.nan))
+    assert write_report(tmp_path, computed(dark, {}, {})).exists()
 
 
-def test_one_material_has_one_colour(ctx):
-    table = colours_of(ctx)
+def test_one_material_has_one_colour(scan):
+    table = colours_of(scan)
     assert {"copper", "acrylic", "cork", "PET <b>", "unknown"} == set(table)
     assert len(set(table.values())) == len(table)
 
@@ -237,32 +228,30 @@ def test_numbers_read_well():
     assert pretty("rows_retaken") == "rows retaken"
 
 
-def scanned(ctx, boards):
-    return replace(ctx, plan=RasterPlan(6, 4, 10.0, 5.0), quality={**ctx.quality, "boards": boards})
+def scanned(scan, boards):
+    return changed(scan, plan=RasterPlan(6, 4, 10.0, 5.0), quality=ScanQuality.decode({"boards": boards}))
 
 
-def test_masked_positions_come_out_of_runs_and_of_rows_that_are_absent(ctx):
+def test_masked_positions_come_out_of_runs_and_of_rows_that_are_absent(scan):
     boards = {"RH": {"masked_columns": {"2": [[0, 2], [5, 6]]}, "rows_recorded": [0, 1, 2]}}
-    mask = masked_positions(scanned(ctx, boards))["RH"]
+    mask = masked_positions(scanned(scan, boards))["RH"]
     assert np.argwhere(mask).tolist() == [[2, 0], [2, 1], [2, 5], *([3, c] for c in range(6))]
 
 
-def test_runs_and_their_mask_are_the_same(ctx):
+def test_runs_and_their_mask_are_the_same(scan):
     rng = np.random.default_rng(5)
     for share in (0.0, 0.3, 1.0):
         rows = rng.uniform(size=(4, 6)) < share
         runs = {str(i): masked_runs(row) for i, row in enumerate(rows) if row.any()}
-        found = masked_positions(scanned(ctx, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}}))
+        found = masked_positions(scanned(scan, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}}))
         assert (found["RH"] == rows).all()
 
 
-def test_the_report_says_what_was_masked_the_gains_and_the_whole_rig_file(ctx):
+def test_the_report_says_what_was_masked_the_gains_and_the_whole_rig_file(scan):
     boards = {"RH": {"masked_columns": {"2": [[0, 3]]}, "rows_recorded": [0, 1, 2, 3], "raw_crc32": {"0": "deadbeef"}}}
-    answer = replace(
-        scanned(ctx, boards),
-        rx_gains={"RH": [{"gain_db": 0.0, "phase_deg": 0.0}, {"gain_db": 1.25, "phase_deg": -8.1}]},
-        rig_file='name = "a <rig>"',
-    )
+    gains = {"RH": [RxGain(0.0, 0.0), RxGain(1.25, -8.1)]}
+    rig = rig_table() | {"name": "a <rig>"}
+    answer = changed(scanned(scan, boards), facts=ScanFacts(simulated=True, rx_gains=gains, instrument=rig))
     picture = png(coverage_figure(answer, masked_positions(answer)))
     page = Page(render(answer, {"coverage": picture}))
     assert base64.b64encode(picture).decode() in page.sources[0]
@@ -273,9 +262,9 @@ def test_the_report_says_what_was_masked_the_gains_and_the_whole_rig_file(ctx):
     assert "deadbeef" not in page.words
 
 
-def test_without_anything_masked_that_is_said(ctx):
+def test_without_anything_masked_that_is_said(scan):
     boards = {"RH": {"masked_columns": {}, "rows_recorded": [0, 1, 2, 3]}}
-    assert "Every position of every board has data." in Page(render(scanned(ctx, boards), {})).words
+    assert "Every position of every board has data." in Page(render(scanned(scan, boards), {})).words
 
 
 def test_the_maps_of_amplitude_keep_their_order_in_grey_and_the_phase_map_is_cyclic():
@@ -286,9 +275,9 @@ def test_the_maps_of_amplitude_keep_their_order_in_grey_and_the_phase_map_is_cyc
     assert np.abs(ends[0] - ends[1]).max() < 0.02
 
 
-def test_a_board_s_figures_stand_one_by_one_and_keep_their_units(ctx):
-    board = {"frames_expected": 7, "direct_path_hz": {"median": 123.0, "min": 9}, "stage_backlash_mm": None}
-    words = Page(render(replace(ctx, quality={"boards": {"RH": board}}), {})).words
+def test_a_board_s_figures_stand_one_by_one_and_keep_their_units(scan):
+    board = {"frames_expected": 7, "direct_path_hz": {"median": 123.0, "min": 9, "max": 200}, "stage_backlash_mm": None}
+    words = Page(render(scanned(scan, {"RH": board}), {})).words
     assert "direct path median (Hz) 123" in words
     assert "direct path min (Hz) 9" in words
     assert "stage backlash (mm) –" in words

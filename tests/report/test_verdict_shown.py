@@ -2,43 +2,58 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from html import unescape
 from unittest.mock import patch
 
+import msgspec
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
-from tests.support.products import BUDGET, NAMES, PERMITTIVITY, REASON, judged_products, segments, unrendered
+from tests.support.products import (
+    BUDGET,
+    NAMES,
+    PERMITTIVITY,
+    REASON,
+    changed,
+    computed,
+    judged_products,
+    segments,
+    unrendered,
+)
 
-from polysight.api.plot import plot_scan
-from polysight.products import ProcessedScan, permittivity_spread, read_products
-from polysight.report import ReportContext, write_report
+from polysight import open_scan
+from polysight.materials import TruthPlate
+from polysight.products import ProcessedScan, read_products
+from polysight.report import write_report
 from polysight.report.ellipses import SHARES, ellipse_of, place_numbers
-from polysight.report.figures import channel_figure, phase_limits_deg
-from polysight.report.maps import draw_materials, permittivity_map
+from polysight.report.figures import channel_figure, draw_materials, permittivity_map, phase_limits_deg
+from polysight.report.report import budget_table
 from polysight.report.style import shorten_labels
-from polysight.report.tables import budget_table
+from polysight.results import ErrorBudget, PermittivityFigures
 from polysight.results.verdict import LEVELS
 
 RESULTS = (*NAMES, "2.90", "± 0.20", "ε′ ±")
 
 
-def context(folder, **more) -> ReportContext:
+def processed(folder, rows=None) -> ProcessedScan:
     """What processing hands to the report: names in patches, pixels and truth, and quality.json."""
-    p = read_products(folder)
-    interior = np.zeros(p.h.shape, bool)
+    saved = read_products(folder)
+    interior = np.zeros(saved.h.shape, bool)
     interior[5:9, 12:16] = True
-    given = ReportContext(
-        title="one", simulated=True, x_m=p.x_m, y_m=p.y_m, h=p.h, v=p.v, p=p.p, valid=p.valid,
-        materials=segments("good"), pixel_names={2: (np.array(["PET"] * 16), interior)}, pixel_accuracy=0.5,
-        truth=[{"name": "acrylic", "box_mm": (-10.0, -20.0, 15.0, 20.0), "permittivity": 3 - 0.3j}],
-        library_note="Of its materials 1 could not be judged: copper.", quality=p.quality,
-    )  # fmt: skip
-    return replace(given, **more)
+    content = json.loads((folder / "materials.json").read_text(encoding="utf-8"))
+    content |= {"segments": rows or segments("good"), "library": "Of its materials 1 could not be judged: copper."}
+    return computed(
+        saved.images,
+        {**content, "pixel_accuracy": 0.5, "model": "knn"},
+        json.loads((folder / "quality.json").read_text(encoding="utf-8")),
+        pixel_names={2: (np.array(["PET"] * 16), interior)},
+        plates=(TruthPlate("acrylic", (-10.0, -20.0, 15.0, 20.0), 3 - 0.3j),),
+    )
 
 
 def drawn_text(make) -> str:
@@ -63,7 +78,7 @@ def drawn_text(make) -> str:
 def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
     folder = judged_products(tmp_path, level)
     with unrendered():
-        page = unescape(write_report(folder, context(folder)).read_text(encoding="utf-8"))
+        page = unescape(write_report(folder, processed(folder)).read_text(encoding="utf-8"))
     head = page[page.index("<main>") : page.index("<h2>Images")]
     assert f'<span class="badge">{LEVELS[level]}</span>' in head
     for part in REASON.values():
@@ -77,8 +92,8 @@ def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
 def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_path, careless):
     folder = judged_products(tmp_path, "none", careless)
     with unrendered():
-        text = drawn_text(lambda: write_report(folder, context(folder)))
-    text += drawn_text(lambda: plot_scan(ProcessedScan(folder)))
+        text = drawn_text(lambda: write_report(folder, processed(folder)))
+    text += drawn_text(lambda: open_scan(folder).plot())
     page = unescape((folder / "report.html").read_text(encoding="utf-8"))
     for part in (text, page[page.index("<main>") :]):
         assert [word for word in RESULTS if word in part] == []
@@ -89,7 +104,7 @@ def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_
 
 def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path):
     folder = judged_products(tmp_path, "care")
-    page = unescape(write_report(folder, context(folder)).read_text(encoding="utf-8"))
+    page = unescape(write_report(folder, processed(folder)).read_text(encoding="utf-8"))
     assert "2.90 ± 0.20" in page
     assert "0.20 ± 0.10" in page
     assert "leakage (60 %)" in page
@@ -101,11 +116,11 @@ def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path)
 def test_products_of_earlier_releases_have_no_verdict_and_no_budget(tmp_path):
     folder = judged_products(tmp_path, None)
     with unrendered():
-        page = unescape(write_report(folder, context(folder, materials=segments(None))).read_text(encoding="utf-8"))
+        page = unescape(write_report(folder, processed(folder, segments(None))).read_text(encoding="utf-8"))
     assert 'class="verdict' not in page
     assert "Error budget" not in page
     assert "2.90 ± 0.20" in page
-    assert budget_table({}) is None
+    assert budget_table(ErrorBudget()) is None
 
 
 @pytest.mark.parametrize("share", SHARES)
@@ -122,7 +137,9 @@ def test_an_ellipse_holds_its_share_of_draws(share, mixed):
 
 
 def test_an_ellipse_leans_as_real_part_and_loss_do():
-    spread = permittivity_spread(PERMITTIVITY)  # real and imag rise together: the loss falls as the real part rises
+    spread = PermittivityFigures(
+        **PERMITTIVITY
+    ).spread  # real and imag rise together: the loss falls as the real part rises
     assert spread is not None
     width, height, angle = ellipse_of(spread.matrix, 0.68)
     assert np.tan(np.radians(angle if width > height else angle + 90)) < 0
@@ -145,38 +162,38 @@ def test_long_names_of_close_patches_become_numbers_that_do_not_touch(tmp_path):
          "box_mm": [16 * k - 24, 16 * i - 24, 16 * k - 10, 16 * i - 10]}
         for i in range(3) for k in range(3)
     ]  # fmt: skip
-    ctx = context(judged_products(tmp_path, "good"), materials=rows, pixel_names={}, truth=None)
+    scan = changed(processed(judged_products(tmp_path, "good"), rows), pixel_names={}, plates=())
     fig = Figure(figsize=(4.6, 4.6), dpi=160, layout="constrained")
     FigureCanvasAgg(fig)
-    labels = draw_materials(fig.add_subplot(), ctx)
+    labels = draw_materials(fig.add_subplot(), scan)
     assert shorten_labels(fig, labels) == labels
     fig.draw_without_rendering()
     boxes = [one.text.get_window_extent() for one in labels]
     assert not any(Bbox.intersection(a, b) for i, a in enumerate(boxes) for b in boxes[:i])
-    assert permittivity_map(ctx) is not None
+    assert permittivity_map(scan) is not None
 
 
 def test_the_phase_of_p_has_the_range_of_the_patches_across_180_degrees(tmp_path):
-    ctx = context(judged_products(tmp_path, "good"))
+    scan = processed(judged_products(tmp_path, "good"))
     p = np.exp(1j * np.radians(np.where(np.arange(30) % 2, 170.0, -170.0)))[None, :] * np.ones((20, 1))
-    limits = phase_limits_deg(replace(ctx, p=p))
+    limits = phase_limits_deg(changed(scan, images=replace(scan.images, p=p)))
     assert limits is not None
     low, high = limits
     assert high - low < 40
     assert any(low <= 170 + turn <= high and low <= 190 + turn <= high for turn in (-360, 0))
-    assert phase_limits_deg(replace(ctx, materials=[])) is None
+    assert phase_limits_deg(changed(scan, materials=None)) is None
     random = np.exp(2j * np.pi * np.random.default_rng(1).uniform(size=p.shape))
-    assert phase_limits_deg(replace(ctx, p=random)) is None
+    assert phase_limits_deg(changed(scan, images=replace(scan.images, p=random))) is None
 
 
 def test_a_ratio_of_nearly_one_has_no_negative_zero(tmp_path):
-    ctx = context(judged_products(tmp_path, "good"))
-    ctx = replace(ctx, materials=[{**ctx.materials[0], "ratio": {"real": 0.9999, "imag": -1e-4}}])
-    text = drawn_text(lambda: [channel_figure(ctx, key) for key in ("amplitude_p", "phase_p")])
+    rows = [{**segments("good")[0], "ratio": {"real": 0.9999, "imag": -1e-4}}]
+    scan = processed(judged_products(tmp_path, "good"), rows)
+    text = drawn_text(lambda: [channel_figure(scan, key) for key in ("amplitude_p", "phase_p")])
     assert {"0.0", "0°"} <= set(text.split("\n"))
 
 
 @pytest.mark.parametrize("key", BUDGET)
 def test_an_error_budget_with_a_part_alone_is_shown(key):
-    assert budget_table({key: BUDGET[key]})
-    assert budget_table({"plane": {"known": False}})
+    assert budget_table(msgspec.convert({key: BUDGET[key]}, ErrorBudget))
+    assert budget_table(msgspec.convert({"plane": {"known": False}}, ErrorBudget))

@@ -19,7 +19,7 @@ from tests.support.scenes import COPPER, PET
 
 from polysight.catalogue import Notes, read_notes, write_notes
 from polysight.materials import Library, read_labels
-from polysight.products import SavedProducts
+from polysight.products import ProcessedScan
 from polysight.serve.programs import program_of
 
 pytestmark = pytest.mark.xdist_group("browser")
@@ -313,7 +313,7 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
     found = program_of(scans / "one", "process")
     assert found is not None
     assert "--labels" in found.words
-    named = [s["name"] for s in SavedProducts(scans / "one" / "products").segments if not s["metal_reference"]]
+    named = [s["name"] for s in ProcessedScan(scans / "one" / "products").segments if not s["metal_reference"]]
     assert named == ["my plastic"]
     page.whole()
 

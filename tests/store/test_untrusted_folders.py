@@ -25,8 +25,9 @@ from polysight.materials.labels import read_labels, read_truth
 from polysight.materials.library import Library
 from polysight.materials.published import read_material
 from polysight.materials.result import read_patches
-from polysight.products.dataset_files import read_netcdf
-from polysight.products.files import SavedProducts, read_image, write_atomically
+from polysight.products import ProcessedScan
+from polysight.products.datasets import read_netcdf
+from polysight.products.files import read_image, write_atomically
 from polysight.products.folder import making_products
 from polysight.store import manifest
 from polysight.store.published import read_json as read_settings_json
@@ -257,7 +258,7 @@ DEEP = "[" * 100_000
 
 
 @pytest.mark.parametrize(
-    "read", [read_index, read_truth, read_labels, read_settings_json, lambda p: SavedProducts(p.parent).quality]
+    "read", [read_index, read_truth, read_labels, read_settings_json, lambda p: ProcessedScan(p.parent).quality]
 )
 def test_json_that_is_nested_too_deeply_is_refused(read, tmp_path):
     (tmp_path / "quality.json").write_text(DEEP)

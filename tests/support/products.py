@@ -14,7 +14,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from polysight.imaging import Images
-from polysight.products import write_image, write_json
+from polysight.products import ProcessedScan, write_image, write_json
+from polysight.products.processed import Computed
+from polysight.results import ScanFacts, ScanMaterials, ScanQuality
 
 NAMES = ("PET", "acrylic", "copper")
 REASON = {"what": "no metal reference", "why": "it is the only patch", "do": "lay a metal plate into the scene"}
@@ -74,6 +76,21 @@ def judged_products(folder: Path, level: str | None, careless: bool = False) -> 
     write_json(folder / "quality.json", quality)
     write_json(folder / "scan.json", {"scan_id": "s", "simulated": True})
     return folder
+
+
+def computed(images: Images, content: dict[str, Any] | None, quality: dict[str, Any], **more: Any) -> ProcessedScan:
+    """A result that was just computed, with these contents of materials.json (None: images only) and quality.json."""
+    given: dict[str, Any] = {"facts": ScanFacts(scan_id="s", simulated=True), "plates": (), **more}
+    materials = None if content is None else ScanMaterials.decode(content)
+    return ProcessedScan.computed(
+        Path(), images=images, materials=materials, quality=ScanQuality.decode(quality), **given
+    )
+
+
+def changed(scan: ProcessedScan, **content: Any) -> ProcessedScan:
+    """The same result with other contents."""
+    given = {name: value for name, value in vars(scan).items() if name in Computed.__annotations__}
+    return ProcessedScan.computed(scan.folder, **{**given, **content})
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

@@ -3,7 +3,7 @@
 :func:`open_scan` opens recorded data or the products of an earlier run and gives a :class:`Scan`. Its methods `image`,
 `patches`, `permittivity`, `materials` return `xarray.Dataset`; `plot` returns a matplotlib figure. Rows are read and
 images are formed once, when a result is first asked for, and nothing is written to disk unless
-:meth:`Scan.to_netcdf` or :meth:`Scan.to_zarr` is called. :func:`read_netcdf` reads such a file back. The functions
+:meth:`Scan.to_netcdf` is called. :func:`read_netcdf` reads such a file back. The functions
 that need no scan (`backproject`, `fresnel`, `permittivity_from_ratio`, `multilayer`) are in `polysight` itself.
 """
 

@@ -47,7 +47,7 @@ def layer_dataset(
         "notes": described(notes, "", "rivals and other warnings"),
     }
     return xarray.Dataset(
-        table, {"patch": described([row["label"] for row in done.segments], "1", "number of the patch")}
+        table, {"patch": described([patch.label for patch in done.segments], "1", "number of the patch")}
     )
 
 

@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from polysight.products import ProcessedScan
-from polysight.report import ReportContext, draw_overview, figure_label, font_families
+from polysight.report import draw_overview, figure_label, font_families
 
 _PANEL_IN = 3.8  # width of one picture
 
@@ -30,9 +30,7 @@ def plot_scan(done: ProcessedScan) -> Figure:
     size = (columns * (_PANEL_IN + 1.2), rows * (height_in + 0.4) + 0.5)
     fig = NotebookFigure(figsize=size, dpi=100, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
-    draw_overview(
-        fig, list(fig.subplots(rows, columns).flat), ReportContext.of_products(done, done.labels), bar_labels=True
-    )
+    draw_overview(fig, list(fig.subplots(rows, columns).flat), done, bar_labels=True)
     stamp = {True: " (simulated)", False: "", None: " (not known whether simulated)"}[done.simulated]
     title = figure_label(f"Scan {done.scan_id}{stamp}", "title")
     fig.suptitle(title, fontsize=12, family=list(font_families()), parse_math=False)

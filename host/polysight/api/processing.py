@@ -6,14 +6,11 @@ import warnings
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from polysight.imaging import Images
-from polysight.materials import find_truth, pixel_accuracy
+from polysight.materials import find_truth
 from polysight.pipeline import Pipeline
-from polysight.polarimetry import with_ratio
-from polysight.process import materials_content, why_unnamed
-from polysight.products import ProcessedScan, plain, scan_facts, withhold
+from polysight.process import imaged_scan, processed_scan, why_unnamed
+from polysight.products import ProcessedScan
 from polysight.settings import Settings
 from polysight.store import Source
 
@@ -44,8 +41,8 @@ class Processing:
     @cached_property
     def unreferenced(self) -> ProcessedScan:
         """Images in arbitrary units, as `polysight image` writes them. Raises PolysightError."""
-        images, none = self._images, np.zeros(self._images.h.shape, np.int32)
-        return self._processed(with_ratio(images), {}, none, None)
+        pipeline = self.pipeline
+        return imaged_scan(self.folder, self.source, pipeline.rig, self._images, pipeline.quality)
 
     @cached_property
     def referenced(self) -> ProcessedScan:
@@ -62,22 +59,4 @@ class Processing:
         if note:
             warnings.warn(note, stacklevel=2)
         findings = pipeline.examine(self._images, plates)
-        found = findings.found
-        pipeline.quality.note(pixel_accuracy=pixel_accuracy(found), verdict=findings.verdict.to_dict())
-        labels = found.segmentation.labels
-        interior = np.zeros(labels.shape, bool)
-        for patch in found.segmentation.patches:
-            interior |= patch.interior
-        materials = plain(materials_content(self.source, findings, unnamed))
-        return self._processed(findings.calibrated, materials, labels, interior)
-
-    def _processed(self, images: Images, materials, labels, interior) -> ProcessedScan:
-        return ProcessedScan.computed(
-            self.folder,
-            labels,
-            interior,
-            image=images,
-            scan=plain(scan_facts(self.source, self.pipeline.rig, images)),
-            quality=plain(self.pipeline.quality.to_dict()),
-            materials=withhold(materials),
-        )
+        return processed_scan(self.folder, self.source, pipeline.rig, findings, pipeline.quality, unnamed)

@@ -7,6 +7,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from msgspec import UNSET
+
 from polysight.api.processing import Processing
 from polysight.data import packaged
 from polysight.materials import MODELS, SHORT
@@ -15,14 +17,12 @@ from polysight.products import (
     IMAGE,
     ProcessedScan,
     Rows,
-    SavedProducts,
     find_products,
     full_dataset,
     image_dataset,
     patch_dataset,
     ranges_text,
     write_netcdf,
-    write_zarr,
 )
 from polysight.results import Verdict
 from polysight.settings import Settings
@@ -131,7 +131,7 @@ def _products_only(path: Path, settings: Settings, anew: bool) -> Scan:
             "give the scan folder with these parameters, or leave them out to read the products",
             code=ErrorCode.VALUES_CONFLICT,
         )  # fmt: skip
-    return Scan(path, None, SavedProducts(path), settings)
+    return Scan(path, None, ProcessedScan(path), settings)
 
 
 def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:
@@ -141,13 +141,12 @@ def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) ->
     return open_source(path, rig if isinstance(rig, Instrument) else Path(rig), dropped=True)
 
 
-def _is_current(saved: SavedProducts, scan: ScanFolder) -> bool:
+def _is_current(saved: ProcessedScan, scan: ScanFolder) -> bool:
     """True unless the products say that they were made from other rows than the scan holds now. Raises DataError."""
     committed = scan.committed()
-    for name, board in saved.quality.get("boards", {}).items():
-        made_from = board.get("raw_crc32")
-        there = {str(n): row.boards[name].crc32 for n, row in committed.items() if name in row.boards}
-        if made_from is not None and made_from != there:
+    for name, board in saved.quality.boards.items():
+        recorded = {row: entry.boards[name].crc32 for row, entry in committed.items() if name in entry.boards}
+        if board.raw_crc32 is not UNSET and board.raw_crc32 != recorded:
             return False
     return True
 
@@ -166,7 +165,7 @@ class Scan:
         The folder that was opened.
     """
 
-    def __init__(self, folder: Path, source: Source | None, saved: SavedProducts | None, settings: Settings) -> None:
+    def __init__(self, folder: Path, source: Source | None, saved: ProcessedScan | None, settings: Settings) -> None:
         self.folder = folder
         self._source, self._saved_products, self._settings = source, saved, settings
 
@@ -329,10 +328,6 @@ class Scan:
             as :meth:`image`.
         """
         write_netcdf(Path(path), full_dataset(self._processed(metal_referenced)))
-
-    def to_zarr(self, path: str | os.PathLike[str], *, metal_referenced: bool = True) -> None:
-        """Write all results as one Zarr store, which replaces an earlier one. Raises as :meth:`to_netcdf`."""
-        write_zarr(Path(path), full_dataset(self._processed(metal_referenced)))
 
     def __repr__(self) -> str:
         try:

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from polysight.imaging import Images
 from polysight.materials import axis_mm
 from polysight.polarimetry import permittivity_from_ratio, specular_incidence_rad
-from polysight.products import MATERIALS, SavedProducts
-from polysight.results import PatchFigures, ScanMaterials
+from polysight.products import ProcessedScan
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -39,23 +38,13 @@ THUMBNAIL_PIXELS = 96
 
 
 @dataclass(frozen=True)
-class Pixels(SavedProducts):
+class Pixels(ProcessedScan):
     """Saved products with permittivity and errors of each pixel. Arrays are [ny, nx], row 0 the smallest y."""
 
     @property
     def referenced(self) -> bool:
         """True if the images are relative to metal and the verdict allows a result."""
-        return self.metal_referenced and (self.verdict is None or self.verdict.usable)
-
-    @cached_property
-    def results(self) -> ScanMaterials | None:
-        """Content of materials.json; None if only images were made. Raises DataError if it is damaged."""
-        return ScanMaterials.read(self.folder / MATERIALS)
-
-    @property
-    def figures(self) -> list[PatchFigures]:
-        """Patches; empty if only images were made."""
-        return [] if self.results is None else self.results.segments
+        return self.metal_referenced and self.judged
 
     @cached_property
     def clear(self) -> NDArray[np.bool_]:
@@ -88,14 +77,14 @@ class Pixels(SavedProducts):
     @cached_property
     def p_std(self) -> Real:
         """Standard deviation of each part of P; nan where unknown."""
-        if self.p_sigma is None:
+        if self.images.p_sigma is None:
             return np.full(self.valid.shape, np.nan)
-        return np.asarray(self.p_sigma, np.float64)
+        return np.asarray(self.images.p_sigma, np.float64)
 
     @cached_property
     def theta_rad(self) -> float:
         """Incidence angle, from the error budget or the rig. Raises DataError."""
-        budget = None if self.results is None else self.results.error_budget
+        budget = None if self.materials is None else self.materials.error_budget
         if budget and budget.incidence is not None and budget.incidence.deg is not None:
             return float(np.radians(budget.incidence.deg))
         if self.rig is None:

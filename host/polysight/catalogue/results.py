@@ -26,7 +26,7 @@ from polysight.products import (
     read_products,
     scan_folder_of,
 )
-from polysight.results import ComplexNumber, PatchFigures, PermittivityFigures, ScanFacts, Verdict
+from polysight.results import ComplexNumber, PatchFigures, PermittivityFigures, Verdict
 from polysight.store import MANIFEST, ScanFolder
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError
@@ -94,14 +94,14 @@ def result_of(folder: Path) -> Result:
         if there are none, or one is damaged.
     """
     pixels = Pixels(read_products(folder).folder)
-    source = None if pixels.results is None else pixels.results.metal_reference
+    source = None if pixels.materials is None else pixels.materials.metal_reference
     return Result(
-        processed_utc=ScanFacts.read(pixels.folder / SCAN).processed_utc or "",
+        processed_utc=pixels.facts.processed_utc or "",
         extent_mm=pixels.extent_mm,
         pictures=[drawn for drawn in MAPS.values() if pixels.referenced or not drawn.needs_metal],
         metal=source.how if source else "",
         verdict=pixels.verdict,
-        patches=pixels.figures,
+        patches=pixels.segments,
         labels=_labels(folder, pixels),
         files=files_of(folder),
     )
@@ -213,7 +213,7 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
         permittivity=eps,
         permittivity_sigma=None if why else _number(pixels.permittivity_sigma[row, column]),
         why=why,
-        patch=_patch_at(pixels.figures, place) if pixels.referenced else None,
+        patch=_patch_at(pixels.segments, place) if pixels.referenced else None,
         nearest=_nearest_materials(pixels, row, column, library) if eps else [],
         profile=profile,
         profile_why=profile_why,
@@ -419,7 +419,7 @@ def compare(first: Path, second: Path) -> Comparison:
     sigmas = stated / scatter
     judged = sigmas[np.isfinite(sigmas)]
     figures = ComparisonFigures(
-        patches=_pair_patches(a.figures, b.figures),
+        patches=_pair_patches(a.segments, b.segments),
         notes=_notes(a, b, scatter),
         extent_mm=a.extent_mm,
         compared=int(np.isfinite(p).sum()),

@@ -22,8 +22,7 @@ import msgspec
 from msgspec.structs import replace
 
 from polysight.acquisition import last_alive_s
-from polysight.products import IMAGE, MATERIALS, QUALITY, SavedProducts, write_atomically
-from polysight.results import ScanMaterials
+from polysight.products import IMAGE, MATERIALS, QUALITY, ProcessedScan, write_atomically
 from polysight.store import MANIFEST, Manifest, manifest
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, PolysightError, ScanError, no_such
@@ -244,11 +243,10 @@ def _add_products(folder: Path, summary: Summary) -> Summary:
     processed = (places[0] / MATERIALS).exists()
     summary = replace(summary, processed=processed, images_only=not processed)
     try:
-        products = SavedProducts(places[0])
-        materials = ScanMaterials.read(places[0] / MATERIALS)
-        if materials is not None:
+        products = ProcessedScan(places[0])
+        if products.materials is not None:
             level = "" if products.verdict is None else products.verdict.level
-            names = dict.fromkeys(patch.name for patch in materials.segments if patch.name)
+            names = dict.fromkeys(patch.name for patch in products.segments if patch.name)
             summary = replace(summary, verdict=level, materials=tuple(names)[:12])
         if places[0] == folder:
             summary = replace(summary, scan_id=products.scan_id, simulated=products.simulated)

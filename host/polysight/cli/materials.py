@@ -217,31 +217,39 @@ def _add_train(add: Add) -> None:
 
 _FORMATS = {
     "csv": "materials.csv: a line a patch, permittivity with standard errors",
-    "hdf5": "image.h5: arrays with axes, units, config, versions (needs h5py)",
     "netcdf": "image.nc: an xarray dataset; complex variables as h_real, h_imag (needs h5netcdf)",
-    "zarr": "image.zarr: the same dataset as a Zarr store (needs zarr)",
     "mat": "image.mat: for MATLAB and Octave",
 }
+_REMOVED_FORMATS = {
+    "hdf5": "--netcdf: the file is HDF5 too, and h5py reads it",
+    "zarr": "--netcdf, and xarray's to_zarr",
+    "cphd": "the reduced samples that `polysight process` keeps in the scan folder (docs/spec/samples.md)",
+}
+"""Formats of earlier releases, and what to use instead."""
 
 
 def _export(args: argparse.Namespace) -> int:
-    formats = [name for name in _FORMATS if getattr(args, name)]
-    from polysight.report import export
+    for name, instead in _REMOVED_FORMATS.items():
+        if getattr(args, name):
+            raise ConfigError(f"--{name}: no longer exported", "hardly anybody used it", f"use {instead}")
+    from polysight.products import export
 
-    return export(args.products, formats, args.out)
+    return export(args.products, [name for name in _FORMATS if getattr(args, name)], args.out)
 
 
 def _add_export(add: Add) -> None:
     sub = add(
         "export",
         _export,
-        "export a processed scan to HDF5, NetCDF, Zarr, MATLAB or CSV",
-        "polysight export out/one --hdf5 --csv",
-        ("--csv", "--hdf5", "--netcdf"),
+        "export a processed scan to NetCDF, MATLAB or CSV",
+        "polysight export out/one --netcdf --csv",
+        ("--csv", "--mat", "--netcdf"),
     )
     sub.add_argument("products", type=Path, metavar="DIR", help="folder of products, or a scan folder")
     for name, text in _FORMATS.items():
         sub.add_argument(f"--{name}", action="store_true", help=text)
+    for name in _REMOVED_FORMATS:
+        sub.add_argument(f"--{name}", action="store_true", help=argparse.SUPPRESS)
     sub.add_argument("--out", type=Path, metavar="DIR", help="folder to write into (default: DIR-export beside it)")
 
 

@@ -27,7 +27,7 @@ import msgspec
 from polysight.calibration import calibration_of_scan
 from polysight.jobs.process import process
 from polysight.process import cores
-from polysight.products import FINISHED, SavedProducts, write_json
+from polysight.products import FINISHED, ProcessedScan, write_json
 from polysight.results import NoResult
 from polysight.settings import Settings
 from polysight.store import (
@@ -393,16 +393,17 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
 
 def _results(products: Path) -> tuple[str, str, str]:
     """Share of masked or missing positions, number of patches, and the verdict unless it is `good`; "" if unknown."""
-    saved = SavedProducts(products)
+    saved = ProcessedScan(products)
     try:
-        boards = saved.quality["boards"].values()
-        absent = saved.quality.get("coverage", {}).get("positions_absent", 0)  # of each board
-        lost = sum(b["positions_masked"] + absent for b in boards)
-        share = lost / max(1, sum(b["positions"] + absent for b in boards))
-        masked = f"{100 * share:.2g} %"
-        patches = str(len(saved.materials["segments"]))
-        verdict = saved.verdict
-    except (PolysightError, AttributeError, KeyError, TypeError):
+        boards = saved.quality.boards.values()
+        if not boards or saved.materials is None:
+            return "", "", ""
+        # Absent positions count for each board.
+        absent = saved.quality.coverage.positions_absent if saved.quality.coverage else 0
+        lost = sum((board.positions_masked or 0) + absent for board in boards)
+        share = lost / max(1, sum((board.positions or 0) + absent for board in boards))
+        masked, patches, verdict = f"{100 * share:.2g} %", str(len(saved.segments)), saved.verdict
+    except PolysightError:
         return "", "", ""
     if verdict is None or verdict.level == "good":
         return masked, patches, ""

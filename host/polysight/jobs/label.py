@@ -36,7 +36,7 @@ from polysight.products import (
     IMAGE,
     LABELS,
     LABELS_PICTURE,
-    SavedProducts,
+    ProcessedScan,
     find_labels,
     find_products,
     label_folder,
@@ -137,7 +137,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     return 0
 
 
-def save_labels(place: Path, products: SavedProducts, labels: Labels) -> tuple[Labels, list[str]]:
+def save_labels(place: Path, products: ProcessedScan, labels: Labels) -> tuple[Labels, list[str]]:
     """Check boxes drawn on products, and write them with their picture into `place`; return them with notes on them.
 
     Raises
@@ -185,7 +185,7 @@ def remove_labels(folder: Path) -> Path:
     return path
 
 
-def _find_dark_boxes(products: SavedProducts, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
+def _find_dark_boxes(products: ProcessedScan, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
     """Names of boxes too dark in both channels to be detected as plates automatically."""
     power = np.where(products.valid, np.abs(products.h) ** 2 + np.abs(products.v) ** 2, np.nan)
     if not np.isfinite(power).any():
@@ -195,18 +195,24 @@ def _find_dark_boxes(products: SavedProducts, masks: Mapping[str, npt.NDArray[np
     return [name for name, p in inside.items() if p.size and np.nanmedian(p) < least]
 
 
-def found_patches(products: SavedProducts) -> list[FoundPatch]:
+def found_patches(products: ProcessedScan) -> list[FoundPatch]:
     """Patches of materials.json, each with a box inside it that avoids its edges if it is wide enough."""
     margin_mm = SegmentSettings().margin_mm
     out = []
-    for row in products.segments:
-        x0, y0, x1, y1 = row["box_mm"]
+    for patch in products.segments:
+        x0, y0, x1, y1 = patch.box_mm
         mx, my = (min(margin_mm, _LARGEST_MARGIN * (b - a)) for a, b in ((x0, x1), (y0, y1)))
-        sure = f" {100 * row['confidence']:.0f} %" if row.get("confidence") is not None else ""
-        text = f"named {row['name']}{sure}" if row.get("name") else "not named"
-        text = REFERENCE if row.get("metal_reference") else text
-        text = row["box"] if row.get("box") else "not judged" if row.get("refused") else text
-        out.append(FoundPatch(int(row["label"]), (x0 + mx, y0 + my, x1 - mx, y1 - my), text))
+        text = "not named"
+        if patch.box:
+            text = patch.box
+        elif patch.refused is not None:
+            text = "not judged"
+        elif patch.metal_reference:
+            text = REFERENCE
+        elif patch.name:
+            sure = f" {100 * patch.confidence:.0f} %" if patch.confidence is not None else ""
+            text = f"named {patch.name}{sure}"
+        out.append(FoundPatch(patch.label, (x0 + mx, y0 + my, x1 - mx, y1 - my), text))
     return out
 
 
@@ -356,7 +362,7 @@ def _table(labels: Labels) -> list[str]:
 
 
 def _listing(
-    folder: Path, products: SavedProducts, there: tuple[Path, Labels] | None, found: Sequence[FoundPatch]
+    folder: Path, products: ProcessedScan, there: tuple[Path, Labels] | None, found: Sequence[FoundPatch]
 ) -> str:
     """Text of the boxes drawn, the patches found, and how to name them."""
     kind = "simulated " if products.simulated else ""

@@ -42,23 +42,22 @@ from polysight.products import (
     MATERIALS,
     REPORT,
     SCAN,
-    SavedProducts,
+    ProcessedScan,
     find_products,
-    permittivity_spread,
     read_products,
-    refused_text,
 )
-from polysight.results import NoResult
+from polysight.results import NoResult, PatchFigures, PermittivityFigures, one_line, plain
 from polysight.store import is_source
 from polysight_shared.config import Chirp, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.findings import Finding
 
 _SAME_FREQUENCY = 1e-6  # relative: far above rounding, far below any other chirp
 _REASONS = 3  # of a verdict, for the terminal
 
 
-def print_verdict(products: SavedProducts, to_terminal: bool = True) -> int:
+def print_verdict(products: ProcessedScan, to_terminal: bool = True) -> int:
     """Print the verdict of products, if they have one; return the exit status it gives: 0, or that of NoResult."""
     verdict = products.verdict
     if verdict is None:
@@ -68,7 +67,7 @@ def print_verdict(products: SavedProducts, to_terminal: bool = True) -> int:
     return 0 if verdict.usable else NoResult.exit_status
 
 
-def _chirp(products: SavedProducts, config: Path | None) -> Chirp:
+def _chirp(products: ProcessedScan, config: Path | None) -> Chirp:
     """The chirp of the products, or that of `config` if given. Raises DataError, ConfigError."""
     rig = load_instrument(config) if config is not None else products.rig
     if rig is None:
@@ -80,14 +79,14 @@ def _chirp(products: SavedProducts, config: Path | None) -> Chirp:
     return rig.chirp
 
 
-def _check_bands(row: Mapping[str, Any], chirp: Chirp, source: str) -> None:
+def _check_bands(patch: PatchFigures, chirp: Chirp, source: str) -> None:
     """Raise DataError if the sub-bands of a patch are not those of this chirp."""
-    recorded = [(b["first_hz"], b["last_hz"]) for b in row.get("bands") or ()]
+    recorded = [(band.first_hz, band.last_hz) for band in patch.bands or ()]
     expected = [(b.first_hz, b.last_hz) for b in sub_bands(chirp, len(recorded))] if recorded else []
     for saved, own in zip(recorded, expected, strict=True):
         if not all(math.isclose(a, b, rel_tol=_SAME_FREQUENCY) for a, b in zip(saved, own, strict=True)):
             raise DataError(
-                f"segment {row.get('label')} covers {saved[0] / 1e9:.4f} to {saved[1] / 1e9:.4f} GHz; the chirp"
+                f"segment {patch.label} covers {saved[0] / 1e9:.4f} to {saved[1] / 1e9:.4f} GHz; the chirp"
                 f" of {source} has that part from {own[0] / 1e9:.4f} to {own[1] / 1e9:.4f} GHz",
                 "that is another rig file than the scan's",
                 "leave --config out: the products bring their own",
@@ -125,40 +124,42 @@ def permittivity(
     products = read_products(folder, MATERIALS)
     if stack and products.verdict is not None and not products.verdict.usable:
         raise products.verdict.error("the images are kept")
-    rows = [r for r in products.segments if segment is None or r["label"] == segment]
-    if not rows:
+    patches = [patch for patch in products.segments if segment is None or patch.label == segment]
+    if not patches:
         raise DataError(f"{products.folder}: no segment {segment}", f"its number is not in {MATERIALS}")
     chirp = _chirp(products, config) if stack else None
     out: list[dict[str, Any]] = []
-    for row in rows:
-        found = None
-        if chirp is not None and not row.get("metal_reference"):
-            _check_bands(row, chirp, str(config or products.folder / SCAN))
-            found = fit_row(row, chirp, stack, bands, amplitude_error, incidence_std_rad(products.materials))
-        out.append({"label": row["label"], "name": row["name"], "single_interface": row["permittivity"]})
-        if row.get("refused"):
-            out[-1]["refused"] = row["refused"]
-        if found is not None:
-            out[-1]["layer"] = layer_content(found)
+    lines: list[str] = []
+    for patch in patches:
+        fit = None
+        if chirp is not None and not patch.metal_reference:
+            _check_bands(patch, chirp, str(config or products.folder / SCAN))
+            fit = fit_row(patch, chirp, stack, bands, amplitude_error, incidence_std_rad(products.materials))
+        row = {"label": patch.label, "name": patch.name, "single_interface": plain(patch.permittivity)}
+        if patch.refused is not None:
+            row["refused"] = plain(patch.refused)
+        if fit is not None:
+            row["layer"] = layer_content(fit)
+        out.append(row)
+        lines.append(_line(patch, row.get("layer")))
     if as_json:
         print_json(out)
         return print_verdict(products, to_terminal=False)
     status = print_verdict(products)
     if status == 0:
-        sys.stdout.write("".join(_line(row) for row in out))
+        sys.stdout.write("".join(lines))
     return status
 
 
-def _line(row: Mapping[str, Any]) -> str:
-    head = f"{row['label']:>3}  {_pad_name(row['name'] or '')}"
-    single = row["single_interface"]
-    if row.get("refused"):
-        text = f"{head} not judged: {refused_text(row)}"
-    elif single is None:
+def _line(patch: PatchFigures, layer: Mapping[str, Any] | None) -> str:
+    head = f"{patch.label:>3}  {_pad_name(patch.name or '')}"
+    if patch.refused is not None:
+        text = f"{head} not judged: {patch.refused_text}"
+    elif patch.permittivity is None:
         text = f"{head} metal-like: no permittivity"
     else:
-        text = f"{head} one interface {_estimate(single)}"
-    return (text + _layer_text(row.get("layer"))).rstrip() + "\n"
+        text = f"{head} one interface {_estimate(patch.permittivity)}"
+    return (text + _layer_text(layer)).rstrip() + "\n"
 
 
 def _layer_text(layer: Mapping[str, Any] | None) -> str:
@@ -173,13 +174,12 @@ def _layer_text(layer: Mapping[str, Any] | None) -> str:
     return text + "".join(f"\n     note: {w}" for w in layer["warnings"])
 
 
-def _estimate(permittivity: Mapping[str, Any]) -> str:
+def _estimate(e: PermittivityFigures) -> str:
     """A permittivity with the errors of both parts and their main source."""
-    text = f"{format_permittivity(complex(permittivity['real'], permittivity['imag']), width=6):15s}"
-    if spread := permittivity_spread(permittivity):
-        text += f"  +- {spread.real_std:.2f}, {spread.loss_std:.2f}"
-    main = permittivity.get("dominated_by")
-    return f"{text}  mostly {main}" if main else text
+    text = f"{format_permittivity(e.value, width=6):15s}"
+    if e.spread is not None:
+        text += f"  +- {e.spread.real_std:.2f}, {e.spread.loss_std:.2f}"
+    return f"{text}  mostly {e.dominated_by}" if e.dominated_by else text
 
 
 def concentration(data: Path, given: Mapping[str, float], confidence: float, as_json: bool) -> int:
@@ -231,7 +231,7 @@ def materials(data: Sequence[Path], as_json: bool) -> int:
     """
     scans = [read_products(folder, MATERIALS) for folder in data]
     if as_json:
-        print_json([{"products": str(s.folder), **s.materials} for s in scans])
+        print_json([{"products": str(s.folder), **plain(s.materials)} for s in scans])
         return max((print_verdict(s, to_terminal=False) for s in scans), default=0)
     worst = 0
     for scan in scans:
@@ -244,16 +244,17 @@ def materials(data: Sequence[Path], as_json: bool) -> int:
     return worst
 
 
-def _patch_line(row: dict[str, Any]) -> str:
-    name = row["name"] or ("metal reference" if row.get("metal_reference") else "not named")
-    drawn = f"   drawn as {row['box']}" if row.get("box") else ""
-    if row.get("refused"):
-        return f"{row['label']:>3}  {'not judged':24s} {refused_text(row)}{drawn}\n"
-    sure = f"{100 * row['confidence']:.0f} %" if row.get("confidence") is not None else ""
-    e = row.get("permittivity")
-    value = _estimate(e) if e is not None else "metal-like" if row.get("metal_like") else "-"
-    why = f"\n     {row['why']}" if row.get("why") else ""
-    return f"{row['label']:>3}  {_pad_name(name)} {sure:>5s}  {value}{drawn}".rstrip() + f"{why}\n"
+def _patch_line(patch: PatchFigures) -> str:
+    drawn = f"   drawn as {patch.box}" if patch.box else ""
+    if patch.refused is not None:
+        return f"{patch.label:>3}  {'not judged':24s} {patch.refused_text}{drawn}\n"
+    name = patch.name or ("metal reference" if patch.metal_reference else "not named")
+    sure = f"{100 * patch.confidence:.0f} %" if patch.confidence is not None else ""
+    value = "metal-like" if patch.metal_like else "-"
+    if patch.permittivity is not None:
+        value = _estimate(patch.permittivity)
+    why = f"\n     {patch.why}" if patch.why else ""
+    return f"{patch.label:>3}  {_pad_name(name)} {sure:>5s}  {value}{drawn}".rstrip() + f"{why}\n"
 
 
 def _pad_name(name: str, width: int = 24) -> str:
@@ -358,9 +359,9 @@ def _score_models(data: Path, as_json: bool) -> int:
     return 0
 
 
-def _name_patches(products: Sequence[SavedProducts], library_path: Path, model: str | None, as_json: bool) -> int:
+def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: str | None, as_json: bool) -> int:
     """Name the patches that lie at the same place in all scans; print names with shares of their pixels."""
-    from polysight.report import classifier_sentence
+    from polysight.materials import classifier_sentence
 
     status = max(print_verdict(p, to_terminal=not as_json) for p in products)
     if status:
@@ -388,10 +389,10 @@ def _name_patches(products: Sequence[SavedProducts], library_path: Path, model: 
         "contradictions": _contradictions(library, model, classifier.angles_deg, matched, named),
         "patches_not_in_every_scan": sum(len(s.patches) for s in scans) - len(scans) * len(matched),
         "refused": [
-            {"products": str(p.folder), "label": s["label"], **s["refused"]}
+            {"products": str(p.folder), "label": patch.label, **plain(patch.refused)}
             for p in products
-            for s in p.segments
-            if s.get("refused")
+            for patch in p.segments
+            if patch.refused is not None
         ],
     }
     if as_json:
@@ -405,9 +406,9 @@ def _name_patches(products: Sequence[SavedProducts], library_path: Path, model: 
     return 0
 
 
-def _classifiable(products: SavedProducts) -> ScanPatches:
+def _classifiable(products: ProcessedScan) -> ScanPatches:
     """Patches of a scan without the refused ones and the metal reference, which is never judged by itself."""
-    left_out = {s["label"] for s in products.segments if s.get("refused") or s.get("metal_reference")}
+    left_out = {patch.label for patch in products.segments if patch.refused is not None or patch.metal_reference}
     scan = products.patches
     return replace(scan, patches=tuple(p for p in scan.patches if p.label not in left_out))
 
@@ -425,7 +426,7 @@ def _print_names(content: dict[str, Any], several: bool) -> None:
     print_lines(f"note: {line}" for line in content["contradictions"])
     for refused in content["refused"]:
         where = f" in {refused['products']}" if several else ""
-        text = refused_text({"refused": refused})
+        text = one_line(Finding("error", refused["what"], refused["why"], refused["do"]))
         sys.stdout.write(f"{refused['label']:>3}  not judged{where}: {text}\n")
 
 
@@ -469,14 +470,14 @@ def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
         sys.stdout.write(f"{right} of {len(known)} patches named right, {share:.1%} of their pixels\n")
 
 
-def _nothing_named(products: Sequence[SavedProducts]) -> dict[str, Any]:
+def _nothing_named(products: Sequence[ProcessedScan]) -> dict[str, Any]:
     """JSON of `classify` if a scan has no result: its patches without names."""
     scan = next(p for p in products if p.verdict is not None and not p.verdict.usable)
     nothing = {"name": None, "confidence": None, "votes": {}, "probabilities": {}}
     return {
         "products": str(scan.folder),
         "verdict": None if scan.verdict is None else scan.verdict.to_dict(),
-        "patches": [{"label": s["label"], **nothing} for s in scan.segments],
+        "patches": [{"label": patch.label, **nothing} for patch in scan.segments],
     }
 
 

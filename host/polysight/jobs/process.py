@@ -20,16 +20,15 @@ from polysight.process import (
     Inputs,
     Products,
     boxes_as_patches,
+    imaged_scan,
     load_classifier,
     map_rows,
-    quality_content,
     save_images,
     why_unnamed,
 )
 from polysight.products import (
     IMAGE,
     QUALITY,
-    RAW_DROPPED,
     REPORT,
     check_products_folder,
     making_products,
@@ -112,7 +111,8 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
         return
     images = pipeline.form_images(from_sums=True)  # within 1e-6 of those that `make_products` puts in their place
     with making_products(out, pipeline.source.scan_id) as new:
-        save_images(new, pipeline.source, pipeline.rig, images, pipeline.quality, backlash=False)
+        scan = imaged_scan(out, pipeline.source, pipeline.rig, images, pipeline.quality, backlash=False)
+        save_images(new, scan)
     with suppress(OSError):  # that nobody reads it is no reason not to make the rest
         sys.stderr.write(f"image: {out / IMAGE}\n")
 
@@ -250,7 +250,7 @@ def _check_dropped(pipeline: Pipeline, out: Path) -> None:
     pipeline.source.reload()
     if not dropped_rows(pipeline.source):
         return
-    pipeline.quality.note(**{RAW_DROPPED: mark})
+    pipeline.quality.note(raw_dropped=mark)
     absent = pipeline.quality.coverage().rows_absent
     if absent:
         raise DataError(
@@ -270,12 +270,12 @@ def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
     pipeline = processed_rows(source, data, settings)
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:
-        save_images(new, source, pipeline.rig, images, pipeline.quality)
+        save_images(new, imaged_scan(out, source, pipeline.rig, images, pipeline.quality))
     lines = (*pipeline.quality.coverage().lines(), f"image: {out / IMAGE}")
     print_lines(lines)
     sys.stdout.flush()
     pipeline.quality.note_imaging(pipeline.images, images)
-    write_json(out / QUALITY, quality_content(pipeline.quality))
+    write_json(out / QUALITY, imaged_scan(out, source, pipeline.rig, images, pipeline.quality).quality)
     if not images.valid.any():
         raise DataError(
             "the image has no valid pixel",

@@ -130,7 +130,7 @@ def inspect_file(
     report = inspect_pcap(file, layout, card_address) if pcap else inspect_bin(file, layout)
     report.simulated = scan is not None and scan.simulated
     if as_json:
-        from polysight.products import plain
+        from polysight.results import plain
 
         content = asdict(report)
         content |= content.pop("layout")

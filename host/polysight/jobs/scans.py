@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import msgspec
+from msgspec import UNSET, structs
 
 from polysight.acquisition import ScanCommand, send_command
 from polysight.catalogue import (
@@ -22,8 +23,8 @@ from polysight.catalogue import (
 )
 from polysight.jobs.output import confirm, print_json
 from polysight.materials import UNKNOWN
-from polysight.products import QUALITY, RAW_DROPPED, REPORT, products_locked, read_products, write_json
-from polysight.results import ComplexNumber, plain
+from polysight.products import QUALITY, REPORT, products_locked, read_products, write_json
+from polysight.results import ComplexNumber, RawDropped, plain
 from polysight.store import Digests, ScanFolder, damaged_samples, drop, droppable, dropped_rows, locked_samples, utc_now
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, no_such
@@ -240,20 +241,20 @@ def _check_samples(scan: ScanFolder, rows: set[int]) -> None:
 
 def _keep(products: Path, scan: ScanFolder) -> None:
     """Mark the products as the only remaining data of the scan, so that they are never overwritten."""
-    mark = {"scan_id": scan.scan_id, "scan": str(scan.path.resolve()), "dropped_utc": utc_now()}
-    write_json(products / QUALITY, {**read_products(products).quality, RAW_DROPPED: mark})
+    mark = RawDropped(scan_id=scan.scan_id, scan=str(scan.path.resolve()), dropped_utc=utc_now())
+    write_json(products / QUALITY, structs.replace(read_products(products).quality, raw_dropped=mark))
 
 
 def processed_digests(folder: Path) -> Digests:
     """Return the CRCs of the processed rows, by board. Raises DataError."""
     products = read_products(folder)
-    _ = products.image  # raises when it cannot be read
-    try:
-        boards = products.quality["boards"]
-        return {name: {int(r): str(crc) for r, crc in b["raw_crc32"].items()} for name, b in boards.items()}
-    except (ValueError, KeyError, AttributeError, TypeError) as e:
+    _ = products.images  # raises when it cannot be read
+    boards = products.quality.boards
+    digests = {name: board.raw_crc32 for name, board in boards.items() if board.raw_crc32 is not UNSET}
+    if not digests or len(digests) < len(boards):
         raise DataError(
-            f"{products.folder / QUALITY}: does not say what it was made from: {e}",
-            "made by an earlier release, damaged, or from another program's recordings",
+            f"{products.folder / QUALITY}: does not say what it was made from",
+            "made by an earlier release, or from another program's recordings",
             "`polysight process SCAN --out DIR` makes it again",
-        ) from None
+        )
+    return digests

@@ -41,9 +41,8 @@ from polysight.process import Inputs
 from polysight.products import (
     IMAGE,
     LABELS,
-    RAW_DROPPED,
     SCAN,
-    SavedProducts,
+    ProcessedScan,
     find_labels,
     find_products,
     read_products,
@@ -108,13 +107,13 @@ def check_labelled(data: Path) -> None:
             raise DataError(f"{path}: {e.what}", e.why, e.remedy) from None
 
 
-def _products_without_rows(data: Path, scan: Path) -> SavedProducts | None:
+def _products_without_rows(data: Path, scan: Path) -> ProcessedScan | None:
     """Return the products if the raw rows are deleted, else None. Raises DataError."""
     if scan_folder_of(data) is None:
         return read_products(data)
     if (scan / "products" / IMAGE).exists():
-        saved = SavedProducts(scan / "products")
-        return saved if saved.quality.get(RAW_DROPPED) else None
+        saved = ProcessedScan(scan / "products")
+        return saved if saved.quality.raw_dropped else None
     return None
 
 
@@ -133,7 +132,7 @@ def _from_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
     return _labelled(source.scan_id, findings.found, source.simulated, checked)
 
 
-def _from_images(saved: SavedProducts, labels: Labels) -> TrainingScan:
+def _from_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
     """Use the saved images of a labelled scan."""
     if saved.verdict is not None and not saved.verdict.usable:
         raise saved.verdict.error("no library was written")
@@ -147,26 +146,27 @@ def _from_images(saved: SavedProducts, labels: Labels) -> TrainingScan:
     return _labelled(saved.scan_id, found, saved.simulated is not False, checked)
 
 
-def _optics_of(saved: SavedProducts) -> Optics:
+def _optics_of(saved: ProcessedScan) -> Optics:
     """Return incidence angle and leakage of saved images; leakage that processing removed is zero here."""
     rig = saved.rig
     path = saved.folder / SCAN
     if rig is None:
         raise DataError(f"{path}: names no rig", "an earlier release processed the scan", "process the scan again")
     optics = Optics.of(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
-    budget = saved.materials.get("error_budget") or {}
-    if not budget:
+    budget = (saved.materials and saved.materials.error_budget) or None
+    if budget is None or budget.incidence is None or budget.leakage is None:
         return optics
-    angle = budget["incidence"]
-    leakage = budget["leakage"]
+    angle_deg, angle_std_deg, leakage_std = budget.incidence.deg, budget.incidence.std_deg, budget.leakage.std
+    if angle_deg is None or angle_std_deg is None or leakage_std is None:
+        return optics
     return replace(
         optics,
-        theta_rad=float(np.radians(angle["deg"])),
+        theta_rad=float(np.radians(angle_deg)),
         prior=replace(
             optics.prior,
-            theta_std_rad=float(np.radians(angle["std_deg"])),
+            theta_std_rad=float(np.radians(angle_std_deg)),
             leakage=(0j, 0j),
-            leakage_std=float(np.max(leakage["std"])),
+            leakage_std=max(std or 0.0 for std in leakage_std),
             leakage_measured=True,
         ),
     )

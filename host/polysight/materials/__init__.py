@@ -17,7 +17,17 @@ from polysight.materials.analyse import (
     permittivity_change,
     pixel_accuracy,
 )
-from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, SHORT, UNKNOWN, Classifier, NamedPatch, PatchName
+from polysight.materials.classify import (
+    DISCRIMINANT,
+    MODELS,
+    PAPER,
+    SHORT,
+    UNKNOWN,
+    Classifier,
+    NamedPatch,
+    PatchName,
+    classifier_sentence,
+)
 from polysight.materials.concentration import (
     ConcentrationResult,
     concentrations,
@@ -152,6 +162,7 @@ __all__ = [
     "by_angle",
     "calibration_error",
     "check_labels",
+    "classifier_sentence",
     "clean_name",
     "concentrations",
     "entries_of_boxes",

@@ -24,7 +24,6 @@ from polysight.materials.measure import (
     LEAST_STD,
     MetalReference,
     Permittivity,
-    Refused,
     background,
     check_patches,
     find_metal,
@@ -52,6 +51,7 @@ from polysight.polarimetry import (
 )
 from polysight_shared.config import Instrument
 from polysight_shared.errors import DataError
+from polysight_shared.findings import Finding
 
 LEAST_LEAKAGE_STD = 5e-4
 """Least standard deviation of the leakage, whatever the rig file says."""
@@ -238,16 +238,16 @@ def _to_angle(permittivity: complex | None, theta_rad: float, angles_deg: Sequen
     return float(abs(s / own_s)), complex((p / s) / (own_p / own_s))
 
 
-def _no_material(e: Permittivity) -> Refused | None:
+def _no_material(e: Permittivity) -> Finding | None:
     """Return why a permittivity is impossible for a passive material, beyond its error; None if it is possible."""
     if e.value is None or e.real_std is None or e.loss_std is None:
         return None
     remedy = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
     why = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
     if e.value.imag > ACTIVE * e.loss_std + 0.02:
-        return Refused(AMPLIFIES, why, remedy)
+        return Finding("error", AMPLIFIES, why, remedy)
     if e.value.real < 1 - ACTIVE * e.real_std - 0.02:
-        return Refused(BELOW_AIR, why, remedy)
+        return Finding("error", BELOW_AIR, why, remedy)
     return None
 
 

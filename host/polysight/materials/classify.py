@@ -536,3 +536,35 @@ def _estimate(permittivity: complex | None, covariance: npt.NDArray[np.float64] 
 
 def _with_permittivity(name: str, permittivity: complex | None) -> str:
     return name if permittivity is None else f"{name} ({format_permittivity(permittivity)})"
+
+
+def classifier_sentence(classifier: Classifier) -> str:
+    """Describe a classifier, its library, and its score on scans left out of training."""
+    library, fit = classifier.library, classifier.fit
+    kind = "simulated " if library.simulated else ""
+    angles = " and ".join(f"{a:g}" for a in classifier.angles_deg)
+    out = f"{classifier.model} on |H|, |V| and complex P"
+    judged = fit.get("judged", {}).get(classifier.model)
+    if judged and fit.get("model") != classifier.model:
+        out += ", chosen by the user; not the default model"
+    out += f"; library of {len(library.names)} materials from {len(library.scans)} {kind}scans, {angles} degrees."
+    if judged:
+        out += (
+            f" On scans left out of the library it names {100 * judged['pixels']:.1f} % of the pixels and "
+            f"{100 * judged['patches']:.1f} % of the patches right"
+        )
+        if fit.get("model") == classifier.model and fit.get("calibration_error") is not None:
+            out += f", its probabilities off by {fit['calibration_error']:.3f} (expected calibration error)"
+        if "pixels_split_by_pixel" in judged:
+            out += f" (split by pixel, which is optimistic: {100 * judged['pixels_split_by_pixel']:.1f} %)"
+        channel = fit.get("by_channel", {})
+        if {"h", "v", "p"} <= set(channel):
+            alone = ", ".join(f"{k.upper()} {100 * channel[k]:.0f} %" for k in "hvp")
+            out += f"; the KNN by one channel alone: {alone}"
+        out += "."
+        if missing := fit.get("not_judged"):
+            out += (
+                f" Of its {fit['materials']} materials {len(missing)} could not be judged, because only one scan has"
+                f" them: {', '.join(missing)}."
+            )
+    return f"{out} {library.note}".strip()

@@ -26,6 +26,7 @@ from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import inverse_spread, permittivity_from_ratio
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
+from polysight_shared.findings import Finding
 
 SPREAD_SHARE = 0.40
 """Error of a patch's V / H over the spread of its pixels: speckle averages out, edges and neighbours do not.
@@ -56,19 +57,6 @@ NOT_PASSIVE = (AMPLIFIES, BELOW_AIR)
 """Reasons for refusing plates whose permittivity is impossible for a passive material."""
 
 
-@dataclass(frozen=True)
-class Refused:
-    """Reason why a patch gets no name and no permittivity."""
-
-    what: str
-    why: str
-    do: str
-
-    def to_dict(self) -> dict[str, str]:
-        """Return plain values for JSON."""
-        return {"what": self.what, "why": self.why, "do": self.do}
-
-
 def background(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[float, float]:
     """Return the rms of |H| and |V| away from all patches (noise and sidelobes); NaN without such pixels."""
     away = usable & np.isfinite(h) & np.isfinite(v)
@@ -80,7 +68,7 @@ def background(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[f
     return levels[0], levels[1]
 
 
-def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], uneven: float) -> Refused | None:
+def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], uneven: float) -> Finding | None:
     """Return why a patch is no flat plate; None if it may be one.
 
     Parameters
@@ -97,28 +85,30 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
     at = patch.interior & np.isfinite(h) & np.isfinite(v)
     remedy = "check the image, the direct path and the range profile"
     if int(at.sum()) < LEAST_PIXELS:
-        return Refused(
-            "too few pixels", f"{int(at.sum())} lie inside its edges", "scan a larger plate, or finer pixels"
+        return Finding(
+            "error", "too few pixels", f"{int(at.sum())} lie inside its edges", "scan a larger plate, or finer pixels"
         )
     level = np.abs(h[at]).astype(np.float64)
     if not level.mean() > 0:
-        return Refused("no signal", "H is zero there", remedy)
+        return Finding("error", "no signal", "H is zero there", remedy)
     if float(level.std() / level.mean()) > FLAT_CONTRAST:
-        return Refused("noise or speckle, not a flat plate", "its brightness varies like noise", remedy)
+        return Finding("error", "noise or speckle, not a flat plate", "its brightness varies like noise", remedy)
     if np.isfinite(dark[0]) and float(np.median(level)) < LEAST_LEVEL * dark[0]:
-        return Refused("as dark as the background", "it does not stand out from noise and sidelobes", remedy)
+        return Finding("error", "as dark as the background", "it does not stand out from noise and sidelobes", remedy)
     cross = abs(np.vdot(h[at].astype(np.complex128), v[at]))
     power_h, power_v = (float(np.sum(np.abs(c[at].astype(np.complex128)) ** 2)) for c in (h, v))
     dim = float(np.median(np.abs(v[at]))) < 0.12 * float(np.median(level))
     if not dim and cross < 0.7 * np.sqrt(power_h * power_v):
-        return Refused("H and V do not agree", "their phase difference varies from pixel to pixel, like noise", remedy)
+        return Finding(
+            "error", "H and V do not agree", "their phase difference varies from pixel to pixel, like noise", remedy
+        )
     allowed = max(HALVES_APART, uneven) * (1 + 2 * float(np.median(np.abs(v[at])) / np.median(level)))
     several, apart = "several kinds together", "move the plates apart, or draw boxes"
     if halves_apart(h, v, at) > allowed:
-        return Refused(several, "its halves have different ratios", apart)
+        return Finding("error", several, "its halves have different ratios", apart)
     odd = np.abs(v[at] / h[at] - 1 / median_ratio(h[at], v[at])) > ODD_RATIO
     if float(odd.mean()) > ODD_SHARE:
-        return Refused(several, f"{100 * odd.mean():.0f} % of its pixels have another ratio", apart)
+        return Finding("error", several, f"{100 * odd.mean():.0f} % of its pixels have another ratio", apart)
     return None
 
 
@@ -167,7 +157,7 @@ def reference_std(spread: float) -> float:
 
 def check_patches(
     found: Segmentation, h: Image, v: Image, dark: tuple[float, float], metal: Mask
-) -> dict[int, Refused]:
+) -> dict[int, Finding]:
     """Return patch number to reason for all patches that are no plates; `metal` is the metal reference's interior."""
     uneven = halves_apart(h, v, metal)
     why = ((p.label, check_patch(p, h, v, dark, uneven)) for p in found.patches)

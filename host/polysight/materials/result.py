@@ -18,17 +18,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy
+from msgspec import UNSET
 
 from polysight.imaging import Image, Images, Rise
 from polysight.materials.classify import NamedPatch, PatchName, features_of
 from polysight.materials.inversion import Inversion, RigPrior, ratio_error
 from polysight.materials.labels import Labels, TruthPlate
 from polysight.materials.library import Real, SceneErrors
-from polysight.materials.measure import MetalReference, Permittivity, Refused, background, ratio_sigma
+from polysight.materials.measure import MetalReference, Permittivity, background, ratio_sigma
 from polysight.materials.segment import Box, Patch, Segmentation, axis_mm
+from polysight.results import BandFigures, ComplexNumber, PatchFigures, PermittivityFigures, TruthFigures
 from polysight.store import open_npz
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
+from polysight_shared.findings import Finding
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ class PatchResult:
     permittivity: Permittivity
     named: NamedPatch | None = None
     truth: TruthPlate | None = None
-    refused: Refused | None = None
+    refused: Finding | None = None
 
     @property
     def verdict(self) -> PatchName | None:
@@ -137,7 +140,7 @@ class MaterialsResult:
     theta_rad: npt.NDArray[np.float64]
     inversion: Inversion
     prior: RigPrior
-    bands: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
+    bands: dict[int, list[BandFigures]] = field(default_factory=dict)
     boxes: dict[int, str] = field(default_factory=dict)
     library: tuple[str, ...] = ()
     withheld: bool = False
@@ -145,9 +148,10 @@ class MaterialsResult:
     brightness_off: Mapping[int, float] = field(default_factory=dict)
     errors: tuple[tuple[int, ...], SceneErrors] | None = None
 
-    def rows(self) -> list[dict[str, Any]]:
-        """Return one plain dict for each patch, for materials.json (no infinities, complex numbers as two parts)."""
-        return [self._row(r) for r in self.patches]
+    def rows(self) -> list[PatchFigures]:
+        """Return the figures of each patch, for materials.json."""
+        figures = [self._figures(r) for r in self.patches]
+        return [patch.withheld() for patch in figures] if self.withheld else figures
 
     def without_result(self) -> MaterialsResult:
         """Return the same patches without names, ratios, permittivities and metal reference."""
@@ -170,75 +174,65 @@ class MaterialsResult:
         inside = self.theta_rad[patch.interior] if self.theta_rad.ndim and patch.interior.any() else self.theta_rad
         return float(np.degrees(np.mean(inside)))
 
-    def _row(self, r: PatchResult) -> dict[str, Any]:
-        row = _row(r, self.metal, self.incidence_deg(r.patch))
-        if row["truth"] is not None:
-            row["truth"]["in_library"] = row["truth"]["name"] in self.library
-        if self.withheld:
-            return row | {"amplitude_h": None}
+    def _figures(self, r: PatchResult) -> PatchFigures:
+        label, e, name = r.patch.label, r.permittivity, r.verdict
+        x0, y0, x1, y1 = r.patch.box_mm
         level = np.abs(self.h[r.patch.interior])
         level = level[np.isfinite(level)]
-        row["amplitude_h"] = round(float(np.median(level)), 6) if level.size else None
-        if r.patch.label in self.tilts.rises and r.refused is None:
-            row["tilt_across_deg"] = round(float(np.degrees(self.tilts.across_rad(r.patch.label))), 3)
-        if r.patch.label in self.bands:
-            row["bands"] = self.bands[r.patch.label]
-        if r.patch.label in self.boxes:
-            row["box"] = self.boxes[r.patch.label]
-        return row
+        tilt = r.refused is None and label in self.tilts.rises
+        return PatchFigures(
+            label=label,
+            name=name.name if name else None,
+            confidence=name.confidence if name else None,
+            votes=name.votes if name else {},
+            probabilities=name.probabilities if name else {},
+            why=name.why if name else "",
+            distance=name.distance if name and math.isfinite(name.distance) else None,
+            metal_reference=label == self.metal.label,
+            metal_like=e.metal_like and r.refused is None,
+            box_mm=(round(x0, 3), round(y0, 3), round(x1, 3), round(y1, 3)),
+            outline_mm=[(round(float(x), 2), round(float(y), 2)) for x, y in r.patch.outline_mm],
+            pixels=r.patch.pixels,
+            interior_pixels=e.pixels,
+            incidence_deg=self.incidence_deg(r.patch),
+            ratio=ComplexNumber.of(e.ratio),
+            inverse_ratio_std=e.inverse_std if math.isfinite(e.inverse_std) else None,
+            permittivity=_permittivity_figures(e) if r.refused is None else None,
+            amplitude_h=round(float(np.median(level)), 6) if level.size else None,
+            refused=r.refused,
+            truth=None if r.truth is None else _truth_figures(r.truth, self.library),
+            tilt_across_deg=round(float(np.degrees(self.tilts.across_rad(label))), 3) if tilt else UNSET,
+            bands=self.bands.get(label, UNSET),
+            box=self.boxes.get(label, UNSET),
+        )
 
 
-def _complex(z: complex | None) -> dict[str, float] | None:
-    if z is None or not (math.isfinite(z.real) and math.isfinite(z.imag)):
+def _permittivity_figures(e: Permittivity) -> PermittivityFigures | None:
+    """Return value and errors for materials.json; None if it is not known."""
+    if e.value is None or e.real_range is None or e.imag_range is None:
         return None
-    return {"real": z.real, "imag": z.imag}
+    return PermittivityFigures(
+        real=e.value.real,
+        imag=e.value.imag,
+        real_p30_p70=e.real_range,
+        imag_p30_p70=e.imag_range,
+        real_std=e.real_std,
+        imag_std=e.loss_std,
+        covariance=None if e.covariance is None else e.covariance.tolist(),
+        shares=dict(e.shares),
+        dominated_by=e.dominated_by,
+        do=SHRINKS.get(e.dominated_by or "", ""),
+    )
 
 
-def _row(r: PatchResult, metal: MetalReference, incidence_deg: float) -> dict[str, Any]:
-    e, v = r.permittivity, r.verdict
-    permittivity = None
-    if e.value is not None and e.real_range is not None and e.imag_range is not None and r.refused is None:
-        permittivity = {
-            "real": e.value.real,
-            "imag": e.value.imag,
-            "real_p30_p70": list(e.real_range),
-            "imag_p30_p70": list(e.imag_range),
-            "real_std": e.real_std,
-            "imag_std": e.loss_std,
-            "covariance": None if e.covariance is None else e.covariance.tolist(),
-            "shares": dict(e.shares),
-            "dominated_by": e.dominated_by,
-            "do": SHRINKS.get(e.dominated_by or "", ""),
-        }
-    truth = None
-    if r.truth is not None:
-        truth = {
-            "name": r.truth.name,
-            "metal": r.truth.metal,
-            "permittivity": _complex(r.truth.permittivity),
-            "thickness_mm": r.truth.thickness_mm,
-        }
-    return {
-        "label": r.patch.label,
-        "name": v.name if v else None,
-        "confidence": v.confidence if v else None,
-        "votes": v.votes if v else {},
-        "probabilities": v.probabilities if v else {},
-        "why": v.why if v else "",
-        "distance": v.distance if v and math.isfinite(v.distance) else None,
-        "metal_reference": r.patch.label == metal.label,
-        "box_mm": [round(b, 3) for b in r.patch.box_mm],
-        "outline_mm": [[round(float(x), 2), round(float(y), 2)] for x, y in r.patch.outline_mm],
-        "pixels": r.patch.pixels,
-        "interior_pixels": e.pixels,
-        "incidence_deg": incidence_deg,
-        "ratio": _complex(e.ratio),
-        "inverse_ratio_std": e.inverse_std if math.isfinite(e.inverse_std) else None,
-        "permittivity": permittivity,
-        "metal_like": e.metal_like and r.refused is None,
-        "refused": None if r.refused is None else r.refused.to_dict(),
-        "truth": truth,
-    }
+def _truth_figures(truth: TruthPlate, library: tuple[str, ...]) -> TruthFigures:
+    return TruthFigures(
+        name=truth.name,
+        metal=truth.metal,
+        permittivity=ComplexNumber.of(truth.permittivity),
+        thickness_mm=truth.thickness_mm,
+        in_library=truth.name in library,
+    )
 
 
 PATCHES = "patches.npz"

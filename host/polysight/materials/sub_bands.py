@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from polysight.imaging import Image, Images, SubBand
 from polysight.materials.analyse import Optics, level, reference_spread, smooth_inside, to_metal
@@ -25,6 +26,7 @@ from polysight.materials.layers import METAL, THICKNESS_RANGE_M, Bands, Layer, L
 from polysight.materials.measure import NOT_PASSIVE, measure_patch, median_ratio
 from polysight.materials.result import MaterialsResult
 from polysight.polarimetry import PlaneReference, inverse_spread, remove_leakage
+from polysight.results import BandFigures, ComplexNumber, PatchFigures, ScanMaterials
 from polysight_shared.config import Chirp
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -72,7 +74,7 @@ def band_rows(
     leakage: tuple[complex, complex],
     smooth_px: float,
     references: Sequence[PlaneReference] | None = None,
-) -> dict[int, list[dict[str, Any]]]:
+) -> dict[int, list[BandFigures]]:
     """Return each patch's ratio in each sub-band, for materials.json.
 
     Parameters
@@ -88,10 +90,8 @@ def band_rows(
 
     Returns
     -------
-    Patch number to K dicts: first_hz, last_hz, ratio {real, imag} or null, inverse_ratio_std, own_std (the part that
-    the other sub-bands do not share), amplitude_h, covariance [2][2 K] of the real and the imaginary part of 1 / ratio
-    with those of all sub-bands (real, imaginary part of the first, of the second, ...). Null if the sub-band shows no
-    pixel of the patch or of the metal: its footprint differs from the whole sweep's.
+    Patch number to K entries. Values are None if the sub-band shows no pixel of the patch or of the metal: its
+    footprint differs from the whole sweep's.
 
     Raises
     ------
@@ -105,32 +105,30 @@ def band_rows(
             f"give a reference with --bands {len(bands)}",
             code=ErrorCode.MISMATCH,
         )
-    parts: dict[int, list[dict[str, Any]]] = {r.patch.label: [] for r in found.patches}
+    parts: dict[int, list[BandFigures]] = {r.patch.label: [] for r in found.patches}
     for k, (band, made) in enumerate(zip(bands, images, strict=True)):
         reference = references[k] if references is not None else None
         h, v, error = _relative_to_metal(found, made, leakage, smooth_px, reference)
         for r in found.patches:
             at = r.patch.interior & made.valid
             whole = (found.h[at], found.v[at])
-            parts[r.patch.label].append(
-                {"first_hz": band.first_hz, "last_hz": band.last_hz, **_measure_band(h[at], v[at], whole, error)}
-            )
+            parts[r.patch.label].append(_measure_band(band, h[at], v[at], whole, error))
     common = {r.patch.label: measure_patch(r.patch, found.h, found.v, 0.0).std for r in found.patches}
     return {label: _with_covariance(rows, found, common[label]) for label, rows in parts.items()}
 
 
-def _with_covariance(rows: list[dict[str, Any]], found: MaterialsResult, common: float) -> list[dict[str, Any]]:
+def _with_covariance(rows: list[BandFigures], found: MaterialsResult, common: float) -> list[BandFigures]:
     """Add the covariance of the errors to one patch's sub-bands; `common` is the deviation common to all of them."""
-    if any(row["ratio"] is None for row in rows) or not math.isfinite(common):
-        return [row | {"covariance": None} for row in rows]
-    inverse = np.array([1 / complex(row["ratio"]["real"], row["ratio"]["imag"]) for row in rows])
-    slopes = ratio_slopes(found.inversion, found.prior, inverse).reshape(2 * len(rows), 6)
+    ratios = [row.ratio.value for row in rows if row.ratio is not None]
+    if len(ratios) < len(rows) or not math.isfinite(common):
+        return rows
+    slopes = ratio_slopes(found.inversion, found.prior, 1 / np.array(ratios, np.complex128)).reshape(2 * len(rows), 6)
     place = common * np.tile(np.eye(2), (len(rows), 1))
-    own = np.repeat([row["own_std"] ** 2 for row in rows], 2)
+    own = np.repeat([(row.own_std or 0.0) ** 2 for row in rows], 2)
     covariance = slopes @ slopes.T + place @ place.T + np.diag(own)
     std = np.sqrt(np.diag(covariance).reshape(-1, 2).mean(axis=1))
     return [
-        row | {"inverse_ratio_std": float(std[k]), "covariance": covariance[2 * k : 2 * k + 2].tolist()}
+        structs.replace(row, inverse_ratio_std=float(std[k]), covariance=covariance[2 * k : 2 * k + 2].tolist())
         for k, row in enumerate(rows)
     ]
 
@@ -157,27 +155,29 @@ def _relative_to_metal(
     return h, v, reference_spread(h, v, metal, reference)
 
 
-def _measure_band(h: Image, v: Image, whole: tuple[Image, Image], error: float) -> dict[str, Any]:
-    """Return ratio of a patch's pixels [n] in a sub-band, its standard deviations, and |H|; null without usable pixels.
+def _measure_band(band: SubBand, h: Image, v: Image, whole: tuple[Image, Image], error: float) -> BandFigures:
+    """Return ratio of a patch's pixels [n] in a sub-band, its standard deviations, and |H|; None without usable pixels.
 
     `whole` are H and V of the same pixels of the whole sweep, `error` the relative error of the metal reference.
     """
     ratio = median_ratio(h, v)
     std = math.hypot(inverse_spread(h, v), error / abs(ratio)) if ratio else float("nan")
     if not (math.isfinite(abs(ratio)) and math.isfinite(std)):
-        return {"ratio": None, "inverse_ratio_std": None, "own_std": None, "amplitude_h": None}
+        return BandFigures(first_hz=band.first_hz, last_hz=band.last_hz)
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = inverse_spread(np.ones_like(h), v / h - whole[1] / whole[0])
-    return {
-        "ratio": {"real": ratio.real, "imag": ratio.imag},
-        "inverse_ratio_std": std,
-        "own_std": math.hypot(BAND_STD, BAND_SHARE * apart) if math.isfinite(apart) else std,
-        "amplitude_h": float(np.nanmedian(np.abs(h))),
-    }
+    return BandFigures(
+        first_hz=band.first_hz,
+        last_hz=band.last_hz,
+        ratio=ComplexNumber.of(ratio),
+        inverse_ratio_std=std,
+        own_std=math.hypot(BAND_STD, BAND_SHARE * apart) if math.isfinite(apart) else std,
+        amplitude_h=float(np.nanmedian(np.abs(h))),
+    )
 
 
 def bands_of_row(
-    row: Mapping[str, Any],
+    row: PatchFigures,
     chirp: Chirp,
     count: int = 1,
     amplitude_error: float = AMPLITUDE_ERROR,
@@ -207,22 +207,25 @@ def bands_of_row(
     DataError
         if the segment was not processed with so many sub-bands.
     """
-    parts = [row] if count == 1 else list(row.get("bands") or ())
+    parts = [row] if count == 1 else list(row.bands or ())
     if len(parts) != count:
         raise DataError(
-            f"segment {row.get('label')} has {len(parts) or 'no'} sub-bands, not {count}",
+            f"segment {row.label} has {len(parts) or 'no'} sub-bands, not {count}",
             "sub-bands are imaged from the recorded rows",
             f"process the scan again with --bands {count}",
             code=ErrorCode.MISMATCH,
         )
-    if any(p.get("ratio") is None or not p.get("inverse_ratio_std") for p in parts):
+    ratios = [part.ratio.value for part in parts if part.ratio is not None]
+    errors = [part.inverse_ratio_std for part in parts if part.inverse_ratio_std]
+    if len(ratios) < count or len(errors) < count:
         return None
-    inverse = np.array([1 / complex(p["ratio"]["real"], p["ratio"]["imag"]) for p in parts])
-    spectrum, level = Spectrum.of(chirp, count), [p.get("amplitude_h") for p in parts]
-    sigma = np.array([float(p["inverse_ratio_std"]) for p in parts])
+    inverse = 1 / np.array(ratios, np.complex128)
+    sigma = np.array(errors)
+    spectrum, level = Spectrum.of(chirp, count), [part.amplitude_h for part in parts]
+    shared = [part.covariance for part in row.bands or () if part.covariance]
     covariance = None
-    if count > 1 and all(p.get("covariance") for p in parts):
-        covariance = np.array([line for p in parts for line in p["covariance"]], np.float64)
+    if count > 1 and len(shared) == count:
+        covariance = np.array([line for lines in shared for line in lines], np.float64)
     else:
         # Products of earlier releases have no covariance: K bands are then no better than one.
         sigma = np.sqrt(count) * sigma
@@ -277,7 +280,7 @@ def _metres(mm: float) -> float:
 
 
 def fit_row(
-    row: Mapping[str, Any],
+    row: PatchFigures,
     chirp: Chirp,
     stack: Sequence[Layer],
     bands: int | None = None,
@@ -310,19 +313,19 @@ def fit_row(
     PolysightError
         if the stack has not exactly one unknown layer, or a thickness is missing.
     """
-    refused = row.get("refused")
-    if row.get("metal_reference") or (refused and refused.get("what") not in NOT_PASSIVE):
+    if row.metal_reference or (row.refused is not None and row.refused.what not in NOT_PASSIVE):
         return None
     if bands is None:
         sized = any(layer.thickness_range_m for layer in stack)
-        bands = max(1, len(row.get("bands") or ())) if sized else 1
+        bands = max(1, len(row.bands or ())) if sized else 1
     data = bands_of_row(row, chirp, bands, amplitude_error, theta_std_rad)
-    return None if data is None else fit_layer(data, stack, float(np.radians(row["incidence_deg"])))
+    return None if data is None else fit_layer(data, stack, float(np.radians(row.incidence_deg or np.nan)))
 
 
-def incidence_std_rad(materials: Mapping[str, Any]) -> float:
+def incidence_std_rad(materials: ScanMaterials | None) -> float:
     """Return the standard deviation of the incidence angle in materials.json, radians; 0 if it is not there."""
-    std_deg = ((materials.get("error_budget") or {}).get("incidence") or {}).get("std_deg")
+    budget = materials.error_budget if materials is not None else None
+    std_deg = budget.incidence.std_deg if budget and budget.incidence else None
     return float(np.radians(std_deg or 0.0))
 
 

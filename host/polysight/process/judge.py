@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+import msgspec
 import numpy as np
 
 from polysight.imaging import PlaneEstimate
 from polysight.materials import NOT_PASSIVE, Classifier, MaterialsResult
 from polysight.process.quality import Quality
 from polysight.results import (
+    ErrorBudget,
+    IncidenceError,
+    LeakageError,
+    MetalScore,
+    PlaneError,
     Verdict,
     brightness_reasons,
     direct_path_reasons,
@@ -102,26 +106,29 @@ def _leakage_error(found: MaterialsResult) -> float:
     return float(np.median(parts)) if parts else 0.0
 
 
-def error_budget(found: MaterialsResult, plane: PlaneEstimate | None) -> dict[str, Any]:
+def error_budget(found: MaterialsResult, plane: PlaneEstimate | None) -> ErrorBudget:
     """Return `error_budget` of materials.json: leakage, incidence angle, plane and evidence for metal."""
     i, prior = found.inversion, found.prior
-    source = "measured" if prior.leakage_measured else "scene" if i.leakage_determined else "prior and scene"
+    source = "prior and scene"
+    if prior.leakage_measured:
+        source = "measured"
+    elif i.leakage_determined:
+        source = "scene"
     evidence = found.metal.evidence
+    metal = None
+    if evidence is not None:
+        ratio_db = evidence.channel_ratio_db
+        ratio_db = None if ratio_db is None else round(ratio_db, 2)
+        metal = MetalScore(score=round(evidence.score, 2), others=evidence.others, channel_ratio_db=ratio_db)
     angle = float(np.degrees(np.mean(found.theta_rad) + i.theta_error_rad))
-    return {
-        "leakage": {
-            "h": [round(i.leakage[0].real, 5), round(i.leakage[0].imag, 5)],
-            "v": [round(i.leakage[1].real, 5), round(i.leakage[1].imag, 5)],
-            "std": [round(s, 5) for s in i.leakage_std],
-            "source": source,
-        },
-        "incidence": {"deg": round(angle, 4), "std_deg": round(float(np.degrees(i.theta_std_rad)), 4)},
-        "plane": {"known": False} if plane is None else plane.to_dict(),
-        "metal": None
-        if evidence is None
-        else {
-            "score": round(evidence.score, 2),
-            "others": evidence.others,
-            "channel_ratio_db": None if evidence.channel_ratio_db is None else round(evidence.channel_ratio_db, 2),
-        },
-    }
+    return ErrorBudget(
+        leakage=LeakageError(
+            h=(round(i.leakage[0].real, 5), round(i.leakage[0].imag, 5)),
+            v=(round(i.leakage[1].real, 5), round(i.leakage[1].imag, 5)),
+            std=(round(i.leakage_std[0], 5), round(i.leakage_std[1], 5)),
+            source=source,
+        ),
+        incidence=IncidenceError(deg=round(angle, 4), std_deg=round(float(np.degrees(i.theta_std_rad)), 4)),
+        plane=PlaneError() if plane is None else msgspec.convert(plane.to_dict(), PlaneError),
+        metal=metal,
+    )

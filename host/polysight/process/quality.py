@@ -9,13 +9,24 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from polysight.imaging import ImageBuilder, Images, imaging_facts
 from polysight.materials import MaterialsResult, permittivity_change
 from polysight.polarimetry import IncidenceChoice, PlaneReference
-from polysight.results import Coverage, plain
+from polysight.results import (
+    Backlash,
+    BoardQuality,
+    Coverage,
+    FrequencyRange,
+    Residual,
+    ScanQuality,
+    Verdict,
+    plain,
+)
 from polysight.store import CubeRow, RowData, Source
 from polysight.sync import SyncedRow, echo_of_row, estimate_backlash, object_filter
 from polysight_shared.config import Board, Instrument
@@ -23,7 +34,7 @@ from polysight_shared.raster import plan_raster
 
 
 @dataclass
-class BoardQuality:
+class BoardRows:
     """Quality figures of one board, by row; adding a row again replaces its earlier figures."""
 
     rig: Instrument
@@ -84,43 +95,56 @@ class BoardQuality:
         found = [r["stages"][stage][1] for r in self.rows.values() if stage in r["stages"]]
         return float(np.median(found)) if found else None
 
-    def summary(self, backlash: bool = True) -> dict[str, Any]:
+    def summary(self, backlash: bool = True) -> BoardQuality:
         """Return the board's entry of quality.json. Residuals are RMS over rows, weighted by valid positions.
 
         `backlash=False` skips the estimate of the stage's backlash, which takes 2 ms per row.
         """
         ordered = dict(sorted(self.rows.items()))  # threads add rows in any order
-        rows = list(ordered.values())
-        total: dict[str, Any] = {
-            key: sum(r[key] for r in rows)
-            for key in ("frames_expected", "frames_received", "bytes_missing", "positions", "positions_masked")
-        }
-        total["frames_masked"] = total["frames_expected"] - total["frames_received"]
-        stages: dict[str, dict[str, float]] = {}
-        for stage in dict.fromkeys(s for r in rows for s in r["stages"]):
-            found = [(r["stages"][stage], r["positions"] - r["positions_masked"]) for r in rows if stage in r["stages"]]
-            weight = sum(n for _, n in found)
-            f, p, a = (float(np.sqrt(sum(s[i] ** 2 * n for s, n in found) / weight)) for i in range(3))
-            stages[stage] = {"frequency_std_hz": f, "phase_std_rad": p, "amplitude_std": a}
-        direct = _known([r["direct_hz"] for r in rows])
-        if direct.size:
-            total["direct_path_hz"] = {
-                "median": float(np.median(direct)),
-                "min": float(direct.min()),
-                "max": float(direct.max()),
-            }
+        expected = sum(row["frames_expected"] for row in ordered.values())
+        received = sum(row["frames_received"] for row in ordered.values())
+        direct = _known([row["direct_hz"] for row in ordered.values()])
         snr = self.direct_snr_db
-        total["direct_path_snr_db"] = None if snr is None else round(snr, 2)
-        total["stage_backlash_mm"] = self._backlash() if backlash else None
-        total["masked_columns"] = {row: r["masked_columns"] for row, r in ordered.items() if r["masked_columns"]}
-        total["rows_recorded"] = list(ordered)
-        total["raw_crc32"] = {row: r["crc32"] for row, r in ordered.items() if r["crc32"]}
-        return {**total, "synchronisation": stages}
+        return BoardQuality(
+            frames_expected=expected,
+            frames_received=received,
+            bytes_missing=sum(row["bytes_missing"] for row in ordered.values()),
+            positions=self.positions,
+            positions_masked=self.positions_masked,
+            frames_masked=expected - received,
+            direct_path_hz=_frequency_range(direct) if direct.size else UNSET,
+            direct_path_snr_db=None if snr is None else round(snr, 2),
+            stage_backlash_mm=self._backlash() if backlash else None,
+            masked_columns={
+                row: figures["masked_columns"] for row, figures in ordered.items() if figures["masked_columns"]
+            },
+            rows_recorded=list(ordered),
+            raw_crc32={number: row["crc32"] for number, row in ordered.items() if row["crc32"]},
+            synchronisation=_residuals(list(ordered.values())),
+        )
 
-    def _backlash(self) -> dict[str, float] | None:
+    def _backlash(self) -> Backlash | None:
         """Return the shift of odd rows towards +x relative to the plan, estimated from echoes; None if undetermined."""
-        found = estimate_backlash(self.echoes, self.rig)
-        return None if found is None else {"shift": round(found.shift_mm, 4), "std": round(found.std_mm, 4)}
+        estimate = estimate_backlash(self.echoes, self.rig)
+        if estimate is None:
+            return None
+        return Backlash(shift=round(estimate.shift_mm, 4), std=round(estimate.std_mm, 4))
+
+
+def _frequency_range(direct_hz: NDArray[np.float64]) -> FrequencyRange:
+    return FrequencyRange(float(np.median(direct_hz)), float(direct_hz.min()), float(direct_hz.max()))
+
+
+def _residuals(rows: list[dict[str, Any]]) -> dict[str, Residual]:
+    """Return the RMS over rows of the residuals after each stage, weighted by valid positions."""
+    residuals = {}
+    for stage in dict.fromkeys(name for row in rows for name in row["stages"]):
+        with_stage = [row for row in rows if stage in row["stages"]]
+        weights = np.array([row["positions"] - row["positions_masked"] for row in with_stage], np.float64)
+        squares = np.array([row["stages"][stage] for row in with_stage], np.float64) ** 2
+        frequency, phase, amplitude = np.sqrt(weights @ squares / weights.sum()).tolist()
+        residuals[stage] = Residual(frequency_std_hz=frequency, phase_std_rad=phase, amplitude_std=amplitude)
+    return residuals
 
 
 def _direct_snr(row: SyncedRow) -> NDArray[np.float64]:
@@ -152,7 +176,7 @@ class Quality:
 
     def __init__(self, rig: Instrument, source: Source) -> None:
         self.source = source
-        self.boards = {board.name: BoardQuality(rig, board) for board in rig.receivers}
+        self.boards = {board.name: BoardRows(rig, board) for board in rig.receivers}
         self.seconds: dict[str, float] = {}
         self.notes: dict[str, Any] = {}
         self._lock = threading.Lock()  # rows are processed in several threads
@@ -205,12 +229,16 @@ class Quality:
             with self._lock:
                 self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
 
-    def to_dict(self, backlash: bool = True, **more: Any) -> dict[str, Any]:
-        """Return the content of quality.json, with the entries `more`."""
-        return {
-            "boards": {name: board.summary(backlash) for name, board in self.boards.items()},
-            "coverage": plain(self.coverage()),
-            "seconds_per_stage": {stage: round(s, 4) for stage, s in self.seconds.items()},
-            **more,
-            **self.notes,
-        }
+    def result(
+        self, verdict: Verdict | None = None, pixel_accuracy: float | None = None, backlash: bool = True
+    ) -> ScanQuality:
+        """Return the content of quality.json; `backlash=False` leaves the estimate of the stage's backlash out."""
+        notes = msgspec.convert(plain(self.notes), ScanQuality)
+        return msgspec.structs.replace(
+            notes,
+            boards={name: board.summary(backlash) for name, board in self.boards.items()},
+            coverage=self.coverage(),
+            seconds_per_stage={stage: round(s, 4) for stage, s in self.seconds.items()},
+            verdict=verdict or UNSET,
+            pixel_accuracy=pixel_accuracy,
+        )

@@ -1,20 +1,20 @@
-"""Products of processed scans: write a folder of products, read it back, and convert it to xarray datasets.
+"""Products of processed scans: write a folder of products, read it back, and export it.
 
-`making_products` is a context manager: products are written to a temporary folder, which replaces the old one when
-all are complete. `read_products` returns `SavedProducts`, the content of each file. `ProcessedScan` adds the patch of
-each pixel, also for results that are not saved; `image_dataset`, `patch_dataset` and `full_dataset` make datasets of
-it. Names and permittivities of scans whose verdict is "no result" are never returned (`withhold`).
+`ProcessedScan` is the result of one scan: images, patches, quality, verdict and provenance, read from a folder of
+products (`read_products`) or just computed. Reports, pages, exports and notebooks render it. `making_products` is a
+context manager: products are written to a temporary folder, which replaces the old one when all are complete.
+`image_dataset`, `patch_dataset` and `full_dataset` are xarray datasets; `export` writes NetCDF, MATLAB and CSV files.
 """
 
-from polysight.products.dataset_files import read_netcdf, write_netcdf, write_zarr
 from polysight.products.datasets import (
-    CONVENTION,
     full_dataset,
     image_dataset,
     patch_dataset,
     ranges_text,
-    verdict_attributes,
+    read_netcdf,
+    write_netcdf,
 )
+from polysight.products.exports import export
 from polysight.products.files import (
     FINISHED,
     IMAGE,
@@ -23,80 +23,51 @@ from polysight.products.files import (
     QUALITY,
     REPORT,
     SCAN,
-    SavedProducts,
-    find_products,
-    plain,
-    read_image,
-    read_products,
     rx_gains,
-    scan_facts,
-    temporary_path,
-    withhold,
     write_atomically,
     write_image,
     write_json,
-    write_scan_facts,
 )
 from polysight.products.folder import (
     LABELS_PICTURE,
-    RAW_DROPPED,
     check_products_folder,
     find_labels,
     label_folder,
     making_products,
     products_locked,
-    raw_dropped,
     scan_folder_of,
 )
-from polysight.products.material_table import (
-    material_columns,
-    permittivity_spread,
-    refused_text,
-)
-from polysight.products.processed import ProcessedScan, Rows
+from polysight.products.processed import ProcessedScan, Rows, find_products, raw_dropped, read_products
 
 __all__ = [
-    "CONVENTION",
     "FINISHED",
     "IMAGE",
     "LABELS",
     "LABELS_PICTURE",
     "MATERIALS",
     "QUALITY",
-    "RAW_DROPPED",
     "REPORT",
     "SCAN",
     "ProcessedScan",
     "Rows",
-    "SavedProducts",
     "check_products_folder",
+    "export",
     "find_labels",
     "find_products",
     "full_dataset",
     "image_dataset",
     "label_folder",
     "making_products",
-    "material_columns",
     "patch_dataset",
-    "permittivity_spread",
-    "plain",
     "products_locked",
     "ranges_text",
     "raw_dropped",
-    "read_image",
     "read_netcdf",
     "read_products",
-    "refused_text",
     "rx_gains",
-    "scan_facts",
     "scan_folder_of",
-    "temporary_path",
-    "verdict_attributes",
-    "withhold",
     "write_atomically",
     "write_image",
     "write_json",
     "write_netcdf",
-    "write_scan_facts",
-    "write_zarr",
 ]

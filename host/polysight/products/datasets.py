@@ -1,25 +1,32 @@
-"""Convert processed scans to xarray datasets with named dimensions, coordinates in metres, units and provenance.
+"""Processed scans as xarray datasets and NetCDF files: named dimensions, metres, units, provenance.
 
 Notebooks and exports use the same names: `image_dataset` has the pixels, `patch_dataset` the patches, `full_dataset`
 both. Permittivity is eps' - j eps'' (eps'' is the loss); unknown values are NaN. xarray is imported at first use.
+
+NetCDF has no complex numbers: a complex variable `h` is stored as `h_real` and `h_imag`, each with the attribute
+`complex_part`; :func:`read_netcdf` joins them again.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import UNSET
 
 from polysight.materials import image_centre_mm
 from polysight.polarimetry import incidence_choice, specular_incidence_rad
-from polysight.products.material_table import material_columns
+from polysight.products.files import temporary_path
 from polysight.products.processed import ProcessedScan
-from polysight.results import Verdict
+from polysight.results import PatchFigures, Verdict, figures_of
+from polysight.store import MAX_BYTES
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     import xarray
@@ -28,6 +35,7 @@ CONVENTION = (
     "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
     " column 0 the smallest x; rig frame; permittivity is real - j loss"
 )
+_PART = "complex_part"
 UNREFERENCED = "none: h, v and p are in arbitrary units"
 
 
@@ -50,62 +58,52 @@ def verdict_attributes(verdict: Verdict | None) -> dict[str, str]:
     return {"verdict": content["level"], "verdict_reasons": json.dumps(content["reasons"], ensure_ascii=False)}
 
 
-def provenance(done: ProcessedScan) -> dict[str, Any]:
+def provenance(scan: ProcessedScan) -> dict[str, Any]:
     """Return the attributes of every dataset: identity and origin of the data. Unknown entries are left out.
 
     `simulated` is True, False or "unknown"; `versions` is JSON; `rows_missing` and `positions_masked` are text; see
     :func:`verdict_attributes` for `verdict` and `verdict_reasons`.
     """
-    simulated = "unknown" if done.simulated is None else done.simulated
+    simulated = "unknown" if scan.simulated is None else scan.simulated
+    metal = UNREFERENCED
+    if scan.materials is not None:
+        metal = scan.materials.metal_reference.how if scan.materials.metal_reference else "given"
     attrs: dict[str, Any] = {
-        "title": f"scan {done.scan_id or 'without a name'}{' (simulated)' if simulated is True else ''}",
-        "scan_id": done.scan_id,
+        "title": f"scan {scan.scan_id or 'without a name'}{' (simulated)' if simulated is True else ''}",
+        "scan_id": scan.scan_id,
         "simulated": simulated,
         "convention": CONVENTION,
-        "metal_reference": done.materials.get("metal_reference", {}).get("how", "given")
-        if done.metal_referenced
-        else UNREFERENCED,
-        **verdict_attributes(done.verdict),
+        "metal_reference": metal,
+        **verdict_attributes(scan.verdict),
     }
-    if done.rig is not None:
-        attrs["rig"] = done.rig.name
-    if "processed_utc" in done.scan:
-        attrs["processed_utc"] = done.scan["processed_utc"]
-    if "versions" in done.scan:
-        attrs["versions"] = json.dumps(done.scan["versions"])
-    if done.rows is not None:
-        attrs["rows_planned"] = done.rows.planned
-        attrs["rows_missing"] = ranges_text(done.rows.missing)
+    if scan.rig is not None:
+        attrs["rig"] = scan.rig.name
+    if scan.facts.processed_utc:
+        attrs["processed_utc"] = scan.facts.processed_utc
+    if scan.facts.versions:
+        attrs["versions"] = json.dumps(scan.facts.versions)
+    if scan.rows is not None:
+        attrs["rows_planned"] = scan.rows.planned
+        attrs["rows_missing"] = ranges_text(scan.rows.missing)
     masked = [
-        f"{name} {b['positions_masked']} of {b['positions']}"
-        for name, b in done.quality.get("boards", {}).items()
-        if "positions_masked" in b and "positions" in b
+        f"{name} {board.positions_masked} of {board.positions}"
+        for name, board in scan.quality.boards.items()
+        if board.positions_masked is not UNSET and board.positions is not UNSET
     ]
     if masked:
         attrs["positions_masked"] = ", ".join(masked)
     return attrs
 
 
-def _text(values: Sequence[Any]) -> npt.NDArray[np.str_]:
-    return np.array([v or "" for v in values], dtype=np.str_)
-
-
 def _numbers(values: Sequence[Any]) -> npt.NDArray[np.float64]:
     return np.array([np.nan if v is None else v for v in values], np.float64)
-
-
-def _complex(real: Sequence[Any], loss_or_imag: Sequence[Any], sign: int = 1) -> npt.NDArray[np.complex128]:
-    """Return complex numbers; both parts are NaN if one is unknown."""
-    out = _numbers(real) + 1j * sign * _numbers(loss_or_imag)
-    out[np.isnan(out)] = complex(np.nan, np.nan)
-    return out
 
 
 def _described(dims: tuple[str, ...], values: Any, units: str, long_name: str) -> tuple[Any, ...]:
     return dims, np.array(values), {"units": units, "long_name": long_name}
 
 
-def image_dataset(done: ProcessedScan) -> xarray.Dataset:
+def image_dataset(scan: ProcessedScan) -> xarray.Dataset:
     """Return the images of a processed scan.
 
     Returns
@@ -119,47 +117,44 @@ def image_dataset(done: ProcessedScan) -> xarray.Dataset:
     """
     import xarray
 
-    image, plane = done.image, ("y", "x")
-    unit = "reflection relative to metal" if done.metal_referenced else "arbitrary units"
+    images, plane = scan.images, ("y", "x")
+    unit = "reflection relative to metal" if scan.metal_referenced else "arbitrary units"
     data = {
-        "h": _described(plane, image.h, "1", f"s-polarised channel, {unit}"),
-        "v": _described(plane, image.v, "1", f"p-polarised channel, {unit}"),
-        "p": _described(plane, image.p, "1", f"polarisation ratio H / V, {unit}"),
-        "valid": _described(plane, image.valid, "1", "True where the scan illuminates the pixel"),
+        "h": _described(plane, images.h, "1", f"s-polarised channel, {unit}"),
+        "v": _described(plane, images.v, "1", f"p-polarised channel, {unit}"),
+        "p": _described(plane, images.p, "1", f"polarisation ratio H / V, {unit}"),
+        "valid": _described(plane, images.valid, "1", "True where the scan illuminates the pixel"),
     }
-    if image.p_sigma is not None:
+    if images.p_sigma is not None:
         about = "standard deviation of p: root of the mean variance of its real and imaginary part"
-        data["p_sigma"] = _described(plane, image.p_sigma, "1", about)
-    if done.rig is not None:
-        if done.quality.get("incidence", {}).get("used") == "by pixel":
-            angles = incidence_choice(done.rig, image.x_m, image.y_m, "pixel").used_rad
+        data["p_sigma"] = _described(plane, images.p_sigma, "1", about)
+    if scan.rig is not None:
+        if scan.quality.incidence and scan.quality.incidence.used == "by pixel":
+            angles = incidence_choice(scan.rig, images.x_m, images.y_m, "pixel").used_rad
             data["incidence_deg"] = _described(plane, np.degrees(angles), "degree", "incidence angle of the pixel")
         else:
-            angle = np.degrees(specular_incidence_rad(done.rig))
+            angle = np.degrees(specular_incidence_rad(scan.rig))
             data["incidence_deg"] = _described((), angle, "degree", "incidence angle")
-    return xarray.Dataset(data, _axes(done), provenance(done))
+    return xarray.Dataset(data, _axes(scan), provenance(scan))
 
 
-def _axes(done: ProcessedScan) -> dict[str, Any]:
+def _axes(scan: ProcessedScan) -> dict[str, Any]:
     return {
-        name: _described((name,), getattr(done.image, f"{name}_m"), "m", f"pixel centre, {name} of the rig frame")
-        for name in ("y", "x")
+        "y": _described(("y",), scan.y_m, "m", "pixel centre, y of the rig frame"),
+        "x": _described(("x",), scan.x_m, "m", "pixel centre, x of the rig frame"),
     }
 
 
-def patch_dataset(done: ProcessedScan) -> xarray.Dataset:
+def patch_dataset(scan: ProcessedScan) -> xarray.Dataset:
     """Return the patches of a processed scan: the patch number of each pixel, and a table.
 
     Returns
     -------
     xarray.Dataset
         `label` int32 [y, x] (0: no patch) and, if known, `interior` bool [y, x], the pixels used for the values.
-        On dimension `patch`: `name`, `confidence`, `runner_up`, `runner_up_share`, `metal_reference`, `metal_like`,
-        `width` and `height` (m), `pixels`, `patch_incidence_deg`, `ratio` and `permittivity` (complex) with their
-        standard errors, `permittivity_real_loss_covariance`, `dominated_by` (largest source of the error) and
-        `refused` (why a patch has no result); for boxes drawn by hand `drawn_as`, if the truth is known `true_name`
-        and `true_permittivity`, and with sub-bands `band_ratio` [patch, band]. Coordinates `centre_x` and `centre_y`
-        (m, rig frame). Attributes: :func:`provenance`, `library`, `model`.
+        On dimension `patch` the figures declared in :class:`polysight.results.PatchFigures`, and with sub-bands
+        `band_ratio` [patch, band]. Coordinates `centre_x` and `centre_y` (m, rig frame). Attributes:
+        :func:`provenance`, `library`, `model`.
 
     Raises
     ------
@@ -168,105 +163,200 @@ def patch_dataset(done: ProcessedScan) -> xarray.Dataset:
     """
     import xarray
 
-    if not done.metal_referenced:
+    if scan.materials is None:
         raise DataError(
-            f"scan {done.scan_id} has no materials",
+            f"scan {scan.scan_id} has no materials",
             "only images were made of this scan",
             "`polysight process` finds patches and materials; give the folder it writes, or the scan folder",
             code=ErrorCode.NO_DATA,
         )
     plane = ("y", "x")
-    data = {"label": _described(plane, done.labels, "1", "number of the patch that holds the pixel, 0 for none")}
-    if done.interior is not None:
-        data["interior"] = _described(plane, done.interior, "1", "True where the pixel is used for the patch's numbers")
-    data |= _table(done) | _band_table(done.segments)
-    naming = {key: done.materials[key] for key in ("library", "model") if done.materials.get(key)}
-    return xarray.Dataset(data, _axes(done) | _patch_axes(done), provenance(done) | naming)
+    data = {"label": _described(plane, scan.labels, "1", "number of the patch that holds the pixel, 0 for none")}
+    if scan.interior is not None:
+        data["interior"] = _described(plane, scan.interior, "1", "True where the pixel is used for the patch's numbers")
+    data |= _figure_variables(scan.segments) | _band_variables(scan.segments)
+    naming = {"library": scan.materials.library, "model": scan.materials.model}
+    attributes = provenance(scan) | {key: text for key, text in naming.items() if text}
+    return xarray.Dataset(data, _axes(scan) | _patch_axes(scan), attributes)
 
 
-def _patch_axes(done: ProcessedScan) -> dict[str, Any]:
-    columns = material_columns(done)
-    middle = image_centre_mm(done.image.x_m, done.image.y_m)
-    axes = {"patch": _described(("patch",), np.array(columns["patch"], np.int32), "1", "number of the patch in label")}
-    for name, offset_mm in zip("xy", middle, strict=True):
-        at = (_numbers(columns[f"centre_{name}_mm"]) + offset_mm) / 1e3
-        axes[f"centre_{name}"] = _described(("patch",), at, "m", f"middle of the patch, {name} of the rig frame")
-    return axes
-
-
-def _table(done: ProcessedScan) -> dict[str, Any]:
-    """Return the variables on dimension `patch`."""
-    c = material_columns(done)
-    second = [_runner_up(s) for s in done.segments]
-    inverse = _numbers(c["inverse_p_standard_error"])
-    rows: list[tuple[str, Any, str, str]] = [
-        ("name", _text(c["name"]), "", "material; empty where it was not named"),
-        ("confidence", _numbers(c["confidence"]), "1", "confidence in the name, 0 to 1"),
-        ("runner_up", _text([name for name, _ in second]), "", "next likeliest material"),
-        ("runner_up_share", _numbers([share for _, share in second]), "1", "probability of runner_up"),
-        ("metal_reference", np.array(c["metal_reference"], bool), "1", "True where the patch is the metal reference"),
-        ("metal_like", np.array(c["metal_like"], bool), "1", "True where P is too close to metal for a permittivity"),
-        ("width", _numbers(c["width_mm"]) / 1e3, "m", "extent along x"),
-        ("height", _numbers(c["height_mm"]) / 1e3, "m", "extent along y"),
-        ("pixels", _numbers(c["pixels"]), "1", "number of pixels behind the numbers"),
-        ("patch_incidence_deg", _numbers(c["incidence_deg"]), "degree", "mean incidence angle of the patch"),
-        ("ratio", _complex(c["p_real"], c["p_imag"]), "1", "median of P = H / V relative to metal"),
-        ("inverse_ratio_standard_error", inverse, "1", "standard error of V / H, real and imaginary part each"),
-        ("permittivity", _complex(c["permittivity_real"], c["permittivity_loss"], -1), "1", "relative permittivity"),
-    ]
-    for part in ("real", "loss"):
-        name = f"permittivity_{part}_standard_error"
-        rows.append((name, _numbers(c[name]), "1", f"standard error of the permittivity, {part} part"))
-    name = "permittivity_real_loss_covariance"
-    rows.append((name, _numbers(c[name]), "1", "covariance of the permittivity's real part and loss"))
-    rows.append(("dominated_by", _text(c["dominated_by"]), "", "what most of the permittivity's error comes from"))
-    rows.append(("refused", _text(c["refused"]), "", "why the patch was not judged, and what to do"))
-    if any(c["drawn_as"]):
-        rows.append(("drawn_as", _text(c["drawn_as"]), "", "what a person called the box of the patch"))
-    if any(c["true_name"]):
-        truth = _complex(c["true_permittivity_real"], c["true_permittivity_loss"], -1)
-        rows.append(("true_name", _text(c["true_name"]), "", "material of the simulated scene"))
-        rows.append(("true_permittivity", truth, "1", "relative permittivity of the simulated scene"))
-    return {name: _described(("patch",), values, units, about) for name, values, units, about in rows}
-
-
-def _runner_up(segment: dict[str, Any]) -> tuple[str | None, float | None]:
-    """Return the second most probable material and its probability (without probabilities: share of pixels)."""
-    every = segment.get("probabilities") or segment.get("votes") or {}
-    others = {name: share for name, share in every.items() if name != segment.get("name")}
-    return max(others.items(), key=lambda item: item[1], default=(None, None))
-
-
-def _band_table(segments: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the variables on dimensions `patch`, `band`; empty unless every patch has sub-bands."""
-    bands = [s.get("bands") for s in segments]
-    if not bands or any(b is None for b in bands):
-        return {}
-    rows: list[list[dict[str, Any]]] = [b for b in bands if b is not None]
-    ratios = [[b.get("ratio") or {"real": None, "imag": None} for b in row] for row in rows]
-    errors = [_numbers([b.get("inverse_ratio_std") for b in row]) for row in rows]
-    found = [_complex([p["real"] for p in row], [p["imag"] for p in row]) for row in ratios]
-    name, error = "band_ratio", "band_inverse_ratio_standard_error"
-    edges = {
-        f"band_{edge}_hz": _described(("band",), [b[f"{edge}_hz"] for b in rows[0]], "Hz", f"{edge} transmit frequency")
-        for edge in ("first", "last")
-    }
+def _patch_axes(scan: ProcessedScan) -> dict[str, Any]:
+    numbers = np.array([patch.label for patch in scan.segments], np.int32)
+    x_mm, y_mm = image_centre_mm(scan.x_m, scan.y_m)
+    centre_x_m = (_numbers([patch.centre_x_mm for patch in scan.segments]) + x_mm) / 1e3
+    centre_y_m = (_numbers([patch.centre_y_mm for patch in scan.segments]) + y_mm) / 1e3
     return {
-        name: _described(("patch", "band"), found, "1", "median of P = H / V in the sub-band"),
-        error: _described(("patch", "band"), errors, "1", "standard error of V / H in the sub-band"),
-        **edges,
+        "patch": _described(("patch",), numbers, "1", "number of the patch in label"),
+        "centre_x": _described(("patch",), centre_x_m, "m", "middle of the patch, x of the rig frame"),
+        "centre_y": _described(("patch",), centre_y_m, "m", "middle of the patch, y of the rig frame"),
     }
 
 
-def full_dataset(done: ProcessedScan) -> xarray.Dataset:
+def _figure_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
+    """Return a variable on dimension `patch` for each declared figure; lengths in metres."""
+    variables = {}
+    for figure in figures_of(type(patches[0]) if patches else PatchFigures):
+        values = figure.values(patches)
+        if not figure.variable or (figure.column.optional and not any(values)):
+            continue
+        unit = figure.column.unit
+        array = figure.array(patches)
+        if unit == "mm":
+            array = array / 1e3
+            unit = "m"
+        variables[figure.variable] = _described(("patch",), array, unit, figure.column.about)
+    return variables
+
+
+def _band_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
+    """Return the variables on dimensions `patch`, `band`; empty unless every patch has sub-bands."""
+    rows = [patch.bands for patch in patches if patch.bands]
+    if not rows or len(rows) < len(patches):
+        return {}
+    nothing = complex(np.nan, np.nan)
+    ratios = [[nothing if band.ratio is None else band.ratio.value for band in row] for row in rows]
+    errors = [_numbers([band.inverse_ratio_std for band in row]) for row in rows]
+    first_hz = [band.first_hz for band in rows[0]]
+    last_hz = [band.last_hz for band in rows[0]]
+    plane = ("patch", "band")
+    return {
+        "band_ratio": _described(plane, ratios, "1", "median of P = H / V in the sub-band"),
+        "band_inverse_ratio_standard_error": _described(plane, errors, "1", "standard error of V / H in the sub-band"),
+        "band_first_hz": _described(("band",), first_hz, "Hz", "first transmit frequency"),
+        "band_last_hz": _described(("band",), last_hz, "Hz", "last transmit frequency"),
+    }
+
+
+def full_dataset(scan: ProcessedScan) -> xarray.Dataset:
     """Return :func:`image_dataset` and, if there are materials, :func:`patch_dataset` in one dataset.
 
     The attribute `instrument` is the rig file as JSON.
     """
-    made = image_dataset(done)
-    if done.metal_referenced:
-        patches = patch_dataset(done)
-        made = made.assign_coords(patches.coords).assign(patches.data_vars).assign_attrs(patches.attrs)
-    if "instrument" in done.scan:
-        made.attrs["instrument"] = json.dumps(done.scan["instrument"])
-    return made
+    dataset = image_dataset(scan)
+    if scan.metal_referenced:
+        patches = patch_dataset(scan)
+        dataset = dataset.assign_coords(patches.coords).assign(patches.data_vars).assign_attrs(patches.attrs)
+    if scan.facts.instrument:
+        dataset.attrs["instrument"] = json.dumps(scan.facts.instrument)
+    return dataset
+
+
+def split_complex(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Return a dataset with each complex variable `h` replaced by real variables `h_real` and `h_imag`."""
+    made: dict[str, Any] = {}
+    for name, variable in dataset.data_vars.items():
+        if variable.dtype.kind != "c":
+            made[str(name)] = variable
+            continue
+        about = variable.attrs.get("long_name", str(name))
+        for suffix, part in (("real", "real"), ("imag", "imaginary")):
+            values = variable.real if suffix == "real" else variable.imag
+            attrs = {**variable.attrs, "long_name": f"{about}, {part} part", _PART: suffix}
+            made[f"{name}_{suffix}"] = values.copy().assign_attrs(attrs)
+    return dataset.drop_vars(list(dataset.data_vars)).assign(made)
+
+
+def join_complex(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Undo :func:`split_complex`: join the variables with the attribute `complex_part`."""
+    made: dict[str, Any] = {}
+    for full_name, variable in dataset.data_vars.items():
+        name, _, suffix = str(full_name).rpartition("_")
+        if variable.attrs.get(_PART) == "real" and f"{name}_imag" in dataset:
+            both = np.empty(variable.shape, np.complex64 if variable.dtype == np.float32 else np.complex128)
+            both.real, both.imag = variable.values, dataset[f"{name}_imag"].values
+            attrs = {key: text for key, text in variable.attrs.items() if key != _PART}
+            attrs["long_name"] = str(attrs.get("long_name", name)).removesuffix(", real part")
+            made[name] = (variable.dims, both, attrs)
+        elif variable.attrs.get(_PART) != suffix or suffix != "imag":
+            made[str(full_name)] = variable
+    return dataset.drop_vars(list(dataset.data_vars)).assign(made)
+
+
+def _require_h5netcdf() -> None:
+    try:
+        import_module("h5netcdf")
+    except ImportError:
+        raise ConfigError(
+            "NetCDF needs the package h5netcdf, which is not installed",
+            "only NetCDF files use it, so it is optional",
+            "pip install 'polysight[export]', or pip install h5netcdf",
+            code=ErrorCode.PACKAGE_MISSING,
+        ) from None
+
+
+def write_netcdf(path: Path, dataset: xarray.Dataset) -> None:
+    """Write a NetCDF 4 file; complex variables become two real ones, True and False in attributes 1 and 0.
+
+    Raises
+    ------
+    ConfigError
+        if h5netcdf is not installed.
+    """
+    _require_h5netcdf()
+    split = split_complex(dataset)
+    split.attrs = {key: int(value) if isinstance(value, bool) else value for key, value in split.attrs.items()}
+    packed = {"zlib": True, "complevel": 4, "shuffle": True}
+    encoding = {name: packed for name, v in split.data_vars.items() if v.ndim == 2 and v.dtype.kind in "biuf"}
+    part = temporary_path(path)
+    split.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+    part.replace(path)
+
+
+def read_netcdf(path: Path) -> xarray.Dataset:
+    """Load a file of :func:`write_netcdf` into memory, with complex variables.
+
+    Raises
+    ------
+    ConfigError
+        if h5netcdf is not installed.
+    DataError
+        if the file cannot be read.
+    """
+    import xarray
+
+    _require_h5netcdf()
+    try:
+        _check_hdf5(path)
+        dataset = xarray.load_dataset(path, engine="h5netcdf")
+    except (OSError, ValueError) as e:
+        raise DataError(
+            f"{path}: not a NetCDF file: {e}",
+            "the path is wrong, or the file is damaged",
+            code=ErrorCode.FILE_UNREADABLE,
+        ) from None
+    if "simulated" in dataset.attrs and dataset.attrs["simulated"] != "unknown":
+        dataset.attrs["simulated"] = bool(dataset.attrs["simulated"])
+    return join_complex(dataset)
+
+
+def _check_hdf5(path: Path) -> None:
+    """Raise DataError if arrays lie in other files or are too large, before anything is read. Raises OSError."""
+    import h5py
+
+    sizes: list[int] = []
+    external: list[str] = []
+    with h5py.File(path, "r") as file:
+
+        def check(name: str) -> None:  # called by HDF5, must not raise
+            outside = isinstance(file.get(name, getlink=True), h5py.ExternalLink)
+            found = None if outside else file.get(name)
+            if isinstance(found, h5py.Dataset):
+                outside = bool(found.external) or found.is_virtual
+                sizes.append((found.size or 0) * found.dtype.itemsize)
+            if outside:
+                external.append(name)
+
+        file.visit_links(check)
+    if external:
+        raise DataError(
+            f"{path}: {external[0]} lies in another file",
+            "it was not written by this program",
+            code=ErrorCode.PATH_OUTSIDE,
+        )
+    if sum(sizes) > MAX_BYTES:
+        raise DataError(
+            f"{path}: its arrays take {sum(sizes)} bytes, more than the limit of {MAX_BYTES} bytes",
+            "it was not written by this program, or is damaged",
+            "export the products again",
+            code=ErrorCode.FILE_TOO_LARGE,
+        )

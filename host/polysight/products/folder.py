@@ -17,7 +17,6 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from polysight.materials import PATCHES, Labels, read_labels
 from polysight.products.files import (
@@ -28,17 +27,15 @@ from polysight.products.files import (
     QUALITY,
     REPORT,
     SCAN,
-    SavedProducts,
     write_atomically,
 )
+from polysight.products.processed import ProcessedScan, raw_dropped
 from polysight.store import is_source, sync_folder
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError
 
 LABELS_PICTURE = "labels.png"
 PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, REPORT, "figures")
-RAW_DROPPED = "raw_dropped"
-"""Key of quality.json: the scan whose raw data was deleted after these products were made."""
 _BY_HAND = b'"by_hand": true'
 _HERE = -100  # AT_FDCWD of renameat2(2)
 _EXCHANGE = 2
@@ -74,10 +71,10 @@ def check_products_folder(out: Path, scan_id: str) -> None:
             code=ErrorCode.VALUE_INVALID,
         )
     dropped = raw_dropped(out)
-    if dropped and dropped.get("scan_id") != scan_id:
+    if dropped and dropped.scan_id != scan_id:
         raise ConfigError(
-            f"{out} holds the only products of scan {dropped.get('scan_id')}",
-            f"its raw rows were dropped on {str(dropped.get('dropped_utc'))[:10]}, so they cannot be made again",
+            f"{out} holds the only products of scan {dropped.scan_id}",
+            f"its raw rows were dropped on {dropped.dropped_utc[:10]}, so they cannot be made again",
             "give another --out",
             code=ErrorCode.NAME_TAKEN,
         )
@@ -219,15 +216,6 @@ def _is_product(name: str) -> bool:
     return name in PRODUCTS or name == FINISHED
 
 
-def raw_dropped(out: Path) -> dict[str, Any]:
-    """Return the entry `raw_dropped` of quality.json; empty without it."""
-    try:
-        dropped = SavedProducts(out).quality.get(RAW_DROPPED)
-    except DataError:
-        return {}
-    return dropped if isinstance(dropped, dict) else {}
-
-
 def scan_folder_of(folder: Path) -> Path | None:
     """Return the scan folder of a scan or of its products; None for products outside a scan folder."""
     if is_source(folder):
@@ -264,7 +252,7 @@ def _hand_labels(products: Path, scan_id: str) -> dict[str, bytes]:
     """Return the label file by hand among products of this scan and its picture, name to content."""
     path = products / LABELS
     try:
-        if not path.exists() or SavedProducts(products).scan_id != scan_id or not _is_by_hand(path):
+        if not path.exists() or ProcessedScan(products).scan_id != scan_id or not _is_by_hand(path):
             return {}
         files = (path, products / LABELS_PICTURE)
         return {f.name: f.read_bytes() for f in files if f.exists()}

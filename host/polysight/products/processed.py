@@ -1,35 +1,46 @@
-"""A processed scan with the patch of each pixel: read from a folder of products, or just computed."""
+"""One processed scan: images, patches, quality, verdict and provenance, read from its folder or just computed."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Required, Self, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
 import skimage
+from msgspec import UNSET
 
-from polysight.imaging import Images
-from polysight.materials import PATCHES, axis_mm, box_mask
-from polysight.products.files import SavedProducts
+from polysight.imaging import Image, Images
+from polysight.materials import (
+    PATCHES,
+    MaterialsResult,
+    ScanPatches,
+    TruthPlate,
+    axis_mm,
+    box_mask,
+    expected_pixel_accuracy,
+    read_patches,
+)
+from polysight.products.files import IMAGE, MATERIALS, QUALITY, SCAN, read_image
+from polysight.results import PatchFigures, RawDropped, ScanFacts, ScanMaterials, ScanQuality, Verdict, damaged
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DataError, no_such
+from polysight_shared.raster import RasterPlan, plan_raster
+from polysight_shared.tables import decode
 
 Labels = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
+PixelNames = Mapping[int, tuple[npt.NDArray[np.str_], Mask]]
+_PRODUCTS = "products"  # in a scan folder
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a scan, counted from 0.
-
-    Attributes
-    ----------
-    planned
-        Number of rows in the plan.
-    committed
-        Indices of the rows with data, ascending.
-    """
+    """Rows of a scan, counted from 0: number of rows in the plan, and the indices of those with data, ascending."""
 
     planned: int
     committed: tuple[int, ...]
@@ -45,66 +56,260 @@ class Rows:
         return tuple(sorted(set(self.indices) - set(self.committed)))
 
 
-class ProcessedScan(SavedProducts):
-    """A processed scan with the patch of each pixel: saved products, or results that were just computed."""
+class Computed(TypedDict, total=False):
+    """Content of a result that was just computed, see the properties of :class:`ProcessedScan`."""
+
+    images: Required[Images]
+    quality: Required[ScanQuality]
+    facts: Required[ScanFacts]
+    materials: ScanMaterials | None
+    found: MaterialsResult | None
+    plates: tuple[TruthPlate, ...]
+    plan: RasterPlan | None
+    labels: Labels
+    pixel_names: PixelNames
+    expected_accuracy: float | None
+
+
+@dataclass(frozen=True)
+class ProcessedScan:
+    """The result of processing one scan. What is not given is read from the folder, at first use.
+
+    Reading raises DataError if a file is damaged. Names and permittivities are withheld where the verdict is "no
+    result", see :class:`polysight.results.ScanMaterials`.
+
+    Attributes
+    ----------
+    folder
+        Folder of the products, also if a scan folder was given.
+    """
+
+    folder: Path
 
     @classmethod
-    def computed(
-        cls, folder: Path, labels: Labels, interior: Mask | None, **content: Images | dict[str, Any]
-    ) -> ProcessedScan:
-        """Return results that are not saved; `content` replaces `image`, `scan`, `quality` and `materials`."""
-        made = cls(folder)
-        vars(made).update(content, labels=labels, interior=interior)
-        return made
+    def computed(cls, folder: Path, **content: Unpack[Computed]) -> Self:
+        """Return a result that was just computed; `folder` is where its data were read."""
+        scan = cls(folder)
+        vars(scan).update({"materials": None, **content})
+        if not scan.judged:
+            vars(scan).update(plates=(), pixel_names={}, expected_accuracy=None)
+        return scan
+
+    @cached_property
+    def images(self) -> Images:
+        """Images of image.npz: h, v, p, valid and, if the products have it, p_sigma."""
+        return read_image(self.folder / IMAGE)
+
+    @property
+    def h(self) -> Image:
+        """H, complex [ny, nx]."""
+        return self.images.h
+
+    @property
+    def v(self) -> Image:
+        """V, complex [ny, nx]."""
+        return self.images.v
+
+    @property
+    def p(self) -> Image:
+        """P = H / V, complex [ny, nx]."""
+        return np.asarray(self.images.p)
+
+    @property
+    def x_m(self) -> npt.NDArray[np.float64]:
+        """Pixel centres, float64 [nx], rig frame."""
+        return self.images.x_m
+
+    @property
+    def y_m(self) -> npt.NDArray[np.float64]:
+        """Pixel centres, float64 [ny], rig frame."""
+        return self.images.y_m
+
+    @property
+    def valid(self) -> Mask:
+        """Pixels illuminated by the scan, bool [ny, nx]."""
+        return self.images.valid
+
+    @cached_property
+    def materials(self) -> ScanMaterials | None:
+        """Content of materials.json; None if only images were made."""
+        return ScanMaterials.read(self.folder / MATERIALS)
+
+    @cached_property
+    def quality(self) -> ScanQuality:
+        """Content of quality.json."""
+        return ScanQuality.read(self.folder / QUALITY)
+
+    @cached_property
+    def facts(self) -> ScanFacts:
+        """Content of scan.json."""
+        return ScanFacts.read(self.folder / SCAN)
+
+    @cached_property
+    def patches(self) -> ScanPatches:
+        """Pixels of the patches, from patches.npz. Raises DataError without the file."""
+        return read_patches(self.folder / PATCHES)
+
+    @cached_property
+    def found(self) -> MaterialsResult | None:
+        """Result of the analysis behind the figures of the patches; None for saved products."""
+        return None
+
+    @cached_property
+    def plates(self) -> tuple[TruthPlate, ...]:
+        """True plates of a simulated scene; empty for saved products."""
+        return ()
+
+    @cached_property
+    def pixel_names(self) -> PixelNames:
+        """Patch to the names of its interior's pixels in image order, and that interior; empty for saved products."""
+        patches = () if self.found is None else self.found.patches
+        return {r.patch.label: (r.names, r.patch.interior) for r in patches if r.names is not None}
+
+    @cached_property
+    def expected_accuracy(self) -> float | None:
+        """Share of pixels that the best classifier is expected to name right; None for saved products."""
+        return None if self.found is None else expected_pixel_accuracy(self.found)
+
+    @property
+    def segments(self) -> list[PatchFigures]:
+        """Patches; empty if only images were made."""
+        return [] if self.materials is None else self.materials.segments
+
+    @property
+    def metal_referenced(self) -> bool:
+        """True if h, v and p are relative to metal."""
+        return self.materials is not None
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Verdict on the results; None in products of earlier releases."""
+        return (self.materials and self.materials.verdict) or self.quality.verdict or None
+
+    @property
+    def judged(self) -> bool:
+        """False if the verdict is "no result": then there are no names and permittivities."""
+        return self.verdict is None or self.verdict.usable
+
+    @property
+    def simulated(self) -> bool | None:
+        """True if the data was simulated; None if unknown."""
+        if self.facts.simulated is not UNSET:
+            return self.facts.simulated
+        return None if self.materials is None or self.materials.simulated is UNSET else self.materials.simulated
+
+    @property
+    def stamped(self) -> bool:
+        """True if pictures and pages are stamped SIMULATED: also where it is not known."""
+        return self.simulated is not False
+
+    @property
+    def scan_id(self) -> str:
+        """Name of the scan; "" if unknown."""
+        return self.facts.scan_id or (self.materials and self.materials.scan_id) or ""
+
+    @cached_property
+    def rig(self) -> Instrument | None:
+        """Rig of the images; None if unknown."""
+        path = self.folder / SCAN
+        try:
+            return decode(self.facts.instrument, Instrument, f"{path}: instrument") if self.facts.instrument else None
+        except ConfigError as e:
+            raise damaged(path, e.what) from None
+
+    @property
+    def rows(self) -> Rows | None:
+        """Planned rows and rows in the images; None if unknown."""
+        recorded = [board.rows_recorded for board in self.quality.boards.values()]
+        indices = [set(rows) for rows in recorded if rows is not UNSET]
+        if self.rig is None or not recorded or len(indices) < len(recorded):
+            return None
+        planned = self.rig.grid.columns if self.by_columns else self.rig.grid.rows
+        return Rows(planned, tuple(sorted(set.intersection(*indices))))
+
+    @property
+    def by_columns(self) -> bool:
+        """True if published data were recorded column by column."""
+        return bool(self.quality.recording) and self.quality.recording.direction == "col"
+
+    @cached_property
+    def plan(self) -> RasterPlan | None:
+        """Raster of the scan; None if unknown."""
+        return None if self.rig is None or self.by_columns else plan_raster(self.rig.grid)
 
     @cached_property
     def labels(self) -> Labels:
         """Patch number of each pixel, 0 for none, int32 [ny, nx]; saved outlines are accurate to half a pixel."""
-        x, y = axis_mm(self.x_m), axis_mm(self.y_m)
-        labels = np.zeros((y.size, x.size), np.int32)
-        points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        for s in self.segments:
-            outline = np.asarray(s.get("outline_mm") or [], np.float64)
-            if len(outline):
-                inside = skimage.measure.points_in_poly(points, outline).reshape(labels.shape)
+        if self.found is not None:
+            return self.found.segmentation.labels
+        x_m, y_m = self.images.x_m, self.images.y_m
+        labels = np.zeros((y_m.size, x_m.size), np.int32)
+        points = np.stack(np.meshgrid(axis_mm(x_m), axis_mm(y_m)), axis=-1).reshape(-1, 2)
+        for patch in self.segments:
+            if patch.outline_mm:
+                inside = skimage.measure.points_in_poly(points, patch.outline_mm).reshape(labels.shape)
             else:
-                inside = box_mask(tuple(s["box_mm"]), self.x_m, self.y_m)
-            labels[inside] = s["label"]
-        for patch in self.patches.patches if self._has_pixels else ():
-            labels[self._pixels(patch.places_mm)] = patch.label
+                inside = box_mask(patch.box_mm, x_m, y_m)
+            labels[inside] = patch.label
+        if self._has_pixels:
+            for pixels in self.patches.patches:
+                labels[self._pixels(pixels.places_mm)] = pixels.label
         return labels
 
     @cached_property
     def interior(self) -> Mask | None:
         """Pixels used for the patches' statistics, bool [ny, nx]; None if unknown."""
-        if not self._has_pixels:
+        interior = np.zeros(self.images.valid.shape, bool)
+        if self.found is not None:
+            for patch in self.found.segmentation.patches:
+                interior |= patch.interior
+        elif self._has_pixels:
+            for pixels in self.patches.patches:
+                interior[self._pixels(pixels.places_mm)] = True
+        else:
             return None
-        interior = np.zeros(self.valid.shape, bool)
-        for patch in self.patches.patches:
-            interior[self._pixels(patch.places_mm)] = True
         return interior
 
     @property
     def _has_pixels(self) -> bool:
-        return (self.folder / PATCHES).exists()
+        return self.materials is not None and (self.folder / PATCHES).exists()
 
     def _pixels(self, places_mm: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-        """Rows and columns of the pixels at places x, y [n, 2]."""
-        columns, rows = (_nearest(axis_mm(a), places_mm[:, i]) for i, a in enumerate((self.x_m, self.y_m)))
-        return rows, columns
-
-    @property
-    def rows(self) -> Rows | None:
-        """Planned rows and rows in the images; None if unknown."""
-        boards = self.quality.get("boards", {}).values()
-        if self.rig is None or not boards or any("rows_recorded" not in b for b in boards):
-            return None
-        committed = set.intersection(*(set(b["rows_recorded"]) for b in boards))
-        by_columns = self.quality.get("recording", {}).get("direction") == "col"
-        planned = self.rig.grid.columns if by_columns else self.rig.grid.rows
-        return Rows(planned, tuple(sorted(committed)))
+        """Return rows and columns of the pixels at places x, y [n, 2]."""
+        rows = _nearest(axis_mm(self.images.y_m), places_mm[:, 1])
+        return rows, _nearest(axis_mm(self.images.x_m), places_mm[:, 0])
 
 
 def _nearest(axis: npt.NDArray[np.float64], places: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
     """Return the indices of the nearest values of an evenly spaced axis."""
     return np.rint((places - axis[0]) / (axis[1] - axis[0])).astype(np.intp)
+
+
+def find_products(folder: Path, needs: str = IMAGE) -> ProcessedScan | None:
+    """Find products in a folder, or in `products` of a scan folder; None if the file `needs` is in neither."""
+    for place in (folder, folder / _PRODUCTS):
+        if (place / needs).exists():
+            return ProcessedScan(place)
+    return None
+
+
+def read_products(folder: Path, needs: str = IMAGE) -> ProcessedScan:
+    """Return the products that :func:`find_products` finds. Raises DataError if there are none."""
+    if products := find_products(folder, needs):
+        return products
+    if not folder.exists():
+        raise no_such(folder)
+    raise DataError(
+        f"{folder}: no {needs}",
+        "the folder is wrong, the scan was not processed" + ("" if needs == IMAGE else ", or only to images"),
+        "give a folder that polysight process" + (" or polysight image wrote" if needs == IMAGE else " wrote"),
+        code=ErrorCode.FILE_MISSING,
+    )
+
+
+def raw_dropped(folder: Path) -> RawDropped | None:
+    """Return what products say about their scan's dropped raw data; None without it, or if they cannot be read."""
+    try:
+        return ProcessedScan(folder).quality.raw_dropped or None
+    except DataError:
+        return None

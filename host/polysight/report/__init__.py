@@ -1,14 +1,9 @@
-"""The report of a processed scan, its figures and tables, and exports for other programs.
+"""The report of a processed scan, and its figures and tables.
 
-`context_of` collects the content of a report, `write_report` writes the page; `write_sync_report` reports the residual
-errors of synchronisation; `export` writes HDF5, MATLAB, NetCDF, Zarr, PNG and CSV from saved products; `write_cphd`
-writes a scan's phase history for other SAR processors.
+`write_report` writes the page of a :class:`polysight.products.ProcessedScan`; `write_sync_report` reports the residual
+errors of synchronisation. The other names are for single figures of commands and papers.
 """
 
-from polysight.report.context import ReportContext, classifier_sentence, context_of
-from polysight.report.cphd import Channel as CphdChannel
-from polysight.report.cphd import PhaseHistory, write_cphd
-from polysight.report.exports import export, export_folder
 from polysight.report.figures import draw_channel, draw_overview, figures, focus_figure, label_figure
 from polysight.report.report import write_report
 from polysight.report.style import INK, MUTED, PALETTE, STAMP, extent_mm, figure_label, font_families, png
@@ -20,16 +15,9 @@ __all__ = [
     "PALETTE",
     "QUANTITIES",
     "STAMP",
-    "CphdChannel",
-    "PhaseHistory",
-    "ReportContext",
     "SyncReport",
-    "classifier_sentence",
-    "context_of",
     "draw_channel",
     "draw_overview",
-    "export",
-    "export_folder",
     "extent_mm",
     "figure_label",
     "figures",
@@ -37,7 +25,6 @@ __all__ = [
     "font_families",
     "label_figure",
     "png",
-    "write_cphd",
     "write_report",
     "write_sync_report",
 ]

@@ -15,8 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from matplotlib.patheffects import withStroke
 
-from polysight.products import permittivity_spread
-from polysight.report.context import ReportContext
+from polysight.products import ProcessedScan
 from polysight.report.style import (
     INK,
     MUTED,
@@ -28,6 +27,7 @@ from polysight.report.style import (
     short_label,
     style_legend,
 )
+from polysight.results import PatchFigures, PermittivityFigures
 
 SHARES = {0.68: 2.279, 0.95: 5.991}
 """Share of draws to the squared radius that holds it: quantiles of chi-squared with two degrees of freedom."""
@@ -38,6 +38,8 @@ _STYLES: dict[float, dict[str, Any]] = {
 _LABEL_PT, _NEAR_PT = (9.0, 9.0), 5.0  # sizes of a number and of a point
 _RADII_PT, _ANGLES = (11, 17, 25, 34, 45, 58), 16
 Array = npt.NDArray[np.float64]
+Point = tuple[float, float]
+Estimate = tuple[PatchFigures, PermittivityFigures]
 
 
 def ellipse_of(matrix: Array, share: float) -> tuple[float, float, float]:
@@ -79,57 +81,57 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
     return np.array(taken).reshape(-1, 2)
 
 
-def permittivity_figure(ctx: ReportContext) -> bytes | None:
+def permittivity_figure(scan: ProcessedScan) -> bytes | None:
     """Return a PNG of the estimates with ellipses of 68 % and 95 %, and the truth as crosses; None without estimates.
 
     Patches are numbered; a legend names them. Without a covariance, bars show the spread of the pixels.
     """
-    rows = [r for r in ctx.materials if r.get("permittivity")]
-    if not rows:
+    estimates = [(patch, patch.permittivity) for patch in scan.segments if patch.permittivity is not None]
+    if not estimates:
         return None
-    colours = colours_of(ctx)
-    fig = Figure(figsize=(7.8, max(4.4, 1.5 + 0.19 * len(rows))), dpi=160, layout="constrained", facecolor="white")
+    colours = colours_of(scan)
+    size_in = (7.8, max(4.4, 1.5 + 0.19 * len(estimates)))
+    fig = Figure(figsize=size_in, dpi=160, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
     ax = fig.add_subplot()
-    truths = [t for r in rows if (t := _truth(r))]
-    dress(ax, "Permittivity, estimate and truth" if truths else "Permittivity", ctx.simulated)
+    truths = [t for patch, _ in estimates if (t := _truth(patch))]
+    dress(ax, "Permittivity, estimate and truth" if truths else "Permittivity", scan.stamped)
     ax.set_aspect("auto")
     ax.set_facecolor("white")
     ax.grid(color="#e6e9ee", linewidth=0.8)
     ax.set_axisbelow(True)
     ax.set_xlabel("real part ε′", fontsize=9, color=MUTED)
     ax.set_ylabel("loss ε″", fontsize=9, color=MUTED)
-    for row in rows:
-        _draw_estimate(ax, row, patch_colour(row, colours))
-    _set_limits(ax, rows)
+    for patch, e in estimates:
+        _draw_estimate(ax, e, _truth(patch), patch_colour(patch, colours))
+    _set_limits(ax, [e for _, e in estimates], truths)
     low = ax.get_ylim()[0]
     ax.axhspan(low, 0, color="#f0e7e6", zorder=0)
     ax.annotate(
         "ε″ < 0: gain", (0, 0), xycoords="axes fraction", xytext=(4, 3), textcoords="offset points", fontsize=7,
         color=MUTED, zorder=1,
     )  # fmt: skip
-    _legend(fig, rows, colours, bool(truths))
+    _legend(fig, estimates, colours, bool(truths))
     fig.draw_without_rendering()
-    _write_numbers(fig, ax, rows, truths)
+    _write_numbers(fig, ax, estimates, truths)
     return png(fig)
 
 
-def _truth(row: dict[str, Any]) -> tuple[float, float] | None:
-    truth = (row.get("truth") or {}).get("permittivity")
-    return (truth["real"], -truth["imag"]) if truth else None
+def _truth(patch: PatchFigures) -> Point | None:
+    truth = patch.true_permittivity
+    return None if truth is None else (truth.real, -truth.imag)
 
 
-def _draw_estimate(ax: Axes, row: dict[str, Any], colour: str) -> None:
-    e = row["permittivity"]
-    at, spread, truth = (e["real"], -e["imag"]), permittivity_spread(e), _truth(row)
-    if spread is not None:
+def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour: str) -> None:
+    at = (e.real, e.loss)
+    if e.spread is not None:
         for share, style in _STYLES.items():
-            w, h, angle = ellipse_of(spread.matrix, share)
+            w, h, angle = ellipse_of(e.spread.matrix, share)
             ax.add_patch(Ellipse(at, w, h, angle=angle, facecolor="none", edgecolor=colour, zorder=2.5, **style))
             if share == min(_STYLES):
                 ax.add_patch(Ellipse(at, w, h, angle=angle, facecolor=colour, alpha=0.18, linewidth=0, zorder=2))
-    elif "real_p30_p70" in e and "imag_p30_p70" in e:
-        (r0, r1), (i0, i1) = e["real_p30_p70"], e["imag_p30_p70"]
+    elif e.real_p30_p70 and e.imag_p30_p70:
+        (r0, r1), (i0, i1) = e.real_p30_p70, e.imag_p30_p70
         ax.errorbar(
             *at, xerr=[[max(at[0] - r0, 0)], [max(r1 - at[0], 0)]], yerr=[[max(at[1] + i1, 0)], [max(-i0 - at[1], 0)]],
             color=colour, linewidth=1.2, zorder=3,
@@ -140,11 +142,11 @@ def _draw_estimate(ax: Axes, row: dict[str, Any], colour: str) -> None:
         ax.plot(*truth, "x", color=INK, markersize=6, markeredgewidth=1.5, zorder=4)
 
 
-def _set_limits(ax: Axes, rows: Sequence[dict[str, Any]]) -> None:
+def _set_limits(ax: Axes, estimates: Sequence[PermittivityFigures], truths: Sequence[Point]) -> None:
     """Set limits around estimates, truths and ellipses; one very uncertain patch must not shrink all others."""
-    centres = np.array([(r["permittivity"]["real"], -r["permittivity"]["imag"]) for r in rows])
-    certain = np.concatenate([centres, np.array([t for r in rows if (t := _truth(r))], float).reshape(-1, 2)])
-    half = np.array([_half_size(r["permittivity"]) for r in rows])
+    centres = np.array([(e.real, e.loss) for e in estimates])
+    certain = np.concatenate([centres, np.array(truths, float).reshape(-1, 2)])
+    half = np.array([_half_size(e) for e in estimates])
     low, high = certain.min(axis=0), certain.max(axis=0)
     span = np.maximum(high - low, (0.5, 0.3))
     low = np.minimum(low, np.maximum((centres - half).min(axis=0), low - 0.75 * span)) - 0.08 * span
@@ -153,16 +155,16 @@ def _set_limits(ax: Axes, rows: Sequence[dict[str, Any]]) -> None:
     ax.set_ylim(min(low[1], -0.1), high[1])
 
 
-def _half_size(e: dict[str, Any]) -> tuple[float, float]:
+def _half_size(e: PermittivityFigures) -> Point:
     """Return how far the drawing of an estimate reaches: its 95 % ellipse, or its bars."""
-    if spread := permittivity_spread(e):
+    if e.spread is not None:
         radius = math.sqrt(SHARES[0.95])
-        return radius * spread.real_std, radius * spread.loss_std
-    bars = [e.get(f"{part}_p30_p70") or [e[part]] for part in ("real", "imag")]
-    return tuple(max(abs(v - e[part]) for v in bar) for part, bar in zip(("real", "imag"), bars, strict=True))
+        return radius * e.spread.real_std, radius * e.spread.loss_std
+    real = max(abs(end - e.real) for end in e.real_p30_p70 or (e.real,))
+    return real, max(abs(end - e.imag) for end in e.imag_p30_p70 or (e.imag,))
 
 
-def _legend(fig: Figure, rows: Sequence[dict[str, Any]], colours: dict[str, str], with_truth: bool) -> None:
+def _legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, str], with_truth: bool) -> None:
     dot: dict[str, Any] = {
         "marker": "o",
         "linestyle": "",
@@ -170,11 +172,11 @@ def _legend(fig: Figure, rows: Sequence[dict[str, Any]], colours: dict[str, str]
         "markeredgecolor": INK,
         "markeredgewidth": 0.6,
     }
-    handles = [
-        Line2D([], [], color=patch_colour(r, colours), label=f"{r['label']}  {short_label(patch_label(r))}", **dot)
-        for r in rows
-    ]
-    if any(permittivity_spread(r["permittivity"]) for r in rows):
+    handles = []
+    for patch, _ in estimates:
+        label = f"{patch.label}  {short_label(patch_label(patch))}"
+        handles.append(Line2D([], [], color=patch_colour(patch, colours), label=label, **dot))
+    if any(e.spread for _, e in estimates):
         handles += [
             Line2D([], [], color=MUTED, **style, label=f"{100 * share:.0f} % region")
             for share, style in _STYLES.items()
@@ -184,18 +186,19 @@ def _legend(fig: Figure, rows: Sequence[dict[str, Any]], colours: dict[str, str]
     style_legend(fig.legend(handles=handles, loc="outside right upper", fontsize=7.5, frameon=False))
 
 
-def _write_numbers(fig: Figure, ax: Axes, rows: Sequence[dict[str, Any]], truths: Sequence[Sequence[float]]) -> None:
+def _write_numbers(fig: Figure, ax: Axes, estimates: Sequence[Estimate], truths: Sequence[Point]) -> None:
     """Write the patches' numbers beside their points, with a line to numbers that are further away."""
     per_point = fig.dpi / 72
-    estimates = np.array([(r["permittivity"]["real"], -r["permittivity"]["imag"]) for r in rows])
-    points = ax.transData.transform(estimates) / per_point
+    values = np.array([(e.real, e.loss) for _, e in estimates])
+    points = ax.transData.transform(values) / per_point
     crosses = ax.transData.transform(np.array(truths, float).reshape(-1, 2)) / per_point
+    places = place_numbers(points, crosses)
     line = {"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkA": 3, "shrinkB": 3}
-    for row, at, place, point in zip(rows, estimates, place_numbers(points, crosses), points, strict=True):
+    for (patch, e), place, point in zip(estimates, places, points, strict=True):
         offset = place - point
         far = float(np.hypot(*offset)) > _RADII_PT[0] + 1
         ax.annotate(
-            str(row["label"]), (float(at[0]), float(at[1])), textcoords="offset points",
+            str(patch.label), (e.real, e.loss), textcoords="offset points",
             xytext=(float(offset[0]), float(offset[1])), ha="center", va="center", fontsize=8, color=INK, zorder=5,
             fontweight="bold", path_effects=[withStroke(linewidth=2, foreground="white")],
             arrowprops=line if far else None,

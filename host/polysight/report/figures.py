@@ -1,42 +1,56 @@
 """Figures of a report and of single commands: amplitude and phase of H, V and P, with axes in millimetres.
 
-Amplitude has a perceptually uniform, colour-blind safe map (cividis), phase a cyclic one (twilight). `maps` and
-`ellipses` draw the patches. `label_figure` shows the boxes of a label file, `focus_figure` a sweep over depth.
+Amplitude has a perceptually uniform, colour-blind safe map (cividis), phase a cyclic one (twilight).
+`label_figure` shows the boxes of a label file, `focus_figure` a sweep over depth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
+from msgspec import UNSET
 
 from polysight.materials import Box, axis_mm
-from polysight.products import SavedProducts
-from polysight.report.context import ReportContext
+from polysight.products import ProcessedScan
 from polysight.report.ellipses import permittivity_figure
-from polysight.report.maps import coverage_figure, draw_materials, draw_truth, map_figure, permittivity_map
 from polysight.report.style import (
+    HATCH,
     INK,
+    METAL_COLOUR,
     MUTED,
+    REFUSED_COLOUR,
     STAMP,
+    UNKNOWN_COLOUR,
     MapLabel,
     colour_bar,
+    colours_of,
     dress,
     extent_mm,
     figure_label,
     fit_labels,
     new_axes,
+    outline_of,
+    patch_colour,
+    patch_label,
+    plate_label,
     png,
     shorten_labels,
     write_label,
 )
-from polysight.report.tables import masked_positions
+from polysight.results import BoardQuality
+from polysight_shared.raster import RasterPlan
 
 FIGURES: dict[str, str] = {
     "amplitude_h": "Amplitude H (s-polarised)",
@@ -52,31 +66,32 @@ _LEAST_DEG, _MAX_DEG = 20.0, 300.0
 _METAL, _OTHER = "#ff9e3d", "#ffffff"  # boxes drawn by hand
 _FOCUS_RANGE_DB = 30.0
 Limits = tuple[float, float]
+_ROOM = 0.05  # of a map's height, for a label
+_POSITION_COLOURS = ("#dfe5ec", "#882255")  # with data light, masked dark: readable without colour
 
 
-def _shown(ctx: ReportContext, values: npt.NDArray) -> npt.NDArray:
+def _shown(scan: ProcessedScan, values: npt.NDArray) -> npt.NDArray:
     bad = ~np.isfinite(values)
-    return np.ma.masked_array(values, bad if ctx.valid is None else bad | ~ctx.valid)
+    return np.ma.masked_array(values, bad | ~scan.valid)
 
 
 def _db(values: npt.NDArray) -> npt.NDArray[np.float64]:
     return 20 * np.log10(np.maximum(np.nan_to_num(np.abs(values), nan=0.0, posinf=0.0), 1e-9))
 
 
-def phase_limits_deg(ctx: ReportContext) -> Limits | None:
+def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
     """Return the range of the phase of P inside the judged patches, degrees; None if it is nearly the whole circle.
 
     The metal reference, 0 degrees by definition, counts only if there is no other patch. The range is taken around the
     circular mean, so that values on both sides of 180 degrees lie side by side: limits may pass 180.
     """
-    x, y = axis_mm(ctx.x_m), axis_mm(ctx.y_m)
+    x, y = axis_mm(scan.x_m), axis_mm(scan.y_m)
     inside: list[npt.NDArray] = []
-    others = [r for r in ctx.materials if not r.get("refused") and not r.get("metal_reference")]
-    for row in others or ctx.materials:
-        x0, y0, x1, y1 = row["box_mm"]
-        near_x = np.abs(x - (x0 + x1) / 2) <= _INSIDE * (x1 - x0) / 2
-        near_y = np.abs(y - (y0 + y1) / 2) <= _INSIDE * (y1 - y0) / 2
-        part = ctx.p[np.ix_(near_y, near_x)]
+    others = [patch for patch in scan.segments if patch.refused is None and not patch.metal_reference]
+    for patch in others or scan.segments:
+        near_x = np.abs(x - patch.centre_x_mm) <= _INSIDE * patch.width_mm / 2
+        near_y = np.abs(y - patch.centre_y_mm) <= _INSIDE * patch.height_mm / 2
+        part = scan.p[np.ix_(near_y, near_x)]
         part = part[np.isfinite(part) & (part != 0)]
         if part.size:
             inside.append(part / np.abs(part))
@@ -90,21 +105,21 @@ def phase_limits_deg(ctx: ReportContext) -> Limits | None:
     return (low, high) if high - low < _MAX_DEG else None
 
 
-def _decibels(ctx: ReportContext) -> str:
-    if not ctx.metal_referenced:
+def _decibels(scan: ProcessedScan) -> str:
+    if not scan.metal_referenced:
         return "dB"
-    return "dB (metal = 0)" if ctx.judged else "dB (reference = 0)"
+    return "dB (metal = 0)" if scan.judged else "dB (reference = 0)"
 
 
-def draw_channel(ax: Axes, ctx: ReportContext, key: str, phase_deg: Limits | None = None):
+def draw_channel(ax: Axes, scan: ProcessedScan, key: str, phase_deg: Limits | None = None):
     """Draw one of FIGURES on an axes; return the image for a colour bar, and the bar's label.
 
     Phases span -180 to 180 degrees, or `phase_deg`, which may pass 180.
     """
     kind, _, channel = key.partition("_")
-    data = {"h": ctx.h, "v": ctx.v, "p": ctx.p}[channel]
-    unit, colours = _decibels(ctx), "cividis"
-    fade = _fade(ctx) if kind == "phase" or channel == "p" else None
+    data = {"h": scan.h, "v": scan.v, "p": scan.p}[channel]
+    unit, colours = _decibels(scan), "cividis"
+    fade = _fade(scan) if kind == "phase" or channel == "p" else None
     if kind == "phase":
         unit, colours = "degrees", "cividis" if phase_deg else "twilight"
         low, high = phase_deg or (-180.0, 180.0)
@@ -113,53 +128,53 @@ def draw_channel(ax: Axes, ctx: ReportContext, key: str, phase_deg: Limits | Non
         values = (values - middle + 180) % 360 - 180 + middle
     elif channel == "p":
         values = _db(data)
-        low, high = _ratio_range_db(ctx, values)
+        low, high = _ratio_range_db(scan, values)
     else:
         values = _db(data)
-        finite = values[np.isfinite(data)] if ctx.valid is None else values[np.isfinite(data) & ctx.valid]
-        high = 0.0 if ctx.metal_referenced else float(np.percentile(finite, 99.8)) if finite.size else 0.0
+        finite = values[np.isfinite(data) & scan.valid]
+        high = 0.0 if scan.metal_referenced else float(np.percentile(finite, 99.8)) if finite.size else 0.0
         low = high - 35
     shown = ax.imshow(
-        _shown(ctx, values), extent=extent_mm(ctx), origin="lower", cmap=colours, vmin=low, vmax=high, alpha=fade,
+        _shown(scan, values), extent=extent_mm(scan), origin="lower", cmap=colours, vmin=low, vmax=high, alpha=fade,
         interpolation="nearest",
     )  # fmt: skip
     return shown, unit
 
 
-def _ratio_range_db(ctx: ReportContext, level: npt.NDArray) -> tuple[float, float]:
+def _ratio_range_db(scan: ProcessedScan, level: npt.NDArray) -> tuple[float, float]:
     """Return the range of |P| to show, dB: that of the patches' medians if there are any, else of the bright pixels."""
-    medians = [complex(r["ratio"]["real"], r["ratio"]["imag"]) for r in ctx.materials if r.get("ratio")]
-    values = np.array([20 * np.log10(abs(m)) for m in medians if m != 0])
+    levels = [patch.p_abs_db for patch in scan.segments]
+    values = np.array([level for level in levels if level is not None])
     if values.size == 0:
-        values = level[(_fade(ctx) > 0.5) & np.isfinite(level)]
+        values = level[(_fade(scan) > 0.5) & np.isfinite(level)]
         values = np.percentile(values, [5, 95]) if values.size else np.array([0.0, 20.0])
     low, high = float(values.min()), float(values.max())
     return np.floor(min(low, 0.0) - 1), max(np.ceil(high + 1), np.floor(low) + 6)
 
 
-def _fade(ctx: ReportContext) -> npt.NDArray[np.float64]:
+def _fade(scan: ProcessedScan) -> npt.NDArray[np.float64]:
     """Return the opacity of ratio and phase: pixels without signal are noise and fade into the background."""
-    return np.clip((_strength_db(ctx) + 26) / 8, 0.0, 1.0)
+    return np.clip((_strength_db(scan) + 26) / 8, 0.0, 1.0)
 
 
-def _strength_db(ctx: ReportContext) -> npt.NDArray[np.float64]:
+def _strength_db(scan: ProcessedScan) -> npt.NDArray[np.float64]:
     """Return the level of both channels together, dB, each relative to its own brightest."""
-    power = np.zeros(ctx.h.shape)
-    for channel in (ctx.h, ctx.v):
+    power = np.zeros(scan.h.shape)
+    for channel in (scan.h, scan.v):
         p = np.nan_to_num(np.abs(channel).astype(np.float64) ** 2, nan=0.0, posinf=0.0)
         top = float(np.percentile(p, 99.5))
         power += p / top if top > 0 else 0.0
     return 10 * np.log10(np.maximum(power, 1e-12))
 
 
-def channel_figure(ctx: ReportContext, key: str) -> bytes:
+def channel_figure(scan: ProcessedScan, key: str) -> bytes:
     """Return a PNG of one of FIGURES with a colour bar. The phase of P spans the range of the patches."""
     fig, ax = new_axes()
-    limits = phase_limits_deg(ctx) if key == "phase_p" else None
-    shown, unit = draw_channel(ax, ctx, key, limits)
-    dress(ax, FIGURES[key], ctx.simulated)
+    limits = phase_limits_deg(scan) if key == "phase_p" else None
+    shown, unit = draw_channel(ax, scan, key, limits)
+    dress(ax, FIGURES[key], scan.stamped)
     if key.endswith("_p"):
-        _write_ratios(ax, ctx, key)
+        _write_ratios(ax, scan, key)
     bar = colour_bar(fig, ax, shown, unit, "both" if limits else "neither")
     if unit == "degrees" and limits is None:
         bar.set_ticks([-180, -90, 0, 90, 180])
@@ -169,19 +184,211 @@ def channel_figure(ctx: ReportContext, key: str) -> bytes:
     return png(fig)
 
 
-def _write_ratios(ax: Axes, ctx: ReportContext, key: str) -> None:
+def _write_ratios(ax: Axes, scan: ProcessedScan, key: str) -> None:
     """Write each patch's median as a number: small differences do not show as colours."""
-    for row in ctx.materials:
-        ratio = row.get("ratio")
-        if ratio:
-            x0, y0, x1, y1 = row["box_mm"]
-            p = complex(ratio["real"], ratio["imag"])
-            degrees, level = round(float(np.degrees(np.angle(p)))), round(20 * float(np.log10(abs(p))), 1) + 0.0
-            number = f"{degrees}°" if key == "phase_p" else f"{level:.1f}"
-            write_label(ax, (x0 + x1) / 2, (y0 + y1) / 2, number, 9, on_dark=True)
+    for patch in scan.segments:
+        if patch.p_phase_deg is not None and patch.p_abs_db is not None:
+            # Adding zero after rounding removes the sign of a negative zero.
+            level = round(patch.p_abs_db, 1) + 0.0
+            number = f"{round(patch.p_phase_deg)}°" if key == "phase_p" else f"{level:.1f}"
+            write_label(ax, patch.centre_x_mm, patch.centre_y_mm, number, 9, on_dark=True)
 
 
-def draw_overview(fig: Figure, axes: Sequence[Axes], ctx: ReportContext, bar_labels: bool = False) -> None:
+def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[MapLabel]:
+    """Draw the material map: each patch in the colour of its name, each interior pixel in that of its own name.
+
+    Patches that were not judged are hatched grey. Return the labels.
+    """
+    colours = colours_of(scan)
+    rgb = np.ones((*scan.h.shape, 3)) * np.array(to_rgb("#f3f5f8"))
+    for patch in scan.segments:
+        rgb[scan.labels == patch.label] = 0.55 + 0.45 * np.array(to_rgb(patch_colour(patch, colours)))
+    refused = {patch.label for patch in scan.segments if patch.refused is not None}
+    for label, (names, interior) in scan.pixel_names.items():
+        if label not in refused:
+            rgb[interior] = [to_rgb(colours.get(str(n), UNKNOWN_COLOUR)) for n in names]
+    ax.imshow(rgb, extent=extent_mm(scan), origin="lower", interpolation="nearest")
+    _crop(ax, scan)
+    labels = []
+    for patch in scan.segments:
+        _, y0, _, y1 = patch.box_mm
+        if patch.refused is not None:
+            ax.add_patch(outline_of(patch, fill=False, edgecolor=REFUSED_COLOUR, hatch=HATCH, linewidth=0.0))
+        if patch.outline_mm or patch.refused is not None:
+            ax.add_patch(outline_of(patch, fill=False, edgecolor=INK, linewidth=0.9))
+        name = patch_label(patch)
+        within = "" if patch.confidence is None else f"{100 * patch.confidence:.0f} %"
+        within = within if patch.refused is None else "not judged"
+        text = write_label(ax, patch.centre_x_mm, y1 + 0.5, name, size, above=True)
+        _keep_inside(ax, text, y1)
+        # Two lines above the patch would reach the next one.
+        write_label(ax, patch.centre_x_mm, y0 + 1.0, within, size, above=True)
+        labels.append(MapLabel(text, str(patch.label), name, patch_colour(patch, colours)))
+    return labels
+
+
+def _keep_inside(ax: Axes, text: Text, top_mm: float) -> None:
+    """Put a label below the upper edge of its patch if it would reach into the title."""
+    bottom, top = ax.get_ylim()
+    if top_mm > top - _ROOM * (top - bottom):
+        text.set(y=min(top_mm, top) - 1.0, verticalalignment="top")
+
+
+def _crop(ax: Axes, scan: ProcessedScan) -> None:
+    """Set limits around patches and plates: square, inside the image, the same for map and truth."""
+    boxes = [patch.box_mm for patch in scan.segments] + [plate.box_mm for plate in scan.plates]
+    left, right, bottom, top = extent_mm(scan)
+    if boxes:
+        b = np.array(boxes)
+        x0, y0, x1, y1 = b[:, 0].min() - 20, b[:, 1].min() - 12, b[:, 2].max() + 20, b[:, 3].max() + 24
+        half = max(x1 - x0, y1 - y0) / 2
+        cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
+        left, right, bottom, top = (
+            max(left, cx - half),
+            min(right, cx + half),
+            max(bottom, cy - half),
+            min(top, cy + half),
+        )
+    ax.set_xlim(left, right)
+    ax.set_ylim(bottom, top)
+
+
+def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[MapLabel]:
+    """Draw the true plates. Return the labels."""
+    colours = colours_of(scan)
+    _crop(ax, scan)
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    labels = []
+    for number, plate in enumerate(scan.plates, 1):
+        x0, y0, x1, y1 = plate.box_mm
+        name = plate_label(plate, number)
+        colour = colours[plate.name]
+        ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=colour, edgecolor=INK, linewidth=0.9))
+        if y1 < top:
+            text = write_label(ax, (x0 + x1) / 2, y1 + 0.5, name, size, above=True)
+            _keep_inside(ax, text, y1)
+        else:  # larger than the image: a name above it would be far outside the picture
+            text = write_label(ax, (max(x0, left) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, name, size)
+        labels.append(MapLabel(text, str(number), name, colour))
+    return labels
+
+
+def map_figure(scan: ProcessedScan, draw: Callable[[Axes, ProcessedScan], list[MapLabel]], title: str) -> bytes:
+    """Return a PNG of a material map or of the truth. If names lack room all become numbers, with a legend below."""
+    fig, ax = new_axes(4.6, 4.6)
+    labels = draw(ax, scan)
+    dress(ax, title, scan.stamped)
+    ax.set_facecolor("#f3f5f8")
+    fit_labels(fig, labels, 4.7)
+    return png(fig)
+
+
+def permittivity_map(scan: ProcessedScan) -> bytes | None:
+    """Return a PNG of eps' with its standard error in each patch, and of the relative error; None without errors."""
+    real: dict[int, float] = {}
+    errors: dict[int, float] = {}
+    middle: dict[int, str] = {}
+    for patch in scan.segments:
+        e = patch.permittivity
+        if e is not None and e.spread is not None:
+            real[patch.label] = e.real
+            size = abs(e.value)
+            errors[patch.label] = 100 * math.hypot(e.spread.real_std, e.spread.loss_std) / size if size else 0.0
+            middle[patch.label] = f"{e.real:.2f}\n± {e.spread.real_std:.2f}"
+    if not real:
+        return None
+    fig = Figure(figsize=(9.4, 4.6), dpi=160, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    percents = {label: f"{v:.0f} %" if v >= 10 else f"{v:.1f} %" for label, v in errors.items()}
+    low, high = min(real.values()), max(real.values())
+    margin = max(0.1 * (high - low), 0.25)
+    left, right = fig.subplots(1, 2)
+    _fill_patches(fig, left, scan, real, middle, ("viridis", low - margin, high + margin, "real part ε′"))
+    _fill_patches(fig, right, scan, errors, percents, ("YlOrBr", 0.0, max(*errors.values(), 5.0), "percent of |ε|"))
+    dress(left, "Permittivity ε′ ± standard error", simulated=False)
+    dress(right, "Relative error of ε", scan.stamped)
+    for ax in (left, right):
+        ax.set_facecolor("#f3f5f8")
+    right.set_ylabel("")
+    return png(fig)
+
+
+def _fill_patches(
+    fig: Figure,
+    ax: Axes,
+    scan: ProcessedScan,
+    values: dict[int, float],
+    texts: dict[int, str],
+    scale: tuple[str, float, float, str],
+) -> None:
+    """Fill patches in the colours of their values; others are grey, hatched if they were not judged.
+
+    `scale` is the colour map, the values at its ends, and the colour bar's label.
+    """
+    colours = ScalarMappable(Normalize(scale[1], scale[2]), scale[0])
+    for patch in scan.segments:
+        fill: Any = METAL_COLOUR if patch.metal_reference else "#e4e7ec"
+        if patch.label in values:
+            fill = colours.to_rgba(np.array([values[patch.label]]))[0]
+        ax.add_patch(outline_of(patch, facecolor=fill, edgecolor=INK, linewidth=0.9))
+        text = "–"
+        if patch.refused is not None:
+            ax.add_patch(outline_of(patch, fill=False, edgecolor=REFUSED_COLOUR, hatch=HATCH, linewidth=0.0))
+            text = "not\njudged"
+        if patch.metal_reference or patch.metal_like:
+            text = "metal"
+        write_label(ax, patch.centre_x_mm, patch.centre_y_mm, texts.get(patch.label, text), 8)
+        ax.annotate(
+            str(patch.label), (patch.box_mm[0], patch.box_mm[3]), textcoords="offset points", xytext=(2.5, -2),
+            ha="left", va="top", fontsize=6.5, color=INK, path_effects=[withStroke(linewidth=2, foreground="white")],
+        )  # fmt: skip
+    _crop(ax, scan)
+    ax.set_aspect("equal")
+    colour_bar(fig, ax, colours, scale[3])
+
+
+def masked_positions(scan: ProcessedScan) -> dict[str, npt.NDArray[np.bool_]]:
+    """Return for each board bool [row, column]: masked or never recorded. Empty if plan or boards are not known."""
+    if scan.plan is None:
+        return {}
+    boards = scan.quality.boards
+    return {name: _mask(board, scan.plan) for name, board in boards.items() if board.masked_columns is not UNSET}
+
+
+def _mask(board: BoardQuality, plan: RasterPlan) -> npt.NDArray[np.bool_]:
+    mask = np.zeros((plan.rows, plan.columns), np.bool_)
+    for row, runs in (board.masked_columns or {}).items():
+        for start, stop in runs:
+            mask[row, start:stop] = True
+    recorded = range(plan.rows) if board.rows_recorded is UNSET else board.rows_recorded
+    absent = sorted(set(range(plan.rows)) - set(recorded))
+    mask[absent] = True
+    return mask
+
+
+def coverage_figure(scan: ProcessedScan, masks: dict[str, npt.NDArray[np.bool_]]) -> Figure:
+    """Return a map of masked stage positions for each board, millimetres from the middle of the grid.
+
+    `masks` as of :func:`masked_positions`; the scan's plan must be known.
+    """
+    plan = scan.plan
+    if plan is None:
+        raise ValueError("a map of positions needs the plan")
+    width, height = plan.columns * plan.step_x_mm, plan.rows * plan.step_y_mm
+    extent = (-width / 2, width / 2, -height / 2, height / 2)
+    size = (9.0, 0.9 + 4.2 * min(1.2, max(0.3, height / width)))
+    fig = Figure(figsize=size, dpi=130, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    for ax, (name, mask) in zip(fig.subplots(1, len(masks), squeeze=False)[0], masks.items(), strict=True):
+        colours = ListedColormap(_POSITION_COLOURS)
+        ax.imshow(mask, origin="lower", extent=extent, cmap=colours, vmin=0, vmax=1, interpolation="nearest")
+        dress(ax, f"{name}: {mask.mean():.2%} masked", scan.stamped)
+        ax.set_xlabel("stage offset x (mm)", fontsize=9, color=MUTED)
+        ax.set_ylabel("stage offset y (mm)", fontsize=9, color=MUTED)
+    return fig
+
+
+def draw_overview(fig: Figure, axes: Sequence[Axes], scan: ProcessedScan, bar_labels: bool = False) -> None:
     """Draw amplitude H, V, P with colour bars on the first three axes, and the materials on the fourth if given."""
     for ax, key, title in zip(
         axes[:3],
@@ -189,46 +396,45 @@ def draw_overview(fig: Figure, axes: Sequence[Axes], ctx: ReportContext, bar_lab
         ("H, s-polarised (dB)", "V, p-polarised (dB)", "P = H / V (dB)"),
         strict=True,
     ):
-        shown, unit = draw_channel(ax, ctx, key)
-        dress(ax, title, ctx.simulated)
+        shown, unit = draw_channel(ax, scan, key)
+        dress(ax, title, scan.stamped)
         colour_bar(fig, ax, shown, unit if bar_labels else "")
     labels = []
     for ax in axes[3:]:
-        labels += draw_materials(ax, ctx, size=6.5)
-        dress(ax, "Materials" if ctx.judged else "Patches", ctx.simulated)
+        labels += draw_materials(ax, scan, size=6.5)
+        dress(ax, "Materials" if scan.judged else "Patches", scan.stamped)
     shorten_labels(fig, labels)
 
 
-def figures(ctx: ReportContext) -> dict[str, bytes]:
+def figures(scan: ProcessedScan) -> dict[str, bytes]:
     """Return all figures of a report as PNG, by file name without suffix."""
-    out = {key: channel_figure(ctx, key) for key in FIGURES}
-    if ctx.materials:
-        out["materials"] = map_figure(ctx, draw_materials, "Materials found" if ctx.judged else "Patches found")
-        made = {"permittivity": permittivity_figure(ctx), "permittivity_map": permittivity_map(ctx)}
+    out = {key: channel_figure(scan, key) for key in FIGURES}
+    if scan.segments:
+        out["materials"] = map_figure(scan, draw_materials, "Materials found" if scan.judged else "Patches found")
+        made = {"permittivity": permittivity_figure(scan), "permittivity_map": permittivity_map(scan)}
         out |= {name: picture for name, picture in made.items() if picture is not None}
-    masks = masked_positions(ctx)
+    masks = masked_positions(scan)
     if any(m.any() for m in masks.values()):
-        out["coverage"] = png(coverage_figure(ctx, masks))
-    if ctx.truth:
-        out["truth"] = map_figure(ctx, draw_truth, "Truth")
+        out["coverage"] = png(coverage_figure(scan, masks))
+    if scan.plates:
+        out["truth"] = map_figure(scan, draw_truth, "Truth")
     return out
 
 
-def label_figure(products: SavedProducts, boxes_mm: Mapping[str, Box], metal: str | None) -> bytes:
+def label_figure(scan: ProcessedScan, boxes_mm: Mapping[str, Box], metal: str | None) -> bytes:
     """Return a PNG of |H| with boxes and their names; the metal reference has another colour.
 
     Parameters
     ----------
-    products
+    scan
         The processed scan.
     boxes_mm
         Name to (x0, y0, x1, y1), millimetres from the image centre.
     metal
         Name of the metal reference; None without one.
     """
-    context = ReportContext.of_products(products)
     fig, ax = new_axes(5.4, 4.8)
-    shown, unit = draw_channel(ax, context, "amplitude_h")
+    shown, unit = draw_channel(ax, scan, "amplitude_h")
     labels = []
     for number, (name, (x0, y0, x1, y1)) in enumerate(boxes_mm.items(), 1):
         colour = _METAL if name == metal else _OTHER
@@ -238,7 +444,7 @@ def label_figure(products: SavedProducts, boxes_mm: Mapping[str, Box], metal: st
         written = f"{text}\n{below}" if below else text
         middle = write_label(ax, (x0 + x1) / 2, (y0 + y1) / 2, written, 8.5, on_dark=True)
         labels.append(MapLabel(middle, str(number), text, colour, below))
-    dress(ax, "Amplitude H, and the boxes", context.simulated)
+    dress(ax, "Amplitude H, and the boxes", scan.stamped)
     colour_bar(fig, ax, shown, unit)
     fit_labels(fig, labels, 4.9)
     return png(fig)

@@ -29,8 +29,9 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox, BboxBase
 
-from polysight.materials import axis_mm
-from polysight.report.context import ReportContext
+from polysight.materials import TruthPlate, axis_mm
+from polysight.products import ProcessedScan
+from polysight.results import PatchFigures
 
 INK, MUTED, STAMP = "#1b2330", "#5b6675", "#b3261e"
 """Colours of a figure's text: titles, axes, and the word SIMULATED."""
@@ -89,20 +90,19 @@ def figure_label(name: str, number: str) -> str:
     return f"{number}: {''.join(c if c.isascii() and c.isprintable() else '?' for c in name)}"
 
 
-def colours_of(ctx: ReportContext) -> dict[str, str]:
+def colours_of(scan: ProcessedScan) -> dict[str, str]:
     """Return the colour of each material in the results or the truth, the same in all figures."""
-    names = {str(r["name"]) for r in ctx.materials if r.get("name")}
-    names |= {str(t["name"]) for t in ctx.truth or []}
-    for pixels, _ in ctx.pixel_names.values():
+    names = {patch.name for patch in scan.segments if patch.name} | {plate.name for plate in scan.plates}
+    for pixels, _ in scan.pixel_names.values():
         names |= set(np.unique(pixels).tolist())
     names.discard("unknown")
     table = {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(sorted(names))}
     return {**table, "unknown": UNKNOWN_COLOUR}
 
 
-def extent_mm(ctx: ReportContext) -> tuple[float, float, float, float]:
+def extent_mm(scan: ProcessedScan) -> tuple[float, float, float, float]:
     """Return the left, right, bottom, top edge of the image, millimetres from its centre."""
-    x, y = axis_mm(ctx.x_m), axis_mm(ctx.y_m)
+    x, y = axis_mm(scan.x_m), axis_mm(scan.y_m)
     hx, hy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
     return float(x[0] - hx), float(x[-1] + hx), float(y[0] - hy), float(y[-1] + hy)
 
@@ -153,12 +153,12 @@ def write_label(
     )  # fmt: skip
 
 
-def patch_label(row: dict[str, Any]) -> str:
+def patch_label(patch: PatchFigures) -> str:
     """Return the text beside a patch in figures."""
-    number = f"patch {row['label']}"
-    if not row.get("name"):
-        return "metal reference" if row.get("metal_reference") else number
-    return figure_label(str(row["name"]), number)
+    number = f"patch {patch.label}"
+    if not patch.name:
+        return "metal reference" if patch.metal_reference else number
+    return figure_label(patch.name, number)
 
 
 def short_label(text: str) -> str:
@@ -167,26 +167,25 @@ def short_label(text: str) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
-def patch_colour(row: dict[str, Any], colours: dict[str, str]) -> str:
+def patch_colour(patch: PatchFigures, colours: dict[str, str]) -> str:
     """Return a patch's colour: that of its name, of refused patches, or of the metal reference."""
-    if row.get("refused"):
+    if patch.refused is not None:
         return REFUSED_COLOUR
-    if not row.get("name") and row.get("metal_reference"):
+    if not patch.name and patch.metal_reference:
         return METAL_COLOUR
-    return colours.get(str(row.get("name") or "unknown"), UNKNOWN_COLOUR)
+    return colours.get(patch.name or "unknown", UNKNOWN_COLOUR)
 
 
-def plate_label(plate: dict[str, Any], number: int) -> str:
+def plate_label(plate: TruthPlate, number: int) -> str:
     """Return the text beside a plate in the figure of the truth; `number` counts plates from 1."""
-    return figure_label(str(plate["name"]), f"plate {number}")
+    return figure_label(plate.name, f"plate {number}")
 
 
-def outline_of(row: dict[str, Any], **style: Any) -> Polygon | Rectangle:
+def outline_of(patch: PatchFigures, **style: Any) -> Polygon | Rectangle:
     """Return a patch's outline, or its box if it has none; `style` are options of matplotlib's patches."""
-    if row.get("outline_mm"):
-        return Polygon(row["outline_mm"], closed=True, **style)
-    x0, y0, x1, y1 = row["box_mm"]
-    return Rectangle((x0, y0), x1 - x0, y1 - y0, **style)
+    if patch.outline_mm:
+        return Polygon(patch.outline_mm, closed=True, **style)
+    return Rectangle(patch.box_mm[:2], patch.width_mm, patch.height_mm, **style)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ with its name, unit and title. Tables, exports, datasets and pages render all co
 # Annotations are evaluated in the order in which they stand here: that is the order of the columns.
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import count
@@ -75,6 +76,22 @@ class Figure:
         if self.column.variable is None:
             return self.column.name.removesuffix("_mm")
         return self.column.variable
+
+    def values(self, patches: "Sequence[PatchFigures]") -> list[Any]:
+        """Return the value of each patch; None where it is not known."""
+        values = [getattr(patch, self.attribute) for patch in patches]
+        return [None if value is UNSET else value for value in values]
+
+    def array(self, patches: "Sequence[PatchFigures]") -> npt.NDArray[Any]:
+        """Return the values as an array: unknown text is empty, unknown numbers are NaN in both parts."""
+        values = self.values(patches)
+        if self.kind is str:
+            return np.array([value or "" for value in values], np.str_)
+        if self.kind is bool:
+            return np.array(values, np.bool_)
+        number = np.complex128 if self.kind is complex else np.float64
+        unknown = complex(np.nan, np.nan) if self.kind is complex else np.nan
+        return np.array([unknown if value is None else value for value in values], number)
 
     def shown(self, patch: "PatchFigures") -> str:
         """Return the value for people, with its unit; a dash if it is not known."""
@@ -276,7 +293,7 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     distance: Number = None
     metal_reference: Annotated[bool, Column("metal_reference", "True where the patch is the metal reference")] = False
     metal_like: Annotated[bool, Column("metal_like", "True where P is too close to metal for a permittivity")] = False
-    box_mm: tuple[float, float, float, float]
+    box_mm: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     outline_mm: list[tuple[float, float]] = []
 
     @property
@@ -302,8 +319,7 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     pixels: int = 0
     interior_pixels: Annotated[int | None, Column("pixels", "number of pixels behind the numbers")] = None
     incidence_deg: Annotated[
-        Number,
-        Column("incidence_deg", "mean incidence angle of the patch", "degree", "patch_incidence_deg"),
+        Number, Column("incidence_deg", "mean incidence angle of the patch", "degree", "patch_incidence_deg")
     ] = None
     permittivity: PermittivityFigures | None = None
 
@@ -488,7 +504,7 @@ class PlaneError(msgspec.Struct, frozen=True, kw_only=True):
     plates: int | UnsetType = UNSET
 
 
-class MetalEvidence(msgspec.Struct, frozen=True, kw_only=True):
+class MetalScore(msgspec.Struct, frozen=True, kw_only=True):
     """Evidence that the reference is metal: score from the other patches, V over H beside the direct path."""
 
     score: float | None = None
@@ -502,7 +518,7 @@ class ErrorBudget(msgspec.Struct, frozen=True, kw_only=True):
     leakage: LeakageError | None = None
     incidence: IncidenceError | None = None
     plane: PlaneError | None = None
-    metal: MetalEvidence | None = None
+    metal: MetalScore | None = None
 
 
 class MetalSource(msgspec.Struct, frozen=True, kw_only=True):
@@ -545,8 +561,11 @@ class ScanMaterials(msgspec.Struct, frozen=True, kw_only=True):
     def read(cls, path: Path) -> "ScanMaterials | None":
         """Read a file; None if there is none, as where only images were made. Raises DataError if it is damaged."""
         content = read_object(path)
-        if content is None:
-            return None
+        return None if content is None else cls.decode(content, path)
+
+    @classmethod
+    def decode(cls, content: dict[str, Any], path: Path = Path("materials.json")) -> Self:
+        """Return the content of a file as a struct; `path` is for messages. Raises DataError if it is damaged."""
         segments = content.get("segments", [])
         if isinstance(segments, list):
             segments = [_with_finding(segment) if isinstance(segment, dict) else segment for segment in segments]

@@ -169,7 +169,11 @@ class ScanQuality(msgspec.Struct, frozen=True, kw_only=True):
     @classmethod
     def read(cls, path: Path) -> ScanQuality:
         """Read a file; without it nothing is known. Raises DataError if it is damaged."""
-        content = read_object(path) or {}
+        return cls.decode(read_object(path) or {}, path)
+
+    @classmethod
+    def decode(cls, content: dict[str, Any], path: Path = Path("quality.json")) -> ScanQuality:
+        """Return the content of a file as a struct; `path` is for messages. Raises DataError if it is damaged."""
         return convert({**content, "verdict": read_verdict(content)}, cls, path)
 
 

@@ -32,7 +32,9 @@ from polysight.materials import (
 )
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import ratio_from_permittivity
-from polysight.report import INK, ReportContext, context_of, draw_channel, extent_mm
+from polysight.products import ProcessedScan
+from polysight.report import INK, draw_channel, extent_mm
+from polysight.results import ScanFacts, ScanMaterials, ScanQuality
 from polysight.store import TRUTH, RawSource, ScanFolder
 from polysight_papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, table2
 from polysight_shared.error_codes import ErrorCode
@@ -117,7 +119,7 @@ class ScanView:
     """A scan's images and its known plates."""
 
     result: MaterialsResult
-    context: ReportContext
+    scan: ProcessedScan
 
 
 @cache
@@ -137,26 +139,34 @@ def _scan(
     plates += [plate(table2()[n - 1].name, table2()[n - 1].permittivity, *xy) for n, xy in zip(rows, at, strict=True)]
     with scanned(name, plates, config, seed=seed, **more) as (source, truth):
         found = imaged(source, truth)
-    context = context_of(found.result, found.x_m, found.y_m, title=name, simulated=True, plates=truth)
-    return ScanView(found.result, context)
+    scan = ProcessedScan.computed(
+        Path(),
+        images=found.result.calibrated,
+        quality=ScanQuality(),
+        facts=ScanFacts(scan_id=name, simulated=True),
+        materials=ScanMaterials(segments=found.result.rows()),
+        found=found.result,
+        plates=truth,
+    )
+    return ScanView(found.result, scan)
 
 
-def _label_plates(ax: Any, ctx: ReportContext, size: float = 7.5) -> None:
-    for t in ctx.truth or []:
-        x0, y0, x1, y1 = t["box_mm"]
-        name = str(t["name"]).split(" (")[0]
+def _label_plates(ax: Any, scan: ProcessedScan, size: float = 7.5) -> None:
+    for plate in scan.plates:
+        x0, y0, x1, y1 = plate.box_mm
+        name = plate.name.split(" (")[0]
         ax.text(
             (x0 + x1) / 2, (y0 + y1) / 2, name.replace(" ", "\n"), ha="center", va="center", fontsize=size,
             color="white", path_effects=[withStroke(linewidth=2.0, foreground=INK)],
         )  # fmt: skip
-    left, right, bottom, top = extent_mm(ctx)
+    left, right, bottom, top = extent_mm(scan)
     ax.set_xlim(max(left, -110), min(right, 110))
     ax.set_ylim(max(bottom, -110), min(top, 110))
 
 
-def _reflects(ctx: ReportContext) -> npt.NDArray[np.float64]:
+def _reflects(scan: ProcessedScan) -> npt.NDArray[np.float64]:
     """Return the opacity of P: pixels 20 dB below metal or less are noise."""
-    power = (np.abs(ctx.h).astype(np.float64) ** 2 + np.abs(ctx.v).astype(np.float64) ** 2) / 2
+    power = (np.abs(scan.h).astype(np.float64) ** 2 + np.abs(scan.v).astype(np.float64) ** 2) / 2
     power = np.nan_to_num(power)
     level = 10 * np.log10(np.maximum(np.minimum(power, scipy.ndimage.gaussian_filter(power, 1.5)), 1e-12))
     return np.clip((level + 20) / 6, 0.0, 1.0)
@@ -165,9 +175,9 @@ def _reflects(ctx: ReportContext) -> npt.NDArray[np.float64]:
 def draw_row(fig: Any, axes: Any, view: ScanView, keys: tuple[str, ...], name: str) -> None:
     """Draw images of a scan side by side, with colour bars and the plates' names."""
     for ax, key in zip(axes, keys, strict=True):
-        shown, unit = draw_channel(ax, view.context, key)
+        shown, unit = draw_channel(ax, view.scan, key)
         if key.endswith("_p"):
-            shown.set_alpha(_reflects(view.context))
+            shown.set_alpha(_reflects(view.scan))
         kind, _, channel = key.partition("_")
         dress(ax, f"{name}: {kind} {channel.upper()}", "x (mm)", "y (mm)" if ax is axes[0] else "")
         ax.set_aspect("equal")
@@ -178,7 +188,7 @@ def draw_row(fig: Any, axes: Any, view: ScanView, keys: tuple[str, ...], name: s
         bar.ax.tick_params(labelsize=7.5)
         if bar.solids is not None:
             bar.solids.set_alpha(1)
-        _label_plates(ax, view.context)
+        _label_plates(ax, view.scan)
 
 
 def ratio_table(views: dict[str, ScanView]) -> Table:
@@ -269,7 +279,7 @@ def fig14(run: Run) -> Item:
         angle = np.angle(values / metal, deg=True)
         phase = np.ma.masked_array(angle, ~inside)
         picture = ax.imshow(
-            phase, extent=extent_mm(view.context), origin="lower", cmap="PuOr", vmin=-PHASE_DEG, vmax=PHASE_DEG,
+            phase, extent=extent_mm(view.scan), origin="lower", cmap="PuOr", vmin=-PHASE_DEG, vmax=PHASE_DEG,
             interpolation="nearest",
         )  # fmt: skip
         dress(ax, f"phase of {channel}", "x (mm)", "y (mm)")

@@ -19,7 +19,7 @@ import tomli_w
 from polysight_shared.config import Instrument
 from polysight_shared.tables import to_builtins
 from polysight_shared.wires import WireClient, WireEdge, WireMotion
-from polysight_simulators.cards.sender import ReceiveQueue, bound_udp
+from polysight_simulators.cards.card import ReceiveQueue, bound_udp
 from polysight_simulators.loopback import is_free, on_subnet
 from polysight_simulators.scene import pattern_frames
 

@@ -7,10 +7,9 @@ sockets; `card` adds sockets and a radar; `sender` sends many packets per call; 
 """
 
 from polysight_simulators.cards.adversary import KINDS, Adversary, Arrival, Sent
-from polysight_simulators.cards.card import MAC, CardEndpoint, Clock, SimulatedCard
+from polysight_simulators.cards.card import MAC, CardEndpoint, CardSender, Clock, Pace, SimulatedCard, bound_udp
 from polysight_simulators.cards.dca1000 import SOURCE_PORT, Network
 from polysight_simulators.cards.fault_draws import EventKind
-from polysight_simulators.cards.sender import CardSender, Pace, bound_udp
 from polysight_simulators.cards.sync_in import StageTrack
 
 __all__ = [

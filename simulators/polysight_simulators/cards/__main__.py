@@ -19,8 +19,7 @@ from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, PolysightError
 from polysight_shared.wires import WireClient
-from polysight_simulators.cards.card import SimulatedCard
-from polysight_simulators.cards.sender import Pace
+from polysight_simulators.cards.card import Pace, SimulatedCard
 from polysight_simulators.cards.server import CardServer
 from polysight_simulators.cards.sync_in import StageTrack
 from polysight_simulators.faults import read_faults

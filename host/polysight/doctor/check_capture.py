@@ -64,29 +64,29 @@ def check_network(context: CheckContext, board: Board) -> Finding:
 def _judge_interface(interface: NetworkInterface) -> Finding:
     name = interface.name
     ring = interface.ring
-    found = f"{name}: MTU {interface.mtu or 'unknown'}, {interface.speed_mbit or 'unknown'} Mbit/s"
-    found += f", ring {ring} of {interface.ring_max}" if ring is not None else ""
+    observed = f"{name}: MTU {interface.mtu or 'unknown'}, {interface.speed_mbit or 'unknown'} Mbit/s"
+    observed += f", ring {ring} of {interface.ring_max}" if ring is not None else ""
     if interface.mtu is not None and interface.mtu < _MIN_MTU:
-        return warning(found, f"a card sends frames of {_MIN_MTU} bytes", f"`ip link set {name} mtu {_MIN_MTU}`")
+        return warning(observed, f"a card sends frames of {_MIN_MTU} bytes", f"`ip link set {name} mtu {_MIN_MTU}`")
     if interface.speed_mbit is not None and interface.speed_mbit < _MIN_SPEED_MBIT:
         return warning(
-            found,
+            observed,
             "a DCA1000 sends at gigabit speed; a slower link drops packets of every burst",
             "use a cable of category 5e or better and a gigabit port, without a 100 Mbit switch",
         )
     if ring is not None and ring < min(_MIN_RING, interface.ring_max or _MIN_RING):
         return warning(
-            found,
+            observed,
             "few receive descriptors: packets are lost while this machine is busy",
             f"`ethtool -G {name} rx {interface.ring_max}`",
         )
     if interface.lost:
         return warning(
-            f"{found}; {interface.lost} packets dropped since it came up",
+            f"{observed}; {interface.lost} packets dropped since it came up",
             "the interface or the kernel dropped packets before a program received them",
             f"`ethtool -S {name}`: check if the number increases during a scan",
         )
-    return ok(found)
+    return ok(observed)
 
 
 def check_buffer(context: CheckContext, board: Board) -> Finding:
@@ -123,15 +123,15 @@ def check_pulses(context: CheckContext) -> Finding:
         if e.number != PiFault.BAD_REQUEST:
             raise
         return error(e.what, "the Pi's release does not know this command", "install the same release on both")
-    found = (
+    observed = (
         f"{sent.pulses} sent at rest, at most {sent.width_max_ns / 1e3:.2f} us long,"
         f" at most {sent.jitter_ns / 1e3:.2f} us late"
     )
     facts = {k: getattr(sent, k) for k in ("pulses", "width_max_ns", "jitter_ns", "fault")}
     if sent.fault:
         e = explain(sent.fault)
-        return error(f"{found}: {e.what}", e.why, e.remedy, **facts)
-    return ok(found, **facts)
+        return error(f"{observed}: {e.what}", e.why, e.remedy, **facts)
+    return ok(observed, **facts)
 
 
 def check_radar(context: CheckContext, board: Board) -> Finding:
@@ -144,41 +144,41 @@ def check_radar(context: CheckContext, board: Board) -> Finding:
     facts = {"frames_expected": frames, "frames": complete, "bytes": captured.row.bytes}
     facts["packets"] = captured.row.packets
     if captured.radar is not None and captured.radar.state is RadarState.FAULT:
-        found = f"the radar stopped: {captured.radar.detail}"
-        return error(found, "the radar reported a fault", "`polysight radar check BOARD`", **facts)
+        observed = f"the radar stopped: {captured.radar.detail}"
+        return error(observed, "the radar reported a fault", "`polysight radar check BOARD`", **facts)
     text = f"{complete} of {frames} frames, {captured.row.packets} packets"
     return msgspec.structs.replace(_judge_frames(board, captured.row, text), facts=facts)
 
 
-def _judge_frames(board: Board, row: RowCapture, found: str) -> Finding:
+def _judge_frames(board: Board, row: RowCapture, observed: str) -> Finding:
     if row.packets == 0:
         e = silent_radar(board, row)
         return error(e.what, e.why, e.remedy)
     if row.slipped or (row.bytes < row.expected and not row.gap_bytes):
         return error(
-            f"{found}: {row.reason or 'the record ended early'}",
+            f"{observed}: {row.reason or 'the record ended early'}",
             "the radar missed pulses: wrong level or width of SYNC_IN, or it was armed for fewer frames",
             "check SYNC_IN at the board with an oscilloscope (0..3.3 V, 25 ns..4 us)",
         )
     if row.lost_before_packets:
         return error(
-            f"{found}; the card reports {row.lost_before_packets.name}",
+            f"{observed}; the card reports {row.lost_before_packets.name}",
             "the card dropped data before it was numbered: it sends more slowly than the radar measures",
             "shorten card.packet_delay_us",
         )
     if row.missing:
         return warning(
-            f"{found}; {row.missing_bytes} bytes are missing, {row.kernel_drops} packets dropped by this machine",
+            f"{observed}; {row.missing_bytes} bytes are missing, {row.kernel_drops} packets dropped by this machine",
             "packets were lost between card and program",
             "check cable, switch and the receive buffer above; a scan retakes such rows",
         )
     if row.strangers:
         return warning(
-            f"{found}; {row.strangers} packets from other addresses",
+            f"{observed}; {row.strangers} packets from other addresses",
             "two cards have the same data port",
             "give each card its own port with `polysight card program`",
         )
-    return ok(found)
+    return ok(observed)
 
 
 def check_level(context: CheckContext, board: Board) -> Finding:
@@ -190,20 +190,20 @@ def check_level(context: CheckContext, board: Board) -> Finding:
     clipped = int(((words >= FULL_SCALE) | (words <= -FULL_SCALE)).any(axis=(1, 2, 3)).sum())
     rms = np.sqrt(np.mean(words.astype(np.float64) ** 2, axis=(0, 1, 2)) * 2)  # of I and Q together, for each RX
     peak = int(np.abs(words.astype(np.int32)).max())
-    found = f"rms {rms.min():.0f}..{rms.max():.0f} counts over the RX, peak {peak} of {FULL_SCALE}"
+    observed = f"rms {rms.min():.0f}..{rms.max():.0f} counts over the RX, peak {peak} of {FULL_SCALE}"
     facts = {"clipped_chirps": clipped, "chirps": len(words), "rms": [round(float(r), 1) for r in rms], "peak": peak}
     if clipped:
         fault = error if clipped > _MAX_CLIPPED * len(words) else warning
         return fault(
-            f"{found}; {clipped} of {len(words)} chirps are clipped",
+            f"{observed}; {clipped} of {len(words)} chirps are clipped",
             "a strong reflection reaches the receiver, or its gain is too high",
             "lower the RX gain (radar.rx_gain_db, or the profile in mmWave Studio), or move the reflector away",
             **facts,
         )
     if rms.min() < _MIN_RMS:
         remedy = "check the RX mask of the profile; `polysight card reset --radar`, and arm it again"
-        return error(found, "an RX is off, or the radar sends zeros", remedy, **facts)
-    return ok(found, **facts)
+        return error(observed, "an RX is off, or the radar sends zeros", remedy, **facts)
+    return ok(observed, **facts)
 
 
 def check_direct_path(context: CheckContext, board: Board) -> Finding:
@@ -228,12 +228,12 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
     facts = {"expected_hz": expected, "band_hz": [low, high], "chirps": signal.chirps, "heard": signal.if_hz.size}
     if not signal.found:
         missed = signal.chirps - signal.if_hz.size
-        found = f"no direct path in {missed} of {signal.chirps} chirps; {predicted}"
+        observed = f"no direct path in {missed} of {signal.chirps} chirps; {predicted}"
         if outside:
             why = "its IF is outside the receiver's band, so it is filtered out or aliased"
-            return error(found, why, _better_start(rig, board, expected), **facts)
+            return error(observed, why, _better_start(rig, board, expected), **facts)
         return error(
-            found,
+            observed,
             "the transmitter is off or not armed, something stands between the boards, or the start frequencies"
             " differ by more than in the rig file",
             "clear the line of sight from TX to RX; check that the transmitting board is armed, and the start"
@@ -244,11 +244,11 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
     spread = jitter_hz(rig)
     median = float(np.median(if_hz))
     std = float(if_hz.std())
-    found = f"at {median / 1e3:.0f} kHz, std {std / 1e3:.0f} kHz, {signal.if_hz.size} of {signal.chirps} chirps"
+    observed = f"at {median / 1e3:.0f} kHz, std {std / 1e3:.0f} kHz, {signal.if_hz.size} of {signal.chirps} chirps"
     facts |= {"if_hz": median, "std_hz": std, "amplitude": float(np.sqrt(np.median(signal.power)))}
     if outside:
         return error(
-            f"{found}; {predicted}, outside {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
+            f"{observed}; {predicted}, outside {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
             "this is an alias: the anti-aliasing filter attenuates it, and the high-pass filter is inverted at the"
             " wrong frequency",
             _better_start(rig, board, expected),
@@ -256,7 +256,7 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
         )
     if median - spread < low or median + spread > high or signal.if_hz.size < _MIN_DETECTED * signal.chirps:
         return error(
-            f"{found}: too near the edge of {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
+            f"{observed}: too near the edge of {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
             f"5 ns of trigger jitter move it by {spread / 1e3:.0f} kHz, so that some chirps are lost",
             _better_start(rig, board, median),
             **facts,
@@ -265,13 +265,13 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
     if abs(delay_s) > _MAX_DELAY_S:
         start = board.start_offset_hz + delay_s * rig.chirp.slope_hz_per_s
         return warning(
-            f"{found}; {predicted}, {delay_s * 1e9:+.1f} ns away",
+            f"{observed}; {predicted}, {delay_s * 1e9:+.1f} ns away",
             "start_offset_hz in the rig file is not the programmed one, the geometry is wrong, or the board is"
             " triggered at another time than the transmitter",
             f"if the board was programmed so: start_offset_hz = {start:.0f} for {board.name}",
             **facts,
         )
-    return ok(f"{found}; {predicted}", **facts)
+    return ok(f"{observed}; {predicted}", **facts)
 
 
 def _better_start(rig: Instrument, board: Board, if_hz: float) -> str:
@@ -294,7 +294,7 @@ def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
     uncertainty = float(np.hypot(delay[h.name][1], delay[v.name][1]))
     jitter = max(float(unwrapped(signals[b.name].if_hz, rig).std()) for b in (h, v)) / rig.chirp.slope_hz_per_s
     ppm = {b.name: signals[b.name].crystal_ppm(rig) for b in (h, v)}
-    found = f"{v.name} starts {skew * 1e9:+.2f} +- {uncertainty * 1e9:.2f} ns after {h.name}; " + ", ".join(
+    observed = f"{v.name} starts {skew * 1e9:+.2f} +- {uncertainty * 1e9:.2f} ns after {h.name}; " + ", ".join(
         f"{name} {mean * 1e9:+.1f} ns after the transmitter, crystal {ppm[name]:+.2f} ppm"
         for name, (mean, _) in delay.items()
     )
@@ -313,12 +313,12 @@ def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
         "use one line and a clock buffer (docs/how-to/wiring.md); compare SYNC_IN at the boards with an oscilloscope"
     )
     if abs(skew) > _SKEW_WARNING_S:
-        return (error if abs(skew) > _SKEW_ERROR_S else warning)(found, why, remedy, **facts)
+        return (error if abs(skew) > _SKEW_ERROR_S else warning)(observed, why, remedy, **facts)
     if jitter > _MAX_JITTER_S:
         return warning(
-            f"{found}; {jitter * 1e9:.1f} ns from chirp to chirp",
+            f"{observed}; {jitter * 1e9:.1f} ns from chirp to chirp",
             "more jitter than two clocks of 5 ns cause: noise or slow edges on SYNC_IN",
             remedy,
             **facts,
         )
-    return ok(found, **facts)
+    return ok(observed, **facts)

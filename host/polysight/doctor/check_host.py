@@ -57,12 +57,12 @@ def check_config(context: CheckContext) -> Finding:
 def check_host_clock(context: CheckContext) -> Finding:
     """Check that the clock is later than this program's files, and synchronised."""
     now_s = context.system.wall_ns() * 1e-9
-    found = f"{datetime.fromtimestamp(now_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    observed = f"{datetime.fromtimestamp(now_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
     if now_s < Path(__file__).stat().st_mtime - _CLOCK_LOST_S:
-        return error(f"{found}: earlier than this program's installation", "the clock lost its time", _SET_CLOCK)
+        return error(f"{observed}: earlier than this program's installation", "the clock lost its time", _SET_CLOCK)
     if context.system.clock_is_synchronised() is False:
-        return warning(f"{found}, not synchronised", "no time server is reachable", _SET_CLOCK)
-    return ok(found)
+        return warning(f"{observed}, not synchronised", "no time server is reachable", _SET_CLOCK)
+    return ok(observed)
 
 
 def check_pi_clock(context: CheckContext) -> Finding:
@@ -71,13 +71,13 @@ def check_pi_clock(context: CheckContext) -> Finding:
         return not_checked("the Pi does not report its time", "install the same release on both")
     offset_s = (context.hello.t_unix_ns - context.hello_at_ns) * 1e-9
     uncertainty_s = context.hello_took_ns * 0.5e-9
-    found = f"the Pi's clock minus this machine's: {offset_s:+.3f} s (+- {uncertainty_s:.3f} s)"
+    observed = f"the Pi's clock minus this machine's: {offset_s:+.3f} s (+- {uncertainty_s:.3f} s)"
     facts = {"offset_s": offset_s, "uncertainty_s": uncertainty_s}
     if abs(offset_s) - uncertainty_s > _CLOCK_LOST_S:
-        return error(found, "one clock is wrong: times in logs and scans cannot be compared", _SET_CLOCK, **facts)
+        return error(observed, "one clock is wrong: times in logs and scans cannot be compared", _SET_CLOCK, **facts)
     if abs(offset_s) - uncertainty_s > _MAX_CLOCK_OFFSET_S:
-        return warning(found, "one of the two clocks is not synchronised", _SET_CLOCK, **facts)
-    return ok(found, **facts)
+        return warning(observed, "one of the two clocks is not synchronised", _SET_CLOCK, **facts)
+    return ok(observed, **facts)
 
 
 def check_calibration(context: CheckContext) -> Finding:
@@ -93,13 +93,13 @@ def check_library(context: CheckContext) -> Finding:
     """Compare the rig's incidence angle with those of the default library; without a match no material is named."""
     angle = incidence_deg(context.rig, context.rig.receivers[0])
     angles = Library.load(SIMULATED_LIBRARY).angles_deg
-    known = " and ".join(f"{a:g}" for a in angles)
+    library_angles = " and ".join(f"{a:g}" for a in angles)
     facts = {"incidence_deg": angle, "library_deg": list(angles)}
-    found = f"incidence angle of the rig {angle:.1f} degrees, of {SIMULATED_LIBRARY.name} {known} degrees"
+    observed = f"incidence angle of the rig {angle:.1f} degrees, of {SIMULATED_LIBRARY.name} {library_angles} degrees"
     if not why_unnamed(DEFAULT, context.rig):
-        return ok(found, **facts)
+        return ok(observed, **facts)
     return warning(
-        found,
+        observed,
         "|P| changes by about 10 % per degree, so no material of this rig's scans will be named",
         "train a library at this angle (docs/how-to/add-a-material.md) and scan with --library; or --model none",
         **facts,
@@ -114,13 +114,13 @@ def check_receivers(context: CheckContext) -> Finding:
         f"{r.mbit_s:.0f} Mbit/s a card: {'no loss' if not r.lost else f'{100 * r.lost / r.sent:.1f} % lost'}"
         for r in results
     )
-    found = f"receivers ({scheduling}) with all cores busy: {losses}"
+    observed = f"receivers ({scheduling}) with all cores busy: {losses}"
     facts = {"held": [vars(r) for r in results], "scheduling": scheduling}
     needed = results[: rates.index(1e6 / (context.rig.card.packet_delay_us + PACKET_TIME_US)) + 1]
     if any(r.lost for r in needed):
         remedy = "use a faster machine" if "real-time" in scheduling else PRIORITY_REMEDY
-        return warning(found, "other programs take processor time from the receivers", remedy, **facts)
-    return ok(found, **facts)
+        return warning(observed, "other programs take processor time from the receivers", remedy, **facts)
+    return ok(observed, **facts)
 
 
 def check_disk(context: CheckContext) -> Finding:
@@ -130,28 +130,30 @@ def check_disk(context: CheckContext) -> Finding:
     need = rig.scan_bytes
     reserve = rig.limits.free_disk_bytes
     free = shutil.disk_usage(folder).free
-    found = f"{folder}: {free / 1e9:.1f} GB free, a scan needs {need / 1e9:.2f} GB and {reserve / 1e9:.1f} GB reserve"
+    observed = (
+        f"{folder}: {free / 1e9:.1f} GB free, a scan needs {need / 1e9:.2f} GB and {reserve / 1e9:.1f} GB reserve"
+    )
     facts: dict[str, float] = {"free_bytes": free, "need_bytes": need}
     if free < need + reserve:
-        return error(found, "the disk is too full for a scan", "free space, or give another --out", **facts)
+        return error(observed, "the disk is too full for a scan", "free space, or give another --out", **facts)
     speed = context.system.write_speed(folder)
     rate = need / scan_time(rig).total_s
-    found += f"; durable write speed {speed / 1e6:.0f} MB/s, data rate of a scan {rate / 1e6:.2f} MB/s"
+    observed += f"; durable write speed {speed / 1e6:.0f} MB/s, data rate of a scan {rate / 1e6:.2f} MB/s"
     facts |= {"write_bytes_s": speed, "scan_bytes_s": rate}
     if speed < rate:
-        return error(found, "the disk is too slow: a network share or a worn card", "scan to a local disk", **facts)
+        return error(observed, "the disk is too slow: a network share or a worn card", "scan to a local disk", **facts)
     if speed < _SPEED_MARGIN * rate:
-        return warning(found, "the disk is hardly fast enough", "scan to a faster disk", **facts)
-    return ok(found, **facts)
+        return warning(observed, "the disk is hardly fast enough", "scan to a faster disk", **facts)
+    return ok(observed, **facts)
 
 
 def _nearest_existing(folder: Path) -> Path:
-    found = folder.resolve()
-    while not found.exists():
-        found = found.parent
-    if not found.is_dir():
-        raise ConfigError(f"--out {folder}: {found} is a file", "a scan needs a folder", "give another --out")
-    return found
+    observed = folder.resolve()
+    while not observed.exists():
+        observed = observed.parent
+    if not observed.is_dir():
+        raise ConfigError(f"--out {folder}: {observed} is a file", "a scan needs a folder", "give another --out")
+    return observed
 
 
 def check_time(context: CheckContext) -> Finding:
@@ -206,23 +208,23 @@ def check_pi(context: CheckContext) -> Finding:
     context.hello_at_ns = (before + after) // 2
     context.hello_took_ns = after - before
     backend = SIMULATED if is_simulated(hello.backend) else f"GPIO backend {hello.backend}"
-    found = f"{context.rig.pi.command_address} answers: release {hello.pi_release}, {backend}, state {hello.state}"
+    observed = f"{context.rig.pi.command_address} answers: release {hello.pi_release}, {backend}, state {hello.state}"
     facts = {"release": hello.pi_release, "backend": hello.backend, "state": hello.state}
     if hello.pi_release != __version__:
         return error(
-            found,
+            observed,
             f"this host has release {__version__}",
             "install the same release on both: `make pi-install HOST=...`",
             **facts,
         )
     if differing := stage_differences(context.rig.stage, hello):
         return error(
-            f"{found}; {'; '.join(differing)}",
+            f"{observed}; {'; '.join(differing)}",
             "host and Pi have different rig files, so the Pi would refuse a scan",
             "copy the right [stage] to the other machine, `sudo systemctl restart polysight-pi`",
             **facts,
         )
-    return ok(found, **facts)
+    return ok(observed, **facts)
 
 
 def check_free(context: CheckContext) -> Finding:
@@ -249,11 +251,11 @@ def check_trigger(context: CheckContext) -> Finding:
         return busy
     row = _run_row(context)
     facts = {"points": row.points, "edges": row.edges, "pulses": row.pulses, "fault": row.fault}
-    found = f"{row.points} points passed, {row.edges} edges detected, {row.pulses} pulses sent"
+    observed = f"{row.points} points passed, {row.edges} edges detected, {row.pulses} pulses sent"
     expected = _POINTS * context.rig.burst.pulses
     if row.points and not row.edges:
         return error(
-            found,
+            observed,
             "the trigger line is stuck: no edge reaches the Pi",
             f"check the wire and its ground from the stage's trigger pin to GPIO {context.rig.pi.trigger_in}, the level"
             " shifter, and pi.trigger_in; with the Pi's service stopped, `polysight-pi check` there reports which"
@@ -262,10 +264,10 @@ def check_trigger(context: CheckContext) -> Finding:
         )
     if row.status != "done" or row.edges != _POINTS or row.pulses != expected:
         e = explain(row.fault)
-        return error(f"{found}, {_POINTS} and {expected} expected: {row.reason or e.what}", e.why, e.remedy, **facts)
+        return error(f"{observed}, {_POINTS} and {expected} expected: {row.reason or e.what}", e.why, e.remedy, **facts)
     if row.fault or row.reason:
-        return warning(f"{found}; {row.reason}", "", "watch the stage during a row", **facts)
-    return ok(found, **facts)
+        return warning(f"{observed}; {row.reason}", "", "watch the stage during a row", **facts)
+    return ok(observed, **facts)
 
 
 def _run_row(context: CheckContext) -> RowFinished:
@@ -323,16 +325,16 @@ def check_stage(context: CheckContext) -> Finding:
         )
     firmware = context.hello.firmware if context.hello is not None else ""
     where = f"at {status.x_mm:.1f}, {status.y_mm:.1f} mm" if status.homed else "not homed yet"
-    found = f"answers, sketch {firmware or 'unknown'}, {where}"
+    observed = f"answers, sketch {firmware or 'unknown'}, {where}"
     facts = {"firmware": firmware, "homed": status.homed}
     if firmware != __version__:
         return error(
-            found,
+            observed,
             f"this release needs sketch {__version__}; the board was flashed with another",
             "`make flash PORT=/dev/ttyACM0` with the board on this machine",
             **facts,
         )
     if status.fault:
         e = explain(status.fault)
-        return warning(f"{found}; its last row ended with fault {status.fault}: {e.what}", e.why, e.remedy, **facts)
-    return ok(found, **facts)
+        return warning(f"{observed}; its last row ended with fault {status.fault}: {e.what}", e.why, e.remedy, **facts)
+    return ok(observed, **facts)

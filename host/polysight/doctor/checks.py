@@ -43,7 +43,9 @@ from polysight_shared.errors import PolysightError, no_such, os_error
 from polysight_shared.findings import Finding
 from polysight_shared.messages import is_simulated
 
-_VERDICT_WIDTH, _NAME_WIDTH = 12, 16  # the operator's page parses these columns
+# The operator's page parses these columns.
+_VERDICT_WIDTH = 12
+_NAME_WIDTH = 16
 
 
 @dataclass(frozen=True)
@@ -110,8 +112,8 @@ def _failed_prerequisite(check: Check, board: Board | None, blocked: dict[tuple[
     A check of one board depends on the same board's checks, and one of the whole rig on those of every board.
     """
     for need in check.needs:
-        for (name, of), failed in blocked.items():
-            if name == need and (board is None or of in ("", board.name)):
+        for (name, board_name), failed in blocked.items():
+            if name == need and (board is None or board_name in ("", board.name)):
                 return failed
     return next((name for name in check.unless if blocked.get((name, "")) == name), "")
 

@@ -10,7 +10,7 @@ from tests.support.products import judged_products
 from tests.support.refusals import refused
 from tests.support.scenes import COPPER, PET
 
-from polysight.catalogue import Pixels, compare, draw_comparison, draw_products, probe, result_of, thumbnail
+from polysight.catalogue import Pixels, compare, draw_comparison, draw_products, probe, read_result, thumbnail
 from polysight.catalogue.pictures import MAPS
 from polysight.catalogue.results import SIGNIFICANT, scatter_of
 from polysight.polarimetry import permittivity_from_ratio
@@ -70,7 +70,7 @@ def test_without_a_result_nothing_is_told_of_materials(tmp_path):
     judged_products(tmp_path, "none", careless=True)
     answer = probe(tmp_path, 0.0, 0.0)
     assert (answer.permittivity, answer.patch, answer.nearest) == (None, None, [])
-    assert {p.name for p in result_of(tmp_path).pictures} <= {n for n in MAPS if n[0] in "hvp" and n != "p_sigma"}
+    assert {p.name for p in read_result(tmp_path).pictures} <= {n for n in MAPS if n[0] in "hvp" and n != "p_sigma"}
 
 
 def test_a_scan_does_not_differ_from_itself(processed):

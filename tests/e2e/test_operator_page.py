@@ -17,7 +17,7 @@ from tests.support.scenes import small_scene
 from tests.support.simulated_rig import Rig, running
 
 from polysight.catalogue import PROGRAM
-from polysight.serve.programs import program_of
+from polysight.serve.programs import find_program
 from polysight.store import ScanFolder, validate
 
 ROWS = 40
@@ -85,7 +85,7 @@ class Lab:
 
 
 def _program(folder: Path) -> Any:
-    found = program_of(folder, "scan")
+    found = find_program(folder, "scan")
     assert found is not None
     return found
 

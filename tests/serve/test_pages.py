@@ -20,7 +20,7 @@ from tests.support.scenes import COPPER, PET
 from polysight.catalogue import Notes, read_notes, write_notes
 from polysight.materials import Library, read_labels
 from polysight.products import ProcessedScan
-from polysight.serve.programs import program_of
+from polysight.serve.programs import find_program
 
 pytestmark = pytest.mark.xdist_group("browser")
 SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
@@ -310,10 +310,10 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
     page.browser.value("document.getElementById('library').value = 'mine'")
     page.browser.click("#process button")
     page.browser.wait("document.getElementById('rows').innerText.includes('my plastic')", "the new name")
-    found = program_of(scans / "one", "process")
+    found = find_program(scans / "one", "process")
     assert found is not None
     assert "--labels" in found.words
-    named = [s["name"] for s in ProcessedScan(scans / "one" / "products").segments if not s["metal_reference"]]
+    named = [s.name for s in ProcessedScan(scans / "one" / "products").segments if not s.metal_reference]
     assert named == ["my plastic"]
     page.whole()
 

@@ -19,7 +19,7 @@ from tests.support.refusals import refused
 from polysight.catalogue import PROGRAM
 from polysight.jobs.live_scan import _check_new
 from polysight.serve import launcher
-from polysight.serve.programs import Programs, program_of
+from polysight.serve.programs import Programs, find_program
 from polysight.store import validate
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
@@ -33,17 +33,17 @@ def programs() -> Iterator[Programs]:
 
 
 def ended(folder: Path, kind: str) -> None:
-    wait_for(lambda: not (program_of(folder, kind) or pytest.fail("none")).running, "its end")
+    wait_for(lambda: not (find_program(folder, kind) or pytest.fail("none")).running, "its end")
 
 
 def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
     programs.start(tmp_path, "export", ["--version"])
-    wait_for(lambda: program_of(tmp_path, "export").status is not None, "its status")
-    found = program_of(tmp_path, "export")
+    wait_for(lambda: find_program(tmp_path, "export").status is not None, "its status")
+    found = find_program(tmp_path, "export")
     assert (found.status, found.words, found.log.split()[0]) == (0, ("polysight", "--version"), "polysight")
     programs.start(tmp_path, "export", ["validate", tmp_path])
-    wait_for(lambda: program_of(tmp_path, "export").status is not None, "its status")
-    found = program_of(tmp_path, "export")
+    wait_for(lambda: find_program(tmp_path, "export").status is not None, "its status")
+    found = find_program(tmp_path, "export")
     assert found.status == 3
     assert "why:" in found.log
     assert "--version" not in found.log  # the log of the earlier one stays in the file
@@ -58,15 +58,15 @@ def sleeping(tmp_path: Path) -> Iterator[Path]:
     finally:
         os.killpg(child.pid, 9)
         child.wait()
-    assert program_of(tmp_path, "scan").status is None  # killed: it could not say
+    assert find_program(tmp_path, "scan").status is None  # killed: it could not say
 
 
 def test_a_program_is_known_by_its_number_and_its_begin(sleeping):
-    assert program_of(sleeping, "scan").running
+    assert find_program(sleeping, "scan").running
     file = sleeping / PROGRAM / "scan.json"
     answer = json.loads(file.read_text())
     file.write_text(json.dumps(answer | {"ticks": answer["ticks"] - 1}))
-    assert not program_of(sleeping, "scan").running  # another process has the number now
+    assert not find_program(sleeping, "scan").running  # another process has the number now
 
 
 def test_one_program_of_a_kind_runs_in_a_folder(programs, sleeping):
@@ -81,7 +81,7 @@ def test_one_program_of_a_kind_runs_in_a_folder(programs, sleeping):
 def test_a_made_up_number_is_no_program_that_runs(tmp_path, content):
     (tmp_path / PROGRAM).mkdir()
     (tmp_path / PROGRAM / "scan.json").write_bytes(content)
-    found = program_of(tmp_path, "scan")
+    found = find_program(tmp_path, "scan")
     assert found is None or not found.running
 
 
@@ -90,7 +90,7 @@ def test_a_log_is_shown_without_what_moves_a_terminal(tmp_path):
     answer = {"pid": 0, "ticks": 0, "words": ["x"], "started_utc": ""}
     (tmp_path / PROGRAM / "scan.json").write_text(json.dumps(answer))
     (tmp_path / PROGRAM / "scan.log").write_bytes(b"--- t x\n\x1b[31mred\x1b[0m\x07 \xe2\x80\xaeback\xff\n")
-    assert program_of(tmp_path, "scan").log == "red back\ufffd"
+    assert find_program(tmp_path, "scan").log == "red back\ufffd"
 
 
 def test_a_scan_may_begin_beside_its_program_and_its_notes(tmp_path):
@@ -121,13 +121,13 @@ def test_a_scan_starts_with_its_plan_and_without_a_pi_says_why(tmp_path):
         assert post(view, "/api/start", {"name": "two"})[0] == 409  # one rig
         assert not (tmp_path / "two").exists()
         ended(folder, "scan")
-        wait_for(lambda: program_of(folder, "scan").status is not None, "its status")
-        assert program_of(folder, "scan").status != 0
+        wait_for(lambda: find_program(folder, "scan").status is not None, "its status")
+        assert find_program(folder, "scan").status != 0
         wait_for(lambda: get(view, "/api/scan?scan=week/one")["state"] == "failed", "the state")
         reason = get(view, "/api/scan?scan=week/one")["reason"]
         assert len(reason) > 10
         assert "polysight" not in reason
-        assert reason in program_of(folder, "scan").log
+        assert reason in find_program(folder, "scan").log
         assert get(view, "/api/scans")["scans"][0]["tags"] == ["t"]
         assert post(view, "/api/start", {"name": "week/one"})[0] == 200  # once more, by the same name
         assert get(view, "/api/scan?scan=week/one")["notes"] == "n"
@@ -155,7 +155,7 @@ def test_nothing_is_written_through_a_link(programs, tmp_path, name):
     else:
         (tmp_path / "scan").mkdir()
         (tmp_path / "scan" / PROGRAM).symlink_to(tmp_path / "victim")
-    assert program_of(tmp_path / "scan", "scan") is None
+    assert find_program(tmp_path / "scan", "scan") is None
     with pytest.raises(DeviceError):
         programs.start(tmp_path / "scan", "scan", ["--version"])
     assert [p.name for p in (tmp_path / "victim").iterdir()] == ["file"]

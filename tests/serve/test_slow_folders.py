@@ -62,7 +62,7 @@ def view(root: Path) -> Iterator[Served]:
 
 
 def test_other_scans_are_read_while_one_folder_hangs(dead, view):
-    dead.stop(reading, "result_of")
+    dead.stop(reading, "read_result")
     answers: list[tuple[int, bytes, dict[str, str]]] = []
     many = [threading.Thread(target=lambda: answers.append(ask(view, "/api/result?scan=dead"))) for _ in range(20)]
     for one in many:

@@ -1,7 +1,7 @@
 """Recorded and processed scans for lists, pages and commands; nothing is processed here.
 
 `Scans` lists the scans under a folder and finds the folder of one by its name. `Notes` are the operator's notes and
-tags beside a scan. Of a processed scan, `result_of` gives the results as plain data, `draw_products` draws its maps and
+tags beside a scan. Of a processed scan, `read_result` gives the results for a page, `draw_products` draws its maps and
 `probe` reads one place; `compare` takes two scans. They share `Pixels`: images with permittivity and errors.
 """
 
@@ -22,9 +22,9 @@ from polysight.catalogue.results import (
     PermittivityDifference,
     compare,
     draw_comparison,
-    files_of,
+    list_files,
     probe,
-    result_of,
+    read_result,
 )
 from polysight.catalogue.scans import (
     NOTES,
@@ -59,14 +59,14 @@ __all__ = [
     "draw",
     "draw_comparison",
     "draw_products",
-    "files_of",
     "folder_bytes",
     "is_plain",
+    "list_files",
     "log_tail",
     "printable",
     "probe",
     "read_notes",
-    "result_of",
+    "read_result",
     "thumbnail",
     "write_notes",
 ]

@@ -85,7 +85,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     files: list[File]
 
 
-def result_of(folder: Path) -> Result:
+def read_result(folder: Path) -> Result:
     """Collect the products of a scan folder, or of a folder of products.
 
     Raises
@@ -103,7 +103,7 @@ def result_of(folder: Path) -> Result:
         verdict=pixels.verdict,
         patches=pixels.segments,
         labels=_labels(folder, pixels),
-        files=files_of(folder),
+        files=list_files(folder),
     )
 
 
@@ -119,7 +119,7 @@ def _labels(folder: Path, pixels: Pixels) -> DrawnLabels | None:
     return DrawnLabels(dict(labels.boxes), labels.metal, dict(labels.specimens))
 
 
-def files_of(folder: Path) -> list[File]:
+def list_files(folder: Path) -> list[File]:
     """Downloadable files of a scan's products and exports."""
     products = read_products(folder).folder
     files = []

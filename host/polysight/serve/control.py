@@ -21,8 +21,8 @@ from polysight.jobs.label import remove_labels, save_labels
 from polysight.materials import Labels
 from polysight.plan import Changes, forecast, forecast_values
 from polysight.products import find_labels, label_folder, read_products
-from polysight.serve.guard import BODY_BYTES, cookie_name, refused_body
-from polysight.serve.programs import program_of
+from polysight.serve.guard import BODY_BYTES, cookie_name, refuse_body
+from polysight.serve.programs import find_program
 from polysight.serve.reading import json_answer
 from polysight.serve.site import LIBRARIES, Site
 from polysight_shared.config import Instrument, load_instrument
@@ -141,7 +141,7 @@ def control_routes(site: Site) -> list[Route]:
             async for chunk in request.stream():
                 content += chunk
                 if len(content) > BODY_BYTES:
-                    return refused_body()
+                    return refuse_body()
             return json_answer(await answer(site, request, _decode_body(bytes(content), kind)))
 
         return Route(f"/api/{path}", endpoint, methods=["POST"])
@@ -245,7 +245,7 @@ async def _start(site: Site, request: Request, body: StartRequest) -> None:
 def _check_free(site: Site) -> None:
     """Refuse what needs the rig while a program that the list shows has it. Raises ScanError."""
     running = [s.name for s in site.scans.list() if s.state in ("running", "paused") or _is_starting(site, s)]
-    doctor = program_of(site.logs, "doctor")
+    doctor = find_program(site.logs, "doctor")
     if running:
         what = f"{running[0]} is being scanned"
     elif doctor is not None and doctor.running:
@@ -257,7 +257,7 @@ def _check_free(site: Site) -> None:
 
 def _is_starting(site: Site, s: Summary) -> bool:
     """True if the scan's program runs without a sign of life yet, or is processing."""
-    program = program_of(site.scans.root / s.name, "scan") if s.state in ("begun", "lost") else None
+    program = find_program(site.scans.root / s.name, "scan") if s.state in ("begun", "lost") else None
     return program is not None and program.running
 
 

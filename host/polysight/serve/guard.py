@@ -118,23 +118,23 @@ class Guard:
         line_bytes = len(scope.get("raw_path") or scope["path"]) + len(scope.get("query_string", b""))
         if line_bytes + sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_BYTES:
             what = f"The head is longer than {HEAD_BYTES} bytes"
-            return refused(431, ErrorCode.MESSAGE_INVALID, what, "no page sends so much", "send less")
+            return refuse(431, ErrorCode.MESSAGE_INVALID, what, "no page sends so much", "send less")
         if not self._access.accepts_host(headers.get("host", "")):
-            return refused(
+            return refuse(
                 400, ErrorCode.HOST_UNKNOWN, "This server has another name", "the request names another host",
                 "open the address that it printed; --allow-host NAME adds one",
             )  # fmt: skip
         is_api = scope["path"].startswith("/api/")
         if method not in ("GET", "HEAD", "POST") or (method == "POST" and not is_api):
-            return refused(405, ErrorCode.MESSAGE_INVALID, f"{method} is not supported here", "", "use the page")
+            return refuse(405, ErrorCode.MESSAGE_INVALID, f"{method} is not supported here", "", "use the page")
         if is_api and not _is_same_site(headers, scope.get("scheme", "http"), writes=method == "POST"):
-            return refused(
+            return refuse(
                 403, ErrorCode.ORIGIN_FOREIGN, "The request comes from a page of another site", "only this server's own"
                 " pages may ask", "use the page that this server serves",
             )  # fmt: skip
         length = headers.get("content-length", "0")
         if length.isdecimal() and len(length) < 19 and int(length) > BODY_BYTES:
-            return refused_body()
+            return refuse_body()
         return None
 
     def _check_token(self, scope: Scope, headers: Headers) -> Response | None:
@@ -145,24 +145,24 @@ class Guard:
             is_open = access.loopback or not access.token or path in OPEN_PATHS or not path.startswith("/api/")
             if is_open or access.has_session(scope) or access.has_token(headers):
                 return None
-            return _refused_token(401)
+            return _refuse_token(401)
         if not access.control and path != "/api/session":
-            return refused(
+            return refuse(
                 403, ErrorCode.READ_ONLY, "This view is read-only", "it was started so",
                 "start it with --control to have buttons",
             )  # fmt: skip
-        return None if access.has_token(headers) else _refused_token(403)
+        return None if access.has_token(headers) else _refuse_token(403)
 
 
-def refused(status: int, code: ErrorCode, what: str, why: str, do: str) -> Response:
+def refuse(status: int, code: ErrorCode, what: str, why: str, do: str) -> Response:
     """An error as JSON: its code, and the three parts that people read."""
     return JSONResponse({"code": code, "what": what, "why": why, "do": do}, status)
 
 
-def refused_body() -> Response:
+def refuse_body() -> Response:
     """The refusal of a body that is too large."""
     what = f"More than {BODY_BYTES} bytes"
-    return _close_after(refused(413, ErrorCode.MESSAGE_INVALID, what, "no page sends so much", "send less"))
+    return _close_after(refuse(413, ErrorCode.MESSAGE_INVALID, what, "no page sends so much", "send less"))
 
 
 def _close_after(answer: Response) -> Response:
@@ -171,8 +171,8 @@ def _close_after(answer: Response) -> Response:
     return answer
 
 
-def _refused_token(status: int) -> Response:
-    return refused(
+def _refuse_token(status: int) -> Response:
+    return refuse(
         status, ErrorCode.TOKEN_WRONG, "The token is wrong or missing", "another server start has another token",
         "open the address that the server printed when it started",
     )  # fmt: skip

@@ -57,7 +57,7 @@ class Programs:
             if none can be started.
         """
         with self._lock:
-            earlier = program_of(folder, kind)
+            earlier = find_program(folder, kind)
             if earlier is not None and earlier.running:
                 raise ScanError(
                     f"{folder}: {kind} runs already", "it was started before", "wait for it, or stop it",
@@ -104,13 +104,13 @@ def _check_place(place: Path, kind: str) -> None:
             )  # fmt: skip
 
 
-def programs_of(folder: Path) -> list[Program]:
+def find_programs(folder: Path) -> list[Program]:
     """All programs started for a folder, the newest first."""
-    programs = [program_of(folder, kind) for kind in KINDS]
+    programs = [find_program(folder, kind) for kind in KINDS]
     return sorted((p for p in programs if p is not None), key=lambda p: p.started_utc, reverse=True)
 
 
-def program_of(folder: Path, kind: str) -> Program | None:
+def find_program(folder: Path, kind: str) -> Program | None:
     """The program of a kind that was started last for a folder; None if there is none."""
     base = folder / PROGRAM / kind
     path = base.with_suffix(".json")

@@ -30,15 +30,15 @@ from polysight.catalogue import (
     Summary,
     colour_bar,
     draw_comparison,
-    files_of,
+    list_files,
     probe,
     read_notes,
-    result_of,
+    read_result,
 )
 from polysight.page import Watch
 from polysight.products import REPORT, read_products
-from polysight.serve.guard import refused
-from polysight.serve.programs import Program, program_of, programs_of
+from polysight.serve.guard import refuse
+from polysight.serve.programs import Program, find_program, find_programs
 from polysight.serve.site import THUMBNAIL, Site, compare_products, draw_map
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -143,7 +143,7 @@ async def _scan(site: Site, request: Request) -> Response:
     def read_details(folder: Path) -> ScanDetails:
         facts = asdict(site.scans.summary(name)) | asdict(read_notes(folder))
         place = str(folder.absolute())
-        return ScanDetails(**facts, bytes=site.size(name), folder=place, programs=programs_of(folder))
+        return ScanDetails(**facts, bytes=site.size(name), folder=place, programs=find_programs(folder))
 
     return json_answer(await site.read_scan(request, read_details))
 
@@ -164,7 +164,7 @@ async def _thumbnail(site: Site, request: Request) -> Response:
 
 async def _program(site: Site, request: Request) -> Response:
     kind = request.path_params["kind"]
-    return json_answer(program_of(site.logs, kind) if kind in ("doctor", "train") else None)
+    return json_answer(find_program(site.logs, kind) if kind in ("doctor", "train") else None)
 
 
 # --- the live view ---
@@ -189,7 +189,7 @@ async def _live_picture(site: Site, request: Request) -> Response:
     picture = (await _open_watch(site, request)).shown.pictures.get(request.path_params["name"])
     if picture is None:
         what = "This picture is not there yet"
-        return refused(404, ErrorCode.FILE_MISSING, what, "no row is processed", "it comes with the first row")
+        return refuse(404, ErrorCode.FILE_MISSING, what, "no row is processed", "it comes with the first row")
     return Response(picture.png, media_type="image/png")
 
 
@@ -198,7 +198,7 @@ async def _bar(site: Site, request: Request) -> Response:
     kind = request.path_params["kind"]
     colours = {"phase": PHASE, "amplitude": AMPLITUDE}.get(kind, str(kind))
     if colours not in (AMPLITUDE, PHASE, DIFFERENCE):
-        return refused(404, ErrorCode.VALUE_INVALID, "There are no such colours", "", "use the page")
+        return refuse(404, ErrorCode.VALUE_INVALID, "There are no such colours", "", "use the page")
     return Response(colour_bar(colours), media_type="image/png")
 
 
@@ -206,7 +206,7 @@ async def _bar(site: Site, request: Request) -> Response:
 
 
 async def _result(site: Site, request: Request) -> Response:
-    return json_answer(await site.read_scan(request, result_of))
+    return json_answer(await site.read_scan(request, read_result))
 
 
 async def _map(site: Site, request: Request) -> Response:
@@ -232,7 +232,7 @@ async def _file(site: Site, request: Request) -> Response:
     of = request.query_params.get("of", "products")
 
     def find_file(folder: Path) -> tuple[str, Path]:
-        if not any(file.name == name and file.of == of for file in files_of(folder)):
+        if not any(file.name == name and file.of == of for file in list_files(folder)):
             raise DataError(
                 f"no file is called {name[:80]!r}", "it was not made, or the name is wrong", "see the scan's page",
                 code=ErrorCode.FILE_MISSING,

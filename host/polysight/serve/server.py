@@ -29,7 +29,7 @@ from starlette.routing import Route
 from polysight.catalogue import Scans
 from polysight.page import Watch
 from polysight.serve.control import control_routes
-from polysight.serve.guard import HEAD_BYTES, Access, Guard, refused
+from polysight.serve.guard import HEAD_BYTES, Access, Guard, refuse
 from polysight.serve.programs import Programs
 from polysight.serve.reading import reading_routes
 from polysight.serve.site import Site, Watches
@@ -279,7 +279,7 @@ async def _tell_error(request: Request, e: Exception) -> Response:
         status = 503
     else:
         status = 409
-    return refused(status, error.code, error.what, error.why, error.remedy)
+    return refuse(status, error.code, error.what, error.why, error.remedy)
 
 
 async def _tell_nobody(request: Request, e: Exception) -> Response:
@@ -290,7 +290,7 @@ async def _tell_nobody(request: Request, e: Exception) -> Response:
 
 async def _tell_no_page(request: Request, e: Exception) -> Response:
     del request, e
-    return refused(404, ErrorCode.OTHER, "There is no such page", "the address is wrong", "begin at the list of scans")
+    return refuse(404, ErrorCode.OTHER, "There is no such page", "the address is wrong", "begin at the list of scans")
 
 
 async def _tell_defect(request: Request, e: Exception) -> Response:
@@ -298,4 +298,4 @@ async def _tell_defect(request: Request, e: Exception) -> Response:
     sys.stderr.flush()
     what = f"An internal error of the server: {type(e).__name__}"
     do = "report it, with the server's terminal output"
-    return refused(500, ErrorCode.OTHER, what, "a defect of this program", do)
+    return refuse(500, ErrorCode.OTHER, what, "a defect of this program", do)

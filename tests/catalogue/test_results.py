@@ -109,7 +109,7 @@ def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
     found = compare(processed / "one", tmp_path / "changed")
     answer = np.nan_to_num(found.sigmas)
     assert found.figures.scatter == 0.1  # a copy, which shares its errors
-    expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.p_sigma) / 0.1
+    expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.images.p_sigma) / 0.1
     assert np.allclose(answer[inside], expected[inside], rtol=1e-4)
     assert answer[inside].min() > 0.5
     answer[inside] = 0

@@ -50,8 +50,8 @@ def test_a_finished_folder_is_shown_as_it_is(finished, truth, watching):
     assert state["scan"]["simulated"] is True
     for board in state["boards"]:
         summary = pipeline.quality.boards[board["name"]].summary()
-        assert board["frames_received"] == summary["frames_received"]
-        assert board["masked"] == summary["positions_masked"]
+        assert board["frames_received"] == summary.frames_received
+        assert board["masked"] == summary.positions_masked
     assert {name: p.png for name, p in watch.shown.pictures.items()} == {n: p.png for n, p in pictures.items()}
     assert set(state["pictures"]["scales"]) == {f"{c}_{k}" for c in "hvp" for k in ("amplitude", "phase")}
     assert state["profile"]["row"] == 2

@@ -220,7 +220,7 @@ def test_scans_at_a_time_follow_cores_and_memory():
 def test_the_table_names_every_scan_and_counts(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "quality.json").write_text('{"boards": {"RH": {"positions": 200, "positions_masked": 3}}}')
-    (tmp_path / "a" / "materials.json").write_text('{"segments": [1, 2]}')
+    (tmp_path / "a" / "materials.json").write_text('{"segments": [{"label": 1}, {"label": 2}]}')
     text = table([Outcome("a", "done", 61.0, 0.54), Outcome("b", "failed", 2.0, 0.0, "broken")], tmp_path)
     head, a, b, end = text.splitlines()
     assert head.split() == ["scan", "result", "seconds", "memory", "masked", "patches"]

@@ -15,12 +15,10 @@ from polysight_shared import __version__
 
 if TYPE_CHECKING:
     from polysight.api import Scan, open_scan, read_netcdf
-    from polysight.api.bluesky_device import RadarScan, radar_scan
     from polysight.imaging import backproject
     from polysight.polarimetry import fresnel, multilayer, permittivity_from_ratio
 
 __all__ = [
-    "RadarScan",
     "Scan",
     "__version__",
     "backproject",
@@ -28,12 +26,10 @@ __all__ = [
     "multilayer",
     "open_scan",
     "permittivity_from_ratio",
-    "radar_scan",
     "read_netcdf",
 ]
 
 _HOME = {
-    "RadarScan": "polysight.api.bluesky_device",
     "Scan": "polysight.api",
     "open_scan": "polysight.api",
     "read_netcdf": "polysight.api",
@@ -41,7 +37,6 @@ _HOME = {
     "fresnel": "polysight.polarimetry",
     "multilayer": "polysight.polarimetry",
     "permittivity_from_ratio": "polysight.polarimetry",
-    "radar_scan": "polysight.api.bluesky_device",
 }
 
 

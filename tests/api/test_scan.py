@@ -20,7 +20,7 @@ from polysight.store import manifest
 from polysight.store.scan_folder import MANIFEST, ScanFolder
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, PolysightError
+from polysight_shared.errors import DataError, PolysightError
 
 from .conftest import COPPER, PET, REPO, command, simulated
 
@@ -263,26 +263,13 @@ def same_dataset(found: xarray.Dataset, expected: xarray.Dataset) -> None:
             assert found[name].dtype == variable.dtype, name
 
 
-def test_netcdf_and_zarr_keep_every_value(products, tmp_path):
+def test_netcdf_keeps_every_value(products, tmp_path):
     scan = open_scan(products)
     scan.to_netcdf(tmp_path / "image.nc")
-    for _ in range(2):  # an earlier store is replaced
-        scan.to_zarr(tmp_path / "image.zarr")
-    netcdf, zarr = read_netcdf(tmp_path / "image.nc"), xarray.open_zarr(tmp_path / "image.zarr").load()
-    expected = scan.image().assign(scan.patches().data_vars)
-    for found in (netcdf, zarr):
-        same_dataset(found, expected)
-        assert found.attrs.items() >= {**scan.image().attrs, **scan.patches().attrs}.items()
-        assert scan.rig.name in found.attrs["instrument"]
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["image.nc", "image.zarr"]
-
-
-def test_a_folder_that_is_no_store_is_not_replaced(scan, tmp_path):
-    (tmp_path / "mine.zarr").mkdir()
-    (tmp_path / "mine.zarr" / "thesis.txt").write_text("text")
-    with pytest.raises(ConfigError):
-        scan.to_zarr(tmp_path / "mine.zarr")
-    assert (tmp_path / "mine.zarr" / "thesis.txt").exists()
+    found = read_netcdf(tmp_path / "image.nc")
+    same_dataset(found, scan.image().assign(scan.patches().data_vars))
+    assert found.attrs.items() >= {**scan.image().attrs, **scan.patches().attrs}.items()
+    assert scan.rig.name in found.attrs["instrument"]
 
 
 # --- the figure -------------------------------------------------------------------------------------------------------

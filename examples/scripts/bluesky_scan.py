@@ -1,9 +1,15 @@
 """A scan as a Bluesky run: `RadarScan`, an ophyd-async flyer, and the plan `radar_scan`.
 
+Needs `pip install "bluesky>=1.14" "ophyd-async>=0.19"`, and is used as
+
+    from bluesky import RunEngine
+
+    RunEngine()(radar_scan(RadarScan("instrument.toml"), "scans/one", md={"operator": "a person"}))
+
 The scan runs as with `polysight scan`: rows are transactions, and committed rows stay, however the plan ends. Bluesky
 gets metadata, an event for each committed row, and progress; the data stay in the scan folder, whose path is in the
-start document. Needs the extra `bluesky`. A RunEngine that is paused while rows are taken ends the run, since rows
-cannot be replayed: the scan stops after the row, and `polysight resume` continues it.
+start document. A RunEngine that is paused while rows are taken ends the run, since rows cannot be replayed: the scan
+stops after the row, and `polysight resume` continues it.
 """
 
 from __future__ import annotations
@@ -47,7 +53,8 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
     """
 
     def __init__(self, config: Path | str, name: str = "radar_scan", keep_incomplete: bool = False) -> None:
-        self._config, self._keep_incomplete = Path(config), keep_incomplete
+        self.config = Path(config)
+        self._keep_incomplete = keep_incomplete
         with self.add_children_as_readables():
             self.folder, self._set_folder = soft_signal_r_and_setter(str)
             self.scan_id, self._set_scan_id = soft_signal_r_and_setter(str)
@@ -92,7 +99,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
             if the folder is not empty, or the rig file is wrong.
         """
         folder = Path(value)
-        rig = load_instrument(self._config)
+        rig = load_instrument(self.config)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ConfigError(
                 f"{folder} is not an empty folder", "a scan has a folder of its own", "give another one",
@@ -172,7 +179,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
                 self._progress = (progress.committed, progress.rows)
                 loop.call_soon_threadsafe(self._show, progress.phase, progress.committed, folder)
 
-            rig = load_instrument(self._config)
+            rig = load_instrument(self.config)
             return run_scan(rig, folder, progress=show, keep_incomplete=self._keep_incomplete, stop=self._stop)
 
     def _show(self, phase: str, committed: int, folder: Path) -> None:
@@ -202,7 +209,7 @@ def radar_scan(scan: RadarScan, folder: Path | str, md: dict[str, Any] | None = 
     md
         More metadata for the start document.
     """
-    metadata = {"plan_name": "radar_scan", "scan_folder": str(Path(folder).resolve()), "rig_file": str(scan._config)}
+    metadata = {"plan_name": "radar_scan", "scan_folder": str(Path(folder).resolve()), "rig_file": str(scan.config)}
 
     @bpp.stage_decorator([scan])
     @bpp.run_decorator(md={**metadata, **(md or {})})

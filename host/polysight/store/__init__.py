@@ -29,7 +29,7 @@ from polysight.store.manifest import (
     ScanStarted,
 )
 from polysight.store.open import is_source, open_source
-from polysight.store.published import COLLECTION, read_settings, rig_of
+from polysight.store.published import COLLECTION, mirrored, read_settings, rig_of
 from polysight.store.raw import (
     Digests,
     PlacedAgain,
@@ -115,6 +115,7 @@ __all__ = [
     "is_source",
     "locked_samples",
     "manifest",
+    "mirrored",
     "new_scan_id",
     "open_npz",
     "open_records",

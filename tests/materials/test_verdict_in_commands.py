@@ -13,7 +13,8 @@ from tests.support.products import NAMES, PERMITTIVITY, REASON, judged_products
 from polysight.cli.main import main
 from polysight.materials import PATCHES
 from polysight.materials.result import PATCHES_FORMAT
-from polysight.results import LEVELS, NoResult
+from polysight.results import NoResult
+from polysight.results.verdict import LEVELS
 
 NUMBERS = ("2.9", "0.2", "3.0")
 

@@ -9,7 +9,7 @@ on the result; `save_images` and `save_materials` write the products. `polysight
 from polysight.process.inputs import NO_INPUTS, Inputs, boxes_as_patches, load_classifier, why_unnamed
 from polysight.process.judge import judge
 from polysight.process.parallel import cores, map_boards, map_rows
-from polysight.process.quality import Quality, masked_runs
+from polysight.process.quality import Quality
 from polysight.process.samples import KeptSamples, Use
 from polysight.process.save import (
     Findings,
@@ -38,7 +38,6 @@ __all__ = [
     "load_classifier",
     "map_boards",
     "map_rows",
-    "masked_runs",
     "no_progress",
     "processed_scan",
     "save_images",

@@ -4,7 +4,7 @@
 errors of synchronisation. The other names are for single figures of commands and papers.
 """
 
-from polysight.report.figures import draw_channel, draw_overview, figures, focus_figure, label_figure
+from polysight.report.figures import draw_channel, draw_overview, focus_figure, label_figure
 from polysight.report.report import write_report
 from polysight.report.style import INK, MUTED, PALETTE, STAMP, extent_mm, figure_label, font_families, png
 from polysight.report.sync_report import QUANTITIES, SyncReport, write_sync_report
@@ -20,7 +20,6 @@ __all__ = [
     "draw_overview",
     "extent_mm",
     "figure_label",
-    "figures",
     "focus_figure",
     "font_families",
     "label_figure",

@@ -7,7 +7,7 @@ cannot hold names or permittivities. The functions `*_reasons` are the rules of 
 `plain` converts all of it to JSON types.
 """
 
-from polysight.results.json_files import convert, damaged, json_text, one_line, plain, read_object
+from polysight.results.json_files import damaged, json_text, one_line, plain
 from polysight.results.materials import (
     BandFigures,
     ComplexNumber,
@@ -19,7 +19,6 @@ from polysight.results.materials import (
     MetalSource,
     PatchFigures,
     PermittivityFigures,
-    PermittivitySpread,
     PlaneError,
     ScanMaterials,
     TruthFigures,
@@ -27,21 +26,15 @@ from polysight.results.materials import (
 )
 from polysight.results.quality import (
     Backlash,
-    BoardImaging,
     BoardQuality,
-    CalibrationSource,
     FrequencyRange,
-    IncidenceAngles,
-    MetalPlate,
     RawDropped,
-    Recording,
     Residual,
     RxGain,
     ScanFacts,
     ScanQuality,
 )
 from polysight.results.verdict import (
-    LEVELS,
     Coverage,
     NoResult,
     Verdict,
@@ -54,7 +47,6 @@ from polysight.results.verdict import (
     passivity_reasons,
     percent,
     plane_reasons,
-    read_verdict,
     recording_reasons,
     signal_reasons,
     tilt_reasons,
@@ -62,30 +54,23 @@ from polysight.results.verdict import (
 )
 
 __all__ = [
-    "LEVELS",
     "Backlash",
     "BandFigures",
-    "BoardImaging",
     "BoardQuality",
-    "CalibrationSource",
     "ComplexNumber",
     "Coverage",
     "ErrorBudget",
     "Figure",
     "FrequencyRange",
-    "IncidenceAngles",
     "IncidenceError",
     "LeakageError",
-    "MetalPlate",
     "MetalScore",
     "MetalSource",
     "NoResult",
     "PatchFigures",
     "PermittivityFigures",
-    "PermittivitySpread",
     "PlaneError",
     "RawDropped",
-    "Recording",
     "Residual",
     "RxGain",
     "ScanFacts",
@@ -94,7 +79,6 @@ __all__ = [
     "TruthFigures",
     "Verdict",
     "brightness_reasons",
-    "convert",
     "damaged",
     "direct_path_reasons",
     "figures_of",
@@ -108,8 +92,6 @@ __all__ = [
     "percent",
     "plain",
     "plane_reasons",
-    "read_object",
-    "read_verdict",
     "recording_reasons",
     "signal_reasons",
     "tilt_reasons",

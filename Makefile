@@ -71,6 +71,7 @@ library: $(VENV)/installed  ## make the simulated reference library of the class
 	$(BIN)/polysight train --simulate examples/library --times 2 --out host/polysight/materials/simulated-library.npz
 
 wheels: $(VENV)/installed  ## wheels for users, x86-64 and ARM64, any Python, for machines without a compiler (OUT=out)
+	rm -rf $(PROJECTS:%=%/build)  # modules that were renamed since would come along
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/wheels $(patsubst %,./%,$(filter-out host,$(PROJECTS)))
 	for platform in manylinux_2_17_x86_64 manylinux_2_17_aarch64; do \
 	  POLYSIGHT_WHEEL=$$platform $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/wheels ./host || exit 1; done

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from polysight.imaging import PlaneEstimate
 from polysight.materials import NOT_PASSIVE, Classifier, MaterialsResult
@@ -80,7 +81,7 @@ def judge(
         reasons += metal_reasons(patch, enough, enough and e.sure, metal.given, e.against, e.others == 0)
     if found.prior.channels_known:
         gains = {"H": found.calibrated.metal_h, "V": found.calibrated.metal_v}
-        reasons += level_reasons({k: float(np.median(np.abs(v))) for k, v in gains.items() if v is not None})
+        reasons += level_reasons({channel: _median_level(gain) for channel, gain in gains.items()})
     reasons += leakage_reasons(found.prior.leakage_measured, found.inversion.leakage_determined, _leakage_error(found))
     if plane is not None:
         std = float(np.degrees(found.prior.theta_std_rad))
@@ -93,6 +94,15 @@ def judge(
         angle = float(np.degrees(np.mean(found.theta_rad)))
         reasons += incidence_reasons(angle, float(classifier.angles_deg[0]))
     return verdict_of(reasons)
+
+
+def _median_level(gain: npt.NDArray[np.complexfloating] | complex | None) -> float | None:
+    """Median of metal's magnitude where it is known; a reference plate need not cover the image. None: nowhere."""
+    if gain is None:
+        return None
+    magnitude = np.abs(np.asarray(gain))
+    known = magnitude[np.isfinite(magnitude)]
+    return float(np.median(known)) if known.size else None
 
 
 def _leakage_error(found: MaterialsResult) -> float:

@@ -38,7 +38,7 @@ def test_scans_and_their_scenes_give_the_same_library(scan_of, rig_file, tmp_pat
     library = Library.load(out)
     assert (library.names, library.scans) == (NAMES, ("first", "second"))
     assert library.fit
-    first, second = (library.select([name]).entries for name in library.scans)
+    first, second = ([e for e in library.entries if e.scan == name] for name in library.scans)
     for one, other in zip(first, second, strict=True):
         assert one.simulated
         assert one.h.size >= 10

@@ -3,16 +3,31 @@
 from __future__ import annotations
 
 import os
+import warnings
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from msgspec import UNSET
 
-from polysight.api.processing import Processing
 from polysight.data import packaged
-from polysight.materials import MODELS, SHORT
+from polysight.imaging import Images
+from polysight.materials import (
+    LAYER_FORMS,
+    MODELS,
+    SHORT,
+    Layer,
+    LayerFit,
+    find_truth,
+    fit_row,
+    incidence_std_rad,
+    parse_layer,
+)
+from polysight.pipeline import Pipeline
 from polysight.polarimetry import Incidence
+from polysight.process import imaged_scan, processed_scan, why_unnamed
 from polysight.products import (
     IMAGE,
     ProcessedScan,
@@ -27,7 +42,7 @@ from polysight.products import (
 from polysight.results import Verdict
 from polysight.settings import Settings
 from polysight.store import MANIFEST, ScanFolder, Source, open_source
-from polysight_shared.config import Instrument
+from polysight_shared.config import Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 
@@ -299,8 +314,6 @@ class Scan:
         are the sub-bands used (None: all where a thickness is fitted), `amplitude_percent` says how far |H| may be
         trusted. `ambiguous` and `notes` tell what the data leave open. Raises as :meth:`image`, and ConfigError.
         """
-        from polysight.api.layers import layer_dataset
-
         return layer_dataset(self._processed(True), self.rig.chirp, stack, bands, amplitude_percent)
 
     def plot(self, *, metal_referenced: bool = True) -> Figure:
@@ -387,3 +400,99 @@ class Scan:
         """These variables of the patches, where they exist, with the coordinates of their dimension."""
         patches = self.patches()
         return patches[[name for name in names if name in patches]].drop_vars(["x", "y"], errors="ignore")
+
+
+class Processing:
+    """Processes one source; each step runs once, when its result is first used.
+
+    `folder` is where the source was read; `truth.json` there holds the truth of a simulated scene.
+    """
+
+    def __init__(self, source: Source, folder: Path, settings: Settings) -> None:
+        self.source, self.folder, self.settings = source, folder, settings
+
+    @cached_property
+    def pipeline(self) -> Pipeline:
+        """The pipeline, without rows at first. Raises PolysightError when calibration and rig do not fit."""
+        return Pipeline(self.source, self.settings, samples="read")
+
+    @cached_property
+    def _images(self) -> Images:
+        """Both channels from all rows that hold data. Raises DataError when there are none."""
+        for row in self.pipeline.samples.processable(self.source, self.folder):
+            self.pipeline.add_row(row)
+        images = self.pipeline.form_images()
+        self.pipeline.quality.note_imaging(self.pipeline.images, images)
+        return images
+
+    @cached_property
+    def unreferenced(self) -> ProcessedScan:
+        """Images in arbitrary units, as `polysight image` writes them. Raises PolysightError."""
+        pipeline = self.pipeline
+        return imaged_scan(self.folder, self.source, pipeline.rig, self._images, pipeline.quality)
+
+    @cached_property
+    def referenced(self) -> ProcessedScan:
+        """Images relative to metal, patches and materials, as `polysight process` writes them.
+
+        Raises
+        ------
+        DataError
+            when no metal is found, a row is damaged, or library or metal reference do not fit the scan.
+        """
+        pipeline = self.pipeline
+        unnamed = why_unnamed(self.settings, pipeline.rig)
+        plates, note = find_truth(self.folder)
+        if note:
+            warnings.warn(note, stacklevel=2)
+        findings = pipeline.examine(self._images, plates)
+        return processed_scan(self.folder, self.source, pipeline.rig, findings, pipeline.quality, unnamed)
+
+
+def layer_dataset(
+    done: ProcessedScan, chirp: Chirp, stack: Sequence[str | Layer], bands: int | None, amplitude_percent: float
+) -> xarray.Dataset:
+    """Fit the unknown layer of a stack at each patch; parameters and errors as `Scan.layers`."""
+    import xarray
+
+    if done.verdict is not None and not done.verdict.usable:
+        raise done.verdict.error("the images are kept")
+    layers, std = [_layer(one) for one in stack], incidence_std_rad(done.materials)
+    fits = [fit_row(row, chirp, layers, bands, amplitude_percent / 100, std) for row in done.segments]
+
+    def column(of: str, factor: float = 1.0) -> list[float]:
+        values = [None if fit is None else getattr(fit, of) for fit in fits]
+        return [np.nan if value is None else factor * value for value in values]
+
+    def described(values: Sequence[object], units: str, about: str) -> tuple[str, np.ndarray, dict[str, str]]:
+        return "patch", np.asarray(values), {"units": units, "long_name": about}
+
+    unknown = [complex(np.nan, np.nan) if fit is None else fit.permittivity for fit in fits]
+    notes = [str((fit and "; ".join(fit.warnings())) or "") for fit in fits]
+    table = {
+        "permittivity": described(unknown, "1", "relative permittivity of the unknown layer"),
+        "permittivity_real_standard_error": described(column("std_real"), "1", "standard error, real part"),
+        "permittivity_loss_standard_error": described(column("std_loss"), "1", "standard error, loss"),
+        "thickness": described(column("thickness_m"), "m", "thickness of the unknown layer; not a number: half space"),
+        "thickness_standard_error": described(column("std_thickness_m"), "m", "standard error; 0 where it was given"),
+        "ambiguous": described([_ambiguous(fit) for fit in fits], "1", "another solution fits, or it is open by 5 %"),
+        "notes": described(notes, "", "rivals and other warnings"),
+    }
+    return xarray.Dataset(
+        table, {"patch": described([patch.label for patch in done.segments], "1", "number of the patch")}
+    )
+
+
+def _layer(one: str | Layer) -> Layer:
+    if isinstance(one, Layer):
+        return one
+    try:
+        return parse_layer(one)
+    except ValueError:
+        raise ConfigError(
+            f"{one!r} is no layer", "it has another form", f"write {LAYER_FORMS}", code=ErrorCode.VALUE_INVALID
+        ) from None
+
+
+def _ambiguous(fit: LayerFit | None) -> bool:
+    return fit is not None and fit.ambiguous

@@ -16,7 +16,7 @@ from polysight.acquisition.control import StopRequest
 from polysight.acquisition.pi_client import PiClient
 from polysight.acquisition.ready import STAGE_NOT_REPORTED, check_disk, make_ready
 from polysight.acquisition.scan import resume_scan, run_scan
-from polysight.doctor.check_host import check_time
+from polysight.doctor.rig_checks import check_time
 from polysight.plan.forecast import forecast
 from polysight.store.scan_folder import ScanFolder
 from polysight_shared.error_codes import ErrorCode

@@ -12,19 +12,18 @@ from tests.support.rigs import programmed_rig
 from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
 from polysight.capture.network import route_interface
 from polysight.cli.main import main
-from polysight.doctor import checks, machine
-from polysight.doctor.check_capture import check_network
-from polysight.doctor.check_host import (
+from polysight.doctor import checks, context
+from polysight.doctor.checks import CHECKS, run_checks
+from polysight.doctor.context import CheckContext, DoctorOptions, LoadResult, System, error, measure_receivers, ok
+from polysight.doctor.rig_checks import (
     check_calibration,
     check_disk,
     check_host_clock,
     check_keys,
+    check_network,
     check_receivers,
     check_time,
 )
-from polysight.doctor.checks import CHECKS, run_checks
-from polysight.doctor.context import CheckContext, DoctorOptions, System, error, ok
-from polysight.doctor.machine import LoadResult, measure_receivers
 from polysight_shared.messages import GPIOD, WIRES, HelloReply
 from polysight_shared.sockets import HOST_KEYS
 from polysight_shared.tables import to_builtins
@@ -89,7 +88,7 @@ def test_the_secret_key_must_be_there_and_for_its_user_alone(tmp_path, mode, ver
 
 
 def test_the_kernel_reports_if_its_clock_is_synchronised():
-    assert machine.clock_is_synchronised() in (True, False, None)
+    assert context.clock_is_synchronised() in (True, False, None)
 
 
 def test_a_full_disk_and_a_slow_one(tmp_path):
@@ -102,8 +101,8 @@ def test_a_full_disk_and_a_slow_one(tmp_path):
 
 
 def test_the_disk_probe_leaves_nothing_behind(tmp_path, monkeypatch):
-    monkeypatch.setattr(machine, "_PROBE_BYTES", 2 << 20)
-    assert machine.write_speed(tmp_path) > 0
+    monkeypatch.setattr(context, "_PROBE_BYTES", 2 << 20)
+    assert context.write_speed(tmp_path) > 0
     assert list(tmp_path.iterdir()) == []
 
 

@@ -6,8 +6,8 @@ from tests.support.doctor.case import FRAMES, RIG, context_of, frames_of, signal
 from tests.support.rigs import programmed_rig
 
 from polysight.capture.receiver import RowCapture
-from polysight.doctor.check_capture import check_direct_path, check_level, check_radar, judge_direct_path, judge_skew
 from polysight.doctor.context import CapturedFrames
+from polysight.doctor.rig_checks import check_direct_path, check_level, check_radar, judge_direct_path, judge_skew
 from polysight.radar.commands import direct_if_hz
 
 

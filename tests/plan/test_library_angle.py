@@ -4,7 +4,7 @@ import msgspec
 import pytest
 from tests.support.doctor.case import context_of
 
-from polysight.doctor.check_host import check_library
+from polysight.doctor.rig_checks import check_library
 from polysight.plan import forecast
 from polysight_shared.geometry import incidence_deg
 

@@ -17,8 +17,7 @@ from dataclasses import asdict
 from importlib.metadata import distributions
 from pathlib import Path
 
-from polysight.doctor.context import DoctorOptions, finding_facts
-from polysight.doctor.machine import read_interface
+from polysight.doctor.context import DoctorOptions, finding_facts, read_interface
 from polysight.store import MANIFEST, utc_now, versions
 from polysight_shared.config import Instrument
 from polysight_shared.errors import DataError, DeviceError

@@ -11,33 +11,31 @@ from pathlib import Path
 import msgspec
 
 from polysight.doctor.bundle import write_bundle
-from polysight.doctor.check_capture import (
-    check_buffer,
-    check_card,
-    check_direct_path,
-    check_level,
-    check_network,
-    check_pulses,
-    check_radar,
-    check_skew,
-)
-from polysight.doctor.check_host import (
+from polysight.doctor.context import CheckContext, DoctorOptions, System, finding_facts, not_checked, verdict
+from polysight.doctor.rig_checks import (
     SIMULATED,
+    check_buffer,
     check_calibration,
+    check_card,
     check_config,
+    check_direct_path,
     check_disk,
     check_free,
     check_host_clock,
     check_keys,
+    check_level,
     check_library,
+    check_network,
     check_pi,
     check_pi_clock,
+    check_pulses,
+    check_radar,
     check_receivers,
+    check_skew,
     check_stage,
     check_time,
     check_trigger,
 )
-from polysight.doctor.context import CheckContext, DoctorOptions, System, finding_facts, not_checked, verdict
 from polysight_shared.config import Board
 from polysight_shared.errors import PolysightError, no_such, os_error
 from polysight_shared.findings import Finding

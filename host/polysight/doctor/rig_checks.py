@@ -1,0 +1,668 @@
+"""Checks of the rig, from its rig file to the trigger skew. A check is a function of a `CheckContext`.
+
+Host, Pi and stage come first: rig file, clocks, keys, calibration, library, receivers, disk, trigger line. The trigger
+line is checked with a short row in which every point must give an edge. Only this check moves the stage, and only with
+`--move`. Then comes the capture side: capture cards, network, SYNC_IN pulses, radars, level, direct path, trigger skew.
+The checks from `check_pulses` on use a few bursts captured at rest. Armed radars transmit during these pulses, for some
+tens of milliseconds.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from polysight.acquisition import RefusedError, StopRequest, make_ready, stage_differences
+from polysight.calibration import (
+    FULL_SCALE,
+    DirectSignal,
+    band_hz,
+    checked_calibration,
+    find_direct,
+    jitter_hz,
+    unwrapped,
+)
+from polysight.capture import PRIORITY_REMEDY, RowCapture, route_interface, silent_radar
+from polysight.doctor.context import (
+    PACKET_TIME_US,
+    CheckContext,
+    NetworkInterface,
+    capture_frames,
+    card_rates,
+    error,
+    not_checked,
+    ok,
+    read_interface,
+    warning,
+    with_boards,
+)
+from polysight.materials import SIMULATED_LIBRARY, Library
+from polysight.plan import scan_time
+from polysight.process import why_unnamed
+from polysight.radar import RadarState, require
+from polysight.settings import DEFAULT
+from polysight.store import new_scan_id
+from polysight_shared import __version__
+from polysight_shared.config import Board, Instrument, load_instrument
+from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.faults import PiFault, explain
+from polysight_shared.findings import Finding
+from polysight_shared.geometry import incidence_deg
+from polysight_shared.messages import MAX_PULSES_AT_REST, MAX_PULSES_AT_REST_S, BeginRun, RowFinished, is_simulated
+from polysight_shared.raster import RasterPlan, check_burst_fits
+from polysight_shared.sockets import HOST_KEYS, is_loopback
+
+_SPEED_MARGIN = 2.0  # disk speed relative to the data rate
+_MAX_CLOCK_OFFSET_S = 1.0  # between host and Pi
+_CLOCK_LOST_S = 60.0
+_SET_CLOCK = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery for its clock"
+
+_CARD_HOPS = ("host", "route", "link", "card")  # of the network survey
+_MIN_MTU = 1500
+_MIN_SPEED_MBIT = 1000
+_MIN_RING = 512
+_MAX_CLIPPED = 0.01  # of the chirps
+_MIN_RMS = 4.0  # counts
+_MIN_DETECTED = 0.9  # of the chirps, for the direct path
+_MAX_DELAY_S = 10e-9  # 5 ns trigger clock and some ppm of the crystals
+_SKEW_WARNING_S = 10e-9
+_SKEW_ERROR_S = 20e-9
+_MAX_JITTER_S = 4e-9  # two trigger clocks of 5 ns give a standard deviation of 2 ns
+
+
+def check_config(context: CheckContext) -> Finding:
+    """Load the rig file; check that a burst fits between two points, and the settings of natively controlled radars."""
+    options = context.options
+    rig = load_instrument(options.config)
+    check_burst_fits(rig.grid, rig.burst, rig.stage)
+    if rig.radar.control == "native":
+        require(rig, rig.grid.columns * rig.burst.pulses)
+    context.loaded_rig = rig
+    boards = ", ".join(b.name for b in rig.recorded)
+    return ok(
+        f"{options.config}: {rig.name}, {rig.grid.columns} x {rig.grid.rows} positions, records {boards},"
+        f" radar control {rig.radar.control!r}"
+    )
+
+
+def check_host_clock(context: CheckContext) -> Finding:
+    """Check that the clock is later than this program's files, and synchronised."""
+    now_s = context.system.wall_ns() * 1e-9
+    observed = f"{datetime.fromtimestamp(now_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    if now_s < Path(__file__).stat().st_mtime - _CLOCK_LOST_S:
+        return error(f"{observed}: earlier than this program's installation", "the clock lost its time", _SET_CLOCK)
+    if context.system.clock_is_synchronised() is False:
+        return warning(f"{observed}, not synchronised", "no time server is reachable", _SET_CLOCK)
+    return ok(observed)
+
+
+def check_pi_clock(context: CheckContext) -> Finding:
+    """Compare the clocks of Pi and host; the uncertainty is half the duration of the request."""
+    if context.hello is None or context.hello.t_unix_ns == 0:
+        return not_checked("the Pi does not report its time", "install the same release on both")
+    offset_s = (context.hello.t_unix_ns - context.hello_at_ns) * 1e-9
+    uncertainty_s = context.hello_took_ns * 0.5e-9
+    observed = f"the Pi's clock minus this machine's: {offset_s:+.3f} s (+- {uncertainty_s:.3f} s)"
+    facts = {"offset_s": offset_s, "uncertainty_s": uncertainty_s}
+    if abs(offset_s) - uncertainty_s > _CLOCK_LOST_S:
+        return error(observed, "one clock is wrong: times in logs and scans cannot be compared", _SET_CLOCK, **facts)
+    if abs(offset_s) - uncertainty_s > _MAX_CLOCK_OFFSET_S:
+        return warning(observed, "one of the two clocks is not synchronised", _SET_CLOCK, **facts)
+    return ok(observed, **facts)
+
+
+def check_calibration(context: CheckContext) -> Finding:
+    """Check the calibration files that a scan would copy into its folder."""
+    simulated = context.hello is not None and is_simulated(context.hello.backend)
+    facts = checked_calibration(context.rig, simulated).facts()
+    if not facts:
+        return ok("no calibration file is configured: geometry, filters and metal as in the rig file and the scene")
+    return ok("; ".join(f"{kind} of {fact['made_utc'][:10]}" for kind, fact in facts.items()), **facts)
+
+
+def check_library(context: CheckContext) -> Finding:
+    """Compare the rig's incidence angle with those of the default library; without a match no material is named."""
+    angle = incidence_deg(context.rig, context.rig.receivers[0])
+    angles = Library.load(SIMULATED_LIBRARY).angles_deg
+    library_angles = " and ".join(f"{a:g}" for a in angles)
+    facts = {"incidence_deg": angle, "library_deg": list(angles)}
+    observed = f"incidence angle of the rig {angle:.1f} degrees, of {SIMULATED_LIBRARY.name} {library_angles} degrees"
+    if not why_unnamed(DEFAULT, context.rig):
+        return ok(observed, **facts)
+    return warning(
+        observed,
+        "|P| changes by about 10 % per degree, so no material of this rig's scans will be named",
+        "train a library at this angle (docs/how-to/add-a-material.md) and scan with --library; or --model none",
+        **facts,
+    )
+
+
+def check_receivers(context: CheckContext) -> Finding:
+    """Measure the receivers' packet loss under load; loss at a rate that this rig's cards reach is a warning."""
+    rates = card_rates(context.rig)
+    results, scheduling = context.system.measure_receivers(context.rig, rates)
+    losses = "; ".join(
+        f"{r.mbit_s:.0f} Mbit/s a card: {'no loss' if not r.lost else f'{100 * r.lost / r.sent:.1f} % lost'}"
+        for r in results
+    )
+    observed = f"receivers ({scheduling}) with all cores busy: {losses}"
+    facts = {"held": [vars(r) for r in results], "scheduling": scheduling}
+    needed = results[: rates.index(1e6 / (context.rig.card.packet_delay_us + PACKET_TIME_US)) + 1]
+    if any(r.lost for r in needed):
+        remedy = "use a faster machine" if "real-time" in scheduling else PRIORITY_REMEDY
+        return warning(observed, "other programs take processor time from the receivers", remedy, **facts)
+    return ok(observed, **facts)
+
+
+def check_disk(context: CheckContext) -> Finding:
+    """Check free space for a scan and the reserve, and for twice the scan's data rate."""
+    rig = context.rig
+    folder = _nearest_existing(context.options.out)
+    need = rig.scan_bytes
+    reserve = rig.limits.free_disk_bytes
+    free = shutil.disk_usage(folder).free
+    observed = (
+        f"{folder}: {free / 1e9:.1f} GB free, a scan needs {need / 1e9:.2f} GB and {reserve / 1e9:.1f} GB reserve"
+    )
+    facts: dict[str, float] = {"free_bytes": free, "need_bytes": need}
+    if free < need + reserve:
+        return error(observed, "the disk is too full for a scan", "free space, or give another --out", **facts)
+    speed = context.system.write_speed(folder)
+    rate = need / scan_time(rig).total_s
+    observed += f"; durable write speed {speed / 1e6:.0f} MB/s, data rate of a scan {rate / 1e6:.2f} MB/s"
+    facts |= {"write_bytes_s": speed, "scan_bytes_s": rate}
+    if speed < rate:
+        return error(observed, "the disk is too slow: a network share or a worn card", "scan to a local disk", **facts)
+    if speed < _SPEED_MARGIN * rate:
+        return warning(observed, "the disk is hardly fast enough", "scan to a faster disk", **facts)
+    return ok(observed, **facts)
+
+
+def _nearest_existing(folder: Path) -> Path:
+    observed = folder.resolve()
+    while not observed.exists():
+        observed = observed.parent
+    if not observed.is_dir():
+        raise ConfigError(f"--out {folder}: {observed} is a file", "a scan needs a folder", "give another --out")
+    return observed
+
+
+def check_time(context: CheckContext) -> Finding:
+    """Estimate the duration of a scan of the configured grid."""
+    rig = context.rig
+    seconds = scan_time(context.rig).total_s
+    hours, minutes = divmod(round(seconds / 60), 60)
+    duration = f"{hours} h {minutes:02d} min" if hours else f"{seconds / 60:.1f} min"
+    return ok(
+        f"a scan of {rig.grid.rows} rows takes about {duration}: {seconds / rig.grid.rows:.1f} s a row,"
+        f" {rig.scan_bytes / 1e9:.2f} GB",
+        seconds=seconds,
+        bytes=rig.scan_bytes,
+    )
+
+
+SIMULATED = "simulated wires: no hardware is driven"
+_POINTS = 8  # of the row for the trigger line
+_ROW_TIMEOUT_S = 120.0
+_POLL_MS = 100
+
+
+def check_keys(context: CheckContext) -> Finding:
+    """Check that the CURVE keys are readable, and by this user only; loopback addresses need none."""
+    pi = context.rig.pi
+    if is_loopback(pi.command_address) and is_loopback(pi.event_address):
+        return ok("not needed: both addresses are loopback")
+    folder = Path(pi.key_dir)
+    if missing := [name for name in HOST_KEYS if not os.access(folder / name, os.R_OK)]:
+        return error(
+            f"{folder}: {', '.join(missing)} cannot be read",
+            "the Pi's keys were not copied here, or belong to another user",
+            f"copy the Pi's {' and '.join(HOST_KEYS)} here (docs/how-to/install.md); pi.key_dir is {folder}",
+        )
+    secret = folder / HOST_KEYS[-1]
+    mode = secret.stat().st_mode
+    if mode & 0o077:
+        return warning(
+            f"{secret} can be read by others ({mode & 0o777:o})",
+            "every user of this machine could drive the stage",
+            f"`chmod 600 {secret}`",
+        )
+    return ok(f"the keys are in {folder}")
+
+
+def check_pi(context: CheckContext) -> Finding:
+    """Check that the Pi answers, has this release, and the same stage settings."""
+    before = context.system.wall_ns()
+    hello = context.pi.hello()
+    after = context.system.wall_ns()
+    context.hello = hello
+    context.hello_at_ns = (before + after) // 2
+    context.hello_took_ns = after - before
+    backend = SIMULATED if is_simulated(hello.backend) else f"GPIO backend {hello.backend}"
+    observed = f"{context.rig.pi.command_address} answers: release {hello.pi_release}, {backend}, state {hello.state}"
+    facts = {"release": hello.pi_release, "backend": hello.backend, "state": hello.state}
+    if hello.pi_release != __version__:
+        return error(
+            observed,
+            f"this host has release {__version__}",
+            "install the same release on both: `make pi-install HOST=...`",
+            **facts,
+        )
+    if differing := stage_differences(context.rig.stage, hello):
+        return error(
+            f"{observed}; {'; '.join(differing)}",
+            "host and Pi have different rig files, so the Pi would refuse a scan",
+            "copy the right [stage] to the other machine, `sudo systemctl restart polysight-pi`",
+            **facts,
+        )
+    return ok(observed, **facts)
+
+
+def check_free(context: CheckContext) -> Finding:
+    """Check that no scan is running; the doctor must not use its cards."""
+    hello = context.hello
+    if hello is not None and (hello.in_run or hello.state in ("ready", "running", "held", "done")):
+        return error(
+            f"scan {hello.scan_id} is in progress, state {hello.state}",
+            "a scan is running, or the program that started it was terminated",
+            "wait for its end, or continue it with `polysight resume`; a restart of polysight-pi discards it",
+        )
+    return ok("no scan is in progress")
+
+
+def check_trigger(context: CheckContext) -> Finding:
+    """Run a short row at the scan's speed, after homing if necessary; compare points, trigger edges and pulses."""
+    if not context.options.move:
+        return not_checked(
+            "only a moving stage gives trigger edges",
+            f"`polysight doctor --move` homes it and runs {_POINTS} points: keep clear of the stage",
+        )
+    context.hello = context.pi.hello()  # a scan may have started since then, and begin_run would end it
+    if (busy := check_free(context)).level == "error":
+        return busy
+    row = _run_row(context)
+    facts = {"points": row.points, "edges": row.edges, "pulses": row.pulses, "fault": row.fault}
+    observed = f"{row.points} points passed, {row.edges} edges detected, {row.pulses} pulses sent"
+    expected = _POINTS * context.rig.burst.pulses
+    if row.points and not row.edges:
+        return error(
+            observed,
+            "the trigger line is stuck: no edge reaches the Pi",
+            f"check the wire and its ground from the stage's trigger pin to GPIO {context.rig.pi.trigger_in}, the level"
+            " shifter, and pi.trigger_in; with the Pi's service stopped, `polysight-pi check` there reports which"
+            " program uses the line",
+            **facts,
+        )
+    if row.status != "done" or row.edges != _POINTS or row.pulses != expected:
+        e = explain(row.fault)
+        return error(f"{observed}, {_POINTS} and {expected} expected: {row.reason or e.what}", e.why, e.remedy, **facts)
+    if row.fault or row.reason:
+        return warning(f"{observed}; {row.reason}", "", "watch the stage during a row", **facts)
+    return ok(observed, **facts)
+
+
+def _run_row(context: CheckContext) -> RowFinished:
+    """Run one row of `_POINTS` points in a run of its own and return its end event."""
+    rig = context.rig
+    pi = context.pi
+    plan = RasterPlan(_POINTS, 1, rig.grid.step_x_mm, rig.grid.step_y_mm)
+    scan_id = f"doctor-{new_scan_id()}"
+    burst = rig.burst
+    pi.follow(scan_id, 0, lambda _event: None)
+    pi.begin_run(
+        BeginRun(
+            scan_id=scan_id,
+            plan=plan,
+            pulses=burst.pulses,
+            period_us=burst.period_us,
+            width_us=burst.width_us,
+            speed_mm_s=rig.stage.speed_mm_s,
+            heartbeat_ms=rig.pi.host_heartbeat_ms,
+        )
+    )
+    try:
+        make_ready(pi, StopRequest(), lambda _phase, _message: None)
+        pi.run_row(scan_id, 0, 1)
+        return _row_end(context)
+    finally:
+        pi.come_to_rest("end of polysight doctor")
+        pi.end_run(scan_id, "success", "polysight doctor --move")
+
+
+def _row_end(context: CheckContext) -> RowFinished:
+    deadline = time.monotonic() + _ROW_TIMEOUT_S
+    while time.monotonic() < deadline:
+        context.pi.event_socket.poll(_POLL_MS)
+        for event in context.pi.events():
+            if isinstance(event, RowFinished):
+                return event
+    raise DeviceError(
+        f"timeout: a row of {_POINTS} points did not end within {_ROW_TIMEOUT_S:.0f} s",
+        "the stage does not move",
+        "look at the stage",
+    )
+
+
+def check_stage(context: CheckContext) -> Finding:
+    """Check that no fault is latched and that the sketch has this release."""
+    status = context.pi.status()
+    if status.fault and status.state == "fault":
+        e = explain(status.fault)
+        return error(
+            f"fault {status.fault}: {e.what}; {status.reason}",
+            e.why,
+            f"{e.remedy}; on the Pi, with its service stopped, run `polysight-pi check` for port and board",
+            fault=status.fault,
+        )
+    firmware = context.hello.firmware if context.hello is not None else ""
+    where = f"at {status.x_mm:.1f}, {status.y_mm:.1f} mm" if status.homed else "not homed yet"
+    observed = f"answers, sketch {firmware or 'unknown'}, {where}"
+    facts = {"firmware": firmware, "homed": status.homed}
+    if firmware != __version__:
+        return error(
+            observed,
+            f"this release needs sketch {__version__}; the board was flashed with another",
+            "`make flash PORT=/dev/ttyACM0` with the board on this machine",
+            **facts,
+        )
+    if status.fault:
+        e = explain(status.fault)
+        return warning(f"{observed}; its last row ended with fault {status.fault}: {e.what}", e.why, e.remedy, **facts)
+    return ok(observed, **facts)
+
+
+def check_card(context: CheckContext, board: Board) -> Finding:
+    """Check that the card replies; otherwise report the first hop that does not."""
+    survey = context.surveys[board.name]
+    for hop in survey.hops:
+        if hop.where in _CARD_HOPS and hop.level == "error":
+            return hop
+    return ok(
+        f"{board.card_address}:{board.command_port} answers, FPGA {survey.version}; data to"
+        f" {board.host_address}:{board.data_port}",
+        fpga=survey.version,
+    )
+
+
+def check_network(context: CheckContext, board: Board) -> Finding:
+    """Check the network interface to the card: MTU, speed, receive ring, dropped packets. Unknown values pass."""
+    if board.card_address.startswith("127."):
+        return ok("loopback: no network interface is used")
+    name = route_interface(board.card_address, context.system.root)
+    if not name:
+        return warning(
+            f"no interface is in the subnet of {board.card_address}",
+            "no interface has an address there, or this system does not list its routes",
+            f"`ip address add {board.host_address}/24 dev <interface>`",
+        )
+    interface = read_interface(name, context.system.root)
+    return msgspec.structs.replace(_judge_interface(interface), facts=vars(interface))
+
+
+def _judge_interface(interface: NetworkInterface) -> Finding:
+    name = interface.name
+    ring = interface.ring
+    observed = f"{name}: MTU {interface.mtu or 'unknown'}, {interface.speed_mbit or 'unknown'} Mbit/s"
+    observed += f", ring {ring} of {interface.ring_max}" if ring is not None else ""
+    if interface.mtu is not None and interface.mtu < _MIN_MTU:
+        return warning(observed, f"a card sends frames of {_MIN_MTU} bytes", f"`ip link set {name} mtu {_MIN_MTU}`")
+    if interface.speed_mbit is not None and interface.speed_mbit < _MIN_SPEED_MBIT:
+        return warning(
+            observed,
+            "a DCA1000 sends at gigabit speed; a slower link drops packets of every burst",
+            "use a cable of category 5e or better and a gigabit port, without a 100 Mbit switch",
+        )
+    if ring is not None and ring < min(_MIN_RING, interface.ring_max or _MIN_RING):
+        return warning(
+            observed,
+            "few receive descriptors: packets are lost while this machine is busy",
+            f"`ethtool -G {name} rx {interface.ring_max}`",
+        )
+    if interface.lost:
+        return warning(
+            f"{observed}; {interface.lost} packets dropped since it came up",
+            "the interface or the kernel dropped packets before a program received them",
+            f"`ethtool -S {name}`: check if the number increases during a scan",
+        )
+    return ok(observed)
+
+
+def check_buffer(context: CheckContext, board: Board) -> Finding:
+    """Check that the receiving process starts and that the kernel grants its receive buffer."""
+    hops = {h.where: h for h in context.surveys[board.name].hops}
+    receiver = hops["receiver"]
+    buffer = hops["buffer"]
+    for level in ("error", "warning"):
+        for hop in (buffer, receiver):
+            if hop.level == level:
+                return hop
+    context.usable_cards.add(board.name)
+    return ok(f"{buffer.what}; {receiver.what}")
+
+
+def check_pulses(context: CheckContext) -> Finding:
+    """Capture a few bursts; check that the Pi sent every pulse and that none was too long."""
+    if not context.options.pulse:
+        return not_checked("--no-pulse: no SYNC_IN pulse is sent", "omit --no-pulse; nothing moves")
+    if not context.usable_cards:
+        return not_checked("no capture card is usable")
+    rig = with_boards(context.rig, context.usable_cards)
+    burst = context.rig.burst
+    burst_s = burst.pulses * burst.period_us * 1e-6
+    bursts = min(context.options.bursts, MAX_PULSES_AT_REST // burst.pulses, int(MAX_PULSES_AT_REST_S / burst_s))
+    if not bursts:
+        return not_checked(
+            f"a burst of {burst.pulses} pulses every {burst.period_us:g} us is longer than the Pi sends at rest",
+            f"`polysight scan` can use it; the limit here is {MAX_PULSES_AT_REST} pulses or {MAX_PULSES_AT_REST_S:g} s",
+        )
+    try:
+        context.captured, sent = capture_frames(rig, context.pi, bursts)
+    except RefusedError as e:
+        if e.number != PiFault.BAD_REQUEST:
+            raise
+        return error(e.what, "the Pi's release does not know this command", "install the same release on both")
+    observed = (
+        f"{sent.pulses} sent at rest, at most {sent.width_max_ns / 1e3:.2f} us long,"
+        f" at most {sent.jitter_ns / 1e3:.2f} us late"
+    )
+    facts = {k: getattr(sent, k) for k in ("pulses", "width_max_ns", "jitter_ns", "fault")}
+    if sent.fault:
+        e = explain(sent.fault)
+        return error(f"{observed}: {e.what}", e.why, e.remedy, **facts)
+    return ok(observed, **facts)
+
+
+def check_radar(context: CheckContext, board: Board) -> Finding:
+    """Check that every pulse gave a frame and that every frame was received complete."""
+    captured = context.captured.get(board.name)
+    if captured is None:
+        return not_checked("nothing was captured")
+    frames = len(captured.valid)
+    complete = int(captured.valid.sum())
+    facts = {"frames_expected": frames, "frames": complete, "bytes": captured.row.bytes}
+    facts["packets"] = captured.row.packets
+    if captured.radar is not None and captured.radar.state is RadarState.FAULT:
+        observed = f"the radar stopped: {captured.radar.detail}"
+        return error(observed, "the radar reported a fault", "`polysight radar check BOARD`", **facts)
+    text = f"{complete} of {frames} frames, {captured.row.packets} packets"
+    return msgspec.structs.replace(_judge_frames(board, captured.row, text), facts=facts)
+
+
+def _judge_frames(board: Board, row: RowCapture, observed: str) -> Finding:
+    if row.packets == 0:
+        e = silent_radar(board, row)
+        return error(e.what, e.why, e.remedy)
+    if row.slipped or (row.bytes < row.expected and not row.gap_bytes):
+        return error(
+            f"{observed}: {row.reason or 'the record ended early'}",
+            "the radar missed pulses: wrong level or width of SYNC_IN, or it was armed for fewer frames",
+            "check SYNC_IN at the board with an oscilloscope (0..3.3 V, 25 ns..4 us)",
+        )
+    if row.lost_before_packets:
+        return error(
+            f"{observed}; the card reports {row.lost_before_packets.name}",
+            "the card dropped data before it was numbered: it sends more slowly than the radar measures",
+            "shorten card.packet_delay_us",
+        )
+    if row.missing:
+        return warning(
+            f"{observed}; {row.missing_bytes} bytes are missing, {row.kernel_drops} packets dropped by this machine",
+            "packets were lost between card and program",
+            "check cable, switch and the receive buffer above; a scan retakes such rows",
+        )
+    if row.strangers:
+        return warning(
+            f"{observed}; {row.strangers} packets from other addresses",
+            "two cards have the same data port",
+            "give each card its own port with `polysight card program`",
+        )
+    return ok(observed)
+
+
+def check_level(context: CheckContext, board: Board) -> Finding:
+    """Check for clipped chirps, which cannot be synchronised, and for an RX without a signal."""
+    captured = context.captured.get(board.name)
+    if captured is None or not captured.valid.any():
+        return not_checked("no complete frame was captured")
+    words = captured.words[captured.valid]
+    clipped = int(((words >= FULL_SCALE) | (words <= -FULL_SCALE)).any(axis=(1, 2, 3)).sum())
+    rms = np.sqrt(np.mean(words.astype(np.float64) ** 2, axis=(0, 1, 2)) * 2)  # of I and Q together, for each RX
+    peak = int(np.abs(words.astype(np.int32)).max())
+    observed = f"rms {rms.min():.0f}..{rms.max():.0f} counts over the RX, peak {peak} of {FULL_SCALE}"
+    facts = {"clipped_chirps": clipped, "chirps": len(words), "rms": [round(float(r), 1) for r in rms], "peak": peak}
+    if clipped:
+        fault = error if clipped > _MAX_CLIPPED * len(words) else warning
+        return fault(
+            f"{observed}; {clipped} of {len(words)} chirps are clipped",
+            "a strong reflection reaches the receiver, or its gain is too high",
+            "lower the RX gain (radar.rx_gain_db, or the profile in mmWave Studio), or move the reflector away",
+            **facts,
+        )
+    if rms.min() < _MIN_RMS:
+        remedy = "check the RX mask of the profile; `polysight card reset --radar`, and arm it again"
+        return error(observed, "an RX is off, or the radar sends zeros", remedy, **facts)
+    return ok(observed, **facts)
+
+
+def check_direct_path(context: CheckContext, board: Board) -> Finding:
+    """Check that the direct path is detected, lies within the band, and at the IF that the rig file predicts."""
+    captured = context.captured.get(board.name)
+    if board.role == "transmit":
+        return not_checked("the transmitter has no direct path to itself")
+    if captured is None or not captured.valid.any():
+        return not_checked("no complete frame was captured")
+    signal = find_direct(context.rig, board, captured.words, captured.valid)
+    if signal.found:
+        context.signals[board.name] = signal
+    return judge_direct_path(context.rig, board, signal)
+
+
+def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Finding:
+    """Judge a board's direct path."""
+    low, high = band_hz(rig)
+    expected = signal.expected_hz
+    outside = not low <= expected <= high
+    predicted = f"{expected / 1e3:.0f} kHz expected from the rig file"
+    facts = {"expected_hz": expected, "band_hz": [low, high], "chirps": signal.chirps, "heard": signal.if_hz.size}
+    if not signal.found:
+        missed = signal.chirps - signal.if_hz.size
+        observed = f"no direct path in {missed} of {signal.chirps} chirps; {predicted}"
+        if outside:
+            why = "its IF is outside the receiver's band, so it is filtered out or aliased"
+            return error(observed, why, _better_start(rig, board, expected), **facts)
+        return error(
+            observed,
+            "the transmitter is off or not armed, something stands between the boards, or the start frequencies"
+            " differ by more than in the rig file",
+            "clear the line of sight from TX to RX; check that the transmitting board is armed, and the start"
+            " frequencies of both boards",
+            **facts,
+        )
+    if_hz = unwrapped(signal.if_hz, rig)
+    spread = jitter_hz(rig)
+    median = float(np.median(if_hz))
+    std = float(if_hz.std())
+    observed = f"at {median / 1e3:.0f} kHz, std {std / 1e3:.0f} kHz, {signal.if_hz.size} of {signal.chirps} chirps"
+    facts |= {"if_hz": median, "std_hz": std, "amplitude": float(np.sqrt(np.median(signal.power)))}
+    if outside:
+        return error(
+            f"{observed}; {predicted}, outside {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
+            "this is an alias: the anti-aliasing filter attenuates it, and the high-pass filter is inverted at the"
+            " wrong frequency",
+            _better_start(rig, board, expected),
+            **facts,
+        )
+    if median - spread < low or median + spread > high or signal.if_hz.size < _MIN_DETECTED * signal.chirps:
+        return error(
+            f"{observed}: too near the edge of {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
+            f"5 ns of trigger jitter move it by {spread / 1e3:.0f} kHz, so that some chirps are lost",
+            _better_start(rig, board, median),
+            **facts,
+        )
+    delay_s = -signal.start_delay_s(rig)[0]  # without the crystals' share
+    if abs(delay_s) > _MAX_DELAY_S:
+        start = board.start_offset_hz + delay_s * rig.chirp.slope_hz_per_s
+        return warning(
+            f"{observed}; {predicted}, {delay_s * 1e9:+.1f} ns away",
+            "start_offset_hz in the rig file is not the programmed one, the geometry is wrong, or the board is"
+            " triggered at another time than the transmitter",
+            f"if the board was programmed so: start_offset_hz = {start:.0f} for {board.name}",
+            **facts,
+        )
+    return ok(f"{observed}; {predicted}", **facts)
+
+
+def _better_start(rig: Instrument, board: Board, if_hz: float) -> str:
+    """Remedy: the start offset that moves a direct path with this true IF to the middle of the band."""
+    return f"start_offset_hz = {board.start_offset_hz + sum(band_hz(rig)) / 2 - if_hz:.0f} for {board.name}"
+
+
+def check_skew(context: CheckContext) -> Finding:
+    """Check that both receivers start their chirps at the same time."""
+    if any(b.name not in context.signals for b in context.rig.receivers):
+        return not_checked("the direct path of a receiver is missing")
+    return judge_skew(context.rig, context.signals)
+
+
+def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
+    """Judge the receivers' start times. Relative to the transmitter they are as exact as the start frequencies."""
+    h, v = rig.receivers
+    delay = {b.name: signals[b.name].start_delay_s(rig) for b in (h, v)}  # mean and standard error, s
+    skew = delay[v.name][0] - delay[h.name][0]
+    uncertainty = float(np.hypot(delay[h.name][1], delay[v.name][1]))
+    jitter = max(float(unwrapped(signals[b.name].if_hz, rig).std()) for b in (h, v)) / rig.chirp.slope_hz_per_s
+    ppm = {b.name: signals[b.name].crystal_ppm(rig) for b in (h, v)}
+    observed = f"{v.name} starts {skew * 1e9:+.2f} +- {uncertainty * 1e9:.2f} ns after {h.name}; " + ", ".join(
+        f"{name} {mean * 1e9:+.1f} ns after the transmitter, crystal {ppm[name]:+.2f} ppm"
+        for name, (mean, _) in delay.items()
+    )
+    facts = {
+        "skew_ns": skew * 1e9,
+        "standard_error_ns": uncertainty * 1e9,
+        "jitter_ns": jitter * 1e9,
+        "later_ns": {name: mean * 1e9 for name, (mean, _) in delay.items()},
+        "crystal_ppm": ppm,
+    }
+    wiring = (
+        "several GPIO lines, switched one after another" if len(rig.pi.sync_out) > 1 else "cables of unequal length"
+    )
+    why = f"{wiring}, a slow edge, or a start_offset_hz that differs from the programmed one"
+    remedy = (
+        "use one line and a clock buffer (docs/how-to/wiring.md); compare SYNC_IN at the boards with an oscilloscope"
+    )
+    if abs(skew) > _SKEW_WARNING_S:
+        return (error if abs(skew) > _SKEW_ERROR_S else warning)(observed, why, remedy, **facts)
+    if jitter > _MAX_JITTER_S:
+        return warning(
+            f"{observed}; {jitter * 1e9:.1f} ns from chirp to chirp",
+            "more jitter than two clocks of 5 ns cause: noise or slow edges on SYNC_IN",
+            remedy,
+            **facts,
+        )
+    return ok(observed, **facts)

@@ -15,9 +15,10 @@ from tests.support.radar.boards import native_rig
 
 from polysight.capture import dca1000
 from polysight.capture.card import EepromSettings
-from polysight.radar import commands, events
+from polysight.radar import commands
+from polysight.radar import messages as radar_messages
 from polysight.radar.commands import DEVICE_CONFIGURATION, Command, program
-from polysight.radar.messages import Direction, Kind, SubBlock, decode
+from polysight.radar.messages import Direction, Kind, SubBlock, decode, decode_event
 from polysight_shared import messages, stage_line
 from polysight_shared.config import load_instrument
 
@@ -201,10 +202,10 @@ def test_whole_messages():
 def test_events():
     table = {row[0]: row[1:] for row in rows("mmwavelink.md", "Events")[2:]}
     assert {int(number, 16): name for number, (name, *_) in table.items()} == {
-        number: name for number, (name, _) in events._EVENTS.items()
+        number: name for number, (name, _) in radar_messages._EVENTS.items()
     }
     for number, (*_, fatal) in table.items():
-        answer = any(events.decode_event(SubBlock(int(number, 16), bytes([k, 0, 0, 0] * 6))).fatal for k in range(255))
+        answer = any(decode_event(SubBlock(int(number, 16), bytes([k, 0, 0, 0] * 6))).fatal for k in range(255))
         assert answer == (fatal != "no"), number
 
 

@@ -10,8 +10,8 @@ from tests.support.refusals import refused
 
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.commands import RF_POWER_UP, Frame, FrameApply, FrameControl, program
-from polysight.radar.events import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
 from polysight.radar.firmware import check_image
+from polysight.radar.messages import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.radars import Fault, cores, make_image
 from polysight_simulators.radars import board as simulated

@@ -14,9 +14,18 @@ from tests.support.radar.boards import VirtualClock
 from tests.support.refusals import refused
 
 from polysight.radar.commands import DEVICE_CONFIGURATION, GET_MAIN_VERSION, LOW_POWER_OFF, RF_POWER_UP
-from polysight.radar.events import BOOT_STATUS, MAIN_CPU_FAULT, MAIN_POWER_UP, decode_event
 from polysight.radar.link import Link
-from polysight.radar.messages import Direction, Kind, SubBlock, decode, decode_header
+from polysight.radar.messages import (
+    BOOT_STATUS,
+    MAIN_CPU_FAULT,
+    MAIN_POWER_UP,
+    Direction,
+    Kind,
+    SubBlock,
+    decode,
+    decode_event,
+    decode_header,
+)
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.radars.cores import frame, ones_sum
 

@@ -6,9 +6,8 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.radar.commands import DEVICE_CONFIGURATION, GET_TEMPERATURES, LOW_POWER_OFF, RF_POWER_UP
-from polysight.radar.events import CALIBRATION_REPORT, MAIN_POWER_UP, RF_POWER_UP_DONE
 from polysight.radar.link import ATTEMPTS, Link
-from polysight.radar.messages import READY_TO_READ, decode
+from polysight.radar.messages import CALIBRATION_REPORT, MAIN_POWER_UP, READY_TO_READ, RF_POWER_UP_DONE, decode
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.radars import Fault
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from polysight.radar import commands as c
-from polysight.radar import events as e
+from polysight.radar import messages as e
 from polysight.radar.calibration_data import (
     ALL,
     NO_DIE,
@@ -62,7 +62,7 @@ class State(Enum):
 class BoardFacts(msgspec.Struct, omit_defaults=True):
     """What a board reported about itself since its last bring-up began; the keys of its entry in the manifest.
 
-    `boot` and `calibration` are values of events (`events.Event`).
+    `boot` and `calibration` are values of events (`messages.Event`).
     """
 
     boot: Mapping[str, object] | None = None

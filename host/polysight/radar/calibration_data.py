@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from polysight.radar import events as e
+from polysight.radar import messages as e
 from polysight.radar.commands import Command
 from polysight.radar.link import Link
 from polysight_shared.error_codes import ErrorCode

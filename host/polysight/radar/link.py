@@ -13,18 +13,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from polysight.radar.commands import RF_POWER_UP, Command
-from polysight.radar.events import RESTARTED, Event, decode_event, describe_refusal
 from polysight.radar.messages import (
     DEVICE_SYNC,
     HEADER_BYTES,
     READY_TO_READ,
+    RESTARTED,
     SYNC_BYTES,
     Direction,
+    Event,
     Kind,
     Message,
     command,
     decode,
+    decode_event,
     decode_header,
+    describe_refusal,
     encode,
 )
 from polysight.radar.usb import Clock, WordLink

@@ -1,7 +1,9 @@
-"""Encode and decode mmWaveLink messages: sync word, header, sub-blocks, CRC.
+"""Encode and decode mmWaveLink messages (sync word, header, sub-blocks, CRC), and decode a radar's events.
 
-Source of all numbers: TI, mmWave Radar Interface Control Document, revision 2.23 ("ICD"), sections 2.3 and 3. The
-format is described in docs/spec/mmwavelink.md. Not run on hardware yet.
+Source of all numbers: TI, mmWave Radar Interface Control Document, revision 2.23 ("ICD"), sections 2.3 and 3; for the
+events, the ICD page is at each table. ICD 337 lists the fatal events, which require a reset and a new configuration.
+Error numbers of refused commands are described as well. The format is described in docs/spec/mmwavelink.md. Not run on
+hardware yet.
 """
 
 from __future__ import annotations
@@ -9,8 +11,10 @@ from __future__ import annotations
 import binascii
 import struct
 import zlib
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import NamedTuple
 
 from polysight_shared.errors import ProtocolError
 
@@ -33,6 +37,24 @@ _NO_CRC = 0x0300
 _CRC32 = 0x0400
 _WHY = "noise on the SPI lines, or a device out of step"
 _DO = "retried automatically; check the 60-pin connector and the USB cable if it happens again"
+
+RF_CPU_FAULT = 0x1002
+RF_ESM_FAULT = 0x1003
+RF_INIT_DONE = 0x1004
+TRIGGER_READY = 0x100B
+FRAME_END = 0x100F
+ANALOG_FAULT = 0x1010
+TIMING_FAILURE = 0x1011
+CALIBRATION_REPORT = 0x1012
+MAIN_POWER_UP = 0x5000
+RF_POWER_UP_DONE = 0x5001
+MAIN_CPU_FAULT = 0x5002
+MAIN_ESM_FAULT = 0x5003
+BOOT_STATUS = 0x5005
+RF_ERROR = 0x5008
+
+
+RESTARTED = frozenset({MAIN_POWER_UP})  # without a reset: the board has lost its settings
 
 
 class Direction(IntEnum):
@@ -232,3 +254,295 @@ def _blocks(body: bytes, count: int) -> tuple[SubBlock, ...]:
     if len(body) - start >= 4:
         raise ProtocolError(f"{len(body) - start} bytes after the last of {count} sub-blocks", _WHY, _DO)
     return tuple(blocks)
+
+
+class InitBit(NamedTuple):
+    """A calibration of the RF init. `of_transmitter`: required only on a transmitting board."""
+
+    name: str
+    of_transmitter: bool = False
+
+
+INIT_BITS = {  # ICD 217, where 0 is "fail"
+    1: InitBit("clock PLL"),
+    2: InitBit("synthesizer VCO1"),
+    3: InitBit("synthesizer VCO2"),
+    4: InitBit("LO distribution"),
+    5: InitBit("ADC offset"),
+    6: InitBit("high-pass filter"),
+    7: InitBit("low-pass filter"),
+    8: InitBit("peak detector", of_transmitter=True),
+    9: InitBit("TX power", of_transmitter=True),
+    10: InitBit("RX gain"),
+    11: InitBit("TX phase", of_transmitter=True),
+    12: InitBit("RX I/Q"),
+}
+_INIT_NAMES = {bit: calibration.name for bit, calibration in INIT_BITS.items()}
+
+
+def failed_calibrations(event: Event, transmits: bool, run: int) -> list[str]:
+    """Return the calibrations that failed in the RF init and that the board needs.
+
+    `run` is the mask of requested calibrations besides clock and synthesizers, which run at every start.
+    """
+    passed = event.values.get("passed")
+    if not isinstance(passed, int):
+        return ["unreadable report"]
+    requested = run | 0b1110
+    failed = [c for bit, c in INIT_BITS.items() if requested >> bit & 1 and not passed >> bit & 1]
+    return [calibration.name for calibration in failed if transmits or not calibration.of_transmitter]
+
+
+_CPU_FAULTS = (  # ICD 212, 317
+    "undefined instruction",
+    "instruction fetch abort",
+    "data access abort",
+    "firmware fatal error",
+    "chirp error",
+    "register read-back error",
+    "power save error",
+)
+_RF_CODES = (  # ICD 213
+    "undefined",
+    "the ramp generator was not triggered by a pulse",
+    "burst starts and ends do not match",
+    "chirp starts and ends do not match",
+    "a calibration was not done before the burst",
+    "event queue full: the host does not read",
+    "sequencer copy error",
+    "temperature data invalid",
+    "test source not ready in time",
+)
+_RF_ERRORS = {1: "RF firmware assert", 2: "RF firmware abort", 3: "ESM group 1", 4: "ESM group 2", 7: "monitoring"}
+_ANALOG = {0: "1.8 V supply", 1: "1.3 V / 1.0 V RF supply", 2: "VCO LDO shorted", 3: "PA LDO shorted"}  # ICD 223
+_RF_TESTS = 0x07FFFFFF  # bits 0..26 of 0x5001, 1 = passed
+_RF_GROUP1_FATAL = 1 << 25  # programmable filter, double bit error (ICD 216); its parity error is reserved there
+_MAIN_GROUP1_FATAL = 1 << 22  # FRC lockstep (ICD 320)
+
+# Boot status (ICD table 7.3), bit: meaning. The first group means an empty flash or a damaged image.
+_FLASH_BITS = {
+    2: "image 1 not authentic",
+    3: "image 2 not authentic",
+    4: "image 3 not authentic",
+    5: "no program header",
+    6: "no image header",
+    19: "image length wrong",
+    20: "main core's image offset wrong",
+    21: "RF core's image offset wrong",
+    22: "DSP's image offset wrong",
+    26: "error in the 2 kB image",
+    28: "main core's image not found",
+    29: "image header counts wrong",
+    30: "image header damaged (CRC)",
+    31: "image 4 not authentic",
+    32: "configuration's offset wrong",
+    39: "serial flash not found",
+}
+_HARDWARE_BITS = {
+    8: "fuses damaged",
+    48: "crystal not detected",
+    50: "DSP does not start",
+    51: "main core's logic self-test failed",
+    52: "DSP's self-test failed",
+    53: "memory self-test failed (single port)",
+    54: "memory self-test failed (two ports)",
+    55: "memory not initialised",
+    56: "ROM self-test failed",
+}
+_OTHER_BITS = {
+    0: "certificate not authentic",
+    1: "certificate unreadable",
+    7: "older software than allowed",
+    27: "shared memory not allocated",
+    49: "started on the crystal",
+    57: "voltage monitor",
+    63: "error signal module",
+    **dict.fromkeys((*range(9, 19), *range(23, 26), *range(33, 39)), "certificate or key"),
+}
+_BOOT_BITS = _FLASH_BITS | _HARDWARE_BITS | _OTHER_BITS
+
+REFUSALS = {  # API error codes, ICD 338-349, of the commands sent here
+    1: "wrong message number",
+    2: "no sub-block in the message",
+    3: "wrong sub-block number",
+    4: "wrong sub-block length",
+    5: "wrong sub-block data",
+    6: "error while processing the command",
+    7: "file CRC mismatch",
+    8: "file type mismatch",
+    20: "frames are already started",
+    21: "frames are already stopped",
+    22: "no valid frame configuration",
+    23: "start/stop word out of range",
+    24: "RX mask out of range",
+    25: "TX mask out of range",
+    36: "start frequency outside 76..81 GHz",
+    38: "idle time shorter than the filters' spill time",
+    41: "ADC window does not end inside the ramp",
+    46: "ramp ends outside 76..81 GHz",
+    48: "number of samples out of range",
+    49: "sample rate out of range",
+    52: "RX gain out of range or odd",
+    66: "sweep outside the VCO's range",
+    69: "ADC window does not end inside the ramp",
+    71: "chirp uses a TX that is not powered",
+    75: "frame uses a chirp that is not configured",
+    76: "frame uses a profile that is not configured",
+    79: "frame period out of range",
+    80: "chirps take longer than the frame period",
+    81: "trigger select out of range",
+    83: "frames are running",
+    129: "stop 4 needs hardware triggers",
+    1013: "data rate and clock edges do not go together",
+    1023: "words per chirp outside 64..8192",
+}
+_Read = tuple[str, bool, Mapping[str, object]]
+
+
+@dataclass(frozen=True)
+class Event:
+    """One asynchronous event.
+
+    Attributes
+    ----------
+    fatal
+        True if the device must be reset.
+    values
+        Numbers for the manifest. In a boot status, `cure` is "firmware" if the flash is empty or damaged, which a
+        download repairs, "hardware" if the device reports a defect, otherwise "".
+    """
+
+    id: int
+    name: str
+    detail: str = ""
+    fatal: bool = False
+    values: Mapping[str, object] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return self.name + (f": {self.detail}" if self.detail else "")
+
+
+def describe_refusal(number: int | None, block: int | None) -> str:
+    """Describe error number and sub-block of a refused command."""
+    if number is None or block is None:
+        return "without a reason"
+    return f"{REFUSALS.get(number, 'see the interface control document')} (error {number}, sub-block 0x{block:04X})"
+
+
+def decode_event(block: SubBlock) -> Event:
+    """Decode an event; an unknown or truncated one keeps its bytes. A truncated fault is fatal."""
+    decoder = _EVENTS.get(block.id)
+    if decoder is None:
+        return Event(block.id, f"event 0x{block.id:04X}", block.data.hex())
+    name, read = decoder
+    try:
+        detail, fatal, values = read(block.data)
+    except (struct.error, IndexError):
+        fatal = block.id in _FATAL_IF_TRUNCATED
+        return Event(block.id, name, f"only {len(block.data)} bytes: {block.data.hex()}", fatal)
+    return Event(block.id, name, detail, fatal, values)
+
+
+def _read_nothing(data: bytes) -> _Read:
+    del data
+    return "", False, {}
+
+
+def _word(words: Mapping[int, str] | tuple[str, ...], number: int, kind: str = "code") -> str:
+    try:
+        return words[number]
+    except (KeyError, IndexError):
+        return f"{kind} {number}"
+
+
+def _bits(names: Mapping[int, str], mask: int, kind: str = "code") -> str:
+    return ", ".join(dict.fromkeys(_word(names, b, kind) for b in range(mask.bit_length()) if mask >> b & 1))
+
+
+def _cpu(codes: tuple[str, ...]) -> Callable[[bytes], _Read]:
+    def read(data: bytes) -> _Read:
+        kind, code, line = struct.unpack_from("<BBH", data)
+        if kind == 0xFF:
+            return "no fault", False, {}
+        more = f", {_word(codes, code)}, firmware line {line}" if kind == 3 and codes else ""
+        return _word(_CPU_FAULTS, kind) + more, True, {"type": kind, "code": code, "line": line}
+
+    return read
+
+
+def _esm(fatal_in_group1: int) -> Callable[[bytes], _Read]:
+    def read(data: bytes) -> _Read:
+        group1, group2 = struct.unpack_from("<II", data)
+        fatal = bool(group2 or group1 & fatal_in_group1)
+        return f"group 1 0x{group1:08X}, group 2 0x{group2:08X}", fatal, {"group1": group1, "group2": group2}
+
+    return read
+
+
+def _init_done(data: bytes) -> _Read:
+    status, updated, temperature, _, stamp = struct.unpack_from("<IIhHI", data)
+    failed = sum(1 << b for b in INIT_BITS if not status >> b & 1)
+    values = {"passed": status, "updated": updated, "temperature_c": temperature, "device_ms": stamp}
+    return f"{temperature} C" + (f"; failed: {_bits(_INIT_NAMES, failed)}" if failed else ""), False, values
+
+
+def _analog(data: bytes) -> _Read:
+    kind, _, _, signals = struct.unpack_from("<BBHI", data)
+    return _bits(_ANALOG, signals) or "no signal reported", bool(kind), {"signals": signals}
+
+
+def _boot(data: bytes) -> _Read:
+    """Decode power-up time and status: 20 bytes, or 16 from the ROM of a first-generation device with empty flash.
+
+    The short form has status, time, tests, as in a message that was received (tests/radar/test_received.py).
+    """
+    if len(data) < 20:
+        boot, ticks, tests = struct.unpack_from("<IIQ", data)
+    else:
+        ticks, boot, tests = struct.unpack_from("<IQQ", data)
+    parts = [_bits(_BOOT_BITS, boot, "bit")] if boot else []
+    if tests:
+        parts.append(f"self-tests failed 0x{tests:X}")
+    if any(boot >> bit & 1 for bit in _HARDWARE_BITS):
+        cure = "hardware"
+    elif any(boot >> bit & 1 for bit in _FLASH_BITS):
+        cure = "firmware"
+    else:
+        cure = ""
+    values = {"power_up_us": ticks * 0.005, "boot_errors": boot, "tests_failed": tests, "cure": cure}
+    return "; ".join(parts), False, values
+
+
+def _rf_power_up(data: bytes) -> _Read:
+    passed, ticks = struct.unpack_from("<II", data)
+    failed = _RF_TESTS & ~passed
+    text = ""
+    if failed:
+        text = f"self-tests failed 0x{failed:07X}"
+    if failed == _RF_TESTS:
+        text += ", all of them"
+    return text, False, {"tests_passed": passed, "power_up_us": ticks * 0.005}
+
+
+def _rf_error(data: bytes) -> _Read:
+    (flag,) = struct.unpack_from("<I", data)
+    return _word(_RF_ERRORS, flag), flag in (1, 2, 4), {"flag": flag}
+
+
+_FATAL_IF_TRUNCATED = (RF_CPU_FAULT, RF_ESM_FAULT, ANALOG_FAULT, MAIN_CPU_FAULT, MAIN_ESM_FAULT, RF_ERROR)
+_EVENTS: dict[int, tuple[str, Callable[[bytes], _Read]]] = {
+    RF_CPU_FAULT: ("RF core fault", _cpu(_RF_CODES)),
+    RF_ESM_FAULT: ("RF core error signal", _esm(_RF_GROUP1_FATAL)),
+    RF_INIT_DONE: ("RF calibrated", _init_done),
+    TRIGGER_READY: ("ready for triggers", _read_nothing),
+    FRAME_END: ("frames ended", _read_nothing),
+    ANALOG_FAULT: ("analog supply fault", _analog),
+    TIMING_FAILURE: ("calibrations do not fit the frame", _read_nothing),
+    CALIBRATION_REPORT: ("run-time calibration", _read_nothing),
+    MAIN_POWER_UP: ("main core is up", _boot),
+    RF_POWER_UP_DONE: ("RF core is up", _rf_power_up),
+    MAIN_CPU_FAULT: ("main core fault", _cpu(())),
+    MAIN_ESM_FAULT: ("main core error signal", _esm(_MAIN_GROUP1_FATAL)),
+    BOOT_STATUS: ("booted over SPI", _boot),
+    RF_ERROR: ("RF core error", _rf_error),
+}

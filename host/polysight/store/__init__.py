@@ -1,10 +1,10 @@
 """Scan folders (append-only, self-validating, resumable), and a common `Source` protocol for all recorded layouts.
 
 `ScanFolder` reads and writes our own scans: `manifest` is the log of facts and its one reader, `logs` has the event log
-of the Pi, `raw` deletes raw data of processed rows and places rows again from their packets, `sample_rows` checks kept
-samples, `validation` checks a folder, `untrusted` the names and links in it.
-`open_source` opens any known layout (our own, and the `published` data) as a `Source`: rig, plan, rows with data,
-`read_row`, and facts about the recording. `raw_source` requires a source that contains the chirps.
+of the Pi, `raw` deletes raw data of processed rows and places rows again from their packets, `validation` checks a
+folder and its kept samples. `open_source` opens any known layout (our own, and the `published` data) as a `Source`:
+rig, plan, rows with data, `read_row`, and facts about the recording. `raw_source` requires a source that contains the
+chirps.
 """
 
 from polysight.store import manifest
@@ -40,32 +40,38 @@ from polysight.store.raw import (
     replace_rows,
     require_raw,
 )
-from polysight.store.sample_rows import (
-    SAMPLE_ROWS,
-    SAMPLES,
-    damaged_samples,
-    locked_samples,
-    open_records,
-    raw_digest,
-    read_sample_rows,
-    record_digest,
-)
 from polysight.store.scan_folder import (
     EVENTS,
+    MAX_BYTES,
     PART,
     TRUTH,
     ScanFolder,
     check_same_scan,
     connection_of,
     dropped_rows,
+    inside,
     new_scan_id,
+    open_npz,
     utc_now,
     versions,
     with_connection,
 )
 from polysight.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
-from polysight.store.untrusted import MAX_BYTES, inside, open_npz
-from polysight.store.validation import damage_of, damaged_rows, to_json, to_text, validate
+from polysight.store.validation import (
+    SAMPLE_ROWS,
+    SAMPLES,
+    damage_of,
+    damaged_rows,
+    damaged_samples,
+    locked_samples,
+    open_records,
+    raw_digest,
+    read_sample_rows,
+    record_digest,
+    to_json,
+    to_text,
+    validate,
+)
 
 __all__ = [
     "COLLECTION",

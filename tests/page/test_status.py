@@ -11,8 +11,7 @@ from tests.support.store.facts import facts_of
 
 from polysight.acquisition.control import ScanCommand
 from polysight.page.history import PiState, notice_of_fault
-from polysight.page.images import RowSync, Shown
-from polysight.page.status import Inputs, LifeSigns, judge, no_scan
+from polysight.page.status import Inputs, LifeSigns, RowSync, Shown, judge, no_scan
 from polysight_shared.faults import EXPLANATIONS, PiFault
 from polysight_shared.messages import Fault
 

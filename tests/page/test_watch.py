@@ -14,8 +14,7 @@ from tests.support.processes import LIMIT_S, wait_for
 from tests.support.products import REASON, judged_products
 from tests.support.store.facts import typed
 
-from polysight.page.images import draw
-from polysight.page.watch import EventTail, ManifestTail, ProductsTail, Watch
+from polysight.page.watch import EventTail, ManifestTail, ProductsTail, Watch, draw
 from polysight.pipeline import Pipeline
 from polysight.store import manifest
 from polysight.store.logs import read_events

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 
 from polysight.acquisition import ScanCommand, time_left
+from polysight.catalogue import Picture
 from polysight.page.history import BoardCounts, PiState, ScanHistory, TriggerHealth, sentence
-from polysight.page.images import Profile, Shown
 from polysight.results import Verdict
 from polysight.store import ScanEnded
 from polysight_shared.findings import Finding
@@ -37,6 +37,49 @@ DIRECT_RAD = 0.1
 MASKED_SHARE = 0.05
 MAX_NOTICES = 30
 MARKS = {"committed": "c", "kept": "k", "rejected": "r"}
+
+
+class RowSync(NamedTuple):
+    """Synchronisation of one board in one row: phase std after all stages and of the direct path (nan: unknown)."""
+
+    object_rad: float
+    direct_rad: float
+    masked: int
+
+
+class Profile(msgspec.Struct, frozen=True):
+    """Range profile of a row: excess path, dB below the direct path by board, and the scene's excess paths."""
+
+    row: int
+    excess_m: list[float]
+    boards: dict[str, list[float]]
+    scene_m: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Results of the rows so far; replaced as a whole, never changed.
+
+    Attributes
+    ----------
+    rows
+        Rows that are in the images, ascending.
+    pictures
+        See :func:`polysight.catalogue.draw`.
+    profile
+        Of the last row.
+    sync
+        By board and row, rows ascending.
+    problem
+        The last error of a row.
+    """
+
+    revision: int = 0
+    rows: tuple[int, ...] = ()
+    pictures: dict[str, Picture] = field(default_factory=dict)
+    profile: Profile | None = None
+    sync: dict[str, dict[int, RowSync]] = field(default_factory=dict)
+    problem: Finding | None = None
 
 
 @dataclass(frozen=True)

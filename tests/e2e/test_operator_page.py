@@ -17,7 +17,7 @@ from tests.support.scenes import small_scene
 from tests.support.simulated_rig import Rig, running
 
 from polysight.catalogue import PROGRAM
-from polysight.serve.programs import find_program
+from polysight.serve.site import find_program
 from polysight.store import ScanFolder, validate
 
 ROWS = 40

@@ -20,7 +20,7 @@ from tests.support.scenes import COPPER, PET
 from polysight.catalogue import Notes, read_notes, write_notes
 from polysight.materials import Library, read_labels
 from polysight.products import ProcessedScan
-from polysight.serve.programs import find_program
+from polysight.serve.site import find_program
 
 pytestmark = pytest.mark.xdist_group("browser")
 SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])

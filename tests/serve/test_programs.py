@@ -19,7 +19,7 @@ from tests.support.refusals import refused
 from polysight.catalogue import PROGRAM
 from polysight.jobs.live_scan import _check_new
 from polysight.serve import launcher
-from polysight.serve.programs import Programs, find_program
+from polysight.serve.site import Programs, find_program
 from polysight.store import validate
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError

@@ -2,8 +2,8 @@
 
 `serve` shows all scans under a folder; whoever holds the token starts, controls and labels them. `preview` shows one.
 Each request passes the access checks of `guard`. `reading` answers GET requests, `control` POST requests; `site` holds
-their shared state, the live views among it. Scans and processing run as processes of their own (`programs`), which
-outlive this server. Threat model: docs/decisions/0014-operators-page.md.
+their shared state: the live views, and the programs that scan and process, which outlive this server.
+Threat model: docs/decisions/0014-operators-page.md.
 """
 
 from polysight.serve.server import Place, preview, serve

@@ -22,9 +22,8 @@ from polysight.materials import Labels
 from polysight.plan import Changes, forecast, forecast_values
 from polysight.products import find_labels, label_folder, read_products
 from polysight.serve.guard import BODY_BYTES, cookie_name, refuse_body
-from polysight.serve.programs import find_program
 from polysight.serve.reading import json_answer
-from polysight.serve.site import LIBRARIES, Site
+from polysight.serve.site import LIBRARIES, Site, find_program
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, ScanError

@@ -38,8 +38,7 @@ from polysight.catalogue import (
 from polysight.page import Watch
 from polysight.products import REPORT, read_products
 from polysight.serve.guard import refuse
-from polysight.serve.programs import Program, find_program, find_programs
-from polysight.serve.site import THUMBNAIL, Site, compare_products, draw_map
+from polysight.serve.site import THUMBNAIL, Program, Site, compare_products, draw_map, find_program, find_programs
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 

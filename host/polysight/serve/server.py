@@ -30,9 +30,8 @@ from polysight.catalogue import Scans
 from polysight.page import Watch
 from polysight.serve.control import control_routes
 from polysight.serve.guard import HEAD_BYTES, Access, Guard, refuse
-from polysight.serve.programs import Programs
 from polysight.serve.reading import reading_routes
-from polysight.serve.site import Site, Watches
+from polysight.serve.site import Programs, Site, Watches
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError, os_error
 

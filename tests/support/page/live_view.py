@@ -14,9 +14,8 @@ from polysight.catalogue import Scans
 from polysight.page.history import ScanHistory
 from polysight.page.watch import Watch
 from polysight.serve.guard import Access
-from polysight.serve.programs import Programs
 from polysight.serve.server import Place, make_server
-from polysight.serve.site import Site, Watches
+from polysight.serve.site import Programs, Site, Watches
 from polysight.store import EVENTS, MANIFEST, manifest, utc_now
 from tests.support.processes import LIMIT_S, wait_for
 from tests.support.store.facts import facts_of

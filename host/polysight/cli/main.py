@@ -18,12 +18,13 @@ from polysight_shared import __version__
 from polysight_shared.errors import PolysightError, os_error
 
 FAMILIES = {
-    "simulated": ("demo", "simulate", "reproduce"),
-    "rig": ("plan", "doctor", "card", "inspect", "radar", "scan", "resume", "validate", "drop-raw"),
+    "rig": (
+        *("demo", "simulate", "reproduce"),
+        *("plan", "doctor", "card", "inspect", "radar", "scan", "resume", "validate", "drop-raw"),
+    ),
     "serve": ("serve", "preview", "scans", "note", "ask", "probe", "compare"),
-    "process": ("process", "image", "focus", "sync-report"),
+    "process": ("process", "image", "focus", "sync-report", "calibrate", "leakage"),
     "materials": ("materials", "report", "permittivity", "concentration", "classify", "train", "export", "label"),
-    "calibrate": ("calibrate", "leakage"),
 }
 """Module of this package to the commands that it adds, in the order of the help."""
 

@@ -1,12 +1,17 @@
-"""The commands around a rig and its scans: plan, doctor, card, inspect, radar, scan, resume, validate, drop-raw."""
+"""The commands around a rig and its scans, simulated or real.
+
+Simulated: demo, simulate, reproduce. Real: plan, doctor, card, inspect, radar, scan, resume, validate, drop-raw.
+"""
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
 from pathlib import Path
 
 from polysight.cli.options import (
+    RIG,
     Add,
     add_action,
     add_config_option,
@@ -17,12 +22,18 @@ from polysight.cli.options import (
     number,
     positive,
 )
+from polysight.data import packaged
+from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
+
+_bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
+_seconds = number(float, "a number of seconds from 0 to 3600", lambda value: 0 <= value <= 3600)
 
 
 def add_commands(add: Add) -> None:
     """Register the commands."""
+    _add_simulated(add)
     _add_plan(add)
     _add_doctor(add)
     _add_card(add)
@@ -112,9 +123,6 @@ def _doctor(args: argparse.Namespace) -> int:
     return run_doctor(options, args.json, bundle=args.bundle)
 
 
-_bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
-
-
 def _add_doctor(add: Add) -> None:
     sub = add(
         "doctor",
@@ -164,9 +172,6 @@ def _card_reset(args: argparse.Namespace) -> int:
     from polysight.jobs.devices import reset_card
 
     return reset_card(args.config, args.board, args.radar)
-
-
-_seconds = number(float, "a number of seconds from 0 to 3600", lambda value: 0 <= value <= 3600)
 
 
 def _add_board(sub: argparse.ArgumentParser) -> None:
@@ -403,3 +408,97 @@ def _add_scans(add: Add) -> None:
     sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder")
     sub.add_argument("--products", type=Path, metavar="DIR", help="products made from it (default: SCAN/products)")
     sub.add_argument("--yes", action="store_true", help="do not ask for confirmation")
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from polysight.jobs.demo import run_demo
+
+    return run_demo(packaged(args.scene), args.config, args.out, args.time_scale)
+
+
+def _simulate(args: argparse.Namespace) -> int:
+    from polysight.jobs.demo import run_simulator
+
+    command = ["simulate", str(packaged(args.scene)), "--config", str(args.config), "--out", str(args.out)]
+    command += ["--layout", args.layout]
+    if args.seed is not None:
+        command += ["--seed", str(args.seed)]
+    return run_simulator(command)
+
+
+def _reproduce(args: argparse.Namespace) -> int:
+    if args.config != packaged(RIG):
+        load_instrument(args.config)  # refuse a wrong one now, not with the first item that needs it
+    sys.stderr.write("polysight reproduce: starting\n")  # its figures' libraries take seconds to load
+    sys.stderr.flush()
+    if args.authors is not None:
+        from polysight_papers.sensys2026.dataset_items import reproduce_authors
+
+        return reproduce_authors(args.authors, args.out, args.config, args.items, args.images, args.names)
+    if args.images is not None or args.names is not None:
+        raise ConfigError("--images and --names say how to read the published files", "no --authors was given")
+    from polysight_papers.sensys2026.item import Run
+    from polysight_papers.sensys2026.run import reproduce
+
+    return reproduce(args.out, args.items, Run(args.quick, args.config))
+
+
+def _add_simulated(add: Add) -> None:
+    sub = add(
+        "demo",
+        _demo,
+        "scan a scene with a simulated rig and write the report; needs no hardware",
+        "polysight demo --out out/demo",
+        ("--out", "--scene"),
+    )
+    sub.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/demo"),
+        metavar="DIR",
+        help="folder to make (default: out/demo); an existing demo folder is overwritten",
+    )
+    sub.add_argument(
+        "--scene",
+        type=Path,
+        default=packaged(Path("examples/nine-materials.toml")),
+        metavar="FILE",
+        help="scene file (default: nine materials)",
+    )
+    sub.add_argument("--time-scale", type=positive, metavar="X", help="simulated seconds per second (default: 40)")
+    add_config_option(sub, shipped=True)
+
+    sub = add(
+        "simulate",
+        _simulate,
+        "write the raw data of a scene, with truth.json",
+        "polysight simulate examples/point-targets.toml --out out/points",
+    )
+    sub.add_argument("scene", type=Path, metavar="SCENE.toml", help="scene file, e.g. examples/metal-plate.toml")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
+    sub.add_argument(
+        "--layout",
+        choices=["own", "authors"],
+        default="own",
+        help="a scan folder (default), or unsynced/<scan> as the paper's authors publish it",
+    )
+    sub.add_argument("--seed", type=int, help="noise seed (default: the scene's)")
+    add_config_option(sub, shipped=True)
+
+    sub = add(
+        "reproduce",
+        _reproduce,
+        "make the paper's tables and figures beside the published values",
+        "polysight reproduce --out out/reproduce fig18 fig20\n"
+        "  polysight reproduce --authors dataset --out out/authors",
+    )
+    sub.add_argument("items", nargs="*", metavar="ITEM", help="fig3, fig18, table2 ... (default: all there are)")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the page and the files")
+    sub.add_argument("--quick", action="store_true", help="fewer draws, models and placements")
+    sub.add_argument("--authors", type=Path, metavar="DIR", help="use the published data set (materials/, labels/)")
+    add_config_option(sub, shipped=True)
+    group = sub.add_argument_group("with --authors")
+    group.add_argument("--images", type=Path, metavar="DIR", help="also judge images that `polysight process` made")
+    group.add_argument(
+        "--names", type=Path, metavar="FILE", help='JSON with the row of Table 2 of a name, {"plexi 3": 3}'
+    )

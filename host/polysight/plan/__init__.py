@@ -5,11 +5,18 @@ least noise within a time. `scan_time` estimates the duration, `field_limits` th
 is the command; it can take noise and standstill from an earlier scan.
 """
 
-from polysight.plan.field import FieldLimits, field_limits
-from polysight.plan.forecast import Forecast, Noise, forecast
-from polysight.plan.plan_command import PlanOptions, forecast_values, run_plan
-from polysight.plan.search import Changes, propose
-from polysight.plan.timing import ScanTime, row_motion_s, scan_time, straight_move_s
+from polysight.plan.forecast import (
+    FieldLimits,
+    Forecast,
+    Noise,
+    ScanTime,
+    field_limits,
+    forecast,
+    row_motion_s,
+    scan_time,
+    straight_move_s,
+)
+from polysight.plan.plan_command import Changes, PlanOptions, forecast_values, propose, run_plan
 
 __all__ = [
     "Changes",

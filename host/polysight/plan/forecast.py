@@ -1,11 +1,19 @@
-"""Predict a scan from its rig file: time, data, point response, alias-free field, noise, and warnings.
+"""Forecast of a scan from its rig file: time, data, point response, alias-free field, noise, and warnings.
 
-`forecast` returns all of it; `find_warnings` only the warnings, which include settings that stage, Pi or radars would
-refuse.
+`scan_time` estimates the duration: rows with their ramps, turns, and the standstill between rows
+(docs/spec/stage-line.md, "A row"); motion has trapezoidal speed with constant acceleration. `field_limits` gives the
+alias-free field for a step size, and the mirror zone around flat plates. `forecast` returns all of it; `find_warnings`
+only the warnings, which include settings that stage, Pi or radars would refuse.
+
+Field of view: TX and RX move together, so an echo's phase slope against stage offset, `k (sin a_tx + sin a_rx)`,
+depends only on the object's place relative to the stage. Samples `d` apart cannot distinguish slopes that differ by
+`2 pi / d`: an object has a ghost where its slope differs by that much. The nearest ghost counts, seen from the middle
+half of the aperture, because the taper suppresses the rest.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -25,15 +33,26 @@ from polysight.imaging import (
     scene_gate_m,
     window_weights,
 )
-from polysight.plan.field import FieldLimits, PhaseSlope, field_limits
-from polysight.plan.timing import ROW_OVERHEAD_S, ScanTime, scan_time, tail_s, whole_packets
 from polysight.process import why_unnamed
 from polysight.radar import constraints
 from polysight.settings import DEFAULT
-from polysight_shared.config import Instrument
+from polysight_shared.config import CARD_TAIL_S, Instrument
 from polysight_shared.errors import ConfigError
-from polysight_shared.raster import burst_duration_s, check_burst_fits, plan_raster
+from polysight_shared.geometry import specular_midpoint_m
+from polysight_shared.raster import Grid, Stage, burst_duration_s, check_burst_fits, plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+ROW_OVERHEAD_S = 0.3
+"""Default standstill between rows, for storing the row, arming cards and radars, and commands.
+
+Simulated: 0.14 and 0.29 s between rows of 350 points x 13 and 16 chirps on the simulated rig at real time, on a busy
+machine. Not measured on hardware; `polysight plan --like SCAN` measures it in a scan.
+"""
+
+_STEP_M = 1e-4  # of the numerical derivative
+_MAX_DISTANCE_M = 20.0
+_PRECISION_M = 1e-6
+_PLACES = 5
 
 Real = NDArray[np.float64]
 
@@ -45,6 +64,166 @@ _MAX_BURST_LOSS_DB = 0.5
 _WIRE_BYTES = 1470 + 42 + 24  # a full packet on Ethernet: headers, preamble, checksum, gap
 _ETHERNET_BYTES_PER_US = 125.0
 _FAST_TIME_WINDOW = "hann"  # as in host.imaging.ImageBuilder
+
+
+@dataclass(frozen=True)
+class ScanTime:
+    """Duration of a scan by cause, summed over its rows, without homing, which depends on the stage's position.
+
+    Attributes
+    ----------
+    approach_s
+        From the home corner to the start of the first row.
+    measuring_s
+        At constant speed from each row's first point to its last.
+    ramps_s
+        Acceleration, deceleration, and the run-up of one step (or the backlash) on either side.
+    turns_s
+        From each row's end to the next one's beginning.
+    tail_s
+        Waiting for the cards' short last packets.
+    overhead_s
+        Other standstill between rows.
+    """
+
+    approach_s: float
+    measuring_s: float
+    ramps_s: float
+    turns_s: float
+    tail_s: float
+    overhead_s: float
+
+    @property
+    def total_s(self) -> float:
+        """Sum of all parts, seconds."""
+        return self.approach_s + self.measuring_s + self.ramps_s + self.turns_s + self.tail_s + self.overhead_s
+
+    @property
+    def minutes(self) -> float:
+        """Sum of all parts, minutes."""
+        return self.total_s / 60
+
+
+def straight_move_s(distance_mm: float, speed_mm_s: float, accel_mm_s2: float) -> float:
+    """Return the duration of a move from rest to rest: trapezoidal speed, or triangular for short distances."""
+    if distance_mm <= 0:
+        return 0.0
+    if distance_mm < speed_mm_s**2 / accel_mm_s2:
+        return 2 * math.sqrt(distance_mm / accel_mm_s2)
+    return distance_mm / speed_mm_s + speed_mm_s / accel_mm_s2
+
+
+def row_motion_s(grid: Grid, stage: Stage) -> float:
+    """Return the duration of a row from rest to rest."""
+    length = (grid.columns - 1) * grid.step_x_mm + 2 * stage.run_up_mm(grid.step_x_mm)
+    return straight_move_s(length, stage.speed_mm_s, stage.accel_mm_s2)
+
+
+def turn_s(grid: Grid, stage: Stage) -> float:
+    """Return the duration from a row's end to the next one's beginning; only y moves, and takes up its backlash."""
+    step, lost = grid.step_y_mm, stage.backlash_mm
+    legs = (step,) if lost <= step else (lost - step, lost)
+    return sum(straight_move_s(leg, stage.travel_speed_mm_s, stage.accel_mm_s2) for leg in legs)
+
+
+def whole_packets(rig: Instrument, pulses: int | None = None) -> bool:
+    """Return True if a row with `pulses` pulses a position fills whole packets, so that no short one is delayed."""
+    return rig.row_bytes // rig.burst.pulses * (pulses or rig.burst.pulses) % rig.card.payload_bytes == 0
+
+
+def tail_s(rig: Instrument) -> float:
+    """Return the wait for the cards' last packet at the end of each row, after the stage has stopped, seconds."""
+    if whole_packets(rig):
+        return 0.0
+    grid, stage = rig.grid, rig.stage
+    run_out = (row_motion_s(grid, stage) - (grid.columns - 1) * grid.step_x_mm / stage.speed_mm_s) / 2
+    return max(0.0, burst_duration_s(rig.burst) + CARD_TAIL_S - run_out)
+
+
+def scan_time(rig: Instrument, row_overhead_s: float = ROW_OVERHEAD_S) -> ScanTime:
+    """Estimate the duration of a scan without retakes.
+
+    `row_overhead_s` is the standstill for each row apart from motion and the wait for the last packet, seconds.
+    """
+    grid, stage = rig.grid, rig.stage
+    row = row_motion_s(grid, stage)
+    measuring = (grid.columns - 1) * grid.step_x_mm / stage.speed_mm_s
+    x = stage.centre_x_mm - (grid.columns - 1) / 2 * grid.step_x_mm - stage.run_up_mm(grid.step_x_mm)
+    y = stage.centre_y_mm - (grid.rows - 1) / 2 * grid.step_y_mm
+    return ScanTime(
+        approach_s=straight_move_s(max(x, y), stage.travel_speed_mm_s, stage.accel_mm_s2),
+        measuring_s=grid.rows * measuring,
+        ramps_s=grid.rows * (row - measuring),
+        turns_s=(grid.rows - 1) * turn_s(grid, stage),
+        tail_s=grid.rows * tail_s(rig),
+        overhead_s=grid.rows * row_overhead_s,
+    )
+
+
+@dataclass(frozen=True)
+class FieldLimits:
+    """Limits for (x, y).
+
+    Attributes
+    ----------
+    alias_free_mm
+        Distance from an object to its nearest ghost at the highest frequency; infinite if there is none.
+    mirror_zone_mm
+        Radius of the first Fresnel zone: the margin of aperture that a flat plate needs on every side.
+    """
+
+    alias_free_mm: tuple[float, float]
+    mirror_zone_mm: tuple[float, float]
+
+
+class PhaseSlope:
+    """Phase slope of an echo against stage offset along an axis (0: x, 1: y) for the H receiver, rad/m."""
+
+    def __init__(self, rig: Instrument, axis: int) -> None:
+        self._antennas = Antennas.of(rig, rig.receivers[0])
+        self._middle = np.array(specular_midpoint_m(rig, rig.receivers[0]))
+        self._axis = axis
+
+    def at(self, place_m: float, frequency_hz: float) -> float:
+        """Return the slope for an object at this distance from the specular midpoint along the axis."""
+        point = self._middle.copy()
+        point[self._axis] += place_m
+        total = 0.0
+        for antenna in (self._antennas.tx_m, self._antennas.rx_m[0]):
+            offset = point - antenna
+            total += float(offset[self._axis] / np.linalg.norm(offset))
+        return 2 * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S * total
+
+
+def field_limits(rig: Instrument) -> FieldLimits:
+    """Compute the limits for a rig's grid."""
+    chirp, grid = rig.chirp, rig.grid
+    low, high = (chirp.first_sample_hz + n * chirp.hz_per_sample for n in chirp.linear_samples)
+    free, zone = [], []
+    for axis, (count, step_mm) in enumerate(((grid.columns, grid.step_x_mm), (grid.rows, grid.step_y_mm))):
+        slope = PhaseSlope(rig, axis)
+        change = (slope.at(_STEP_M, (low + high) / 2) - slope.at(-_STEP_M, (low + high) / 2)) / (2 * _STEP_M)
+        zone.append(1e3 * float(np.sqrt(2 * np.pi / change)))
+        size_m = (count - 1) * step_mm / 1e3
+        places = np.linspace(-size_m / 4, size_m / 4, _PLACES)
+        free.append(1e3 * min(_nearest_ghost_m(slope, high, 2e3 * np.pi / step_mm, p) for p in places))
+    return FieldLimits((free[0], free[1]), (zone[0], zone[1]))
+
+
+def _nearest_ghost_m(slope: PhaseSlope, frequency_hz: float, difference_rad_per_m: float, centre_m: float) -> float:
+    """Distance between two places around `centre_m` whose slopes differ by `difference_rad_per_m`."""
+
+    def too_far(distance_m: float) -> bool:
+        far, near = (slope.at(centre_m + side * distance_m / 2, frequency_hz) for side in (1, -1))
+        return far - near >= difference_rad_per_m
+
+    if not too_far(_MAX_DISTANCE_M):
+        return float("inf")
+    near, far = 0.0, _MAX_DISTANCE_M
+    while far - near > _PRECISION_M:  # bisection: importing scipy.optimize takes longer than the whole forecast
+        middle = (near + far) / 2
+        near, far = (near, middle) if too_far(middle) else (middle, far)
+    return far
 
 
 class PlanWarning(NamedTuple):

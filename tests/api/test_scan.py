@@ -15,7 +15,7 @@ from tests.support.store.facts import facts_of
 
 import polysight
 from polysight import open_scan, read_netcdf
-from polysight.products.files import read_image
+from polysight.products.processed import read_image
 from polysight.store import manifest
 from polysight.store.scan_folder import MANIFEST, ScanFolder
 from polysight_shared.config import load_instrument

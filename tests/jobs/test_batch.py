@@ -17,7 +17,7 @@ from polysight.cli.main import main
 from polysight.jobs import batch as many
 from polysight.jobs.batch import Outcome, at_once, find_scans, finished, make_jobs, memory_bytes, process_many, table
 from polysight.process import cores
-from polysight.products.files import FINISHED
+from polysight.products.processed import FINISHED
 from polysight.settings import Settings
 from polysight.store import ScanFolder, drop
 from polysight_shared.error_codes import ErrorCode

@@ -16,7 +16,7 @@ from polysight.cli.main import main
 from polysight.jobs.process import make_products, processed_rows, publish_images
 from polysight.pipeline import Pipeline
 from polysight.products import read_products
-from polysight.products.files import FINISHED
+from polysight.products.processed import FINISHED
 from polysight.settings import Settings
 from polysight.store import ScanFolder
 from polysight_shared.error_codes import ErrorCode

@@ -8,7 +8,7 @@ import pytest
 
 from polysight.imaging import Images
 from polysight.products import write_atomically, write_image, write_json
-from polysight.products.files import read_image
+from polysight.products.processed import read_image
 from polysight.results import plain
 from polysight_shared.errors import DataError
 

@@ -11,8 +11,8 @@ import xarray
 
 from polysight.cli.main import main
 from polysight.imaging import Images
-from polysight.products import datasets, write_image, write_json
-from polysight.products.datasets import join_complex, read_netcdf, split_complex
+from polysight.products import exports, write_image, write_json
+from polysight.products.exports import join_complex, read_netcdf, split_complex
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import DataError
 from polysight_shared.tables import to_builtins
@@ -130,7 +130,7 @@ def test_a_missing_package_is_named_with_its_extra(folder, monkeypatch, capsys):
     def absent(name):
         raise ImportError(name)
 
-    monkeypatch.setattr(datasets, "import_module", absent)
+    monkeypatch.setattr(exports, "import_module", absent)
     out = folder.parent / "out"
     assert main(["export", str(folder), "--netcdf", "--out", str(out)]) == 2
     message = capsys.readouterr().err

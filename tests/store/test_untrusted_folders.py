@@ -26,9 +26,9 @@ from polysight.materials.library import Library
 from polysight.materials.published import read_material
 from polysight.materials.result import read_patches
 from polysight.products import ProcessedScan
-from polysight.products.datasets import read_netcdf
-from polysight.products.files import read_image, write_atomically
+from polysight.products.exports import read_netcdf
 from polysight.products.folder import making_products
+from polysight.products.processed import read_image, write_atomically
 from polysight.store import manifest
 from polysight.store.published import read_json as read_settings_json
 from polysight.store.raw import drop, droppable

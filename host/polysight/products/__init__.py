@@ -6,27 +6,14 @@ context manager: products are written to a temporary folder, which replaces the 
 `image_dataset`, `patch_dataset` and `full_dataset` are xarray datasets; `export` writes NetCDF, MATLAB and CSV files.
 """
 
-from polysight.products.datasets import (
+from polysight.products.exports import (
+    export,
     full_dataset,
     image_dataset,
     patch_dataset,
     ranges_text,
     read_netcdf,
     write_netcdf,
-)
-from polysight.products.exports import export
-from polysight.products.files import (
-    FINISHED,
-    IMAGE,
-    LABELS,
-    MATERIALS,
-    QUALITY,
-    REPORT,
-    SCAN,
-    rx_gains,
-    write_atomically,
-    write_image,
-    write_json,
 )
 from polysight.products.folder import (
     LABELS_PICTURE,
@@ -37,7 +24,24 @@ from polysight.products.folder import (
     products_locked,
     scan_folder_of,
 )
-from polysight.products.processed import ProcessedScan, Rows, find_products, raw_dropped, read_products
+from polysight.products.processed import (
+    FINISHED,
+    IMAGE,
+    LABELS,
+    MATERIALS,
+    QUALITY,
+    REPORT,
+    SCAN,
+    ProcessedScan,
+    Rows,
+    find_products,
+    raw_dropped,
+    read_products,
+    rx_gains,
+    write_atomically,
+    write_image,
+    write_json,
+)
 
 __all__ = [
     "FINISHED",

@@ -1,4 +1,11 @@
-"""Export saved products for other programs (`polysight export`): NetCDF, MATLAB, CSV."""
+"""Processed scans for other programs: xarray datasets, and files in NetCDF, MATLAB and CSV (`polysight export`).
+
+Notebooks and exports use the same names: `image_dataset` has the pixels, `patch_dataset` the patches, `full_dataset`
+both. Permittivity is eps' - j eps'' (eps'' is the loss); unknown values are NaN. xarray is imported at first use.
+
+NetCDF has no complex numbers: a complex variable `h` is stored as `h_real` and `h_imag`, each with the attribute
+`complex_part`; :func:`read_netcdf` joins them again.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +14,356 @@ import io
 import json
 import re
 import sys
+from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import scipy
+from msgspec import UNSET
 
-from polysight.products.datasets import CONVENTION, full_dataset, verdict_attributes, write_netcdf
-from polysight.products.files import write_atomically
-from polysight.products.processed import ProcessedScan, read_products
-from polysight.results import Figure, PatchFigures, figures_of, plain
+from polysight.materials import image_centre_mm
+from polysight.polarimetry import incidence_choice, specular_incidence_rad
+from polysight.products.processed import ProcessedScan, read_products, temporary_path, write_atomically
+from polysight.results import Figure, PatchFigures, Verdict, figures_of, plain
+from polysight.store import MAX_BYTES
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    import xarray
+
+CONVENTION = (
+    "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
+    " column 0 the smallest x; rig frame; permittivity is real - j loss"
+)
+_PART = "complex_part"
+UNREFERENCED = "none: h, v and p are in arbitrary units"
+
+
+def ranges_text(numbers: Sequence[int]) -> str:
+    """Return ascending numbers as text, `3, 7-9`; `none` without numbers."""
+    found: list[list[int]] = []
+    for n in numbers:
+        if found and n == found[-1][1] + 1:
+            found[-1][1] = n
+        else:
+            found.append([n, n])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in found) or "none"
+
+
+def verdict_attributes(verdict: Verdict | None) -> dict[str, str]:
+    """Return `verdict` (the level) and `verdict_reasons` as JSON (what, why, do); empty without a verdict."""
+    if verdict is None:
+        return {}
+    content = verdict.to_dict()
+    return {"verdict": content["level"], "verdict_reasons": json.dumps(content["reasons"], ensure_ascii=False)}
+
+
+def provenance(scan: ProcessedScan) -> dict[str, Any]:
+    """Return the attributes of every dataset: identity and origin of the data. Unknown entries are left out.
+
+    `simulated` is True, False or "unknown"; `versions` is JSON; `rows_missing` and `positions_masked` are text; see
+    :func:`verdict_attributes` for `verdict` and `verdict_reasons`.
+    """
+    simulated = "unknown" if scan.simulated is None else scan.simulated
+    metal = UNREFERENCED
+    if scan.materials is not None:
+        metal = scan.materials.metal_reference.how if scan.materials.metal_reference else "given"
+    attrs: dict[str, Any] = {
+        "title": f"scan {scan.scan_id or 'without a name'}{' (simulated)' if simulated is True else ''}",
+        "scan_id": scan.scan_id,
+        "simulated": simulated,
+        "convention": CONVENTION,
+        "metal_reference": metal,
+        **verdict_attributes(scan.verdict),
+    }
+    if scan.rig is not None:
+        attrs["rig"] = scan.rig.name
+    if scan.facts.processed_utc:
+        attrs["processed_utc"] = scan.facts.processed_utc
+    if scan.facts.versions:
+        attrs["versions"] = json.dumps(scan.facts.versions)
+    if scan.rows is not None:
+        attrs["rows_planned"] = scan.rows.planned
+        attrs["rows_missing"] = ranges_text(scan.rows.missing)
+    masked = [
+        f"{name} {board.positions_masked} of {board.positions}"
+        for name, board in scan.quality.boards.items()
+        if board.positions_masked is not UNSET and board.positions is not UNSET
+    ]
+    if masked:
+        attrs["positions_masked"] = ", ".join(masked)
+    return attrs
+
+
+def _numbers(values: Sequence[Any]) -> npt.NDArray[np.float64]:
+    return np.array([np.nan if v is None else v for v in values], np.float64)
+
+
+def _described(dims: tuple[str, ...], values: Any, units: str, long_name: str) -> tuple[Any, ...]:
+    return dims, np.array(values), {"units": units, "long_name": long_name}
+
+
+def image_dataset(scan: ProcessedScan) -> xarray.Dataset:
+    """Return the images of a processed scan.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dimensions `y`, `x` (metres, rig frame). `h`, `v`, `p` complex64 [y, x]: s-polarised and p-polarised channel
+        and their ratio, relative to metal unless `metal_reference` begins with "none". `valid` bool [y, x].
+        `p_sigma` float32 [y, x], the standard deviation of `p`, if the products have it.
+        `incidence_deg`: one angle, or [y, x] if the scan was processed with one angle per pixel; left out if the
+        rig is unknown. Attributes: :func:`provenance`.
+    """
+    import xarray
+
+    images, plane = scan.images, ("y", "x")
+    unit = "reflection relative to metal" if scan.metal_referenced else "arbitrary units"
+    data = {
+        "h": _described(plane, images.h, "1", f"s-polarised channel, {unit}"),
+        "v": _described(plane, images.v, "1", f"p-polarised channel, {unit}"),
+        "p": _described(plane, images.p, "1", f"polarisation ratio H / V, {unit}"),
+        "valid": _described(plane, images.valid, "1", "True where the scan illuminates the pixel"),
+    }
+    if images.p_sigma is not None:
+        about = "standard deviation of p: root of the mean variance of its real and imaginary part"
+        data["p_sigma"] = _described(plane, images.p_sigma, "1", about)
+    if scan.rig is not None:
+        if scan.quality.incidence and scan.quality.incidence.used == "by pixel":
+            angles = incidence_choice(scan.rig, images.x_m, images.y_m, "pixel").used_rad
+            data["incidence_deg"] = _described(plane, np.degrees(angles), "degree", "incidence angle of the pixel")
+        else:
+            angle = np.degrees(specular_incidence_rad(scan.rig))
+            data["incidence_deg"] = _described((), angle, "degree", "incidence angle")
+    return xarray.Dataset(data, _axes(scan), provenance(scan))
+
+
+def _axes(scan: ProcessedScan) -> dict[str, Any]:
+    return {
+        "y": _described(("y",), scan.y_m, "m", "pixel centre, y of the rig frame"),
+        "x": _described(("x",), scan.x_m, "m", "pixel centre, x of the rig frame"),
+    }
+
+
+def patch_dataset(scan: ProcessedScan) -> xarray.Dataset:
+    """Return the patches of a processed scan: the patch number of each pixel, and a table.
+
+    Returns
+    -------
+    xarray.Dataset
+        `label` int32 [y, x] (0: no patch) and, if known, `interior` bool [y, x], the pixels used for the values.
+        On dimension `patch` the figures declared in :class:`polysight.results.PatchFigures`, and with sub-bands
+        `band_ratio` [patch, band]. Coordinates `centre_x` and `centre_y` (m, rig frame). Attributes:
+        :func:`provenance`, `library`, `model`.
+
+    Raises
+    ------
+    DataError
+        if only images were made.
+    """
+    import xarray
+
+    if scan.materials is None:
+        raise DataError(
+            f"scan {scan.scan_id} has no materials",
+            "only images were made of this scan",
+            "`polysight process` finds patches and materials; give the folder it writes, or the scan folder",
+            code=ErrorCode.NO_DATA,
+        )
+    plane = ("y", "x")
+    data = {"label": _described(plane, scan.labels, "1", "number of the patch that holds the pixel, 0 for none")}
+    if scan.interior is not None:
+        data["interior"] = _described(plane, scan.interior, "1", "True where the pixel is used for the patch's numbers")
+    data |= _figure_variables(scan.segments) | _band_variables(scan.segments)
+    naming = {"library": scan.materials.library, "model": scan.materials.model}
+    attributes = provenance(scan) | {key: text for key, text in naming.items() if text}
+    return xarray.Dataset(data, _axes(scan) | _patch_axes(scan), attributes)
+
+
+def _patch_axes(scan: ProcessedScan) -> dict[str, Any]:
+    numbers = np.array([patch.label for patch in scan.segments], np.int32)
+    x_mm, y_mm = image_centre_mm(scan.x_m, scan.y_m)
+    centre_x_m = (_numbers([patch.centre_x_mm for patch in scan.segments]) + x_mm) / 1e3
+    centre_y_m = (_numbers([patch.centre_y_mm for patch in scan.segments]) + y_mm) / 1e3
+    return {
+        "patch": _described(("patch",), numbers, "1", "number of the patch in label"),
+        "centre_x": _described(("patch",), centre_x_m, "m", "middle of the patch, x of the rig frame"),
+        "centre_y": _described(("patch",), centre_y_m, "m", "middle of the patch, y of the rig frame"),
+    }
+
+
+def _figure_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
+    """Return a variable on dimension `patch` for each declared figure; lengths in metres."""
+    variables = {}
+    for figure in figures_of(type(patches[0]) if patches else PatchFigures):
+        values = figure.values(patches)
+        if not figure.variable or (figure.column.optional and not any(values)):
+            continue
+        unit = figure.column.unit
+        array = figure.array(patches)
+        if unit == "mm":
+            array = array / 1e3
+            unit = "m"
+        variables[figure.variable] = _described(("patch",), array, unit, figure.column.about)
+    return variables
+
+
+def _band_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
+    """Return the variables on dimensions `patch`, `band`; empty unless every patch has sub-bands."""
+    rows = [patch.bands for patch in patches if patch.bands]
+    if not rows or len(rows) < len(patches):
+        return {}
+    nothing = complex(np.nan, np.nan)
+    ratios = [[nothing if band.ratio is None else band.ratio.value for band in row] for row in rows]
+    errors = [_numbers([band.inverse_ratio_std for band in row]) for row in rows]
+    first_hz = [band.first_hz for band in rows[0]]
+    last_hz = [band.last_hz for band in rows[0]]
+    plane = ("patch", "band")
+    return {
+        "band_ratio": _described(plane, ratios, "1", "median of P = H / V in the sub-band"),
+        "band_inverse_ratio_standard_error": _described(plane, errors, "1", "standard error of V / H in the sub-band"),
+        "band_first_hz": _described(("band",), first_hz, "Hz", "first transmit frequency"),
+        "band_last_hz": _described(("band",), last_hz, "Hz", "last transmit frequency"),
+    }
+
+
+def full_dataset(scan: ProcessedScan) -> xarray.Dataset:
+    """Return :func:`image_dataset` and, if there are materials, :func:`patch_dataset` in one dataset.
+
+    The attribute `instrument` is the rig file as JSON.
+    """
+    dataset = image_dataset(scan)
+    if scan.metal_referenced:
+        patches = patch_dataset(scan)
+        dataset = dataset.assign_coords(patches.coords).assign(patches.data_vars).assign_attrs(patches.attrs)
+    if scan.facts.instrument:
+        dataset.attrs["instrument"] = json.dumps(scan.facts.instrument)
+    return dataset
+
+
+def split_complex(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Return a dataset with each complex variable `h` replaced by real variables `h_real` and `h_imag`."""
+    made: dict[str, Any] = {}
+    for name, variable in dataset.data_vars.items():
+        if variable.dtype.kind != "c":
+            made[str(name)] = variable
+            continue
+        about = variable.attrs.get("long_name", str(name))
+        for suffix, part in (("real", "real"), ("imag", "imaginary")):
+            values = variable.real if suffix == "real" else variable.imag
+            attrs = {**variable.attrs, "long_name": f"{about}, {part} part", _PART: suffix}
+            made[f"{name}_{suffix}"] = values.copy().assign_attrs(attrs)
+    return dataset.drop_vars(list(dataset.data_vars)).assign(made)
+
+
+def join_complex(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Undo :func:`split_complex`: join the variables with the attribute `complex_part`."""
+    made: dict[str, Any] = {}
+    for full_name, variable in dataset.data_vars.items():
+        name, _, suffix = str(full_name).rpartition("_")
+        if variable.attrs.get(_PART) == "real" and f"{name}_imag" in dataset:
+            both = np.empty(variable.shape, np.complex64 if variable.dtype == np.float32 else np.complex128)
+            both.real, both.imag = variable.values, dataset[f"{name}_imag"].values
+            attrs = {key: text for key, text in variable.attrs.items() if key != _PART}
+            attrs["long_name"] = str(attrs.get("long_name", name)).removesuffix(", real part")
+            made[name] = (variable.dims, both, attrs)
+        elif variable.attrs.get(_PART) != suffix or suffix != "imag":
+            made[str(full_name)] = variable
+    return dataset.drop_vars(list(dataset.data_vars)).assign(made)
+
+
+def _require_h5netcdf() -> None:
+    try:
+        import_module("h5netcdf")
+    except ImportError:
+        raise ConfigError(
+            "NetCDF needs the package h5netcdf, which is not installed",
+            "only NetCDF files use it, so it is optional",
+            "pip install 'polysight[export]', or pip install h5netcdf",
+            code=ErrorCode.PACKAGE_MISSING,
+        ) from None
+
+
+def write_netcdf(path: Path, dataset: xarray.Dataset) -> None:
+    """Write a NetCDF 4 file; complex variables become two real ones, True and False in attributes 1 and 0.
+
+    Raises
+    ------
+    ConfigError
+        if h5netcdf is not installed.
+    """
+    _require_h5netcdf()
+    split = split_complex(dataset)
+    split.attrs = {key: int(value) if isinstance(value, bool) else value for key, value in split.attrs.items()}
+    packed = {"zlib": True, "complevel": 4, "shuffle": True}
+    encoding = {name: packed for name, v in split.data_vars.items() if v.ndim == 2 and v.dtype.kind in "biuf"}
+    part = temporary_path(path)
+    split.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+    part.replace(path)
+
+
+def read_netcdf(path: Path) -> xarray.Dataset:
+    """Load a file of :func:`write_netcdf` into memory, with complex variables.
+
+    Raises
+    ------
+    ConfigError
+        if h5netcdf is not installed.
+    DataError
+        if the file cannot be read.
+    """
+    import xarray
+
+    _require_h5netcdf()
+    try:
+        _check_hdf5(path)
+        dataset = xarray.load_dataset(path, engine="h5netcdf")
+    except (OSError, ValueError) as e:
+        raise DataError(
+            f"{path}: not a NetCDF file: {e}",
+            "the path is wrong, or the file is damaged",
+            code=ErrorCode.FILE_UNREADABLE,
+        ) from None
+    if "simulated" in dataset.attrs and dataset.attrs["simulated"] != "unknown":
+        dataset.attrs["simulated"] = bool(dataset.attrs["simulated"])
+    return join_complex(dataset)
+
+
+def _check_hdf5(path: Path) -> None:
+    """Raise DataError if arrays lie in other files or are too large, before anything is read. Raises OSError."""
+    import h5py
+
+    sizes: list[int] = []
+    external: list[str] = []
+    with h5py.File(path, "r") as file:
+
+        def check(name: str) -> None:  # called by HDF5, must not raise
+            outside = isinstance(file.get(name, getlink=True), h5py.ExternalLink)
+            found = None if outside else file.get(name)
+            if isinstance(found, h5py.Dataset):
+                outside = bool(found.external) or found.is_virtual
+                sizes.append((found.size or 0) * found.dtype.itemsize)
+            if outside:
+                external.append(name)
+
+        file.visit_links(check)
+    if external:
+        raise DataError(
+            f"{path}: {external[0]} lies in another file",
+            "it was not written by this program",
+            code=ErrorCode.PATH_OUTSIDE,
+        )
+    if sum(sizes) > MAX_BYTES:
+        raise DataError(
+            f"{path}: its arrays take {sum(sizes)} bytes, more than the limit of {MAX_BYTES} bytes",
+            "it was not written by this program, or is damaged",
+            "export the products again",
+            code=ErrorCode.FILE_TOO_LARGE,
+        )
 
 
 def table_figures(scan: ProcessedScan) -> list[Figure]:

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from polysight.materials import PATCHES, Labels, read_labels
-from polysight.products.files import (
+from polysight.products.processed import (
     FINISHED,
     IMAGE,
     LABELS,
@@ -27,9 +27,10 @@ from polysight.products.files import (
     QUALITY,
     REPORT,
     SCAN,
+    ProcessedScan,
+    raw_dropped,
     write_atomically,
 )
-from polysight.products.processed import ProcessedScan, raw_dropped
 from polysight.store import is_source, sync_folder
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError

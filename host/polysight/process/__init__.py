@@ -6,10 +6,17 @@ the reduced samples in the scan folder, so that images can be formed again witho
 on the result; `save_images` and `save_materials` write the products. `polysight/pipeline.py` calls them in this order.
 """
 
-from polysight.process.inputs import NO_INPUTS, Inputs, boxes_as_patches, load_classifier, why_unnamed
-from polysight.process.judge import judge
-from polysight.process.parallel import cores, map_boards, map_rows
-from polysight.process.quality import Quality
+from polysight.process.inputs import (
+    NO_INPUTS,
+    Inputs,
+    boxes_as_patches,
+    cores,
+    load_classifier,
+    map_boards,
+    map_rows,
+    why_unnamed,
+)
+from polysight.process.quality import Quality, judge
 from polysight.process.samples import KeptSamples, Use
 from polysight.process.save import (
     Findings,

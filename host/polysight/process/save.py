@@ -22,8 +22,7 @@ from polysight.materials import (
     pixel_accuracy,
 )
 from polysight.polarimetry import with_ratio
-from polysight.process.judge import error_budget, recording_verdict
-from polysight.process.quality import Quality
+from polysight.process.quality import Quality, error_budget, recording_verdict
 from polysight.products import (
     IMAGE,
     LABELS,

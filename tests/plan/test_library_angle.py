@@ -16,7 +16,7 @@ def test_a_library_with_another_angle_is_a_warning(rig, distance_mm, known):
     angle = incidence_deg(moved, moved.receivers[0])
     warnings = [w for w in forecast(moved).warnings if w.topic == "library"]
     finding = check_library(context_of(moved))
-    assert (not warnings, finding.verdict) == (known, "ok" if known else "warning")
+    assert (not warnings, finding.level) == (known, "ok" if known else "warning")
     assert finding.facts["incidence_deg"] == pytest.approx(angle)
     for text in [finding.found, *(w.text for w in warnings)]:
         assert f"{angle:.1f} degrees" in text

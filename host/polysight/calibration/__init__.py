@@ -6,14 +6,19 @@ dated calibration file. The rig file names the files that apply; a new scan gets
 filters and the metal reference.
 """
 
-from polysight.calibration.direct_signal import (
+from polysight.calibration.estimates import (
     FULL_SCALE,
     DirectSignal,
+    Prior,
     band_hz,
     find_direct,
     fit_filter,
+    fit_places,
     fit_start,
     jitter_hz,
+    load_echoes,
+    places_file,
+    read_target,
     unwrapped,
 )
 from polysight.calibration.files import (
@@ -33,7 +38,6 @@ from polysight.calibration.files import (
     write_calibration,
     write_metal,
 )
-from polysight.calibration.places import Prior, fit_places, load_echoes, places_file, read_target
 
 __all__ = [
     "FULL_SCALE",

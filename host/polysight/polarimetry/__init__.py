@@ -22,13 +22,16 @@ from polysight.polarimetry.calibrate import (
     with_ratio,
 )
 from polysight.polarimetry.fresnel import (
+    Incidence,
+    IncidenceChoice,
     brewster_angle_rad,
     fresnel,
+    incidence_choice,
     multilayer,
     permittivity_from_ratio,
     ratio_from_permittivity,
+    specular_incidence_rad,
 )
-from polysight.polarimetry.incidence import Incidence, IncidenceChoice, incidence_choice, specular_incidence_rad
 
 __all__ = [
     "Incidence",

@@ -7,9 +7,9 @@ import pytest
 from tests.support.drawn_files import Errors, Material, write_labels
 from tests.support.refusals import refused
 
-from polysight.materials.published import (
+from polysight.materials.train import (
     ORIENTATIONS,
-    PIXELS,
+    PUBLISHED_PIXELS,
     angle_in_text,
     entries_of_boxes,
     image_orientation,
@@ -43,7 +43,7 @@ def test_boxes_give_the_materials_ratios_relative_to_metal(tmp_path, upside_down
         true = 1.0 if eps is None else complex(ratio_from_permittivity(eps, np.radians(60.0)))
         assert np.median(e.p.real) + 1j * np.median(e.p.imag) == pytest.approx(true, rel=0.05)
         assert (e.scan, e.incidence_deg, e.reference, e.simulated) == ("scan_7", 60.0, "Copper plate", True)
-        assert e.h.size == PIXELS
+        assert e.h.size == PUBLISHED_PIXELS
 
 
 @pytest.mark.parametrize("how", list(ORIENTATIONS))

@@ -9,7 +9,7 @@ from tests.support.published_files import write_materials
 from tests.support.refusals import refused
 
 from polysight.materials import Entry
-from polysight.materials.published import read_material, read_materials, read_pickle
+from polysight.materials.train import read_material, read_materials, read_pickle
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 

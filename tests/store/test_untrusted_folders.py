@@ -23,8 +23,8 @@ from polysight.capture.row_files import PACKETS, RUN, write_durably
 from polysight.cli.main import main
 from polysight.materials.labels import read_labels, read_truth
 from polysight.materials.library import Library
-from polysight.materials.published import read_material
 from polysight.materials.result import read_patches
+from polysight.materials.train import read_material
 from polysight.products import ProcessedScan
 from polysight.products.exports import read_netcdf
 from polysight.products.folder import making_products

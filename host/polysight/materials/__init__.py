@@ -5,7 +5,7 @@ returns a `MaterialsResult`. On the way: `segment.py` finds patches, `measure.py
 them, `inversion.py` solves for all permittivities and the rig's errors together, `classify.py` names patches by a
 `Library`, with the materials' distributions of `discriminant.py`. `sub_bands.py` and `layers.py` fit thin layers.
 `make_library` makes a library of scans, `fit_concentration` a line through solutions. `labels.py` reads boxes with
-names and true plates, `published.py` the published data set.
+names and true plates, `train.py` the published data set.
 """
 
 from polysight.materials.analyse import (
@@ -27,12 +27,6 @@ from polysight.materials.classify import (
     NamedPatch,
     PatchName,
     classifier_sentence,
-)
-from polysight.materials.concentration import (
-    ConcentrationResult,
-    concentrations,
-    fit_concentration,
-    polarisation_angle_rad,
 )
 from polysight.materials.discriminant import REJECTED
 from polysight.materials.labels import (
@@ -72,16 +66,6 @@ from polysight.materials.library import (
     feature_matrix,
 )
 from polysight.materials.measure import NOT_PASSIVE, Permittivity, estimate_permittivity, format_permittivity
-from polysight.materials.published import (
-    LabelledScan,
-    angle_in_text,
-    entries_of_boxes,
-    image_orientation,
-    label_folders,
-    read_labelled_scan,
-    read_material,
-    read_materials,
-)
 from polysight.materials.result import (
     PATCHES,
     MatchedPatch,
@@ -96,18 +80,30 @@ from polysight.materials.segment import Box, Segmentation, SegmentSettings, axis
 from polysight.materials.sub_bands import (
     AMPLITUDE_ERROR,
     LAYER_FORMS,
+    ConcentrationResult,
+    concentrations,
+    fit_concentration,
     fit_row,
     incidence_std_rad,
     layer_content,
     parse_layer,
+    polarisation_angle_rad,
     with_bands,
 )
 from polysight.materials.train import (
+    LabelledScan,
     Score,
     TrainingScan,
+    angle_in_text,
     calibration_error,
+    entries_of_boxes,
     fit_library,
+    image_orientation,
+    label_folders,
     make_library,
+    read_labelled_scan,
+    read_material,
+    read_materials,
     score,
     score_unseen_materials,
 )

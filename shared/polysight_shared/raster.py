@@ -23,6 +23,8 @@ WIDTH_US = (0.025, 4.0)
 WIDTH_TEXT = f"{WIDTH_US[0]:g}..{WIDTH_US[1]:g} us"
 MIN_PERIOD_NS = us_to_ns(MIN_PERIOD_US)
 MIN_WIDTH_NS, MAX_WIDTH_NS = map(us_to_ns, WIDTH_US)
+_Points = Annotated[int, msgspec.Meta(ge=1, lt=100_000)]
+_Motion = Annotated[float, msgspec.Meta(ge=0.001, le=1e6)]
 _Steps = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
 _Offset = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # also refuses NaN and infinities
 _PLACEMENT_KEYS = ("steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2")
@@ -40,7 +42,7 @@ class Burst(Section, frozen=True):
     period_us: Positive
     width_us: Positive = 1.0
     chirps: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
-    chirp_us: Annotated[float, msgspec.Meta(ge=0)] = 0.0
+    chirp_us: NonNegative = 0.0
 
     def __post_init__(self) -> None:
         require(
@@ -81,8 +83,8 @@ class Burst(Section, frozen=True):
 class Grid(Section, frozen=True):
     """Serpentine raster of stage positions."""
 
-    columns: Count
-    rows: Count
+    columns: _Points
+    rows: _Points
     step_x_mm: Positive
     step_y_mm: Positive
 
@@ -92,10 +94,10 @@ class Stage(Section, frozen=True):
 
     port: str
     baud: Count = 115200
-    steps_per_mm: Positive = 200.0
-    speed_mm_s: Positive = 20.0
-    travel_speed_mm_s: Positive = 40.0
-    accel_mm_s2: Positive = 200.0
+    steps_per_mm: _Motion = 200.0
+    speed_mm_s: _Motion = 20.0
+    travel_speed_mm_s: _Motion = 40.0
+    accel_mm_s2: _Motion = 200.0
     heartbeat_ms: Count = 500
     trigger_width_us: Count = 20
     travel_x_mm: Positive = 800.0

@@ -19,9 +19,10 @@ from polysight_shared.files import read_bounded
 _MAX_BYTES = 64 << 20
 _RIG_KEYS = "instrument.toml in the repository explains every key"
 T = TypeVar("T")
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NonNegative = Annotated[float, msgspec.Meta(ge=0)]
-Count = Annotated[int, msgspec.Meta(ge=1)]
+# The upper limits only refuse infinities and typing errors.
+Positive = Annotated[float, msgspec.Meta(gt=0, le=1e15)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0, le=1e15)]
+Count = Annotated[int, msgspec.Meta(ge=1, le=1_000_000_000)]
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -18,6 +18,17 @@ from polysight_simulators.process import command_line, exit_status_of
 from polysight_simulators.scene import apply_scene, load_scene, simulate
 
 
+def _count_from_zero(text: str) -> int:
+    """Parse a whole number of at least 0, of 63 bits. Raises ArgumentTypeError."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value < 1 << 63:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number, 0 or more")
+    return value
+
+
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `simulate`."""
     parser.add_argument("scene", type=Path, help="scene file (docs/spec/scene-file.md)")
@@ -25,11 +36,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
     layouts = ("own", "authors")
     parser.add_argument("--layout", choices=layouts, default="own", help="scan folder, or the published data set's")
-    parser.add_argument("--seed", type=int, default=None, help="instead of the scene's seed")
+    parser.add_argument("--seed", type=_count_from_zero, default=None, help="instead of the scene's seed")
     parser.add_argument("--columns", action="store_true", help="authors' layout: scanned column by column")
     parser.add_argument("--absent", action="store_true", help="authors' layout: lost packets are absent, not zeros")
     text = "use another set of specimens, number N (scene seed + 1000 N)"
-    parser.add_argument("--specimens", type=int, default=0, metavar="N", help=text)
+    parser.add_argument("--specimens", type=_count_from_zero, default=0, metavar="N", help=text)
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
 

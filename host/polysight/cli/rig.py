@@ -18,6 +18,7 @@ from polysight.cli.options import (
     add_json_option,
     add_material_options,
     count,
+    count_from_zero,
     material_settings,
     number,
     positive,
@@ -482,7 +483,7 @@ def _add_simulated(add: Add) -> None:
         default="own",
         help="a scan folder (default), or unsynced/<scan> as the paper's authors publish it",
     )
-    sub.add_argument("--seed", type=int, help="noise seed (default: the scene's)")
+    sub.add_argument("--seed", type=count_from_zero, help="noise seed (default: the scene's)")
     add_config_option(sub, shipped=True)
 
     sub = add(

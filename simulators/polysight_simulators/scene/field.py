@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from polysight_shared.config import Board, Instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.raster import mean_burst_travel_mm
 from polysight_shared.tables import to_builtins
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -100,6 +100,10 @@ class Axis:
         return int(np.ceil((self.high_u - self.low_u) / self.step * OVERSAMPLING)) + TAPS + 1
 
 
+# About 24 arrays of these points are in memory: 1.6 GB in all. A scene as wide as the stage (0.8 x 0.5 m) has 0.6e6.
+MAX_KERNEL_POINTS = 4_000_000
+
+
 def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -> tuple[Axis, Axis]:
     """Return extent and pitch in x and y from the extent of the scene and the steepest phase of the kernel.
 
@@ -133,6 +137,14 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
         step = min(np.pi / (1.1 * steepest + 6 * np.pi / FADE_M), 4e-3)
         points = int(scipy.fft.next_fast_len(int(np.ceil((span[3] - span[2] + 2 * FADE_M) / step)) + 1) or 0)
         axes.append(Axis(span[0], span[1], span[2], span[3], step, points))
+    if axes[0].points * axes[1].points > MAX_KERNEL_POINTS:
+        width_m, height_m = (axis.high_w - axis.low_w for axis in axes)
+        raise ConfigError(
+            f"scene {scene.name}: plates, points and grid extend over {width_m:.2f} x {height_m:.2f} m",
+            "the simulation of such a field needs more memory than computers have",
+            "move plates and points nearer to the image centre, or narrow the grid",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
     return axes[0], axes[1]
 
 

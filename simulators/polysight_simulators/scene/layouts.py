@@ -68,8 +68,8 @@ def blank(payload: NDArray[np.int16], gaps: Gaps) -> bytes:
     return bytes(raw)
 
 
-def new_folder(path: Path) -> None:
-    """Create an empty folder. Raises DataError if it is not empty."""
+def require_empty(path: Path) -> None:
+    """Raise DataError if this folder has files."""
     if path.exists() and any(path.iterdir()):
         raise DataError(
             f"{path}: the folder is not empty",
@@ -77,6 +77,11 @@ def new_folder(path: Path) -> None:
             "choose another --out, or empty it",
             code=ErrorCode.FILE_EXISTS,
         )
+
+
+def new_folder(path: Path) -> None:
+    """Create an empty folder. Raises DataError if it is not empty."""
+    require_empty(path)
     path.mkdir(parents=True, exist_ok=True)
 
 
@@ -110,7 +115,7 @@ class OwnLayout:
     """Writer of a scan folder: manifest.jsonl, events.msgpack, raw/<board>/<row>.bin and .idx."""
 
     def __init__(self, path: Path, rig: Instrument, plan: RasterPlan, scan_id: str, started_utc: str) -> None:
-        self._path = path
+        self.folder = path
         self._rig = rig
         self._plan = plan
         self._scan_id = scan_id
@@ -123,7 +128,7 @@ class OwnLayout:
 
     def start(self) -> None:
         """Create the folder, start manifest and events. Raises DataError if it is not empty."""
-        new_folder(self._path)
+        new_folder(self.folder)
         self._fact(
             "scan_started",
             format=1,
@@ -133,7 +138,7 @@ class OwnLayout:
             instrument=to_builtins(self._rig),
             plan=to_builtins(self._plan),
             versions=versions(),
-            **_calibration(self._rig, self._path),
+            **_calibration(self._rig, self.folder),
         )
         self._event(RunStarted(plan=self._plan, **self._stamp()))
 
@@ -144,9 +149,9 @@ class OwnLayout:
         for name, payload in payloads.items():
             raw = blank(payload, gaps[name])
             file = Path("raw") / name / f"{row.index:04d}.bin"
-            (self._path / file).parent.mkdir(parents=True, exist_ok=True)
-            with named(self._path / file):
-                (self._path / file).write_bytes(raw)
+            (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
+            with named(self.folder / file):
+                (self.folder / file).write_bytes(raw)
             missing = sum(stop - start for start, stop in gaps[name])
             partial = {
                 f for a, b in gaps[name] for f in range(a // self._rig.frame_bytes, -(-b // self._rig.frame_bytes))
@@ -157,7 +162,7 @@ class OwnLayout:
                 "missing": gaps[name],
             }
             index = _index(facts)
-            (self._path / file.with_suffix(".idx")).write_bytes(index)
+            (self.folder / file.with_suffix(".idx")).write_bytes(index)
             boards[name] = {
                 "file": str(file),
                 "bytes": len(raw),
@@ -183,14 +188,14 @@ class OwnLayout:
         plain = json.dumps(record, sort_keys=True, separators=(",", ":"))
         record["crc"] = f"{crc32(plain.encode()):08x}"
         line = json.dumps(record, sort_keys=True, separators=(",", ":"))
-        path = self._path / "manifest.jsonl"
+        path = self.folder / "manifest.jsonl"
         with named(path), path.open("a", encoding="utf-8") as f:
             f.write(line + "\n")
         self._lines = self._lines + 1
         self._digest = sha256(line.encode()).hexdigest()[:16]
 
     def _event(self, *events: AnyEvent) -> None:
-        path = self._path / "events.msgpack"
+        path = self.folder / "events.msgpack"
         with named(path), path.open("ab") as f:
             f.write(b"".join(map(pack_with_crc, events)))
 

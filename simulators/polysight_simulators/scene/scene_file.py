@@ -63,15 +63,31 @@ def _normal_values() -> NDArray[np.float32]:
     return (middles / middles.std()).astype(np.float32)
 
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NonNegative = Annotated[float, msgspec.Meta(ge=0)]
-Fraction = Annotated[float, msgspec.Meta(ge=0, le=0.5)]
-Pair = tuple[float, float]
+# Every number has both limits: they also refuse NaN and infinities, and keep a scan's size in proportion.
+Seed = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
+Millimetres = Annotated[float, msgspec.Meta(ge=-2000, le=2000)]
+Size = Annotated[float, msgspec.Meta(ge=0.01, le=2000)]
+Factor = Annotated[float, msgspec.Meta(ge=1e-6, le=1e6)]
+Permittivity = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
+Amplitude = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
+Angle = Annotated[float, msgspec.Meta(ge=-360, le=360)]
+Nanoseconds = Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)]
+Delay = Annotated[float, msgspec.Meta(ge=0, le=1e5)]
+PartsPerMillion = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
+Hertz = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+Microseconds = Annotated[float, msgspec.Meta(ge=0.001, le=1e6)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=0.5)]
 Degrees = Annotated[float, msgspec.Meta(ge=-10, le=10)]  # of tilt: the fast field is checked up to 2
 Tilt = tuple[Degrees, Degrees]
 Height = Annotated[float, msgspec.Meta(ge=-50, le=50)]
+Gain = Annotated[float, msgspec.Meta(ge=-200, le=200)]
+GainSpread = Annotated[float, msgspec.Meta(ge=0, le=100)]
 Decibels = Annotated[float, msgspec.Meta(ge=-40, le=200)]
 Spread = Annotated[float, msgspec.Meta(ge=0, le=2)]
+Leakage = tuple[Annotated[float, msgspec.Meta(ge=-10, le=10)], Annotated[float, msgspec.Meta(ge=-10, le=10)]]
+Pair = tuple[float, float]
+MAX_FACETS = 100_000
+"""Largest number of facets of a rough plate."""
 _OVERRIDES: dict[str, type] = {"grid": Grid, "burst": Burst, "image": Image, "stage": Stage}
 
 
@@ -92,8 +108,8 @@ def _check_permittivity(pair: Pair) -> None:
 class Layer(_Table, frozen=True):
     """A layer of a plate; without `thickness_mm` a half space (only the last layer)."""
 
-    permittivity: Pair
-    thickness_mm: Positive | None = None
+    permittivity: tuple[Permittivity, Permittivity]
+    thickness_mm: Size | None = None
     name: str = ""
 
     def __post_init__(self) -> None:
@@ -119,17 +135,17 @@ class Plate(_Table, frozen=True):
     """
 
     name: str
-    centre_mm: Pair
-    size_mm: tuple[Positive, Positive]
-    permittivity: Pair | None = None
+    centre_mm: tuple[Millimetres, Millimetres]
+    size_mm: tuple[Size, Size]
+    permittivity: tuple[Permittivity, Permittivity] | None = None
     metal: bool = False
-    thickness_mm: Positive | None = None
+    thickness_mm: Size | None = None
     layers: tuple[Layer, ...] = ()
-    strips_deg: float | None = None
+    strips_deg: Angle | None = None
     tilt_deg: Tilt = (0.0, 0.0)
     height_mm: Height = 0.0
     rough_mm: Annotated[float, msgspec.Meta(ge=0, le=5)] = 0.0
-    rough_length_mm: Positive = 6.0
+    rough_length_mm: Size = 6.0
 
     def __post_init__(self) -> None:
         _require(self.strips_deg is None or self.metal, "strips_deg goes with metal = true")
@@ -145,6 +161,19 @@ class Plate(_Table, frozen=True):
         )
         if self.permittivity is not None:
             _check_permittivity(self.permittivity)
+        columns, rows = self.facet_counts
+        _require(
+            columns * rows <= MAX_FACETS,
+            f"size_mm, rough_mm and rough_length_mm give {columns} x {rows} facets; at most {MAX_FACETS} are simulated",
+        )
+
+    @property
+    def facet_counts(self) -> tuple[int, int]:
+        """Facets along x and y, with sides near `rough_length_mm`; one for a smooth plate."""
+        if not self.rough_mm:
+            return 1, 1
+        columns, rows = (max(1, round(side / self.rough_length_mm)) for side in self.size_mm)
+        return columns, rows
 
     @property
     def stack(self) -> tuple[Layer, ...]:
@@ -161,46 +190,54 @@ class Point(_Table, frozen=True):
     from the radars.
     """
 
-    position_mm: Pair
-    amplitude: Pair = (1.0, 0.0)
+    position_mm: tuple[Millimetres, Millimetres]
+    amplitude: tuple[Amplitude, Amplitude] = (1.0, 0.0)
     name: str = ""
     height_mm: Height = 0.0
 
 
-class PerRole(_Table, frozen=True):
-    """One number per role of the boards."""
+class Crystals(_Table, frozen=True):
+    """Errors of the boards' crystals by role, ppm."""
 
-    transmit: float = 0.0
-    receive_h: float = 0.0
-    receive_v: float = 0.0
+    transmit: PartsPerMillion = 0.0
+    receive_h: PartsPerMillion = 0.0
+    receive_v: PartsPerMillion = 0.0
+
+
+class Skews(_Table, frozen=True):
+    """Constant later starts of the boards by role, ns."""
+
+    transmit: Nanoseconds = 0.0
+    receive_h: Nanoseconds = 0.0
+    receive_v: Nanoseconds = 0.0
 
 
 class Disturbances(_Table, frozen=True):
     """Disturbances of the rig. Defaults are those of the published rig; OFF switches all off."""
 
-    sync_uncertainty_ns: NonNegative = 5.0
-    sync_latency_ns: NonNegative = 160.0
-    crystal_ppm: PerRole = PerRole(0.0, 0.8, -1.1)
-    if_offset_hz: float = 870e3
+    sync_uncertainty_ns: Delay = 5.0
+    sync_latency_ns: Delay = 160.0
+    crystal_ppm: Crystals = Crystals(0.0, 0.8, -1.1)
+    if_offset_hz: Hertz = 870e3
     random_phase: bool = True
-    bend_hz: float = 300e3
-    bend_us: Positive = 20.0
-    ripple_hz: float = 3e3
-    ripple_us: Positive = 5.0
+    bend_hz: Hertz = 300e3
+    bend_us: Microseconds = 20.0
+    ripple_hz: Hertz = 3e3
+    ripple_us: Microseconds = 5.0
     hpf: bool = True
-    rx_gain_spread_db: NonNegative = 1.0
-    rx_phase_spread_deg: NonNegative = 20.0
-    hv_gain_db: float = 1.5
-    leakage_h: Pair = (0.05, 0.0)
-    leakage_v: Pair = (0.05, 0.0)
+    rx_gain_spread_db: GainSpread = 1.0
+    rx_phase_spread_deg: Annotated[float, msgspec.Meta(ge=0, le=360)] = 20.0
+    hv_gain_db: Gain = 1.5
+    leakage_h: Leakage = (0.05, 0.0)
+    leakage_v: Leakage = (0.05, 0.0)
     burst_motion: bool = True
-    direct_snr_db: float | None = 5.5
-    adc_full_scale: Positive = 64.0
-    packet_loss: Fraction = 0.0
-    backlash_mm: float = 0.0
-    sync_skew_ns: PerRole = PerRole()
+    direct_snr_db: Gain | None = 5.5
+    adc_full_scale: Factor = 64.0
+    packet_loss: Share = 0.0
+    backlash_mm: Height = 0.0
+    sync_skew_ns: Skews = Skews()
     direct_loss_db: Decibels | Literal["absent"] = 0.0
-    leakage_measured: NonNegative | None = None
+    leakage_measured: Annotated[float, msgspec.Meta(ge=0, le=10)] | None = None
 
     @property
     def direct_gain(self) -> float:
@@ -245,9 +282,9 @@ class Scene(_Table, frozen=True):
     """
 
     name: str
-    seed: int = 1
-    object_distance_mm: Positive | None = None
-    object_gain: Positive = 1.35
+    seed: Seed = 1
+    object_distance_mm: Size | None = None
+    object_gain: Factor = 1.35
     plane_shift_mm: Height = 0.0
     plane_tilt_deg: Tilt = (0.0, 0.0)
     specimen_spread: tuple[Spread, Spread] = (0.0, 0.0)
@@ -415,7 +452,7 @@ def facets(plate: Plate, index: int, seed: int) -> Facets:
 
     A whole number of facets fits the plate, with sides near `rough_length_mm`.
     """
-    n = [max(1, round(side / plate.rough_length_mm)) if plate.rough_mm else 1 for side in plate.size_mm]
+    n = plate.facet_counts
     sx, sy = (side / 1e3 / count for side, count in zip(plate.size_mm, n, strict=True))
     x, y = ((np.arange(count) - (count - 1) / 2) * side for count, side in zip(n, (sx, sy), strict=True))
     height = np.zeros((n[1], n[0]))
@@ -464,6 +501,6 @@ def _vary_layer(layer: Layer, scene: Scene, rng: np.random.Generator) -> Layer:
 
 
 def _vary(nominal: Pair, spread: Pair, rng: np.random.Generator) -> Pair:
-    real, loss = rng.standard_normal(2)
+    real, loss = rng.standard_normal(2).tolist()  # plain numbers, which JSON can write
     width = math.sqrt(math.log1p(spread[1] ** 2))  # the log-normal factor has mean 1 and standard deviation spread[1]
     return max(1.0, nominal[0] * (1 + spread[0] * real)), nominal[1] * math.exp(width * loss - width**2 / 2)

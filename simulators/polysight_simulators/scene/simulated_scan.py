@@ -15,6 +15,8 @@ import tomli_w
 from numpy.typing import NDArray
 
 from polysight_shared.config import Board, Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
 from polysight_shared.geometry import Vector, incidence_deg, specular_midpoint_m
 from polysight_shared.raster import Grid, RasterPlan, Row, check_burst_fits, mean_burst_travel_mm, plan_raster
 from polysight_shared.tables import to_builtins
@@ -25,12 +27,15 @@ from polysight_simulators.scene.layouts import (
     OwnLayout,
     Skipped,
     packet_payload_bytes,
+    require_empty,
     versions,
 )
 from polysight_simulators.scene.radar import SimulatedRig
 from polysight_simulators.scene.scene_file import Pair, Plate, Scene, apply_scene, draw_specimens, stream_key
 
 Progress = Callable[[int, int], None]
+# Six times this is in memory. The published rows have 10 MB.
+MAX_ROW_BYTES = 100_000_000
 
 
 def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
@@ -165,26 +170,56 @@ def simulate(
     plan = _plan(rig, by_columns)
     started_s = time.time() if started_s is None else started_s
     scan_id = "".join(c if c.isalnum() else "-" for c in scene.name).strip("-") or "scene"
+    facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id}
     if layout == "own":
         stamp = datetime.fromtimestamp(started_s, UTC).isoformat(timespec="seconds")
-        _write_rows(OwnLayout(out, rig, plan, scan_id, stamp), radar, plan, rig.recorded, by_columns, progress)
-        folder = out
-    else:
-        writer = AuthorsLayout(out, rig, scan_id, started_s, zero_filling, by_columns, skipped)
-        _write_rows(writer, radar, plan, rig.boards, by_columns, progress)
-        folder = writer.folder
-        # The authors' files contain neither geometry nor filter nor leakage.
-        (folder / "instrument.toml").write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
-    facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id, "samples_clipped": radar.clipped}
-    (folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-    return folder
+        own = OwnLayout(out, rig, plan, scan_id, stamp)
+        return _write_scan(own, radar, plan, rig.recorded, by_columns, progress, facts)
+    authors = AuthorsLayout(out, rig, scan_id, started_s, zero_filling, by_columns, skipped)
+    _write_scan(authors, radar, plan, rig.boards, by_columns, progress, facts)
+    # The authors' files contain neither geometry nor filter nor leakage.
+    (authors.folder / "instrument.toml").write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
+    return authors.folder
+
+
+def _write_scan(
+    writer: OwnLayout | AuthorsLayout,
+    radar: SimulatedRig,
+    plan: RasterPlan,
+    boards: Sequence[Board],
+    by_columns: bool,
+    progress: Progress | None,
+    facts: dict[str, Any],
+) -> Path:
+    """Write a scan with its truth.json of these facts; return its folder."""
+    require_empty(writer.folder)
+    radar.prepare()  # before the first file: a scene that cannot be simulated leaves no folder
+    writer.start()
+    _write_rows(writer, radar, plan, boards, by_columns, progress)
+    content = {**facts, "samples_clipped": radar.clipped}
+    (writer.folder / "truth.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    writer.end()  # last: whatever ends the program before leaves an unfinished scan
+    return writer.folder
 
 
 def _plan(rig: Instrument, by_columns: bool) -> RasterPlan:
     """Return the plan of the rig's grid. Raises ConfigError if a burst does not end before the next point."""
     grid = _by_columns(rig.grid) if by_columns else rig.grid
     check_burst_fits(grid, rig.burst, rig.stage)
+    _check_row_size(rig, grid)
     return plan_raster(grid)
+
+
+def _check_row_size(rig: Instrument, grid: Grid) -> None:
+    """Raise ConfigError if a row does not fit in the memory."""
+    row_bytes = grid.columns * rig.burst.pulses * rig.frame_bytes
+    if row_bytes > MAX_ROW_BYTES:
+        raise ConfigError(
+            f"a row of {grid.columns} positions, each of {rig.burst}, has {row_bytes / 1e6:.0f} MB a board",
+            f"rows are simulated whole in memory, up to {MAX_ROW_BYTES / 1e6:.0f} MB a board",
+            "lower grid.columns, burst.pulses or burst.chirps",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
 
 
 def _write_rows(
@@ -196,7 +231,6 @@ def _write_rows(
     progress: Progress | None,
 ) -> None:
     """Write every row of the plan for these boards; `by_columns`: the stage runs along y."""
-    writer.start()
     for row in plan:
         x, y = row_offsets_mm(radar, row)
         x, y = (y, x) if by_columns else (x, y)
@@ -205,7 +239,6 @@ def _write_rows(
         writer.write_row(row, payloads, {b.name: lost_bytes(radar, b.name, row) for b in boards})
         if progress is not None:
             progress(row.index + 1, plan.rows)
-    writer.end()
 
 
 def _by_columns(grid: Grid) -> Grid:

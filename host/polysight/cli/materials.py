@@ -188,6 +188,9 @@ def _train(args: argparse.Namespace) -> int:
             code=ErrorCode.VALUES_CONFLICT,
         )
     if args.authors is not None:
+        from polysight.jobs.demo import require_package
+
+        require_package("polysight_papers", "papers")
         from polysight_papers.sensys2026.dataset import train_authors
 
         return train_authors(args.authors, args.config, args.out)

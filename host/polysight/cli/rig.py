@@ -428,8 +428,11 @@ def _simulate(args: argparse.Namespace) -> int:
 
 
 def _reproduce(args: argparse.Namespace) -> int:
+    from polysight.jobs.demo import require_package
+
     if args.config != packaged(RIG):
         load_instrument(args.config)  # refuse a wrong one now, not with the first item that needs it
+    require_package("polysight_papers", "papers")
     sys.stderr.write("polysight reproduce: starting\n")  # its figures' libraries take seconds to load
     sys.stderr.flush()
     if args.authors is not None:

@@ -5,6 +5,7 @@ The simulators are started as programs, never imported: nothing at run time depe
 
 from __future__ import annotations
 
+import importlib.util
 import selectors
 import shutil
 import signal
@@ -17,6 +18,7 @@ from pathlib import Path
 
 from polysight.results import NoResult
 from polysight_shared.config import load_instrument
+from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError
 
 _MARK = ".polysight-demo"
@@ -26,8 +28,26 @@ TIME_SCALE = 40.0
 """Simulated seconds per second: a row of 18 s takes about half a second."""
 
 
+def require_package(package: str, folder: str) -> None:
+    """Check that another package of this project is installed; the wheels can be installed singly.
+
+    Raises
+    ------
+    ConfigError
+        when it is missing, with the folder to install it from.
+    """
+    if importlib.util.find_spec(package) is None:
+        raise ConfigError(
+            f"the package {package} is not installed",
+            "this command needs it, and the host's wheel does not contain it",
+            f"pip install ./{folder}, or its wheel",
+            code=ErrorCode.PACKAGE_MISSING,
+        )
+
+
 def run_simulator(arguments: Sequence[str]) -> int:
-    """Run `python -m polysight_simulators ...` and return its exit status."""
+    """Run `python -m polysight_simulators ...` and return its exit status. Raises ConfigError if it is missing."""
+    require_package("polysight_simulators", "simulators")
     return subprocess.run([sys.executable, "-m", "polysight_simulators", *arguments], check=False).returncode
 
 
@@ -39,6 +59,7 @@ def check_scenes(scenes: Iterable[Path], config: Path) -> None:
     ConfigError
         naming the file, the key and the rule that is broken.
     """
+    require_package("polysight_simulators", "simulators")
     command = [sys.executable, "-m", "polysight_simulators", "check", *map(str, scenes), "--config", str(config)]
     checked = subprocess.run(command, capture_output=True, text=True, check=False)
     if checked.returncode != 0:
@@ -78,6 +99,7 @@ def simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) ->
     PolysightError
         when it does not start, with its own message; its logs are in `folder`/logs.
     """
+    require_package("polysight_simulators", "simulators")
     command = [sys.executable, "-m", "polysight_simulators.rig", "--config", str(config), "--scene", str(scene)]
     command += ["--dir", str(folder), "--time-scale", str(time_scale), "--with-pi", "--native"]
     rig = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)

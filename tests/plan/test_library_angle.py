@@ -18,6 +18,6 @@ def test_a_library_with_another_angle_is_a_warning(rig, distance_mm, known):
     finding = check_library(context_of(moved))
     assert (not warnings, finding.level) == (known, "ok" if known else "warning")
     assert finding.facts["incidence_deg"] == pytest.approx(angle)
-    for text in [finding.found, *(w.text for w in warnings)]:
+    for text in [finding.what, *(w.text for w in warnings)]:
         assert f"{angle:.1f} degrees" in text
     assert not any(w.refused for w in warnings)

@@ -21,7 +21,7 @@ from benchmarks.published import Synchroniser
 from polysight.capture.dca1000 import raw_words
 from polysight.imaging import ImageBuilder, backproject
 from polysight.imaging.geometry import Antennas, row_offsets_m
-from polysight.imaging.reduce import reduction, scene_gate_m
+from polysight.imaging.samples import reduction, scene_gate_m
 from polysight.sync.align import align_row
 from polysight.sync.direct_path import prepare, reference
 from polysight.sync.tone import estimate_tone

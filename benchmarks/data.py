@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.imaging.geometry import Antennas, image_grid, row_offsets_m
-from polysight.imaging.reduce import scene_gate_m
+from polysight.imaging.samples import scene_gate_m
 from polysight.store.source import RowData
 from polysight.sync.chain import SyncedRow
 from polysight_shared.config import Board, Instrument, load_instrument

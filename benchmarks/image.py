@@ -16,11 +16,9 @@ from benchmarks.data import as_synced, published, temporary, write_point_cube
 from benchmarks.measure import Line, Seconds, add_arguments, one_core, show, write
 from benchmarks.published import SETTINGS, form_image
 from polysight.imaging import ImageBuilder
-from polysight.imaging import lattice as kernels
-from polysight.imaging.aperture import Aperture, row_starts_m
-from polysight.imaging.geometry import Antennas, image_grid, scan_offsets_m
-from polysight.imaging.reduce import reduction, scene_gate_m
-from polysight.imaging.samples import choose_imager
+from polysight.imaging import spectral as kernels
+from polysight.imaging.geometry import Antennas, Aperture, image_grid, row_starts_m, scan_offsets_m
+from polysight.imaging.samples import choose_imager, reduction, scene_gate_m
 from polysight.imaging.spectral import IncrementalImager
 from polysight_shared.config import Board, Instrument
 from polysight_shared.raster import plan_raster

@@ -15,8 +15,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from benchmarks.measure import Seconds
-from polysight.imaging.aperture import Aperture
-from polysight.imaging.geometry import Antennas, ImageGrid
+from polysight.imaging.geometry import Antennas, Aperture, ImageGrid
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 OVERSAMPLING = 32

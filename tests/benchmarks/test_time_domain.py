@@ -8,8 +8,7 @@ from benchmarks.data import published
 from numpy.typing import NDArray
 
 from polysight.imaging import backproject, image_grid
-from polysight.imaging.aperture import Aperture
-from polysight.imaging.geometry import Antennas
+from polysight.imaging.geometry import Antennas, Aperture
 
 ROWS, COLUMNS, EVERY = 6, 7, 2
 

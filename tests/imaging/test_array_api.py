@@ -7,9 +7,8 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.imaging import backproject, project
-from polysight.imaging.aperture import Aperture
 from polysight.imaging.direct import DirectImager
-from polysight.imaging.geometry import Antennas, image_grid, scan_offsets_m
+from polysight.imaging.geometry import Antennas, Aperture, image_grid, scan_offsets_m
 from polysight.imaging.spectral import IncrementalImager, SpectralImager
 from polysight_shared.error_codes import ErrorCode
 

@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 
 from polysight.imaging import image_grid
-from polysight.imaging.aperture import Aperture, irregular
 from polysight.imaging.direct import DirectImager
-from polysight.imaging.geometry import Antennas, scan_offsets_m
-from polysight.imaging.lattice import forget
-from polysight.imaging.reduce import reduction, scene_gate_m
-from polysight.imaging.samples import choose_imager
-from polysight.imaging.spectral import IncrementalImager, SpectralImager
+from polysight.imaging.geometry import Antennas, Aperture, irregular, scan_offsets_m
+from polysight.imaging.samples import choose_imager, reduction, scene_gate_m
+from polysight.imaging.spectral import IncrementalImager, SpectralImager, forget
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 

@@ -10,8 +10,7 @@ from tests.support.refusals import refused
 
 from polysight.imaging import ImageBuilder, backproject, image_grid
 from polysight.imaging.geometry import Antennas, row_offsets_m
-from polysight.imaging.reduce import reduction, scene_gate_m
-from polysight.imaging.samples import mirror_samples
+from polysight.imaging.samples import mirror_samples, reduction, scene_gate_m
 from polysight.materials.layers import Spectrum
 from polysight.polarimetry import multilayer
 from polysight.sync import BoardSetup, synchronise_row

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.imaging.reduce import REACH, burst_filters, undo_burst_motion
+from polysight.imaging.samples import REACH, burst_filters, undo_burst_motion
 
 COUNT, MIDDLE = 61, slice(REACH, -REACH)
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from polysight.imaging.geometry import Antennas, image_grid
-from polysight.imaging.reduce import reduction, scene_gate_m
+from polysight.imaging.samples import reduction, scene_gate_m
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S as C
 

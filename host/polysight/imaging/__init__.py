@@ -8,7 +8,6 @@ row. `move_to_plane` estimates the plane of the plates and images on it, `focus_
 settings that the gains of an image depend on.
 """
 
-from polysight.imaging.aperture import Aperture, window_weights
 from polysight.imaging.builder import (
     AS_IN_RIG_FILE,
     TAPERS,
@@ -20,14 +19,20 @@ from polysight.imaging.builder import (
     sub_bands,
 )
 from polysight.imaging.direct import backproject, project
-from polysight.imaging.focus import Focus, focus_sweep
 from polysight.imaging.gain_conditions import ImagedWith
-from polysight.imaging.geometry import Antennas, ImageGrid, image_grid, row_offsets_m, scan_offsets_m
+from polysight.imaging.geometry import (
+    Antennas,
+    Aperture,
+    ImageGrid,
+    image_grid,
+    row_offsets_m,
+    scan_offsets_m,
+    window_weights,
+)
 from polysight.imaging.images import Image, Images, Mask, Rise, correct_tilt
-from polysight.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, move_to_plane
-from polysight.imaging.reduce import reduction, scene_gate_m
+from polysight.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, Focus, PlaneEstimate, focus_sweep, move_to_plane
 from polysight.imaging.resolution import PointResponse, imaging_facts, point_response
-from polysight.imaging.samples import ReducedRow
+from polysight.imaging.samples import ReducedRow, reduction, scene_gate_m
 
 __all__ = [
     "AS_IN_RIG_FILE",

@@ -14,11 +14,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.imaging.aperture import Window, window_weights
-from polysight.imaging.geometry import Antennas, image_grid
+from polysight.imaging.geometry import Antennas, Window, image_grid, window_weights
 from polysight.imaging.images import Illumination, Images, illumination_geometry
-from polysight.imaging.reduce import reduction, scene_gate_m
-from polysight.imaging.samples import BoardSamples, Image
+from polysight.imaging.samples import BoardSamples, Image, reduction, scene_gate_m
 from polysight.sync import SyncedRow
 from polysight_shared.config import Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode

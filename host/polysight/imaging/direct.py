@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from polysight.imaging.aperture import Aperture, device_of, namespace
-from polysight.imaging.geometry import excess_path_m, turn
+from polysight.imaging.geometry import Aperture, device_of, excess_path_m, namespace, turn
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 _CHUNK = 1 << 20  # products of position and voxel in memory

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.imaging.aperture import Aperture
 from polysight.imaging.builder import ImageBuilder
 from polysight.imaging.direct import DirectImager, backproject
-from polysight.imaging.geometry import ImageGrid
+from polysight.imaging.geometry import Aperture, ImageGrid
 from polysight.imaging.images import Images
 from polysight.imaging.samples import BoardSamples
 from polysight_shared.units import SPEED_OF_LIGHT_M_S

@@ -56,7 +56,7 @@ class Spectrum:
         """Return sub-bands of the linear part of a chirp: windows that overlap by half, as in Welch's method.
 
         One band is the whole linear part under the image's own window
-        (:func:`polysight.imaging.reduce.reduction`).
+        (:func:`polysight.imaging.samples.reduction`).
         """
         first, last = chirp.linear_samples
         length = 2 * (last - first) / (bands + 1)

@@ -69,7 +69,7 @@ class SyncedRow:
         than two good chirps; None: unknown.
     turn
         float64 [position]: phase change, radians, of the whole signal (direct path and echoes) from one position to
-        the next. Burst alignment removes it within a burst, see `imaging.reduce.undo_burst_motion`. None: not aligned.
+        the next. Burst alignment removes it within a burst, see `imaging.samples.undo_burst_motion`. None: not aligned.
     errors
         Error samples of the row after each stage (`residuals.errors`), {stage: float64 [3, n]}.
     """

@@ -9,11 +9,10 @@ otherwise in NumPy with equal results. `estimate_backlash` measures the backlash
 
 from polysight.sync.align import AlignedRow, align_row, whole_blocks
 from polysight.sync.backlash import echo_of_row, estimate_backlash, object_filter
-from polysight.sync.chain import BoardSetup, SyncedRow, synchronise_row
+from polysight.sync.chain import STAGES, BoardSetup, SyncedRow, noise_power, synchronise_row
 from polysight.sync.direct_path import reference
 from polysight.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
 from polysight.sync.numpy_passes import FOLD
-from polysight.sync.residuals import STAGES, noise_power
 from polysight.sync.rows import RowSynchroniser
 from polysight.sync.tone import cis
 

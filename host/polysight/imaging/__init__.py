@@ -19,7 +19,6 @@ from polysight.imaging.builder import (
     sub_bands,
 )
 from polysight.imaging.direct import backproject, project
-from polysight.imaging.gain_conditions import ImagedWith
 from polysight.imaging.geometry import (
     Antennas,
     Aperture,
@@ -29,7 +28,7 @@ from polysight.imaging.geometry import (
     scan_offsets_m,
     window_weights,
 )
-from polysight.imaging.images import Image, Images, Mask, Rise, correct_tilt
+from polysight.imaging.images import Image, ImagedWith, Images, Mask, Rise, correct_tilt
 from polysight.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, Focus, PlaneEstimate, focus_sweep, move_to_plane
 from polysight.imaging.resolution import PointResponse, imaging_facts, point_response
 from polysight.imaging.samples import ReducedRow, reduction, scene_gate_m

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from polysight.results.verdict import (
+from polysight.results.quality import (
     Coverage,
     NoResult,
     Verdict,

@@ -27,16 +27,14 @@ from polysight.results.materials import (
 from polysight.results.quality import (
     Backlash,
     BoardQuality,
+    Coverage,
     FrequencyRange,
+    NoResult,
     RawDropped,
     Residual,
     RxGain,
     ScanFacts,
     ScanQuality,
-)
-from polysight.results.verdict import (
-    Coverage,
-    NoResult,
     Verdict,
     brightness_reasons,
     direct_path_reasons,

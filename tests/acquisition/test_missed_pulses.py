@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.support.acquisition.arrival_model import MS, PAYLOAD, US, Load, pulse_times, receive
 
 from polysight.acquisition.missed_pulses import PlacedFrames, describe, place_frames, rewrite_row, slipped_frames
-from polysight.capture.row_files import read_index, write_index
+from polysight.capture.placement import read_index, write_index
 
 FRAME = 4096
 BURSTS, PULSES = 12, 16

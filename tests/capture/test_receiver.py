@@ -21,8 +21,8 @@ from tests.support.refusals import refused
 from polysight.acquisition.capture_rig import record_ended
 from polysight.capture.dca1000 import Status
 from polysight.capture.network import BatchReceiver, bind_udp
+from polysight.capture.placement import read_index
 from polysight.capture.receiver import Progress, ReceiverProcess
-from polysight.capture.row_files import read_index
 from polysight_shared.config import Board
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError

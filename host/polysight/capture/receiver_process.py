@@ -22,10 +22,18 @@ from numpy.typing import NDArray
 from polysight.capture import receiver as messages
 from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, Status
 from polysight.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
-from polysight.capture.placement import Preview, place_record, preview
+from polysight.capture.placement import (
+    PACKETS,
+    Evidence,
+    Preview,
+    Segment,
+    place_record,
+    preview,
+    write_index,
+    write_packets,
+)
 from polysight.capture.receiver import take_core, take_priority
 from polysight.capture.record_search import PacketLog, Past
-from polysight.capture.row_files import PACKETS, Evidence, Segment, write_index, write_packets
 from polysight_shared.errors import DeviceError, PolysightError
 
 _MAX_BATCHES = 64  # batches fetched before requests are checked again

@@ -14,6 +14,7 @@ from polysight.results.quality import (
     leakage_reasons,
     level_reasons,
     metal_reasons,
+    passivity_reasons,
     plane_reasons,
     read_verdict,
     reason,
@@ -173,3 +174,122 @@ def test_every_reason_says_what_why_and_what_to_do():
     for r in reasons:
         assert all((r.what, r.why, r.do))
         assert not any(text.endswith(".") for text in (r.what, r.do))
+
+
+def rows(recorded, masked=0.0):
+    return recording_reasons(Coverage(1000, recorded, 1000, recorded), masked)
+
+
+def path(snr_db=5.5, phase_rad=0.004, share=1.0):
+    return direct_path_reasons("RH", snr_db, phase_rad, share)
+
+
+def plane(offset_mm=0.0, tilt_deg=(0.0, 0.0)):
+    return plane_reasons(True, offset_mm, tilt_deg, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("judge", "inside", "outside", "levels"),
+    [
+        (rows, 1000, 999, ("good", "care")),
+        (rows, 500, 499, ("care", "none")),
+        (lambda masked: rows(1000, masked), 0.005, 0.0051, ("good", "care")),
+        (lambda masked: rows(1000, masked), 0.5, 0.501, ("care", "none")),
+        (path, 0.0, -0.01, ("good", "care")),
+        (path, -14.0, -14.01, ("care", "none")),
+        (lambda phase: path(phase_rad=phase), 0.05, 0.0501, ("good", "care")),
+        (lambda share: path(share=share), 0.5, 0.499, ("good", "none")),
+        (lambda level: level_reasons({"H": level}), 0.4, 0.399, ("good", "care")),
+        (lambda level: level_reasons({"H": level}), 3.0, 3.01, ("good", "care")),
+        (plane, 3.0, 3.01, ("good", "care")),
+        (plane, -3.0, -3.01, ("good", "care")),
+        (plane, 13.0, 13.01, ("care", "none")),
+        (plane, -13.0, -13.01, ("care", "none")),
+        (lambda tilt: plane(0.0, (0.0, tilt)), 0.5, 0.501, ("good", "care")),
+        (lambda tilt: plane(0.0, (tilt, 0.0)), -0.5, -0.501, ("good", "care")),
+        (lambda across: tilt_reasons({1: across}), 0.5, 0.501, ("good", "care")),
+        (lambda ln: brightness_reasons({1: ln}), 0.2, 0.201, ("good", "care")),
+        (lambda ln: brightness_reasons({1: ln}), -0.2, -0.201, ("good", "care")),
+        (lambda error: leakage_reasons(False, False, error), 0.0199, 0.02, ("good", "care")),
+        (lambda angle: incidence_reasons(angle, 55.0), 55.299, 55.301, ("good", "care")),
+        (lambda angle: incidence_reasons(angle, 55.0), 54.701, 54.699, ("good", "care")),
+    ],
+)
+def test_each_limit_just_inside_and_just_outside(judge, inside, outside, levels):
+    assert (level(judge(inside)), level(judge(outside))) == levels
+
+
+@pytest.mark.parametrize(
+    ("reasons", "said", "never"),
+    [
+        (brightness_reasons({1: 0.4}), ("patch 1 is 49 % brighter",), "darker"),
+        (brightness_reasons({1: -0.4}), ("patch 1 is 33 % darker",), "brighter"),
+        (level_reasons({"H": 10.0}), ("H: the direct path is weak", "+20 dB", "weakens the direct path"), "weaker"),
+        (level_reasons({"V": 0.1}), ("V: the direct path is strong", "-20 dB", "weaker than the"), "weakens"),
+        (plane(20.0), ("+20 mm",), "-20"),
+        (plane(-20.0), ("-20 mm",), "+20"),
+        (plane(-4.0), ("-4.0 mm",), "+4"),
+        (plane(0.0, (-0.9, 0.2)), ("0.9 degrees",), "0.2"),
+        (tilt_reasons({1: 0.6, 4: -2.0}), ("patch 4", "-2.0 degrees", "(2 patches in all)"), "patch 1"),
+        (tilt_reasons({1: 0.6, 4: 0.1}), ("patch 1", "+0.6 degrees"), "in all"),
+        (leakage_reasons(False, True, 0.1), ("estimated from the scene", "10 %"), "prior"),
+        (leakage_reasons(False, False, 0.1), ("never measured",), "estimated"),
+        (signal_reasons({1: "noise"}, 3), ("patch 1 not judged: noise",), "patches"),
+        (signal_reasons({1: "noise", 3: "noise"}, 3), ("patches 1, 3 not judged: noise",), "patch 1"),
+        (signal_reasons({1: "b", 2: "a", 3: "b"}, 3), ("none of the 3 patches is a plate: a; b",), "not judged"),
+        (metal_reasons("p", False, False, False, False, True), ("nothing else in the scene",), "impossible"),
+        (metal_reasons("p", False, False, False, True, False), ("impossible materials",), "nothing else"),
+        (metal_reasons("p", False, False, True, True, False), ("given metal reference (p)",), "likely"),
+        (metal_reasons("p", True, False, False, False, False), ("likely metal, not certainly",), "given"),
+        (passivity_reasons({2: "a gain"}), ("patch 2 has no permittivity: a gain",), "none"),
+        (rows(1000, 0.25), ("25.0 % of the recorded",), "absent"),
+        (path(-3.0), ("RH: the direct path is weak, -3 dB",), "missing"),
+        (path(share=0.25), ("missing (25 % of the positions",), "weak"),
+    ],
+)
+def test_each_reason_says_what_was_found(reasons, said, never):
+    (one,) = reasons
+    text = f"{one.what}; {one.why}"
+    assert all(part in text for part in said), text
+    assert never not in text, text
+
+
+def test_reasons_come_from_the_recording_to_the_names():
+    """The cause of the others first: without a direct path all is meaningless, without metal every permittivity."""
+    assert order(
+        path(-20.0), signal_reasons({}, 0), metal_reasons("metal", False, False, False, True, False), plane(20.0)
+    ) == ["direct path is missing", "no patch", "no metal", "off the rig"]
+    assert order(
+        recording_reasons(Coverage(10, 10, 10, 10, ("a damaged line",))),
+        rows(900),
+        rows(1000, 0.2),
+        level_reasons({"H": 9.0}),
+        path(-3.0),
+        metal_reasons("metal", True, False, False, False, False),
+        path(phase_rad=0.1),
+        passivity_reasons({1: "a gain"}),
+        signal_reasons({1: "noise"}, 2),
+        incidence_reasons(57.0, 55.0),
+        brightness_reasons({1: 0.4}),
+        plane(4.0),
+        leakage_reasons(False, False, 0.1),
+        plane(0.0, (1.0, 0.0)),
+        tilt_reasons({1: 1.0}),
+    ) == [
+        "a damaged", "rows are", "masked", "relative to", "is weak, -3", "likely metal", "residual phase",
+        "no permittivity", "not judged", "incidence angle", "brighter", "the angle was", "leakage", "plane is",
+        "across",
+    ]  # fmt: skip
+
+
+PARTS = (
+    "direct path is missing", "no patch", "no metal", "a damaged", "rows are", "masked", "relative to", "is weak, -3",
+    "likely metal", "residual phase", "no permittivity", "not judged", "incidence angle", "brighter", "the angle was",
+    "off the rig", "leakage", "plane is", "across",
+)  # fmt: skip
+
+
+def order(*reasons):
+    """Parts of the reasons' texts as the verdict lists them, given in reverse."""
+    listed = verdict_of([r for group in reversed(reasons) for r in group]).reasons
+    return [next(part for part in PARTS if part in r.what) for r in listed]

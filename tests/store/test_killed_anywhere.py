@@ -77,6 +77,22 @@ def test_scan_is_killed_at_every_operation(samples, undisturbed, tmp_path, fault
         shutil.rmtree(folder)
 
 
+def test_nothing_unsynced_is_relied_on(samples, undisturbed, tmp_path):
+    """Power is cut at and after every sync of a folder and operation on the manifest; all unsynced is lost."""
+    folder = tmp_path / "count"
+    done = operations(samples, folder)
+    folders = {f"fsync {path.name}" for path in (folder, *folder.rglob("*")) if path.is_dir()}
+    steps = [at for at, what in enumerate(done, 1) if what in folders or what.endswith(" manifest.jsonl")]
+    assert len(steps) > 16
+    for at in sorted({*steps, *(at + 1 for at in steps if at < len(done))}):
+        folder = tmp_path / str(at)
+        scan = SmallScan(samples, folder)
+        folder.mkdir()
+        assert broken_off(scan, FaultyDisk(folder, "worst power cut", at))
+        goes_on(scan, undisturbed, f"power cut at {at} ({done[at - 1]})")
+        shutil.rmtree(folder)
+
+
 @pytest.mark.parametrize("fault", ["killed within", "power cut"])
 def test_resume_is_killed_at_every_operation_too(samples, undisturbed, tmp_path, fault, sample):
     done = operations(samples, tmp_path / "count")

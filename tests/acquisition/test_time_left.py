@@ -6,17 +6,21 @@ import io
 import re
 import statistics
 
+import msgspec
 import pytest
 from rich.console import Console
 from tests.support.page.live_view import add_fact, begin_history
+from tests.support.rigs import published_rig
 from tests.support.store.facts import facts_of
 
 from polysight.acquisition import scan as running
 from polysight.acquisition.control import StopRequest
+from polysight.acquisition.row import row_limit_s
 from polysight.acquisition.scan import ScanProgress, run_scan, time_left, typical_row_s
 from polysight.jobs.live_scan import ScanBar
 from polysight.page.history import seconds
 from polysight.page.status import remaining
+from polysight_shared.raster import Row
 
 ROW_S, PAUSE_S, HOMING_S = 12.0, 7200.0, 240.0
 
@@ -34,6 +38,16 @@ def test_one_long_row_does_not_change_the_typical_row_time():
     usual = [11.0, 12.0, 13.0] * 20
     assert typical_row_s([*usual, 900.0]) == statistics.median(usual)
     assert typical_row_s([*usual, *[6.0] * 25]) == 6.0, "a rig that was sped up is believed after 25 rows"
+
+
+def test_the_time_limit_of_a_row_is_a_minute_and_four_times_its_travel():
+    rig = published_rig()
+    stage = msgspec.structs.replace(
+        rig.stage, travel_x_mm=800.0, travel_y_mm=400.0, travel_speed_mm_s=40.0, speed_mm_s=5.0
+    )
+    row = Row(index=0, y_mm=0.0, x_start_mm=40.0, step_mm=-2.0, points=50)
+    limit_s = row_limit_s(msgspec.structs.replace(rig, stage=stage), row)
+    assert limit_s == 60 + 4 * ((800 + 400) / 40 + 2 * 50 / 5)
 
 
 class Clock:

@@ -182,6 +182,8 @@ def test_spi_drives_its_mosi():
     with pytest.raises(ValueError, match="GPIO 10"):
         Pi(wiring="spi", sync_out=(22,))
     assert Pi(wiring="spi", sync_out=(20,), spi_device="/dev/spidev1.0").sync_out == (20,)
+    with pytest.raises(ValueError, match="GPIO 20"):
+        Pi(wiring="spi", sync_out=(10,), spi_device="/dev/spidev1.0")
 
 
 def test_a_missing_chip_is_reported_with_those_that_exist(tmp_path):

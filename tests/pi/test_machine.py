@@ -108,6 +108,12 @@ class Bench:
         return [e for e in self.journal.events if isinstance(e, kind)]
 
 
+def test_a_fresh_machine_has_no_fault_and_nothing_to_wait_for():
+    machine = Bench().machine
+    assert (machine.state, machine.fault, machine.reason) == ("idle", 0, "")
+    assert (machine.homed, machine.in_run, machine.row, machine.lost_mm) == (False, False, None, (0.0, 0.0))
+
+
 def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
     bench = Bench().homed()
     bench.start()

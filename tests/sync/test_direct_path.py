@@ -177,6 +177,18 @@ def test_noise_alone_and_lost_positions_are_not_found(rig, paths, noise, prepare
     assert not done.samples[:, [5, 9, 20]].any()
 
 
+@pytest.mark.parametrize(("relative", "found"), [(0.35, True), (0.25, False)])
+def test_a_direct_path_below_three_tenths_of_the_rows_is_lost(
+    rig, paths, prepared, align_single, board, relative, found
+):
+    signal, _ = paths(board, 40, 0.0, np.random.default_rng(2))
+    signal[9] *= relative
+    signal *= np.exp(2j * np.pi * 0.2 * np.arange(256))
+    done = reference(align_single(signal, np.ones(40, bool)), prepared[board.name], rig.chirp)
+    assert done.found[9] == found
+    assert done.found.sum() == 39 + found
+
+
 def test_a_row_of_noise_has_no_direct_path(rig, noise, prepared, align_single, board):
     received = noise((400, 4, 256), 0, np.random.default_rng(7)).astype(np.complex64)
     assert not reference(align_single(received, np.ones(400, bool)), prepared[board.name], rig.chirp).found.any()

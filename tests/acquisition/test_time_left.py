@@ -42,12 +42,11 @@ def test_one_long_row_does_not_change_the_typical_row_time():
 
 def test_the_time_limit_of_a_row_is_a_minute_and_four_times_its_travel():
     rig = published_rig()
-    stage = msgspec.structs.replace(
-        rig.stage, travel_x_mm=800.0, travel_y_mm=400.0, travel_speed_mm_s=40.0, speed_mm_s=5.0
-    )
+    stage = msgspec.structs.replace(rig.stage, travel_speed_mm_s=50.0, speed_mm_s=5.0)
+    travel_s = (stage.travel_x_mm + stage.travel_y_mm) / 50
     row = Row(index=0, y_mm=0.0, x_start_mm=40.0, step_mm=-2.0, points=50)
     limit_s = row_limit_s(msgspec.structs.replace(rig, stage=stage), row)
-    assert limit_s == 60 + 4 * ((800 + 400) / 40 + 2 * 50 / 5)
+    assert limit_s == 60 + 4 * (travel_s + 2 * 50 / 5)
 
 
 class Clock:

@@ -1,10 +1,10 @@
 """Acquisition: record the rows of a plan with the Pi, the radars and the capture cards.
 
-`run_scan` and `resume_scan` record every row that is not committed yet (`scan`, `scan_loop`). For each row (`row`):
-arm the radars and start the cards' records (`capture_rig`), let the Pi run the row (`pi_client`), compare the received
-data with the pulses sent (`take`), find pulses that a board missed by arrival times (`missed_pulses`, `slipped_row`),
-then commit the row or retake it. `ready` holds the checks before a row: homing, disk space, the Pi's configuration.
-`control` pauses and stops a running scan; `progress` queues committed rows for processing and reports time left.
+`run_scan` and `resume_scan` record every row that is not committed yet (`scan`). For each row (`row`): arm the radars
+and start the cards' records (`capture_rig`), let the Pi run the row (`pi_client`), compare the received data with the
+pulses sent, find pulses that a board missed by arrival times (`missed_pulses`), then commit the row or retake it.
+`ready` holds the checks before a row: homing, disk space, the Pi's configuration. `control` pauses and stops a running
+scan; `scan` also queues committed rows for processing and reports time left.
 """
 
 from polysight.acquisition.capture_rig import CaptureRig

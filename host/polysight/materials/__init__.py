@@ -76,7 +76,7 @@ from polysight.materials.result import (
     pack_patches,
     read_patches,
 )
-from polysight.materials.segment import Box, Segmentation, SegmentSettings, axis_mm, box_mask, insides
+from polysight.materials.segment import Box, SegmentSettings, axis_mm, box_mask, insides
 from polysight.materials.sub_bands import (
     AMPLITUDE_ERROR,
     LAYER_FORMS,
@@ -147,7 +147,6 @@ __all__ = [
     "ScanPatches",
     "Score",
     "SegmentSettings",
-    "Segmentation",
     "TrainingScan",
     "TruthPlate",
     "analyse",

@@ -6,10 +6,7 @@ is the command; it can take noise and standstill from an earlier scan.
 """
 
 from polysight.plan.forecast import (
-    FieldLimits,
-    Forecast,
     Noise,
-    ScanTime,
     field_limits,
     forecast,
     row_motion_s,
@@ -20,11 +17,8 @@ from polysight.plan.plan_command import Changes, PlanOptions, forecast_values, p
 
 __all__ = [
     "Changes",
-    "FieldLimits",
-    "Forecast",
     "Noise",
     "PlanOptions",
-    "ScanTime",
     "field_limits",
     "forecast",
     "forecast_values",

@@ -36,7 +36,6 @@ SPEC_PAGE = (REPO / "docs/spec/wire.md").read_text(encoding="utf-8").split("## S
 class FakeJournal:
     def __init__(self) -> None:
         self.events: list[Any] = []
-        self.broken = False
 
     def add(self, kind: type, **fields: Any) -> None:
         self.events.append(kind(scan_id="", seq=0, t_mono_ns=0, **fields))

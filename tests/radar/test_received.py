@@ -101,14 +101,10 @@ def test_an_error_has_message_id_0_error_number_and_sub_block():
     assert message.error == (62, 0x0105)
 
 
-def test_an_error_without_a_body_is_an_error():
-    message = decode(AWR1243_ERROR)
-    assert message.blocks == ()
-    assert message.error == (None, None)
-
-
-def test_an_acknowledgement_without_a_body_is_no_error():
-    assert decode(AWR1243_RF_UP).error is None
+@pytest.mark.parametrize(("raw", "error"), [(AWR1243_ERROR, (None, None)), (AWR1243_RF_UP, None)])
+def test_a_message_without_a_body_is_an_error_by_its_kind_alone(raw, error):
+    message = decode(raw)
+    assert (message.blocks, message.error) == ((), error)
 
 
 @pytest.mark.parametrize("raw", [AWR1243_UP_EMPTY, AWR1243_UP_WRITTEN])
@@ -154,12 +150,6 @@ def test_a_response_of_another_core_is_no_answer(direction, kind):
         line.call(DEVICE_CONFIGURATION)
 
 
-def test_an_answer_without_its_last_chunk_is_no_answer():
-    line, _ = connect(chunk(1, 0x40E0, bytes(16)))
-    with refused(ErrorCode.NO_ANSWER):
-        line.call(GET_MAIN_VERSION)
-
-
 def test_an_acknowledgement_with_a_16_bit_crc_is_accepted():
     line, _ = connect(AWR1243_RF_UP)
     assert line.call(RF_POWER_UP).blocks == ()
@@ -186,8 +176,9 @@ def test_an_answer_in_chunks_is_joined():
     assert [b.data for b in line.call(GET_MAIN_VERSION).blocks] == [bytes(16), b"abcd", b"efgh"]
 
 
-def test_an_answer_with_a_missing_chunk_is_no_answer():
-    line, _ = connect(chunk(2, 0x40E0, bytes(16)), chunk(0, 0x40E2, b"efgh"))
+@pytest.mark.parametrize("chunks", [[(1, 0x40E0)], [(2, 0x40E0), (0, 0x40E2)]], ids=["last", "middle"])
+def test_an_answer_with_a_missing_chunk_is_no_answer(chunks):
+    line, _ = connect(*[chunk(*each, bytes(16)) for each in chunks])
     with refused(ErrorCode.NO_ANSWER):
         line.call(GET_MAIN_VERSION)
 

@@ -38,11 +38,9 @@ class Browser:
     ----------
     folder
         For its profile.
-    dark
-        Whether pages are told that dark colours are preferred.
     """
 
-    def __init__(self, folder: Path, dark: bool = False) -> None:
+    def __init__(self, folder: Path) -> None:
         program = find_chromium()
         assert program is not None
         profile = folder / "profile"
@@ -75,7 +73,7 @@ class Browser:
         self.call("Emulation.setScrollbarsHidden", hidden=True)
         self.call(
             "Emulation.setEmulatedMedia",
-            features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}],
+            features=[{"name": "prefers-color-scheme", "value": "light"}],
         )
 
     def _page(self, answer: Path) -> str:

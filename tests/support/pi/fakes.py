@@ -120,13 +120,14 @@ class FakeStage:
     point to point).
     """
 
-    def __init__(self, hub: Path | None, trigger: int = 26, banner: bool = True) -> None:
+    def __init__(self, hub: Path | None, trigger: int = 26) -> None:
         self.master, slave = os.openpty()
         tty.setraw(slave, termios.TCSANOW)
         self.port = os.ttyname(slave)
         os.close(slave)
         self.wire = WireClient(hub) if hub else None
-        self.trigger, self.banner = trigger, banner
+        self.trigger = trigger
+        self.banner = True
         self.deaf = False
         self.steps = "200"
         self.lose = self.damage = self.lose_end = 0

@@ -45,15 +45,13 @@ class Bus(IBackend):
     ----------
     packet
         Bytes of data a read returns at most, to cut answers anywhere.
-    enumerations
-        How often the bus was looked at.
     refuses
         Error number with which interfaces are not given; 0: they are.
     """
 
     def __init__(self) -> None:
         self.chips: list[Chip] = []
-        self.packet, self.enumerations, self._addresses = _PACKET - 2, 0, 1
+        self.packet, self._addresses = _PACKET - 2, 1
         self.refuses = 0
 
     def plug(self, chip: Chip) -> None:
@@ -71,7 +69,6 @@ class Bus(IBackend):
     # what pyusb calls
 
     def enumerate_devices(self):
-        self.enumerations += 1
         return iter([(chip, chip.address) for chip in self.chips if chip.plugged])
 
     def get_device_descriptor(self, dev):

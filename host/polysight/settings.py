@@ -27,6 +27,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         Number and distance of the pixels; None: the rig file's.
     bands
         Number of sub-bands of the sweep to image as well; 1: none.
+    sparse
+        Reconstruct positions that are masked, were not recorded, or lie between steps too wide for the image.
     library, model
         Reference library (None: the simulated one) and classifier (None: the library's default, "none": no naming).
     metal_box_mm
@@ -46,6 +48,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     rows: int | None = None
     pixel_mm: float | None = None
     bands: int = 1
+    sparse: bool = False
     library: str | None = None
     model: str | None = None
     metal_box_mm: tuple[float, float, float, float] | None = None

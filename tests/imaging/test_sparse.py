@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from polysight.imaging import ImageBuilder, image_grid
-from polysight.imaging.sparse import reconstruct
+from polysight.imaging import ImageBuilder, fill_missing, image_grid
+from polysight.imaging.sparse import added_steps, reconstruct
 
 AT = [(6, 8), (20, 30), (33, 12)]
 AMPLITUDES = np.array([1.0, 0.6j, -0.8])
@@ -71,3 +71,64 @@ def test_weak_reflectors_beside_a_strong_one_are_kept(board):
 def test_no_data_gives_an_empty_image(make_rig):
     found = reconstruct(ImageBuilder(make_rig(5, 5, pixels=(6, 6))).boards["RH"], iterations=2)
     assert not found.image.any()
+
+
+# --- missing positions are filled ---
+
+
+@pytest.fixture
+def scan(make_rig, points_rows):
+    """`scan(kept)`: a builder with three points; positions outside `kept` [row, column] are left out."""
+
+    def make(kept, step_y_mm=5.0):
+        rig = make_rig(60, len(kept), 5.0, step_y_mm, pixels=(40, 40), pixel=5.0)
+        grid = image_grid(rig)
+        points = [np.array([grid.x_m[i], grid.y_m[j], grid.z_m]) for j, i in AT]
+        builder = ImageBuilder(rig)
+        for board in rig.receivers:
+            for index, row in points_rows(rig, board, points, AMPLITUDES, noise=0.02):
+                row.valid[:] = kept[index][:: 1 if index % 2 == 0 else -1]
+                if row.valid.any():
+                    builder.add_row(board.name, index, row)
+        return builder
+
+    return make
+
+
+def image_error(found, whole):
+    factor = np.vdot(found.h_raw, whole.h_raw) / np.vdot(found.h_raw, found.h_raw)
+    return np.linalg.norm(factor * found.h_raw - whole.h_raw) / np.linalg.norm(whole.h_raw)
+
+
+# Columns twice as far apart make no ghosts in this image: there is little to gain.
+@pytest.mark.parametrize(
+    ("name", "factor"), [("every second row", 10), ("every second column", 1.2), ("a random quarter", 10)]
+)
+def test_the_image_with_filled_positions_is_nearer_to_that_of_the_whole_scan(scan, name, factor):
+    whole = scan(np.ones((40, 60), bool)).finish()
+    thin = scan(_kept(name))
+    filled, errors = fill_missing(thin)
+    error = image_error(filled.finish(), whole)
+    assert error < image_error(thin.finish(), whole) / factor
+    assert errors["RH"].missing_share == pytest.approx(1 - _kept(name).mean())
+    assert error < 2 * errors["RH"].image_error
+
+
+def test_a_whole_scan_does_not_change(scan):
+    builder = scan(np.ones((40, 60), bool))
+    filled, errors = fill_missing(builder)
+    assert not errors
+    np.testing.assert_array_equal(filled.finish().h_raw, builder.finish().h_raw)
+    np.testing.assert_array_equal(filled.finish().illumination.footprints, builder.finish().illumination.footprints)
+
+
+def test_steps_too_wide_for_the_image_are_divided(scan):
+    coarse = scan(np.ones((20, 60), bool), step_y_mm=10.0)
+    assert added_steps(coarse.rig)[0] > 1
+    filled, _ = fill_missing(coarse)
+    assert filled.rig.grid.rows == added_steps(coarse.rig)[0] * 19 + 1
+    away = np.ones((40, 40), bool)
+    for j, i in AT:
+        away[j - 4 : j + 5, i - 4 : i + 5] = False
+    ghosts = [np.abs(builder.finish().h_raw[away]).max() for builder in (coarse, filled)]
+    assert ghosts[1] < 0.5 * ghosts[0]

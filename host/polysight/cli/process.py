@@ -33,6 +33,7 @@ def process_settings(args: argparse.Namespace, data: Path) -> Settings:
         reference=path_text(args.reference),
         incidence=args.incidence,
         bands=args.bands,
+        sparse=args.sparse,
     )
 
 
@@ -57,6 +58,7 @@ def _image(args: argparse.Namespace) -> int:
         columns=columns,
         rows=rows,
         pixel_mm=pixel_mm,
+        sparse=args.sparse,
     )
     return image(args.data, args.out, settings)
 
@@ -85,6 +87,7 @@ def add_commands(add: Add) -> None:
     _add_data(sub, several=True)
     add_material_options(sub)
     _add_polarimetry_options(sub)
+    _add_sparse(sub)
     _add_several_options(sub)
     sub = add("image", _image, "make only the images from recorded data", "polysight image scans/one --out out/one")
     _add_data(sub)
@@ -98,6 +101,7 @@ def add_commands(add: Add) -> None:
     sub.add_argument(
         "--grid", type=grid, metavar="COLUMNSxROWS@MM", help="number and distance of pixels (default: the rig file's)"
     )
+    _add_sparse(sub)
     sub = add(
         "focus",
         _focus,
@@ -128,6 +132,14 @@ def _add_data(sub: argparse.ArgumentParser, several: bool = False) -> None:
     )
     sub.add_argument(
         "--config", type=Path, metavar="FILE", help="rig file of published data (default: instrument.toml beside it)"
+    )
+
+
+def _add_sparse(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--sparse",
+        action="store_true",
+        help="reconstruct positions that are masked, were not recorded, or lie between steps too wide for the image",
     )
 
 

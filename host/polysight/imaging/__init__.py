@@ -30,8 +30,16 @@ from polysight.imaging.geometry import (
 )
 from polysight.imaging.images import Image, ImagedWith, Images, Mask, Rise, correct_tilt
 from polysight.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, Focus, PlaneEstimate, focus_sweep, move_to_plane
-from polysight.imaging.resolution import PointResponse, imaging_facts, point_response
+from polysight.imaging.resolution import (
+    FieldLimits,
+    PhaseSlope,
+    PointResponse,
+    field_limits,
+    imaging_facts,
+    point_response,
+)
 from polysight.imaging.samples import ReducedRow, reduction, scene_gate_m
+from polysight.imaging.sparse import FilledPositions, fill_missing, fill_sub_bands
 
 __all__ = [
     "AS_IN_RIG_FILE",
@@ -40,6 +48,8 @@ __all__ = [
     "UNKNOWN_PLANE",
     "Antennas",
     "Aperture",
+    "FieldLimits",
+    "FilledPositions",
     "Focus",
     "Image",
     "ImageBuilder",
@@ -47,6 +57,7 @@ __all__ = [
     "ImagedWith",
     "Images",
     "Mask",
+    "PhaseSlope",
     "PlaneEstimate",
     "PointResponse",
     "ReducedRow",
@@ -56,6 +67,9 @@ __all__ = [
     "View",
     "backproject",
     "correct_tilt",
+    "field_limits",
+    "fill_missing",
+    "fill_sub_bands",
     "focus_sweep",
     "image_grid",
     "imaging_facts",

@@ -95,8 +95,9 @@ class ImageBuilder:
         plan = plan_raster(rig.grid)
         antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
         self.gate_m = needed_gate_m(rig, depth_m) if gate_m is None else gate_m
-        taper = TAPERS[rig.image.apodisation] if taper is None else taper
-        weights = np.outer(window_weights(taper, plan.rows), window_weights(taper, plan.columns)).astype(np.float32)
+        self.taper = TAPERS[rig.image.apodisation] if taper is None else taper
+        weights_y = window_weights(self.taper, plan.rows)
+        weights = np.outer(weights_y, window_weights(self.taper, plan.columns)).astype(np.float32)
         gated = reduction(rig.chirp, self.gate_m)
         self._antennas, self._middle_hz = antennas, float(np.mean(gated.frequencies_hz))
         self.boards = {b.name: BoardSamples(rig, b, self.grid, gated, weights, live) for b in rig.receivers}

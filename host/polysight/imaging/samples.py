@@ -409,6 +409,38 @@ class BoardSamples:
     def keep(self, positions: NDArray[np.bool_]) -> None:
         """Mask all positions except those in `positions` [row, column], as if they had not been scanned."""
         self.valid &= positions
+        self._invalidate()
+
+    def copy_samples(self, coarse: BoardSamples, steps: tuple[int, int]) -> None:
+        """Take the samples of a board whose steps between (rows, columns) were divided; others are missing."""
+        rows, columns = steps
+        self._cube[:, :, ::rows, ::columns] = coarse._cube
+        self._direct[:, ::rows, ::columns] = coarse._direct
+        self.valid[::rows, ::columns] = coarse.valid
+        # Positions between are evenly spaced; a row between two has the shift of the one before.
+        count_y = len(self.valid)
+        count_x = len(self.valid[0])
+        along = np.arange(count_x) / columns
+        for index in range(count_y):
+            before = coarse._offsets[index // rows]
+            for axis in range(3):
+                self._offsets[index, :, axis] = np.interp(along, np.arange(len(before)), before[:, axis])
+        y_m = coarse._offsets[:, 0, 1]
+        self._offsets[..., 1] = np.interp(np.arange(count_y) / rows, np.arange(len(y_m)), y_m)[:, None]
+        self._final = None
+        self._invalidate()
+
+    def fill(self, samples: NDArray[np.complex64]) -> None:
+        """Put samples, [rx, frequency, row, column] divided by the gains, at all positions that are not valid."""
+        missing = ~self.valid
+        gains = self.rx_calibration()
+        self._cube[:, :, missing] = samples[:, :, missing] * gains.astype(np.complex64)[:, None, None]
+        self._direct[:, missing] = (gains / self._antennas.direct_m)[:, None]
+        self.valid[:] = True
+        self._invalidate()
+
+    def _invalidate(self) -> None:
+        """Discard everything that was computed from the samples."""
         self._live = None
         self._stale = set(range(len(self.valid)))
 

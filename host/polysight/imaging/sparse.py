@@ -1,24 +1,38 @@
-"""Reconstruct images of scans with omitted positions, iteratively with an imager and its adjoint.
+"""Reconstruct the missing positions of sparse scans, iteratively with an imager and its adjoint.
 
 The matched filter of a thinned grid contains aliases. In mostly empty scenes they can be removed: FISTA (Beck and
 Teboulle, SIAM J. Imaging Sci. 2, 2009) finds the image x that minimises `1/2 |W (G A x - y)|^2 + threshold |x|_1`, with
 the imager's forward model A, the effect G of the range gate on an echo, and the weights W of the positions.
+`fill_missing` predicts the samples of the missing positions from x; recorded samples stay as they are, so that a whole
+scan does not change. Some recorded positions are left out of a first fit: their prediction tells the error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
+from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.imaging.builder import ImageBuilder, SubBandImages
+from polysight.imaging.images import Mask
+from polysight.imaging.resolution import field_limits
 from polysight.imaging.samples import BoardSamples, choose_imager
+from polysight_shared.config import Instrument
 
 STRENGTH = 0.002
 """Found with simulated plates (docs/decisions/0002-imaging.md): a larger value removes plates with a weak V reflection,
 a smaller one leaves more aliases.
 """
+ITERATIONS = 40
+MOST_ADDED = 4
+"""Largest number of steps into which a step between positions is divided."""
+TEST_SHARE = 10
+"""One in so many recorded rows, columns or positions is left out of the first fit, to measure the prediction."""
 _POWER_ROUNDS = 12  # steps of the power iteration
 
 
@@ -39,7 +53,55 @@ class Reconstruction:
     residual: NDArray[np.float64]
 
 
-def reconstruct(board: BoardSamples, iterations: int = 60, strength: float = STRENGTH) -> Reconstruction:
+@dataclass(frozen=True)
+class FilledPositions:
+    """Errors of the reconstructed positions of one board.
+
+    Attributes
+    ----------
+    missing_share
+        Share of the positions that were reconstructed.
+    residual
+        Share of the recorded samples that the reconstruction does not explain.
+    prediction_error
+        Error of predicted samples relative to recorded ones, in an image of recorded positions that were left out of
+        the fit; None if there were too few.
+    image_error
+        Expected error of the whole image relative to that of a scan of all positions: the prediction error times the
+        part of the image that comes from reconstructed positions; None as above.
+    """
+
+    missing_share: float
+    residual: float
+    prediction_error: float | None
+    image_error: float | None
+
+
+class _Model:
+    """Forward model of one board and its adjoint, both with weights [row, column]."""
+
+    def __init__(self, board: BoardSamples) -> None:
+        self.imager, _ = choose_imager(board.aperture)
+        self._gate = board.model.astype(np.complex64)
+
+    def samples(self, image: NDArray[np.complexfloating]) -> NDArray[np.complex64]:
+        """Return the samples that an image predicts, divided by the gains, [rx, frequency, row, column]."""
+        echoes = self.imager.samples(image)
+        return (self._gate @ echoes.reshape(*echoes.shape[:2], -1)).reshape(echoes.shape)
+
+    def adjoint(self, samples: NDArray[np.complexfloating]) -> NDArray[np.complex64]:
+        """Return the adjoint of :meth:`samples`, complex64 [ny, nx]."""
+        gated = self._gate.conj().T @ samples.reshape(*samples.shape[:2], -1)
+        return self.imager.image(gated.reshape(samples.shape))
+
+
+def reconstruct(
+    board: BoardSamples,
+    iterations: int = 60,
+    strength: float = STRENGTH,
+    used: Mask | None = None,
+    start: NDArray[np.complex64] | None = None,
+) -> Reconstruction:
     """Reconstruct the image of a board from its valid positions.
 
     Parameters
@@ -51,24 +113,28 @@ def reconstruct(board: BoardSamples, iterations: int = 60, strength: float = STR
     strength
         Weight of sparsity relative to the strongest pixel of the matched filter: pixels below about this level become
         0, and the others weaker by as much. For a few points with many random omissions 0.01 converges faster.
+    used
+        bool [row, column]: positions to use; None: all that are valid.
+    start
+        complex64 [ny, nx]: image to start from; None: empty.
     """
-    imager, _ = choose_imager(board.aperture)
-    weights, gate = np.sqrt(board.weights), board.model.astype(np.complex64)
+    model = _Model(board)
+    weights = np.sqrt(board.weights if used is None else board.weights * used)
     data = board.calibrated() * weights
-    shape = data.shape
 
     def forward(x: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        return (gate @ imager.samples(x).reshape(*shape[:2], -1)).reshape(shape) * weights
+        return model.samples(x) * weights
 
     def adjoint(y: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        return imager.image((gate.conj().T @ (y * weights).reshape(*shape[:2], -1)).reshape(shape))
+        return model.adjoint(y * weights)
 
     matched = adjoint(data)
     lipschitz = _largest_eigenvalue(lambda x: adjoint(forward(x)), matched)
     threshold = strength * float(np.abs(matched).max()) / lipschitz
     norm = float(np.linalg.norm(data)) or 1.0
-    x = np.zeros_like(matched)
-    ahead, t = x, 1.0
+    x = np.zeros_like(matched) if start is None else start
+    ahead = x
+    t = 1.0
     residuals = []
     for _ in range(iterations):
         misfit = forward(ahead) - data
@@ -76,7 +142,8 @@ def reconstruct(board: BoardSamples, iterations: int = 60, strength: float = STR
         new = _shrunk(ahead - adjoint(misfit) / np.float32(lipschitz), threshold)
         grown = (1 + np.sqrt(1 + 4 * t * t)) / 2
         ahead = (new + (t - 1) / grown * (new - x)).astype(np.complex64)
-        x, t = new, grown
+        x = new
+        t = grown
     return Reconstruction(x, np.array(residuals))
 
 
@@ -90,7 +157,8 @@ def _largest_eigenvalue(
     operator: Callable[[NDArray[np.complex64]], NDArray[np.complex64]], start: NDArray[np.complex64]
 ) -> float:
     """Return the largest eigenvalue of a positive operator by power iteration, plus 5 %."""
-    x, value = start, 1.0
+    x = start
+    value = 1.0
     for _ in range(_POWER_ROUNDS):
         norm = float(np.linalg.norm(x))
         if norm == 0:
@@ -98,3 +166,100 @@ def _largest_eigenvalue(
         x = operator((x / norm).astype(np.complex64))
         value = float(np.linalg.norm(x))
     return 1.05 * value
+
+
+def added_steps(rig: Instrument) -> tuple[int, int]:
+    """Return into how many steps (row, column) those of a rig's grid are divided, so that its image has no ghosts.
+
+    The image itself is the scene: ghosts of objects in it must lie outside. At most `MOST_ADDED`.
+    """
+    free_mm = field_limits(rig).alias_free_mm
+    size_mm = (rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm)
+    columns, rows = (int(np.ceil(size / free)) for size, free in zip(size_mm, free_mm, strict=True))
+    return min(MOST_ADDED, max(1, rows)), min(MOST_ADDED, max(1, columns))
+
+
+def fill_missing(
+    builder: ImageBuilder, iterations: int = ITERATIONS
+) -> tuple[ImageBuilder, dict[str, FilledPositions]]:
+    """Reconstruct the positions that were masked, not recorded, or not planned although the image needs them.
+
+    Returns
+    -------
+    filled
+        A builder with samples at all positions of a grid without ghosts; recorded samples are unchanged.
+    errors
+        Board name to the errors of its reconstructed positions; boards of which none is missing are left out.
+    """
+    steps = added_steps(builder.rig)
+    filled = ImageBuilder(_finer(builder.rig, steps), builder.taper, gate_m=builder.gate_m)
+    errors = {}
+    for name, board in filled.boards.items():
+        board.copy_samples(builder.boards[name], steps)
+        if board.valid.any() and not board.valid.all():
+            errors[name] = _fill(board, iterations)
+    return filled, errors
+
+
+def fill_sub_bands(sub_bands: SubBandImages) -> SubBandImages:
+    """Return the images of every sub-band with missing positions reconstructed, see :func:`fill_missing`."""
+    filled = copy(sub_bands)
+    filled.builders = tuple(fill_missing(builder)[0] for builder in sub_bands.builders)
+    return filled
+
+
+def _finer(rig: Instrument, steps: tuple[int, int]) -> Instrument:
+    """Return the rig with each step between rows and between columns divided."""
+    grid = msgspec.structs.replace(
+        rig.grid,
+        rows=(rig.grid.rows - 1) * steps[0] + 1,
+        columns=(rig.grid.columns - 1) * steps[1] + 1,
+        step_y_mm=rig.grid.step_y_mm / steps[0],
+        step_x_mm=rig.grid.step_x_mm / steps[1],
+    )
+    return msgspec.structs.replace(rig, grid=grid)
+
+
+def _fill(board: BoardSamples, iterations: int) -> FilledPositions:
+    """Predict the samples of a board's missing positions and put them in their place; return their errors."""
+    model = _Model(board)
+    recorded = board.valid.copy()
+    samples = board.calibrated()
+    tested = _positions_to_test(recorded)
+    first = reconstruct(board, iterations, used=~tested)
+    error = None
+    if tested.any():
+        wrong = model.samples(first.image) - samples
+        weights = board.taper * tested
+        error = _norm_of_image(model, wrong, weights) / _norm_of_image(model, samples, weights)
+    last = reconstruct(board, max(1, iterations // 2), start=first.image)
+    board.fill(model.samples(last.image))
+    samples = board.calibrated()
+    reconstructed = _norm_of_image(model, samples, board.taper * ~recorded)
+    share = reconstructed / _norm_of_image(model, samples, board.taper)
+    return FilledPositions(
+        missing_share=float(1 - recorded.mean()),
+        residual=float(last.residual[-1]),
+        prediction_error=error,
+        image_error=None if error is None else error * share,
+    )
+
+
+def _positions_to_test(recorded: Mask) -> Mask:
+    """Return recorded positions to leave out of a fit: whole rows or columns if such are missing, otherwise any."""
+    rows = np.flatnonzero(recorded.any(axis=1))
+    columns = np.flatnonzero(recorded.any(axis=0))
+    tested = np.zeros_like(recorded)
+    if rows.size < recorded.shape[0]:
+        tested[rows[TEST_SHARE // 2 :: TEST_SHARE]] = True
+    elif columns.size < recorded.shape[1]:
+        tested[:, columns[TEST_SHARE // 2 :: TEST_SHARE]] = True
+    else:
+        tested = np.random.default_rng(0).uniform(size=recorded.shape) < 1 / TEST_SHARE
+    return tested & recorded
+
+
+def _norm_of_image(model: _Model, samples: NDArray[np.complexfloating], weights: NDArray[Any]) -> float:
+    """Return the root of the sum of the squares of an image's pixels; 1e-30 if it is dark."""
+    image = model.imager.image((samples * weights).astype(np.complex64))
+    return float(np.linalg.norm(image)) or 1e-30

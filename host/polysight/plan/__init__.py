@@ -1,13 +1,12 @@
 """`polysight plan`: predict a scan before it is made: time, data, resolution, noise, aliases, warnings.
 
 `forecast` predicts the scan of a rig file to which `Changes` were applied; `propose` searches for the plans with the
-least noise within a time. `scan_time` estimates the duration, `field_limits` the alias-free field of view. `run_plan`
+least noise within a time. `scan_time` estimates the duration. `run_plan`
 is the command; it can take noise and standstill from an earlier scan.
 """
 
 from polysight.plan.forecast import (
     Noise,
-    field_limits,
     forecast,
     row_motion_s,
     scan_time,
@@ -19,7 +18,6 @@ __all__ = [
     "Changes",
     "Noise",
     "PlanOptions",
-    "field_limits",
     "forecast",
     "forecast_values",
     "propose",

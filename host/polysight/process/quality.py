@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import msgspec
@@ -19,7 +19,7 @@ import numpy.typing as npt
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from polysight.imaging import ImageBuilder, Images, PlaneEstimate, imaging_facts
+from polysight.imaging import FilledPositions, ImageBuilder, Images, PlaneEstimate, imaging_facts
 from polysight.materials import NOT_PASSIVE, Classifier, MaterialsResult, permittivity_change
 from polysight.polarimetry import IncidenceChoice, PlaneReference
 from polysight.results import (
@@ -44,6 +44,7 @@ from polysight.results import (
     passivity_reasons,
     plain,
     plane_reasons,
+    reconstruction_reasons,
     recording_reasons,
     signal_reasons,
     tilt_reasons,
@@ -202,6 +203,7 @@ class Quality:
         self.boards = {board.name: BoardRows(rig, board) for board in rig.receivers}
         self.seconds: dict[str, float] = {}
         self.notes: dict[str, Any] = {}
+        self.filled: Mapping[str, FilledPositions] = {}  # boards with reconstructed positions
         self._lock = threading.Lock()  # rows are processed in several threads
 
     @property
@@ -233,6 +235,11 @@ class Quality:
         """Add the point response of the aperture to quality.json."""
         with self.timed("point response"):
             self.note(imaging=imaging_facts(builder, images))
+
+    def note_filled(self, filled: Mapping[str, FilledPositions]) -> None:
+        """Add the errors of reconstructed positions, by board, to quality.json and the verdict."""
+        self.filled = filled
+        self.note(sparse={board: asdict(errors) for board, errors in filled.items()})
 
     def note_materials(
         self, found: MaterialsResult, angles: IncidenceChoice, valid: NDArray[np.bool_], plane: PlaneReference | None
@@ -281,7 +288,8 @@ def recording_verdict(quality: Quality) -> list[Finding]:
             name, board.direct_snr_db, board.residual("averaged"), share / received if received else 1.0
         )
     recorded = recording_reasons(coverage, masked / positions if positions else 1.0)
-    return recorded + missing
+    filled = [(board, e.missing_share, e.image_error) for board, e in quality.filled.items()]
+    return recorded + missing + reconstruction_reasons(filled)
 
 
 def judge(

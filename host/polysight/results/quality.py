@@ -114,6 +114,9 @@ FEW_POSITIONS = 0.5
 """Share of absent or masked positions above which there is no result."""
 SOME_POSITIONS = 0.005
 """Share of masked positions above which the result needs care."""
+RECONSTRUCTION_NONE = 0.15
+"""Expected error of an image with reconstructed positions, above which there is no result. The true errors of simulated
+scans stay below twice the expected ones (tests/imaging/test_sparse.py)."""
 DIRECT_SNR_NONE_DB = -14.0
 """Direct path over noise in one sample of one chirp and channel, below which it counts as missing."""
 DIRECT_SNR_CARE_DB = 0.0
@@ -199,6 +202,26 @@ def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Fin
             f"{100 * lost:.1f} % of the recorded positions or frames are masked",
             "packets were lost, or the direct path was not found there",
             "look at each board's frames in the report; `polysight doctor` checks the network", 4 + lost,
+        ))  # fmt: skip
+    return out
+
+
+def reconstruction_reasons(boards: Iterable[tuple[str, float, float | None]]) -> list[Finding]:
+    """Judge reconstructed positions by board: its name, their share, and the expected error of its image."""
+    out = []
+    for board, missing_share, image_error in boards:
+        if missing_share <= SOME_POSITIONS:
+            continue
+        if image_error is None:
+            level = "none"
+            error = "too few rows were recorded to measure its error"
+        else:
+            level = "none" if image_error > RECONSTRUCTION_NONE else "care"
+            error = f"its image is expected to be wrong by {100 * image_error:.1f} %"
+        out.append(reason(
+            level, f"{100 * missing_share:.1f} % of the positions of {board} were reconstructed: {error}",
+            "a reconstruction is right only where the scene is mostly empty, such as separate plates",
+            "record the missing rows, or scan with a smaller step (`polysight plan`)", 3 + missing_share,
         ))  # fmt: skip
     return out
 
@@ -466,6 +489,15 @@ class BoardImaging(msgspec.Struct, frozen=True, kw_only=True):
     point_sidelobe_db: Pair | UnsetType = UNSET
 
 
+class ReconstructedPositions(msgspec.Struct, frozen=True, kw_only=True):
+    """Reconstructed positions of one receiver: their share, and errors (docs/spec/products.md); null if unknown."""
+
+    missing_share: float = 0.0
+    residual: float = 0.0
+    prediction_error: float | None = None
+    image_error: float | None = None
+
+
 class IncidenceAngles(msgspec.Struct, frozen=True, kw_only=True):
     """The incidence angle used, the other kind, and the effect of the choice on the permittivities.
 
@@ -531,6 +563,7 @@ class ScanQuality(msgspec.Struct, frozen=True, kw_only=True):
     rows_retaken: int | UnsetType = UNSET
     rows_incomplete: list[int] | UnsetType = UNSET
     imaging: dict[str, BoardImaging | list[str]] | UnsetType = UNSET
+    sparse: dict[str, ReconstructedPositions] | UnsetType = UNSET
     incidence: IncidenceAngles | UnsetType = UNSET
     metal_reference: MetalPlate | UnsetType = UNSET
     raw_dropped: RawDropped | UnsetType = UNSET

@@ -29,7 +29,6 @@ class Pipeline:
         self.synchroniser, self.quality = sync.RowSynchroniser(source, rig, filters), process.Quality(rig, source)
         kept = process.KeptSamples(source, rig, filters, self.quality, settings, live=live, samples=samples)
         self.samples, self.images, self.sub_bands = kept, kept.images, kept.sub_bands
-        self.filled = kept.images  # with `sparse`, the missing positions are reconstructed before imaging
         self.rig = store.mirrored(self.images.rig) if source.mirrored else self.images.rig  # x from TX to RX
 
     def add_row(self, row: int) -> None:
@@ -55,24 +54,17 @@ class Pipeline:
     def form_images(self, from_sums: bool = False) -> imaging.Images:
         """Form both images on the rig file's plane, divided by the footprint, not referenced; `from_sums`: live."""
         if self.settings.sparse and not from_sums:
-            self.fill_missing()
+            self.sub_bands = self.samples.fill_missing()
         with self.quality.timed("image"):
-            images = self.images.current() if from_sums else self.filled.finish()
+            images = self.images.current() if from_sums else self.samples.filled.finish()
         self.quality.note(**self.calibration.quality_facts(), **self.synchroniser.recording_facts())
         return images.transposed() if self.source.mirrored else images
-
-    def fill_missing(self) -> None:
-        """Reconstruct missing positions from the rows so far, for the images and those of sub-bands."""
-        with self.quality.timed("reconstruct missing positions"):
-            self.filled, errors = imaging.fill_missing(self.images)
-            self.sub_bands = imaging.fill_sub_bands(self.samples.sub_bands)
-        self.quality.note_filled(errors)
 
     def place_plane(self, images: imaging.Images, move: bool = True) -> imaging.Images:
         """Estimate the plane of the plates; return the images on it (unchanged if `move` is False)."""
         with self.quality.timed("plane"):
             masks, swapped = materials.insides(images), self.source.mirrored
-            self.plane, images = imaging.move_to_plane(self.filled, images, masks, swapped, move)
+            self.plane, images = imaging.move_to_plane(self.samples.filled, images, masks, swapped, move)
         return images
 
     def find_materials(

@@ -30,6 +30,8 @@ from polysight.imaging import (
     ReducedRow,
     SubBandImages,
     View,
+    fill_missing,
+    fill_sub_bands,
     needed_gate_m,
     reduction,
 )
@@ -122,6 +124,8 @@ class KeptSamples:
     images, sub_bands
         Image builders: restored rows are added to them, saved rows are read from them. They use the range gate of the
         samples on disk if it covers what they need. Rows of a wider gate than usual are not saved.
+    filled
+        `images`, with reconstructed positions after :meth:`fill_missing`.
     """
 
     def __init__(
@@ -153,6 +157,7 @@ class KeptSamples:
         gate = self._gate_m(rig, needed_gate_m(viewed, depth_m), needed_gate_m(rig, PLANE_REACH_M))
         self.images = ImageBuilder(viewed, live=live, gate_m=gate)
         self.sub_bands = SubBandImages(viewed, self._bands, gate)
+        self.filled = self.images
         self._builders = {"samples": self.images}
         self._builders |= {f"band_{k}": builder for k, builder in enumerate(self.sub_bands.builders)}
         self._keep &= not self._head or set(self._builders) == set(self._head["frequencies_hz"])
@@ -198,6 +203,14 @@ class KeptSamples:
     def is_kept(self, row: int) -> bool:
         """True if a row can be restored."""
         return self._records(row) is not None
+
+    def fill_missing(self) -> SubBandImages:
+        """Reconstruct missing positions from the rows so far: set `filled`, and return the images of sub-bands."""
+        with self._quality.timed("reconstruct missing positions"):
+            self.filled, errors = fill_missing(self.images)
+            sub_bands = fill_sub_bands(self.sub_bands)
+        self._quality.note_filled(errors)
+        return sub_bands
 
     def restore(self, row: int) -> bool:
         """Restore a row into the images; return False if it must be synchronised instead."""

@@ -40,27 +40,56 @@ def test_every_stop_is_a_file_and_a_function(file, name):
     assert name in functions(file)
 
 
-def test_a_scan_passes_the_stops_in_their_order(tmp_path):
+# Files of the host and of shared that one row passes from its raw bytes to a name; 51 in November 2026, 30 are wanted.
+MAX_FILES = 39
+ROW_TO_NAME = ("add_row", "form_images", "place_plane", "find_materials")
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory) -> tuple[list[tuple[str, str]], set[str]]:
+    """Functions (file, name) of the host in the order in which processing a small scan first calls them, and the files
+    that are passed within the pipeline's steps from raw row to name.
+    """
     from polysight.jobs.process import process
+    from polysight.pipeline import Pipeline
     from polysight_simulators.__main__ import main
 
-    scan = tmp_path / "scan"
+    folder = tmp_path_factory.mktemp("walk")
     command = ["simulate", str(ROOT / "examples" / "own-scene.toml"), "--config", str(ROOT / "instrument.toml")]
-    assert main([*command, "--out", str(scan)]) == 0
-    wanted = {(str(file), name.rpartition(".")[2]): n for n, file, name in stops() if n >= PROCESSED_FROM}
-    passed: list[int] = []
+    assert main([*command, "--out", str(folder / "scan")]) == 0
+    calls: dict[tuple[str, str], None] = {}
+    files: set[str] = set()
+    steps = {getattr(Pipeline, name).__code__: name for name in ROW_TO_NAME}
+    open_steps: list[str] = []
 
     def look(frame: FrameType, event: str, _: object) -> None:
-        if event == "call":
-            code = frame.f_code
-            stop = wanted.get((str(Path(code.co_filename).resolve()), code.co_name)) if code.co_name in names else None
-            if stop is not None and stop not in passed:
-                passed.append(stop)
+        code = frame.f_code
+        if code in steps:
+            if event == "call":
+                open_steps.append(steps[code])
+            elif event == "return":
+                open_steps.pop()
+        if event == "call" and ("polysight" in code.co_filename):
+            calls.setdefault((code.co_filename, code.co_name))
+            if open_steps:
+                files.add(code.co_filename)
 
-    names = {name for _, name in wanted}
     sys.setprofile(look)
     try:
-        assert process(scan, tmp_path / "out", threads=1) == 0
+        assert process(folder / "scan", folder / "out", threads=1) == 0
     finally:
         sys.setprofile(None)
-    assert passed == sorted(wanted.values())
+    ours = {f for f in files if "/host/polysight/" in f or "/polysight_shared/" in f}
+    return list(calls), ours
+
+
+def test_a_scan_passes_the_stops_in_their_order(walk):
+    calls, _ = walk
+    stop_numbers = {(str(file), name.rpartition(".")[2]): n for n, file, name in stops() if n >= PROCESSED_FROM}
+    passed = [stop_numbers[call] for call in calls if call in stop_numbers]
+    assert passed == sorted(stop_numbers.values())
+
+
+def test_from_raw_row_to_name_few_files_are_passed(walk):
+    _, files = walk
+    assert len(files) <= MAX_FILES, sorted(files)

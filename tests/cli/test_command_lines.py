@@ -76,6 +76,11 @@ def test_a_number_that_is_none_is_refused_in_words(words, rule, text):
     assert refusal(*words[:-1], f"{words[-1]}={text}").endswith(f"{text} is not {rule}")
 
 
+@pytest.mark.parametrize("text", ["nan", "inf", "-inf", "1e9"])
+def test_a_shift_of_the_plane_is_a_length_in_the_lab(text):
+    assert refusal("image", "s", "--out", "o", f"--depth={text}").endswith(f"{text} is not a shift of at most 1000 mm")
+
+
 @pytest.mark.parametrize(
     ("words", "value"),
     [(["--metal", "-45,0,40,40"], (-65, -20, -25, 20)), (["--metal", "45,-10,40,40"], (25, -30, 65, 10)),

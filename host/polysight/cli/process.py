@@ -22,6 +22,7 @@ from polysight.cli.options import (
 )
 from polysight.settings import Settings, path_text
 
+_shift = number(float, "a shift of at most 1000 mm", lambda value: abs(value) <= 1000)
 _millimetres = number(float, "a length above 0, at most 50 mm", lambda value: 0 < value <= 50)
 
 
@@ -93,7 +94,7 @@ def add_commands(add: Add) -> None:
     _add_data(sub)
     sub.add_argument(
         "--depth",
-        type=float,
+        type=_shift,
         default=0.0,
         metavar="MM",
         help="shift of the imaged plane, away from the rig (default: 0)",

@@ -5,6 +5,7 @@ import pytest
 
 from polysight.imaging import ImageBuilder, fill_missing, image_grid
 from polysight.imaging.sparse import added_steps, reconstruct
+from polysight_shared.errors import ConfigError
 
 AT = [(6, 8), (20, 30), (33, 12)]
 AMPLITUDES = np.array([1.0, 0.6j, -0.8])
@@ -132,3 +133,11 @@ def test_steps_too_wide_for_the_image_are_divided(scan):
         away[j - 4 : j + 5, i - 4 : i + 5] = False
     ghosts = [np.abs(builder.finish().h_raw[away]).max() for builder in (coarse, filled)]
     assert ghosts[1] < 0.5 * ghosts[0]
+
+
+def test_an_aperture_that_needs_the_direct_sum_is_refused_at_once(scan):
+    """Rows 6 mm apart and pixels of 5 mm: each of a hundred images would take seconds."""
+    kept = np.ones((10, 60), bool)
+    kept[4] = False
+    with pytest.raises(ConfigError):
+        fill_missing(scan(kept, step_y_mm=6.0))

@@ -23,6 +23,7 @@ from polysight.imaging.images import Mask
 from polysight.imaging.resolution import field_limits
 from polysight.imaging.samples import BoardSamples, choose_imager
 from polysight_shared.config import Instrument
+from polysight_shared.errors import ConfigError
 
 STRENGTH = 0.002
 """Found with simulated plates (docs/decisions/0002-imaging.md): a larger value removes plates with a weak V reflection,
@@ -190,6 +191,11 @@ def fill_missing(
         A builder with samples at all positions of a grid without ghosts; recorded samples are unchanged.
     errors
         Board name to the errors of its reconstructed positions; boards of which none is missing are left out.
+
+    Raises
+    ------
+    ConfigError
+        if positions are missing and the aperture needs the direct sum: its hundred images would take hours.
     """
     steps = added_steps(builder.rig)
     filled = ImageBuilder(_finer(builder.rig, steps), builder.taper, gate_m=builder.gate_m)
@@ -197,6 +203,13 @@ def fill_missing(
     for name, board in filled.boards.items():
         board.copy_samples(builder.boards[name], steps)
         if board.valid.any() and not board.valid.all():
+            _, slow = choose_imager(board.aperture)
+            if slow is not None:
+                raise ConfigError(
+                    "missing positions cannot be reconstructed on this grid of pixels",
+                    slow,
+                    "leave --sparse out, or give pixels whose distance divides that of the positions (--grid, [image])",
+                )
             errors[name] = _fill(board, iterations)
     return filled, errors
 

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 from tests.support.store.facts import facts_of
+from tests.support.store.plain_scan import errors
 
 from polysight.acquisition.scan import run_scan
-from polysight.store.validation import validate
 
 POINTS, PULSES = 8, 6
 
@@ -59,7 +59,7 @@ def _kept(paced, payload, folder: Path, missed: dict[str, set[int]]) -> set[str]
     paced.pi.rows_run.clear()  # the rows of the scan before
     result, answer = run_scan(paced.instrument, folder, keep_incomplete=True), set()
     assert (result.exit_status, result.incomplete_rows) == ("success", [0])
-    assert [f for f in validate(folder) if f.level == "error"] == []
+    assert errors(folder) == []
     frame = paced.instrument.frame_bytes
     for name, slots in missed.items():
         data = result.folder.read_row(name, 0)
@@ -96,4 +96,4 @@ def test_row_with_a_spurious_edge_is_not_complete(paced, payload, tmp_path):
             break
     else:
         pytest.fail("not noticed, or not placed, in 20 scans")
-    assert [f for f in validate(tmp_path / str(number)) if f.level == "error"] == []
+    assert errors(tmp_path / str(number)) == []

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.support.capture.cards import reply
+from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
 from polysight.capture.card import CardClient, EepromSettings, program_eeprom
@@ -60,9 +61,7 @@ def test_status_messages_are_not_replies(scripted):
     assert client.take_status() == Status.LVDS_BUFFER_FULL
     client.record_start()
     card.say(reply(Code.STATUS, Status.RECORD_COMPLETED))
-    deadline = time.monotonic() + 60.0
-    while Status.RECORD_COMPLETED not in client.take_status() and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_for(lambda: Status.RECORD_COMPLETED in client.take_status(), "the status")
     assert client.take_status() == Status.LVDS_BUFFER_FULL | Status.RECORD_COMPLETED
     assert client.strangers == 2
 
@@ -92,10 +91,7 @@ def test_silent_card_is_named(scripted):
     client, card = scripted(lambda *_: [], timeout_s=0.15)
     with refused(ErrorCode.NO_ANSWER, "RV", ":4202", "ALIVE", "EEPROM"):
         client.alive()
-    deadline = time.monotonic() + 60.0
-    while len(card.seen) < 3 and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert len(card.seen) == 3
+    wait_for(lambda: len(card.seen) == 3, "three requests")
 
 
 def test_command_port_in_use(scripted):

@@ -6,7 +6,6 @@ import io
 import json
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,13 +13,12 @@ import numpy as np
 import pytest
 import tomli_w
 from tests.support.paths import POLYSIGHT
-from tests.support.processes import Bench, Ended
+from tests.support.processes import LIMIT_S, Bench, Ended, wait_for
 
 from polysight_shared.tables import to_builtins
 from polysight_simulators.cards import bound_udp
 from polysight_simulators.faults import Faults
 
-LIMIT_S = 60.0
 NEW_MAC = "12:34:56:78:90:13"
 
 
@@ -147,11 +145,8 @@ def programmed(made, name: str, folder: Path, typed: str, *words: str) -> str:
         assert done.stdin is not None
         with done.stdin:
             done.stdin.write(typed + "\n")
-        deadline = time.monotonic() + LIMIT_S
-        while "looking for it" not in answer.read_text():
-            assert done.poll() is None, answer.read_text()
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
+        wait_for(lambda: done.poll() is not None or "looking for it" in answer.read_text(), "the search for the card")
+        assert done.poll() is None, answer.read_text()
         made.power_cycle(name)
         assert done.wait(LIMIT_S) == 0, answer.read_text()
     return answer.read_text()

@@ -12,7 +12,7 @@ import dpkt
 import numpy as np
 import pytest
 from tests.support.capture.recordings import CARD, OTHER, row, write_pcap
-from tests.support.capture.records import encode_packet
+from tests.support.capture.records import encode_packets
 from tests.support.paths import REAL_CAPTURES, RIG_FILE
 from tests.support.processes import Bench
 from tests.support.refusals import refused
@@ -82,10 +82,8 @@ def test_a_fault_is_the_only_remark(tmp_path, fault):
 def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):
     """A program that writes packets as they come leaves ten bytes of counters before every 1456 of payload."""
     data = row(4, False).tobytes()
-    starts = range(0, len(data), 1456)
-    packets = [encode_packet(9 + k, 70_000 + a, data[a : a + 1456]) for k, a in enumerate(starts)]
     path = tmp_path / "x.bin"
-    path.write_bytes(b"".join(packets))
+    path.write_bytes(b"".join(encode_packets(data, 9, 70_000)))
     r = inspect_bin(path)
     assert (r.chirps, r.bytes) == (32, len(data))
     assert ["whole packets" in remark for remark in r.remarks] == [True]
@@ -139,10 +137,7 @@ def test_pcapng_gives_the_same_datagrams(tmp_path):
 
 
 def test_lost_packets_of_a_pcap_are_masked_and_reported(tmp_path):
-    data = row(4, False).tobytes()
-    count, sequence = 2**48 - 30_000, 2**32 - 3
-    starts = range(0, len(data), 1456)
-    packets = [encode_packet(sequence + k, count + a, data[a : a + 1456]) for k, a in enumerate(starts)]
+    packets = encode_packets(row(4, False).tobytes(), 2**32 - 3, 2**48 - 30_000)
     write_pcap(tmp_path / "x.pcap", [*packets[:5], *packets[6:], packets[4]])
     r = inspect_pcap(tmp_path / "x.pcap")
     assert r.card is not None
@@ -228,10 +223,7 @@ def test_the_command_reads_the_layout_that_is_given(polysight, tmp_path):
 
 
 def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
-    data = row(4, False).tobytes()
-    starts = range(0, len(data), 1456)
-    packets = [encode_packet(1 + k, a, data[a : a + 1456]) for k, a in enumerate(starts)]
-    both = [packet for packet in packets for _ in range(2)]
+    both = [packet for packet in encode_packets(row(4, False).tobytes(), 1, 0) for _ in range(2)]
     write_pcap(tmp_path / "both", both, cards=(CARD, OTHER))  # known by its first bytes, not by its name
     done = polysight("both")
     assert done.status == 3

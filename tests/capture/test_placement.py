@@ -13,6 +13,7 @@ from tests.support.capture.records import (
     FULL,
     Record,
     encode_packet,
+    encode_packets,
     is_original_or_masked,
     mask_of,
     next_start,
@@ -273,8 +274,7 @@ def test_truncated_packet(cut, which, count, known):
 def test_missed_frames_are_never_placed_as_if_nothing_was_missing(missed, count, known, at):
     whole = Record.make(20 * 4096, count, 9)
     data = whole.data[: at * 4096] + whole.data[(at + missed) * 4096 :]
-    packets = [encode_packet(9 + k, count + a, data[a : a + FULL]) for k, a in enumerate(range(0, len(data), FULL))]
-    placed, _ = place(len(whole.data), packets, Counters(count, 9) if known else None, 4096)
+    placed, _ = place(len(whole.data), encode_packets(data, 9, count), Counters(count, 9) if known else None, 4096)
     assert not placed.located
     assert placed.missing == [(0, len(whole.data))]
 

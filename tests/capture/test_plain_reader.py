@@ -6,16 +6,17 @@ import hashlib
 import json
 import socket
 import struct
-import time
 import zlib
 from pathlib import Path
 
 import msgpack
 import numpy as np
-from tests.support.capture.records import encode_packet
+from tests.support.capture.records import encode_packets
+from tests.support.processes import wait_for
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 
+from polysight.capture.dca1000 import decode_packet_header
 from polysight.capture.receiver import ReceiverProcess
 from polysight.store.logs import EventWriter
 from polysight.store.manifest import ManifestWriter
@@ -36,6 +37,21 @@ def read_row(path: Path) -> tuple[dict, np.ndarray, np.ndarray]:
     return index, arrivals, samples
 
 
+def take_crc(fact: dict) -> None:
+    """Check and remove the checksum of a manifest line."""
+    crc = fact.pop("crc")
+    assert crc == f"{zlib.crc32(json.dumps(fact, sort_keys=True, separators=(',', ':')).encode()):08x}"
+
+
+def read_events(path: Path) -> list[dict]:
+    """Events of a log, their checksums verified and removed."""
+    with path.open("rb") as f:
+        events = list(msgpack.Unpacker(f))
+    for event in events:
+        assert event.pop("crc") == zlib.crc32(msgpack.packb(event))
+    return events
+
+
 def test_segments(board, tmp_path):
     rng = np.random.default_rng(3)
     counts = rng.integers(-900, 900, (2, 4, FRAMES, SAMPLES))
@@ -45,12 +61,10 @@ def test_segments(board, tmp_path):
     with ReceiverProcess(board, 1 << 20) as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as card:
         card.bind((board.card_address, 1024))
         receiver.begin_row(0, 1, len(sent), 4096, path)
-        for k, a in enumerate(range(0, len(sent), 1456)):
-            if a != gone[0]:
-                card.sendto(encode_packet(1 + k, a, sent[a : a + 1456]), (board.host_address, board.data_port))
-        deadline = time.monotonic() + 60
-        while receiver.report().received < len(sent) - 1456 and time.monotonic() < deadline:
-            time.sleep(0.005)
+        for packet in encode_packets(sent, 1, 0):
+            if decode_packet_header(packet)[1] != gone[0]:
+                card.sendto(packet, (board.host_address, board.data_port))
+        wait_for(lambda: receiver.report().received == len(sent) - 1456, "packets")
         row = receiver.end_row()
     index, arrivals, samples = read_row(path)
     assert index["missing"] == [list(gone)]
@@ -73,10 +87,7 @@ def test_events(tmp_path):
         writer.append(Capture(**event))
     writer.sync()
     writer.close()
-    with path.open("rb") as f:
-        found = list(msgpack.Unpacker(f))
-    for event in found:
-        assert event.pop("crc") == zlib.crc32(msgpack.packb(event))
+    found = read_events(path)
     assert [event.pop("version") for event in found] == ["1.0"] * 5
     assert found == [{"type": "Capture"} | event for event in sent]
 
@@ -92,8 +103,7 @@ def test_manifest(tmp_path):
     lines = (tmp_path / "manifest.jsonl").read_bytes().splitlines()
     found = [json.loads(line) for line in lines]
     for count, fact in enumerate(found):
-        crc = fact.pop("crc")
-        assert crc == f"{zlib.crc32(json.dumps(fact, sort_keys=True, separators=(',', ':')).encode()):08x}"
+        take_crc(fact)
         assert fact.pop("count") == count
         assert fact.pop("previous") == (hashlib.sha256(lines[count - 1]).hexdigest()[:16] if count else "")
     assert found == facts
@@ -105,8 +115,7 @@ def test_whole_scan(tmp_path):
     folder = simulate(published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
     facts = [json.loads(line) for line in (folder / "manifest.jsonl").read_text("ascii").splitlines()]
     for fact in facts:
-        crc = fact.pop("crc")
-        assert crc == f"{zlib.crc32(json.dumps(fact, sort_keys=True, separators=(',', ':')).encode()):08x}"
+        take_crc(fact)
     plan = facts[0]["plan"]
     rows = {fact["row"]: fact for fact in facts if fact["fact"] == "row_committed"}
     assert sorted(rows) == list(range(plan["rows"]))
@@ -117,10 +126,7 @@ def test_whole_scan(tmp_path):
             assert index["missing"] == []
             assert samples.shape == (4, fact["pulses"], SAMPLES)
             assert np.abs(samples).mean() > 100
-    with (folder / "events.msgpack").open("rb") as f:
-        events = list(msgpack.Unpacker(f))
-    for event in events:
-        assert event.pop("crc") == zlib.crc32(msgpack.packb(event))
+    events = read_events(folder / "events.msgpack")
     assert [event["seq"] for event in events] == list(range(1, len(events) + 1))
     points = [event["column"] for event in events if event["type"] == "Capture" and event["row_index"] == 1]
     assert points == list(reversed(range(plan["columns"])))

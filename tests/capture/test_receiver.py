@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.capture.records import encode_packet
+from tests.support.capture.records import FULL, encode_packets
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
@@ -27,19 +27,12 @@ from polysight_shared.config import Board
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
 
-FULL = 1456
-
 
 @pytest.fixture
 def card(board):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
         s.bind((board.card_address, 1024))
         yield s
-
-
-def packets(data: bytes, sequence: int, count: int) -> list[bytes]:
-    starts = range(0, len(data), FULL)
-    return [encode_packet(sequence + k, count + a, data[a : a + FULL]) for k, a in enumerate(starts)]
 
 
 def noise(size: int, seed: int) -> bytes:
@@ -64,7 +57,7 @@ def test_rows_are_bit_exact_and_counters_go_on(board, card, tmp_path):
         for k, data in enumerate((first, second, third)):
             path = tmp_path / f"{k}.part"
             assert receiver.begin_row(k, 1, size, 4096, path) == 0
-            some = packets(data, sequence + k * n, count + k * size)
+            some = encode_packets(data, sequence + k * n, count + k * size)
             if k == 1:
                 some = [*some[2:50], some[51], some[50], some[51], *some[52:]]  # head lost, reordered, duplicate
                 send(card, board, [*some, b"tiny"])
@@ -99,7 +92,7 @@ def test_data_counts_from_any_source_port(board, tmp_path, source_port):
         closing(bind_udp(board.card_address, source_port, "card")) as card,
     ):
         receiver.begin_row(0, 1, len(data), 1, tmp_path / "a.part")
-        send(card, board, packets(data, 1, 0))
+        send(card, board, encode_packets(data, 1, 0))
         wait_for(lambda: receiver.poll().complete, "packets")
         row = receiver.end_row()
     assert (row.complete, row.strangers) == (True, 0)
@@ -110,11 +103,11 @@ def test_strangers_and_stale_packets_are_not_data(board, card, tmp_path):
     data = noise(20_000, 4)
     other = (board.host_address, 0)
     with ReceiverProcess(board, 1 << 20) as receiver, closing(bind_udp(*other, "stranger")) as stranger:
-        send(card, board, packets(noise(5000, 5), 1, 0))
+        send(card, board, encode_packets(noise(5000, 5), 1, 0))
         wait_for(lambda: _waiting(board) > 0, "packets")
         assert receiver.begin_row(0, 1, len(data), 1, tmp_path / "a.part") == 4
-        stranger.sendto(packets(noise(5000, 6), 1, 0)[0], (board.host_address, board.data_port))
-        send(card, board, packets(data, 70, 999))
+        stranger.sendto(encode_packets(noise(5000, 6), 1, 0)[0], (board.host_address, board.data_port))
+        send(card, board, encode_packets(data, 70, 999))
         wait_for(lambda: receiver.poll().complete, "packets")
         row = receiver.end_row()
     assert row.complete
@@ -195,7 +188,7 @@ def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
         for receiver in (swamped, quiet):
             receiver.begin_row(0, 1, 2000 * FULL, FULL, tmp_path / f"{receiver.board.name}.part")
         os.kill(swamped.pid, signal.SIGSTOP)
-        some = packets(noise(2000 * FULL, 3), 1, 0)
+        some = encode_packets(noise(2000 * FULL, 3), 1, 0)
         for packet in some:
             card.sendto(packet, (board.host_address, board.data_port))
         for packet in some[:20]:
@@ -214,7 +207,7 @@ def test_data_dropped_by_the_card_masks_the_row(board, card, tmp_path):
     data = noise(20_000, 4)
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, len(data), 1000, tmp_path / "a.part")
-        send(card, board, packets(data, 1, 0))
+        send(card, board, encode_packets(data, 1, 0))
         wait_for(lambda: receiver.poll().complete, "packets")
         row = receiver.end_row(Status.LVDS_BUFFER_FULL | Status.RECORD_COMPLETED)
     assert row.lost_before_packets == Status.LVDS_BUFFER_FULL
@@ -228,7 +221,7 @@ def test_the_short_last_packet_is_reported_at_once(board, card, tmp_path):
     """Frames were missed: the byte count is never reached, and the card's short tail says that nothing follows."""
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, 40_960, 4096, tmp_path / "a.part")
-        send(card, board, packets(noise(36_864, 4), 1, 0))
+        send(card, board, encode_packets(noise(36_864, 4), 1, 0))
         wait_for(lambda: receiver.poll().ended, "packets")
         assert not receiver.poll().complete
         row = receiver.end_row()

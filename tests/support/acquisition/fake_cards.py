@@ -10,8 +10,7 @@ import threading
 import numpy as np
 
 from polysight_shared.config import Board
-
-FULL = 1456  # bytes of samples in a full packet
+from tests.support.capture.records import FULL, encode_packet
 
 
 @functools.cache
@@ -83,9 +82,9 @@ class FakeCard:
 
     def _send_packet(self, size: int) -> None:
         body, self._rest = self._rest[:size], self._rest[size:]
-        head = struct.pack("<IIH", self.sequence, self.count & 0xFFFFFFFF, self.count >> 32)
         if body:
-            self.out.sendto(head + body, (self.board.host_address, self.board.data_port))
+            packet = encode_packet(self.sequence, self.count, body)
+            self.out.sendto(packet, (self.board.host_address, self.board.data_port))
             self.sequence, self.count = self.sequence + 1, self.count + len(body)
 
     def send_row(self, row: int, take: int) -> None:
@@ -97,8 +96,7 @@ class FakeCard:
         for k, start in enumerate(range(0, len(data), FULL)):
             body = data[start : start + FULL]
             if k not in self.drop.get((row, take), ()):
-                head = struct.pack("<IIH", self.sequence, self.count & 0xFFFFFFFF, self.count >> 32)
-                self.out.sendto(head + body, to)
+                self.out.sendto(encode_packet(self.sequence, self.count, body), to)
             self.sequence += 1
             self.count += len(body)
         self.report_status()

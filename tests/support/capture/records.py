@@ -19,6 +19,12 @@ def encode_packet(sequence: int, byte_count: int, payload: bytes) -> bytes:
     return (sequence % 2**32).to_bytes(4, "little") + count.to_bytes(6, "little") + payload
 
 
+def encode_packets(data: bytes, sequence: int, byte_count: int) -> list[bytes]:
+    """All packets of a record that starts with these counters."""
+    starts = range(0, len(data), FULL)
+    return [encode_packet(sequence + k, byte_count + a, data[a : a + FULL]) for k, a in enumerate(starts)]
+
+
 @dataclass
 class Record:
     data: bytes
@@ -28,8 +34,7 @@ class Record:
     def make(size: int, count: int, sequence: int, seed: int = 0) -> Record:
         # no zero bytes, so that a wrongly zeroed byte shows
         data = np.random.default_rng(seed).integers(1, 256, size, dtype=np.uint8).tobytes()
-        starts = range(0, size, FULL)
-        return Record(data, [encode_packet(sequence + k, count + a, data[a : a + FULL]) for k, a in enumerate(starts)])
+        return Record(data, encode_packets(data, sequence, count))
 
     def bytes_of(self, k: int) -> tuple[int, int]:
         return k * FULL, min((k + 1) * FULL, len(self.data))

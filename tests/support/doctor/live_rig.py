@@ -7,7 +7,7 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.findings import Finding
 from polysight_shared.tables import to_builtins
 from tests.support.doctor.case import QUICK
-from tests.support.processes import LIMIT_S, wait_for
+from tests.support.processes import LIMIT_S, processes_naming, wait_for
 from tests.support.rigs import programmed_rig
 
 SCENE = """name = "doctor"
@@ -118,15 +118,10 @@ class LiveRig:
             wait_for(lambda: pi.status().state == "homed", "homed")
 
     def _pid(self, word: str) -> int:
-        found = []
-        for entry in Path("/proc").iterdir():
-            if entry.name.isdigit():
-                with suppress(OSError):
-                    line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-                    if str(self.folder) in line and word in line and "polysight_simulators.rig" not in line:
-                        found.append(int(entry.name))
-        assert len(found) == 1, (word, found)
-        return found[0]
+        lines = processes_naming(str(self.folder))
+        pids = [pid for pid, line in lines.items() if word in line and "polysight_simulators.rig" not in line]
+        assert len(pids) == 1, (word, pids)
+        return pids[0]
 
 
 @contextmanager

@@ -30,12 +30,11 @@ from polysight_shared.errors import PolysightError
 from polysight_shared.raster import plan_raster
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.scene import SimulatedRig, load_scene, row_offsets_mm
-from tests.support.capture.records import encode_packet
+from tests.support.capture.records import encode_packets
 from tests.support.pipelines import pipeline_of
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 
-FULL = 1456  # bytes of samples in a full packet
 SCENE = small_scene(3, 3, step_mm=(20.0, 20.0), pixels=12)
 
 
@@ -186,8 +185,7 @@ class SmallRig:
         row, take = self._row
         data = self._samples.of(name, row)
         log, evidence = PacketLog(len(data)), Evidence(len(data), self._samples.instrument.frame_bytes)
-        for k, at in enumerate(range(0, len(data), FULL)):
-            packet = encode_packet(k + 1, at, data[at : at + FULL])
+        for k, packet in enumerate(encode_packets(data, 1, 0)):
             log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), k + 1)
         placed, out = place_record(log, evidence.frame_bytes)
         crc = segment.finish(out)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 import tomli_w
 from tests.support.doctor.live_rig import SCENE, LiveRig, impatient_rig
-from tests.support.processes import LIMIT_S, wait_for
+from tests.support.processes import Bench
 
 from polysight_shared.tables import to_builtins
 from polysight_simulators.loopback import on_free_subnet
@@ -21,22 +20,13 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRig]:
     folder = tmp_path_factory.mktemp("d")
     (folder / "base.toml").write_text(tomli_w.dumps(to_builtins(impatient_rig())))
     (folder / "scene.toml").write_text(SCENE)
-    command = [sys.executable, "-m", "polysight_simulators.rig", "--config", str(folder / "base.toml"), "--with-pi"]
-    command += ["--scene", str(folder / "scene.toml"), "--dir", str(folder / "rig"), "--time-scale", "40"]
-    log = folder / "rig.log"
-    with log.open("wb") as out:
-        rig = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, start_new_session=True)
-
-    def ready() -> bool:
-        assert rig.poll() is None, log.read_text()
-        return "ready " in log.read_text()
-
-    try:
-        wait_for(ready, "the simulated rig")
+    with closing(Bench(folder)) as bench:
+        rig = bench.start(
+            "python", "-m", "polysight_simulators.rig", "--config", "base.toml", "--with-pi",
+            "--scene", "scene.toml", "--dir", folder / "rig", "--time-scale", "40",
+        )  # fmt: skip
+        rig.wait_ready()
         yield LiveRig(folder, folder / "rig" / "instrument.toml")
-    finally:
-        rig.terminate()
-        rig.wait(LIMIT_S)
 
 
 @pytest.fixture

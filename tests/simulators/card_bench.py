@@ -74,6 +74,12 @@ class Bench:
             self.card.pulses([(self.pulse + i) * PERIOD_NS for i in range(some)], self.track)
             self.pulse, n = self.pulse + some, n - some
 
+    def record(self, pulses: int) -> None:
+        """Start a record, send pulses and wait for its end."""
+        self.request(*START)
+        self.pulses(pulses)
+        self.end()
+
     def end(self) -> None:
         self.now += 2.001
         self.card.tick(False)

@@ -51,14 +51,21 @@ def positions_by_pauses(log: Path) -> list[int]:
     return frames
 
 
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return scan_in(tmp_path_factory.mktemp("scan"))
+
+
 @pytest.mark.parametrize("board", ["RH", "RV", "LS"])
-def test_the_authors_rule_finds_every_frames_position(tmp_path: Path, board: str) -> None:
-    for log in sorted((scan_in(tmp_path) / board).glob("*_log.csv")):
+def test_the_authors_rule_finds_every_frames_position(scan: Path, board: str) -> None:
+    logs = sorted((scan / board).glob("*_log.csv"))
+    assert len(logs) == 2
+    for log in logs:
         assert positions_by_pauses(log) == [i for i in range(5) for _ in range(PULSES)]
 
 
-def test_the_short_last_packet_comes_two_seconds_after_the_data(tmp_path: Path) -> None:
-    table = np.loadtxt(scan_in(tmp_path) / "RH" / "0_0_log.csv", delimiter=",")
+def test_the_short_last_packet_comes_two_seconds_after_the_data(scan: Path) -> None:
+    table = np.loadtxt(scan / "RH" / "0_0_log.csv", delimiter=",")
     steps = np.diff(table[:, 2])
     assert table[-1, 1] < table[:-1, 1].min()
     assert steps[-1] == pytest.approx(2.0, abs=0.01)

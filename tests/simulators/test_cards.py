@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomli_w
-from tests.simulators.card_bench import ALIVE, EEPROM, START, Bench, reply
+from tests.simulators.card_bench import ALIVE, EEPROM, FRAME, PERIOD_NS, START, Bench, payload, reply
 from tests.support.refusals import refused
 
 from polysight_shared.config import Instrument
@@ -30,8 +30,6 @@ from polysight_simulators.loopback import is_free, on_subnet
 from polysight_simulators.scene import pattern_frames
 
 TIME_SCALE = 20.0
-FRAME = 4096
-PERIOD_NS = 1_500_000
 CONFIGURE, PACKET = bytes.fromhex("01010102031e"), bytes.fromhex("be05350c0000")
 COMPLETED = bytes.fromhex("5aa50a000001aaee")
 
@@ -80,10 +78,6 @@ class HostSide:
         return pattern_frames(self.index, first, n, 256).tobytes()
 
 
-def payload(packets: list[bytes]) -> bytes:
-    return b"".join(p[10:] for p in packets)
-
-
 def sequences(packets: list[bytes]) -> list[int]:
     return [struct.unpack_from("<I", p)[0] for p in packets]
 
@@ -92,7 +86,14 @@ Start = Callable[..., dict[str, HostSide]]
 
 
 @pytest.fixture
-def start(rig: Instrument, tmp_path: Path) -> Iterator[Start]:
+def config(rig: Instrument, tmp_path: Path) -> Path:
+    path = tmp_path / "rig.toml"
+    path.write_text(tomli_w.dumps(to_builtins(rig)))
+    return path
+
+
+@pytest.fixture
+def start(rig: Instrument, config: Path, tmp_path: Path) -> Iterator[Start]:
     """Starts hub and cards with the given arguments; host sockets per board."""
     running: list[subprocess.Popen[str]] = []
     with ExitStack() as sockets:
@@ -108,8 +109,6 @@ def start(rig: Instrument, tmp_path: Path) -> Iterator[Start]:
             return process
 
         def begin(*arguments: str, boards: str = "RH,RV") -> dict[str, HostSide]:
-            config = tmp_path / "rig.toml"
-            config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
             launch("polysight_simulators.wires", "--socket", str(tmp_path / "w.sock"))
             common = ("--config", str(config), "--wires", str(tmp_path / "w.sock"), "--boards", boards, "--pattern")
             launch("polysight_simulators.cards", *common, "--time-scale", str(TIME_SCALE), *arguments)
@@ -188,9 +187,7 @@ def test_a_record_goes_on_while_the_stage_moves_or_owes_a_burst(
         (["--boards", "RH"], "neither --scene nor --pattern"),
     ],
 )
-def test_wrong_arguments_are_one_message(rig: Instrument, tmp_path: Path, arguments: list[str], words: str) -> None:
-    config = tmp_path / "rig.toml"
-    config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
+def test_wrong_arguments_are_one_message(config: Path, tmp_path: Path, arguments: list[str], words: str) -> None:
     command = [sys.executable, "-m", "polysight_simulators.cards", "--config", config, "--wires", tmp_path / "w.sock"]
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=20, check=False)
     assert done.returncode == 2

@@ -15,6 +15,13 @@ from polysight_shared.config import Instrument
 from polysight_simulators.faults import Faults, read_faults
 
 
+def packets_of_40_pulses(rig: Instrument, **faults: Any) -> list[bytes]:
+    with ExitStack() as stack:
+        bench = Bench(rig, stack, **faults)
+        bench.record(40)
+        return bench.packets()
+
+
 @pytest.mark.parametrize("bit", range(12))
 def test_every_status_bit_comes_on_demand(rig: Instrument, sockets: ExitStack, bit: int) -> None:
     bench = Bench(rig, sockets, pulse_status=[[5, bit]], command_status=[[0x02, bit]])
@@ -70,9 +77,7 @@ def test_the_same_seed_gives_the_same_bytes_and_the_counts_are_the_truth(rig: In
     def run(seed: int) -> tuple[list[bytes], dict[str, int | None]]:
         with ExitStack() as stack:
             bench = Bench(rig, stack, seed, **faults)
-            bench.request(*START)
-            bench.pulses(100)
-            bench.end()
+            bench.record(100)
             return bench.packets(), bench.counts
 
     packets, counts = run(4)
@@ -98,17 +103,9 @@ def test_the_same_seed_gives_the_same_bytes_and_the_counts_are_the_truth(rig: In
 
 
 def test_a_turned_bit_is_one_bit_of_the_payload_or_of_the_header(rig: Instrument) -> None:
-    def run(**faults: float) -> list[bytes]:
-        with ExitStack() as stack:
-            bench = Bench(rig, stack, **faults)
-            bench.request(*START)
-            bench.pulses(40)
-            bench.end()
-            return bench.packets()
-
-    clean = run()
+    clean = packets_of_40_pulses(rig)
     for key, at in (("corrupt", slice(10, None)), ("corrupt_header", slice(0, 10))):
-        dirty = run(**{key: 1.0})
+        dirty = packets_of_40_pulses(rig, **{key: 1.0})
         assert len(dirty) == len(clean)
         for a, b in zip(clean, dirty, strict=True):
             turned = np.bitwise_xor(np.frombuffer(a, np.uint8), np.frombuffer(b, np.uint8))
@@ -120,9 +117,7 @@ def test_the_ddr_overflow_has_its_own_bit_and_leaves_no_gap_in_the_sequence(
     rig: Instrument, sockets: ExitStack
 ) -> None:
     bench = Bench(rig, sockets, ddr_full=0.2)
-    bench.request(*START)
-    bench.pulses(50)
-    bench.end()
+    bench.record(50)
     answer = bench.messages()
     packets = bench.packets()
     lost = int(bench.counts["overflows"] or 0)
@@ -153,24 +148,16 @@ def test_the_link_is_down_for_a_time(rig: Instrument, sockets: ExitStack) -> Non
 
 
 def test_a_link_that_is_down_does_not_shift_other_faults(rig: Instrument) -> None:
-    def run(**faults: Any) -> set[bytes]:
-        with ExitStack() as stack:
-            bench = Bench(rig, stack, loss=0.3, corrupt=0.3, **faults)
-            bench.request(*START)
-            bench.pulses(40)
-            bench.end()
-            return set(bench.packets())
-
-    whole, broken = run(), run(link_down=[[10, 0.015]])
+    others = {"loss": 0.3, "corrupt": 0.3}
+    whole = set(packets_of_40_pulses(rig, **others))
+    broken = set(packets_of_40_pulses(rig, **others, link_down=[[10, 0.015]]))
     assert broken < whole
     assert {p[4:10] for p in whole - broken} <= {n.to_bytes(6, "little") for n in range(9 * FRAME, 20 * FRAME)}
 
 
 def test_the_end_of_a_record_is_lost_with_the_link(rig: Instrument, sockets: ExitStack) -> None:
     bench = Bench(rig, sockets, link_down=[[8, 5.0]])
-    bench.request(*START)
-    bench.pulses(10)
-    bench.end()
+    bench.record(10)
     assert bench.messages() == []
     assert len(bench.packets()) == 8 * FRAME // 1456
     assert bench.counts["link_down_statuses"] == 1
@@ -181,15 +168,11 @@ def test_a_card_that_resets_in_a_record_loses_the_rest_and_counts_afresh(
     rig: Instrument, sockets: ExitStack, key: str
 ) -> None:
     bench = Bench(rig, sockets, **{key: [10]})
-    bench.request(*START)
-    bench.pulses(20)
-    bench.end()
+    bench.record(20)
     assert bench.messages() == []
     packets = bench.packets()
     assert payload(packets) == bench.pattern(0, 10)[: 10 * FRAME // 1456 * 1456]
-    bench.request(*START)
-    bench.pulses(4)
-    bench.end()
+    bench.record(4)
     packets = bench.packets()
     assert struct.unpack_from("<IIH", packets[0]) == (1, 0, 0)
     assert payload(packets) == bench.pattern(20, 4)

@@ -33,8 +33,12 @@ SCENE = decode_scene(RAW, "t")
 LOSSY = SCENE.with_disturbances(packet_loss=0.02)
 
 
-def test_rows_contain_the_radars_bytes_at_true_positions(tmp_path: Path) -> None:
-    folder = simulate(RIG, SCENE, tmp_path / "scan", started_s=0.0)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulate(RIG, SCENE, tmp_path_factory.mktemp("own") / "scan", started_s=0.0)
+
+
+def test_rows_contain_the_radars_bytes_at_true_positions(folder: Path) -> None:
     radar = SimulatedRig(RIG, SCENE)
     row = plan_raster(radar.rig.grid).row(1)
     x, y = row_offsets_mm(radar, row)
@@ -71,8 +75,7 @@ def test_every_manifest_line_has_its_crc(tmp_path: Path) -> None:
             assert board["frames_received"] == board["frames_expected"] - len(hit)
 
 
-def test_events_agree_with_the_rows_in_sequence(tmp_path: Path) -> None:
-    folder = simulate(RIG, SCENE, tmp_path / "scan", started_s=0.0)
+def test_events_agree_with_the_rows_in_sequence(folder: Path) -> None:
     unpacker = msgpack.Unpacker()
     unpacker.feed((folder / "events.msgpack").read_bytes())
     events = [unpack_event(msgpack.packb(e)) for e in unpacker]
@@ -86,16 +89,17 @@ def test_events_agree_with_the_rows_in_sequence(tmp_path: Path) -> None:
     assert sum(e.pulses for e in events if isinstance(e, RowFinished)) == 15 * 16
 
 
-def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
-    a, b, c = (simulate(RIG, SCENE, tmp_path / n, seed=s, started_s=0.0) for n, s in (("a", 9), ("b", None), ("c", 10)))
+def test_the_same_seed_writes_the_same_bytes_also_of_drawn_specimens(tmp_path: Path) -> None:
+    rough = {**RAW["plates"][1], "rough_mm": 0.2, "tilt_deg": [0.5, 0.1]}
+    scene = decode_scene({**RAW, "plates": [RAW["plates"][0], rough], "specimen_spread": [0.03, 0.3]}, "t")
+    a, b, c = (simulate(RIG, scene, tmp_path / n, seed=s, started_s=0.0) for n, s in (("a", 9), ("b", None), ("c", 10)))
     names = sorted(p.relative_to(a) for p in a.rglob("*") if p.is_file())
     assert names == sorted(p.relative_to(b) for p in b.rglob("*") if p.is_file())
     assert all((a / n).read_bytes() == (b / n).read_bytes() for n in names)
     assert (a / "raw/RH/0000.bin").read_bytes() != (c / "raw/RH/0000.bin").read_bytes()
 
 
-def test_truth_json_has_plates_and_points(tmp_path: Path) -> None:
-    folder = simulate(RIG, SCENE, tmp_path / "scan", started_s=0.0)
+def test_truth_json_has_plates_and_points(folder: Path) -> None:
     truth = json.loads((folder / "truth.json").read_text())
     assert truth["simulated"] is True
     assert truth["seed"] == 9

@@ -82,14 +82,6 @@ def test_facets_fill_the_plate_and_have_the_given_roughness() -> None:
     assert np.array_equal(found.height_m, facets(plate, 0, 1).height_m)
 
 
-def test_the_same_seed_gives_the_same_bytes() -> None:
-    real = {"plates": [{**PLATE, "rough_mm": 0.2, "tilt_deg": [0.5, 0.1]}], "specimen_spread": [0.03, 0.3]}
-    x = np.array([0.0, 5.0])
-    one, two = (SimulatedRig(RIG, scene(**real)).chirps("RH", x, x, 0) for _ in range(2))
-    assert one.tobytes() == two.tobytes()
-    assert one.tobytes() != SimulatedRig(RIG, scene()).chirps("RH", x, x, 0).tobytes()
-
-
 @pytest.mark.parametrize(
     "plate", [{"tilt_deg": [30.0, 0.0]}, {"height_mm": 400.0}, {"rough_mm": -0.1}, {"rough_length_mm": 0.0}]
 )

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import pytest
+import tomli_w
 from tests.support.acquisition.fake_cards import payload_of
 from tests.support.acquisition.fake_rig import FakeRig, small_instrument
 from tests.support.acquisition.receivers import fork_receivers
 from tests.support.page.fixtures import finished, samples
+
+from polysight_shared.tables import to_builtins
 
 __all__ = ["finished", "samples"]
 
@@ -22,6 +25,14 @@ def rig():
     fake.start()
     yield fake
     fake.close()
+
+
+@pytest.fixture
+def config(rig, tmp_path):
+    """The rig file of `rig`."""
+    path = tmp_path / "rig.toml"
+    path.write_text(tomli_w.dumps(to_builtins(rig.instrument)))
+    return path
 
 
 @pytest.fixture

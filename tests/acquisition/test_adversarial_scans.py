@@ -9,7 +9,6 @@ import random
 import time
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from tests.support.acquisition.fake_cards import FakeCard, payload_of
@@ -65,9 +64,7 @@ GRIDS = [(3, 3), (91, 1), (7, 4)]  # points, pulses; 91 ends in a full packet
 
 def adversarial_rig(number: int) -> FakeRig:
     points, pulses = GRIDS[number % len(GRIDS)]
-    made = small_instrument(row_retakes=4)
-    grid = msgspec.structs.replace(made.grid, columns=points, rows=4)
-    rig = FakeRig(msgspec.structs.replace(made, grid=grid, burst=msgspec.structs.replace(made.burst, pulses=pulses)))
+    rig = FakeRig(small_instrument(columns=points, pulses=pulses, row_retakes=4))
     for board in rig.instrument.recorded:
         chance = random.Random(f"{number} {board.name}")
         rig.cards[board.name] = AdversarialCard(board, rig.instrument.row_bytes, rig.instrument.frame_bytes, chance)

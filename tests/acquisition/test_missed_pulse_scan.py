@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
+from tests.support.acquisition.fake_rig import FakeRig
 from tests.support.store.facts import facts_of
 from tests.support.store.plain_scan import errors
 
@@ -18,12 +18,7 @@ POINTS, PULSES = 8, 6
 @pytest.fixture
 def paced(make_instrument):
     """Rows of 8 points and 6 pulses, their frames sent at the times of their pulses."""
-    from tests.support.acquisition.fake_rig import FakeRig
-
-    made = make_instrument(row_retakes=1)
-    grid = msgspec.structs.replace(made.grid, columns=POINTS, rows=2)
-    burst = msgspec.structs.replace(made.burst, pulses=PULSES)
-    fake = FakeRig(msgspec.structs.replace(made, grid=grid, burst=burst))
+    fake = FakeRig(make_instrument(columns=POINTS, rows=2, pulses=PULSES, row_retakes=1))
     fake.start()
     fake.pi.paced = True
     yield fake

@@ -8,10 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-import tomli_w
 
 from polysight.store import validate
-from polysight_shared.tables import to_builtins
 
 PROCESSING = (
     "api calibration catalogue imaging materials page pipeline plan polarimetry process products report results"
@@ -36,9 +34,7 @@ def modules_after(*words: object, note: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("resumed", [False, True])
-def test_a_recorded_scan_loads_nothing_of_the_processing(rig, tmp_path, resumed):
-    config = tmp_path / "rig.toml"
-    config.write_text(tomli_w.dumps(to_builtins(rig.instrument)))
+def test_a_recorded_scan_loads_nothing_of_the_processing(config, tmp_path, resumed):
     out = tmp_path / "scan"
     loaded = modules_after("scan", "--config", config, "--out", out, "--no-process", note=tmp_path / "note")
     if resumed:

@@ -12,7 +12,6 @@ import time
 import msgspec
 import numpy as np
 import pytest
-import tomli_w
 from tests.support.acquisition.fake_cards import FULL, FakeCard, payload_of
 from tests.support.acquisition.fake_rig import FakeRig
 from tests.support.processes import wait_for
@@ -31,7 +30,6 @@ from polysight_shared.config import Board
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError
 from polysight_shared.messages import Capture, RunStarted, RunStopped
-from polysight_shared.tables import to_builtins
 
 
 def digests(scan: ScanFolder) -> dict[str, str]:
@@ -163,16 +161,15 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
     assert set(takes_so_far(result.folder)) == {0, 1, 2, 3}
 
 
-def test_killed_host_resumes_and_committed_rows_stay(rig, payload, tmp_path):
+def test_killed_host_resumes_and_committed_rows_stay(rig, config, payload, tmp_path):
     """SIGKILL in the middle of row 2. The Pi finishes that row; the new take must not use its end."""
-    (tmp_path / "rig.toml").write_text(tomli_w.dumps(to_builtins(rig.instrument)))
     code = (
         "import sys\nfrom pathlib import Path\nfrom polysight_shared.config import load_instrument\n"
         "from polysight.acquisition.scan import run_scan\n"
         "run_scan(load_instrument(Path(sys.argv[1])), Path(sys.argv[2]))"
     )
     rig.pi.hang_at = {2}
-    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "rig.toml"), str(tmp_path / "s")]) as host:
+    with subprocess.Popen([sys.executable, "-c", code, str(config), str(tmp_path / "s")]) as host:
         wait_for(lambda: rig.pi.hanging is not None, "row 2")
         host.kill()
     rig.pi.finish_hanging()
@@ -290,8 +287,7 @@ class LateCard(FakeCard):
 @pytest.mark.parametrize("lag_ms", [0, 5, 30])
 def test_take_after_a_row_that_ended_early_is_whole(make_instrument, payload, tmp_path, lag_ms):
     """The Pi reports a fault in row 1. The last packet and the status arrive some ms after the reply to the stop."""
-    made = make_instrument(end_of_record_s=10.0)
-    rig = FakeRig(msgspec.structs.replace(made, grid=msgspec.structs.replace(made.grid, rows=2)))
+    rig = FakeRig(make_instrument(rows=2, end_of_record_s=10.0))
     for board in rig.instrument.recorded:
         card = LateCard(board, rig.instrument.row_bytes, lag_ms / 1e3)
         card.cut[1, 1] = 4 * FULL + 100

@@ -14,7 +14,6 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
-import tomli_w
 from tests.support.acquisition.receivers import receiver_of
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
@@ -34,7 +33,6 @@ from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, PolysightError, ScanError, os_error
 from polysight_shared.faults import explain
-from polysight_shared.tables import to_builtins
 
 
 def commands(pi) -> list[type]:
@@ -218,10 +216,8 @@ class ClosedPipe(io.TextIOWrapper):
 
 
 @pytest.mark.parametrize("kind", [FullDisk, ClosedPipe])
-def test_scan_without_a_terminal_is_recorded_and_processed(rig, tmp_path, monkeypatch, kind):
+def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, monkeypatch, kind):
     """In row 1 the terminal closes (SIGHUP), and stdout and stderr fail."""
-    config = tmp_path / "rig.toml"
-    config.write_text(tomli_w.dumps(to_builtins(rig.instrument)))
     made, streams = [], [kind(), kind()]
     monkeypatch.setattr(processing, "check_inputs", lambda *_: None)
     monkeypatch.setattr(processing, "Pipeline", lambda *_, **__: SimpleNamespace(add_row=lambda _: None))
@@ -266,9 +262,7 @@ def test_lost_terminal_is_ignored_and_then_as_before():
 
 
 @pytest.mark.parametrize("error", [ValueError("oops"), ScanError("no images", "", "look")])
-def test_processing_that_fails_does_not_hide_that_every_row_is_there(rig, tmp_path, monkeypatch, capsys, error):
-    config = tmp_path / "rig.toml"
-    config.write_text(tomli_w.dumps(to_builtins(rig.instrument)))
+def test_processing_that_fails_does_not_hide_that_every_row_is_there(config, tmp_path, monkeypatch, capsys, error):
     monkeypatch.setattr(processing, "check_inputs", lambda *_: None)
 
     def broken(*_: object, **__: object):

@@ -14,7 +14,7 @@ import numpy as np
 from tests.support.capture.records import encode_packets
 from tests.support.processes import wait_for
 from tests.support.rigs import published_rig
-from tests.support.scenes import small_scene
+from tests.support.scenes import COPPER, scene_of
 
 from polysight.capture.dca1000 import decode_packet_header
 from polysight.capture.receiver import ReceiverProcess
@@ -22,7 +22,7 @@ from polysight.store.logs import EventWriter
 from polysight.store.manifest import ManifestWriter
 from polysight_pi.journal import JournalFile
 from polysight_shared.messages import Capture, RunStopped, pack
-from polysight_simulators.scene import load_scene, simulate
+from polysight_simulators.scene import decode_scene, simulate
 
 FRAMES, SAMPLES = 96, 256
 
@@ -111,8 +111,7 @@ def test_manifest(tmp_path):
 
 def test_whole_scan(tmp_path):
     """A simulated scan folder, from its first file to its last, by the words of docs/spec alone."""
-    (tmp_path / "scene.toml").write_text(small_scene(3, 2))
-    folder = simulate(published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
+    folder = simulate(published_rig(), decode_scene(scene_of(COPPER, columns=3, rows=2), "t"), tmp_path / "scan")
     facts = [json.loads(line) for line in (folder / "manifest.jsonl").read_text("ascii").splitlines()]
     for fact in facts:
         take_crc(fact)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from tests.support.capture.records import FULL, Card, Record, is_original_or_masked, place
+from tests.support.capture.records import FULL, Card, Record, is_original_or_masked, past_after, place
 
 from polysight.capture.record_search import Past
 
@@ -30,7 +30,7 @@ def rows_until_accepted(card: Card, size: int, past: Past) -> int:
 def test_a_card_that_restarts_soon_after_power_up_is_accepted_again(size, resets):
     """Its counters are those of records that came whole: they are no leftovers, and no perfect row is lost for ever."""
     card, many = Card(size), -(-size // FULL)
-    past = place(size, card.record().packets, None, FRAME, batch=64)[0].past
+    past = past_after(card.record(), FRAME)
     disturbed = card.record(tuple(k % many for k in resets))
     placed, out = place(size, disturbed.packets, past, FRAME, batch=64)
     assert is_original_or_masked(disturbed, placed, out)
@@ -40,7 +40,7 @@ def test_a_card_that_restarts_soon_after_power_up_is_accepted_again(size, resets
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
 def test_a_card_that_restarts_with_every_record_is_accepted(size):
     card = Card(size)
-    past = place(size, card.record().packets, None, FRAME, batch=64)[0].past
+    past = past_after(card.record(), FRAME)
     accepted = []
     for _ in range(8):
         card.reset()
@@ -64,7 +64,7 @@ def test_two_whole_records_in_a_first_row_decide_nothing(lost):
 @pytest.mark.parametrize("came", [0.5, 0.8])
 def test_a_silent_row_that_comes_with_the_next_one_is_not_taken_for_it(came):
     card = Card(SHORT_END)
-    past = place(SHORT_END, card.record().packets, None, FRAME, batch=64)[0].past
+    past = past_after(card.record(), FRAME)
     late = card.record()
     past = place(SHORT_END, [], past, FRAME)[0].past
     own = card.record()
@@ -76,7 +76,7 @@ def test_a_silent_row_that_comes_with_the_next_one_is_not_taken_for_it(came):
 @pytest.mark.parametrize("tail", [4, 60, 175])
 def test_the_end_of_an_unseen_record_is_not_taken_for_a_row(tail):
     card = Card(SHORT_END)
-    past = place(SHORT_END, card.record().packets, None, FRAME, batch=64)[0].past
+    past = past_after(card.record(), FRAME)
     unseen, own = card.record(), card.record()
     placed, out = place(SHORT_END, [*unseen.packets[-tail:], *own.packets], past, FRAME, batch=64)
     assert is_original_or_masked(own, placed, out)

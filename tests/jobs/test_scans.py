@@ -11,19 +11,18 @@ from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
-from tests.support.scenes import small_scene
+from tests.support.scenes import COPPER, scene_of
 
 from polysight.catalogue import Notes, read_notes
 from polysight.cli.main import build_parser, main
 from polysight_shared.error_codes import ErrorCode
-from polysight_simulators.scene import load_scene, simulate
+from polysight_simulators.scene import decode_scene, simulate
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """A folder with a small simulated scan and with made-up products."""
-    (tmp_path / "scene.toml").write_text(small_scene(4, 3))
-    simulate(published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scans" / "one")
+    simulate(published_rig(), decode_scene(scene_of(COPPER, columns=4, rows=3), "t"), tmp_path / "scans" / "one")
     judged_products(tmp_path / "scans" / "two", "good")
     return tmp_path / "scans"
 

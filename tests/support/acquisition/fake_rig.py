@@ -227,8 +227,9 @@ class FakeRig:
             self.pi.close()
 
 
-def small_instrument(**limits: float) -> Instrument:
-    """The published rig with a grid of 3 x 4 points and 3 pulses, on a loopback subnet that is free."""
+def small_instrument(columns: int = 3, rows: int = 4, pulses: int = 3, **limits: float) -> Instrument:
+    """The published rig with a small grid and few pulses, on a loopback subnet that is free."""
     limits = {"end_of_record_s": 0.25, "command_timeout_s": 1.5, "free_disk_bytes": 0, **limits}
     card = {"receive_buffer_bytes": 1 << 20}
-    return on_free_subnet(rig_with(grid={"columns": 3, "rows": 4}, burst={"pulses": 3}, limits=limits, card=card))
+    grid = {"columns": columns, "rows": rows}
+    return on_free_subnet(rig_with(grid=grid, burst={"pulses": pulses}, limits=limits, card=card))

@@ -83,6 +83,11 @@ def place(
     return place_record(log_of(size, packets, batch), frame, past)
 
 
+def past_after(record: Record, frame: int, before: Past | None = None) -> Past:
+    """What is known after a record that came whole."""
+    return place(len(record.data), record.packets, before, frame, batch=64)[0].past
+
+
 def next_start(placed: Placed) -> Counters | None:
     """Counters with which the card's next record starts; None if that is uncertain."""
     base, ends = placed.past.base, placed.past.ends

@@ -283,7 +283,7 @@ def _require_h5netcdf() -> None:
         raise ConfigError(
             "NetCDF needs the package h5netcdf, which is not installed",
             "only NetCDF files use it, so it is optional",
-            "pip install 'polysight[export]', or pip install h5netcdf",
+            "pip install h5netcdf h5py",
             code=ErrorCode.PACKAGE_MISSING,
         ) from None
 

@@ -17,9 +17,16 @@ if TYPE_CHECKING:
 
 
 def _materials(args: argparse.Namespace) -> int:
-    from polysight.jobs.materials import materials
+    from polysight.jobs.materials import catalogue, materials
 
-    return materials(args.data, args.json)
+    if bool(args.data) == args.catalogue:
+        raise ConfigError(
+            "materials takes either DATA or --catalogue",
+            "it prints the patches of scans, or the materials of the literature",
+            "polysight materials out/one, or polysight materials --catalogue",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
+    return catalogue(args.json) if args.catalogue else materials(args.data, args.json)
 
 
 def _report(args: argparse.Namespace) -> int:
@@ -94,10 +101,11 @@ def _add_results(add: Add) -> None:
     sub = add(
         "materials",
         _materials,
-        "print names and permittivities of the patches of processed scans",
-        "polysight materials out/one",
+        "print names and permittivities of the patches of processed scans, or the catalogue of the literature",
+        "polysight materials out/one\n  polysight materials --catalogue",
     )
-    sub.add_argument("data", type=Path, nargs="+", metavar="DATA", help="scan folders, or folders of products")
+    sub.add_argument("data", type=Path, nargs="*", metavar="DATA", help="scan folders, or folders of products")
+    sub.add_argument("--catalogue", action="store_true", help="print the permittivities of the open literature instead")
     add_json_option(sub)
 
     sub = add(

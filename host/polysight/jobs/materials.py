@@ -23,6 +23,7 @@ from polysight.materials import (
     PATCHES,
     SIMULATED_LIBRARY,
     UNKNOWN,
+    CatalogueMaterial,
     Classifier,
     Layer,
     Library,
@@ -35,6 +36,7 @@ from polysight.materials import (
     format_permittivity,
     incidence_std_rad,
     layer_content,
+    load_catalogue,
     match_patches,
     read_materials,
 )
@@ -242,6 +244,31 @@ def materials(data: Sequence[Path], as_json: bool) -> int:
             sys.stdout.write("".join(map(_patch_line, scan.segments)))
         worst = max(worst, status)
     return worst
+
+
+def catalogue(as_json: bool) -> int:
+    """Print the catalogue of the literature, sorted by eps'; return the exit status. A star marks a default spread."""
+    entries = sorted(load_catalogue(), key=lambda material: material.permittivity.real)
+    if as_json:
+        print_json([plain(material) for material in entries])
+        return 0
+    sources = {source.key: source.citation for material in entries for source in material.sources}
+    number = {key: k for k, key in enumerate(sorted(sources), 1)}
+    print_lines(_catalogue_line(material, number) for material in entries)
+    print_lines(["", "spread: standard deviation between specimens; * is the default of the kind"])
+    print_lines(f"[{number[key]}] {sources[key]}" for key in number)
+    return 0
+
+
+def _catalogue_line(material: CatalogueMaterial, number: Mapping[str, int]) -> str:
+    """Name, permittivity and spreads, frequency and numbers of the sources."""
+    value = format_permittivity(material.permittivity, 4, 8)
+    real, loss = (100 * spread for spread in material.spread)
+    star = "*" if material.spread_is_default else " "
+    cited = "".join(f"[{number[source.key]}]" for source in material.sources)
+    spread = f"+-{real:3.0f} %, {loss:3.0f} %{star}"
+    at = f"{material.frequency_hz / 1e9:5.4g} GHz"
+    return f"{_pad_name(material.name, 30)} {value:19s} {spread} {at}  {material.kind:10s} {cited}"
 
 
 def _patch_line(patch: PatchFigures) -> str:

@@ -5,7 +5,7 @@ returns a `MaterialsResult`. On the way: `segment.py` finds patches, `measure.py
 them, `inversion.py` solves for all permittivities and the rig's errors together, `classify.py` names patches by a
 `Library`, with the materials' distributions of `discriminant.py`. `sub_bands.py` and `layers.py` fit thin layers.
 `make_library` makes a library of scans, `fit_concentration` a line through solutions. `labels.py` reads boxes with
-names and true plates, `train.py` the published data set.
+names and true plates, `catalogue.py` the permittivities of the literature, `train.py` the published data set.
 """
 
 from polysight.materials.analyse import (
@@ -16,6 +16,15 @@ from polysight.materials.analyse import (
     image_centre_mm,
     permittivity_change,
     pixel_accuracy,
+)
+from polysight.materials.catalogue import (
+    CATALOGUE,
+    CatalogueMaterial,
+    find_material,
+    load_catalogue,
+    normalise_name,
+    read_catalogue,
+    same_material,
 )
 from polysight.materials.classify import (
     DISCRIMINANT,
@@ -110,6 +119,7 @@ from polysight.materials.train import (
 
 __all__ = [
     "AMPLITUDE_ERROR",
+    "CATALOGUE",
     "CHANNELS",
     "DISCRIMINANT",
     "LAYER_FORMS",
@@ -126,6 +136,7 @@ __all__ = [
     "SPECIMEN",
     "UNKNOWN",
     "Box",
+    "CatalogueMaterial",
     "Classifier",
     "ConcentrationResult",
     "Entry",
@@ -164,6 +175,7 @@ __all__ = [
     "estimate_permittivity",
     "expected_pixel_accuracy",
     "feature_matrix",
+    "find_material",
     "find_truth",
     "fit_concentration",
     "fit_library",
@@ -179,12 +191,14 @@ __all__ = [
     "label_folders",
     "labels_of",
     "layer_content",
+    "load_catalogue",
     "make_library",
     "match_patches",
     "match_truth",
     "material_of",
     "name_taken",
     "no_box",
+    "normalise_name",
     "pack_labels",
     "pack_patches",
     "parse_layer",
@@ -192,12 +206,14 @@ __all__ = [
     "permittivity_change",
     "pixel_accuracy",
     "polarisation_angle_rad",
+    "read_catalogue",
     "read_labelled_scan",
     "read_labels",
     "read_material",
     "read_materials",
     "read_patches",
     "read_truth",
+    "same_material",
     "score",
     "score_unseen_materials",
     "specimen_seed",

@@ -1,0 +1,166 @@
+"""The catalogue: permittivities of real materials near 77 GHz from the open literature (catalogue.toml).
+
+The file has three tables. `sources`: citation of each key. `kinds`: for each kind of material its generic names
+("wood") and the default spread between specimens. `materials`: a line each.
+
+Two names are of one material if they are equal after `normalise_name`, if both are names of one entry, or if one is the
+generic name of the other ("wood" and "oak", but not "oak" and "pine").
+"""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+
+import msgspec
+
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+from polysight_shared.tables import decode, read_toml
+
+CATALOGUE = Path(__file__).with_name("catalogue.toml")
+
+
+class Source(msgspec.Struct, frozen=True):
+    """A publication: its key in the file, and its full citation."""
+
+    key: str
+    citation: str
+
+
+class CatalogueMaterial(msgspec.Struct, frozen=True):
+    """A material of the literature.
+
+    Attributes
+    ----------
+    name, aliases
+        Name, and other names of the same material; unique in the catalogue.
+    generic
+        Wider names that the material also goes by: that of its kind, "glass" of borosilicate glass.
+    kind
+        Class of the material: "polymer", "wood", "liquid", ...
+    permittivity
+        eps' - j eps'', relative to vacuum.
+    frequency_hz
+        Frequency at which it was measured, or for which the formula was evaluated.
+    spread
+        Standard deviations of ln eps' and of ln eps'' between specimens.
+    spread_is_default
+        True if the spread is that of the kind, False if it is that of several sources or specimens.
+    sources
+        Publications of the value.
+    """
+
+    name: str
+    aliases: tuple[str, ...]
+    generic: tuple[str, ...]
+    kind: str
+    permittivity: complex
+    frequency_hz: float
+    spread: tuple[float, float]
+    spread_is_default: bool
+    sources: tuple[Source, ...]
+
+
+class _Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Generic names and default spread of a kind."""
+
+    generic: tuple[str, ...]
+    spread: tuple[float, float]
+
+
+class _Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A line of the file."""
+
+    name: str
+    kind: str
+    real: float
+    loss: float
+    ghz: float
+    source: tuple[str, ...]
+    also: tuple[str, ...] = ()
+    generic: tuple[str, ...] = ()
+    spread: tuple[float, float] | None = None
+
+
+class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The file."""
+
+    sources: dict[str, str]
+    kinds: dict[str, _Kind]
+    materials: tuple[_Row, ...]
+
+
+def read_catalogue(path: Path) -> tuple[CatalogueMaterial, ...]:
+    """Read a catalogue, in the order of the file.
+
+    Raises
+    ------
+    ConfigError
+        if the file is missing, is no TOML, has a wrong or unknown key, or a kind or source that it does not list.
+    """
+    file = decode(read_toml(path), _File, str(path), keys="docs/spec/catalogue.md explains every key")
+    try:
+        return tuple(_material(row, file) for row in file.materials)
+    except KeyError as error:
+        raise ConfigError(
+            f"{path}: {error} is used, but not listed",
+            "it is the kind or the source of a material",
+            "add it to [kinds] or [sources]",
+            code=ErrorCode.KEY_MISSING,
+        ) from None
+
+
+def _material(row: _Row, file: _File) -> CatalogueMaterial:
+    """The material of a line. Raises KeyError if its kind or a source is not listed."""
+    kind = file.kinds[row.kind]
+    return CatalogueMaterial(
+        name=row.name,
+        aliases=row.also,
+        generic=row.generic + kind.generic,
+        kind=row.kind,
+        permittivity=complex(row.real, -row.loss),
+        frequency_hz=row.ghz * 1e9,
+        spread=row.spread or kind.spread,
+        spread_is_default=row.spread is None,
+        sources=tuple(Source(key, file.sources[key]) for key in row.source),
+    )
+
+
+@cache
+def load_catalogue() -> tuple[CatalogueMaterial, ...]:
+    """The catalogue of the package, read once. Raises ConfigError as `read_catalogue`."""
+    return read_catalogue(CATALOGUE)
+
+
+def normalise_name(name: str) -> str:
+    """A name without case, punctuation, bracketed remarks and thickness: "PET (0.5 mm)" and "pet 1 mm" are "pet"."""
+    bare = re.sub(r"\([^)]*\)|\b\d+(\.\d+)?\s*mm\b", " ", name.casefold())
+    return " ".join(re.findall(r"\w+", bare))
+
+
+@cache
+def _names() -> dict[str, CatalogueMaterial]:
+    """Materials by each of their normalised names."""
+    return {normalise_name(name): m for m in load_catalogue() for name in (m.name, *m.aliases)}
+
+
+def find_material(name: str) -> CatalogueMaterial | None:
+    """The material of the catalogue that has this name or alias; None if it has none."""
+    return _names().get(normalise_name(name))
+
+
+def same_material(name: str, other: str) -> bool:
+    """True if both names are, or may be, of one material: equal, aliases, or one the generic name of the other."""
+    first, second = normalise_name(name), normalise_name(other)
+    return first == second or second in _all_names(first) or first in _all_names(second)
+
+
+@cache
+def _all_names(name: str) -> frozenset[str]:
+    """A normalised name with its aliases and generic names, normalised."""
+    material = _names().get(name)
+    if material is None:
+        return frozenset((name,))
+    return frozenset(map(normalise_name, (material.name, *material.aliases, *material.generic)))

@@ -1,0 +1,177 @@
+"""The catalogue of the literature: its values, its sources, and which names are of one material."""
+
+import json
+import math
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from tests.support.paths import REPO
+from tests.support.refusals import refused
+
+from polysight.cli.main import main
+from polysight.materials import (
+    CATALOGUE,
+    find_material,
+    load_catalogue,
+    normalise_name,
+    read_catalogue,
+    same_material,
+)
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.tables import read_toml
+
+VACUUM = 8.8541878128e-12
+
+# ITU-R P.2040-4, Table 3: a, b, c, d and the upper and lower limits in GHz.
+ITU = {
+    "concrete": (5.24, 0, 0.0462, 0.7822, 1, 100),
+    "brick": (4.15, 0, 0.0006, 1.5712, 110, 330),
+    "plasterboard": (2.73, 0, 0.0085, 0.9395, 1, 100),
+    "wood": (1.99, 0, 0.0047, 1.0718, 0.001, 100),
+    "window glass": (6.31, 0, 0.0036, 1.3394, 0.1, 100),
+    "clear acrylic": (2.58, 0, 0.0001, 1.6524, 110, 330),
+    "ceiling board": (1.48, 0, 0.0011, 1.0750, 1, 100),
+    "chipboard": (2.58, 0, 0.0217, 0.7800, 1, 100),
+    "plywood": (1.94, 0, 0.0067, 0.9982, 110, 330),
+    "marble": (7.074, 0, 0.0055, 0.9262, 1, 60),
+    "floorboard": (3.66, 0, 0.0044, 1.3515, 50, 100),
+    "vinyl tile": (3.62, 0, 0.0051, 0.8422, 1, 40),
+    "carpet tile": (2.08, 0, 0.0009, 0.8200, 1, 40),
+    "asphalt concrete": (4.83, 0, 0.0108, 1.3969, 1, 40),
+}
+
+
+def value(name: str) -> tuple[complex, float]:
+    """Permittivity and frequency in GHz of a material of the catalogue."""
+    material = find_material(name)
+    assert material is not None, name
+    return material.permittivity, material.frequency_hz / 1e9
+
+
+def debye(water_c: float, ghz: float) -> complex:
+    """Double-Debye water of ITU-R P.527-6, as in Liebe, Hufford, Manabe (1991)."""
+    theta = 300 / (water_c + 273.15) - 1
+    static = 77.66 + 103.3 * theta
+    middle = 0.0671 * static
+    high = 3.52 - 7.52 * theta
+    first_ghz = 20.20 - 146.4 * theta + 316 * theta**2
+    slow = (static - middle) / (1 + 1j * ghz / first_ghz)
+    fast = (middle - high) / (1 + 1j * ghz / (39.8 * first_ghz))
+    return slow + fast + high
+
+
+def test_values_are_of_passive_dielectrics_at_millimetre_waves():
+    for material in load_catalogue():
+        assert 1 < material.permittivity.real < 100, material
+        assert material.permittivity.imag <= 0, material
+        assert 10e9 <= material.frequency_hz <= 300e9, material
+        assert all(0 < spread < 1.5 for spread in material.spread), material
+
+
+def test_it_covers_the_common_materials():
+    assert len(load_catalogue()) >= 60
+    kinds = Counter(material.kind for material in load_catalogue())
+    assert max(kinds.values()) < len(load_catalogue()) / 4
+
+
+def test_names_are_unique_over_aliases():
+    names = Counter(normalise_name(name) for m in load_catalogue() for name in (m.name, *m.aliases))
+    assert [name for name, count in names.items() if count > 1] == []
+    for material in load_catalogue():
+        for name in (material.name, *material.aliases):
+            assert find_material(name) is material
+
+
+def test_every_source_is_used_and_every_value_has_one():
+    listed = read_toml(CATALOGUE)["sources"]
+    assert {source.key for m in load_catalogue() for source in m.sources} == set(listed)
+    assert all(material.sources for material in load_catalogue())
+    assert all(len(text) > 40 for text in listed.values())
+
+
+@pytest.mark.parametrize("name", ITU)
+def test_building_materials_follow_the_recommendation(name):
+    a, b, c, d, lowest_ghz, highest_ghz = ITU[name]
+    eps, ghz = value(name)
+    assert lowest_ghz <= ghz <= highest_ghz
+    loss = c * ghz**d / (2 * math.pi * VACUUM * ghz * 1e9)
+    assert eps == pytest.approx(a * ghz**b - 1j * loss, rel=3e-3)
+
+
+@pytest.mark.parametrize("celsius", [0, 5, 20, 37])
+def test_water_is_the_double_debye_formula(celsius):
+    eps, ghz = value(f"water at {celsius} degrees")
+    assert eps == pytest.approx(debye(celsius, ghz), rel=3e-3)
+
+
+def test_names_of_one_material():
+    assert same_material("Acrylic (3 mm)", "PMMA")
+    assert same_material("PCB", "FR4")
+    assert same_material("glass fibre", "fr-4")
+    assert same_material("rubber", "RUBBER")
+    assert same_material("water", "water at 37 degrees")
+    assert same_material("glass", "borosilicate glass")
+    assert same_material("wood", "plywood")
+    assert not same_material("plywood", "chipboard")
+    assert not same_material("copper", "PTFE")
+    assert not same_material("own mixture 7", "own mixture 8")
+
+
+def test_same_is_symmetric():
+    names = ["wood", "plywood", "PMMA", "acrylic", "glass", "Pyrex", "water", "copper", "cardboard (rough)"]
+    for one in names:
+        assert same_material(one, one)
+        for other in names:
+            assert same_material(one, other) == same_material(other, one)
+
+
+def test_a_spread_is_of_the_line_or_the_default_of_the_kind(tmp_path):
+    line = 'real = 2.0, loss = 0.1, ghz = 77, source = ["Own"], kind = "felt"'
+    text = f'materials = [{{ name = "a", {line} }}, {{ name = "b", spread = [0.01, 0.2], {line} }}]\n'
+    path = tmp_path / "catalogue.toml"
+    path.write_text(text + '[sources]\nOwn = "Own"\n[kinds]\nfelt = { generic = ["textile"], spread = [0.1, 0.5] }\n')
+    default, own = read_catalogue(path)
+    assert default.spread_is_default
+    assert default.spread == (0.1, 0.5)
+    assert not own.spread_is_default
+    assert own.spread == (0.01, 0.2)
+
+
+def test_a_bad_file_is_refused(tmp_path):
+    path = tmp_path / "catalogue.toml"
+    with refused(ErrorCode.FILE_MISSING, path):
+        read_catalogue(path)
+    path.write_text("materials = [")
+    with refused(ErrorCode.FILE_DAMAGED, path):
+        read_catalogue(path)
+    line = '{ name = "a", real = 2.0, loss = 0.1, ghz = 77, source = ["Nobody"], kind = "felt" }'
+    path.write_text(f"materials = [{line}]\n[sources]\n[kinds]\n")
+    with refused(ErrorCode.KEY_MISSING, path, "felt"):
+        read_catalogue(path)
+    path.write_text(f"materials = [{line}]\n[sources]\n[kinds]\nfelt = {{ generic = [], spread = [0.1, 0.5] }}\n")
+    with refused(ErrorCode.KEY_MISSING, path, "Nobody"):
+        read_catalogue(path)
+
+
+def test_the_command_prints_it_sorted_with_sources(capsys):
+    assert main(["materials", "--catalogue"]) == 0
+    text = capsys.readouterr().out
+    assert text.index("PTFE") < text.index("window glass") < text.index("water at 20 degrees")
+    assert "P.2040-4" in text
+    assert main(["materials", "--catalogue", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    real = [row["permittivity"]["real"] for row in rows]
+    assert real == sorted(real)
+    assert len(real) == len(load_catalogue())
+
+
+@pytest.mark.parametrize("arguments", [[], ["--catalogue", "scans/one"]])
+def test_the_command_takes_scans_or_the_catalogue(arguments, capsys):
+    assert main(["materials", *arguments]) != 0
+    assert "--catalogue" in capsys.readouterr().err
+
+
+def test_a_wheel_contains_the_file():
+    package_data = read_toml(REPO / "host" / "pyproject.toml")["tool"]["setuptools"]["package-data"]
+    assert any(Path(CATALOGUE.name).match(pattern) for pattern in package_data["*"])

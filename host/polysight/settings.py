@@ -39,6 +39,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         Scan of a metal plate, used as reference at each pixel instead of metal in the scene.
     incidence
         One incidence angle for the image, or one per pixel.
+    incidence_deg
+        Incidence angle of given images; None: that of their file, or of the rig file.
     """
 
     config: str | None = None
@@ -55,6 +57,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     labels: str | None = None
     reference: str | None = None
     incidence: Literal["one", "pixel"] = "one"
+    incidence_deg: float | None = None
 
     def path(self, name: str) -> Path | None:
         """Return one of `FILES` as a path; None if it is not given."""

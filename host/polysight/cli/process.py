@@ -26,13 +26,22 @@ _shift = number(float, "a shift of at most 1000 mm", lambda value: abs(value) <=
 _millimetres = number(float, "a length above 0, at most 50 mm", lambda value: 0 < value <= 50)
 
 
+_degrees = number(float, "`one`, `pixel` or an angle of 5 to 80 degrees", lambda value: 5 <= value <= 80)
+
+
+def _incidence(text: str) -> str | float:
+    """`one`, `pixel`, or degrees."""
+    return text if text in ("one", "pixel") else _degrees(text)
+
+
 def process_settings(args: argparse.Namespace, data: Path) -> Settings:
     """The settings of `polysight process` for one scan. Raises ConfigError."""
     return msgspec.structs.replace(
         material_settings(args),
         config=path_text(rig_file(args.config, data)),
         reference=path_text(args.reference),
-        incidence=args.incidence,
+        incidence="one" if isinstance(args.incidence, float) else args.incidence,
+        incidence_deg=args.incidence if isinstance(args.incidence, float) else None,
         bands=args.bands,
         sparse=args.sparse,
     )
@@ -126,7 +135,9 @@ def add_commands(add: Add) -> None:
 
 def _add_data(sub: argparse.ArgumentParser, several: bool = False) -> None:
     """Recorded data, the folder of results, and the rig file of published data."""
-    text = "scan folder, or published unsynced/<scan> or raw/<scan>" + ("; or several, or a folder of them" * several)
+    text = "scan folder, or published unsynced/<scan> or raw/<scan>"
+    if several:
+        text += "; or images: published labels/<scan>, or .npz with h and v; or several, or a folder of them"
     sub.add_argument("data", type=Path, nargs="+" if several else None, metavar="DATA", help=text)
     sub.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="folder of the results; earlier ones are replaced"
@@ -173,9 +184,10 @@ def _add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
     )
     sub.add_argument(
         "--incidence",
-        choices=["one", "pixel"],
+        type=_incidence,
         default="one",
-        help="incidence angle: one for the image (default), or each pixel's own",
+        metavar="one|pixel|DEG",
+        help="incidence angle: one for the image (default), or each pixel's own; degrees for given images",
     )
     sub.add_argument(
         "--bands", type=count, default=1, metavar="K", help="also image K sub-bands, to fit layers (default: none)"

@@ -26,7 +26,7 @@ import msgspec
 
 from polysight.calibration import calibration_of_scan
 from polysight.jobs.process import process
-from polysight.process import cores
+from polysight.process import cores, is_given_images
 from polysight.products import FINISHED, ProcessedScan, write_json
 from polysight.results import NoResult
 from polysight.settings import Settings
@@ -91,9 +91,15 @@ def find_scans(paths: Sequence[Path]) -> list[Path]:
     """Return the scans at paths: scan folders themselves, and the scans in other folders."""
     out: list[Path] = []
     for path in paths:
-        inside = [] if is_source(path) or not path.is_dir() else sorted(p for p in path.iterdir() if is_source(p))
+        single = _is_data(path) or not path.is_dir()
+        inside = [] if single else sorted(p for p in path.iterdir() if _is_data(p))
         out += inside or [path]
     return out
+
+
+def _is_data(path: Path) -> bool:
+    """True for a scan of any layout, and for given images."""
+    return is_source(path) or is_given_images(path)
 
 
 def make_jobs(scans: Sequence[tuple[Path, Settings]], out: Path) -> list[Job]:
@@ -156,6 +162,8 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
     `config` is the rig file of scans without one. Kept samples count where raw data was dropped: elsewhere they are
     made again from it. Notes, labels, exports, programs and products in the folder are no data.
     """
+    if is_given_images(folder):
+        return [folder] if folder.is_file() else sorted([*folder.glob("*.npy"), *folder.glob("*.json")])
     patterns = _OWN_FILES if (folder / MANIFEST).exists() else _PUBLISHED_FILES
     files: list[Path] = []
     with suppress(PolysightError):  # the scan's own program will say what is wrong with it

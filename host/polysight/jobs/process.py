@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.calibration import Calibration, calibration_of_rig, calibration_of_scan
+from polysight.data import packaged
 from polysight.imaging import PLANE_REACH_M, Focus, Images, PlaneEstimate, focus_sweep, image_grid
 from polysight.jobs.output import counted, current_step, print_lines, say
 from polysight.materials import Plates, find_truth, read_labels, read_truth
@@ -19,11 +20,16 @@ from polysight.polarimetry import PlaneReference, plane_reference
 from polysight.process import (
     Inputs,
     Products,
+    analyse_given_images,
     boxes_as_patches,
     imaged_scan,
+    is_given_images,
     load_classifier,
     map_rows,
+    read_given_images,
+    reference_of,
     save_images,
+    save_materials,
     why_unnamed,
 )
 from polysight.products import (
@@ -37,9 +43,9 @@ from polysight.products import (
 )
 from polysight.settings import DEFAULT, Settings, path_text
 from polysight.store import ScanFolder, Source, dropped_rows, open_source, raw_source, require_raw
-from polysight_shared.config import Instrument
+from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, advice
+from polysight_shared.errors import ConfigError, DataError, advice
 
 PRODUCTS = "products"
 """Folder of the products of a scan, in the scan's folder."""
@@ -161,6 +167,8 @@ def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> 
     PolysightError
         when the scan cannot be read, or shows no metal plate.
     """
+    if is_given_images(folder):
+        return reference_of(read_given_images(folder, rig_of_images(config)))
     pipeline, images = imaged(folder, Settings(config=path_text(config), bands=bands))
     parts = tuple(plane_of(pipeline, band) for band in pipeline.sub_bands.finish(pipeline.source.mirrored))
     return replace(plane_of(pipeline, images), bands=parts)
@@ -179,9 +187,16 @@ def load_inputs(settings: Settings) -> Inputs:
 def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | None = None) -> int:
     """Make images, materials and report of one scan on `threads` (None: all cores); return the exit status.
 
-    Raises PolysightError.
+    `data` is a scan, or a pair of images (see :func:`process_images`). Raises PolysightError.
     """
     inputs = load_inputs(settings)
+    if is_given_images(data):
+        return process_images(data, out, settings, inputs)
+    if settings.incidence_deg is not None:
+        raise ConfigError(
+            f"--incidence {settings.incidence_deg:g} with a recorded scan", "its angle follows from its rig file",
+            "correct geometry.object_distance_mm, or leave the option out", code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
     source = open_source(data, settings.path("config"), dropped=True)
     plates = find_plates(data)
     check_products_folder(out, source.scan_id)
@@ -191,6 +206,32 @@ def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | 
     _check_dropped(pipeline, out)
     publish_images(pipeline, out)
     products = make_products(pipeline, out, plates)
+    sys.stdout.write(products.summary())
+    return products.exit_status
+
+
+def rig_of_images(config: Path | None) -> Instrument:
+    """Return the rig file for given images: `config`, or the packaged one. Raises ConfigError."""
+    return load_instrument(packaged(Path("instrument.toml")) if config is None else config)
+
+
+def process_images(data: Path, out: Path, settings: Settings, inputs: Inputs) -> int:
+    """Find the materials of given images, and write all products; return the exit status.
+
+    `data` is an `.npz` file, or a folder `labels/<scan>` of the published data. Raises PolysightError.
+    """
+    if settings.bands > 1 or settings.sparse:
+        raise ConfigError(
+            f"{'--sparse' if settings.sparse else '--bands'} with given images", "it needs the rows of a recorded scan",
+            "leave it out", code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
+    rig = rig_of_images(settings.path("config"))
+    pair = read_given_images(data, rig)
+    check_products_folder(out, pair.scan_id)
+    plates = find_plates(data) if data.is_dir() else ()
+    scan, findings, unnamed = analyse_given_images(pair, settings, inputs, rig, plates)
+    with making_products(out, pair.scan_id) as new, current_step("figures and report"):
+        products = replace(save_materials(new, scan, findings.found, unnamed), folder=out)
     sys.stdout.write(products.summary())
     return products.exit_status
 

@@ -1,11 +1,19 @@
 """Processing of one scan: what its settings name, kept samples, quality figures, verdict and products.
 
-`Inputs` are the contents of the files that `polysight.settings.Settings` names.
+`Inputs` are the contents of the files that `polysight.settings.Settings` names. `read_given_images` and
+`analyse_given_images` take images of another program instead of rows.
 `map_rows` processes rows on several threads. For each row, `Quality` collects quality figures and `KeptSamples` stores
 the reduced samples in the scan folder, so that images can be formed again without raw data. `judge` gives the verdict
 on the result; `save_images` and `save_materials` write the products. `polysight/pipeline.py` calls them in this order.
 """
 
+from polysight.process.given_images import (
+    GivenPair,
+    analyse_given_images,
+    is_given_images,
+    read_given_images,
+    reference_of,
+)
 from polysight.process.inputs import (
     NO_INPUTS,
     Inputs,
@@ -32,21 +40,26 @@ from polysight.process.save import (
 __all__ = [
     "NO_INPUTS",
     "Findings",
+    "GivenPair",
     "Inputs",
     "KeptSamples",
     "Products",
     "Progress",
     "Quality",
     "Use",
+    "analyse_given_images",
     "boxes_as_patches",
     "cores",
     "imaged_scan",
+    "is_given_images",
     "judge",
     "load_classifier",
     "map_boards",
     "map_rows",
     "no_progress",
     "processed_scan",
+    "read_given_images",
+    "reference_of",
     "save_images",
     "save_materials",
     "why_unnamed",

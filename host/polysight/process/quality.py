@@ -308,7 +308,12 @@ def judge(
     classifier
         The classifier that named the patches; None without naming.
     """
-    reasons = recording_verdict(quality)
+    return verdict_of(recording_verdict(quality) + scene_reasons(found, plane, classifier))
+
+
+def scene_reasons(found: MaterialsResult, plane: PlaneEstimate | None, classifier: Classifier | None) -> list[Finding]:
+    """Return reasons from the scene: patches, metal, leakage, plane, tilts, brightness and angle, as :func:`judge`."""
+    reasons: list[Finding] = []
     refused = {r.patch.label: r.refused.what for r in found.patches if r.refused is not None}
     gaining = {
         r.patch.label: r.refused.what
@@ -336,7 +341,7 @@ def judge(
     if classifier is not None and len(classifier.angles_deg) == 1:
         angle = float(np.degrees(np.mean(found.theta_rad)))
         reasons += incidence_reasons(angle, float(classifier.angles_deg[0]))
-    return verdict_of(reasons)
+    return reasons
 
 
 def _median_level(gain: npt.NDArray[np.complexfloating] | complex | None) -> float | None:

@@ -35,9 +35,10 @@ from polysight.products import (
     write_image,
     write_json,
 )
-from polysight.results import MetalSource, NoResult, ScanFacts, ScanMaterials, Verdict, verdict_of
+from polysight.results import MetalSource, NoResult, ScanFacts, ScanMaterials, ScanQuality, Verdict, verdict_of
 from polysight.store import Scan, versions
 from polysight_shared.config import Instrument
+from polysight_shared.raster import RasterPlan
 from polysight_shared.tables import to_builtins
 
 Progress = Callable[[str], None]
@@ -123,28 +124,46 @@ def processed_scan(
     folder: Path, source: Scan, rig: Instrument, findings: Findings, quality: Quality, unnamed: str
 ) -> ProcessedScan:
     """Return the result of a scan with its materials; `unnamed` is the reason why nothing was named, or ""."""
-    found, verdict, classifier = findings.found, findings.verdict, findings.classifier
-    accuracy = pixel_accuracy(found)
+    return materials_of(
+        folder,
+        _facts(source, rig, findings.images),
+        quality.result(findings.verdict, pixel_accuracy(findings.found)),
+        findings,
+        unnamed,
+        source.plan,
+    )
+
+
+def materials_of(
+    folder: Path,
+    facts: ScanFacts,
+    quality: ScanQuality,
+    findings: Findings,
+    unnamed: str,
+    plan: RasterPlan | None = None,
+) -> ProcessedScan:
+    """Return the result with its materials, from findings; parameters as of :func:`processed_scan`."""
+    found, classifier = findings.found, findings.classifier
     materials = ScanMaterials(
-        scan_id=source.scan_id,
-        simulated=source.simulated,
-        verdict=verdict,
+        scan_id=facts.scan_id or "",
+        simulated=facts.simulated,
+        verdict=findings.verdict,
         error_budget=error_budget(found, findings.plane),
         metal_reference=MetalSource(how=found.metal.how, certain=found.metal.certain),
         library=classifier_sentence(classifier) if classifier else unnamed or "Nothing was named.",
         model=classifier.model if classifier else None,
-        pixel_accuracy=accuracy,
+        pixel_accuracy=pixel_accuracy(found),
         segments=found.rows(),
     )
     return ProcessedScan.computed(
         folder,
         images=findings.calibrated,
-        quality=quality.result(verdict, accuracy),
-        facts=_facts(source, rig, findings.images),
+        quality=quality,
+        facts=facts,
         materials=materials,
         found=found,
         plates=findings.plates,
-        plan=source.plan,
+        plan=plan,
     )
 
 

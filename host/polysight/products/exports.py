@@ -139,6 +139,8 @@ def image_dataset(scan: ProcessedScan) -> xarray.Dataset:
         else:
             angle = np.degrees(specular_incidence_rad(scan.rig))
             data["incidence_deg"] = _described((), angle, "degree", "incidence angle")
+    elif scan.quality.incidence and scan.quality.incidence.one_deg is not None:
+        data["incidence_deg"] = _described((), scan.quality.incidence.one_deg, "degree", "incidence angle")
     return xarray.Dataset(data, _axes(scan), provenance(scan))
 
 

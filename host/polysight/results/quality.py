@@ -542,6 +542,17 @@ class Recording(msgspec.Struct, frozen=True, kw_only=True):
     cubes: dict[str, str] | UnsetType = UNSET
 
 
+class GivenImages(msgspec.Struct, frozen=True, kw_only=True):
+    """Images of another program that were processed instead of rows.
+
+    `incidence_from` is "option", "file" or "rig file"; `assumed` says what the file left open.
+    """
+
+    file: str
+    incidence_from: str
+    assumed: list[str] = []
+
+
 class RawDropped(msgspec.Struct, frozen=True):
     """The scan whose raw data was deleted after these products were made."""
 
@@ -567,6 +578,7 @@ class ScanQuality(msgspec.Struct, frozen=True, kw_only=True):
     incidence: IncidenceAngles | UnsetType = UNSET
     metal_reference: MetalPlate | UnsetType = UNSET
     raw_dropped: RawDropped | UnsetType = UNSET
+    given_images: GivenImages | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         """Leave out what depends on names or permittivities if the verdict allows none."""

@@ -1,0 +1,407 @@
+"""Images of another program as input: an `.npz` file, or a folder `labels/<scan>` of the published data.
+
+`read_given_images` reads the pair and says what had to be assumed; `analyse_given_images` finds materials and verdict
+as for a recorded scan. There are no rows, no direct path and no antennas behind such images: the incidence angle is
+taken from the option, the file or the rig file, in this order, and the verdict is "usable with care" at best.
+"""
+
+from __future__ import annotations
+
+import time
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from polysight.imaging import UNKNOWN_PLANE, Images
+from polysight.materials import (
+    Labels,
+    Optics,
+    TruthPlate,
+    analyse,
+    image_orientation,
+    pixel_accuracy,
+    read_labelled_scan,
+    read_labels,
+)
+from polysight.polarimetry import IncidenceChoice, PlaneReference, plane_reference, specular_incidence_rad
+from polysight.process.inputs import Inputs, boxes_as_patches, load_classifier, why_unnamed
+from polysight.process.quality import scene_reasons
+from polysight.process.save import Findings, materials_of
+from polysight.products import ProcessedScan
+from polysight.results import GivenImages, IncidenceAngles, ScanFacts, ScanQuality, reason, verdict_of
+from polysight.settings import Settings
+from polysight.store import open_npz, versions
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError, DataError, no_such
+from polysight_shared.findings import Finding
+
+NPZ = ".npz"
+CHANNELS = ("h", "v")
+AXES = ("x_m", "y_m")
+OPTIONAL = ("valid", "incidence_deg", "simulated")
+SAR_FILES = ("sar_h.npy", "sar_v.npy")
+MIN_PIXELS = 8
+"""Least rows and columns of an image: the smallest patch is 14 mm wide."""
+EVEN = 0.01
+"""Largest deviation of a pixel's distance from the mean one, relative to it."""
+_EXPECTED = "expected h, v complex [ny, nx]; optional x_m [nx], y_m [ny], valid [ny, nx], incidence_deg, simulated"
+_FARTHEST_MM = 1e5
+
+
+@dataclass(frozen=True)
+class GivenPair:
+    """A pair of images as read.
+
+    Attributes
+    ----------
+    path
+        File or folder.
+    images
+        Both channels, with ascending axes; `p` is None.
+    x_m, y_m
+        The axes in the order of the file, which boxes in pixels refer to.
+    labels
+        Boxes of the folder `labels/<scan>`; None without any.
+    incidence_deg
+        Angle in the file; None without one.
+    simulated
+        True if the file says so.
+    assumed
+        What the file does not say and was assumed, one sentence each.
+    """
+
+    path: Path
+    images: Images
+    x_m: npt.NDArray[np.float64]
+    y_m: npt.NDArray[np.float64]
+    labels: Labels | None
+    incidence_deg: float | None
+    simulated: bool
+    assumed: tuple[str, ...]
+
+    @property
+    def scan_id(self) -> str:
+        """Name of the images: that of the file or folder."""
+        return self.path.stem if self.path.suffix == NPZ else self.path.name
+
+    def boxes(self, drawn: Labels | None) -> Labels | None:
+        """Return drawn boxes, or else those that came with the images, in millimetres from the image centre."""
+        labels = self.labels if drawn is None else drawn
+        return None if labels is None else labels.in_mm(self.x_m, self.y_m)
+
+
+def is_given_images(path: Path) -> bool:
+    """Return true for an `.npz` file, and for a folder with the published `sar_h.npy` and `sar_v.npy`."""
+    if path.suffix == NPZ and not path.is_dir():
+        return True
+    return path.is_dir() and any((path / name).exists() for name in SAR_FILES)
+
+
+def read_given_images(path: Path, rig: Instrument) -> GivenPair:
+    """Read a pair of images; the rig file's pixel is assumed where the file has no axes.
+
+    Raises DataError if a file or array is missing, or has a wrong type, shape or value.
+    """
+    if path.is_dir():
+        return _read_folder(path, rig)
+    if not path.exists():
+        raise no_such(path)
+    arrays = _read_arrays(path)
+    _check_channels(path, arrays)
+    assumed: list[str] = []
+    h, v = arrays["h"], arrays["v"]
+    x_m = _axis(path, arrays, "x_m", h.shape[1], rig, assumed)
+    y_m = _axis(path, arrays, "y_m", h.shape[0], rig, assumed)
+    _check_square(path, x_m, y_m)
+    unused = sorted(set(arrays) - {*CHANNELS, *AXES, *OPTIONAL, "p", "p_sigma"})
+    if unused:
+        assumed.append(f"not used: {', '.join(unused)}")
+    valid = _valid(path, arrays)
+    angle = _number(path, arrays, "incidence_deg")
+    images = _ascending(h, v, valid, x_m, y_m)
+    simulated = bool(_number(path, arrays, "simulated") or False)
+    return GivenPair(path, images, x_m, y_m, None, angle, simulated, tuple(assumed))
+
+
+def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
+    try:
+        with open_npz(path) as archive:
+            return {name: archive[name] for name in archive}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as e:
+        raise DataError(
+            f"{path}: cannot be read as images: {e}", _EXPECTED, "write it with numpy.savez(path, h=h, v=v)",
+            code=ErrorCode.FILE_UNREADABLE,
+        ) from None  # fmt: skip
+
+
+def _check_channels(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Raise DataError unless h and v are complex images of one shape."""
+    missing = [name for name in CHANNELS if name not in arrays]
+    if missing:
+        held = ", ".join(arrays) or "nothing"
+        raise DataError(
+            f"{path}: no {' and no '.join(missing)}; it holds {held}", _EXPECTED,
+            "save the s-polarised channel as h and the p-polarised one as v", code=ErrorCode.KEY_MISSING,
+        )  # fmt: skip
+    for name in CHANNELS:
+        array = arrays[name]
+        if array.dtype.kind != "c":
+            raise DataError(
+                f"{path}: {name} holds {array.dtype}, not complex numbers",
+                "the phase between H and V is needed for a permittivity",
+                "save the complex image, not its magnitude", code=ErrorCode.TYPE_WRONG,
+            )  # fmt: skip
+        if array.ndim != 2 or min(array.shape) < MIN_PIXELS:
+            raise DataError(
+                f"{path}: {name} has the shape {_shape(array)}",
+                f"an image has two axes [ny, nx], each of {MIN_PIXELS} pixels or more",
+                "save one image per channel", code=ErrorCode.MISMATCH,
+            )  # fmt: skip
+    h, v = arrays["h"], arrays["v"]
+    if h.shape != v.shape:
+        raise DataError(
+            f"{path}: h is {_shape(h)}, v is {_shape(v)}", "both channels need the same pixels",
+            "form both images on one grid", code=ErrorCode.MISMATCH,
+        )  # fmt: skip
+
+
+def _shape(array: npt.NDArray[Any]) -> str:
+    return " x ".join(map(str, array.shape)) or "a single number"
+
+
+def _axis(
+    path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str, size: int, rig: Instrument, assumed: list[str]
+) -> npt.NDArray[np.float64]:
+    """Return the pixel centres along one axis, metres; the rig file's pixel, centred, if the file has none."""
+    if name not in arrays:
+        pixel_mm = rig.image.pixel_mm
+        first = "the lowest" if name == "y_m" else "the leftmost"
+        line = "row" if name == "y_m" else "column"
+        assumed.append(f"no {name}: pixels of {pixel_mm:g} mm (rig file), {line} 0 is {first}")
+        centred = np.arange(size, dtype=np.float64) - (size - 1) / 2
+        return np.asarray(centred * pixel_mm / 1e3, np.float64)
+    axis = arrays[name]
+    if axis.dtype.kind not in "fiu" or axis.shape != (size,):
+        raise DataError(
+            f"{path}: {name} is {axis.dtype} {_shape(axis)}, the images have {size} pixels along it",
+            "an axis holds one pixel centre, in metres, for each row or column",
+            f"save {name} with {size} numbers, or leave it out", code=ErrorCode.MISMATCH,
+        )  # fmt: skip
+    values = axis.astype(np.float64)
+    steps = np.diff(values)
+    pitch = float(steps.mean())
+    if not np.isfinite(values).all() or pitch == 0 or float(np.abs(steps - pitch).max()) > EVEN * abs(pitch):
+        raise DataError(
+            f"{path}: {name} is not evenly spaced, or not finite", "pixels of one size are needed",
+            "form the images on an even grid", code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
+    return values
+
+
+def _check_square(path: Path, x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.float64]) -> None:
+    """Raise DataError unless pixels are square and of 0.1 to 20 mm: other numbers are a mistaken unit."""
+    dx, dy = abs(x_m[1] - x_m[0]) * 1e3, abs(y_m[1] - y_m[0]) * 1e3
+    if not 0.1 <= dx <= 20 or abs(dx - dy) > EVEN * dx:
+        raise DataError(
+            f"{path}: pixels of {dx:.4g} x {dy:.4g} mm", "pixels must be square, of 0.1 to 20 mm; axes are in metres",
+            "give x_m and y_m in metres, with one pitch", code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
+
+
+def _valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.bool_]:
+    """Return the pixels to use. Raises DataError if one of them is not finite, or none is left."""
+    h, v = arrays["h"], arrays["v"]
+    valid = arrays.get("valid", np.ones(h.shape, bool))
+    if valid.dtype.kind != "b" or valid.shape != h.shape:
+        raise DataError(
+            f"{path}: valid is {valid.dtype} {_shape(valid)}", f"expected bool {_shape(h)}",
+            "save it as bool with the shape of h, or leave it out", code=ErrorCode.MISMATCH,
+        )  # fmt: skip
+    bad = valid & ~(np.isfinite(h) & np.isfinite(v))
+    if bad.any():
+        raise DataError(
+            f"{path}: {int(bad.sum())} of {bad.size} pixels are not finite",
+            "a pixel without data cannot be told from a wrong one",
+            "save valid (bool, [ny, nx]), false where there is no data", code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
+    lit = valid & ((h != 0) | (v != 0))
+    if not lit.any():
+        raise DataError(
+            f"{path}: no pixel holds data", "both channels are zero, or valid is false everywhere",
+            "look at the program that made the images", code=ErrorCode.NO_DATA,
+        )  # fmt: skip
+    return lit
+
+
+def _number(path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str) -> float | None:
+    """Return an optional single number. Raises DataError if it is none."""
+    if name not in arrays:
+        return None
+    value = arrays[name]
+    if value.size != 1 or value.dtype.kind not in "bfiu" or not np.isfinite(value).all():
+        raise DataError(
+            f"{path}: {name} is {value.dtype} {_shape(value)}", "expected one finite number",
+            f"save {name} as one number, or leave it out", code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
+    return float(value.reshape(-1)[0])
+
+
+def _ascending(
+    h: npt.NDArray[Any],
+    v: npt.NDArray[Any],
+    valid: npt.NDArray[np.bool_],
+    x_m: npt.NDArray[np.float64],
+    y_m: npt.NDArray[np.float64],
+) -> Images:
+    """Return the pair with ascending axes, zero where it is not valid."""
+    rows = slice(None, None, 1 if y_m[1] > y_m[0] else -1)
+    columns = slice(None, None, 1 if x_m[1] > x_m[0] else -1)
+    usable = valid[rows, columns]
+    shown_h = np.where(usable, h[rows, columns], 0).astype(np.complex64)
+    shown_v = np.where(usable, v[rows, columns], 0).astype(np.complex64)
+    return Images(shown_h, shown_v, x_m[columns], y_m[rows], usable)
+
+
+def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
+    """Read `labels/<scan>`; row 0 of its images is the top of the published pictures."""
+    scan = read_labelled_scan(folder)
+    how = image_orientation([scan])
+    scan = scan.oriented(how)
+    arrays = {"h": scan.h, "v": scan.v}
+    _check_channels(folder, arrays)
+    x_m = _axis(folder, arrays, "x_m", scan.h.shape[1], rig, [])
+    y_m = _axis(folder, arrays, "y_m", scan.h.shape[0], rig, [])[::-1]
+    assumed = [f"no geometry: pixels of {rig.image.pixel_mm:g} mm (rig file), row 0 is the highest; boxes: {how}"]
+    file = next(iter([folder / f"{folder.name}.json", *sorted(folder.glob("*.json"))]))
+    labels = read_labels(file) if scan.boxes else None
+    images = _ascending(scan.h, scan.v, _valid(folder, arrays), x_m, y_m)
+    return GivenPair(folder, images, x_m, y_m, labels, None, scan.simulated, tuple(assumed))
+
+
+def rig_at(rig: Instrument, incidence_deg: float) -> Instrument:
+    """Return the rig with its object plane where the specular incidence angle is the given one.
+
+    Raises ConfigError if no distance of the plane gives this angle.
+    """
+
+    def moved(distance_mm: float) -> Instrument:
+        geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=distance_mm)
+        return msgspec.structs.replace(rig, geometry=geometry)
+
+    def miss(distance_mm: float) -> float:
+        return float(np.degrees(specular_incidence_rad(moved(distance_mm)))) - incidence_deg
+
+    nearest = 60.0
+    if not miss(nearest) > 0 > miss(_FARTHEST_MM):
+        raise ConfigError(
+            f"an incidence angle of {incidence_deg:g} degrees", "the rig's geometry has no plane with this angle",
+            "give an angle between 5 and 80 degrees", code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
+    return moved(float(scipy.optimize.brentq(miss, nearest, _FARTHEST_MM, xtol=1e-9)))
+
+
+@dataclass(frozen=True)
+class Angle:
+    """Incidence angle of given images: degrees, and where it comes from."""
+
+    deg: float
+    source: str
+
+
+def choose_angle(pair: GivenPair, settings: Settings, rig: Instrument) -> Angle:
+    """Return the angle of the option, of the file, or of the rig file.
+
+    Raises ConfigError if one angle for each pixel is asked for: that needs the raster and the antennas.
+    """
+    if settings.incidence == "pixel":
+        raise ConfigError(
+            "--incidence pixel with given images", "the angle of a pixel needs the raster of a recorded scan",
+            "give --incidence DEGREES, or leave it out", code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
+    if settings.incidence_deg is not None:
+        return Angle(settings.incidence_deg, "option")
+    if pair.incidence_deg is not None:
+        return Angle(pair.incidence_deg, "file")
+    return Angle(float(np.degrees(specular_incidence_rad(rig))), "rig file")
+
+
+def given_reasons(pair: GivenPair, angle: Angle) -> list[Finding]:
+    """Return what limits the verdict on given images: no direct path, an assumed geometry, an assumed angle."""
+    out = [reason(
+        "care", "the images were given: there is no direct path beside them",
+        "gains of H against V, the recording, the plane and tilts of plates cannot be checked",
+        "process the recorded scan where there is one", 2.4,
+    )]  # fmt: skip
+    if pair.assumed:
+        out.append(reason(
+            "care", f"assumed, not in the file: {'; '.join(pair.assumed)}",
+            "sizes and places of patches depend on it", "save x_m and y_m (metres) with the images", 1.1,
+        ))  # fmt: skip
+    if angle.source == "rig file":
+        out.append(reason(
+            "care", f"the incidence angle is not known: {angle.deg:.1f} degrees of the rig file were used",
+            "|P| of a dielectric changes by a tenth in a degree",
+            "give --incidence DEGREES, or save incidence_deg", 2.3,
+        ))  # fmt: skip
+    return out
+
+
+def reference_of(pair: GivenPair) -> PlaneReference:
+    """Return the metal reference that given images of a plate make. Raises DataError if they show none."""
+    return plane_reference(pair.images, name=pair.scan_id)
+
+
+def analyse_given_images(
+    pair: GivenPair,
+    settings: Settings,
+    inputs: Inputs,
+    rig: Instrument,
+    plates: tuple[TruthPlate, ...] = (),
+) -> tuple[ProcessedScan, Findings, str]:
+    """Find the materials of given images; return the result, its findings, and why nothing was named, or "".
+
+    Raises PolysightError as `Pipeline.examine` for a recorded scan.
+    """
+    began = time.perf_counter()
+    angle = choose_angle(pair, settings, rig)
+    rig = rig_at(rig, angle.deg)
+    classifier = load_classifier(settings, rig)
+    images = pair.images
+    boxed = replace(inputs, labels=pair.boxes(inputs.labels))
+    known = boxes_as_patches(settings, boxed, images.x_m, images.y_m)
+    plane = inputs.reference
+    if plane is not None and known.metal is None:
+        images = images.within(plane.valid_on(images.x_m, images.y_m))
+        known = replace(known, metal=plane)
+    everywhere = np.full(images.h.shape, np.radians(angle.deg))
+    optics = Optics.of(
+        rig, IncidenceChoice("one", everywhere, everywhere), theta_std_rad=UNKNOWN_PLANE.incidence_std_rad(rig)
+    )
+    found = analyse(images, optics, replace(known, plates=plates), classifier)
+    verdict = verdict_of([*given_reasons(pair, angle), *scene_reasons(found, None, classifier)])
+    shown = found if verdict.usable else found.without_result()
+    findings = Findings(images, shown, verdict, UNKNOWN_PLANE, classifier, plates)
+    quality = ScanQuality(
+        seconds_per_stage={"materials": round(time.perf_counter() - began, 4)},
+        verdict=verdict,
+        pixel_accuracy=pixel_accuracy(shown),
+        incidence=IncidenceAngles(used="one number for the image", one_deg=round(angle.deg, 4)),
+        given_images=GivenImages(file=str(pair.path), incidence_from=angle.source, assumed=list(pair.assumed)),
+    )
+    facts = ScanFacts(
+        scan_id=pair.scan_id,
+        simulated=pair.simulated,
+        processed_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        versions=versions(),
+    )
+    unnamed = why_unnamed(settings, rig)
+    return materials_of(pair.path.parent, facts, quality, findings, unnamed), findings, unnamed

@@ -1,0 +1,217 @@
+"""Images of another program go through the same analysis as a recorded scan, and say what had to be assumed."""
+
+import json
+
+import numpy as np
+import pytest
+from tests.support.drawn_files import Errors, Material, write_labels
+from tests.support.refusals import refused
+
+from polysight import open_scan
+from polysight.cli.main import main
+from polysight.process import Inputs, analyse_given_images, read_given_images
+from polysight.products import ProcessedScan
+from polysight.settings import Settings
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import PolysightError
+
+ANGLE = 55.0
+MATERIALS = {
+    "copper": Material("copper", None),
+    "acrylic": Material("acrylic", 4.0 - 0.4j),
+    "ceramic": Material("ceramic", 4.75 - 2.43j),
+    "rubber": Material("rubber", 5.06 - 1.11j),
+    "PET": Material("PET", 3.78 - 0.70j),
+}
+BOXES = {
+    "copper": (15, 15, 40, 40), "acrylic": (60, 15, 85, 40), "ceramic": (105, 15, 130, 40),
+    "rubber": (15, 90, 40, 115), "PET": (60, 90, 85, 115),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def labels_folder(tmp_path_factory):
+    """`labels/<scan>` of five plates, without leakage."""
+    return write_labels(tmp_path_factory.mktemp("labels"), "plates", BOXES, MATERIALS, ANGLE, Errors(), seed=4)
+
+
+@pytest.fixture(scope="module")
+def pair(labels_folder):
+    return {name: np.load(labels_folder / f"sar_{name}.npy") for name in "hv"}
+
+
+@pytest.fixture
+def saved(tmp_path, pair):
+    """`saved(h=..., x_m=None)`: the pair as a file, with changed arrays; None leaves one out."""
+
+    def save(name="plates", **changed):
+        arrays = {**pair, "incidence_deg": ANGLE, **changed}
+        np.savez(tmp_path / f"{name}.npz", **{k: v for k, v in arrays.items() if v is not None})
+        return tmp_path / f"{name}.npz"
+
+    return save
+
+
+def analysed(path, rig, **settings):
+    given = read_given_images(path, rig)
+    return analyse_given_images(given, Settings(model="none", **settings), Inputs(), rig)[0]
+
+
+def permittivities(scan):
+    return {(round(s.centre_x_mm), round(s.centre_y_mm)): s.permittivity for s in scan.segments}
+
+
+def test_plates_of_an_npz_and_of_a_labels_folder_are_the_same(labels_folder, saved, rig):
+    """The folder brings boxes and has its top row first; the file has neither."""
+    by_folder = analysed(labels_folder, rig)
+    by_file = analysed(saved(), rig)
+    assert {s.box for s in by_folder.segments} == set(BOXES)
+    assert len(by_file.segments) == len(by_folder.segments)
+    upside_down = {(x, -y): e for (x, y), e in permittivities(by_file).items()}
+    for place, e in permittivities(by_folder).items():
+        near = min(upside_down, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
+        assert np.hypot(near[0] - place[0], near[1] - place[1]) < 5
+        assert (e is None) == (upside_down[near] is None)
+        if e is not None:
+            assert e.real == pytest.approx(upside_down[near].real, rel=0.05)
+
+
+def test_permittivities_are_those_of_the_plates(labels_folder, rig):
+    for s in analysed(labels_folder, rig, incidence_deg=ANGLE).segments:
+        if s.permittivity is not None:
+            true = MATERIALS[s.box].permittivity
+            assert abs(complex(s.permittivity.real, s.permittivity.imag) - true) < 0.15 * abs(true)
+
+
+def test_the_direction_of_an_axis_does_not_matter(saved, pair, rig):
+    x = 1.3 + np.arange(150) * 2e-3
+    one = analysed(saved(x_m=x, y_m=x), rig)
+    turned = {name: image[::-1, ::-1] for name, image in pair.items()}
+    other = analysed(saved(x_m=x[::-1], y_m=x[::-1], **turned), rig)
+    np.testing.assert_array_equal(one.images.h, other.images.h)
+    assert permittivities(one) == permittivities(other)
+    assert one.images.x_m[0] == 1.3
+
+
+def test_the_angle_of_the_option_comes_before_that_of_the_file_and_the_rigs(saved, rig):
+    with_angle, without = saved(), saved("bare", incidence_deg=None)
+    for path, option, deg, source in (
+        (with_angle, 60.0, 60.0, "option"),
+        (with_angle, None, ANGLE, "file"),
+        (without, None, 54.9, "rig file"),
+    ):
+        scan = analysed(path, rig, incidence_deg=option)
+        assert scan.quality.incidence.one_deg == pytest.approx(deg, abs=0.05)
+        assert scan.quality.given_images.incidence_from == source
+        assert {round(s.incidence_deg, 1) for s in scan.segments} == {round(scan.quality.incidence.one_deg, 1)}
+
+
+def test_without_a_direct_path_the_verdict_is_never_good_and_nothing_is_invented(saved, rig):
+    known = np.arange(150) * 2e-3
+    scan = analysed(saved(x_m=known, y_m=known), rig)
+    assert scan.verdict.level == "care"
+    assert scan.quality.given_images.assumed == []
+    bare = analysed(saved("bare", incidence_deg=None), rig)
+    assert len(bare.verdict.reasons) == len(scan.verdict.reasons) + 2  # pixels and angle
+    for unknown in (scan.rig, scan.rows, scan.plan):
+        assert unknown is None
+    assert scan.quality.boards == {}
+    assert scan.simulated is False
+
+
+def test_pixels_marked_invalid_are_left_out(saved, pair, rig):
+    valid = np.ones((150, 150), bool)
+    valid[80:] = False
+    holed = {name: np.where(valid, image, np.nan) for name, image in pair.items()}
+    scan = analysed(saved(valid=valid, **holed), rig)
+    assert len(scan.segments) == 3
+    assert not scan.images.valid[80:].any()
+
+
+WRONG = {
+    "no v": ({"v": None, "sar_v": np.ones(3)}, ErrorCode.KEY_MISSING, "sar_v"),
+    "magnitude": ({"h": np.ones((150, 150))}, ErrorCode.TYPE_WRONG, "float64"),
+    "cube": ({"h": np.ones((4, 150, 150), complex)}, ErrorCode.MISMATCH, "4 x 150 x 150"),
+    "line": ({"h": np.ones((2, 150), complex)}, ErrorCode.MISMATCH, "2 x 150"),
+    "two shapes": ({"v": np.ones((150, 149), complex)}, ErrorCode.MISMATCH, "150 x 149"),
+    "infinite": ({"v": np.full((150, 150), np.inf + 0j)}, ErrorCode.VALUE_INVALID, 22500),
+    "dark": ({"h": np.zeros((150, 150), complex), "v": np.zeros((150, 150), complex)}, ErrorCode.NO_DATA, ""),
+    "short axis": ({"x_m": np.arange(149) * 2e-3}, ErrorCode.MISMATCH, 149),
+    "uneven axis": ({"x_m": (np.arange(150) * 2e-3) ** 2}, ErrorCode.VALUE_INVALID, "x_m"),
+    "millimetres": ({"x_m": np.arange(150) * 2.0, "y_m": np.arange(150) * 2.0}, ErrorCode.VALUE_INVALID, "2000"),
+    "words": ({"incidence_deg": np.array("55")}, ErrorCode.VALUE_INVALID, "incidence_deg"),
+    "valid as numbers": ({"valid": np.ones((150, 150))}, ErrorCode.MISMATCH, "valid"),
+}
+
+
+@pytest.mark.parametrize(("changed", "code", "named"), WRONG.values(), ids=WRONG.keys())
+def test_wrong_files_are_refused_by_name(saved, rig, changed, code, named):
+    path = saved(**changed)
+    with refused(code, path, named) as caught:
+        read_given_images(path, rig)
+    assert caught.value.why
+    assert caught.value.remedy
+
+
+def test_files_that_are_no_archive_are_refused(tmp_path, rig):
+    path = tmp_path / "other.npz"
+    with refused(ErrorCode.FILE_MISSING, path):
+        read_given_images(path, rig)
+    path.write_bytes(b"PK no archive")
+    with refused(ErrorCode.FILE_UNREADABLE, path):
+        read_given_images(path, rig)
+    np.savez(path, h=np.array([{}], dtype=object), v=np.ones((9, 9), complex))
+    with refused(ErrorCode.FILE_UNREADABLE, path):
+        read_given_images(path, rig)
+
+
+@pytest.mark.parametrize("options", [["--incidence", "pixel"], ["--bands", "3"], ["--sparse"]])
+def test_options_that_need_rows_are_refused(saved, tmp_path, capsys, options):
+    assert main(["process", str(saved()), "--out", str(tmp_path / "out"), *options]) != 0
+    assert options[0] in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_reader_of_products_reads_them(saved, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["process", str(saved()), "--out", str(out), "--metal", "-94,-94,40,40"]) == 0
+    for command in (
+        ["materials", out],
+        ["permittivity", out],
+        ["classify", out],
+        ["report", out],
+        ["probe", out, "0,0"],
+        ["compare", out, out],
+        ["label", out, "--list"],
+        ["scans", tmp_path],
+        ["export", out, "--csv", "--mat", "--netcdf", "--out", tmp_path / "exported"],
+    ):
+        capsys.readouterr()
+        assert main([str(word) for word in command]) == 0, capsys.readouterr().err
+    scan = open_scan(out)
+    assert float(scan.image().incidence_deg) == ANGLE
+    assert scan.materials().sizes["patch"] == 5
+    with pytest.raises(PolysightError):
+        _ = scan.rig
+
+
+def test_a_plate_over_the_plane_is_the_reference_of_every_pixel(saved, pair, tmp_path):
+    """Its gains need not be even: they are divided out."""
+    uneven = np.exp(np.add.outer(np.linspace(0, 0.5, 150), np.linspace(0, 0.3j, 150)))
+    plate = saved("plate", h=-uneven, v=-0.5 * uneven)
+    scene = saved(h=-pair["h"] * uneven, v=-0.5 * pair["v"] * uneven)
+    out = tmp_path / "out"
+    assert main(["process", str(scene), "--reference", str(plate), "--out", str(out), "--model", "none"]) == 0
+    assert ProcessedScan(out).materials.metal_reference.certain
+
+
+def test_all_images_of_a_folder_are_processed(labels_folder, tmp_path):
+    folder = tmp_path / "labels"
+    for name in ("one", "two"):
+        (folder / name).mkdir(parents=True)
+        for file in ("sar_h.npy", "sar_v.npy"):
+            (folder / name / file).write_bytes((labels_folder / file).read_bytes())
+        (folder / name / f"{name}.json").write_text(json.dumps({"labels": {}}))
+    out = tmp_path / "out"
+    assert main(["process", str(folder), "--out", str(out), "--jobs", "1"]) == 0
+    assert [len(ProcessedScan(out / name).segments) for name in ("one", "two")] == [5, 5]

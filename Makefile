@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE  # modules are compiled once, not for each of a
 help:  ## this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-PROJECTS := shared pi_controller simulators host papers
+PROJECTS := shared pi_controller simulators host papers worlds
 KERNELS := $(wildcard host/polysight/sync/*.c host/polysight/sync/*.h) host/polysight/sync/build.py host/setup.py
 
 $(VENV)/installed: pyproject.toml $(PROJECTS:%=%/pyproject.toml) $(KERNELS)
@@ -40,7 +40,7 @@ test-pi: $(VENV)/installed  ## a Raspberry Pi 3B in a box: Debian's kernel on QE
 	@./tests/install-tools.sh pi
 	$(BIN)/python -m pytest tests/pi_box --pi-box -rP
 
-CHANGED = $(shell git diff --name-only --diff-filter=d HEAD -- host papers pi_controller shared simulators 2>/dev/null | grep '\.py$$')
+CHANGED = $(shell git diff --name-only --diff-filter=d HEAD -- host papers pi_controller shared simulators worlds 2>/dev/null | grep '\.py$$')
 LAWS := tests/house/test_rooms.py tests/shared tests/polarimetry tests/sync/test_tone.py tests/imaging/test_direct.py
 
 mutants: $(VENV)/installed  ## change the code at 100 random places: do the tests notice? (hours; COUNT=100 SEED=1)

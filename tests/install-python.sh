@@ -3,7 +3,7 @@
 # Says what it does, and each minute that it still does it; warnings of packages that are none of the user's business stay away.
 set -u
 python=$1 venv=$2
-projects="-e ./shared -e ./pi_controller -e ./simulators -e ./host -e ./papers"
+projects="-e ./shared -e ./pi_controller -e ./simulators -e ./host -e ./papers -e ./worlds"
 export PYTHONWARNINGS=ignore PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_QUIET=2 PIP_NO_INPUT=1 PIP_ROOT_USER_ACTION=ignore UV_NO_PROGRESS=1
 
 patiently() {  # COMMAND...: its exit status, and a line for every minute that it takes

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from polysight.materials import format_permittivity
 
 ROOT = Path(__file__).parents[2]
-TOPS = ("host", "papers", "simulators", "benchmarks", "examples", "shared", "pi_controller")
+TOPS = ("host", "papers", "simulators", "worlds", "benchmarks", "examples", "shared", "pi_controller")
 BY_HAND = re.compile(r"[-+−–] ?j\(?$")
 OTHERS = re.compile(r"[-+−–] ?j\(?(\$?\{|%)")
 WRITER = "host/polysight/materials/measure.py"

@@ -122,6 +122,13 @@ def test_only_simulators_use_simulators():
     assert wrong == []
 
 
+def test_worlds_know_nothing_of_ours():
+    """They judge the instrument: no code and no belief is shared."""
+    files = (ROOT / "worlds").rglob("*.py")
+    used = {module.split(".")[0] for file in files for _, module in imports(file)}
+    assert used - set(sys.stdlib_module_names) == {"numpy", "scipy", "polysight_worlds"}
+
+
 def test_every_folder_of_modules_is_a_package():
     tops = [ROOT / top / package for top, package in PROJECTS.items()]
     folders = {f.parent for top in tops for f in top.rglob("*.py") if "build" not in f.parts}

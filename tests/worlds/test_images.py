@@ -1,0 +1,87 @@
+"""Images of drawn scenes: what is true stands in them, and each nuisance does something."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from polysight_worlds import METAL, NUISANCES, Plate, Stack, World, draw_nuisances, draw_world, published_rig, simulate
+from polysight_worlds.__main__ import main
+from polysight_worlds.images import ImagePair
+
+RIG = published_rig()
+CENTRE_M = float(RIG.centre_m[0]), float(RIG.centre_m[1])
+DIELECTRIC = Stack(below=5 - 1j)
+
+
+def ratio(images: ImagePair, plate: Plate) -> complex:
+    """H / V over the inner part of a plate."""
+    x0, y0, x1, y1 = plate.box_m
+    inside_x = (images.x_m > x0 + 0.015) & (images.x_m < x1 - 0.015)
+    inside_y = (images.y_m > y0 + 0.015) & (images.y_m < y1 - 0.015)
+    inside = np.ix_(inside_y, inside_x)
+    return images.h[inside].mean() / images.v[inside].mean()
+
+
+@pytest.fixture(scope="module")
+def pair() -> World:
+    """Metal and a dielectric, each in its turn at the middle."""
+    return World((Plate("plate", CENTRE_M, (0.06, 0.06), METAL),))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(pair) -> ImagePair:
+    return simulate(pair)
+
+
+def test_a_plate_stands_where_it_was_put(undisturbed):
+    x0, y0, x1, y1 = undisturbed.world.plates[0].box_m
+    lit = np.abs(undisturbed.h) > 0.5 * np.abs(undisturbed.h).max()
+    columns, rows = np.flatnonzero(lit.any(axis=0)), np.flatnonzero(lit.any(axis=1))
+    assert undisturbed.x_m[columns[[0, -1]]] == pytest.approx([x0, x1], abs=0.005)
+    assert undisturbed.y_m[rows[[0, -1]]] == pytest.approx([y0, y1], abs=0.005)
+
+
+def test_a_dielectric_beside_metal_has_the_ratio_of_fresnel(undisturbed):
+    plate = Plate("plate", CENTRE_M, (0.06, 0.06), DIELECTRIC)
+    images = simulate(World((plate,)))
+    measured = ratio(images, plate) / ratio(undisturbed, undisturbed.world.plates[0])
+    assert measured == pytest.approx(images.ratio_of(plate), rel=0.02)
+
+
+@pytest.mark.parametrize("name", [*NUISANCES, "all"])
+def test_each_nuisance_changes_the_images_and_is_told(name, pair, undisturbed):
+    nuisances = draw_nuisances(np.random.default_rng(1), name)
+    assert nuisances.active()
+    images = simulate(pair, nuisances)
+    assert images.h.shape == undisturbed.h.shape
+    assert np.isfinite(images.h).all()
+    changes = [np.abs(a - b).max() / np.abs(b).max() for a, b in ((images.h, undisturbed.h), (images.v, undisturbed.v))]
+    assert max(changes) > 1e-3
+
+
+def test_a_seed_gives_one_scan(pair):
+    nuisances = draw_nuisances(np.random.default_rng(5), "all")
+    assert np.array_equal(simulate(pair, nuisances).h, simulate(pair, nuisances).h)
+
+
+def test_no_nuisance_is_none():
+    assert draw_nuisances(np.random.default_rng(0)).active() == ()
+
+
+def test_a_drawn_world_has_one_metal_and_the_pieces_asked_for():
+    world = draw_world(np.random.default_rng(3), CENTRE_M, with_table=True, pieces=7)
+    assert len(world.plates) == 8
+    assert [plate.name for plate in world.plates if plate.stack.is_metal] == ["copper"]
+
+
+def test_the_program_writes_images_and_truth(tmp_path):
+    main(["--seed", "2", "--nuisances", "tilt", "drift", "--out", str(tmp_path / "scene.npz")])
+    with np.load(tmp_path / "scene.npz") as arrays:
+        assert arrays["h"].shape == (len(arrays["y_m"]), len(arrays["x_m"]))
+        assert arrays["v"].dtype == np.complex64
+    truth = json.loads((tmp_path / "scene.json").read_text())
+    assert set(truth["active"]) == {"tilt_deg", "drift", "drift_deg"}
+    assert len(truth["plates"]) == 9

@@ -1,0 +1,76 @@
+"""Reflection at layers against closed forms, and laws of energy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from polysight_worlds import METAL, Stack, reflect
+from polysight_worlds.media import LIGHT_M_PER_S, ReflectionTable
+
+FREQUENCY_HZ = 78e9
+cosines = st.floats(0.05, 1.0)
+permittivities = st.builds(lambda real, loss: real - 1j * loss, st.floats(1.01, 20), st.floats(0, 20))
+
+
+def fresnel(permittivity: complex, cosine: float) -> tuple[complex, complex]:
+    """Fresnel's formulas; r_p is of the tangential electric field."""
+    root = np.sqrt(permittivity - (1 - cosine**2))
+    return (cosine - root) / (cosine + root), (root - permittivity * cosine) / (root + permittivity * cosine)
+
+
+def between(above: complex, below: complex, cosine: float) -> tuple[complex, complex]:
+    """Fresnel's formulas at a boundary of two media; `cosine` of the angle in air."""
+    sine_squared = 1 - cosine**2
+    first, second = np.sqrt(above - sine_squared + 0j), np.sqrt(below - sine_squared + 0j)
+    s = (first - second) / (first + second)
+    return s, (above * second - below * first) / (above * second + below * first)
+
+
+@given(permittivities, cosines)
+def test_a_half_space_reflects_by_fresnel(permittivity, cosine):
+    assert reflect(Stack(below=permittivity), FREQUENCY_HZ, cosine) == pytest.approx(fresnel(permittivity, cosine))
+
+
+@given(permittivities, permittivities, st.floats(0.0, 0.006), cosines)
+def test_a_layer_reflects_by_airy(layer, below, thickness_m, cosine):
+    root = np.sqrt(layer - (1 - cosine**2))
+    turn = np.exp(-4j * np.pi * FREQUENCY_HZ / LIGHT_M_PER_S * root * thickness_m)
+    stack = Stack(((layer, thickness_m),), below)
+    pairs = zip(between(1, layer, cosine), between(layer, below, cosine), strict=True)
+    expected = [(top + bottom * turn) / (1 + top * bottom * turn) for top, bottom in pairs]
+    assert reflect(stack, FREQUENCY_HZ, cosine) == pytest.approx(expected, abs=1e-9)
+
+
+@given(permittivities, permittivities, st.floats(0.0, 0.004), st.floats(0.0, 0.004), cosines)
+def test_a_layer_cut_in_two_is_one_layer(layer, below, first_m, second_m, cosine):
+    cut = Stack(((layer, first_m), (layer, second_m)), below)
+    whole = Stack(((layer, first_m + second_m),), below)
+    whole_r = np.array(reflect(whole, FREQUENCY_HZ, cosine))
+    assert np.array(reflect(cut, FREQUENCY_HZ, cosine)) == pytest.approx(whole_r, abs=1e-9)
+
+
+@given(st.lists(st.tuples(permittivities, st.floats(0.0, 0.01)), max_size=4), permittivities, cosines)
+def test_no_stack_returns_more_than_it_was_given(layers, below, cosine):
+    assert all(abs(r) <= 1 + 1e-9 for r in reflect(Stack(tuple(layers), below), FREQUENCY_HZ, cosine))
+
+
+@given(st.lists(st.tuples(st.floats(1.01, 20), st.floats(0.0, 0.01)), max_size=4), cosines)
+def test_layers_without_loss_on_metal_return_all(layers, cosine):
+    # Of a conductor without loss: copper's own loss grows where the layers resonate.
+    stack = Stack(tuple((eps, thickness) for eps, thickness in layers), -1e7)
+    assert np.abs(reflect(stack, FREQUENCY_HZ, cosine)) == pytest.approx([1, 1])
+
+
+@given(cosines)
+def test_metal_turns_both_polarisations_alike(cosine):
+    assert np.array(reflect(METAL, FREQUENCY_HZ, cosine)) == pytest.approx([-1, -1], abs=0.02)
+
+
+def test_the_table_interpolates_the_solution():
+    stack = Stack(((4 - 0.4j, 0.003),), 2 - 0.1j)
+    cosine = np.linspace(0.2, 1, 97)
+    table = np.array(ReflectionTable(stack, FREQUENCY_HZ).look_up(cosine))
+    assert table == pytest.approx(np.array(reflect(stack, FREQUENCY_HZ, cosine)), abs=1e-4)

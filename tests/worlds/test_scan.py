@@ -1,0 +1,86 @@
+"""The convolutions against the direct sum over facets, and the rig against the published numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polysight_worlds import Plate, Rig, Stack, World, load_rig, published_rig, record
+from polysight_worlds.optics import Facets, scatter
+from polysight_worlds.scan import Surface, make_surface
+
+ROOT = Path(__file__).parents[2]
+LAYER = Stack(((4 - 0.4j, 0.003),), 2 - 0.1j)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The published rig on a small grid, at two frequencies."""
+    return replace(published_rig(), columns=60, rows=40, frequencies_hz=np.array([76.3e9, 79.7e9]))
+
+
+def facets_of(surface: Surface, plate: Plate, rig: Rig) -> Facets:
+    rows, columns = surface.cover.shape
+    x = surface.x0_m + np.arange(columns) * rig.step_m
+    y = surface.y0_m + np.arange(rows) * rig.step_m
+    x, y = (grid.ravel() for grid in np.meshgrid(x, y))
+    z = rig.plane_m - plate.height_mm / 1000 + surface.height_m.ravel()
+    slope_x, slope_y = (np.full(x.shape, slope) for slope in surface.mean_slopes)
+    if surface.rough_slopes is not None:
+        slope_x, slope_y = slope_x + surface.rough_slopes[0].ravel(), slope_y + surface.rough_slopes[1].ravel()
+    step, flat = np.full(x.shape, rig.step_m), np.zeros(x.shape)
+    edges = np.stack([flat, step, step * slope_y]), np.stack([step, flat, step * slope_x])
+    return Facets(np.stack([x, y, z]), *edges)
+
+
+@pytest.mark.parametrize(
+    ("shape", "error"),
+    [
+        ({}, 1e-5),
+        ({"height_mm": 4.0}, 1e-5),
+        ({"tilt_x_deg": 1.5, "tilt_y_deg": -1.0}, 5e-3),
+        ({"tilt_x_deg": 8.0, "tilt_y_deg": -5.0}, 8e-2),
+        ({"waviness_mm": 0.15}, 1e-2),
+        ({"roughness_mm": 0.1}, 3e-2),
+    ],
+)
+@pytest.mark.parametrize("channel", ["h", "v"])
+def test_convolutions_equal_the_sum_over_facets(rig, shape, error, channel):
+    plate = Plate("plate", (0.01, 0.09), (0.050, 0.044), LAYER, **shape)
+    rx = getattr(rig, channel)
+    data = record(rig, rx, World((plate,)), seed=7)
+    surface = make_surface(plate, rig.step_m, np.random.default_rng([7, 2, 0]))
+    x, y = rig.offsets_m()
+    rng = np.random.default_rng(0)
+    row, column = rng.integers(0, rig.rows, 12), rng.integers(0, rig.columns, 12)
+    offsets = np.stack([x[column], y[row], np.zeros(12)], axis=1)
+    expected = scatter(rig.tx, rx, facets_of(surface, plate, rig), plate.stack, rig.frequencies_hz, offsets)
+    rms = np.sqrt(np.mean(np.abs(expected) ** 2))
+    assert np.sqrt(np.mean(np.abs(data[:, row, column].T - expected) ** 2)) < error * rms
+
+
+def test_the_rig_file_is_the_published_rig():
+    loaded, built = load_rig(ROOT / "instrument.toml"), published_rig()
+    for name in ("tx", "h", "v"):
+        one, other = getattr(loaded, name), getattr(built, name)
+        assert one.position == pytest.approx(other.position, abs=1e-5)
+        assert one.polarisation == pytest.approx(other.polarisation, abs=1e-5)
+    assert loaded.incidence_deg == pytest.approx(55, abs=0.1)
+    # TX2 as the rig's description has it.
+    assert loaded.tx.position == pytest.approx([-0.7055, 0.0974, 0.0130], abs=1e-4)
+
+
+def test_a_rough_surface_has_the_rms_that_was_asked_for():
+    plate = Plate("plate", (0, 0), (0.4, 0.4), LAYER, roughness_mm=0.2)
+    heights = make_surface(plate, 0.002, np.random.default_rng(0)).height_m
+    assert np.std(heights) == pytest.approx(0.2e-3, rel=0.1)
+
+
+def test_cells_cover_the_plates_area():
+    for size_m, round_ in (((0.05, 0.044), False), ((0.0473, 0.0391), False), ((0.06, 0.06), True)):
+        plate = Plate("plate", (0, 0), size_m, LAYER, round_=round_)
+        area_m2 = make_surface(plate, 0.002, np.random.default_rng(0)).cover.sum() * 0.002**2
+        assert area_m2 == pytest.approx(size_m[0] * size_m[1] * (np.pi / 4 if round_ else 1), rel=0.01)

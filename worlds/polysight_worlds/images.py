@@ -1,0 +1,261 @@
+"""From a world to a pair of images: echoes, direct path, nuisances of the scan, matched filter.
+
+The processing knows the nominal rig only. Each sample is divided by the direct path of its position (the nominal one in
+length), the range gate is the sum over frequencies, and the image a matched filter on the object plane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from polysight_worlds.media import LIGHT_M_PER_S, reflect
+from polysight_worlds.optics import Antenna, receive_direct
+from polysight_worlds.rig import Rig, published_rig, turn
+from polysight_worlds.scan import fast_length, fft2, ifft2, record, signed_lags
+from polysight_worlds.world import Nuisances, Plate, World, disturb_plates
+
+# Window over the aperture in each direction.
+KAISER_BETA = 2.5
+
+
+@dataclass(frozen=True)
+class ImagePair:
+    """Images of one scan in the rig frame, and what is true.
+
+    h, v: complex64 [ny, nx], row 0 at the smallest y, relative to the direct path; phases grow with the path (IF
+    convention), so H / V of a plate over that of metal is the conjugate of r_s / r_p for eps' - j eps''.
+    `world`: as it was scanned, with the plates' drawn heights and tilts.
+    """
+
+    h: NDArray
+    v: NDArray
+    x_m: NDArray
+    y_m: NDArray
+    world: World
+    nuisances: Nuisances
+    incidence_deg: float
+    frequencies_hz: NDArray
+
+    def ratio_of(self, plate: Plate) -> complex:
+        """H / V of a plate over that of metal, without any disturbance, at the middle of band and picture."""
+        r_s, r_p = reflect(plate.stack, self.frequencies_hz.mean(), np.cos(np.radians(self.incidence_deg)))
+        return complex(np.conj(r_s / r_p))
+
+    def truth(self) -> dict:
+        """What is true, for JSON; complex numbers as [real, imaginary]."""
+        plates = []
+        for plate in self.world.plates:
+            written = asdict(plate)
+            stack = written.pop("stack")
+            ratio = self.ratio_of(plate)
+            written["box_m"] = plate.box_m
+            written["is_metal"] = plate.stack.is_metal
+            written["layers"] = [[eps.real, eps.imag, 1000 * thick] for eps, thick in stack["layers"]]
+            written["below"] = [stack["below"].real, stack["below"].imag]
+            written["ratio"] = [ratio.real, ratio.imag]
+            plates.append(written)
+        return {
+            "simulated": True,
+            "phase": "grows with the path",
+            "incidence_deg": self.incidence_deg,
+            "frequencies_hz": self.frequencies_hz.tolist(),
+            "nuisances": asdict(self.nuisances),
+            "active": self.nuisances.active(),
+            "plates": plates,
+        }
+
+
+def simulate(
+    world: World, nuisances: Nuisances | None = None, rig: Rig | None = None, *, pixels: int = 150
+) -> ImagePair:
+    """Scan a world and image it on `pixels` x `pixels` of one stage step, centred as `Rig.centre_m`."""
+    nominal = published_rig() if rig is None else rig
+    nuisances = Nuisances() if nuisances is None else nuisances
+    nominal = _cut_grid(nominal, nuisances)
+    true_world = disturb_plates(_shift_world(world, nuisances, pixels * nominal.step_m), nuisances)
+    true_rig = disturb_rig(nominal, nuisances)
+    rng = np.random.default_rng([nuisances.seed, 3])
+    positions = _draw_bad_positions(rng, nominal, nuisances)
+    images = []
+    for channel in ("h", "v"):
+        true_rx: Antenna = getattr(true_rig, channel)
+        echoes = record(true_rig, true_rx, true_world, seed=nuisances.seed)
+        direct = receive_direct(true_rig.tx, true_rx, true_rig.frequencies_hz)
+        data = disturb_data(rng, nominal, echoes, direct, nuisances, channel, positions)
+        images.append(backproject(nominal, getattr(nominal, channel), data, pixels))
+    x_m, y_m = pixel_centres(nominal, pixels)
+    return ImagePair(
+        h=images[0],
+        v=images[1],
+        x_m=x_m,
+        y_m=y_m,
+        world=true_world,
+        nuisances=nuisances,
+        incidence_deg=nominal.incidence_deg,
+        frequencies_hz=nominal.frequencies_hz,
+    )
+
+
+def disturb_rig(rig: Rig, nuisances: Nuisances) -> Rig:
+    """The rig as it really stands: boards turned and misplaced, other polarisation leaking in, longer stage steps."""
+    rng = np.random.default_rng([nuisances.seed, 4])
+
+    def disturb(antenna: Antenna, turn_deg: float, leakage: float) -> Antenna:
+        axis = _draw_direction(rng)
+        shift_m = _draw_direction(rng) * nuisances.misplaced_mm / 1000
+        phase = rng.uniform(0, 2 * np.pi)
+        return antenna.turned(turn(axis, turn_deg), shift_m).with_leakage(leakage * np.exp(1j * phase))
+
+    return replace(
+        rig,
+        tx=disturb(rig.tx, nuisances.tx_turn_deg, 0.0),
+        h=disturb(rig.h, nuisances.h_turn_deg, nuisances.leakage),
+        v=disturb(rig.v, nuisances.v_turn_deg, nuisances.leakage),
+        step_m=rig.step_m * (1 + nuisances.stage_scale),
+    )
+
+
+def _draw_direction(rng: Generator) -> NDArray:
+    vector = rng.standard_normal(3)
+    return vector / np.linalg.norm(vector)
+
+
+def _cut_grid(rig: Rig, nuisances: Nuisances) -> Rig:
+    share = 1 - nuisances.aperture
+    return replace(rig, columns=round(rig.columns * share), rows=round(rig.rows * share))
+
+
+def _shift_world(world: World, nuisances: Nuisances, width_m: float) -> World:
+    if not nuisances.border:
+        return world
+    rng = np.random.default_rng([nuisances.seed, 5])
+    direction = [(1, 0), (-1, 0), (0, 1), (0, -1)][rng.integers(4)]
+    dx, dy = (nuisances.border * width_m * d for d in direction)
+    plates = []
+    for plate in world.plates:
+        x, y = plate.centre_m
+        plates.append(replace(plate, centre_m=(x + dx, y + dy)))
+    return World(tuple(plates))
+
+
+def _draw_bad_positions(rng: Generator, rig: Rig, nuisances: Nuisances) -> NDArray:
+    """Positions without signal, bool [rows, columns]: runs of 1 to 20 in a row, the same for both receivers."""
+    bad = np.zeros((rig.rows, rig.columns), bool)
+    return _add_runs(rng, bad, nuisances.dark)
+
+
+def _add_runs(rng: Generator, marked: NDArray, share: float) -> NDArray:
+    while marked.mean() < share:
+        row, first = rng.integers(marked.shape[0]), rng.integers(marked.shape[1])
+        marked[row, first : first + rng.integers(1, 21)] = True
+    return marked
+
+
+def disturb_data(
+    rng: Generator,
+    rig: Rig,
+    echoes: NDArray,
+    direct: NDArray,
+    nuisances: Nuisances,
+    channel: str,
+    dark: NDArray,
+) -> NDArray:
+    """Echoes relative to the direct path as the synchronisation sees it, complex64 [frequencies, rows, columns]."""
+    shape = echoes.shape[1:]
+    beside = nuisances.multipath * _draw_fringes(rng, rig)
+    received_direct = direct[:, None, None] * (1 + beside)
+    echoes = echoes.copy()
+    if nuisances.clipping:
+        echoes, received_direct = _clip(echoes, received_direct, nuisances.clipping)
+    rms = np.sqrt(np.mean(np.abs(echoes) ** 2))
+    if nuisances.noise:
+        echoes = echoes + nuisances.noise * rms * _draw_noise(rng, echoes.shape)
+    if nuisances.interference:
+        hit = _add_runs(rng, np.zeros(shape, bool), nuisances.interference)
+        strength = rms * rng.uniform(2, 10) * np.exp(2j * np.pi * rng.random(echoes.shape))
+        echoes = echoes + hit * strength
+    data = echoes / received_direct
+    if channel == "v" and (nuisances.drift or nuisances.drift_deg):
+        data = data * _draw_drift(rng, shape, nuisances)
+    data = np.where(dark, 0, data)
+    return data.astype(np.complex64)
+
+
+def _draw_noise(rng: Generator, shape: tuple[int, ...]) -> NDArray:
+    pair = rng.standard_normal((2, *shape), dtype=np.float32)
+    return (pair[0] + 1j * pair[1]) * np.float32(np.sqrt(0.5))
+
+
+def _draw_fringes(rng: Generator, rig: Rig) -> NDArray:
+    """Unit phasors [rows, columns] of a second path beside the direct one: fringes of 60 to 400 mm, slightly curved."""
+    x, y = rig.offsets_m()
+    period_m = rng.uniform(0.06, 0.4)
+    direction = rng.uniform(0, 2 * np.pi)
+    along = x * np.cos(direction) + y[:, None] * np.sin(direction)
+    curved = rng.uniform(-5, 5) * (x**2 + y[:, None] ** 2)
+    return np.exp(2j * np.pi * (along / period_m + curved + rng.random()))
+
+
+def _draw_drift(rng: Generator, shape: tuple[int, int], nuisances: Nuisances) -> NDArray:
+    """Complex gain over the scan [rows, columns]: smooth in time, row after row; its span is what the nuisances say."""
+    time = np.arange(shape[0])[:, None] / shape[0] + np.arange(shape[1]) / (shape[0] * shape[1])
+    gains = []
+    for span in (nuisances.drift, np.radians(nuisances.drift_deg)):
+        wander = rng.uniform(-1, 1) * time
+        for waves in (1, 2, 3):
+            wave = np.sin(np.pi * waves * time + 2 * np.pi * rng.random())
+            wander = wander + rng.standard_normal() / (2 * waves) * wave
+        gains.append(span * (wander - wander.mean()) / np.ptp(wander))
+    return (1 + gains[0]) * np.exp(1j * gains[1])
+
+
+def _clip(echoes: NDArray, direct: NDArray, share: float) -> tuple[NDArray, NDArray]:
+    """Limit direct path plus echo to (1 - share) of its largest amplitude.
+
+    Each frequency is a time of the chirp. What the limiter leaves is split again: the direct path has its mean gain.
+    """
+    both = direct + echoes
+    amplitude = np.abs(both)
+    limit = (1 - share) * amplitude.max()
+    gain = np.minimum(1, limit / amplitude)
+    new_direct = direct * gain.mean(axis=0)
+    return both * gain - new_direct, new_direct
+
+
+def pixel_centres(rig: Rig, pixels: int) -> tuple[NDArray, NDArray]:
+    """Coordinates of the picture's pixel centres in the rig frame, metres."""
+    along = (np.arange(pixels) - (pixels - 1) / 2) * rig.step_m
+    return rig.centre_m[0] + along, rig.centre_m[1] + along
+
+
+def backproject(rig: Rig, rx: Antenna, data: NDArray, pixels: int) -> NDArray:
+    """Matched filter of complex64 `data` [frequencies, rows, columns] on the object plane: complex64 [pixels, pixels].
+
+    I(v) = sum over offsets u and frequencies of w(u) data(u, f) exp(+jk (path(v - u) - direct)), divided by the sum of
+    w, and conjugated: phases of the result grow with the path.
+    """
+    window = np.outer(np.kaiser(rig.rows, KAISER_BETA), np.kaiser(rig.columns, KAISER_BETA)).astype(np.float32)
+    shape = fast_length(rig.rows + pixels - 1), fast_length(rig.columns + pixels - 1)
+    x_m, y_m = pixel_centres(rig, pixels)
+    offsets_x, offsets_y = rig.offsets_m()
+    x = x_m[0] - offsets_x[0] + signed_lags(shape[1], pixels) * rig.step_m
+    y = y_m[0] - offsets_y[0] + signed_lags(shape[0], pixels) * rig.step_m
+    out = _distance(rig.tx, x, y, rig.plane_m)
+    back = _distance(rx, x, y, rig.plane_m)
+    excess_m = out + back - np.linalg.norm(rx.position - rig.tx.position)
+    spectrum = np.zeros(shape, np.complex64)
+    for index, frequency_hz in enumerate(rig.frequencies_hz):
+        k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
+        kernel = np.exp(1j * k * excess_m).astype(np.complex64)
+        spectrum += fft2(window * data[index], shape) * fft2(kernel)
+    image = ifft2(spectrum)[:pixels, :pixels] / (window.sum() * len(rig.frequencies_hz))
+    return np.conj(image).astype(np.complex64)
+
+
+def _distance(antenna: Antenna, x: NDArray, y: NDArray, z: float) -> NDArray:
+    ax, ay, az = antenna.position
+    return np.sqrt((x[None, :] - ax) ** 2 + (y[:, None] - ay) ** 2 + (z - az) ** 2)

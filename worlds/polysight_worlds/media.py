@@ -1,0 +1,100 @@
+"""Reflection of plane waves at layered media, from the boundary conditions.
+
+Fields vary as exp(+j omega t), so a lossy permittivity is eps' - j eps''. Both coefficients are ratios of the electric
+field's tangential part: metal has r_s = r_p = -1, and P = r_s / r_p = 1, at every angle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+LIGHT_M_PER_S = 299_792_458.0
+# Copper at 78 GHz: sigma / (omega eps0), with 5.8e7 S/m.
+COPPER = 1 - 1.3e7j
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Layers on a half space: `layers` from the top as (relative permittivity, thickness in metres)."""
+
+    layers: tuple[tuple[complex, float], ...] = ()
+    below: complex = 1.0 + 0j
+
+    @property
+    def is_metal(self) -> bool:
+        """True if the wave meets metal first."""
+        return not self.layers and abs(self.below) > 1e4
+
+
+METAL = Stack(below=COPPER)
+
+
+def reflect(stack: Stack, frequency_hz: ArrayLike, cos_incidence: ArrayLike) -> tuple[NDArray, NDArray]:
+    """Reflection coefficients (r_s, r_p) in air, complex128 of the broadcast shape of the two arguments.
+
+    Solves for the waves in all layers at once: tangential E and H are continuous at each boundary.
+    """
+    k0 = 2 * np.pi * np.asarray(frequency_hz, float) / LIGHT_M_PER_S
+    k0, cos_incidence = np.broadcast_arrays(k0, np.asarray(cos_incidence, float))
+    permittivities = [1.0, *(eps for eps, _ in stack.layers), stack.below]
+    # The principal root of eps' - j eps'' decays downwards.
+    kz = [np.sqrt(complex(eps) - (1 - cos_incidence**2) + 0j) for eps in permittivities]
+    kz[0] = cos_incidence + 0j
+    delays = [np.ones_like(kz[0])]
+    for (_, thickness_m), root in zip(stack.layers, kz[1:-1], strict=True):
+        delays.append(np.exp(-1j * k0 * root * thickness_m))
+    delays.append(np.zeros_like(kz[0]))
+    s_admittances = kz
+    p_admittances = [eps / root for eps, root in zip(permittivities, kz, strict=True)]
+    return _solve_waves(s_admittances, delays), _solve_waves(p_admittances, delays)
+
+
+def _solve_waves(admittances: list[NDArray], delays: list[NDArray]) -> NDArray:
+    """Amplitude of the wave that comes back, for a unit wave that falls onto the first boundary.
+
+    Unknowns in order: r; of each layer the wave down (at its top) and up (at its bottom); the wave in the half space.
+    """
+    boundaries = len(admittances) - 1
+    size = 2 * boundaries
+    matrix = np.zeros((*delays[0].shape, size, size), complex)
+    source = np.zeros((*delays[0].shape, size, 1), complex)
+    for m in range(boundaries):
+        above, below = admittances[m], admittances[m + 1]
+        electric, magnetic = 2 * m, 2 * m + 1
+        down_below = 2 * m + 1
+        if m == 0:
+            source[..., electric, 0] = -1
+            source[..., magnetic, 0] = -above
+        else:
+            matrix[..., electric, 2 * m - 1] = delays[m]
+            matrix[..., magnetic, 2 * m - 1] = above * delays[m]
+        matrix[..., electric, 2 * m] = 1
+        matrix[..., magnetic, 2 * m] = -above
+        matrix[..., electric, down_below] = -1
+        matrix[..., magnetic, down_below] = -below
+        if m + 1 < boundaries:
+            matrix[..., electric, down_below + 1] = -delays[m + 1]
+            matrix[..., magnetic, down_below + 1] = below * delays[m + 1]
+    return np.linalg.solve(matrix, source)[..., 0, 0]
+
+
+class ReflectionTable:
+    """Coefficients of a stack at one frequency over the cosine of incidence, for quick look-up."""
+
+    POINTS = 513
+
+    def __init__(self, stack: Stack, frequency_hz: float) -> None:
+        cosines = np.linspace(0, 1, self.POINTS)
+        cosines[0] = 1e-6
+        self._tables = [table.astype(np.complex64) for table in reflect(stack, frequency_hz, cosines)]
+
+    def look_up(self, cos_incidence: NDArray) -> tuple[NDArray, NDArray]:
+        """(r_s, r_p) as complex64 by linear interpolation."""
+        place = np.clip(cos_incidence, 0, 1) * (self.POINTS - 1)
+        left = np.minimum(place.astype(np.int32), self.POINTS - 2)
+        share = (place - left).astype(np.float32)
+        s, p = (table[left] + share * (table[left + 1] - table[left]) for table in self._tables)
+        return s, p

@@ -1,0 +1,228 @@
+"""Vector physical optics: what an antenna receives of a wave that facets reflect.
+
+A spherical wave of the transmit antenna meets a facet as a plane wave. It is split into s and p at the facet's own
+normal, reflected by the facet's medium, and the currents of the reflected wave (electric J = n x H, magnetic
+M = -n x E) radiate to the receive antenna. The phase over a facet is linear: its integral is a product of two sinc
+functions. Amplitudes are relative to a transmitter with the far field g e exp(-jkr) / r.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight_worlds.media import LIGHT_M_PER_S, ReflectionTable, Stack
+
+# Facets times positions that are evaluated at once: some 200 MB.
+CHUNK = 400_000
+# Side lobes keep some power beside and behind the main lobe.
+PATTERN_FLOOR = 0.03
+
+
+@dataclass(frozen=True)
+class Antenna:
+    """An antenna at `position` (3 metres) that looks along `boresight`, with pattern cos^n in amplitude.
+
+    `polarisation`: complex vector at boresight. In other directions it is carried along the arc from the boresight, as
+    of a Huygens source (Ludwig's third definition).
+    """
+
+    position: NDArray
+    boresight: NDArray
+    polarisation: NDArray
+    exponent: float = 2.0
+
+    @staticmethod
+    def aimed(
+        position: NDArray, boresight: NDArray, direction: NDArray, polarisation: NDArray, exponent: float = 2.0
+    ) -> Antenna:
+        """The antenna whose field in `direction` has the given polarisation (a vector across `direction`)."""
+        at_boresight = _carry(direction, boresight, polarisation)
+        return Antenna(position, boresight, at_boresight, exponent)
+
+    def turned(self, rotation: NDArray, shift_m: NDArray) -> Antenna:
+        """The antenna after a turn about its own place and a shift."""
+        return replace(
+            self,
+            position=self.position + shift_m,
+            boresight=rotation @ self.boresight,
+            polarisation=rotation @ self.polarisation,
+        )
+
+    def with_leakage(self, leakage: complex) -> Antenna:
+        """The antenna that also takes `leakage` times the other polarisation."""
+        other = np.cross(self.boresight, self.polarisation)
+        return replace(self, polarisation=self.polarisation + leakage * other)
+
+    def field(self, directions: NDArray) -> NDArray:
+        """Complex field vectors [3, ...] of unit distance in unit `directions` [3, ...]."""
+        cosine = _dot(self.boresight, directions)
+        gain = np.maximum(np.maximum(cosine, 0) ** self.exponent, PATTERN_FLOOR)
+        return gain * _carry(self.boresight, directions, self.polarisation)
+
+
+def _column(vector: NDArray, like: NDArray) -> NDArray:
+    return vector.reshape(3, *(1,) * (like.ndim - 1)) if vector.ndim == 1 else vector
+
+
+def _dot(a: NDArray, b: NDArray) -> NDArray:
+    a, b = _column(a, b), _column(b, a)
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: NDArray, b: NDArray) -> NDArray:
+    a, b = _column(a, b), _column(b, a)
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _carry(start: NDArray, end: NDArray, vector: NDArray) -> NDArray:
+    """Turn `vector` as the unit vector `start` is turned to `end` on the shortest arc."""
+    start, vector = _column(start, end), _column(vector, end)
+    summed = start + end
+    return vector - summed * (_dot(vector, end) / np.maximum(1 + _dot(start, end), 1e-6))
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a facet of unit area gives before its medium and frequency are known; arrays of one shape.
+
+    Received: (jk / 4 pi) (r_s s_weight + r_p p_weight) exp(-jk path) times the facet's phase integral. `gradient` and
+    `curvature_z` are the path's first derivatives by the facet's place [3, ...] and its second one by z (1 / m).
+    """
+
+    path_m: NDArray
+    gradient: NDArray
+    curvature_z: NDArray
+    s_weight: NDArray
+    p_weight: NDArray
+    cos_incidence: NDArray
+
+
+def respond(tx: Antenna, rx: Antenna, points: NDArray, normals: NDArray) -> Response:
+    """Response of facets at `points` [3, ...] with unit `normals` [3, ...] or [3] towards the antennas."""
+    out = points - _column(tx.position, points)
+    back = _column(rx.position, points) - points
+    out_m = np.sqrt(_dot(out, out))
+    back_m = np.sqrt(_dot(back, back))
+    incident = out / out_m
+    scattered = back / back_m
+    normals = _column(normals, points)
+    cos_incidence = -_dot(incident, normals)
+    lit = (cos_incidence > 0) & (_dot(scattered, normals) > 0)
+
+    s_axis = _cross(incident, normals)
+    length = np.sqrt(_dot(s_axis, s_axis))
+    # At normal incidence any axis across will do.
+    fallback = _cross(incident, np.array([0.6, 0.8, 0.0]))
+    s_axis = np.where(length > 1e-9, s_axis, fallback)
+    s_axis = s_axis / np.sqrt(_dot(s_axis, s_axis))
+    reflected = incident + 2 * cos_incidence * normals
+    p_axis_in = _cross(s_axis, incident)
+    p_axis_out = _cross(reflected, s_axis)
+
+    field = tx.field(incident)
+    s_part = _dot(field, s_axis)
+    p_part = _dot(field, p_axis_in)
+    received = rx.field(-scattered)
+    turned = _cross(scattered, received)
+    n_cross_s = _cross(normals, s_axis)
+    n_cross_p = _cross(normals, p_axis_out)
+    # Reflected wave of unit s: E = s, eta H = p_out; of unit p: E = p_out, eta H = -s.
+    from_s = _dot(received, n_cross_p) - _dot(turned, n_cross_s)
+    from_p = -_dot(received, n_cross_s) - _dot(turned, n_cross_p)
+    spread = np.where(lit, -1 / (out_m * back_m), 0)
+    return Response(
+        path_m=out_m + back_m,
+        gradient=incident - scattered,
+        curvature_z=(1 - incident[2] ** 2) / out_m + (1 - scattered[2] ** 2) / back_m,
+        s_weight=spread * s_part * from_s,
+        p_weight=spread * p_part * from_p,
+        cos_incidence=cos_incidence,
+    )
+
+
+def integrate_phase(response: Response, edge_u: NDArray, edge_v: NDArray, frequency_hz: float) -> NDArray:
+    """Integral of the linear phase over a parallelogram with the given edges [3, ...], relative to its area."""
+    per_metre = frequency_hz / LIGHT_M_PER_S
+    over_u = np.sinc(per_metre * _dot(response.gradient, edge_u))
+    return over_u * np.sinc(per_metre * _dot(response.gradient, edge_v))
+
+
+def receive_direct(tx: Antenna, rx: Antenna, frequencies_hz: NDArray) -> NDArray:
+    """Direct path from TX to RX, complex [frequencies]."""
+    way = rx.position - tx.position
+    distance_m = np.linalg.norm(way)
+    direction = way / distance_m
+    amplitude = _dot(tx.field(direction), rx.field(-direction)) / distance_m
+    return amplitude * np.exp(-2j * np.pi * np.asarray(frequencies_hz) * distance_m / LIGHT_M_PER_S)
+
+
+@dataclass(frozen=True)
+class Facets:
+    """Parallelograms: centres and edges, each [3, n] in metres; edge_u x edge_v points out of the body."""
+
+    centres: NDArray
+    edge_u: NDArray
+    edge_v: NDArray
+
+
+def scatter(
+    tx: Antenna, rx: Antenna, facets: Facets, stack: Stack, frequencies_hz: NDArray, offsets: NDArray | None = None
+) -> NDArray:
+    """Sum over all facets, complex128 [offsets, frequencies], with both antennas moved by `offsets` [n, 3] (metres).
+
+    Works for bodies of any form; each facet is seen without shadows of others.
+    """
+    offsets = np.zeros((1, 3)) if offsets is None else np.asarray(offsets, float)
+    across = np.cross(facets.edge_u, facets.edge_v, axis=0)
+    area_m2 = np.linalg.norm(across, axis=0)
+    normals = (across / area_m2)[:, None]
+    tables = [ReflectionTable(stack, f) for f in frequencies_hz]
+    sums = np.empty((len(offsets), len(frequencies_hz)), complex)
+    positions_at_once = max(1, CHUNK // len(area_m2))
+    for first in range(0, len(offsets), positions_at_once):
+        chunk = slice(first, first + positions_at_once)
+        points = facets.centres[:, None] - offsets[chunk].T[:, :, None]
+        response = respond(tx, rx, points, np.broadcast_to(normals, points.shape))
+        for i, frequency_hz in enumerate(frequencies_hz):
+            k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
+            r_s, r_p = tables[i].look_up(response.cos_incidence)
+            terms = r_s * response.s_weight + r_p * response.p_weight
+            shape = integrate_phase(response, facets.edge_u[:, None], facets.edge_v[:, None], frequency_hz)
+            phase = np.exp(-1j * k * response.path_m)
+            sums[chunk, i] = 1j * k / (4 * np.pi) * (terms * shape * phase) @ area_m2
+    return sums
+
+
+def rectangle(centre: NDArray, edge_a: NDArray, edge_b: NDArray, facet_m: float) -> Facets:
+    """Facets of about `facet_m` of a flat rectangle with the given full edges [3]; edge_a x edge_b points out."""
+    count_a = max(1, round(np.linalg.norm(edge_a) / facet_m))
+    count_b = max(1, round(np.linalg.norm(edge_b) / facet_m))
+    a = (np.arange(count_a) + 0.5) / count_a - 0.5
+    b = (np.arange(count_b) + 0.5) / count_b - 0.5
+    a, b = (grid.ravel() for grid in np.meshgrid(a, b))
+    centres = np.asarray(centre)[:, None] + np.outer(edge_a, a) + np.outer(edge_b, b)
+    repeated = np.ones_like(a)
+    return Facets(centres, np.outer(edge_a, repeated) / count_a, np.outer(edge_b, repeated) / count_b)
+
+
+def ellipsoid(centre: NDArray, radii: NDArray, facet_m: float) -> Facets:
+    """Facets of the half of an ellipsoid that faces the antennas (smaller z). One large radius gives a cylinder."""
+    # Tangent parallelograms over a regular grid in x and y, as far as the surface is not too steep.
+    radii = np.asarray(radii, float)
+    counts = np.ceil(2 * radii[:2] / facet_m).astype(int)
+    step = 2 * radii[:2] / counts
+    x, y = (np.arange(n) * d - r + d / 2 for n, d, r in zip(counts, step, radii[:2], strict=True))
+    x, y = (grid.ravel() for grid in np.meshgrid(x, y))
+    inside = (x / radii[0]) ** 2 + (y / radii[1]) ** 2 < 0.97
+    x, y = x[inside], y[inside]
+    root = np.sqrt(1 - (x / radii[0]) ** 2 - (y / radii[1]) ** 2)
+    slope_x = radii[2] * x / radii[0] ** 2 / root
+    slope_y = radii[2] * y / radii[1] ** 2 / root
+    flat = np.zeros_like(x)
+    centres = np.asarray(centre, float)[:, None] + np.stack([x, y, -radii[2] * root])
+    edge_x = np.stack([flat + step[0], flat, slope_x * step[0]])
+    edge_y = np.stack([flat, flat + step[1], slope_y * step[1]])
+    return Facets(centres, edge_y, edge_x)

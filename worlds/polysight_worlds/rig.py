@@ -1,0 +1,130 @@
+"""The rig: one transmitter and two receivers that a stage moves together in front of the scene.
+
+Axes: x from TX to RX, y up, z towards the object. H receives s (along y at the middle of the picture), V receives p, TX
+sends equal parts of both. A board's mount gives place and boresight. Polarisations are exact where the object plane is
+a mirror, as the authors state: the module's turn of 22.5 degrees would mix s and p, and their pictures have no such
+mixture. A stage offset of zero is the middle of the grid.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight_worlds.optics import Antenna
+
+# Six to twelve frequencies hold the range gate: the chirp's linear part is 76.3 to 79.75 GHz.
+FREQUENCIES_HZ = np.linspace(76.3e9, 79.75e9, 8)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Antennas at stage offset zero, the object plane's z, the grid of offsets, and the transmit frequencies."""
+
+    tx: Antenna
+    h: Antenna
+    v: Antenna
+    plane_m: float = 0.499
+    columns: int = 350
+    rows: int = 200
+    step_m: float = 0.002
+    frequencies_hz: NDArray = field(default_factory=FREQUENCIES_HZ.copy)
+
+    @property
+    def centre_m(self) -> NDArray:
+        """x, y at which TX and H see the object plane as a mirror at stage offset zero; the picture's middle."""
+        return find_mirror_point(self.tx.position, self.h.position, self.plane_m)[:2]
+
+    @property
+    def incidence_deg(self) -> float:
+        """Angle of incidence at the picture's middle."""
+        way = np.array([*self.centre_m, self.plane_m]) - self.tx.position
+        return float(np.degrees(np.arccos(way[2] / np.linalg.norm(way))))
+
+    def offsets_m(self) -> tuple[NDArray, NDArray]:
+        """Stage offsets in x [columns] and y [rows]."""
+        x = (np.arange(self.columns) - (self.columns - 1) / 2) * self.step_m
+        y = (np.arange(self.rows) - (self.rows - 1) / 2) * self.step_m
+        return x, y
+
+
+def turn(axis: NDArray, angle_deg: float) -> NDArray:
+    """Rotation matrix about a unit axis (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = np.radians(angle_deg)
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def find_mirror_point(tx: NDArray, rx: NDArray, plane_m: float) -> NDArray:
+    """Point of the plane z = `plane_m` in which RX sees TX as in a mirror, 3 metres."""
+    share = (plane_m - tx[2]) / (2 * plane_m - tx[2] - rx[2])
+    return np.array([*(tx + share * (rx - tx))[:2], plane_m])
+
+
+def place(steps: list[dict], antenna_mm: NDArray) -> tuple[NDArray, NDArray]:
+    """Position (metres) and boresight of an antenna of a board after the steps of its mount, in their order."""
+    position = np.asarray(antenna_mm, float)
+    boresight = np.array([0.0, 0.0, 1.0])
+    for step in steps:
+        if "shift_mm" in step:
+            position = position + np.asarray(step["shift_mm"], float)
+        else:
+            rotation = turn(np.eye(3)["xyz".index(step["about"])], step["turn_deg"])
+            position = rotation @ position
+            boresight = rotation @ boresight
+    return position / 1000, boresight
+
+
+def load_rig(file: Path) -> Rig:
+    """The rig of an `instrument.toml`: mounts, antennas, object distance, grid. A board's four RX become their mean."""
+    content = tomllib.loads(file.read_text(encoding="utf-8"))
+    boards = {board["role"]: board for board in content["boards"]}
+    antennas = content["antennas"]
+    sender = boards["transmit"]
+    tx = place(sender["mount"], antennas["tx_mm"][sender["tx_antenna"]])
+    middle_mm = np.mean(antennas["rx_mm"], axis=0)
+    h = place(boards["receive_h"]["mount"], middle_mm)
+    v = place(boards["receive_v"]["mount"], middle_mm)
+    plane_m = content["geometry"]["object_distance_mm"] / 1000
+    grid = content["grid"]
+    return build_rig(tx, h, v, plane_m=plane_m, columns=grid["columns"], rows=grid["rows"])
+
+
+def build_rig(
+    tx: tuple[NDArray, NDArray],
+    h: tuple[NDArray, NDArray],
+    v: tuple[NDArray, NDArray],
+    *,
+    plane_m: float,
+    columns: int = 350,
+    rows: int = 200,
+) -> Rig:
+    """The rig of (position, boresight) of three boards, polarised as s, p and both towards their mirror points."""
+
+    def aim(
+        board: tuple[NDArray, NDArray], receiver: tuple[NDArray, NDArray], s_share: float, p_share: float
+    ) -> Antenna:
+        direction = find_mirror_point(tx[0], receiver[0], plane_m) - board[0]
+        direction /= np.linalg.norm(direction)
+        s_axis = np.cross([0.0, 0.0, 1.0], direction)
+        s_axis *= np.sign(s_axis[1]) / np.linalg.norm(s_axis)
+        # Along +x, so that metal gives H and V the same sign.
+        p_axis = np.cross(direction, s_axis)
+        p_axis *= np.sign(p_axis[0])
+        return Antenna.aimed(*board, direction, s_share * s_axis + p_share * p_axis)
+
+    half = np.sqrt(0.5)
+    return Rig(aim(tx, h, half, half), aim(h, h, 1, 0), aim(v, v, 0, 1), plane_m, columns, rows)
+
+
+def published_rig() -> Rig:
+    """The published rig, 55 degrees of incidence: numbers of `place` with the mounts of instrument.toml."""
+    tx = np.array([-0.705544, 0.097419, 0.013030]), np.array([0.694658, 0.0, 0.719340])
+    h = np.array([0.685843, 0.104606, 0.011526]), np.array([-0.819152, 0.0, 0.573576])
+    v = np.array([0.683008, 0.136290, 0.009475]), np.array([-0.950993, -0.130885, 0.280145])
+    return build_rig(tx, h, v, plane_m=0.499)

@@ -1,0 +1,208 @@
+"""Data of a scan by convolutions: facets on the lattice of the stage, so that all positions see the same kernels.
+
+A plate is a height field over cells of one stage step. With d = cell - offset, a cell gives mask(cell) x kernel(d): the
+kernel holds patterns, polarisation, reflection and phase of a facet of the plate's mean slope at the reference height.
+Height differences delta (tilt, waviness, roughness) multiply by exp(-jk c(d) delta), where c = d path / d z hardly
+varies; what varies is a short Taylor series. Slopes of a rough surface turn the local normal, to first order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from polysight_worlds.media import LIGHT_M_PER_S, ReflectionTable
+from polysight_worlds.optics import Antenna, integrate_phase, respond
+from polysight_worlds.rig import Rig
+from polysight_worlds.world import Plate, World
+
+ROUGHNESS_LENGTH_M = 0.005
+WAVINESS_LENGTH_M = 0.020
+# The Taylor series ends where its next term is below this.
+SERIES_ERROR = 2e-3
+SLOPE_STEP = 0.01
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Cells of a plate: coordinates of the first (metres), cover 0..1, height above the reference plane and slopes."""
+
+    x0_m: float
+    y0_m: float
+    cover: NDArray
+    height_m: NDArray
+    rough_slopes: tuple[NDArray, NDArray] | None
+    mean_slopes: tuple[float, float]
+
+
+def make_surface(plate: Plate, step_m: float, rng: np.random.Generator) -> Surface:
+    """Cut a plate into cells of one stage step; cells at the edges are covered in part."""
+    columns, rows = (int(np.ceil(size / step_m - 1e-6)) for size in plate.size_m)
+    x, y = ((np.arange(n) - (n - 1) / 2) * step_m for n in (columns, rows))
+    cover_x, cover_y = (
+        np.clip((size / 2 - np.abs(places)) / step_m + 0.5, 0, 1)
+        for size, places in zip(plate.size_m, (x, y), strict=True)
+    )
+    cover = np.outer(cover_y, cover_x)
+    if plate.round_:
+        from_rim = 0.5 - np.hypot(x / plate.size_m[0], y[:, None] / plate.size_m[1])
+        cover = np.clip(from_rim * min(plate.size_m) / step_m + 0.5, 0, 1)
+    mean_slopes = np.tan(np.radians(plate.tilt_x_deg)), np.tan(np.radians(plate.tilt_y_deg))
+    rough = np.zeros((rows, columns))
+    for rms_mm, length_m in ((plate.roughness_mm, ROUGHNESS_LENGTH_M), (plate.waviness_mm, WAVINESS_LENGTH_M)):
+        if rms_mm:
+            rough += rms_mm / 1000 * _draw_surface(rng, rough.shape, length_m / step_m)
+    slopes = None
+    if rough.any():
+        slopes = np.asarray(np.gradient(rough, step_m, axis=1)), np.asarray(np.gradient(rough, step_m, axis=0))
+    height = rough + mean_slopes[0] * x + mean_slopes[1] * y[:, None]
+    return Surface(
+        x0_m=plate.centre_m[0] + x[0],
+        y0_m=plate.centre_m[1] + y[0],
+        cover=cover,
+        height_m=height,
+        rough_slopes=slopes,
+        mean_slopes=mean_slopes,
+    )
+
+
+def _draw_surface(rng: np.random.Generator, shape: tuple[int, int], length_cells: float) -> NDArray:
+    """Gaussian random surface of rms 1 and correlation exp(-(d / length)^2)."""
+    # White noise filtered with sigma has the correlation exp(-d^2 / 4 sigma^2).
+    sigma = length_cells / 2
+    pad = int(np.ceil(4 * sigma))
+    noise = rng.standard_normal((shape[0] + 2 * pad, shape[1] + 2 * pad))
+    smooth = ndimage.gaussian_filter(noise, sigma)[pad:-pad, pad:-pad]
+    # The filter's own variance, not the sample's: a small plate may happen to be smooth.
+    return smooth * 2 * np.sqrt(np.pi) * sigma
+
+
+def _normal(slopes: tuple[float, float]) -> NDArray:
+    """Unit normal towards the antennas of a surface z = slope_x x + slope_y y."""
+    normal = np.array([slopes[0], slopes[1], -1.0])
+    return normal / np.linalg.norm(normal)
+
+
+class PlateEchoes:
+    """One plate's echoes at one receiver, frequency by frequency."""
+
+    def __init__(self, rig: Rig, rx: Antenna, plate: Plate, surface: Surface) -> None:
+        self._rig, self._surface = rig, surface
+        rows, columns = surface.cover.shape
+        self._shape = fast_length(rig.rows + rows - 1), fast_length(rig.columns + columns - 1)
+        points = self._points(plate)
+        slopes = surface.mean_slopes
+        variations = [slopes]
+        if surface.rough_slopes is not None:
+            variations += [(slopes[0] + SLOPE_STEP, slopes[1]), (slopes[0], slopes[1] + SLOPE_STEP)]
+        self._responses = [respond(rig.tx, rx, points, _normal(varied)) for varied in variations]
+        self._tables = [ReflectionTable(plate.stack, f) for f in rig.frequencies_hz]
+        main = self._responses[0]
+        self._phase = _PhaseSteps(main.path_m, rig.frequencies_hz)
+        weight = np.abs(main.s_weight) + np.abs(main.p_weight)
+        weight /= np.sum(weight)
+        self._rise_mean = float(np.sum(weight * main.gradient[2]))
+        self._rise_rest = main.gradient[2] - self._rise_mean
+        bend_mean = float(np.sum(weight * main.curvature_z))
+        self._path_mean = self._rise_mean * surface.height_m + bend_mean / 2 * surface.height_m**2
+        k = 2 * np.pi * rig.frequencies_hz[-1] / LIGHT_M_PER_S
+        largest = k * np.abs(surface.height_m).max() * np.sqrt(np.sum(weight * self._rise_rest**2))
+        self._orders = 1
+        term = 2 * largest
+        while term > SERIES_ERROR and self._orders < 12:
+            self._orders += 1
+            term *= 2 * largest / self._orders
+
+    def _points(self, plate: Plate) -> NDArray:
+        """Cell minus offset for all circular lags, [3, lags_y, lags_x]."""
+        rig, surface = self._rig, self._surface
+        offsets_x, offsets_y = rig.offsets_m()
+        x = surface.x0_m - offsets_x[0] - signed_lags(self._shape[1], rig.columns) * rig.step_m
+        y = surface.y0_m - offsets_y[0] - signed_lags(self._shape[0], rig.rows) * rig.step_m
+        z = rig.plane_m - plate.height_mm / 1000
+        return np.stack(np.broadcast_arrays(x[None, :], y[:, None], z))
+
+    def add_to(self, data: NDArray, index: int) -> None:
+        """Add the echoes at frequency `index` to complex `data` [rows, columns]."""
+        rig, surface = self._rig, self._surface
+        frequency_hz = rig.frequencies_hz[index]
+        k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
+        step, (slope_x, slope_y) = rig.step_m, surface.mean_slopes
+        edges = np.array([step, 0, slope_x * step]), np.array([0, step, slope_y * step])
+        shape = integrate_phase(self._responses[0], *edges, frequency_hz)
+        area_m2 = step**2 * np.sqrt(1 + slope_x**2 + slope_y**2)
+        common = (1j * k / (4 * np.pi) * area_m2 * shape).astype(np.complex64) * self._phase.at(index)
+        terms = []
+        for response in self._responses:
+            r_s, r_p = self._tables[index].look_up(response.cos_incidence)
+            terms.append(r_s * response.s_weight + r_p * response.p_weight)
+        kernel = (common * terms[0]).astype(np.complex64)
+        mask = surface.cover * np.exp(-1j * k * self._path_mean)
+        spectrum = self._multiply(mask, kernel)
+        if surface.rough_slopes is not None:
+            for slope, varied in zip(surface.rough_slopes, terms[1:], strict=True):
+                spectrum += self._multiply(mask * slope, common * (varied - terms[0]) / SLOPE_STEP)
+        for order in range(1, self._orders):
+            mask = mask * surface.height_m
+            kernel = kernel * (-1j * k / order * self._rise_rest).astype(np.complex64)
+            spectrum += self._multiply(mask, kernel)
+        data += ifft2(spectrum)[: rig.rows, : rig.columns]
+
+    def _multiply(self, mask: NDArray, kernel: NDArray) -> NDArray:
+        return fft2(mask.astype(np.complex64), self._shape) * fft2(kernel.astype(np.complex64))
+
+
+def fast_length(length: int) -> int:
+    """Length of at least `length` that an FFT does fast."""
+    return int(fft.next_fast_len(length) or length)
+
+
+def fft2(values: NDArray, shape: tuple[int, int] | None = None) -> NDArray:
+    """Two-dimensional spectrum, padded to `shape`, in the precision of `values`."""
+    return np.asarray(fft.fft2(values, shape))
+
+
+def ifft2(spectrum: NDArray) -> NDArray:
+    """Inverse of `fft2`."""
+    return np.asarray(fft.ifft2(spectrum))
+
+
+def signed_lags(length: int, positive: int) -> NDArray:
+    """Lags 0 .. positive - 1, then the negative ones, of a circular convolution."""
+    lags = np.arange(length)
+    return np.where(lags < positive, lags, lags - length)
+
+
+class _PhaseSteps:
+    """exp(-jk path) for evenly spaced frequencies, each made from the one before."""
+
+    def __init__(self, path_m: NDArray, frequencies_hz: NDArray) -> None:
+        turns = path_m / LIGHT_M_PER_S
+        self._now = np.exp(-2j * np.pi * frequencies_hz[0] * turns).astype(np.complex64)
+        spacing_hz = frequencies_hz[1] - frequencies_hz[0] if len(frequencies_hz) > 1 else 0.0
+        self._factor = np.exp(-2j * np.pi * spacing_hz * turns).astype(np.complex64)
+        self._index = 0
+
+    def at(self, index: int) -> NDArray:
+        """Phases of frequency `index`; indices are asked for in rising order."""
+        while self._index < index:
+            self._now = self._now * self._factor
+            self._index += 1
+        return self._now
+
+
+def record(rig: Rig, rx: Antenna, world: World, seed: int = 0) -> NDArray:
+    """Echoes of a world at one receiver: complex64 [frequencies, rows, columns], fields as of `optics.scatter`.
+
+    Frequencies must be evenly spaced. `seed`: of rough surfaces, the same for both receivers.
+    """
+    data = np.zeros((len(rig.frequencies_hz), rig.rows, rig.columns), np.complex64)
+    for number, plate in enumerate(world.plates):
+        rng = np.random.default_rng([seed, 2, number])
+        echoes = PlateEchoes(rig, rx, plate, make_surface(plate, rig.step_m, rng))
+        for index in range(len(rig.frequencies_hz)):
+            echoes.add_to(data[index], index)
+    return data

@@ -24,6 +24,7 @@ os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 pytest.register_assert_rewrite("tests.support")  # before the first import of it: its asserts show their values
 
+from tests.support import preloaded  # noqa: E402
 from tests.support.rigs import published_rig  # noqa: E402
 from tests.support.suite import ByFile, Costs, longest_first  # noqa: E402
 
@@ -54,8 +55,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--long"):
         settings.load_profile("searching")
+    else:
+        preloaded.install(preloaded.Server())
     if config.getoption("--costs"):
         config.pluginmanager.register(Costs())
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if not config.getoption("--long"):
+        preloaded.Popen.server.close()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

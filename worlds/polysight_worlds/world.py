@@ -146,7 +146,7 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "roughness": {"roughness_mm": (0.1, 0.3)},
     "waviness": {"waviness_mm": (0.05, 0.2)},
     "leakage": {"leakage": (0.02, 0.1)},
-    "border": {"border": (0.15, 0.2)},
+    "border": {"border": (0.25, 0.31)},
     "aperture": {"aperture": (0.2, 0.45)},
     "dark": {"dark": (0.005, 0.03)},
 }
@@ -158,18 +158,19 @@ TOGETHER = tuple(name for name in NUISANCES if name not in ("border", "aperture"
 def draw_nuisances(rng: Generator, names: str | Sequence[str] = "none", *, strength: float = 1.0) -> Nuisances:
     """Nuisances of the given names: "none", "all" (without `border` and `aperture`), one of `NUISANCES`, or several.
 
-    `strength` multiplies what was drawn.
+    With "all" each is drawn from 0 to its upper limit. `strength` multiplies what was drawn.
     """
+    together = names == "all"
     if names == "none":
         names = ()
-    elif names == "all":
+    elif together:
         names = TOGETHER
     elif isinstance(names, str):
         names = (names,)
     values = {}
     for name in names:
         for key, (low, high) in RANGES[name].items():
-            values[key] = strength * rng.uniform(low, high)
+            values[key] = strength * rng.uniform(0 if together else low, high)
     return Nuisances(seed=int(rng.integers(2**31)), **values)
 
 

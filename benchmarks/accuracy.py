@@ -24,7 +24,7 @@ from polysight.imaging.geometry import Antennas, row_offsets_m
 from polysight.imaging.samples import reduction, scene_gate_m
 from polysight.sync.align import align_row
 from polysight.sync.direct_path import prepare, reference
-from polysight.sync.tone import estimate_tone
+from polysight.sync.loops import estimate_tone
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.raster import plan_raster

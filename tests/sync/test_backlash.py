@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polysight.sync import BoardSetup, synchronise_row
-from polysight.sync.backlash import echo_of_row, estimate_backlash, object_filter
+from polysight.sync.backlash import estimate_backlash, object_filter
 from polysight_shared.raster import plan_raster
 from polysight_simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
 
@@ -23,7 +23,7 @@ def echoes(rig):
         for row in plan_raster(radar.rig.grid):
             x, y = row_offsets_mm(radar, row)
             words = radar.chirps(board.name, x, y, row.index * len(x)).reshape(-1, 256, 2, 4)
-            out[row.index] = echo_of_row(synchronise_row(words, np.ones(len(words), bool), setup), weights)
+            out[row.index] = synchronise_row(words, np.ones(len(words), bool), setup).through(weights)
         return out, radar.rig
 
     return scan

@@ -9,7 +9,7 @@ from tests.support.refusals import refused
 
 from polysight.sync import BoardSetup, synchronise_row
 from polysight.sync.high_pass_filter import high_pass
-from polysight.sync.tone import estimate_tone
+from polysight.sync.loops import estimate_tone
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 

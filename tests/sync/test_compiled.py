@@ -14,7 +14,8 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from polysight.sync import build, compiled, direct_path, numpy_direct_path
+from polysight.sync import build, direct_path
+from polysight.sync import loops as sync_loops
 from polysight.sync.align import AlignedRow, align_in_numpy, align_pieces, align_row
 from polysight.sync.high_pass_filter import Equaliser, HighPass, high_pass
 
@@ -24,8 +25,8 @@ WIDTHS = (128, 256, 512)
 @pytest.fixture(scope="module")
 def library_file(tmp_path_factory):
     """The library beside the sources if it is up to date; otherwise compiled for this test."""
-    with suppress(compiled.LoadError):
-        compiled.Library()
+    with suppress(sync_loops.LoadError):
+        sync_loops.Library()
         return build.HERE / build.LIBRARY
     if build.find_compiler() is None:
         pytest.skip("no C compiler: apt install gcc, or pip install ziglang")
@@ -34,9 +35,9 @@ def library_file(tmp_path_factory):
 
 @pytest.fixture(scope="module", params=WIDTHS)
 def loops(library_file, request):
-    if request.param > compiled.Library(library_file).bits:
+    if request.param > sync_loops.Library(library_file).bits:
         pytest.skip(f"this processor has no vectors of {request.param} bits")
-    return compiled.Library(library_file, request.param)
+    return sync_loops.Library(library_file, request.param)
 
 
 def bursts(positions=5, chirps=6, samples=256, seed=4):
@@ -196,7 +197,7 @@ def test_the_direct_path(loops, rig, paths, noise, counts):
     valid[11] = False
     aligned = align(align_in_numpy, words, valid, rig.chirp.linear_samples, equaliser_of(rig))
     path = direct_path.prepare(rig, board)
-    expected = direct_path.reference(aligned, path, rig.chirp, numpy_direct_path)
+    expected = direct_path.reference(aligned, path, rig.chirp, sync_loops.NumpyLoops)
     got = direct_path.reference(aligned, path, rig.chirp, loops)
     np.testing.assert_array_equal(got.found, expected.found)
     assert 30 < got.found.sum() < 37
@@ -215,7 +216,7 @@ def test_peaks_and_medians_of_any_spectrum(loops, size):
     halves = (rng.standard_normal((35, 2, 4, 16)) + 1j * rng.standard_normal((35, 2, 4, 16))).astype(np.complex64)
     halves[3] = 0
     weights = (rng.standard_normal((4, 16)) + 1j * rng.standard_normal((4, 16))).astype(np.complex64)
-    got, expected = (by.search(halves, weights, size, (3, 9), 0.35) for by in (loops, numpy_direct_path))
+    got, expected = (by.search(halves, weights, size, (3, 9), 0.35) for by in (loops, sync_loops.NumpyLoops))
     np.testing.assert_array_equal(got[0], expected[0])
     np.testing.assert_allclose(got[1], expected[1], rtol=1e-4, atol=1e-5)
 
@@ -226,17 +227,17 @@ def test_three_receivers_are_aligned_in_numpy():
 
 
 def test_the_compiled_loops_are_used_if_available(library_file, monkeypatch):
-    found = compiled.Library(library_file)
-    monkeypatch.setattr(compiled, "library", lambda: found)
+    found = sync_loops.Library(library_file)
+    monkeypatch.setattr(sync_loops, "library", lambda: found)
     monkeypatch.setattr("polysight.sync.align.align_in_numpy", None)
     assert align_row(bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
 
 
 @pytest.fixture
 def fresh_library():
-    compiled._load.cache_clear()
+    sync_loops._load.cache_clear()
     yield
-    compiled._load.cache_clear()
+    sync_loops._load.cache_clear()
 
 
 @pytest.mark.usefixtures("fresh_library")
@@ -254,8 +255,8 @@ def test_without_compiled_loops_there_is_one_warning(library_file, tmp_path, mon
         shutil.copyfile(_ctypes.__file__, file)
     elif broken == "a pipe":
         os.mkfifo(file)
-    real = compiled.Library
-    monkeypatch.setattr(compiled, "Library", lambda: real(file))
+    real = sync_loops.Library
+    monkeypatch.setattr(sync_loops, "Library", lambda: real(file))
     with caplog.at_level(logging.WARNING), ThreadPoolExecutor(3) as pool:
         for row in pool.map(lambda _: align_row(bursts(), np.ones((5, 6), bool), (0, 192)), range(3)):
             assert row.good.all()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.sync.tone import block_edges, block_times, cis, estimate_tone, phasor
+from polysight.sync.loops import block_edges, block_times, cis, estimate_tone, phasor
 
 
 @given(st.floats(-0.49, 0.49), st.floats(-3.1, 3.1), st.integers(24, 256))

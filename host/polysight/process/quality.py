@@ -51,7 +51,7 @@ from polysight.results import (
     verdict_of,
 )
 from polysight.store import CubeRow, RowData, Source
-from polysight.sync import SyncedRow, echo_of_row, estimate_backlash, object_filter
+from polysight.sync import SyncedRow, estimate_backlash, object_filter
 from polysight_shared.config import Board, Instrument
 from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
@@ -83,7 +83,7 @@ class BoardRows:
             "stages": {name: spread for name, spread in synced.stages.items() if np.isfinite(spread).all()},
             "direct_snr": _direct_snr(synced),
         }
-        self.put(row, figures, echo_of_row(synced, self._filter))
+        self.put(row, figures, synced.through(self._filter))
 
     def put(self, row: int, figures: dict[str, Any], echo: NDArray[np.complex64]) -> None:
         """Store figures of a row that :meth:`add` computed earlier."""

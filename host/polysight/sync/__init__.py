@@ -8,13 +8,11 @@ otherwise in NumPy with equal results. `estimate_backlash` measures the backlash
 """
 
 from polysight.sync.align import AlignedRow, align_row, whole_blocks
-from polysight.sync.backlash import echo_of_row, estimate_backlash, object_filter
-from polysight.sync.chain import STAGES, BoardSetup, SyncedRow, noise_power, synchronise_row
+from polysight.sync.backlash import estimate_backlash, object_filter
+from polysight.sync.chain import STAGES, BoardSetup, RowSynchroniser, SyncedRow, noise_power, synchronise_row
 from polysight.sync.direct_path import reference
 from polysight.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
-from polysight.sync.numpy_passes import FOLD
-from polysight.sync.rows import RowSynchroniser
-from polysight.sync.tone import cis
+from polysight.sync.loops import FOLD, cis
 
 __all__ = [
     "FOLD",
@@ -26,7 +24,6 @@ __all__ = [
     "SyncedRow",
     "align_row",
     "cis",
-    "echo_of_row",
     "estimate_backlash",
     "fit_high_pass",
     "high_pass",

@@ -18,11 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.sync import compiled
 from polysight.sync import high_pass_filter as hpf
-from polysight.sync import numpy_passes as passes
-from polysight.sync.numpy_passes import FOLD
-from polysight.sync.tone import Real, Tone, cis
+from polysight.sync import loops
+from polysight.sync.loops import FOLD, Real, Tone, cis, complex64
 
 _REFERENCES = 4  # reference chirps tried per position
 _GOOD = 0.5  # a good chirp has at least this part of the coherence of the position's median chirp
@@ -75,7 +73,7 @@ class AlignedRow(NamedTuple):
         return AlignedRow._make(field[positions] for field in self)
 
 
-Loops = Callable[
+Align = Callable[
     [NDArray[np.int16], NDArray[np.bool_], tuple[int, int], hpf.Equaliser | None, int, AlignedRow],
     None,
 ]
@@ -113,7 +111,7 @@ def align_pieces(
     linear: tuple[int, int],
     equaliser: hpf.Equaliser | None = None,
     full_scale: int = 32767,
-    by: Loops | None = None,
+    by: Align | None = None,
 ) -> AlignedRow:
     """Align and average a row that comes in pieces of some positions; parameters as of :func:`align_row`.
 
@@ -132,7 +130,7 @@ def align_pieces(
         here = slice(done, done + len(words))
         if words.shape[:2] != valid[here].shape:
             raise ValueError(f"bursts {words.shape[:2]} at position {done} of {valid.shape}")
-        align = by or _loops(words.shape[-1])
+        align = by or _choose_loop(words.shape[-1])
         align(words, valid[here], linear, equaliser, full_scale, row.part(here))
         done = here.stop
     if row is None or done != len(valid):
@@ -140,8 +138,8 @@ def align_pieces(
     return row
 
 
-def _loops(rx: int) -> Loops:
-    library = compiled.library() if rx == compiled.RX else None
+def _choose_loop(rx: int) -> Align:
+    library = loops.library() if rx == loops.RX else None
     return library.align if library else align_in_numpy
 
 
@@ -155,8 +153,8 @@ def align_in_numpy(
 ) -> None:
     """Align and average positions in NumPy, for any number of RX: the readable form of `burst.c`."""
     words = np.ascontiguousarray(words)
-    for i in range(0, len(valid), passes.CHUNK):
-        here = slice(i, i + passes.CHUNK)
+    for i in range(0, len(valid), loops.CHUNK):
+        here = slice(i, i + loops.CHUNK)
         for field, values in zip(into, _align(words[here], valid[here], linear, equaliser, full_scale), strict=True):
             field[here] = values
 
@@ -195,7 +193,7 @@ def _align(
 
     # Second pass: each chirp against the sum of the others.
     turned = taps * cis(-start)[..., None]
-    off, product, own, level, apart = passes.against_others(words, frequency, _c64(turned), good, linear)
+    off, product, own, level, apart = loops.against_others(words, frequency, complex64(turned), good, linear)
     n = good.sum(axis=1)
     level = np.maximum(level / np.maximum(n, 1) ** 2, 1e-30)[:, None]
     others = n[:, None] - good
@@ -212,7 +210,7 @@ def _align(
     turned *= cis(2 * np.pi * FOLD * lag * correction[..., None] - shift[..., None])
     weights = turned * (good / np.maximum(good.sum(axis=1), 1)[:, None])[..., None]
     second_half = np.cumsum(good, axis=1) % 2 == 0
-    mean, halves = passes.average(words, frequency + correction, _c64(weights), second_half, linear)
+    mean, halves = loops.average(words, frequency + correction, complex64(weights), second_half, linear)
     return AlignedRow(
         mean,
         halves,
@@ -252,7 +250,7 @@ def _against_one(
     best_sum = np.full(positions, -1.0)
     for attempt in range(min(_REFERENCES, chirps)):
         tried = order[todo, attempt]
-        offset, product, middle, energy, highest = passes.match(words if attempt == 0 else words[todo], tried, linear)
+        offset, product, middle, energy, highest = loops.match(words if attempt == 0 else words[todo], tried, linear)
         if attempt == 0:
             usable, peak = valid & (highest < full_scale) & (energy > 0), highest
             rank = np.where(usable, 1, 2)
@@ -286,10 +284,6 @@ def _coherent(coherence: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDAr
     middle = np.maximum(usable.sum(axis=1) - 1, 0) // 2
     median = np.take_along_axis(rising, middle[:, None], axis=1)
     return usable & (coherence >= _GOOD * median)
-
-
-def _c64(x: NDArray[np.complex128]) -> NDArray[np.complex64]:
-    return np.ascontiguousarray(x, np.complex64)
 
 
 def _centred(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.float64]:

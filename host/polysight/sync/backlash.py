@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.sync.chain import SyncedRow
 from polysight.sync.direct_path import excess_path_m
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
@@ -36,11 +35,6 @@ def object_filter(rig: Instrument, board: Board) -> NDArray[np.complex64]:
     return weights
 
 
-def echo_of_row(row: SyncedRow, weights: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """Return the echo of a row through :func:`object_filter`, complex64 [rx, position], in order of recording."""
-    return (row.samples @ weights) * row.valid
-
-
 @dataclass(frozen=True)
 class Backlash:
     """Shift of odd rows along +x relative to even ones, and its standard deviation."""
@@ -55,7 +49,7 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     Parameters
     ----------
     rows
-        Echoes by row index, from :func:`echo_of_row`. Rows without both neighbours are left out.
+        Echoes by row index, from :meth:`SyncedRow.through`. Rows without both neighbours are left out.
     rig
         Rig of the scan.
 

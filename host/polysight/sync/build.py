@@ -70,7 +70,7 @@ def build(folder: Path = HERE, target: str = "") -> Path:
     BuildError
         if there is no compiler, or it fails.
     """
-    from concurrent.futures import ThreadPoolExecutor  # `compiled.py` needs this module, but no threads
+    from concurrent.futures import ThreadPoolExecutor  # `loops.py` needs this module, but no threads
 
     compiler = _zig() if target else find_compiler()
     if compiler is None:

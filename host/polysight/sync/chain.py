@@ -1,30 +1,41 @@
-"""Synchronise a row of a board: from raw chirps to samples referenced to the direct path, with the residual errors.
+"""Synchronise the rows of a scan: from raw chirps to samples referenced to the direct path, with the residual errors.
 
-Residuals are frequency, phase and amplitude errors after each stage (paper, Fig. 15).
-They are measured on the scan itself, for any scene: an error is half the difference between two measurements with
-independent noise. For a chirp and for the direct path these are two halves of the RX, for the object two averages of
-every other chirp.
+`synchronise_row` processes raw chirps; `RowSynchroniser` reads every row of a source, and converts cubes that another
+program has synchronised.
+
+Residuals are frequency, phase and amplitude errors after each stage (paper, Fig. 15). They are measured on the scan
+itself, for any scene: an error is half the difference between two measurements with independent noise. For a chirp and
+for the direct path these are two halves of the RX, for the object two averages of every other chirp.
+
+Cubes: our convention is that an echo of excess path d is `a exp(+j 2 pi f d / c)`, and the direct path is constant. The
+conventions of a cube are unknown, but the geometry determines where direct path and object must lie. From that
+`detect_form` finds the sign of the phase, whether delays count from the transmitter or from the direct path, whether
+each RX is referenced to its own direct path or all to that of RX1, and whether the direct path was removed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
-from polysight.capture import raw_words
-from polysight.sync import direct_path
+from polysight.capture import raw_words, row_words, valid_frames
+from polysight.store import CubeRow, RowData, Source
 from polysight.sync import high_pass_filter as hpf
-from polysight.sync.align import AlignedRow, align_pieces
-from polysight.sync.direct_path import DirectPath, Referenced
-from polysight.sync.numpy_passes import FOLD
-from polysight.sync.tone import Complex, Real, block_edges, block_times, cis, phasor, refine
+from polysight.sync.align import AlignedRow, align_pieces, whole_blocks
+from polysight.sync.direct_path import DirectPath, Referenced, excess_path_m, prepare, reference
+from polysight.sync.loops import FOLD, Complex, Real, block_edges, block_times, cis, phasor, refine
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
+from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 STAGES = {
     "received": "one chirp as received",
@@ -38,110 +49,25 @@ EXAMINED = 32
 
 Errors = dict[str, NDArray[np.float64]]
 
-_FULL_SCALE = 32767  # largest int16: a sample with this value was clipped
+# Largest int16: a sample with this value was clipped.
+_FULL_SCALE = 32767
+# Positions read at a time: 2 MB, which stay in the processor's cache.
+_POSITIONS = 32
 
-
-def errors(
-    aligned: AlignedRow, done: Referenced, path: DirectPath, sample_rate_hz: float, most: int = EXAMINED
-) -> Errors:
-    """Return the errors after each stage, float64 [3, n]: Hz, rad, and amplitude relative to its mean.
-
-    At most `most` valid positions are used, evenly spaced. Empty if no position is valid. `referenced` contains only
-    positions with an echo.
-    """
-    if not done.found.any():
-        return {}
-    valid = np.flatnonzero(done.found)
-    found = np.zeros_like(done.found)
-    found[valid[np.linspace(0, valid.size - 1, min(most, valid.size)).astype(int)]] = True
-    good = aligned.good[found]
-    received = np.stack(
-        [
-            done.frequency[found, None] + aligned.frequency[found],
-            np.angle(done.amplitude)[found, None] + aligned.phase[found],
-            np.abs(done.amplitude)[found, None] * aligned.amplitude[found] / aligned.gain[found],
-        ]
-    )[:, good]
-    turns = cis(received[1])
-    received[0] -= received[0].mean()
-    received[1] = np.angle(turns * np.conj(turns.mean()))
-    received[2] = received[2] / received[2].mean() - 1
-
-    own = (aligned.amplitude[found] * good).sum(axis=1) / good.sum(axis=1)
-    one = np.stack([*aligned.error[found].swapaxes(0, 1), aligned.amplitude[found] / own[:, None] - 1])[:, good]
-
-    two = found & (aligned.good.sum(axis=1) > 1)
-    n = aligned.good[two].sum(axis=1)
-    whole = (n[:, None] / np.stack([(n + 1) // 2, n // 2], axis=1)).astype(np.float32)
-    with np.errstate(divide="ignore", invalid="ignore"):  # dead RX have no direct path: their figures are not finite
-        out = {
-            "received": received,
-            "aligned": one,
-            "averaged": _direct_path(done.halves[found].sum(axis=1), path),
-            "referenced": _object(done.halves[two] * whole[..., None, None], path) if two.any() else np.zeros((3, 0)),
-        }
-    for values in out.values():
-        values[0] *= sample_rate_hz
-    return out
-
-
-def noise_power(aligned: AlignedRow) -> NDArray[np.float64]:
-    """Return the noise power of a sample of one channel of one chirp, [position], NaN with fewer than two chirps."""
-    n = aligned.good.sum(axis=1)
-    parts = np.stack([(n + 1) // 2, n // 2], axis=1)
-    whole = (n[:, None] / np.maximum(parts, 1)).astype(np.float32)[..., None, None]
-    apart = aligned.halves[:, 0] * whole[:, 0] - aligned.halves[:, 1] * whole[:, 1]
-    power = _energy(apart) / (apart.shape[1] * apart.shape[2])
-    return np.where(n > 1, power * FOLD / (1 / np.maximum(parts, 1)).sum(axis=1), np.nan)
-
-
-def _energy(signal: NDArray[np.complex64]) -> NDArray[np.float32]:
-    """Return the energy over RX and blocks of signals [position, rx, block]."""
-    parts = np.ascontiguousarray(signal).view(np.float32)
-    return np.einsum("prn,prn->p", parts, parts)
-
-
-def _direct_path(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
-    """Return the errors of the direct path [3, n] in averages [position, rx, block], from two halves of the RX."""
-    frequency, phase, size = [], [], []
-    for h in (0, 1):
-        amplitude, w = _estimate(mean[:, h::2], path.half_estimators[h])
-        frequency.append(w / (2 * np.pi))
-        phase.append(np.angle(amplitude * np.conj(amplitude.mean())))  # without the constant difference of the RX
-        size.append(np.abs(amplitude) / np.abs(amplitude).mean())
-    return np.stack([x[0] - x[1] for x in (frequency, phase, size)]) / 2
-
-
-def _estimate(signal: NDArray[np.complex64], estimator: NDArray[np.complex128]) -> tuple[Complex, Real]:
-    """Return amplitude and frequency (radians per sample) [...] of the direct path in signals [..., rx, block]."""
-    estimate = signal.reshape(*signal.shape[:-2], -1) @ estimator.T.astype(np.complex64)
-    return estimate[..., 0].astype(complex), np.real(estimate[..., 1] / estimate[..., 0])
-
-
-def _object(halves: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
-    """Return the errors of the object [3, n] from two averages [position, 2, rx, block], for positions with an echo."""
-    rx, n = halves.shape[2:]
-    # Reference each half to its own direct path and subtract it; the object remains.
-    amplitude, w = _estimate(halves, path.estimator)
-    back = phasor(-w * FOLD / (2 * np.pi), -np.angle(amplitude), n, (n - 1) / 2)
-    echo = halves * back[:, :, None]
-    echo -= np.abs(amplitude).astype(np.float32)[..., None, None]
-    product = (echo[:, 0] * echo[:, 1].conj()).sum(axis=1)
-    edges = block_edges(n)
-    tone = refine(np.add.reduceat(product, edges[:-1], axis=-1).astype(complex), block_times(edges) * FOLD, steps=2)
-    # Amplitudes relative to the mean of both halves.
-    energy, common = np.stack([_energy(echo[:, h]) for h in (0, 1)], axis=1), product.sum(axis=1)
-    size = np.abs(energy + np.stack([common, common.conj()], axis=1))
-    contrast = (size[:, 0] - size[:, 1]) / np.maximum(size.sum(axis=1), 1e-30)
-    # Keep positions whose halves are more coherent than noise would be by chance.
-    echoing = np.abs(tone.amplitude) > 4 / np.sqrt(rx * n) * np.sqrt(energy.prod(axis=1))
-    return np.stack([tone.frequency / 2, np.angle(tone.amplitude) / 2, contrast])[:, echoing]
-
-
-def spread(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Return the RMS of errors [3, n]."""
-    f, p, a = np.sqrt((values**2).mean(axis=1))
-    return float(f), float(p), float(a)
+# Cubes: rows from which their form is detected.
+_CUBE_ROWS = 7
+# Echoes come from within this distance of the mirror point.
+_SPREAD_M = 0.15
+# Noise power of a sample relative to the object, for the estimate of the direct path.
+_NOISE = 1e-3
+# The simplest convention is kept if it explains this part of the best one's power.
+_PREFER_SIMPLE = 0.7
+# Smallest constant share of the direct path's power if the cube is referenced to it.
+_COHERENT = 0.5
+# Smallest share of positions with a direct path.
+_MIN_FOUND = 0.5
+# Share of power at the object above which the cube contains nothing else.
+_ALONE = 0.8
 
 
 @dataclass(frozen=True)
@@ -154,7 +80,7 @@ class BoardSetup:
     chirp: Chirp
     pulses: int
     equaliser: hpf.Equaliser | None
-    path: direct_path.DirectPath
+    path: DirectPath
     examined: int = EXAMINED
 
     @classmethod
@@ -168,7 +94,7 @@ class BoardSetup:
         """
         model = (model or hpf.high_pass(rig.chirp)) if compensate_filter else hpf.HighPass()
         equaliser = hpf.Equaliser.of(model, rig.chirp, FOLD) if model.corners_hz else None
-        return cls(rig.chirp, rig.burst.chirps_a_position, equaliser, direct_path.prepare(rig, board))
+        return cls(rig.chirp, rig.burst.chirps_a_position, equaliser, prepare(rig, board))
 
 
 @dataclass(frozen=True)
@@ -211,7 +137,11 @@ class SyncedRow:
     @property
     def stages(self) -> dict[str, tuple[float, float, float]]:
         """Standard deviations of frequency (Hz), phase (rad) and relative amplitude after each stage."""
-        return {name: spread(values) for name, values in self.errors.items() if values.size}
+        return {name: _spread(values) for name, values in self.errors.items() if values.size}
+
+    def through(self, weights: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """Return the echo of the row through :func:`object_filter`, complex64 [rx, position], in order of recording."""
+        return (self.samples @ weights) * self.valid
 
 
 def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: BoardSetup) -> SyncedRow:
@@ -247,7 +177,7 @@ def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bo
         setup.equaliser,
         _FULL_SCALE,
     )
-    done = direct_path.reference(aligned, setup.path, setup.chirp)
+    done = reference(aligned, setup.path, setup.chirp)
     chirps, rate = aligned.good.sum(axis=1), setup.chirp.sample_rate_hz
     residual = np.sqrt((aligned.error**2).sum(axis=-1) / np.maximum(chirps, 1)[:, None])
     return SyncedRow(
@@ -260,7 +190,7 @@ def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bo
         residual[:, 1],
         errors(aligned, done, setup.path, rate, setup.examined),
         noise_power(aligned),
-        turn_along(done),
+        _turn_along(done),
     )
 
 
@@ -292,9 +222,362 @@ def _mismatch(frames: int, shape: tuple[int, ...], setup: BoardSetup) -> DataErr
     )
 
 
-def turn_along(done: direct_path.Referenced) -> NDArray[np.float64]:
+def _turn_along(done: Referenced) -> NDArray[np.float64]:
     """Return `SyncedRow.turn`, from the valid neighbours of each position; 0 without any."""
     signal = done.halves.sum(axis=1) * done.found[:, None, None]
     flat = signal.reshape(len(signal), -1)
     step = np.einsum("pi,pi->p", flat[:-1].conj(), flat[1:])  # from each to the next
     return np.angle(np.pad(step, (1, 0)) + np.pad(step, (0, 1)))
+
+
+class RowSynchroniser:
+    """Synchronises the rows of one scan.
+
+    Parameters
+    ----------
+    source
+        The scan.
+    rig
+        Its calibrated rig.
+    filters
+        Measured high-pass filter of each receiver, by board name; None: as the chirp profile programs it.
+    """
+
+    def __init__(self, source: Source, rig: Instrument, filters: Mapping[str, hpf.HighPass | None]) -> None:
+        self._source = source
+        self.setups = {b.name: BoardSetup.of(rig, b, model=filters.get(b.name)) for b in rig.receivers}
+        self._forms: dict[str, CubeForm] = {}
+
+    def synchronise(self, board: str, recorded: RowData | CubeRow) -> tuple[SyncedRow, int]:
+        """Synchronise a row of a board; return it and the number of whole frames. Raises DataError."""
+        rig = self._source.instrument
+        if isinstance(recorded, CubeRow):
+            synced = self._form(board).synced(recorded.cube, rig.burst.chirps_a_position)
+            return synced, int(synced.valid.sum())
+        valid = valid_frames(recorded.missing, recorded.frames_expected, rig.frame_bytes // rig.burst.chirps)
+        return synchronise_pieces(self._words(recorded), valid, self.setups[board]), int(valid.sum())
+
+    def _words(self, recorded: RowData) -> Iterator[NDArray[np.int16]]:
+        """Iterate over the words of a row, [frame, sample, 2, rx], some positions at a time."""
+        rig = self._source.instrument
+        frame = rig.frame_bytes // rig.burst.chirps
+        for piece in recorded.pieces(_POSITIONS * rig.burst.chirps_a_position * frame):
+            yield row_words(piece, (), piece.size // frame, rig.chirp.samples)[0]
+
+    @property
+    def direct_path_known(self) -> bool:
+        """True if amplitudes are relative to the direct path; False for cubes without it."""
+        return not any(form.constant.any() for form in self._forms.values())
+
+    def recording_facts(self) -> dict[str, Any]:
+        """Return the entry on recording of quality.json, with the form of cubes."""
+        facts = self._source.recording_facts()
+        if self._forms:
+            facts["recording"]["cubes"] = {name: form.how for name, form in self._forms.items()}
+        return facts
+
+    def _form(self, board: str) -> CubeForm:
+        """Return the form of a board's cube, detected from a few of its rows."""
+        if board not in self._forms:
+            rig, rows = self._source.instrument, self._source.plan.rows
+            some = sorted({int(r) for r in np.linspace(0, rows - 1, _CUBE_ROWS)})
+            cubes = [row.cube for r in some if isinstance(row := self._source.read_row(board, r), CubeRow)]
+            self._forms[board] = detect_form(cubes, rig, rig.by_name(board))
+        return self._forms[board]
+
+
+def errors(
+    aligned: AlignedRow, done: Referenced, path: DirectPath, sample_rate_hz: float, most: int = EXAMINED
+) -> Errors:
+    """Return the errors after each stage, float64 [3, n]: Hz, rad, and amplitude relative to its mean.
+
+    At most `most` valid positions are used, evenly spaced. Empty if no position is valid. `referenced` contains only
+    positions with an echo.
+    """
+    if not done.found.any():
+        return {}
+    valid = np.flatnonzero(done.found)
+    found = np.zeros_like(done.found)
+    found[valid[np.linspace(0, valid.size - 1, min(most, valid.size)).astype(int)]] = True
+    good = aligned.good[found]
+    received = np.stack(
+        [
+            done.frequency[found, None] + aligned.frequency[found],
+            np.angle(done.amplitude)[found, None] + aligned.phase[found],
+            np.abs(done.amplitude)[found, None] * aligned.amplitude[found] / aligned.gain[found],
+        ]
+    )[:, good]
+    turns = cis(received[1])
+    received[0] -= received[0].mean()
+    received[1] = np.angle(turns * np.conj(turns.mean()))
+    received[2] = received[2] / received[2].mean() - 1
+
+    own = (aligned.amplitude[found] * good).sum(axis=1) / good.sum(axis=1)
+    one = np.stack([*aligned.error[found].swapaxes(0, 1), aligned.amplitude[found] / own[:, None] - 1])[:, good]
+
+    two = found & (aligned.good.sum(axis=1) > 1)
+    n = aligned.good[two].sum(axis=1)
+    whole = (n[:, None] / np.stack([(n + 1) // 2, n // 2], axis=1)).astype(np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):  # dead RX have no direct path: their figures are not finite
+        out = {
+            "received": received,
+            "aligned": one,
+            "averaged": _direct_path_errors(done.halves[found].sum(axis=1), path),
+            "referenced": _object_errors(done.halves[two] * whole[..., None, None], path)
+            if two.any()
+            else np.zeros((3, 0)),
+        }
+    for values in out.values():
+        values[0] *= sample_rate_hz
+    return out
+
+
+def noise_power(aligned: AlignedRow) -> NDArray[np.float64]:
+    """Return the noise power of a sample of one channel of one chirp, [position], NaN with fewer than two chirps."""
+    n = aligned.good.sum(axis=1)
+    parts = np.stack([(n + 1) // 2, n // 2], axis=1)
+    whole = (n[:, None] / np.maximum(parts, 1)).astype(np.float32)[..., None, None]
+    apart = aligned.halves[:, 0] * whole[:, 0] - aligned.halves[:, 1] * whole[:, 1]
+    power = _energy(apart) / (apart.shape[1] * apart.shape[2])
+    return np.where(n > 1, power * FOLD / (1 / np.maximum(parts, 1)).sum(axis=1), np.nan)
+
+
+def _energy(signal: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Return the energy over RX and blocks of signals [position, rx, block]."""
+    parts = np.ascontiguousarray(signal).view(np.float32)
+    return np.einsum("prn,prn->p", parts, parts)
+
+
+def _direct_path_errors(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
+    """Return the errors of the direct path [3, n] in averages [position, rx, block], from two halves of the RX."""
+    frequency, phase, size = [], [], []
+    for h in (0, 1):
+        amplitude, w = _estimate(mean[:, h::2], path.half_estimators[h])
+        frequency.append(w / (2 * np.pi))
+        phase.append(np.angle(amplitude * np.conj(amplitude.mean())))  # without the constant difference of the RX
+        size.append(np.abs(amplitude) / np.abs(amplitude).mean())
+    return np.stack([x[0] - x[1] for x in (frequency, phase, size)]) / 2
+
+
+def _estimate(signal: NDArray[np.complex64], estimator: NDArray[np.complex128]) -> tuple[Complex, Real]:
+    """Return amplitude and frequency (radians per sample) [...] of the direct path in signals [..., rx, block]."""
+    estimate = signal.reshape(*signal.shape[:-2], -1) @ estimator.T.astype(np.complex64)
+    return estimate[..., 0].astype(complex), np.real(estimate[..., 1] / estimate[..., 0])
+
+
+def _object_errors(halves: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
+    """Return the errors of the object [3, n] from two averages [position, 2, rx, block], for positions with an echo."""
+    rx, n = halves.shape[2:]
+    # Reference each half to its own direct path and subtract it; the object remains.
+    amplitude, w = _estimate(halves, path.estimator)
+    back = phasor(-w * FOLD / (2 * np.pi), -np.angle(amplitude), n, (n - 1) / 2)
+    echo = halves * back[:, :, None]
+    echo -= np.abs(amplitude).astype(np.float32)[..., None, None]
+    product = (echo[:, 0] * echo[:, 1].conj()).sum(axis=1)
+    edges = block_edges(n)
+    tone = refine(np.add.reduceat(product, edges[:-1], axis=-1).astype(complex), block_times(edges) * FOLD, steps=2)
+    # Amplitudes relative to the mean of both halves.
+    energy, common = np.stack([_energy(echo[:, h]) for h in (0, 1)], axis=1), product.sum(axis=1)
+    size = np.abs(energy + np.stack([common, common.conj()], axis=1))
+    contrast = (size[:, 0] - size[:, 1]) / np.maximum(size.sum(axis=1), 1e-30)
+    # Keep positions whose halves are more coherent than noise would be by chance.
+    echoing = np.abs(tone.amplitude) > 4 / np.sqrt(rx * n) * np.sqrt(energy.prod(axis=1))
+    return np.stack([tone.frequency / 2, np.angle(tone.amplitude) / 2, contrast])[:, echoing]
+
+
+def _spread(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return the RMS of errors [3, n]."""
+    f, p, a = np.sqrt((values**2).mean(axis=1))
+    return float(f), float(p), float(a)
+
+
+@dataclass(frozen=True)
+class CubeForm:
+    """Conversion of a board's cube to our convention. Create with :func:`detect_form`.
+
+    Attributes
+    ----------
+    conjugate
+        The phases have the opposite sign.
+    turn
+        complex64 [rx, sample]: multiplies the cube after that.
+    constant
+        complex64 [rx]: direct path to add if it was removed (equal RX are assumed); otherwise zero.
+    path
+        Estimator to reference every position to its direct path; None if the cube is referenced already.
+    chirp
+        Chirp of the scan.
+    how
+        One sentence for quality.json.
+    """
+
+    conjugate: bool
+    turn: NDArray[np.complex64]
+    constant: NDArray[np.complex64]
+    path: DirectPath | None
+    chirp: Chirp
+    how: str
+
+    def synced(self, cube: NDArray[np.complex64], pulses: int) -> SyncedRow:
+        """Convert a row of the cube, complex64 [rx, position, sample] in order of recording; zeros are masked.
+
+        The receiver's filter is not compensated.
+        """
+        valid = np.isfinite(cube).all(axis=(0, 2)) & (cube != 0).any(axis=(0, 2))
+        samples = self._turned(np.where(valid[:, None], cube, 0)) + self.constant[:, None, None]
+        samples *= valid[:, None]
+        zeros = np.zeros(valid.size)
+        if self.path is not None:
+            samples, valid, hz, amplitude = _referenced(samples, valid, self.path, self.chirp)
+        else:
+            hz, amplitude = zeros, np.abs(samples.mean(axis=(0, 2))).astype(np.float64)
+        return SyncedRow(samples, valid, np.where(valid, pulses, 0), hz, amplitude, zeros, zeros)
+
+    def _turned(self, cube: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        return ((cube.conj() if self.conjugate else cube) * self.turn[:, None]).astype(np.complex64)
+
+
+def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: Board) -> CubeForm:
+    """Detect the conventions of a board's cube.
+
+    Parameters
+    ----------
+    rows
+        Some of its rows, complex64 [rx, position, sample] each.
+    rig, board
+        Rig of the scan, and the board.
+
+    Raises
+    ------
+    DataError
+        if the rows have no data.
+    """
+    cube = np.concatenate([r[:, np.isfinite(r).all(axis=(0, 2)) & (r != 0).any(axis=(0, 2))] for r in rows], axis=1)
+    if cube.shape[1] == 0:
+        raise DataError(
+            f"the cube of board {board.name} has no data",
+            "all samples are zero",
+            "copy it again",
+            code=ErrorCode.NO_DATA,
+        )
+    chirp = rig.chirp
+    (a, b), sweep = chirp.linear_samples, chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    direct_m = np.linalg.norm(rx - tx, axis=1)
+    gate = _gate_echoes(sweep[a:b], _gate_m(rig, board, tx, rx))
+    absolute = np.exp(-2j * np.pi * np.outer(direct_m, sweep) / SPEED_OF_LIGHT_M_S)
+    conjugate, counted_from_tx = _sign_and_origin(cube, absolute, gate, (a, b))
+    turn = absolute if counted_from_tx else np.ones_like(absolute)
+    form = ["conjugated"] * conjugate + ["delays counted from the transmitter"] * counted_from_tx
+    cube = (cube.conj() if conjugate else cube) * turn[:, None]
+
+    constant, path = np.zeros(len(rx)), None
+    mean, coherent = _mean_direct_path(cube[..., a:b], gate)
+    if coherent > _COHERENT:
+        lag = np.exp(2j * np.pi * np.outer(direct_m - direct_m[0], sweep) / SPEED_OF_LIGHT_M_S)
+        phasors = mean / np.abs(mean)
+        if abs((phasors * lag[:, (a + b) // 2].conj()).sum()) > abs(phasors.sum()):
+            turn = turn * lag.conj()
+            form.append("all RX referenced to the direct path of one")
+        else:
+            form.append("each RX referenced to its own direct path")
+    else:
+        own = prepare(rig, board)
+        _, found, _, _ = _referenced(cube.astype(np.complex64), np.ones(cube.shape[1], bool), own, chirp)
+        if found.mean() > _MIN_FOUND and _share(cube[..., a:b], gate) < _ALONE:
+            path = own
+            form.append("not referenced to a direct path; referenced here")
+        else:
+            level = np.sqrt(np.mean(np.abs(cube) ** 2))
+            constant = level * direct_m[0] / direct_m
+            form.append("the direct path was removed; equal RX are assumed")
+    how = "; ".join(form) + "; the receiver's filter is not compensated"
+    return CubeForm(conjugate, turn.astype(np.complex64), constant.astype(np.complex64), path, chirp, how)
+
+
+def _sign_and_origin(
+    cube: NDArray[np.complexfloating],
+    absolute: NDArray[np.complex128],
+    gate: NDArray[np.complex128],
+    linear: tuple[int, int],
+) -> tuple[bool, bool]:
+    """Return two flags: the cube is conjugated, and its delays count from the transmitter.
+
+    `absolute` [rx, sample] removes the delay of the direct path, `gate` [path, sample] are echoes from the object. The
+    combination with the most power at the object is chosen; in doubt the simplest one.
+    """
+    a, b = linear
+    readings = list(itertools.product((False, True), (False, True)))
+    power = []
+    for conjugate, counted_from_tx in readings:
+        turn = absolute if counted_from_tx else np.ones_like(absolute)
+        part = ((cube.conj() if conjugate else cube) * turn[:, None])[..., a:b]
+        power.append(float((np.abs((part * np.hanning(b - a)) @ gate.conj().T) ** 2).mean()))
+    return readings[0 if power[0] >= _PREFER_SIMPLE * max(power) else int(np.argmax(power))]
+
+
+def _mean_direct_path(
+    part: NDArray[np.complexfloating], gate: NDArray[np.complex128]
+) -> tuple[NDArray[np.complexfloating], float]:
+    """Return the mean direct path [rx] in samples [rx, position, sample], and its share of power.
+
+    Generalised least squares, which suppresses the object.
+    """
+    samples = part.shape[-1]
+    covariance = gate.T @ gate.conj() / len(gate) + _NOISE * np.eye(samples)
+    weights = scipy.linalg.solve(covariance, np.ones(samples), assume_a="pos").conj()
+    direct = part @ (weights / weights.sum())  # [rx, position]
+    mean = direct.mean(axis=1)
+    return mean, float(np.mean(np.abs(mean) ** 2 / np.mean(np.abs(direct) ** 2, axis=1)))
+
+
+def _gate_m(rig: Instrument, board: Board, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the smallest and largest excess path of echoes from the object plane."""
+    dx, dy = (m.ravel() for m in np.meshgrid(*2 * [np.linspace(-1, 1, 9) * _SPREAD_M]))
+    excess = excess_path_m(tx, rx, np.array(specular_midpoint_m(rig, board)) + np.stack([dx, dy, 0 * dx], axis=1))
+    return float(excess.min()), float(excess.max())
+
+
+def _gate_echoes(sweep_hz: NDArray[np.floating], gate_m: tuple[float, float]) -> NDArray[np.complex128]:
+    """Return echoes of evenly spaced paths in the gate, [path, sample]."""
+    paths = np.linspace(*gate_m, 33)
+    return np.exp(2j * np.pi * np.outer(paths, sweep_hz) / SPEED_OF_LIGHT_M_S)
+
+
+def _share(part: NDArray[np.complexfloating], gate: NDArray[np.complex128]) -> float:
+    """Return the share of the power of samples [..., sample] explained by echoes in the gate."""
+    _, strength, basis = np.linalg.svd(gate, full_matrices=False)
+    inside = part @ basis[strength > 1e-2 * strength[0]].conj().T
+    return float((np.abs(inside) ** 2).sum() / (np.abs(part) ** 2).sum())
+
+
+def _referenced(
+    cube: NDArray[np.complex64], valid: NDArray[np.bool_], path: DirectPath, chirp: Chirp
+) -> tuple[NDArray[np.complex64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Reference positions to their direct path; return samples, mask of found positions, IF (Hz) and amplitude.
+
+    Each position of the cube is treated as the average of one chirp.
+    """
+    rx, positions, samples = cube.shape
+    a, b = whole_blocks(chirp.linear_samples)
+    power = (np.abs(np.fft.fft(cube[..., a:b], axis=-1)) ** 2).sum(axis=0)
+    centre = np.fft.fftfreq(b - a)[np.argmax(power, axis=-1)].astype(np.float64)
+    mixed = cube * np.exp(-2j * np.pi * np.outer(centre, np.arange(samples)))
+    folded = mixed[..., a:b].reshape(rx, positions, -1, FOLD).mean(axis=-1).swapaxes(0, 1) / 2
+    one, none = valid[:, None], np.zeros((positions, 1))
+    aligned = AlignedRow(
+        np.ascontiguousarray(mixed.swapaxes(0, 1), np.complex64),
+        np.stack([folded, folded], axis=1).astype(np.complex64),
+        centre,
+        one,
+        none,
+        none,
+        none + 1,
+        none + 1,
+        np.zeros((2, positions, 1)),
+        none + 1,
+        np.zeros((positions, 1), np.int32),
+    )
+    near_zero = bool(abs(np.median(centre)) < 0.4)  # mixed down already, so any IF is within the band
+    done = reference(aligned, path, msgspec.structs.replace(chirp, if_mode="complex2x") if near_zero else chirp)
+    return done.samples, done.found, done.frequency * chirp.sample_rate_hz, np.abs(done.amplitude)

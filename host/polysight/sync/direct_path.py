@@ -21,23 +21,20 @@ second of the two strongest peaks is tried. Nothing is smoothed.
 
 from __future__ import annotations
 
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.sync import compiled, numpy_direct_path
+from polysight.sync import loops
 from polysight.sync.align import AlignedRow, whole_blocks
-from polysight.sync.numpy_passes import FOLD
-from polysight.sync.tone import cis
+from polysight.sync.loops import FOLD, Library, NumpyLoops, cis, complex64
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-Loops = compiled.Library | ModuleType
-"""The compiled loops, or `numpy_direct_path`, which has the same functions."""
+Loops = Library | type[NumpyLoops]
 
 _FFT = 256  # size of the search FFT, over averaged samples
 _SPREAD_M = 0.1  # standard deviation in x and y of the echoes' origin, around the mirror point
@@ -174,25 +171,25 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     chirp
         The chirp the samples were taken with.
     by
-        Its loops: compiled or `numpy_direct_path`, with equal results; None: compiled where that is possible.
+        Its loops, with equal results; None: compiled where that is possible.
     """
-    loops = by or (compiled.library() if len(path.beam) == compiled.RX else None) or numpy_direct_path
+    run = by or (loops.library() if len(path.beam) == loops.RX else None) or NumpyLoops
     a, b = whole_blocks(chirp.linear_samples)
     n = (b - a) // FOLD
     usable: NDArray[np.bool_] = np.any(aligned.good, axis=1)
     window = np.hanning(n + 2)[1:-1].astype(np.float32)
     nearest, farthest = int(path.object_bins[0] * 0.9), int(path.object_bins[1] * 1.1)
-    beam = _c64(path.beam[:, None] * path.folded_steering * window)
-    bins, median = loops.search(aligned.halves, beam, _FFT, (nearest, farthest), _COMPARABLE)
+    beam = complex64(path.beam[:, None] * path.folded_steering * window)
+    bins, median = run.search(aligned.halves, beam, _FFT, (nearest, farthest), _COMPARABLE)
     peaks = ((bins + _FFT // 2) % _FFT - _FFT // 2) / _FFT / FOLD
     floor = median**2 / np.log(2) / (window**2).sum()  # from the median bin, for tones fill few bins
-    three, two = _c64(path.drift_estimator), _c64(path.estimator)
-    frequency, estimate, _ = loops.refine(aligned.halves, path.folded_steering, three, peaks[0])
+    three, two = complex64(path.drift_estimator), complex64(path.estimator)
+    frequency, estimate, _ = run.refine(aligned.halves, path.folded_steering, three, peaks[0])
     drifts = _ratio(estimate[:, 2], estimate[:, 0])[usable]
     drift = float(np.median(drifts)) if usable.any() else 0.0
-    flat = _c64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
-    frequency, estimate, step = loops.refine(aligned.halves, flat, two, frequency)
-    _try_others(aligned.halves, peaks, usable, (loops, flat, two), frequency, estimate, step)
+    flat = complex64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
+    frequency, estimate, step = run.refine(aligned.halves, flat, two, frequency)
+    _try_others(aligned.halves, peaks, usable, (run, flat, two), frequency, estimate, step)
 
     # An IF outside the receiver's band is an alias; if the last step is large, no tone was found.
     amplitude = estimate[:, 0] * np.sinc(frequency) / np.sinc(frequency * FOLD)  # averaging attenuated the tone
@@ -210,8 +207,8 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
         found &= strength > _LOST * np.median(strength[found])
 
     origin = (a + b - 1) / 2
-    steering = _c64(path.steering * cis(-0.5 * drift * (np.arange(chirp.samples) - origin) ** 2))
-    samples, halves = loops.turn(
+    steering = complex64(path.steering * cis(-0.5 * drift * (np.arange(chirp.samples) - origin) ** 2))
+    samples, halves = run.turn(
         aligned.mean, aligned.halves, steering, flat, origin, frequency, np.angle(amplitude), found
     )
     return Referenced(samples, heard, amplitude, found, drift, halves)
@@ -237,8 +234,8 @@ def _try_others(
     odd = np.flatnonzero(usable & (np.abs(level - middle) > _OUTLIER * spread) & (peaks[0] != peaks[1]))
     if odd.size == 0:
         return
-    loops, steering, estimator = how
-    other = loops.refine(halves[odd], steering, estimator, peaks[1, odd])
+    run, steering, estimator = how
+    other = run.refine(halves[odd], steering, estimator, peaks[1, odd])
     other_level = np.log(np.maximum(np.abs(other[1][:, 0]), 1e-30))
     better = np.abs(other_level - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
     for whole, part in zip(found, other, strict=True):
@@ -249,7 +246,3 @@ def _ratio(moment: NDArray[np.complex128], amplitude: NDArray[np.complex128]) ->
     ratio = np.zeros(amplitude.shape, complex)
     np.divide(moment, amplitude, out=ratio, where=amplitude != 0)
     return np.real(ratio)
-
-
-def _c64(values: NDArray[np.complexfloating]) -> NDArray[np.complex64]:
-    return np.ascontiguousarray(values, np.complex64)

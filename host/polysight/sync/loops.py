@@ -1,0 +1,629 @@
+"""The loops of synchronisation in two forms with equal results: compiled, and in NumPy, which is the readable one.
+
+* Tones: frequency and phase of a tone in many short records, at the Cramer-Rao bound (`signal.h`).
+* Three passes over the raw samples of a burst: `match`, `against_others`, `average` (`passes.h`); `align.py` decides
+  between them. Words are int16 [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing multiplies
+  by `exp(-j 2 pi f (n - centre))`, with f in cycles per sample and `centre` the middle of the linear samples.
+* `NumpyLoops`: loops over positions that find the direct path (`direct_path.c`); `direct_path.py` has the method.
+* `Library` calls `burst.c` and `direct_path.c` through ctypes, which releases the interpreter. :func:`library` returns
+  it, or None and one warning if nothing was compiled; then the slower NumPy form is used.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import threading
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from polysight.sync import high_pass_filter as hpf
+
+CHUNK = 8
+"""Positions per chunk: the working set fits in the second-level cache."""
+
+FOLD = 4
+"""Samples averaged before the second estimate: tones 2.7 IF bins off the middle lose 0.8 % of their power."""
+
+BAND_BINS = 9
+"""Width in IF bins of the signal's band: direct path and object lie within it."""
+
+RX = 4
+"""Number of RX that the compiled loops support."""
+
+# Blocks of a record whose sums the Newton steps of `refine` use.
+_BLOCKS = 8
+# Gauss-Newton steps to the frequency of the direct path.
+_STEPS = 3
+
+_log = logging.getLogger(__name__)
+_lock = threading.Lock()
+
+Real = NDArray[np.floating]
+Complex = NDArray[np.complexfloating]
+
+
+class Tone(NamedTuple):
+    """`frequency` [...], cycles per sample, about -1/2..1/2; `amplitude` complex [...], at the record's centre."""
+
+    frequency: NDArray[np.float64]
+    amplitude: Complex
+
+
+def cis(angle: Real) -> NDArray[np.complex64]:
+    """Return exp(j angle) within 3e-7. The angle is reduced in float64; sine and cosine of float32 are vectorised."""
+    turns = np.asarray(angle) / (2 * np.pi)
+    turns -= np.rint(turns)
+    small = (2 * np.pi * turns).astype(np.float32)
+    out = np.empty(small.shape, np.complex64)
+    np.cos(small, out=out.real)
+    np.sin(small, out=out.imag)
+    return out
+
+
+def complex64(values: Complex) -> NDArray[np.complex64]:
+    """Return the values in single precision, contiguous, as the loops take them."""
+    return np.ascontiguousarray(values, np.complex64)
+
+
+def phasor(frequency: Real, phase: Real, samples: int, origin: float) -> NDArray[np.complex64]:
+    """Return exp(j (2 pi frequency (n - origin) + phase)) for n = 0..samples-1.
+
+    An outer product of a coarse and a fine ramp: 32 exponentials instead of 256, phases in float64.
+
+    Parameters
+    ----------
+    frequency, phase
+        float64 [...], cycles per sample, and radians at `origin`.
+    samples, origin
+        Number of samples, and the sample at which the phase is `phase`.
+
+    Returns
+    -------
+    complex64 [..., samples].
+    """
+    step = max(1, round(samples**0.5))
+    coarse = np.arange(0, samples, step) - origin
+    w = 2 * np.pi * frequency[..., None]
+    a = cis(w * coarse + phase[..., None])
+    b = cis(w * np.arange(step))
+    ramp = a[..., :, None] * b[..., None, :]
+    return ramp.reshape(*frequency.shape, coarse.size * step)[..., :samples]
+
+
+def block_edges(n: int) -> NDArray[np.intp]:
+    """Return the edges of eight blocks in a record of n samples.
+
+    For frequencies below half a cycle per record, block sums lose less than 1.3 % of the information.
+    """
+    return np.unique(np.linspace(0, n, min(_BLOCKS, n) + 1).astype(np.intp))
+
+
+def block_times(edges: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return the centres of the blocks, in samples from the record's centre."""
+    return (edges[:-1] + edges[1:] - 1) / 2 - (edges[-1] - 1) / 2
+
+
+def refine(blocks: Complex, times: Real, steps: int = 3) -> Tone:
+    """Maximise the periodogram |sum_n y_n exp(-j w t_n)|^2 by Newton's method, starting at zero frequency.
+
+    From the nearest bin of a twofold zero-padded FFT, two steps reach the Cramer-Rao bound up to 30 dB (Rife and
+    Boorstyn 1974); the third removes the remaining bias of a thousandth of a bin.
+
+    Parameters
+    ----------
+    blocks, times
+        complex [..., block], and the blocks' times in samples from the centre.
+    steps
+        Newton steps.
+    """
+    w = np.zeros(blocks.shape[:-1])
+    powers = np.stack([times**0, times, times**2], axis=1).astype(complex)
+    limit = 2 * np.pi / np.ptp(times)
+    turned, s0, s1, s2, step = blocks, w, w, w, w
+    for i in range(steps):
+        if i > 0:
+            turned = blocks * cis(-w[..., None] * times)
+        s0, s1, s2 = np.moveaxis(turned @ powers, -1, 0)
+        slope = (s0.conj() * s1).imag
+        curvature = np.abs(s1) ** 2 - (s0.conj() * s2).real
+        step = np.divide(-slope, curvature, out=np.zeros_like(slope), where=curvature < 0)
+        step = np.clip(step, -limit, limit)
+        w += step
+    # The sum at the final frequency, by a Taylor series about the one before: the last step is small.
+    return Tone(w / (2 * np.pi), s0 - 1j * step * s1 - step**2 / 2 * s2)
+
+
+def search_size(n: int) -> int:
+    """Return the FFT size to find a tone of n samples: a power of two, with at least a quarter of padding."""
+    return 1 << int(np.ceil(np.log2(1.25 * n)))
+
+
+def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
+    """Return the strongest tone of each record, within some hundredths of a bin: FFT peak with parabolic interpolation.
+
+    Parameters
+    ----------
+    z
+        complex64 [..., size], zero beyond the first `samples`; overwritten.
+    samples
+        Length of the record.
+
+    Returns
+    -------
+    Tone
+        The amplitude is the sum over the record (not the mean), at its centre.
+    """
+    size = z.shape[-1]
+    spectrum: NDArray[np.complex64] = np.asarray(scipy.fft.fft(z, axis=-1, overwrite_x=True)).reshape(-1, size)
+    top = np.argmax(spectrum.real**2 + spectrum.imag**2, axis=-1)
+    every = np.arange(len(spectrum))
+    left, at, right = (spectrum[every, (top + d) % size] for d in (-1, 0, 1))
+    below, peak, above = np.abs(left), np.abs(at), np.abs(right)
+    bend = below - 2 * peak + above
+    part = np.divide(0.5 * (below - above), bend, out=np.zeros(len(top)), where=bend < 0)
+    whole = np.where(top < size // 2, top, top - size) / size
+    # The transform of a symmetrical window is real, so the phase of the bin is that of the tone at the centre.
+    amplitude = at * cis(2 * np.pi * whole * (samples - 1) / 2)
+    shape = z.shape[:-1]
+    return Tone((whole + part / size).reshape(shape), amplitude.reshape(shape))
+
+
+def estimate_tone(z: NDArray[np.complex64], steps: int = 3) -> Tone:
+    """Return the strongest tone of each record [..., sample]: FFT, then Newton. Amplitude as in :func:`strongest`."""
+    n = z.shape[-1]
+    padded = np.zeros((*z.shape[:-1], search_size(n)), np.complex64)
+    padded[..., :n] = z
+    coarse = strongest(padded, n).frequency
+    demodulated = z * phasor(-coarse, np.zeros(coarse.shape), n, (n - 1) / 2)
+    edges = block_edges(n)
+    sums = np.add.reduceat(demodulated, edges[:-1], axis=-1).astype(complex)
+    fine = refine(sums, block_times(edges), steps)
+    return Tone(coarse + fine.frequency, fine.amplitude)
+
+
+def match(
+    words: NDArray[np.int16], reference: NDArray[np.intp], linear: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]]:
+    """Find the tone between each chirp and a reference chirp: the strongest in their conjugate product over all RX.
+
+    Parameters
+    ----------
+    words
+        int16 [position, chirp, sample, 2, rx].
+    reference
+        int [position]: the reference chirp of each.
+    linear
+        Linear samples `[a, b)`.
+
+    Returns
+    -------
+    frequency
+        float64 [position, chirp], cycles per sample, within some hundredths of a bin.
+    amplitude
+        complex128 [position, chirp]: the tone's sum over RX and linear samples, at their middle.
+    centre
+        float64 [position]: middle of the band of the reference chirp, cycles per sample 0..1: maximum of the power
+        spectrum of all RX after three passes of a box filter of half `BAND_BINS`.
+    energy
+        float32 [position, chirp], over RX and linear samples.
+    peak
+        int32 [position, chirp]: largest |I| or |Q| of the whole chirp.
+    """
+    frames = _complex(words)
+    n, (positions, chirps, rx, _) = linear[1] - linear[0], frames.shape
+    size = search_size(n)
+    inside = frames[..., slice(*linear)]
+    chosen = np.zeros((positions, rx, size), np.complex64)
+    chosen[..., :n] = inside[np.arange(positions), reference]
+    products = np.zeros((positions, chirps, size), np.complex64)
+    products[..., :n] = (inside * chosen[:, None, :, :n].conj()).sum(axis=2)
+    tone = strongest(products, n)
+
+    spectrum: NDArray[np.complex64] = np.asarray(scipy.fft.fft(chosen, axis=-1))
+    power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1)
+    for _ in range(3):  # nearly Gaussian: two tones give one peak between them
+        power = scipy.ndimage.uniform_filter1d(power, BAND_BINS * size // n // 2, axis=-1, mode="wrap")
+    energy = (inside.real**2 + inside.imag**2).sum(axis=(2, 3))
+    parts = frames.view(np.float32)
+    peak = np.maximum(parts.max(axis=(2, 3)), -parts.min(axis=(2, 3))).astype(np.int32)
+    return tone.frequency, tone.amplitude.astype(complex), np.argmax(power, axis=-1) / size, energy, peak
+
+
+def against_others(
+    words: NDArray[np.int16],
+    frequency: NDArray[np.float64],
+    taps: NDArray[np.complex64],
+    good: NDArray[np.bool_],
+    linear: tuple[int, int],
+) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
+    """Mix down, average every `FOLD` samples, filter; find the tone between each chirp and the sum of all others.
+
+    Parameters
+    ----------
+    words
+        int16 [position, chirp, sample, 2, rx].
+    frequency
+        float64 [position, chirp].
+    taps
+        complex64 [position, chirp, tap]: one or three, one averaged sample apart (`high_pass_filter.Equaliser`).
+    good
+        bool [position, chirp]: chirps in the sum.
+    linear
+        Linear samples `[a, b)`, a multiple of `FOLD` many.
+
+    Returns
+    -------
+    frequency, amplitude
+        float64 and complex128 [position, chirp]: the tone from `refine`, two Newton steps from zero.
+    energy
+        float32 [position, chirp]: energy of the chirp, over RX and averaged samples.
+    level
+        float32 [position]: energy of the good chirps' sum.
+    apart
+        float64 [2, position, chirp]: difference of the tones from even and from odd RX, with the chirp itself in the
+        sum: cycles per sample, and radians.
+    """
+    a, b = linear
+    turn = phasor(-frequency, np.zeros(frequency.shape), b - a, (b - a - 1) / 2)
+    folded = hpf.filtered(_fold(_complex(words)[..., a:b] * turn[:, :, None]), taps)
+    positions, chirps, rx, blocks = folded.shape
+    total = (good[:, None].astype(np.complex64) @ folded.reshape(positions, chirps, rx * blocks)).reshape(
+        positions, 1, rx, blocks
+    )
+    edges = block_edges(blocks)
+    times, starts = block_times(edges) * FOLD, edges[:-1]
+    product = folded * total.conj()
+    halves = np.stack([product[:, :, 0::2].sum(axis=2), product[:, :, 1::2].sum(axis=2)])
+    sums = np.add.reduceat(halves, starts, axis=-1).astype(complex)
+    own = np.add.reduceat((folded.real**2 + folded.imag**2).sum(axis=2), starts, axis=-1)
+    tone = refine(sums[0] + sums[1] - np.where(good[..., None], own, 0), times, steps=2)
+    split = refine(sums * cis(-2 * np.pi * tone.frequency[..., None] * times), times, steps=1)
+    apart = split.frequency[0] - split.frequency[1], np.angle(split.amplitude[0] * split.amplitude[1].conj())
+    return (
+        tone.frequency,
+        tone.amplitude.astype(complex),
+        own.sum(axis=-1),
+        (total.real**2 + total.imag**2).sum(axis=(1, 2, 3)),
+        np.stack(apart),
+    )
+
+
+def average(
+    words: NDArray[np.int16],
+    frequency: NDArray[np.float64],
+    weights: NDArray[np.complex64],
+    second_half: NDArray[np.bool_],
+    linear: tuple[int, int],
+) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+    """Return the weighted sum of the chirps, each mixed down.
+
+    Parameters
+    ----------
+    words
+        int16 [position, chirp, sample, 2, rx].
+    frequency
+        float64 [position, chirp].
+    weights
+        complex64 [position, chirp, tap]: one or three, `FOLD` samples apart.
+    second_half
+        bool [position, chirp]: True for chirps of the second half.
+    linear
+        Linear samples `[a, b)`, a multiple of `FOLD` many.
+
+    Returns
+    -------
+    mean
+        complex64 [position, rx, sample].
+    halves
+        complex64 [position, 2, rx, block]: contribution of each half to the mean, averaged over `FOLD` linear samples.
+    """
+    a, b = linear
+    frames = _complex(words)
+    positions, chirps, rx, samples = frames.shape
+    turn = phasor(-frequency, np.zeros(frequency.shape), samples, (a + b - 1) / 2)
+    mixed = (frames * turn[:, :, None]).reshape(positions, chirps, rx * samples)
+    split = np.stack([~second_half, second_half], axis=1)[:, :, None] * weights.swapaxes(1, 2)[:, None]
+    taps = weights.shape[2]
+    terms = (split.reshape(positions, 2 * taps, chirps) @ mixed).reshape(positions * 2, taps, rx, samples)
+    parts = hpf.shifted(terms, FOLD).sum(axis=1).reshape(positions, 2, rx, samples)
+    return parts.sum(axis=1), _fold(parts[..., a:b])
+
+
+def _complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
+    """Return raw words as complex64 [position, chirp, rx, sample]."""
+    positions, chirps, samples, _, rx = words.shape
+    out = np.empty((positions, chirps, rx, samples), np.complex64)
+    out.real = words[..., 0, :].swapaxes(2, 3)
+    out.imag = words[..., 1, :].swapaxes(2, 3)
+    return out
+
+
+def _fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    """Return the averages of every `FOLD` samples along the last axis."""
+    out = signal[..., ::FOLD].copy()
+    for q in range(1, FOLD):
+        out += signal[..., q::FOLD]
+    out *= np.float32(1 / FOLD)
+    return out
+
+
+class NumpyLoops:
+    """Loops over positions that find the direct path; the same methods as :class:`Library`.
+
+    Halves are complex64 [position, 2, rx, block] from burst alignment (`align.AlignedRow`); frequencies are in cycles
+    per sample.
+    """
+
+    @staticmethod
+    def search(
+        halves: NDArray[np.complex64],
+        weights: NDArray[np.complex64],
+        size: int,
+        object_bins: tuple[int, int],
+        comparable: float,
+    ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """Find the peak of the direct path and a second candidate.
+
+        The object's echo has a higher IF, by a distance known from the geometry. If there is a comparable peak at that
+        distance below the strongest one, the strongest is the object.
+
+        Parameters
+        ----------
+        halves
+            Both halves are added.
+        weights
+            complex64 [rx, block]: beam, steering and window.
+        size
+            Size of the FFT.
+        object_bins
+            Smallest and largest distance of the object, in bins.
+        comparable
+            Smallest amplitude of the lower peak relative to the strongest to be the direct path.
+
+        Returns
+        -------
+        bins
+            int32 [2, position]: direct path, and second candidate.
+        median
+            float64 [position]: median magnitude of the spectrum.
+        """
+        beamed = np.einsum("rn,prn->pn", weights, halves[:, 0] + halves[:, 1])
+        spectrum = np.abs(np.asarray(scipy.fft.fft(beamed, size, axis=-1)))
+        middle = np.sort(spectrum, axis=-1)[
+            :, size // 2 - 1 : size // 2 + 1
+        ]  # their mean is the median, ten times as fast
+        rows = np.arange(len(beamed))
+        top = np.argmax(spectrum, axis=-1)
+        below = top[:, None] - np.arange(object_bins[0], object_bins[1] + 1)
+        values = spectrum[rows[:, None], below % size]
+        is_peak = (values >= spectrum[rows[:, None], (below - 1) % size]) & (
+            values >= spectrum[rows[:, None], (below + 1) % size]
+        )
+        values = np.where(is_peak, values, 0)
+        best = np.argmax(values, axis=-1)
+        lower = np.where(values[rows, best] > 0, below[rows, best] % size, top)
+        is_object = values[rows, best] > comparable * spectrum[rows, top]
+        return np.where(is_object, [lower, top], [top, lower]).astype(np.int32), middle.mean(axis=-1).astype(np.float64)
+
+    @staticmethod
+    def refine(
+        halves: NDArray[np.complex64],
+        steering: NDArray[np.complex64],
+        estimator: NDArray[np.complex64],
+        frequency: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64]]:
+        """Refine frequencies by Gauss-Newton steps.
+
+        Demodulation is the same for all RX, so the estimator sums over RX first.
+
+        Parameters
+        ----------
+        halves
+            Both halves are added.
+        steering
+            complex64 [rx, block].
+        estimator
+            complex64 [2 or 3, rx * block]: see `direct_path.DirectPath`.
+        frequency
+            [position]: starting values.
+
+        Returns
+        -------
+        Frequency [position], the estimate [position, 2 or 3] there, and the last step taken [position].
+        """
+        positions, _, rx, n = halves.shape
+        g = np.einsum("prn,krn->pkn", (halves[:, 0] + halves[:, 1]) * steering, estimator.reshape(-1, rx, n))
+        zero = step = np.zeros(positions)
+        reach = 1 / (n * FOLD)
+
+        def estimate_at(frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+            return np.einsum("pkn,pn->pk", g, phasor(-frequency * FOLD, zero, n, (n - 1) / 2)).astype(complex)
+
+        estimate = estimate_at(frequency)
+        for _ in range(_STEPS):
+            amplitude = np.where(estimate[:, 0] != 0, estimate[:, 0], np.inf)
+            step = np.clip(np.real(estimate[:, 1] / amplitude) / (2 * np.pi), -reach, reach)
+            frequency = frequency + step
+            estimate = estimate_at(frequency)
+        return frequency, estimate, step
+
+    @staticmethod
+    def turn(
+        mean: NDArray[np.complex64],
+        halves: NDArray[np.complex64],
+        steering: NDArray[np.complex64],
+        folded_steering: NDArray[np.complex64],
+        origin: float,
+        frequency: NDArray[np.float64],
+        phase: NDArray[np.float64],
+        found: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+        """Apply the steering and remove frequency and phase of the direct path from a row.
+
+        Parameters
+        ----------
+        mean
+            complex64 [position, rx, sample].
+        halves
+            One block is the average of `FOLD` samples.
+        steering, folded_steering
+            complex64 [rx, sample] and [rx, block].
+        origin
+            Sample at which `phase` is given.
+        frequency, phase
+            [position], cycles per sample and radians.
+        found
+            bool [position]: other positions become zero.
+
+        Returns
+        -------
+        complex64 [rx, position, sample], and the halves.
+        """
+        n, samples = halves.shape[-1], mean.shape[-1]
+        folded = phasor(-frequency * FOLD, -phase, n, (n - 1) / 2)
+        whole = phasor(-frequency, -phase, samples, origin) * found[:, None]
+        out = np.empty((mean.shape[1], len(mean), samples), np.complex64)
+        np.multiply(mean.swapaxes(0, 1), steering[:, None], out=out)
+        out *= whole
+        return out, (halves * folded_steering * folded[:, None, None]).astype(np.complex64)
+
+
+class LoadError(Exception):
+    """The library is missing, or was compiled from other sources."""
+
+
+class Library:
+    """The compiled loops.
+
+    Parameters
+    ----------
+    path
+        File of the library; None: beside the sources.
+    bits
+        Width of vectors, 128, 256 or 512; None: the widest of the processor.
+
+    Raises
+    ------
+    LoadError
+        if it cannot be loaded, or was compiled from other sources.
+    """
+
+    def __init__(self, path: Path | None = None, bits: int | None = None) -> None:
+        from polysight.sync import build  # not at import, so that `python -m polysight.sync.build` is clean
+
+        path = path or build.HERE / build.LIBRARY
+        if not path.is_file():
+            raise LoadError(f"{path} is missing")
+        try:
+            if not path.read_bytes().endswith(build.source_digest().encode()):  # loading it could end the program
+                raise LoadError(f"{path} was compiled from other sources, or is damaged")
+            loaded = ctypes.CDLL(str(path))
+        except OSError as e:
+            raise LoadError(str(e)) from None
+        self.bits = bits or int(loaded.vector_bits())
+        self._loaded = loaded
+
+    def align(
+        self,
+        words: NDArray[np.int16],
+        valid: NDArray[np.bool_],
+        linear: tuple[int, int],
+        equaliser: hpf.Equaliser | None,
+        full_scale: int,
+        into: Sequence[NDArray[Any]],
+    ) -> None:
+        """Align positions into the fields of an `align.AlignedRow`; parameters as in `align.align_in_numpy`."""
+        positions, chirps, samples, _, _ = words.shape
+        a, b = linear
+        filters = [0.0, 0.0, 0.0]
+        if equaliser is not None:
+            filters = [equaliser.sample_rate_hz, equaliser.reach, equaliser.signed, *equaliser.model.corners_hz]
+        self._call(
+            "align",
+            *(words, valid),
+            *(positions, chirps, samples, a, b, search_size(b - a), full_scale),
+            *(np.array(filters), len(filters) - 3, equaliser is not None),
+            *into,
+        )
+
+    def search(
+        self,
+        halves: NDArray[np.complex64],
+        weights: NDArray[np.complex64],
+        size: int,
+        object_bins: tuple[int, int],
+        comparable: float,
+    ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """See `NumpyLoops.search`."""
+        positions, blocks = halves.shape[0], halves.shape[-1]
+        bins, median = np.empty((2, positions), np.int32), np.empty(positions)
+        sizes = positions, blocks, size, *object_bins
+        self._call("search", halves, weights, *sizes, np.array([comparable]), bins, median)
+        return bins, median
+
+    def refine(
+        self,
+        halves: NDArray[np.complex64],
+        steering: NDArray[np.complex64],
+        estimator: NDArray[np.complex64],
+        frequency: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64]]:
+        """See `NumpyLoops.refine`."""
+        positions, blocks, rows = halves.shape[0], halves.shape[-1], len(estimator)
+        found, estimate, step = frequency.copy(), np.empty((positions, rows), complex), np.empty(positions)
+        self._call("refine", halves, steering, estimator, positions, blocks, rows, found, estimate, step)
+        return found, estimate, step
+
+    def turn(
+        self,
+        mean: NDArray[np.complex64],
+        halves: NDArray[np.complex64],
+        steering: NDArray[np.complex64],
+        folded_steering: NDArray[np.complex64],
+        origin: float,
+        frequency: NDArray[np.float64],
+        phase: NDArray[np.float64],
+        found: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+        """See `NumpyLoops.turn`."""
+        positions, rx, samples = mean.shape
+        out, halves_out = np.empty((rx, positions, samples), np.complex64), np.empty_like(halves)
+        self._call(
+            "turn",
+            *(mean, halves, steering, folded_steering, positions, samples, halves.shape[-1]),
+            *(np.array([origin]), frequency, phase / (2 * np.pi), found, out, halves_out),
+        )
+        return out, halves_out
+
+    def _call(self, name: str, *arguments: NDArray[Any] | float) -> None:
+        """Call a loop with arrays as pointers and numbers as int. Raises MemoryError."""
+        arrays = [np.ascontiguousarray(x) if isinstance(x, np.ndarray) else x for x in arguments]
+        given = [ctypes.c_void_p(x.ctypes.data) if isinstance(x, np.ndarray) else ctypes.c_int(int(x)) for x in arrays]
+        if getattr(self._loaded, f"{name}_{self.bits}")(*given):
+            raise MemoryError(f"no memory for {name}")
+
+
+def library() -> Library | None:
+    """Return the compiled loops; None, and one warning, if they cannot be used."""
+    with _lock:
+        return _load()
+
+
+@lru_cache(maxsize=1)
+def _load() -> Library | None:
+    try:
+        return Library()
+    except LoadError as e:
+        _log.warning(
+            "synchronisation runs in NumPy, ten times slower than compiled: %s; to compile it, install a C compiler"
+            " (apt install gcc, or pip install ziglang) and run: python -m polysight.sync.build",
+            e,
+        )
+        return None

@@ -31,6 +31,7 @@ from polysight.materials import (
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference, plane_reference
 from polysight.process import NO_INPUTS, Findings, Inputs
+from polysight.results import Recording
 from polysight.settings import Settings
 from polysight.store import CubeRow, open_source
 from polysight_shared.config import Instrument, load_instrument
@@ -104,7 +105,7 @@ class Cubes:
         return CubeRow(np.ascontiguousarray(cube[:, :: self.plan.row(row).direction]))
 
     def recording_facts(self) -> dict[str, Any]:
-        return {"recording": {}}
+        return {"recording": Recording()}
 
 
 def draw_scene(seed: int, kind: str = "full") -> Scene:

@@ -26,7 +26,8 @@ class Pipeline:
         self.calibration = calibration.calibration_of_scan(source)
         rig = self.calibration.rig(source.instrument)
         filters, self.plane = self.calibration.high_passes(rig), imaging.UNKNOWN_PLANE
-        self.synchroniser, self.quality = sync.RowSynchroniser(source, rig, filters), process.Quality(rig, source)
+        self.synchroniser = sync.RowSynchroniser(source, rig, filters)
+        self.quality = process.Quality(rig, source, self.calibration.facts())
         kept = process.KeptSamples(source, rig, filters, self.quality, settings, live=live, samples=samples)
         self.samples, self.images, self.sub_bands = kept, kept.images, kept.sub_bands
         self.rig = store.mirrored(self.images.rig) if source.mirrored else self.images.rig  # x from TX to RX
@@ -57,7 +58,7 @@ class Pipeline:
             self.sub_bands = self.samples.fill_missing()
         with self.quality.timed("image"):
             images = self.images.current() if from_sums else self.samples.filled.finish()
-        self.quality.note(**self.calibration.quality_facts(), **self.synchroniser.recording_facts())
+        self.quality.note(**self.synchroniser.recording_facts())
         return images.transposed() if self.source.mirrored else images
 
     def place_plane(self, images: imaging.Images, move: bool = True) -> imaging.Images:
@@ -82,16 +83,15 @@ class Pipeline:
             plane = None if known is None else known.plane
             self.quality.note_materials(found, angles, images.valid, plane)
         with self.quality.timed("sub-bands"):
-            moved = self.plane.offset_m if self.plane.worth_moving else 0.0
-            parts = self.sub_bands.finish(self.source.mirrored, moved)
-            return materials.with_bands(found, self.sub_bands.bands, parts, optics, plane)
+            parts = self.sub_bands.finish(self.source.mirrored, self.plane.moved_m)
+            return materials.with_bands(found, self.sub_bands.bands, parts, optics, plane) if parts else found
 
     def examine(self, images: imaging.Images, plates: materials.Plates = ()) -> process.Findings:
         """Find plane and materials, and judge them; a verdict "no result" removes names and permittivities."""
         classifier = process.load_classifier(self.settings, self.rig)
         known = process.boxes_as_patches(self.settings, self.inputs, images.x_m, images.y_m)
-        in_scene = known.metal is not None
-        plane = self.calibration.metal_plane(self.rig, self.inputs.reference, in_scene, self.settings.bands)
+        given, bands = self.inputs.reference, self.settings.bands
+        plane = self.calibration.metal_plane(self.rig, given, known.metal is not None, bands)
         images = self.place_plane(images)
         if plane is not None:
             images = images.within(plane.valid_on(images.x_m, images.y_m))

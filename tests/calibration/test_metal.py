@@ -213,4 +213,4 @@ def test_metal_is_one_in_the_whole_sweep_and_in_every_sub_band(banded, taken_wit
     assert len(found.bands) == BANDS
     for ratio in (found.ratio, *(band.ratio for band in found.bands)):
         assert ratio.value == pytest.approx(1.0, abs=0.02)
-    assert pipeline.quality.notes["metal_reference"]["sub_bands"] == BANDS
+    assert pipeline.quality.notes["metal_reference"].sub_bands == BANDS

@@ -3,6 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
+from msgspec import UNSET
 
 from polysight.imaging import ImageBuilder
 from polysight.imaging.resolution import board_facts, point_response
@@ -63,15 +64,15 @@ def test_missing_positions_cost_what_is_reported(make_rig, points_rows):
         builder.add_row("RH", index, row)
     board = builder.boards["RH"]
     facts = board_facts(board)
-    assert facts["masked_positions"] == (~board.valid).sum() > 10
-    assert facts["masked"] == pytest.approx(facts["masked_positions"] / facts["positions"], abs=1e-6)
+    assert facts.masked_positions == (~board.valid).sum() > 10
+    assert facts.masked == pytest.approx(facts.masked_positions / facts.positions, abs=1e-6)
     summed = np.abs(board.image()[0]).max() * float(board.count) / (board.valid.size * 4)
     whole = np.abs(board.image()[0]).max()
-    assert -20 * np.log10(summed / whole) == pytest.approx(facts["loss_db"], abs=1e-3)
+    assert -20 * np.log10(summed / whole) == pytest.approx(facts.loss_db, abs=1e-3)
     assert whole == pytest.approx(1, abs=0.03)  # image amplitudes do not change
 
 
 def test_without_data_there_is_no_response(make_rig):
     facts = board_facts(ImageBuilder(make_rig(5, 5)).boards["RV"])
-    assert facts["masked"] == 1
-    assert "loss_db" not in facts
+    assert facts.masked == 1
+    assert facts.loss_db is UNSET

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
-from polysight.imaging.builder import MIN_SAMPLES, sub_bands
+from polysight.imaging.images import MIN_SAMPLES, sub_bands
 from polysight.materials.layers import Spectrum
 from polysight_shared.error_codes import ErrorCode
 

@@ -8,7 +8,7 @@ import pytest
 from tests.support.rigs import published_rig
 
 from polysight.imaging import Images
-from polysight.imaging.builder import SubBand
+from polysight.imaging.images import SubBand
 from polysight.materials.layers import Bands, Layer, fit_layer
 from polysight.materials.sub_bands import band_rows, bands_of_row
 from polysight.polarimetry import fresnel, ratio_from_permittivity

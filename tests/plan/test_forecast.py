@@ -110,9 +110,9 @@ def test_the_predicted_resolution_is_that_of_quality_json(rig):
     board.valid[:] = True
     measured = board_facts(board)
     predicted = forecast(small).response
-    assert measured["point_width_mm"] == pytest.approx(predicted.width_mm, abs=2e-3)
-    assert measured["point_limit_mm"] == pytest.approx(predicted.limit_mm, abs=2e-3)
-    assert measured["point_paper_mm"] == pytest.approx(predicted.paper_mm, abs=2e-3)
+    assert measured.point_width_mm == pytest.approx(predicted.width_mm, abs=2e-3)
+    assert measured.point_limit_mm == pytest.approx(predicted.limit_mm, abs=2e-3)
+    assert measured.point_paper_mm == pytest.approx(predicted.paper_mm, abs=2e-3)
 
 
 def test_the_published_plan_is_possible_and_takes_two_hours(rig):

@@ -66,12 +66,12 @@ def test_weak_parts_and_the_rim_are_masked():
     got = reference.apply(images_of(h, h))
     assert np.isnan(got.p[:, -1]).all()
     np.testing.assert_allclose(got.p[reference.valid], 1, atol=0.02)
-    assert reference.facts()["share_of_plane"] == pytest.approx(reference.valid.mean(), abs=1e-3)
+    assert reference.facts().share_of_plane == pytest.approx(reference.valid.mean(), abs=1e-3)
 
 
 def test_its_facts_tell_how_the_gains_vary_over_the_plane():
     reference = plane_reference(images_of(*gains(np.random.default_rng(5), 0.02)))
-    assert reference.facts()["ratio_variation_db"] > 0.01
+    assert reference.facts().ratio_variation_db > 0.01
 
 
 def test_images_without_a_metal_plate_are_refused():

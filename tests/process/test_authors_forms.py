@@ -64,9 +64,9 @@ def test_a_scan_by_columns_makes_the_image_of_one_by_rows(quiet, tmp_path):
     for channel in ("h", "v"):
         assert correlation(made, quiet, channel) > 0.98
     facts = pipeline.quality.notes["recording"]
-    assert facts["direction"] == "col"
-    assert facts["boards"]["RV"]["positions_missing"] == 2
-    assert facts["boards"]["RH"]["packets_lost"] > 0
+    assert facts.direction == "col"
+    assert facts.boards["RV"]["positions_missing"] == 2
+    assert facts.boards["RH"]["packets_lost"] > 0
     assert pipeline.rig.grid.columns == 17
 
 
@@ -79,7 +79,7 @@ def test_a_synchronised_cube_of_any_convention_makes_the_same_image(quiet, tmp_p
     made, pipeline = images(folder)
     for channel in ("h", "v"):
         assert correlation(made, quiet, channel) > 0.999
-    assert set(pipeline.quality.notes["recording"]["cubes"]) == {"RH", "RV"}
+    assert set(pipeline.quality.notes["recording"].cubes) == {"RH", "RV"}
     assert pipeline.quality.result().boards["RH"].positions_masked == 0
 
 

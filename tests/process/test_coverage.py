@@ -88,7 +88,7 @@ def test_lost_positions_of_odd_rows_are_counted_by_column(scan_of, tmp_path):
     source = Lossy(ScanFolder.load(scan_of(tmp_path / "scan", scene)))
     quality = pipeline_of(source).quality.result()
     for board in quality.boards.values():
-        assert board.masked_columns == {0: [[0, 2], [4, 5]], 1: [[2, 3], [5, 7]], 3: [[0, 1]]}
+        assert board.masked_columns == {0: [(0, 2), (4, 5)], 1: [(2, 3), (5, 7)], 3: [(0, 1)]}
         assert board.positions_masked == 7
         assert board.frames_masked == 7 * PULSES
     expected = np.zeros((4, 7), bool)

@@ -86,7 +86,7 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
             assert mask.reshape(plan.columns, -1)[sorted(gone)].all()
             assert mask.sum() in (missing, mask.size)  # the transmitter's board was never missing: it tells all places
             assert mask.sum() == missing or len(gone) > plan.columns - 3
-    answer = scan.recording_facts()["recording"]["boards"]
+    answer = scan.recording_facts()["recording"].boards
     for board in ("RH", "RV"):
         assert answer[board]["positions_short"] == 0
         if not answer[board]["rows_not_placed"]:
@@ -146,7 +146,7 @@ def test_the_other_boards_tell_which_end_is_missing(tmp_path, gone):
     scan = open_source(folder, BASE)
     mask = check(scan.read_row("RH", 2), sent["RH", 2])
     np.testing.assert_array_equal(mask.reshape(COLUMNS, -1).all(axis=1), np.isin(range(COLUMNS), list(gone)))
-    assert scan.recording_facts()["recording"]["boards"]["RH"]["positions_missing"] == len(gone)
+    assert scan.recording_facts()["recording"].boards["RH"]["positions_missing"] == len(gone)
 
 
 def test_an_end_that_all_boards_miss_masks_the_row(tmp_path):
@@ -154,7 +154,7 @@ def test_an_end_that_all_boards_miss_masks_the_row(tmp_path):
     scan = open_source(folder, BASE)
     for board in ("RH", "RV"):
         assert check(scan.read_row(board, 2), sent[board, 2]).all()
-        assert scan.recording_facts()["recording"]["boards"][board]["rows_not_placed"] == 1
+        assert scan.recording_facts()["recording"].boards[board]["rows_not_placed"] == 1
 
 
 @pytest.mark.parametrize("zero_filling", [True, False])
@@ -193,7 +193,7 @@ def test_without_a_log_zeros_are_lost_packets_and_a_short_row_is_masked(tmp_path
     assert mask.sum() == 3 * PACKET
     assert check(scan.read_row("RV", 0), sent["RV", 0]).all()
     assert check(scan.read_row("RV", 2), sent["RV", 2]).sum() == 0
-    answer = scan.recording_facts()["recording"]["boards"]["RV"]
+    answer = scan.recording_facts()["recording"].boards["RV"]
     assert (answer["packets_lost"], answer["rows_not_placed"], answer["rows_absent"]) == (3, 1, 0)
 
 
@@ -203,7 +203,7 @@ def test_columns_are_rows_of_the_mirrored_rig(tmp_path):
     assert (folder / "RH" / f"1_{ROWS - 1}.bin").exists()
     scan = open_source(folder, BASE)
     assert (scan.plan.columns, scan.plan.rows) == (ROWS, COLUMNS)
-    assert scan.recording_facts()["recording"]["direction"] == "col"
+    assert scan.recording_facts()["recording"].direction == "col"
     back = mirrored(scan.instrument)
     assert (back.grid.columns, back.grid.rows) == (COLUMNS, ROWS)
 

@@ -142,7 +142,7 @@ def test_a_board_never_looks_away_from_the_object(write, base):
     scan = open_source(folder, base)
     assert scan.instrument.boards == base.boards
     assert len(scan.notices) == 3
-    assert "away from the object" in scan.recording_facts()["recording"]["notices"][0]
+    assert "away from the object" in scan.recording_facts()["recording"].notices[0]
 
 
 def test_units_of_tis_tools_are_understood_too(write, base):

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from polysight.capture import row_words
 from polysight.imaging import ImagedWith, SubBand, image_grid
 from polysight.polarimetry import PlaneReference
+from polysight.results import CalibrationSource
 from polysight.store import (
     MANIFEST,
     RawSource,
@@ -244,7 +245,7 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
     DeviceError
         if the files cannot be written.
     """
-    facts = reference.facts()
+    facts = msgspec.structs.asdict(reference.facts())
     for channel, image in (("H", reference.h), ("V", reference.v)):
         level = float(np.median(np.abs(image[reference.valid])))
         if level < MIN_METAL_LEVEL:
@@ -259,7 +260,7 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
         images="",
         images_crc32="",
         share_of_plane=facts["share_of_plane"],
-        **{key: value for key, value in facts.items() if "_variation_" in key},
+        **{name: value for name, value in facts.items() if "_variation_" in name},
         spread=reference.spread,
         how=reference.how,
         imaged_with=reference.made_with,
@@ -404,16 +405,12 @@ class Calibration:
         """Return the settings that the gains of images depend on; `placed` is a rig that :meth:`rig` returned."""
         return ImagedWith.of(placed, self.high_passes(placed))
 
-    def facts(self) -> dict[str, Any]:
-        """Return path, date and origin of the active files, by kind."""
+    def facts(self) -> dict[str, CalibrationSource]:
+        """Return path, date and origin of the active files, by kind, for quality.json."""
         return {
-            kind: {"file": str(self.path(kind)), "made_utc": file.made_utc, "simulated": file.simulated}
+            kind: CalibrationSource(str(self.path(kind)), file.made_utc, file.simulated)
             for kind, file in self.files().items()
         }
-
-    def quality_facts(self) -> dict[str, Any]:
-        """Return :meth:`facts` as the entry `calibration` of quality.json; empty without files."""
-        return {"calibration": self.facts()} if self.files() else {}
 
     def files(self) -> dict[str, CalibrationFile]:
         """Return the active calibration files by kind."""

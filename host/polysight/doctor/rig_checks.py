@@ -123,7 +123,8 @@ def check_calibration(context: CheckContext) -> Finding:
     facts = checked_calibration(context.rig, simulated).facts()
     if not facts:
         return ok("no calibration file is configured: geometry, filters and metal as in the rig file and the scene")
-    return ok("; ".join(f"{kind} of {fact['made_utc'][:10]}" for kind, fact in facts.items()), **facts)
+    observed = "; ".join(f"{kind} of {file.made_utc[:10]}" for kind, file in facts.items())
+    return ok(observed, **{kind: msgspec.to_builtins(file) for kind, file in facts.items()})
 
 
 def check_library(context: CheckContext) -> Finding:

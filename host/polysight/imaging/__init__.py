@@ -8,16 +8,6 @@ row. `move_to_plane` estimates the plane of the plates and images on it, `focus_
 settings that the gains of an image depend on.
 """
 
-from polysight.imaging.builder import (
-    AS_IN_RIG_FILE,
-    TAPERS,
-    ImageBuilder,
-    SubBand,
-    SubBandImages,
-    View,
-    needed_gate_m,
-    sub_bands,
-)
 from polysight.imaging.direct import backproject, project
 from polysight.imaging.geometry import (
     Antennas,
@@ -28,7 +18,22 @@ from polysight.imaging.geometry import (
     scan_offsets_m,
     window_weights,
 )
-from polysight.imaging.images import Image, ImagedWith, Images, Mask, Rise, correct_tilt
+from polysight.imaging.images import (
+    AS_IN_RIG_FILE,
+    TAPERS,
+    Image,
+    ImageBuilder,
+    ImagedWith,
+    Images,
+    Mask,
+    Rise,
+    SubBand,
+    SubBandImages,
+    View,
+    correct_tilt,
+    needed_gate_m,
+    sub_bands,
+)
 from polysight.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, Focus, PlaneEstimate, focus_sweep, move_to_plane
 from polysight.imaging.resolution import (
     FieldLimits,
@@ -39,7 +44,7 @@ from polysight.imaging.resolution import (
     point_response,
 )
 from polysight.imaging.samples import ReducedRow, reduction, scene_gate_m
-from polysight.imaging.sparse import FilledPositions, fill_missing, fill_sub_bands
+from polysight.imaging.sparse import fill_missing, fill_sub_bands
 
 __all__ = [
     "AS_IN_RIG_FILE",
@@ -49,7 +54,6 @@ __all__ = [
     "Antennas",
     "Aperture",
     "FieldLimits",
-    "FilledPositions",
     "Focus",
     "Image",
     "ImageBuilder",

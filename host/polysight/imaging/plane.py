@@ -32,8 +32,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.imaging.builder import ImageBuilder
-from polysight.imaging.images import Images
+from polysight.imaging.images import ImageBuilder, Images
 from polysight.imaging.resolution import limit_m
 from polysight.imaging.samples import BoardSamples
 from polysight_shared.config import Instrument
@@ -232,6 +231,11 @@ class PlaneEstimate:
     def worth_moving(self) -> bool:
         """True if the offset from the rig file's plane is large enough to form images and angles again."""
         return self.known and abs(self.offset_m) > _WORTH_M and abs(self.offset_m) < PLANE_REACH_M
+
+    @property
+    def moved_m(self) -> float:
+        """Distance from the rig file's plane to that of the images: 0 if moving them is not worth it."""
+        return self.offset_m if self.worth_moving else 0.0
 
     def applied_to(self, rig: Instrument) -> Instrument:
         """Return a rig with its object plane at the plates."""

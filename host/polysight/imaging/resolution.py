@@ -7,16 +7,16 @@ entry `imaging` of quality.json.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.imaging.builder import ImageBuilder
 from polysight.imaging.direct import DirectImager, backproject
 from polysight.imaging.geometry import Antennas, Aperture, ImageGrid
-from polysight.imaging.images import Images
+from polysight.imaging.images import ImageBuilder, Images
 from polysight.imaging.samples import BoardSamples
+from polysight.results import BoardImaging, Pair
 from polysight_shared.config import Instrument
 from polysight_shared.geometry import specular_midpoint_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -147,15 +147,15 @@ def _sidelobe_db(cut: NDArray[np.float64]) -> float:
     return float(20 * np.log10(max(max(levels), 1e-9)))
 
 
-def imaging_facts(builder: ImageBuilder, images: Images) -> dict[str, Any]:
+def imaging_facts(builder: ImageBuilder, images: Images) -> dict[str, BoardImaging | list[str]]:
     """Return the entry `imaging` of quality.json, by board."""
-    out: dict[str, Any] = {name: board_facts(board) for name, board in builder.boards.items()}
+    out: dict[str, BoardImaging | list[str]] = {name: board_facts(board) for name, board in builder.boards.items()}
     if images.notices:
         out["notices"] = list(images.notices)
     return out
 
 
-def board_facts(board: BoardSamples) -> dict[str, Any]:
+def board_facts(board: BoardSamples) -> BoardImaging:
     """Return the figures of one board.
 
     `masked` is the share of the tapered aperture without data, `loss_db` the loss of a point's sum due to it,
@@ -163,19 +163,30 @@ def board_facts(board: BoardSamples) -> dict[str, Any]:
     """
     weights = board.weights
     masked = 1 - float(weights.sum() / board.taper.sum())
-    facts: dict[str, Any] = {
-        "positions": int(board.valid.size),
-        "masked_positions": int(board.valid.size - board.valid.sum()),
-        "rows_without_data": int((~board.valid.any(axis=1)).sum()),
-        "masked": round(masked, 6),
-        "frequencies": board.aperture.frequencies_hz.size,
-    }
-    if masked < 1:
-        response = point_response(board.aperture, weights)
-        facts["loss_db"] = round(-20 * float(np.log10(1 - masked)), 4) + 0.0
-        for key in ("width_mm", "limit_mm", "paper_mm", "sidelobe_db"):
-            facts[f"point_{key}"] = [round(v, 3) if np.isfinite(v) else None for v in getattr(response, key)]
-    return facts
+    facts = BoardImaging(
+        positions=int(board.valid.size),
+        masked_positions=int(board.valid.size - board.valid.sum()),
+        rows_without_data=int((~board.valid.any(axis=1)).sum()),
+        masked=round(masked, 6),
+        frequencies=board.aperture.frequencies_hz.size,
+    )
+    if masked >= 1:
+        return facts
+    response = point_response(board.aperture, weights)
+    return msgspec.structs.replace(
+        facts,
+        loss_db=round(-20 * float(np.log10(1 - masked)), 4) + 0.0,
+        point_width_mm=_rounded(response.width_mm),
+        point_limit_mm=_rounded(response.limit_mm),
+        point_paper_mm=_rounded(response.paper_mm),
+        point_sidelobe_db=_rounded(response.sidelobe_db),
+    )
+
+
+def _rounded(pair: tuple[float, float]) -> Pair:
+    """Return (x, y) with three decimals, None for what is not finite."""
+    x, y = (round(value, 3) if np.isfinite(value) else None for value in pair)
+    return x, y
 
 
 # Limits of the field of view: the alias-free field for a step size, and the mirror zone around flat plates. TX and RX

@@ -18,10 +18,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.imaging.builder import ImageBuilder, SubBandImages
-from polysight.imaging.images import Mask
+from polysight.imaging.images import ImageBuilder, Mask, SubBandImages
 from polysight.imaging.resolution import field_limits
 from polysight.imaging.samples import BoardSamples, choose_imager
+from polysight.results import ReconstructedPositions
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError
 
@@ -52,30 +52,6 @@ class Reconstruction:
 
     image: NDArray[np.complex64]
     residual: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class FilledPositions:
-    """Errors of the reconstructed positions of one board.
-
-    Attributes
-    ----------
-    missing_share
-        Share of the positions that were reconstructed.
-    residual
-        Share of the recorded samples that the reconstruction does not explain.
-    prediction_error
-        Error of predicted samples relative to recorded ones, in an image of recorded positions that were left out of
-        the fit; None if there were too few.
-    image_error
-        Expected error of the whole image relative to that of a scan of all positions: the prediction error times the
-        part of the image that comes from reconstructed positions; None as above.
-    """
-
-    missing_share: float
-    residual: float
-    prediction_error: float | None
-    image_error: float | None
 
 
 class _Model:
@@ -182,7 +158,7 @@ def added_steps(rig: Instrument) -> tuple[int, int]:
 
 def fill_missing(
     builder: ImageBuilder, iterations: int = ITERATIONS
-) -> tuple[ImageBuilder, dict[str, FilledPositions]]:
+) -> tuple[ImageBuilder, dict[str, ReconstructedPositions]]:
     """Reconstruct the positions that were masked, not recorded, or not planned although the image needs them.
 
     Returns
@@ -233,7 +209,7 @@ def _finer(rig: Instrument, steps: tuple[int, int]) -> Instrument:
     return msgspec.structs.replace(rig, grid=grid)
 
 
-def _fill(board: BoardSamples, iterations: int) -> FilledPositions:
+def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
     """Predict the samples of a board's missing positions and put them in their place; return their errors."""
     model = _Model(board)
     recorded = board.valid.copy()
@@ -250,7 +226,7 @@ def _fill(board: BoardSamples, iterations: int) -> FilledPositions:
     samples = board.calibrated()
     reconstructed = _norm_of_image(model, samples, board.taper * ~recorded)
     share = reconstructed / _norm_of_image(model, samples, board.taper)
-    return FilledPositions(
+    return ReconstructedPositions(
         missing_share=float(1 - recorded.mean()),
         residual=float(last.residual[-1]),
         prediction_error=error,

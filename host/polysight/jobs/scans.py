@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import msgspec
-from msgspec import UNSET, structs
+from msgspec import UNSET
 
 from polysight.acquisition import ScanCommand, send_command
 from polysight.catalogue import (
@@ -24,7 +24,7 @@ from polysight.catalogue import (
 from polysight.jobs.output import confirm, print_json
 from polysight.materials import UNKNOWN
 from polysight.products import QUALITY, REPORT, products_locked, read_products, write_json
-from polysight.results import ComplexNumber, RawDropped, plain
+from polysight.results import ComplexNumber, RawDropped, plain, read_object
 from polysight.store import Digests, ScanFolder, damaged_samples, drop, droppable, dropped_rows, locked_samples, utc_now
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, no_such
@@ -242,7 +242,9 @@ def _check_samples(scan: ScanFolder, rows: set[int]) -> None:
 def _keep(products: Path, scan: ScanFolder) -> None:
     """Mark the products as the only remaining data of the scan, so that they are never overwritten."""
     mark = RawDropped(scan_id=scan.scan_id, scan=str(scan.path.resolve()), dropped_utc=utc_now())
-    write_json(products / QUALITY, structs.replace(read_products(products).quality, raw_dropped=mark))
+    # The object of the file, not its struct: keys of a later release stay.
+    content = read_object(products / QUALITY) or {}
+    write_json(products / QUALITY, {**content, "raw_dropped": mark})
 
 
 def processed_digests(folder: Path) -> Digests:

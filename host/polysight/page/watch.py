@@ -182,11 +182,11 @@ class RowViewer:
         pipeline.add_row(row)
         self._done[row] = take
         for name, board in pipeline.quality.boards.items():
-            record = board.rows[row]
-            phases = {stage: float(residuals[1]) for stage, residuals in record["stages"].items()}
+            figures = board.rows[row].figures
+            phases = {stage: phase_rad for stage, (_, phase_rad, _) in figures.residuals.items()}
             object_rad = phases.get("referenced", math.nan)
             direct_rad = phases.get("averaged", math.nan)
-            sync = RowSync(object_rad, direct_rad, int(record["positions_masked"]))
+            sync = RowSync(object_rad, direct_rad, figures.positions_masked)
             self._sync.setdefault(name, {})[row] = sync
         if draws or time.monotonic() - self._drawn_at > PICTURE_INTERVAL_S:
             self._publish(draw(pipeline.images.current()), self._profile(pipeline, row))

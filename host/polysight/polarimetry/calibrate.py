@@ -41,8 +41,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy
+from msgspec import UNSET
 
 from polysight.imaging import Image, ImagedWith, Images, Mask
+from polysight.results import MetalPlate
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError
 
@@ -259,20 +261,26 @@ class PlaneReference:
                 code=ErrorCode.MISMATCH,
             )
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> MetalPlate:
         """Return the variation of the gains over the plane, for quality.json."""
         at = self.valid
         h, v = self.h[at], self.v[at]
-        out: dict[str, Any] = {"how": self.how, "share_of_plane": round(float(at.mean()), 4)}
-        for name, z in (("h", h), ("v", v), ("ratio", h / v)):
-            level = 20 * np.log10(np.abs(z))
-            out[f"{name}_variation_db"] = round(float(np.std(level)), 4)
         turned = np.angle(h / v * np.conj(np.mean(h / v)))
-        out["ratio_variation_deg"] = round(float(np.degrees(np.std(turned))), 4)
-        out["spread"] = round(self.spread, 5)
-        if self.bands:
-            out["sub_bands"] = len(self.bands)
-        return out
+        return MetalPlate(
+            how=self.how,
+            share_of_plane=round(float(at.mean()), 4),
+            h_variation_db=_variation_db(h),
+            v_variation_db=_variation_db(v),
+            ratio_variation_db=_variation_db(h / v),
+            ratio_variation_deg=round(float(np.degrees(np.std(turned))), 4),
+            spread=round(self.spread, 5),
+            sub_bands=len(self.bands) or UNSET,
+        )
+
+
+def _variation_db(gain: Image) -> float:
+    """Return the standard deviation of the level of a gain over its pixels."""
+    return round(float(np.std(20 * np.log10(np.abs(gain)))), 4)
 
 
 def plane_reference(

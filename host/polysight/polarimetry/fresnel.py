@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from polysight.results import IncidenceAngles
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import PolysightError
@@ -314,16 +315,16 @@ class IncidenceChoice:
         """The other angles."""
         return self.pixel_rad if self.choice == "one" else self.one_rad
 
-    def facts(self, valid: npt.NDArray[np.bool_]) -> dict[str, Any]:
+    def facts(self, valid: npt.NDArray[np.bool_]) -> IncidenceAngles:
         """Return both angles and their largest difference over valid pixels, for quality.json; degrees."""
         pixel = np.degrees(self.pixel_rad[valid]) if valid.any() else np.degrees(self.pixel_rad).ravel()
         one = float(np.degrees(self.one_rad.flat[0]))
-        return {
-            "used": "one number for the image" if self.choice == "one" else "by pixel",
-            "one_deg": round(one, 4),
-            "pixel_deg": [round(float(q), 4) for q in (pixel.min(), np.median(pixel), pixel.max())],
-            "largest_difference_deg": round(float(np.abs(pixel - one).max()), 4),
-        }
+        return IncidenceAngles(
+            used="one number for the image" if self.choice == "one" else "by pixel",
+            one_deg=round(one, 4),
+            pixel_deg=tuple(round(float(q), 4) for q in (pixel.min(), np.median(pixel), pixel.max())),
+            largest_difference_deg=round(float(np.abs(pixel - one).max()), 4),
+        )
 
 
 def incidence_choice(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayLike, choice: Incidence) -> IncidenceChoice:

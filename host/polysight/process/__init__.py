@@ -18,14 +18,11 @@ from polysight.process.inputs import (
     NO_INPUTS,
     Inputs,
     boxes_as_patches,
-    cores,
     load_classifier,
-    map_boards,
-    map_rows,
     why_unnamed,
 )
 from polysight.process.quality import Quality, judge
-from polysight.process.samples import KeptSamples, Use
+from polysight.process.rows import KeptSamples, Use, cores, map_boards, map_rows
 from polysight.process.save import (
     Findings,
     Products,

@@ -10,8 +10,8 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -19,12 +19,13 @@ import numpy.typing as npt
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from polysight.imaging import FilledPositions, ImageBuilder, Images, PlaneEstimate, imaging_facts
+from polysight.imaging import ImageBuilder, Images, PlaneEstimate, imaging_facts
 from polysight.materials import NOT_PASSIVE, Classifier, MaterialsResult, permittivity_change
 from polysight.polarimetry import IncidenceChoice, PlaneReference
 from polysight.results import (
     Backlash,
     BoardQuality,
+    CalibrationSource,
     Coverage,
     ErrorBudget,
     FrequencyRange,
@@ -32,6 +33,7 @@ from polysight.results import (
     LeakageError,
     MetalScore,
     PlaneError,
+    ReconstructedPositions,
     Residual,
     ScanQuality,
     Verdict,
@@ -42,7 +44,6 @@ from polysight.results import (
     level_reasons,
     metal_reasons,
     passivity_reasons,
-    plain,
     plane_reasons,
     reconstruction_reasons,
     recording_reasons,
@@ -56,54 +57,104 @@ from polysight_shared.config import Board, Instrument
 from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
 
+NO_FILES: Mapping[str, CalibrationSource] = {}
+Count = Annotated[int, msgspec.Meta(ge=0)]
+
+
+class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
+    """Figures of one row and board, as the kept samples store them (docs/spec/samples.md).
+
+    Attributes
+    ----------
+    masked_columns
+        Half-open ranges [start, stop) of masked columns, from the smallest x.
+    stages
+        Each stage of synchronisation with the standard deviations after it: Hz, rad, and relative amplitude.
+    """
+
+    frames_expected: Count
+    frames_received: Count
+    bytes_missing: Count
+    crc32: str
+    positions: Count
+    positions_masked: Count
+    masked_columns: list[tuple[Count, Count]]
+    stages: list[tuple[str, float, float, float]]
+
+    @property
+    def residuals(self) -> dict[str, tuple[float, float, float]]:
+        """Standard deviations after each stage, by its name."""
+        return {name: (frequency, phase, amplitude) for name, frequency, phase, amplitude in self.stages}
+
+
+@dataclass(frozen=True)
+class RowQuality:
+    """Figures of one row and board, and what is known of each position, in order of recording.
+
+    Attributes
+    ----------
+    direct_hz, direct_snr
+        float64 [position]: IF of the direct path, NaN where not valid, and its SNR, see `_direct_snr`.
+    echo
+        complex64 [rx, position]: echo of the mirror point, for the estimate of the backlash.
+    """
+
+    figures: RowFigures
+    direct_hz: NDArray[np.float64]
+    direct_snr: NDArray[np.float64]
+    echo: NDArray[np.complex64]
+
 
 @dataclass
 class BoardRows:
-    """Quality figures of one board, by row; adding a row again replaces its earlier figures."""
+    """Quality figures of one board, by row; a row added again replaces its earlier figures."""
 
     rig: Instrument
     board: Board
-    rows: dict[int, dict[str, Any]] = field(default_factory=dict)
-    echoes: dict[int, NDArray[np.complex64]] = field(default_factory=dict)
+    rows: dict[int, RowQuality] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._filter = object_filter(self.rig, self.board)
 
     def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:
         """Compute and store the figures of a synchronised row."""
-        figures = {
-            "frames_expected": recorded.frames_expected,
-            "frames_received": frames_valid,
-            "bytes_missing": recorded.missing_bytes,
-            "crc32": recorded.crc32,
-            "positions": int(synced.valid.size),
-            "positions_masked": int(synced.valid.size - synced.valid.sum()),
-            "masked_columns": masked_runs(~synced.valid[:: plan_raster(self.rig.grid).row(row).direction]),
-            "direct_hz": np.where(synced.valid, synced.direct_hz, np.nan),
-            "stages": {name: spread for name, spread in synced.stages.items() if np.isfinite(spread).all()},
-            "direct_snr": _direct_snr(synced),
-        }
-        self.put(row, figures, synced.through(self._filter))
+        figures = RowFigures(
+            frames_expected=recorded.frames_expected,
+            frames_received=frames_valid,
+            bytes_missing=recorded.missing_bytes,
+            crc32=recorded.crc32,
+            positions=int(synced.valid.size),
+            positions_masked=int(synced.valid.size - synced.valid.sum()),
+            masked_columns=masked_runs(~synced.valid[:: plan_raster(self.rig.grid).row(row).direction]),
+            stages=[(name, *spread) for name, spread in synced.stages.items() if np.isfinite(spread).all()],
+        )
+        direct_hz = np.where(synced.valid, synced.direct_hz, np.nan)
+        self.rows[row] = RowQuality(figures, direct_hz, _direct_snr(synced), synced.through(self._filter))
 
-    def put(self, row: int, figures: dict[str, Any], echo: NDArray[np.complex64]) -> None:
-        """Store figures of a row that :meth:`add` computed earlier."""
-        self.rows[row], self.echoes[row] = figures, echo
+    @property
+    def figures(self) -> dict[int, RowFigures]:
+        """Figures by row, ascending (threads add rows in any order)."""
+        return {row: quality.figures for row, quality in sorted(self.rows.items())}
 
     @property
     def positions(self) -> int:
         """Number of positions in the recorded rows."""
-        return sum(r["positions"] for r in self.rows.values())
+        return sum(r.positions for r in self.figures.values())
 
     @property
     def positions_masked(self) -> int:
         """Number of recorded positions without usable data."""
-        return sum(r["positions_masked"] for r in self.rows.values())
+        return sum(r.positions_masked for r in self.figures.values())
 
     @property
-    def frames_share(self) -> float:
-        """Share of the frames of recorded rows that were received whole, 0 to 1."""
-        expected = sum(r["frames_expected"] for r in self.rows.values())
-        return sum(r["frames_received"] for r in self.rows.values()) / expected if expected else 0.0
+    def frames_expected(self) -> int:
+        """Number of frames in the recorded rows."""
+        return sum(r.frames_expected for r in self.figures.values())
+
+    @property
+    def frames_received(self) -> int:
+        """Number of frames that were received whole."""
+        return sum(r.frames_received for r in self.figures.values())
 
     @property
     def direct_snr_db(self) -> float | None:
@@ -111,45 +162,41 @@ class BoardRows:
 
         None if unknown (cubes that another program synchronised).
         """
-        values = _known([r["direct_snr"] for r in self.rows.values()])
+        values = _known([r.direct_snr for r in self.rows.values()])
         return float(10 * np.log10(np.median(values))) if values.size else None
 
     def residual(self, stage: str) -> float | None:
         """Return the standard deviation of the phase after a synchronisation stage, radians; None if unknown."""
-        found = [r["stages"][stage][1] for r in self.rows.values() if stage in r["stages"]]
-        return float(np.median(found)) if found else None
+        phases = [r.residuals[stage][1] for r in self.figures.values() if stage in r.residuals]
+        return float(np.median(phases)) if phases else None
 
     def summary(self, backlash: bool = True) -> BoardQuality:
         """Return the board's entry of quality.json. Residuals are RMS over rows, weighted by valid positions.
 
         `backlash=False` skips the estimate of the stage's backlash, which takes 2 ms per row.
         """
-        ordered = dict(sorted(self.rows.items()))  # threads add rows in any order
-        expected = sum(row["frames_expected"] for row in ordered.values())
-        received = sum(row["frames_received"] for row in ordered.values())
-        direct = _known([row["direct_hz"] for row in ordered.values()])
+        figures = self.figures
+        direct = _known([self.rows[row].direct_hz for row in figures])
         snr = self.direct_snr_db
         return BoardQuality(
-            frames_expected=expected,
-            frames_received=received,
-            bytes_missing=sum(row["bytes_missing"] for row in ordered.values()),
+            frames_expected=self.frames_expected,
+            frames_received=self.frames_received,
+            bytes_missing=sum(r.bytes_missing for r in figures.values()),
             positions=self.positions,
             positions_masked=self.positions_masked,
-            frames_masked=expected - received,
+            frames_masked=self.frames_expected - self.frames_received,
             direct_path_hz=_frequency_range(direct) if direct.size else UNSET,
             direct_path_snr_db=None if snr is None else round(snr, 2),
             stage_backlash_mm=self._backlash() if backlash else None,
-            masked_columns={
-                row: figures["masked_columns"] for row, figures in ordered.items() if figures["masked_columns"]
-            },
-            rows_recorded=list(ordered),
-            raw_crc32={number: row["crc32"] for number, row in ordered.items() if row["crc32"]},
-            synchronisation=_residuals(list(ordered.values())),
+            masked_columns={row: r.masked_columns for row, r in figures.items() if r.masked_columns},
+            rows_recorded=list(figures),
+            raw_crc32={row: r.crc32 for row, r in figures.items() if r.crc32},
+            synchronisation=_residuals(list(figures.values())),
         )
 
     def _backlash(self) -> Backlash | None:
         """Return the shift of odd rows towards +x relative to the plan, estimated from echoes; None if undetermined."""
-        estimate = estimate_backlash(self.echoes, self.rig)
+        estimate = estimate_backlash({row: quality.echo for row, quality in self.rows.items()}, self.rig)
         if estimate is None:
             return None
         return Backlash(shift=round(estimate.shift_mm, 4), std=round(estimate.std_mm, 4))
@@ -159,13 +206,13 @@ def _frequency_range(direct_hz: NDArray[np.float64]) -> FrequencyRange:
     return FrequencyRange(float(np.median(direct_hz)), float(direct_hz.min()), float(direct_hz.max()))
 
 
-def _residuals(rows: list[dict[str, Any]]) -> dict[str, Residual]:
+def _residuals(rows: list[RowFigures]) -> dict[str, Residual]:
     """Return the RMS over rows of the residuals after each stage, weighted by valid positions."""
     residuals = {}
-    for stage in dict.fromkeys(name for row in rows for name in row["stages"]):
-        with_stage = [row for row in rows if stage in row["stages"]]
-        weights = np.array([row["positions"] - row["positions_masked"] for row in with_stage], np.float64)
-        squares = np.array([row["stages"][stage] for row in with_stage], np.float64) ** 2
+    for stage in dict.fromkeys(name for row in rows for name in row.residuals):
+        with_stage = [row for row in rows if stage in row.residuals]
+        weights = np.array([row.positions - row.positions_masked for row in with_stage], np.float64)
+        squares = np.array([row.residuals[stage] for row in with_stage], np.float64) ** 2
         frequency, phase, amplitude = np.sqrt(weights @ squares / weights.sum()).tolist()
         residuals[stage] = Residual(frequency_std_hz=frequency, phase_std_rad=phase, amplitude_std=amplitude)
     return residuals
@@ -189,21 +236,26 @@ def _known(rows: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     return values[np.isfinite(values)]
 
 
-def masked_runs(masked: NDArray[np.bool_]) -> list[list[int]]:
+def masked_runs(masked: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the half-open ranges [start, stop) of True values, ascending."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], masked.astype(np.int8), [0]])))
-    return edges.reshape(-1, 2).tolist()
+    return [(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
 
 
 class Quality:
-    """Collects the quality figures of a scan during processing; `rig` is the source's rig, calibrated."""
+    """Collects the quality figures of a scan during processing.
 
-    def __init__(self, rig: Instrument, source: Source) -> None:
+    `rig` is the source's rig, calibrated with the files `calibration`, by kind.
+    """
+
+    def __init__(
+        self, rig: Instrument, source: Source, calibration: Mapping[str, CalibrationSource] = NO_FILES
+    ) -> None:
         self.source = source
         self.boards = {board.name: BoardRows(rig, board) for board in rig.receivers}
         self.seconds: dict[str, float] = {}
-        self.notes: dict[str, Any] = {}
-        self.filled: Mapping[str, FilledPositions] = {}  # boards with reconstructed positions
+        self.notes: dict[str, Any] = {"calibration": dict(calibration)} if calibration else {}
+        self.filled: Mapping[str, ReconstructedPositions] = {}  # boards with reconstructed positions
         self._lock = threading.Lock()  # rows are processed in several threads
 
     @property
@@ -220,7 +272,7 @@ class Quality:
             rows_planned=plan.rows,
             rows_recorded=plan.rows - len(absent),
             frames_planned=len(boards) * plan.positions * frames_at,
-            frames_received=sum(row["frames_received"] for board in boards for row in board.rows.values()),
+            frames_received=sum(board.frames_received for board in boards),
             manifest=tuple(f"{fault.where}: {fault.what}" for fault in self.source.manifest_faults),
             rows_absent=tuple(absent),
             positions_planned=plan.positions,
@@ -228,7 +280,7 @@ class Quality:
         )
 
     def note(self, **entries: Any) -> None:
-        """Add entries to quality.json."""
+        """Add entries to quality.json, as `ScanQuality` declares them."""
         self.notes |= entries
 
     def note_imaging(self, builder: ImageBuilder, images: Images) -> None:
@@ -236,16 +288,16 @@ class Quality:
         with self.timed("point response"):
             self.note(imaging=imaging_facts(builder, images))
 
-    def note_filled(self, filled: Mapping[str, FilledPositions]) -> None:
+    def note_filled(self, filled: Mapping[str, ReconstructedPositions]) -> None:
         """Add the errors of reconstructed positions, by board, to quality.json and the verdict."""
         self.filled = filled
-        self.note(sparse={board: asdict(errors) for board, errors in filled.items()})
+        self.note(sparse=dict(filled))
 
     def note_materials(
         self, found: MaterialsResult, angles: IncidenceChoice, valid: NDArray[np.bool_], plane: PlaneReference | None
     ) -> None:
         """Add the effect of the incidence angle and the use of the metal plate to quality.json."""
-        self.note(incidence={**angles.facts(valid), **permittivity_change(found, angles)})
+        self.note(incidence=msgspec.structs.replace(angles.facts(valid), **permittivity_change(found, angles)))
         if plane is not None:
             self.note(metal_reference=plane.facts())
 
@@ -263,9 +315,8 @@ class Quality:
         self, verdict: Verdict | None = None, pixel_accuracy: float | None = None, backlash: bool = True
     ) -> ScanQuality:
         """Return the content of quality.json; `backlash=False` leaves the estimate of the stage's backlash out."""
-        notes = msgspec.convert(plain(self.notes), ScanQuality)
-        return msgspec.structs.replace(
-            notes,
+        return ScanQuality(
+            **self.notes,
             boards={name: board.summary(backlash) for name, board in self.boards.items()},
             coverage=self.coverage(),
             seconds_per_stage={stage: round(s, 4) for stage, s in self.seconds.items()},
@@ -283,7 +334,7 @@ def recording_verdict(quality: Quality) -> list[Finding]:
     for name, board in quality.boards.items():
         share = 1 - board.positions_masked / board.positions if board.positions else 0.0
         # Positions without a whole frame have no direct path either; do not count that loss twice.
-        received = board.frames_share
+        received = board.frames_received / board.frames_expected if board.frames_expected else 0.0
         missing += direct_path_reasons(
             name, board.direct_snr_db, board.residual("averaged"), share / received if received else 1.0
         )

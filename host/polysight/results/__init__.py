@@ -7,7 +7,7 @@ cannot hold names or permittivities. The functions `*_reasons` are the rules of 
 `plain` converts all of it to JSON types.
 """
 
-from polysight.results.json_files import damaged, json_text, one_line, plain
+from polysight.results.json_files import damaged, json_text, one_line, plain, read_object
 from polysight.results.materials import (
     BandFigures,
     ComplexNumber,
@@ -26,13 +26,19 @@ from polysight.results.materials import (
 )
 from polysight.results.quality import (
     Backlash,
+    BoardImaging,
     BoardQuality,
+    CalibrationSource,
     Coverage,
     FrequencyRange,
     GivenImages,
     IncidenceAngles,
+    MetalPlate,
     NoResult,
+    Pair,
     RawDropped,
+    ReconstructedPositions,
+    Recording,
     Residual,
     RxGain,
     ScanFacts,
@@ -58,7 +64,9 @@ from polysight.results.quality import (
 __all__ = [
     "Backlash",
     "BandFigures",
+    "BoardImaging",
     "BoardQuality",
+    "CalibrationSource",
     "ComplexNumber",
     "Coverage",
     "ErrorBudget",
@@ -68,13 +76,17 @@ __all__ = [
     "IncidenceAngles",
     "IncidenceError",
     "LeakageError",
+    "MetalPlate",
     "MetalScore",
     "MetalSource",
     "NoResult",
+    "Pair",
     "PatchFigures",
     "PermittivityFigures",
     "PlaneError",
     "RawDropped",
+    "ReconstructedPositions",
+    "Recording",
     "Residual",
     "RxGain",
     "ScanFacts",
@@ -96,6 +108,7 @@ __all__ = [
     "percent",
     "plain",
     "plane_reasons",
+    "read_object",
     "reason",
     "reconstruction_reasons",
     "recording_reasons",

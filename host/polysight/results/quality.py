@@ -490,7 +490,21 @@ class BoardImaging(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ReconstructedPositions(msgspec.Struct, frozen=True, kw_only=True):
-    """Reconstructed positions of one receiver: their share, and errors (docs/spec/products.md); null if unknown."""
+    """Reconstructed positions of one receiver, and their errors.
+
+    Attributes
+    ----------
+    missing_share
+        Share of the positions that were reconstructed.
+    residual
+        Share of the recorded samples that the reconstruction does not explain.
+    prediction_error
+        Error of predicted samples relative to recorded ones, in an image of recorded positions that were left out of
+        the fit; None if there were too few.
+    image_error
+        Expected error of the whole image relative to that of a scan of all positions: the prediction error times the
+        part of the image that comes from reconstructed positions; None as above.
+    """
 
     missing_share: float = 0.0
     residual: float = 0.0

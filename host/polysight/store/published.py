@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.results import Recording
 from polysight.store.source import CubeRow, RowData, pieces_of
 from polysight_shared import files
 from polysight_shared.config import Board, Instrument, MountStep
@@ -595,8 +596,8 @@ class PublishedScan(_Published):
             rows = [asdict(r) for r in self._losses[board.name].values()]
             total = {key: sum(r[key] for r in rows) for key in asdict(RowLosses())}
             boards[board.name] = {**total, "rows_absent": self._plan.rows - len(self._files[board.name])}
-        how = {"direction": self._settings.moving_direction, "boards": boards, "notices": list(self.notices)}
-        return {"recording": how}
+        direction = self._settings.moving_direction
+        return {"recording": Recording(direction=direction, boards=boards, notices=list(self.notices))}
 
 
 def _place(
@@ -646,4 +647,4 @@ class PublishedCubes(_Published):
 
     def recording_facts(self) -> dict[str, Any]:
         """Return the direction and the notices."""
-        return {"recording": {"direction": self._settings.moving_direction, "notices": list(self.notices)}}
+        return {"recording": Recording(direction=self._settings.moving_direction, notices=list(self.notices))}

@@ -1,14 +1,18 @@
-"""The scan folder: raw rows, and the manifest with the committed rows (docs/spec/scan-folder.md).
+"""The scan folder: raw rows, the manifest with the committed rows (docs/spec/scan-folder.md), and kept samples.
 
 `ScanFolder` reads a scan; its `writer` opens it for appending. A scan is resumed with the rig file it was begun with.
 Only the connection may change: `connection_of` and `with_connection` take addresses and limits from another rig file;
 `check_same_scan` refuses one that differs in anything else. A folder may come from anywhere: `inside` and `check_links`
 refuse names and links that lead out of it, `open_npz` refuses oversized arrays.
+
+Kept samples (docs/spec/samples.md) are made and restored by `process/rows.py`. What their files say of themselves is
+read here, without anything of the processing, so that `validate` and `drop-raw` check them.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import platform
 import secrets
@@ -61,6 +65,8 @@ SERIAL = ("port", "baud")
 FORMAT = 1
 EVENTS = "events.msgpack"
 TRUTH = "truth.json"  # of a simulated scene: its plates
+SAMPLES = "samples"
+SAMPLE_ROWS = "rows.jsonl"
 PART = ".part"  # suffix of a row during reception
 
 _MAY_BE_LINK = "products"
@@ -388,6 +394,104 @@ def dropped_files(scan: ScanFolder) -> dict[str, RawDropped]:
 def dropped_rows(scan: ScanFolder) -> set[int]:
     """Return the rows of which a dropped file is gone."""
     return {fact.row for file, fact in dropped_files(scan).items() if not (scan.path / file).exists()}
+
+
+def raw_digest(board: BoardRow) -> str:
+    """Return the digest of a board's committed row, by which its samples know the data they were made from."""
+    return f"{board.crc32} {board.index_crc32} {board.missing_bytes}"
+
+
+def read_sample_rows(folder: Path, start: int = 0) -> tuple[dict[int, dict[str, Any]], int]:
+    """Read rows.jsonl in a folder of samples from byte `start`; return its lines by row, and the end of the last one.
+
+    Truncated and damaged lines are skipped. Nothing is returned for a file that cannot be read.
+    """
+    try:
+        raw = (folder / SAMPLE_ROWS).read_bytes()
+    except OSError:
+        return {}, start
+    end = raw.rfind(b"\n") + 1
+    lines = (manifest.decode_line(text) for text in raw[start:end].splitlines())
+    return {line["row"]: line for line in lines if line is not None and _is_row(line)}, end
+
+
+def open_records(path: Path) -> NDArray[Any] | None:
+    """Return a board's records, memory-mapped, one per row; None if the file cannot be read."""
+    try:
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        return None
+
+
+def record_digest(record: Any) -> str:
+    """Return the CRC of a record as in rows.jsonl."""
+    return f"{crc32(record.tobytes()):08x}"
+
+
+def damaged_samples(scan: ScanFolder) -> dict[int, list[str]]:
+    """Check the kept samples of all committed rows; return the rows without whole samples, with the files to blame."""
+    folder, boards = scan.path / SAMPLES, [board.name for board in scan.instrument.receivers]
+    lines, _ = read_sample_rows(folder)
+    records = {name: open_records(folder / f"{name}.npy") for name in boards}
+    found: dict[int, list[str]] = {}
+    for row, committed in scan.committed().items():
+        saved = lines.get(row, {}).get("boards", {})
+        if any(name not in saved or saved[name]["raw"] != raw_digest(committed.boards[name]) for name in boards):
+            found[row] = [f"{SAMPLES}/{SAMPLE_ROWS}"]
+            continue
+        bad = [name for name in boards if not _is_whole(records[name], scan.plan.rows, row, saved[name]["crc32"])]
+        if bad:
+            found[row] = [f"{SAMPLES}/{name}.npy" for name in bad]
+    return found
+
+
+@contextmanager
+def locked_samples(scan: ScanFolder) -> Iterator[None]:
+    """Lock the kept samples, so that no program writes them meanwhile.
+
+    Raises
+    ------
+    DataError
+        if there are none.
+    DeviceError
+        if another program is writing them.
+    """
+    path = scan.path / SAMPLES / SAMPLE_ROWS
+    try:
+        file = os.open(path, os.O_RDONLY)
+    except OSError as e:
+        raise DataError(
+            f"{path}: {e.strerror}",
+            "the samples of this scan are not kept: its raw data is all there is to make images from",
+            f"`polysight process {scan.path} --out DIR` keeps them",
+            code=ErrorCode.FILE_MISSING,
+        ) from None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    except BlockingIOError:
+        raise DeviceError(
+            f"{scan.path}: another program is processing this scan",
+            f"it has locked {path}",
+            "wait for its end",
+            code=ErrorCode.BUSY,
+        ) from None
+    finally:
+        os.close(file)
+
+
+def _is_whole(records: NDArray[Any] | None, rows: int, row: int, digest: str) -> bool:
+    return records is not None and records.shape == (rows,) and record_digest(records[row]) == digest
+
+
+def _is_row(line: Mapping[str, Any]) -> bool:
+    """True if a line of rows.jsonl has a row number and the entries of its boards."""
+    boards = line.get("boards")
+    return (
+        isinstance(line.get("row"), int)
+        and isinstance(boards, dict)
+        and all(isinstance(b, dict) and {"crc32", "raw", "figures"} <= b.keys() for b in boards.values())
+    )
 
 
 def _make_folder(folder: Path) -> None:

@@ -273,7 +273,8 @@ class RowSynchroniser:
         """Return the entry on recording of quality.json, with the form of cubes."""
         facts = self._source.recording_facts()
         if self._forms:
-            facts["recording"]["cubes"] = {name: form.how for name, form in self._forms.items()}
+            cubes = {name: form.how for name, form in self._forms.items()}
+            facts["recording"] = msgspec.structs.replace(facts["recording"], cubes=cubes)
         return facts
 
     def _form(self, board: str) -> CubeForm:

@@ -1,8 +1,12 @@
-"""Kept samples: the reduced samples of a scan on disk, from which images are formed without raw data.
+"""How rows reach the images: several at a time, and restored from kept samples where that is possible.
 
-`KeptSamples` belongs to one pipeline. It restores a row from disk if the row was made from the same raw bytes with the
-same settings; otherwise the pipeline synchronises the row and saves it. Missing, truncated or damaged records are
-synchronised again. File format: docs/spec/samples.md.
+`map_rows` and `map_boards` process rows, or the boards of a row, on several threads: the compiled synchronisation
+releases the interpreter.
+
+Kept samples are the reduced samples of a scan on disk, from which images are formed without raw data. `KeptSamples`
+belongs to one pipeline. It restores a row from disk if the row was made from the same raw bytes with the same settings;
+otherwise the pipeline synchronises the row and saves it. Missing, truncated or damaged records are synchronised again.
+File format: docs/spec/samples.md.
 """
 
 from __future__ import annotations
@@ -14,9 +18,10 @@ import math
 import os
 import threading
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -35,7 +40,7 @@ from polysight.imaging import (
     needed_gate_m,
     reduction,
 )
-from polysight.process.quality import Quality
+from polysight.process.quality import Quality, RowFigures, RowQuality
 from polysight.settings import DEFAULT, Settings
 from polysight.store import (
     SAMPLE_ROWS,
@@ -64,8 +69,10 @@ MAKING = 1
 Use = Literal["none", "read", "keep"]
 Filters = Mapping[str, HighPass | None]
 Gate = tuple[float, float]
-Count = Annotated[int, msgspec.Meta(ge=0)]
-_FIGURES = ("direct_hz", "direct_snr")  # of a row's quality figures: one number a position
+Result = TypeVar("Result")
+
+MAX_ROWS = 8
+"""Rows in flight: each takes some 60 MB on the published grid, and memory bandwidth limits more threads."""
 _log = logging.getLogger(__name__)
 
 
@@ -77,28 +84,48 @@ def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
     return json.loads(json.dumps({"making": MAKING, **imaged, **parts, "speed_mm_s": rig.stage.speed_mm_s}))
 
 
-class _RowFigures(msgspec.Struct):
-    """Quality figures of a row and board as rows.jsonl has them, see `Quality`."""
-
-    frames_expected: Count
-    frames_received: Count
-    bytes_missing: Count
-    crc32: str
-    positions: Count
-    positions_masked: Count
-    masked_columns: list[tuple[Count, Count]]
-    stages: list[tuple[str, float, float, float]]
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _read_figures(entry: object) -> dict[str, Any] | None:
+def map_rows(add: Callable[[int], object], rows: Sequence[int], threads: int | None = None) -> Iterator[int]:
+    """Call `add` for every row, on `threads` threads (None: one per core); yield each finished row, in order.
+
+    The first error is raised, and rows that were not started are cancelled.
+    """
+    count = min(threads or cores(), MAX_ROWS, len(rows))
+    if count <= 1:
+        for row in rows:
+            add(row)
+            yield row
+        return
+    with ThreadPoolExecutor(count) as pool:
+        try:
+            futures = [pool.submit(add, row) for row in rows]
+            for row, future in zip(rows, futures, strict=True):
+                future.result()
+                yield row
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def map_boards(names: Iterable[str], function: Callable[[str], Result], parallel: bool) -> dict[str, Result]:
+    """Return `function(name)` for each board, by name; on one thread per core if `parallel`."""
+    names = list(names)
+    count = min(cores(), len(names)) if parallel else 1
+    if count <= 1:
+        return {name: function(name) for name in names}
+    with ThreadPoolExecutor(count) as pool:
+        return dict(zip(names, pool.map(function, names), strict=True))
+
+
+def _read_figures(entry: object) -> RowFigures | None:
     """Return the figures of a row from its line; None if they have another form."""
     try:
-        figures = msgspec.convert(entry, _RowFigures)
+        return msgspec.convert(entry, RowFigures)
     except msgspec.ValidationError:
         return None
-    stages = {name: tuple(spread) for name, *spread in figures.stages}
-    columns = [list(run) for run in figures.masked_columns]
-    return {**msgspec.structs.asdict(figures), "masked_columns": columns, "stages": stages}
 
 
 class KeptSamples:
@@ -219,7 +246,7 @@ class KeptSamples:
             self._put(board, row, record, figures)
         return records is not None
 
-    def _records(self, row: int) -> dict[str, tuple[Any, dict[str, Any]]] | None:
+    def _records(self, row: int) -> dict[str, tuple[Any, RowFigures]] | None:
         """Return a row's record and figures by board; None if one of them is missing, damaged or outdated."""
         line, found = self._line(row), {}
         for board, entry in ({} if line is None else line["boards"]).items():
@@ -249,7 +276,7 @@ class KeptSamples:
                 with (self._folder / f"{board}.npy").open("r+b") as file:
                     file.seek(-(self._plan.rows - row) * record.nbytes, 2)
                     file.write(record.tobytes())
-                boards[board] = {"crc32": record_digest(record), "raw": digest, "figures": figures}
+                boards[board] = {"crc32": record_digest(record), "raw": digest, "figures": msgspec.to_builtins(figures)}
             os.write(rows, manifest.encode_line({"fact": "row", "row": row, "boards": boards}))
         except (OSError, ValueError, DataError) as e:
             self._keep = False
@@ -311,28 +338,27 @@ class KeptSamples:
         parts: list[Any] = []
         for name, frequencies in self._head["frequencies_hz"].items():
             parts += [(name, "<c8", (rx, len(frequencies), columns)), (f"{name}_direct", "<c8", (rx, columns))]
-        parts += [("echo", "<c8", (rx, columns)), *((name, "<f8", (columns,)) for name in _FIGURES)]
+        parts += [("echo", "<c8", (rx, columns)), ("direct_hz", "<f8", (columns,)), ("direct_snr", "<f8", (columns,))]
         return np.dtype([*parts, ("valid", "?", (columns,))])
 
-    def _record(self, board: str, row: int) -> tuple[NDArray[Any], dict[str, Any]]:
+    def _record(self, board: str, row: int) -> tuple[NDArray[Any], RowFigures]:
         """Return the record of a row, and its quality figures for rows.jsonl."""
         out, forward = np.zeros((), self._type(board)), slice(None, None, self._plan.row(row).direction)
         for name, builder in self._builders.items():
             out[name], out[f"{name}_direct"], out["valid"] = builder.boards[board].reduced(row)
-        quality = self._quality.boards[board]
-        out["echo"] = quality.echoes[row][:, forward]
-        for name in _FIGURES:
-            out[name] = quality.rows[row][name][forward]
-        figures = {name: value for name, value in quality.rows[row].items() if name not in _FIGURES}
-        return out, {**figures, "stages": [[name, *spread] for name, spread in figures["stages"].items()]}
+        quality = self._quality.boards[board].rows[row]
+        out["echo"] = quality.echo[:, forward]
+        out["direct_hz"], out["direct_snr"] = quality.direct_hz[forward], quality.direct_snr[forward]
+        return out, quality.figures
 
-    def _put(self, board: str, row: int, record: Any, figures: dict[str, Any]) -> None:
+    def _put(self, board: str, row: int, record: Any, figures: RowFigures) -> None:
         """Add a record to the images and its figures to the quality; the inverse of `_record`."""
         forward = slice(None, None, self._plan.row(row).direction)
         for name, builder in self._builders.items():
             builder.boards[board].put(row, ReducedRow(record[name], record[f"{name}_direct"], record["valid"]))
-        values: dict[str, Any] = {name: np.array(record[name][forward]) for name in _FIGURES}
-        self._quality.boards[board].put(row, {**figures, **values}, np.array(record["echo"][:, forward]))
+        direct_hz, direct_snr = np.array(record["direct_hz"][forward]), np.array(record["direct_snr"][forward])
+        echo = np.array(record["echo"][:, forward])
+        self._quality.boards[board].rows[row] = RowQuality(figures, direct_hz, direct_snr, echo)
 
     def _open(self) -> int | None:
         """Open and lock rows.jsonl; start new files if those on disk do not fit. None if another program locked it."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
 import signal
 import sys
 from pathlib import Path
@@ -18,6 +17,7 @@ from polysight_shared import __version__
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.errors import PolysightError, os_error
 from polysight_shared.faults import explain
+from polysight_shared.program import close_standard_output, open_standard_streams
 from polysight_shared.raster import WIDTH_TEXT
 
 # Commands import their modules when they are called, so `--help` needs no other package.
@@ -270,6 +270,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point. Returns 0 on success; an error is one message on stderr, without a trace."""
+    open_standard_streams()
     args = _parser().parse_args(argv)
     try:
         return args.action(args) if args.action is _keys else args.action(args, _rig(args))
@@ -279,8 +280,8 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except BrokenPipeError:
-        # The reader has closed the pipe; nothing must be flushed to it at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # Whoever read our output has enough.
+        close_standard_output()
         return 0
     except OSError as e:
         error = os_error(e, "a path is wrong, the disk is full, or it belongs to another user", AS_THE_SERVICE)

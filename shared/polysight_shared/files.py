@@ -5,14 +5,15 @@ from __future__ import annotations
 import errno
 import json
 import os
+import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, DeviceError
 
 MAX_JSON_BYTES = 256 << 20  # a hundred times the manifest of a scan of ten thousand rows
 
@@ -89,3 +90,55 @@ def open_to_write(path: Path, mode: str = "wb", buffering: int = -1) -> IO[Any]:
     if path.is_symlink():
         raise OSError(errno.ELOOP, "it is a symbolic link; polysight does not write through links", str(path))
     return path.open(mode, buffering)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file, or leave the present one as it is; see :func:`write_together`."""
+    write_together({path: data})
+
+
+def write_together(files: Mapping[Path, bytes]) -> None:
+    """Write files that belong together: all of them, or none.
+
+    Each is written beside its place and flushed to disk; then all are renamed, in their order. A program killed between
+    two renames leaves the last file as it was: it is the one that makes the others count.
+
+    Raises
+    ------
+    OSError
+        if one cannot be written; nothing has changed then.
+    """
+    parts: dict[Path, Path] = {}
+    try:
+        for path, data in files.items():
+            # A name of its own: two programs may write the same file at once.
+            part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+            with named(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with part.open("xb") as f:
+                    parts[path] = part
+                    f.write(data)
+                    f.flush()
+                    os.fsync(f.fileno())
+        for path, part in parts.items():
+            with named(path):
+                part.replace(path)
+    except BaseException:
+        for part in parts.values():
+            part.unlink(missing_ok=True)
+        raise
+    for folder in dict.fromkeys(path.parent for path in files):
+        sync_folder(folder)
+
+
+def sync_folder(path: Path) -> None:
+    """Make names that were created, renamed or removed in a folder durable. Raises DeviceError."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as e:
+        what, why = f"{path}: cannot be made durable: {e.strerror}", "the disk is full or fails"
+        raise DeviceError(what, why, f"free space below {path}", code=ErrorCode.FILE_UNWRITABLE) from None

@@ -61,6 +61,21 @@ def test_older_names_of_numpy_are_read(tmp_path):
     assert read_material(path).name == "PET"
 
 
+@pytest.mark.parametrize(
+    "thing",
+    [
+        np.arange(5), np.arange(5.0), [], ["values"], "text", 3, None, {}, np.zeros((), [("values", float)]),
+        {"values": np.arange(5), "ref_values": 3}, content() | {"values": np.zeros(0)},
+        content() | {"incident_angle": 10**400}, content() | {"incident_angle": []},
+    ],
+)  # fmt: skip
+def test_a_pickle_of_something_else_is_no_material_file(tmp_path, thing):
+    path = tmp_path / "PET_55.pkl"
+    path.write_bytes(pickle.dumps(thing))
+    with refused(ErrorCode.FILE_FOREIGN, path):
+        read_material(path)
+
+
 class Hostile:
     def __init__(self, target):
         self.target = target

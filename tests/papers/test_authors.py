@@ -29,6 +29,7 @@ from polysight_papers.sensys2026.dataset_items import (
 )
 from polysight_papers.sensys2026.item import table2
 from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
 
 CHOSEN = (1, 3, 12, 15, 27, 28, 30, 32, 34, 36)
 ERRORS = Errors(0.004, 0.01, leakage=0.05)
@@ -218,6 +219,31 @@ def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, ca
         assert np.median(e.p.real) + 1j * np.median(e.p.imag) == pytest.approx(true, rel=0.08)
         np.testing.assert_allclose(abs(e.p), e.h / e.v, rtol=1e-5)
     assert "unobtainium" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "stand",
+    [
+        # Materials of each scan at 60 degrees, and pixels of a box.
+        [[(1, 60), (3, 60)], [(12, 60)]], [[(3, 60), (15, 60), (12, 60)]], [[(3, 1), (15, 1)]],
+        [[(3, 2), (15, 2)], [(3, 60)]], [[(3, 20), (15, 40)]], [[(1, 9), (3, 7)], [(1, 5)], [(12, 1)]],
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("make", [authors_items.authors_fig18, authors_fig20])
+def test_few_scans_of_few_pixels_give_figures_or_are_refused(tmp_path, monkeypatch, stand, make):
+    monkeypatch.setattr(authors_items, "ALL", 240)
+    monkeypatch.setattr(classify, "GRID", (1.0,))
+    for seed in range(3):
+        folder = tmp_path / f"{seed}" / "materials"
+        for k, boxes in enumerate(stand):
+            for number, pixels in boxes:
+                drawn = 100 * seed + 10 * k + number
+                write_material(folder, material(number), 60, f"set{k}", pixels, ERRORS, drawn)
+        try:
+            table = make(Judgements(read_authors(folder.parent, RIG_FILE))).tables[0]
+        except DataError:
+            continue
+        assert "nan" not in str(table.rows)
 
 
 def test_refusals(dataset, tmp_path, capsys):

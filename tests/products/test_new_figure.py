@@ -11,7 +11,7 @@ import scipy.io
 from tests.support.products import changed, computed, judged_products
 
 from polysight.products import patch_dataset, read_products
-from polysight.products.exports import write_csv, write_mat
+from polysight.products.exports import pack_csv, pack_mat
 from polysight.report.report import render
 from polysight.results import PatchFigures, ScanMaterials, plain
 from polysight.results.materials import Column
@@ -37,10 +37,10 @@ def scan(tmp_path):
 
 
 def test_a_declared_figure_is_a_column_of_the_tables(scan, tmp_path):
-    write_csv(tmp_path / "materials.csv", scan)
+    (tmp_path / "materials.csv").write_bytes(pack_csv(scan))
     with (tmp_path / "materials.csv").open(newline="", encoding="utf-8") as f:
         assert [row["roughness_mm"] for row in csv.DictReader(f)] == ["0.25"] * 3
-    write_mat(tmp_path / "image.mat", scan)
+    (tmp_path / "image.mat").write_bytes(pack_mat(scan))
     table = scipy.io.loadmat(tmp_path / "image.mat", simplify_cells=True)["materials"]
     assert table["roughness_mm"].tolist() == [0.25] * 3
 

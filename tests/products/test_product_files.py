@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from polysight.imaging import Images
-from polysight.products import write_atomically, write_image, write_json
+from polysight.products import write_image, write_json
 from polysight.products.processed import read_image
 from polysight.results import plain
 from polysight_shared.errors import DataError
+from polysight_shared.files import write_atomically
 
 
 def test_image_product_round_trips(tmp_path):

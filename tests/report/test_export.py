@@ -14,7 +14,7 @@ from tests.support.rigs import rig_table
 from polysight.cli.main import main
 from polysight.imaging import Images
 from polysight.products import read_products, write_image, write_json
-from polysight.products.exports import write_mat
+from polysight.products.exports import pack_mat
 from polysight.results import plain
 
 
@@ -43,7 +43,7 @@ def same_arrays(found, products):
 
 def test_matlab_round_trip(folder, tmp_path):
     products = read_products(folder)
-    write_mat(tmp_path / "image.mat", products)
+    (tmp_path / "image.mat").write_bytes(pack_mat(products))
     found = scipy.io.loadmat(tmp_path / "image.mat", simplify_cells=True)
     same_arrays(lambda name: found[name].astype(getattr(products, name).dtype), products)
     assert np.array_equal(found["x_m"], products.x_m)
@@ -61,7 +61,7 @@ def test_images_without_materials_export_too(folder, tmp_path):
         (folder / name).unlink()
     products = read_products(folder)
     assert products.simulated is None
-    write_mat(tmp_path / "image.mat", products)
+    (tmp_path / "image.mat").write_bytes(pack_mat(products))
     assert np.array_equal(scipy.io.loadmat(tmp_path / "image.mat")["h"], products.h)
 
 

@@ -28,7 +28,7 @@ from polysight.materials.train import read_material
 from polysight.products import ProcessedScan
 from polysight.products.exports import read_netcdf
 from polysight.products.folder import making_products
-from polysight.products.processed import read_image, write_atomically
+from polysight.products.processed import read_image
 from polysight.store import manifest
 from polysight.store.published import read_json as read_settings_json
 from polysight.store.raw import drop, droppable
@@ -37,6 +37,7 @@ from polysight.store.validation import validate
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError
+from polysight_shared.files import write_atomically
 
 OUTSIDE = ["../victim.bin", "/etc/passwd", "raw/../../victim.bin", "raw/a\0b.bin", "", ".", "manifest.jsonl"]
 

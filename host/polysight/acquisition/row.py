@@ -41,13 +41,13 @@ from polysight.store import (
     RowFault,
     RowRejected,
     ScanFolder,
-    sync_folder,
     utc_now,
 )
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError, advice
 from polysight_shared.faults import explain
+from polysight_shared.files import sync_folder
 from polysight_shared.messages import Capture, RowFinished
 from polysight_shared.raster import Row
 from polysight_shared.units import NS_PER_S

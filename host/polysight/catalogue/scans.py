@@ -22,10 +22,11 @@ import msgspec
 from msgspec.structs import replace
 
 from polysight.acquisition import last_alive_s
-from polysight.products import IMAGE, MATERIALS, QUALITY, ProcessedScan, write_atomically
+from polysight.products import IMAGE, MATERIALS, QUALITY, ProcessedScan
 from polysight.store import MANIFEST, Manifest, manifest
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, PolysightError, ScanError, no_such
+from polysight_shared.files import write_atomically
 
 READ_S = 3.0
 """Time limit for reading one folder of the list; it is then listed as `silent` until the read returns."""

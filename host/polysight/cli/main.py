@@ -1,21 +1,29 @@
 """The program `polysight`: parse the command line and run one command. Exit status 0 only when it worked.
 
-Only the module of the command is imported, so that every command starts at once. Errors go to stderr: what happened,
-why, and what to do.
+Only the module of the command is imported, so that every command starts at once; this module imports what `main` needs
+to be interrupted, and the rest is loaded below it. Errors go to stderr: what happened, why, and what to do.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
-from importlib import import_module
+from typing import TYPE_CHECKING
 
-from polysight.cli.options import CommandParser, describe, joined
 from polysight_shared import __version__
-from polysight_shared.errors import PolysightError, os_error
+from polysight_shared.program import (
+    close_standard_output,
+    flush_standard_output,
+    interrupts_between_imports,
+    open_standard_streams,
+)
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable, Sequence
+
+    from polysight.cli.options import CommandParser
 
 FAMILIES = {
     "rig": (
@@ -31,6 +39,11 @@ FAMILIES = {
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     """The command line: of one command's family, or of all of them when it is not known."""
+    import argparse
+    from importlib import import_module
+
+    from polysight.cli.options import CommandParser, describe
+
     parser = argparse.ArgumentParser(
         prog="polysight",
         description="See what things are made of: bistatic polarimetric SAR with commodity mmWave radars.",
@@ -57,24 +70,40 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    words = joined(sys.argv[1:] if argv is None else argv)
-    args = build_parser(words[0] if words else None).parse_args(words)
-    # Two BLAS threads on two busy cores wait for each other in a spin: ten times slower than one thread each.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # SIGTERM ends as cleanly as Ctrl-C
+    words = list(sys.argv[1:] if argv is None else argv)
+    name = " ".join(["polysight", *words[:1]])
+    open_standard_streams()
     try:
-        return args.run(args)
-    except PolysightError as e:
-        sys.stderr.write(f"polysight {args.command}: {e}\n")
-        return e.exit_status
+        with interrupts_between_imports():
+            return _run(words)
     except KeyboardInterrupt:
-        sys.stderr.write(f"polysight {args.command}: stopped\n")
+        sys.stderr.write(f"{name}: stopped\n")
         return 128 + signal.SIGINT
     except BrokenPipeError:
-        # Whoever read our output has enough; nothing must be flushed to it at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # Whoever read our output has enough.
+        close_standard_output()
         return 0
-    except OSError as e:
-        error = os_error(e)
-        sys.stderr.write(f"polysight {args.command}: {error}\n")
+    except Exception as e:
+        from polysight_shared.errors import PolysightError, os_error
+
+        error = os_error(e) if isinstance(e, OSError) else e
+        if not isinstance(error, PolysightError):
+            raise
+        sys.stderr.write(f"{name}: {error}\n")
         return error.exit_status
+
+
+def _run(words: list[str]) -> int:
+    """Parse the words and run the command; what it printed is written when this returns."""
+    from polysight.cli.options import joined
+
+    try:
+        args = build_parser(words[0] if words else None).parse_args(joined(words))
+    except SystemExit:
+        flush_standard_output()
+        raise
+    # Two BLAS threads on two busy cores wait for each other in a spin: ten times slower than one thread each.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    status = args.run(args)
+    flush_standard_output()
+    return status

@@ -40,11 +40,11 @@ from polysight.products import (
     find_labels,
     find_products,
     label_folder,
-    write_atomically,
 )
 from polysight.report import label_figure
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.files import write_together
 
 METAL = "metal"
 REFERENCE = "the metal reference"
@@ -156,8 +156,9 @@ def save_labels(place: Path, products: ProcessedScan, labels: Labels) -> tuple[L
     checked = replace(
         checked, by_hand=True, description=f"boxes of scan {products.scan_id}, in mm from the image centre"
     )
-    write_atomically(place / LABELS, pack_labels(checked))
-    write_atomically(place / LABELS_PICTURE, label_figure(products, checked.boxes, checked.metal))
+    picture = label_figure(products, checked.boxes, checked.metal)
+    # The boxes last: where they are, their picture is.
+    write_together({place / LABELS_PICTURE: picture, place / LABELS: pack_labels(checked)})
     masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked.boxes.items()}
     few = [name for name, mask in masks.items() if (mask & products.valid).sum() < FEW]
     notes = [f"fewer than {FEW} pixels: {', '.join(few)}; speckle decides what is learnt of so few"] if few else []
@@ -249,8 +250,10 @@ def apply_edits(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tu
     metal = names.get(metal or "")
     for name, box in edits.boxes:
         clean = box_name(name)
-        _refuse_twin(clean, boxes)
-        boxes[clean] = box
+        # The same box again is no other one: a command that was killed can be repeated.
+        if boxes.get(clean) != box:
+            _refuse_twin(clean, boxes)
+            boxes[clean] = box
     left_out = [name for name in boxes if name.isdecimal()]
     boxes = {n: b for n, b in boxes.items() if n not in left_out}
     for text in edits.specimens:

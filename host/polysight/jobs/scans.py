@@ -28,6 +28,7 @@ from polysight.results import ComplexNumber, RawDropped, plain, read_object
 from polysight.store import Digests, ScanFolder, damaged_samples, drop, droppable, dropped_rows, locked_samples, utc_now
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, no_such
+from polysight_shared.files import write_atomically
 
 _NAME_WIDTH = 40
 """Widest column of names; a longer name pads no other line."""
@@ -124,10 +125,7 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
     if picture is not None:
         from polysight.catalogue import draw_comparison
 
-        try:
-            picture.write_bytes(draw_comparison(found, "sigmas").png)
-        except OSError as e:
-            raise DataError(f"{picture}: cannot be written: {e.strerror}", "no such folder, or no permission") from None
+        write_atomically(picture, draw_comparison(found, "sigmas").png)
     if as_json:
         print_json(plain(values))
         return 0

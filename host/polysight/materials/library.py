@@ -8,8 +8,8 @@ model itself.
 
 from __future__ import annotations
 
+import io
 import json
-import os
 import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -23,6 +23,7 @@ import numpy.typing as npt
 from polysight.store import open_npz
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
+from polysight_shared.files import write_atomically
 
 FORMAT = "polysight-library-1"
 SAME_ANGLE_DEG = 1.0
@@ -140,18 +141,15 @@ class Library:
         meta = {"format": FORMAT, "note": self.note, "fit": self.fit, "entries": entries}
         text = np.frombuffer(json.dumps(meta, sort_keys=True).encode("utf-8"), np.uint8)
         empty_f, empty_c = np.zeros(0, np.float32), np.zeros(0, np.complex64)
-        part = path.with_name(path.name + ".part")
-        with part.open("wb") as f:
-            np.savez_compressed(
-                f,
-                h=np.concatenate([empty_f, *(e.h for e in self.entries)]),
-                v=np.concatenate([empty_f, *(e.v for e in self.entries)]),
-                p=np.concatenate([empty_c, *(e.p for e in self.entries)]),
-                meta=text,
-            )
-            f.flush()
-            os.fsync(f.fileno())
-        part.replace(path)
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer,
+            h=np.concatenate([empty_f, *(e.h for e in self.entries)]),
+            v=np.concatenate([empty_f, *(e.v for e in self.entries)]),
+            p=np.concatenate([empty_c, *(e.p for e in self.entries)]),
+            meta=text,
+        )
+        write_atomically(path, buffer.getvalue())
 
     @staticmethod
     def load(path: Path) -> Library:

@@ -27,6 +27,7 @@ from __future__ import annotations
 import io
 import pickle
 import re
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -292,7 +293,7 @@ def read_material(path: Path) -> Entry:
         name, angle = str(raw["name"]), float(raw["incident_angle"])
         scan, reference = str(raw["collection_name"]), str(raw["ref_name"])
         thickness = _number(raw.get("thickness"))
-    except (KeyError, TypeError, ValueError, AttributeError) as e:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as e:
         raise DataError(
             f"{path}: not a material file: {type(e).__name__}: {e}",
             "expected a dict with name, collection_name, incident_angle, ref_name, values [P, H, V], ref_values",
@@ -412,15 +413,25 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
 
     Every group is a fold of its own if `folds` could put all groups of a material into one fold.
 
-    Raises DataError with fewer than two groups, or without a material in two groups.
+    Raises DataError with fewer than two groups, or without a material in two groups; by pixel, in two pixels.
     """
     from sklearn.model_selection import GroupKFold, StratifiedKFold
 
     groups = np.unique(samples.independent)
     if by_pixel:
-        smallest = int(np.unique(samples.names, return_counts=True)[1].min())
+        sizes = np.unique(samples.names, return_counts=True)[1]
+        if sizes.max() < 2:
+            raise DataError(
+                "no material has two pixels", "one is left out, and none would remain for training",
+                "larger boxes, or more scans", code=ErrorCode.NOT_ENOUGH_DATA,
+            )  # fmt: skip
+        smallest = int(sizes.min())
         kept = StratifiedKFold(max(2, min(folds, smallest)), shuffle=True, random_state=0)
-        yield from kept.split(samples.x, samples.names)
+        with warnings.catch_warnings():
+            # A material of one pixel is not judged.
+            warnings.filterwarnings("ignore", "The least populated class")
+            pairs = list(kept.split(samples.x, samples.names))
+        yield from pairs
         return
     if groups.size < 2:
         raise DataError(

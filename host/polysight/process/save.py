@@ -31,13 +31,13 @@ from polysight.products import (
     SCAN,
     ProcessedScan,
     rx_gains,
-    write_atomically,
     write_image,
     write_json,
 )
 from polysight.results import MetalSource, NoResult, ScanFacts, ScanMaterials, ScanQuality, Verdict, verdict_of
 from polysight.store import Scan, versions
 from polysight_shared.config import Instrument
+from polysight_shared.files import write_atomically
 from polysight_shared.raster import RasterPlan
 from polysight_shared.tables import to_builtins
 

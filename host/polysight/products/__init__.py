@@ -38,7 +38,6 @@ from polysight.products.processed import (
     raw_dropped,
     read_products,
     rx_gains,
-    write_atomically,
     write_image,
     write_json,
 )
@@ -70,7 +69,6 @@ __all__ = [
     "read_products",
     "rx_gains",
     "scan_folder_of",
-    "write_atomically",
     "write_image",
     "write_json",
     "write_netcdf",

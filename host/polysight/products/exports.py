@@ -26,11 +26,12 @@ from msgspec import UNSET
 
 from polysight.materials import image_centre_mm
 from polysight.polarimetry import incidence_choice, specular_incidence_rad
-from polysight.products.processed import ProcessedScan, read_products, temporary_path, write_atomically
+from polysight.products.processed import ProcessedScan, read_products
 from polysight.results import Figure, PatchFigures, Verdict, figures_of, plain
 from polysight.store import MAX_BYTES
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.files import write_atomically, write_together
 
 if TYPE_CHECKING:
     import xarray
@@ -291,7 +292,12 @@ def _require_h5netcdf() -> None:
 
 
 def write_netcdf(path: Path, dataset: xarray.Dataset) -> None:
-    """Write a NetCDF 4 file; complex variables become two real ones, True and False in attributes 1 and 0.
+    """Write a NetCDF 4 file as of :func:`pack_netcdf`; its folder is made. Raises ConfigError and OSError."""
+    write_atomically(path, pack_netcdf(dataset))
+
+
+def pack_netcdf(dataset: xarray.Dataset) -> bytes:
+    """Return a NetCDF 4 file; complex variables become two real ones, True and False in attributes 1 and 0.
 
     Raises
     ------
@@ -303,9 +309,9 @@ def write_netcdf(path: Path, dataset: xarray.Dataset) -> None:
     split.attrs = {key: int(value) if isinstance(value, bool) else value for key, value in split.attrs.items()}
     packed = {"zlib": True, "complevel": 4, "shuffle": True}
     encoding = {name: packed for name, v in split.data_vars.items() if v.ndim == 2 and v.dtype.kind in "biuf"}
-    part = temporary_path(path)
-    split.to_netcdf(part, engine="h5netcdf", encoding=encoding)
-    part.replace(path)
+    buffer = io.BytesIO()
+    split.to_netcdf(buffer, engine="h5netcdf", encoding=encoding)
+    return buffer.getvalue()
 
 
 def read_netcdf(path: Path) -> xarray.Dataset:
@@ -374,8 +380,8 @@ def table_figures(scan: ProcessedScan) -> list[Figure]:
     return [figure for figure in figures_of(kind) if figure.column.name]
 
 
-def write_csv(path: Path, scan: ProcessedScan) -> None:
-    """Write the table of materials as CSV: comma, UTF-8, a header line; unknown values are empty, digits are kept.
+def pack_csv(scan: ProcessedScan) -> bytes:
+    """Return the table of materials as CSV: comma, UTF-8, a header line; unknown values are empty, digits are kept.
 
     The last columns, `verdict` and `verdict_reasons` (JSON), are the same in every line; products without a verdict
     have none.
@@ -387,14 +393,14 @@ def write_csv(path: Path, scan: ProcessedScan) -> None:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
     writer.writerows(zip(*columns.values(), strict=True))
-    write_atomically(path, text.getvalue().encode("utf-8"))
+    return text.getvalue().encode("utf-8")
 
 
 _LONGEST_NAME = 63
 
 
-def write_mat(path: Path, scan: ProcessedScan) -> None:
-    """Write a MATLAB file: `h`, `v`, `p`, `valid` [y, x], `x_m`, `y_m`, structs `materials`, `config`, `versions`.
+def pack_mat(scan: ProcessedScan) -> bytes:
+    """Return a MATLAB file: `h`, `v`, `p`, `valid` [y, x], `x_m`, `y_m`, structs `materials`, `config`, `versions`.
 
     If known also `p_sigma` [y, x], `verdict` and `verdict_reasons` (JSON). `quality_json` and `materials_json` are the
     files as text, for jsondecode.
@@ -421,7 +427,7 @@ def write_mat(path: Path, scan: ProcessedScan) -> None:
         content["p_sigma"] = images.p_sigma
     buffer = io.BytesIO()
     scipy.io.savemat(buffer, content, long_field_names=True, do_compression=True, oned_as="column")
-    write_atomically(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def _column(figure: Figure, scan: ProcessedScan) -> Any:
@@ -466,12 +472,14 @@ def export_folder(folder: Path, out: Path | None) -> Path:
 
 
 def export(folder: Path, formats: list[str], out: Path | None) -> int:
-    """Write the requested formats; print each format to stderr before, each file to stdout after writing it.
+    """Write the requested formats, all or none; print each format to stderr before, each file to stdout when all are.
 
     Raises
     ------
     PolysightError
         if no format is requested, the products cannot be read, or a package is missing.
+    OSError
+        if a file cannot be written; nothing was written then.
     """
     if not formats:
         raise ConfigError(
@@ -489,18 +497,17 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
             code=ErrorCode.FILE_MISSING,
         )
     out = export_folder(scan.folder, out)
+    packers = {
+        "netcdf": ("image.nc", lambda: pack_netcdf(full_dataset(scan))),
+        "mat": ("image.mat", lambda: pack_mat(scan)),
+        "csv": ("materials.csv", lambda: pack_csv(scan)),
+    }
+    files: dict[Path, bytes] = {}
     for kind in formats:
         sys.stderr.write(f"writing {kind} ...\n")
         sys.stderr.flush()
-        if kind == "netcdf":
-            path = out / "image.nc"
-            write_netcdf(path, full_dataset(scan))
-        elif kind == "mat":
-            path = out / "image.mat"
-            write_mat(path, scan)
-        else:
-            path = out / "materials.csv"
-            write_csv(path, scan)
-        sys.stdout.write(f"{path}\n")
-        sys.stdout.flush()
+        name, pack = packers[kind]
+        files[out / name] = pack()
+    write_together(files)
+    sys.stdout.write("".join(f"{path}\n" for path in files))
     return 0

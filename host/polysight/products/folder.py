@@ -29,11 +29,11 @@ from polysight.products.processed import (
     SCAN,
     ProcessedScan,
     raw_dropped,
-    write_atomically,
 )
-from polysight.store import is_source, sync_folder
+from polysight.store import is_source
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError
+from polysight_shared.files import sync_folder, write_atomically
 
 LABELS_PICTURE = "labels.png"
 PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, REPORT, "figures")

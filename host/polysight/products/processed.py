@@ -8,9 +8,6 @@ of products, `ProcessedScan` reads its files, without names and permittivities i
 from __future__ import annotations
 
 import io
-import os
-import secrets
-import shutil
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -49,7 +46,7 @@ from polysight.store import open_npz
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, no_such
-from polysight_shared.files import named
+from polysight_shared.files import write_atomically
 from polysight_shared.raster import RasterPlan, plan_raster
 from polysight_shared.tables import decode
 
@@ -72,32 +69,6 @@ Labels = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
 PixelNames = Mapping[int, tuple[npt.NDArray[np.str_], Mask]]
 _PRODUCTS = "products"  # in a scan folder
-
-
-def temporary_path(path: Path) -> Path:
-    """Return a temporary path beside a file or folder to be written; delete leftovers there. Raises OSError."""
-    part = path.with_name(f".{path.name}.part")
-    if part.is_dir() and not part.is_symlink():
-        shutil.rmtree(part)
-    else:
-        part.unlink(missing_ok=True)
-    return part
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name of its own, flush it to disk, and rename it. Raises OSError."""
-    with named(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")  # two may write the same file at once
-        try:
-            with part.open("xb") as f:
-                f.write(data)
-                f.flush()
-                os.fsync(f.fileno())
-            part.replace(path)
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
 
 
 def write_image(path: Path, images: Images) -> None:

@@ -19,7 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from markupsafe import Markup, escape
 
 from polysight.materials import UNKNOWN
-from polysight.products import REPORT, ProcessedScan, write_atomically
+from polysight.products import REPORT, ProcessedScan
 from polysight.report.figures import FIGURES, figures, masked_positions
 from polysight.report.style import colours_of, patch_colour, patch_label, plate_label
 from polysight.results import (
@@ -36,6 +36,7 @@ from polysight.results import (
     plain,
 )
 from polysight_shared.config import Instrument
+from polysight_shared.files import write_atomically
 from polysight_shared.geometry import incidence_deg
 
 DASH = "–"

@@ -15,9 +15,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from polysight.products import write_atomically, write_json
+from polysight.products import write_json
 from polysight.report.style import INK, MUTED, STAMP, png
 from polysight.sync import STAGES, SyncedRow
+from polysight_shared.files import write_atomically
 
 PAPER = {"frequency_hz": 138.0, "phase_rad": 0.022}
 """Standard deviations after all stages, paper section 9.1."""

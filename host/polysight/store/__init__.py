@@ -8,7 +8,7 @@ chirps.
 """
 
 from polysight.store import manifest
-from polysight.store.logs import EventWriter, LogDigest, read_events, sync_folder
+from polysight.store.logs import EventWriter, LogDigest, read_events
 from polysight.store.manifest import (
     MANIFEST,
     BoardRow,
@@ -136,7 +136,6 @@ __all__ = [
     "replace_rows",
     "require_raw",
     "rig_of",
-    "sync_folder",
     "to_json",
     "to_text",
     "utc_now",

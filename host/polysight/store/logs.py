@@ -4,7 +4,7 @@
 stream the file. Each map has a CRC-32, as each line of the manifest has. A torn last event, after a kill or power cut,
 is cut off before appending; the journal of the Pi contains it.
 
-`sync_folder` makes names in a folder durable; `crc32` is that of zlib-ng if it is installed.
+`crc32` is that of zlib-ng if it is installed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import msgspec
 from polysight.capture import write_error
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError, ProtocolError
-from polysight_shared.files import open_to_write
+from polysight_shared.files import open_to_write, sync_folder
 from polysight_shared.messages import AnyEvent, pack_with_crc, unpack_with_crc
 
 try:
@@ -31,7 +31,7 @@ try:
 except ImportError:
     from zlib import crc32
 
-__all__ = ["AppendFile", "EventLog", "EventWriter", "LogDigest", "crc32", "read_events", "sync_folder"]
+__all__ = ["AppendFile", "EventLog", "EventWriter", "LogDigest", "crc32", "read_events"]
 
 
 class AppendFile:
@@ -103,19 +103,6 @@ class AppendFile:
     def close(self) -> None:
         """Close the file. Safe to repeat."""
         self._file.close()
-
-
-def sync_folder(path: Path) -> None:
-    """Make names that were created, renamed or removed in a folder durable. Raises DeviceError."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-    except OSError as e:
-        what, why = f"{path}: cannot be made durable: {e.strerror}", "the disk is full or fails"
-        raise DeviceError(what, why, f"free space below {path}", code=ErrorCode.FILE_UNWRITABLE) from None
 
 
 DAMAGED = ".damaged"  # suffix of the file with the data that was cut off

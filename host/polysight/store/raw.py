@@ -26,12 +26,13 @@ from polysight.capture import (
     write_index,
     write_packets,
 )
-from polysight.store.logs import crc32, sync_folder
+from polysight.store.logs import crc32
 from polysight.store.manifest import BoardRow, DroppedFile, ManifestWriter, RawDropped, RowCommitted
 from polysight.store.scan_folder import ScanFolder, dropped_files, utc_now
 from polysight.store.validation import board_faults, to_text
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError, ScanError
+from polysight_shared.files import sync_folder
 
 Digests = dict[str, dict[int, str]]
 """CRC-32 (hex) of the payload from which a product was made, by board and row."""

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from polysight.capture import kind_of, read_index
 from polysight.store import manifest
-from polysight.store.logs import crc32, sync_folder
+from polysight.store.logs import crc32
 from polysight.store.manifest import (
     MANIFEST,
     BoardRow,
@@ -52,7 +52,7 @@ from polysight_shared import __version__
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError
-from polysight_shared.files import open_regular
+from polysight_shared.files import open_regular, sync_folder
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan
 from polysight_shared.tables import decode, to_builtins

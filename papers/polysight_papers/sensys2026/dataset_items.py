@@ -117,10 +117,14 @@ def repeated(samples: Samples) -> Samples | None:
 
 
 def _split_one_scan(samples: Samples) -> Samples:
-    """Pixels of one scan as if of two, every other pixel each: only for the split by pixel, which is no better."""
+    """Pixels of one scan as if of two, every other pixel each: only for the split by pixel, which is no better.
+
+    The halves of a patch are two patches, because weights are fitted to a few pixels of each patch.
+    """
     if np.unique(samples.groups).size > 1:
         return samples
-    return replace(samples, groups=np.array(["even", "odd"])[np.arange(samples.names.size) % 2])
+    half = np.arange(samples.names.size) % 2
+    return replace(samples, groups=np.array(["even", "odd"])[half], patches=2 * samples.patches + half)
 
 
 class Judgements:

@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from matplotlib.figure import Figure
 
 from polysight.jobs.output import steps
-from polysight.products import write_atomically, write_json
+from polysight.products import write_json
 from polysight.report import STAMP, png
 from polysight_papers.sensys2026.classification import fig18, fig20
 from polysight_papers.sensys2026.images import fig4, fig13, fig14, fig19
@@ -24,6 +24,7 @@ from polysight_papers.sensys2026.permittivities import fig3, fig16, fig17, fig21
 from polysight_papers.sensys2026.synchronisation import fig9, fig12, fig15
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, PolysightError
+from polysight_shared.files import write_atomically
 
 TITLES: dict[str, str] = {
     "fig3": "Fresnel reflection of common materials",

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import pytest
 
 Fault = Literal["full", "short", "killed", "killed within", "power cut", "worst power cut"]
-SEEN = ("open", "pwrite", "fsync", "mkdir", "rename", "unlink", "ftruncate", "posix_fallocate")
+SEEN = ("open", "pwrite", "fsync", "mkdir", "rename", "replace", "unlink", "ftruncate", "posix_fallocate")
 REAL_OPEN = io.open
 REAL = SimpleNamespace(**{name: getattr(os, name) for name in SEEN})
 GROWS = ("write", "pwrite", "posix_fallocate", "create", "mkdir", "rename", "fsync")
@@ -108,7 +108,7 @@ class FaultyDisk:
     def __call__(self) -> Iterator[FaultyDisk]:
         """Redirect all disk operations of the block to this object."""
         calls = {"open": self._os_open, "pwrite": self._pwrite, "fsync": self._fsync, "mkdir": self._mkdir}
-        calls |= {"rename": self._rename, "unlink": self._unlink}
+        calls |= {"rename": self._rename, "replace": self._rename, "unlink": self._unlink}
         calls |= {name: partial(self._on_file, name) for name in ("ftruncate", "posix_fallocate")}
         try:
             with pytest.MonkeyPatch.context() as patch:

@@ -1,0 +1,112 @@
+"""Life of a command: closed or full output, Ctrl-C at any moment. One message, no traceback, an exit status."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tests.support.paths import BIN, RIG_FILE
+from tests.support.processes import wait_for
+from tests.support.products import judged_products
+
+POLYSIGHT = str(BIN / "polysight")
+
+
+@pytest.fixture
+def products(tmp_path) -> Path:
+    return judged_products(tmp_path / "products", "good")
+
+
+def run_in_shell(line: str, folder: Path) -> tuple[int, str]:
+    """Exit status and stderr of a line of a shell, in which $P is `polysight`."""
+    environment = {**os.environ, "P": POLYSIGHT, "PYTHONUNBUFFERED": ""}
+    done = subprocess.run(["sh", "-c", line], cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize("command", ["materials products", "--help"])
+@pytest.mark.parametrize("streams", [">&-", "<&- >&- 2>&-"])
+def test_closed_streams_are_the_null_device(products, command, streams):
+    assert run_in_shell(f"$P {command} {streams}", products.parent) == (0, "")
+
+
+def test_a_file_never_takes_the_place_of_a_closed_stream(products):
+    """Else what a command prints would be written into the file that it opened first."""
+    assert run_in_shell("$P export products --csv --out o <&- >&- 2>&-", products.parent) == (0, "")
+    table = (products.parent / "o" / "materials.csv").read_text()
+    assert "PET" in table
+    assert "writing" not in table
+
+
+@pytest.mark.parametrize("command", ["materials products", "--help"])
+def test_output_that_cannot_be_written_is_an_error(products, command):
+    status, said = run_in_shell(f"$P {command} >/dev/full", products.parent)
+    assert status == 5
+    assert "No space left" in said
+    assert "Traceback" not in said
+    assert "Exception ignored" not in said
+
+
+# A module that takes long to load, as extensions do. It ends when it is interrupted, or when the file `go` is there.
+SLOW_MODULE = """
+import sys
+from pathlib import Path
+sys.stderr.write("loading, ")
+sys.stderr.flush()
+while not Path("go").exists():
+    pass
+sys.stderr.write("loaded, ")
+"""
+INTERRUPT_WHILE_LOADING = """
+import sys
+import polysight.cli.materials
+from polysight.cli.main import main
+def load(args):
+    import slow_module
+    while True:
+        pass
+polysight.cli.materials._materials = load
+sys.exit(main(["materials", "x"]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_waits_for_the_module_that_is_loading(tmp_path, number):
+    """Extensions that are interrupted while they load end in a traceback, or in a segmentation fault."""
+    (tmp_path / "slow_module.py").write_text(SLOW_MODULE)
+    said = tmp_path / "said"
+    with said.open("w") as err:
+        program = subprocess.Popen([sys.executable, "-c", INTERRUPT_WHILE_LOADING], cwd=tmp_path, stderr=err)
+    wait_for(lambda: "loading" in said.read_text(), "the module loads")
+    program.send_signal(number)
+    (tmp_path / "go").touch()
+    assert program.wait(60) == 128 + signal.SIGINT
+    assert said.read_text() == "loading, loaded, polysight materials: stopped\n"
+
+
+INTERRUPT_AFTER = """
+import signal, sys
+from polysight.cli.main import main
+signal.signal(signal.SIGPROF, lambda *_: signal.raise_signal(signal.SIGINT))
+signal.setitimer(signal.ITIMER_PROF, float(sys.argv[1]))
+status = main(sys.argv[2:])
+signal.setitimer(signal.ITIMER_PROF, 0)
+sys.exit(status)
+"""
+
+
+def test_an_interrupt_at_any_moment_ends_in_one_line():
+    """A command is interrupted after growing CPU times, until it is finished before."""
+    ends = []
+    for cpu_ms in range(2, 5000, 60):
+        command = [sys.executable, "-c", INTERRUPT_AFTER, f"{cpu_ms / 1e3}", "plan", "--config", str(RIG_FILE)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        ends.append((done.returncode, done.stderr))
+        if done.returncode == 0:
+            break
+    assert len(ends) > 1
+    assert set(ends[:-1]) == {(128 + signal.SIGINT, "polysight plan: stopped\n")}

@@ -1,0 +1,101 @@
+"""What a command writes is there as a whole or not at all, under a full disk, a kill and a power cut, everywhere.
+
+Every operation on the disk fails once. Then the command is repeated, and does what it was asked for.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tests.support.products import PIXEL, judged_products
+from tests.support.store.faulty_disk import FaultyDisk, Killed
+
+import polysight.catalogue
+from polysight.cli.main import main
+from polysight.jobs import label
+from polysight.materials import SIMULATED_LIBRARY, Library
+from polysight.products import exports
+from polysight_shared.errors import PolysightError
+
+Command = Callable[[Path], int]
+
+
+def run(*words: str) -> Command:
+    """A command on the products `one` and `two` in a folder."""
+    return lambda folder: main([word.replace("%", str(folder)) for word in words])
+
+
+def save_library(folder: Path) -> int:
+    """The end of `polysight train`."""
+    known = Library.load(SIMULATED_LIBRARY)
+    Library(known.entries[:4], {}, "new").save(folder / "one" / "library.npz")
+    return 0
+
+
+COMMANDS = {
+    "label": run("label", "%/one", "--box", "sheet=-40,-10,-30,10", "--box", "oak=0,0,10,10", "--metal", "sheet"),
+    "label again": run("label", "%/two", "--box", "sheet=-40,-10,-30,10"),
+    "note": run("note", "%/one", "--text", "oak, second board", "--tag", "oak"),
+    "export": run("export", "%/one", "--csv", "--mat", "--netcdf", "--out", "%/one/export"),
+    "compare": run("compare", "%/one", "%/two", "--png", "%/one/difference.png"),
+    "train": save_library,
+}
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("before")
+    for name in ("one", "two"):
+        judged_products(folder / name, "good")
+    assert main(["label", str(folder / "two"), "--box", "plate=20,0,30,10", "--metal", "plate"]) == 0
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch) -> None:
+    """Nothing is drawn or compressed again for every fault."""
+    monkeypatch.setattr(label, "label_figure", lambda *_: PIXEL)
+    drawn = type("Drawn", (), {"png": PIXEL})
+    monkeypatch.setattr(polysight.catalogue, "draw_comparison", lambda *_: drawn)
+    for pack in ("pack_netcdf", "pack_mat"):
+        monkeypatch.setattr(exports, pack, lambda _: b"packed")
+
+
+def written(folder: Path) -> dict[str, bytes]:
+    """Files that a person sees."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("fault", ["full", "short", "killed", "killed within", "worst power cut"])
+def test_everything_or_nothing_is_written_and_the_command_can_be_repeated(before, tmp_path, name, fault):
+    command = COMMANDS[name]
+    whole = Path(shutil.copytree(before, tmp_path / "whole"))
+    with FaultyDisk(whole)() as disk:
+        assert command(whole) == 0
+    old, new = written(before), written(whole)
+    assert old.keys() != new.keys() or old != new
+    (last_rename,) = [step.split()[1] for step in disk.done if step.startswith("rename")][-1:]
+    (committing,) = [name for name in new if name.endswith(f"/{last_rename}") and new[name] != old.get(name)]
+    for at in range(1, len(disk.done) + 1):
+        folder = Path(shutil.copytree(before, tmp_path / f"{at}"))
+        try:
+            with FaultyDisk(folder, fault, at)():
+                status = command(folder)
+        except (Killed, OSError, PolysightError):
+            status = 1
+        left = written(folder)
+        committed = left == new
+        if status == 0:
+            assert committed, (at, disk.done[at - 1])
+        if fault in ("full", "short"):
+            assert not list(folder.rglob(".*.part")), "what failed leaves nothing behind"
+        if not committed:
+            # A picture may be new already: the file that makes it count is the old one.
+            assert left.get(committing) == old.get(committing), (at, disk.done[at - 1])
+        assert command(folder) == 0, (at, disk.done[at - 1])
+        assert written(folder) == new

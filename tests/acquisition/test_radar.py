@@ -10,7 +10,7 @@ import sys
 
 import msgspec
 import pytest
-from tests.support.processes import wait_for
+from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 
@@ -30,13 +30,13 @@ class Server:
 
     def __init__(self) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))
-        self.listener.settimeout(30)
+        self.listener.settimeout(HANG_S)
         self.address = f"127.0.0.1:{self.listener.getsockname()[1]}"
         self.clients: list[socket.socket] = []
 
     def accept(self) -> socket.socket:
         client, _ = self.listener.accept()
-        client.settimeout(30)
+        client.settimeout(HANG_S)
         self.clients.append(client)
         return client
 
@@ -134,7 +134,7 @@ def test_half_open_connection_is_noticed():
     if shutil.which("ip") is None or subprocess.run(["unshare", "-rn", "true"], check=False).returncode:
         pytest.skip("needs iproute2 and user namespaces")
     done = subprocess.run(
-        ["unshare", "-rn", sys.executable, "-c", HALF_OPEN], capture_output=True, text=True, check=True, timeout=60
+        ["unshare", "-rn", sys.executable, "-c", HALF_OPEN], capture_output=True, text=True, check=True, timeout=HANG_S
     )
     assert "did not acknowledge the line within 0.5 s" in done.stdout
     assert "half-open" in done.stdout

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.support.processes import HANG_S
 
 from polysight.store import validate
 
@@ -27,7 +28,7 @@ open(sys.argv[1], "w").write(json.dumps([status, loaded]))
 def modules_after(*words: object, note: Path) -> list[str]:
     """Run a command of `polysight` in a process of its own; return the modules of ours that it loaded."""
     command = [sys.executable, "-c", PROGRAM, str(note), *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=HANG_S, check=False)
     status, loaded = json.loads(note.read_text())
     assert status == 0, done.stderr
     return loaded

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 from tests.support.acquisition.receivers import receiver_of
+from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 
@@ -146,7 +147,7 @@ def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, tmp_
             release.set()
 
     with refused(ErrorCode.NO_ANSWER, board) as e:
-        run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: release.wait(60) and None, progress=progress)
+        run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: release.wait(HANG_S) and None, progress=progress)
     assert "1 of 4 rows are safe" in e.value.remedy
     assert commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
     assert rig.pi.hanging is None

@@ -14,6 +14,7 @@ import msgspec
 import pytest
 import zmq
 from tests.support.acquisition.receivers import receivers
+from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 
@@ -35,7 +36,7 @@ def test_next_row_waits_for_processing_with_a_notice(rig, tmp_path):
     release, started, at_wait = threading.Event(), [], []
 
     def on_row(_: int) -> None:
-        assert release.wait(60)
+        assert release.wait(HANG_S)
 
     def progress(p) -> None:
         if p.phase == "row" and p.message:
@@ -62,7 +63,7 @@ def test_stop_while_waiting_for_processing(rig, tmp_path):
             release.set()
 
     result = run_scan(
-        limited(rig.instrument, rows_waiting=1), tmp_path / "s", on_row=lambda _: release.wait(60) and None,
+        limited(rig.instrument, rows_waiting=1), tmp_path / "s", on_row=lambda _: release.wait(HANG_S) and None,
         progress=progress, stop=stop,
     )  # fmt: skip
     assert (result.exit_status, sorted(result.folder.committed())) == ("abort", [0, 1])
@@ -78,7 +79,7 @@ def test_rows_of_an_earlier_run_hold_nothing_up(rig, tmp_path):
         if p.phase == "committed":
             release.set()
 
-    resume_scan(tmp_path / "s", on_row=lambda _: release.wait(60) and None, progress=progress)
+    resume_scan(tmp_path / "s", on_row=lambda _: release.wait(HANG_S) and None, progress=progress)
     assert waits == []
 
 

@@ -15,13 +15,6 @@ from polysight_shared.config import Instrument
 from polysight_simulators.loopback import on_free_subnet
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests of whole programs are limited by what they wait for: on a busy machine they take many times as long."""
-    for item in items:
-        if Path(__file__).parent in item.path.parents and item.get_closest_marker("timeout") is None:
-            item.add_marker(pytest.mark.timeout(1800))
-
-
 @pytest.fixture(scope="session")
 def running_rig() -> Callable[..., AbstractContextManager[Rig]]:
     return running

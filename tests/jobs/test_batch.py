@@ -289,7 +289,6 @@ batch.run_scan(batch.make_jobs([(Path(sys.argv[1]), batch.Settings())], Path(sys
 """
 
 
-@pytest.mark.timeout(900)
 def test_the_program_of_a_killed_worker_ends_with_it(tmp_path):
     scans(tmp_path / "in", "a")
     answer = tmp_path / "pid"
@@ -308,7 +307,6 @@ def test_the_program_of_a_killed_worker_ends_with_it(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_a_killed_dask_worker_loses_no_scan(tmp_path):
     """One of two workers is killed while it processes; its nanny starts another one, and every scan is done."""
     distributed = pytest.importorskip("distributed", reason="the host's extra `dask` is not installed")
@@ -333,7 +331,6 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
     assert (tmp_path / "out" / "runs.txt").read_text().split().count("slow") == 2
 
 
-@pytest.mark.timeout(900)
 def test_real_scans_end_to_end(tmp_path, capsys):
     """A simulated scan and a damaged one by the real program; then the mark holds."""
     plate = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "metal": True}

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.page.chromium import DESK, PHONE
 from tests.support.page.live_view import GrowingScan, served
-from tests.support.processes import LIMIT_S, wait_for
+from tests.support.processes import wait_for
 from tests.support.products import REASON, judged_products
 from tests.support.store.facts import typed
 
@@ -42,7 +42,7 @@ def truth(finished):
 def test_a_finished_folder_is_shown_as_it_is(finished, truth, watching):
     scan, pipeline, pictures = truth
     watch = watching(finished)
-    assert watch.wait_for(shows(scan.plan.rows), LIMIT_S)
+    watch.wait_for(shows(scan.plan.rows))
     state = answer(watch)
     assert (state["status"]["level"], state["scan"]["marks"]) == ("done", "ccc")
     assert (state["scan"]["rows"], state["scan"]["committed"]) == (3, 3)
@@ -64,12 +64,12 @@ def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
     assert answer(watch)["scan"] is None
     growing.live()
     growing.grow_to("scan_started")
-    assert watch.wait_for(lambda s: s["scan"] is not None, LIMIT_S)
+    watch.wait_for(lambda s: s["scan"] is not None)
     assert answer(watch)["scan"]["marks"] == "..."
     revision = 0
     for row in range(3):
         growing.grow_to("row_committed")
-        assert watch.wait_for(shows(row + 1), LIMIT_S)
+        watch.wait_for(shows(row + 1))
         state = answer(watch)
         assert state["scan"]["marks"] == "c" * (row + 1) + "." * (2 - row)
         assert state["pictures"]["revision"] > revision
@@ -77,7 +77,7 @@ def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
         revision = state["pictures"]["revision"]
     assert answer(watch)["status"]["level"] == "good"
     growing.grow_to("scan_ended")
-    assert watch.wait_for(lambda s: s["status"]["level"] == "done", LIMIT_S)
+    watch.wait_for(lambda s: s["status"]["level"] == "done")
 
 
 def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
@@ -90,7 +90,7 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
         return state["status"]["level"] == "good" and state["running"]
 
     wait_for(lives, "that it lives")
-    assert watch.wait_for(lambda s: s["status"]["headline"] == "The scan program has ended", LIMIT_S)
+    watch.wait_for(lambda s: s["status"]["headline"] == "The scan program has ended")
     state = answer(watch)
     assert not state["running"]
     assert "polysight resume" in state["status"]["do"]
@@ -109,18 +109,18 @@ def test_a_damaged_row_is_named_and_the_others_are_shown(growing, watching):
     while growing.grow():
         pass
     watch = watching(growing.path)
-    assert watch.wait_for(shows(2), LIMIT_S)
-    assert watch.wait_for(lambda s: len(s["notices"]) == 1, LIMIT_S)
+    watch.wait_for(shows(2))
+    watch.wait_for(lambda s: len(s["notices"]) == 1)
     assert "0001.bin" in answer(watch)["notices"][0]["what"]
 
 
 def test_another_scan_in_the_same_place_begins_afresh(growing, finished, watching):
     growing.grow_to("row_committed")
     watch = watching(growing.path, lapse_s=1e6)
-    assert watch.wait_for(shows(1), LIMIT_S)
+    watch.wait_for(shows(1))
     shutil.rmtree(growing.path)
     shutil.copytree(finished, growing.path)
-    assert watch.wait_for(shows(3), LIMIT_S)
+    watch.wait_for(shows(3))
     assert answer(watch)["status"]["level"] == "done"
 
 
@@ -133,7 +133,7 @@ def test_looking_on_changes_nothing_in_the_folder(finished, watching, tmp_path):
 
     before = content()
     watch = watching(folder, control=True)
-    assert watch.wait_for(shows(3), LIMIT_S)
+    watch.wait_for(shows(3))
     watch.close()
     assert content() == before
 
@@ -222,10 +222,10 @@ def test_it_is_shown_when_the_scan_has_ended(growing: GrowingScan, watching):
     growing.grow_to("row_committed")
     judged_products(growing.path / "products", "care")
     watch = watching(growing.path)
-    assert watch.wait_for(lambda s: s["scan"] is not None, LIMIT_S)
+    watch.wait_for(lambda s: s["scan"] is not None)
     assert json.loads(watch.state.data)["verdict"] is None  # of an earlier run of the scan
     growing.grow_to("scan_ended")
-    assert watch.wait_for(lambda s: s["verdict"] is not None, LIMIT_S)
+    watch.wait_for(lambda s: s["verdict"] is not None)
     answer = json.loads(watch.state.data)["verdict"]
     assert answer["level"] == "care"
     assert [{key: r[key] for key in REASON} for r in answer["reasons"]] == [REASON]
@@ -235,7 +235,7 @@ def test_the_page_shows_it(browser, finished, watching, tmp_path):
     scan = shutil.copytree(finished, tmp_path / "scan")
     judged_products(scan / "products", "none")
     watch = watching(scan)
-    assert watch.wait_for(lambda s: bool(s.get("verdict")), LIMIT_S)
+    watch.wait_for(lambda s: bool(s.get("verdict")))
     with served(watch) as view:
         for size in (DESK, PHONE):
             browser.visit(view.address + "/", size)

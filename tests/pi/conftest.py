@@ -125,7 +125,7 @@ class Running:
     def close(self) -> None:
         self.host.close()
         self.service.stop()
-        self.thread.join(5)
+        self.thread.join()
         self.service.close()
 
 

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.support.pi.fakes import FakeLines, gone
+from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
@@ -112,7 +113,7 @@ class Loop:
         self.lines.edges.put(Edge(t_ms * 1_000_000, seqno))
 
     def next(self):
-        return self.posted.get(timeout=5)
+        return self.posted.get(timeout=HANG_S)
 
     def __enter__(self):
         return self
@@ -205,7 +206,7 @@ def test_an_exception_inside_a_pulse_leaves_the_outputs_low_and_is_a_fault(monke
         fault = x.next()
         assert (fault.number, fault.job) == (PiFault.TRIGGER_LINE_LOST, None)
         assert "a bug" in fault.detail
-        assert isinstance(raised.get(timeout=60), ZeroDivisionError)
+        assert isinstance(raised.get(timeout=HANG_S), ZeroDivisionError)
         assert tuple(active for _, active in x.lines.changes) == (True, False)
 
 
@@ -221,7 +222,7 @@ def test_disarming_ends_a_running_burst_after_its_pulse():
     with Loop(lines=FakeLines(late=disarm)) as x:
         x.edge(100, 1)
         assert x.next().record.pulses == 3
-        assert counted.get(timeout=60) == Counts(1, 1, 3)
+        assert counted.get(timeout=HANG_S) == Counts(1, 1, 3)
 
 
 def test_stop_within_a_burst_ends_it_at_a_whole_pulse():

@@ -13,7 +13,6 @@ import resource
 import signal
 import subprocess
 import sys
-import time
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +21,7 @@ import msgspec
 import pytest
 from tests.support.paths import REPO
 from tests.support.pi.program import WiresLog, require_stand_in_chip, run
+from tests.support.processes import wait_for
 from tests.support.stage.processes import StageProcess
 
 from polysight_pi.system import OTHERS_PRIORITY, PRIORITY
@@ -356,10 +356,9 @@ def test_all_threads_are_scheduled_and_the_trigger_thread_first(start, gpio_rig)
     if not may_schedule():
         pytest.skip("SCHED_FIFO is not permitted here: run as root, or with RLIMIT_RTPRIO")
     program, _ = start(gpio_rig, **gpio.environment(gpio_rig.pi.gpio_chip))
-    deadline = time.monotonic() + 60
-    while PRIORITY not in (found := priorities(program.popen.pid)):  # `ready` comes before the threads
-        assert time.monotonic() < deadline, found
-        time.sleep(0.02)
+    # `ready` comes before the threads.
+    wait_for(lambda: PRIORITY in priorities(program.popen.pid), "the trigger thread")
+    found = priorities(program.popen.pid)
     assert found.count(PRIORITY) == 1
     assert found.count(OTHERS_PRIORITY) >= 3  # main, stage, executor
     assert "real-time" not in program.end()[2]

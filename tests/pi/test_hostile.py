@@ -24,6 +24,7 @@ import pytest
 import zmq
 from tests.support.pi.host_side import HostSide
 from tests.support.pi.program import WiresLog, resident_bytes
+from tests.support.processes import HANG_S, wait_for
 
 from polysight_pi import executor as executors
 from polysight_pi.executor import REPLAYS_WAITING
@@ -164,12 +165,8 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
             if isinstance(event, m.RowFinished):
                 assert (event.status, event.pulses) == ("done", instrument.grid.columns * instrument.burst.pulses)
                 taken += 1
-                deadline = time.monotonic() + 60
-                while isinstance(
-                    host.ask(m.RunRow(scan_id="scan", row_index=0, take=taken + 1, owner="mine")), m.Refused
-                ):
-                    assert time.monotonic() < deadline
-                    time.sleep(0.01)
+                again = m.RunRow(scan_id="scan", row_index=0, take=taken + 1, owner="mine")
+                wait_for(lambda row=again: not isinstance(host.ask(row), m.Refused), "the next row")
             host.accepted(m.Alive(scan_id="scan", owner="mine"))
     assert resident_bytes() - before < BOUND_BYTES
     assert pi.service.executor.crash is None
@@ -257,7 +254,7 @@ def frame(body: bytes, flags: int = 0) -> bytes:
 def connected(address: str, kind: bytes) -> socket.socket:
     """A connection after its handshake, as a socket of this kind."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
-    peer = socket.create_connection((host, int(port)), timeout=60)
+    peer = socket.create_connection((host, int(port)), timeout=HANG_S)
     peer.sendall(GREETING)
     peer.recv(len(GREETING), socket.MSG_WAITALL)
     peer.sendall(frame(b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind, COMMAND))
@@ -317,15 +314,16 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     host.wait(m.Heartbeat, lambda beat: beat.t_mono_ns > cut_ns)  # events were cut off, too: they come again
     # What is left of the messages may have the connections cut once more, and a command or an event with them.
     host.limit_s = 5.0
-    deadline = time.monotonic() + 120
-    for take in itertools.count(1):
-        assert time.monotonic() < deadline, "no row is done"
+    takes = itertools.count(1)
+
+    def is_done() -> bool:
         with suppress(AssertionError):
-            assert host.row(0, take).status == "done"
-            break
-    deadline = time.monotonic() + 60
-    while resident_bytes(pid) >= HIGHEST_BYTES and time.monotonic() < deadline:
-        time.sleep(0.1)
+            return host.row(0, next(takes)).status == "done"
+        return False
+
+    wait_for(is_done, "a row", 120.0)
+    with suppress(AssertionError):
+        wait_for(lambda: resident_bytes(pid) < HIGHEST_BYTES, "that its memory is free")
     status, _, err = program.end()
     assert status == 0
     assert "connections were cut" in err, (sent, highest)
@@ -348,7 +346,7 @@ def test_a_queue_that_never_empties_is_not_a_hang(pi, monkeypatch):
 def test_replays_do_not_keep_other_commands_waiting(pi):
     """Only few of them wait at a time; more are refused."""
     slow = threading.Event()
-    pi.service.executor.post(lambda: slow.wait(60))
+    pi.service.executor.post(lambda: slow.wait(HANG_S))
     replay = m.Replay(scan_id="scan", from_seq=1)
     taken = [pi.service.executor.submit(replay, lambda _: None) for _ in range(10)]
     assert taken == [True] * REPLAYS_WAITING + [False] * (10 - REPLAYS_WAITING)

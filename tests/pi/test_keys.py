@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import shutil
 import threading
-import time
 from pathlib import Path
 
 import msgspec
 import pytest
 import zmq
 from tests.support.paths import REPO, RIG_FILE
+from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused as expect_refused
 from tests.support.rigs import published_rig
 from zmq.auth import load_certificate
@@ -59,7 +59,7 @@ def served(tmp_path):
     thread.start()
     yield server
     server.stop()
-    thread.join(10)
+    thread.join()
     server.close()
 
 
@@ -89,13 +89,6 @@ def client_of(context):
         socket.close(linger=0)
 
 
-def until(there, limit_s=60.0):
-    deadline = time.monotonic() + limit_s
-    while not there() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert there()
-
-
 KEYS = {
     "allowed": ("keys/host.key_secret", "keys/pi.key"),
     "another Pi's key": ("keys/host.key_secret", "other/pi.key"),
@@ -111,13 +104,13 @@ def test_only_allowed_keys_connect(tmp_path, served, client_of, which):
     listener, _ = client_of(zmq.SUB, served.event_address, mine, pis)
     listener.subscribe(b"")
     if which == "allowed":
-        assert client.poll(60_000)
+        assert client.poll(HANG_S * 1e3)
         assert isinstance(m.unpack_reply(client.recv()), m.HelloReply)
         assert not refused()
-        assert listener.poll(60_000)
+        assert listener.poll(HANG_S * 1e3)
         return
     if which != "another Pi's key":  # which cannot be told from silence
-        until(refused)
+        wait_for(refused, "the refusal")
     assert not listener.poll(300)
     assert not client.poll(0)
 
@@ -135,7 +128,7 @@ def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served, c
 
     def ask(name):
         clients[name][0].send(m.pack(m.Hello()))
-        assert clients[name][0].poll(60_000)
+        assert clients[name][0].poll(HANG_S * 1e3)
         return m.unpack_reply(clients[name][0].recv())
 
     assert [type(ask(name)) for name in clients] == [m.HelloReply, m.HelloReply]
@@ -146,7 +139,7 @@ def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served, c
     assert isinstance(ask("host"), m.HelloReply)
     again, refused = client_of(zmq.REQ, served.command_address, secret, keys / "pi.key")
     again.send(m.pack(m.Hello()))
-    until(refused)
+    wait_for(refused, "the refusal")
     with expect_refused(ErrorCode.KEY_UNKNOWN, "laptop"):
         revoke(keys, "laptop")
     with expect_refused(ErrorCode.NAME_TAKEN, "host"):
@@ -187,7 +180,7 @@ def test_the_files_to_copy_are_enough_for_the_host(tmp_path, served, context):
     # The kernel takes any of this machine's own addresses; 0.0.0.0 is none of the loopback ones.
     client = requester(context, f"tcp://0.0.0.0:{port}", tmp_path / "host")
     client.send(m.pack(m.Hello()))
-    assert client.poll(60_000)
+    assert client.poll(HANG_S * 1e3)
     client.close()
     install = (REPO / "docs/how-to/install.md").read_text(encoding="utf-8")
     assert f"tar -c -C /etc/polysight/keys {' '.join(HOST_KEYS)} |" in install

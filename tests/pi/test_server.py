@@ -2,6 +2,7 @@
 
 import msgspec
 import pytest
+from tests.support.processes import HANG_S
 
 from polysight.acquisition.pi_client import HostHeartbeat
 from polysight_pi.lines import GpiodLines, SpiLines, WireLines
@@ -237,7 +238,7 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(pi, 
     monkeypatch.setattr("polysight_pi.machine.Machine.on_burst", fail)
     stage.pace_s = 0.2  # the reply to the row goes out before its first edge comes
     host.start_row()
-    pi.thread.join(60)
+    pi.thread.join(HANG_S)
     assert raised == [ZeroDivisionError, DeviceError], "in the executor's thread, and out of `serve`"
     pi.service._loop.stop()
     assert not pi.service._loop._lines._active

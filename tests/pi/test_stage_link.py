@@ -10,7 +10,7 @@ from contextlib import closing
 import msgspec
 import pytest
 from tests.support.pi.fakes import FakeStage
-from tests.support.processes import wait_for
+from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
 from tests.support.rigs import at_stage_port
 from tests.support.stage.processes import StageProcess
@@ -88,7 +88,7 @@ def test_answers_are_told_apart_from_what_comes_by_itself(dry_stage, connect):
     dry_stage.say(Reply("alarm", number=12))
     link.request("SET", 1, 500)
     link.send_byte(Immediate.STATUS)
-    kinds = [news.get(timeout=5).kind for _ in range(3)]
+    kinds = [news.get(timeout=HANG_S).kind for _ in range(3)]
     assert sorted(kinds) == ["alarm", "ok", "status"]
     assert link.bad_lines == 2
 
@@ -96,9 +96,9 @@ def test_answers_are_told_apart_from_what_comes_by_itself(dry_stage, connect):
 def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage, connect):
     link, news = connect(heartbeat_s=0.2)
     link.ask_status_every(0.02)
-    assert news.get(timeout=5).kind == "status"
+    assert news.get(timeout=HANG_S).kind == "status"
     dry_stage.deaf = True
-    while not isinstance(lost := news.get(timeout=5), StageLost):
+    while not isinstance(lost := news.get(timeout=HANG_S), StageLost):
         pass
     assert "silent" in lost.reason
     with pytest.raises(StageLostError):
@@ -108,7 +108,7 @@ def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage, connect):
 def test_a_pulled_cable_is_a_lost_stage(dry_stage, connect):
     link, news = connect()
     dry_stage.unplug()
-    assert isinstance(news.get(timeout=5), StageLost)
+    assert isinstance(news.get(timeout=HANG_S), StageLost)
     with pytest.raises(StageLostError):
         link.send_byte(Immediate.STOP)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
@@ -79,9 +80,7 @@ def test_a_board_runs_a_row_over_its_socket(rig, served):
     radar.arm(2)
     for n in range(2):
         assert board.trigger(n * 1.5e-3)
-    deadline = time.monotonic() + 30
-    while radar.poll() is not State.DONE:
-        assert time.monotonic() < deadline
+    wait_for(lambda: radar.poll() is State.DONE, "the end of the row")
     assert made.chip.errors == []
     radar.close()
 
@@ -109,7 +108,7 @@ def test_a_split_request_is_processed(served):
     made, _ = served
     ask = struct.pack("<ccH", b"B", b"W", 2) + b"\x81\x87" + struct.pack("<ccH", b"B", b"R", 1)
     with socket.create_connection(("127.0.0.1", int(made.address.rpartition(":")[2]))) as client:
-        client.settimeout(30)
+        client.settimeout(HANG_S)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         for byte in ask:
             client.sendall(bytes((byte,)))

@@ -7,7 +7,7 @@ import time
 import pytest
 from tests.support.page.chromium import DESK, PHONE, Browser
 from tests.support.page.live_view import GrowingScan, open_control, served
-from tests.support.processes import LIMIT_S, wait_for
+from tests.support.processes import wait_for
 from tests.support.rigs import published_rig
 
 from polysight_simulators.loopback import on_free_subnet
@@ -25,7 +25,7 @@ def opened(browser: Browser, view, size=DESK, token: str = "") -> None:
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
 def test_a_finished_scan_at_a_glance(browser, finished, watching, tmp_path, size):
     watch = watching(finished)
-    assert watch.wait_for(lambda s: s["pictures"]["rows"] == 3, LIMIT_S)
+    watch.wait_for(lambda s: s["pictures"]["rows"] == 3)
     with served(watch) as view:
         opened(browser, view, size)
         browser.wait(f"{PICTURES}.length == 6 && {PICTURES}.every(i => i.naturalWidth == 12)", "six pictures")

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import tomli_w
 from tests.simulators.card_bench import ALIVE, EEPROM, FRAME, PERIOD_NS, START, Bench, payload, reply
+from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 
 from polysight_shared.config import Instrument
@@ -43,7 +44,7 @@ class HostSide:
         self.commands = sockets.enter_context(bound_udp(self.board.host_address, self.board.command_port))
         self.data = sockets.enter_context(bound_udp(self.board.host_address, self.board.data_port))
         for s in (self.commands, self.data):
-            s.settimeout(5.0)
+            s.settimeout(HANG_S)
         self.data.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
 
     def request(self, code: int, body: bytes = b"") -> bytes:
@@ -69,7 +70,7 @@ class HostSide:
             try:
                 packet, source = self.data.recvfrom(2000)
             except BlockingIOError:
-                self.data.settimeout(5.0)
+                self.data.settimeout(HANG_S)
                 return got
             assert source == (self.board.card_address, 1024)
             got.append(packet)
@@ -117,7 +118,7 @@ def start(rig: Instrument, config: Path, tmp_path: Path) -> Iterator[Start]:
         yield begin
         for process in reversed(running):
             process.send_signal(signal.SIGTERM)
-            assert process.wait(5) == 0
+            assert process.wait(HANG_S) == 0
 
 
 @pytest.fixture
@@ -134,7 +135,7 @@ def pulse(start: Start, tmp_path: Path) -> Iterator[Callable[..., None]]:
         for k in range(first, first + n):
             edges += [WireEdge(k * PERIOD_NS, line, 1), WireEdge(k * PERIOD_NS + 1000, line, 0)]
         clients[0].send(*edges)
-        while clients[1].receive(5.0) != edges[-1]:
+        while clients[1].receive(HANG_S) != edges[-1]:
             pass
 
     yield send
@@ -174,7 +175,7 @@ def test_a_record_goes_on_while_the_stage_moves_or_owes_a_burst(
     stage.send(WireEdge(10 * PERIOD_NS, 26, 1), WireMotion(20 * PERIOD_NS, 0, 0, 0))
     with pytest.raises(TimeoutError):
         host.message()
-    host.commands.settimeout(5.0)
+    host.commands.settimeout(HANG_S)
     pulse(11, 2)
     assert payload(host.record()) == host.pattern(0, 4)
     stage.close()
@@ -189,7 +190,7 @@ def test_a_record_goes_on_while_the_stage_moves_or_owes_a_burst(
 )
 def test_wrong_arguments_are_one_message(config: Path, tmp_path: Path, arguments: list[str], words: str) -> None:
     command = [sys.executable, "-m", "polysight_simulators.cards", "--config", config, "--wires", tmp_path / "w.sock"]
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=20, check=False)
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert words in done.stderr
     assert "Traceback" not in done.stderr

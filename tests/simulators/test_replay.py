@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.support.processes import HANG_S
 from tests.support.rigs import published_rig
 
 from polysight_simulators import process, replay
@@ -53,13 +54,20 @@ Play = Callable[..., "Client"]
 class Client:
     """Binds 4096 and 4098 at the host's address, as they all do."""
 
-    def __init__(self, subnet: str, sockets: ExitStack) -> None:
+    def __init__(self, subnet: str, sockets: ExitStack, player: subprocess.Popen[str]) -> None:
+        self.player = player
         self.card = (f"{subnet}.180", 4096)
         self.commands = sockets.enter_context(bound_udp(f"{subnet}.30", 4096))
         self.data = sockets.enter_context(bound_udp(f"{subnet}.30", 4098))
         self.data.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         for s in (self.commands, self.data):
-            s.settimeout(5.0)
+            s.settimeout(HANG_S)
+
+    def end(self) -> None:
+        """End the card's program, which must succeed."""
+        if self.player.poll() is None:
+            self.player.send_signal(signal.SIGTERM)
+        assert self.player.wait(HANG_S) == 0
 
     def send(self, request: str) -> bytes:
         self.commands.sendto(bytes.fromhex(request), self.card)
@@ -93,7 +101,7 @@ def recording(tmp_path: Path) -> Path:
 @pytest.fixture
 def play() -> Iterator[Play]:
     with ExitStack() as sockets:
-        players: list[subprocess.Popen[str]] = []
+        clients: list[Client] = []
 
         def begin(source: Path, *arguments: str) -> Client:
             subnet = free_subnet()
@@ -101,15 +109,14 @@ def play() -> Iterator[Play]:
             command = [sys.executable, "-m", "polysight_simulators.replay", str(source), *addresses, *arguments]
             player = sockets.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
             sockets.callback(player.kill)
-            players.append(player)
             assert player.stdout is not None
             assert player.stdout.readline().startswith("ready")
-            return Client(subnet, sockets)
+            clients.append(Client(subnet, sockets, player))
+            return clients[-1]
 
         yield begin
-        for player in players:
-            player.send_signal(signal.SIGTERM)
-            assert player.wait(5) == 0
+        for client in clients:
+            client.end()
 
 
 @pytest.mark.parametrize("requests", CLIENTS.values(), ids=CLIENTS.keys())
@@ -153,7 +160,10 @@ def test_frames_end_the_record_and_faults_are_counted(play: Play, recording: Pat
     sizes = [len(client.data.recv(4096)) - 10 for _ in range(10)]
     assert sum(sizes) == 4 * 4096 - 2 * 1456
     assert client.commands.recv(100) == bytes.fromhex("5aa50a000001aaee")
-    client.send(STOP)
+    assert client.send(STOP) == OK[6]
+    client.end()
+    counts = json.loads(report.read_text())["boards"]["card"]
+    assert (counts["packets_made"], counts["packets_sent"], counts["lost"], counts["lost_bytes"]) == (12, 10, 2, 2912)
 
 
 @pytest.mark.parametrize("bytes_per_s", [1e5, 7e6])

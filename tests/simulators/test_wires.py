@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 
 from polysight_shared.error_codes import ErrorCode
@@ -53,7 +54,7 @@ def serve(tmp_path: Path, reports: list[str]) -> Iterator[Serve]:
     yield start
     stop.set()
     for thread, hub in threads:
-        thread.join(5)
+        thread.join()
         hub.close()
 
 
@@ -140,7 +141,7 @@ def test_a_client_that_sends_an_invalid_line_is_disconnected(
     path = serve()
     listener = join(path, (26,))
     with socket.socket(socket.AF_UNIX) as bad:
-        bad.settimeout(5)
+        bad.settimeout(HANG_S)
         bad.connect(str(path))
         bad.sendall(encode(WireEdge(1, 26, 1)) + line)
         assert bad.recv(1) == b""

@@ -65,7 +65,6 @@ def test_every_damaged_line_is_refused(talker):
 CHUNK = 4096
 
 
-@pytest.mark.timeout(600)
 def test_random_bytes(talker, request: pytest.FixtureRequest):
     amount = 1_000_000 if request.config.getoption("--long") else 24_000
     rng = random.Random(amount)
@@ -83,7 +82,6 @@ def test_random_bytes(talker, request: pytest.FixtureRequest):
     assert (done.kind, done.integer("x"), done.integer("y")) == ("done", 500, 400)
 
 
-@pytest.mark.timeout(600)
 def test_almost_lines(talker, request: pytest.FixtureRequest):
     """Random lines of the characters of commands."""
     amount = 10_000 if request.config.getoption("--long") else 300

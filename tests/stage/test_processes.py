@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 from tests.support.paths import RIG_FILE
+from tests.support.processes import HANG_S
 from tests.support.stage.conversation import play
 from tests.support.stage.drivers import PortDriver
-from tests.support.stage.processes import COMMANDS, LIMIT_S, StageProcess, outlives_its_parent
+from tests.support.stage.processes import COMMANDS, StageProcess, outlives_its_parent
 
 from polysight_shared.wires import WireMotion
 
@@ -105,7 +106,7 @@ def test_ends_when_the_wires_are_gone(start: Start, speed: float):
         for command in (("HELLO",), ("SET", 1, 20_000), ("ENABLE", 1), ("HOME",)):
             assert driver.command(*command).kind == "ok"
         stage.wires.shutdown(2)
-        stage.process.wait(LIMIT_S)
+        stage.process.wait(HANG_S)
 
 
 def test_dies_with_its_parent(kind: str, tmp_path: Path):
@@ -119,4 +120,4 @@ def test_an_emulator_in_lockstep_dies_with_its_parent(uno_programs: tuple[Path, 
     program, image = uno_programs
     assert not outlives_its_parent(uno_programs, "rest 1000000000000000\nrun 1000000000000000\n")
     with subprocess.Popen([program, "--parent", str(os.getppid()), image], stdin=subprocess.PIPE) as uno:
-        assert uno.wait(LIMIT_S) == 0
+        assert uno.wait(HANG_S) == 0

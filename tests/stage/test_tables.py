@@ -198,7 +198,7 @@ class BootLoader:
 
     def close(self) -> None:
         os.write(self._near, b"\x00")
-        self._thread.join(10)
+        self._thread.join()
         os.close(self._near)
         os.close(self._far)
 
@@ -211,7 +211,7 @@ def image_of(path: Path) -> bytes:
 
 def flash(folder: Path, port: str) -> subprocess.CompletedProcess[str]:
     command = ["make", "-C", str(SKETCH), "flash", f"AVR_B={folder}", f"PORT={port}"]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def test_flash(built: tuple[Path, str]):

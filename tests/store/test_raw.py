@@ -39,7 +39,7 @@ SCENE = small_scene(8, ROWS, metal=False)
 
 def polysight(*words: object, typed: str = "") -> subprocess.CompletedProcess[str]:
     command = [POLYSIGHT, *map(str, words)]
-    return subprocess.run(command, input=typed, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, input=typed, capture_output=True, text=True, check=False)
 
 
 @pytest.fixture(scope="module")

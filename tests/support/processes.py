@@ -20,6 +20,9 @@ from tests.support.paths import BIN
 LIMIT_S = 60.0
 """Seconds in which this machine may idle while a test waits for something: see :func:`idle_s`."""
 
+HANG_S = 900.0
+"""Seconds by the clock after which a call that blocks (socket, queue, thread) hangs. No busy machine reaches it."""
+
 
 def idle_s() -> float:
     """Seconds that a core of this machine was idle so far, the mean of all.

@@ -15,6 +15,7 @@ from polysight_shared.config import Board
 from polysight_simulators.cards import MAC, CardEndpoint, Network, Pace
 from polysight_simulators.faults import Faults
 from polysight_simulators.replay import Player, Recording
+from tests.support.processes import HANG_S
 
 LIMIT_S = 60.0
 
@@ -48,7 +49,7 @@ class Cards:
         """Switch a card off and on; returns when it is done."""
         done = threading.Event()
         self._tasks.append(lambda: (self.endpoints[name].power_cycle(), done.set()))
-        assert done.wait(LIMIT_S)
+        assert done.wait(HANG_S)
 
     def _serve(self) -> None:
         while not self._end.is_set():

@@ -18,7 +18,8 @@ from urllib.request import urlopen
 
 from websockets.sync.client import connect
 
-LIMIT_S = 120.0
+from tests.support.processes import HANG_S, LIMIT_S, idle_s, wait_for
+
 DESK, PHONE = (1400, 900, False), (390, 844, True)  # width, height, whether it is a phone
 
 
@@ -60,7 +61,7 @@ class Browser:
             address = self._page(profile / "DevToolsActivePort")
             self._stack = ExitStack()
             self._socket = self._stack.enter_context(
-                connect(address, max_size=None, open_timeout=LIMIT_S, ping_interval=None)
+                connect(address, max_size=None, open_timeout=HANG_S, ping_interval=None)
             )
         except BaseException:
             self._end()
@@ -78,26 +79,30 @@ class Browser:
 
     def _page(self, answer: Path) -> str:
         """Address of the first page's DevTools socket."""
-        deadline = time.monotonic() + LIMIT_S
-        while not (answer.exists() and answer.read_text().count("\n")):
+
+        def is_ready() -> bool:
             assert self._process.poll() is None, "Chromium ended; see chromium.log"
-            assert time.monotonic() < deadline, "Chromium does not start"
-            time.sleep(0.05)
+            return answer.exists() and "\n" in answer.read_text()
+
+        wait_for(is_ready, "that Chromium starts")
         port = answer.read_text().split()[0]
-        while time.monotonic() < deadline:
-            with urlopen(f"http://127.0.0.1:{port}/json/list", timeout=LIMIT_S) as reply:
-                for target in json.load(reply):
-                    if target["type"] == "page":
-                        return target["webSocketDebuggerUrl"]
-            time.sleep(0.05)
-        raise AssertionError("Chromium has no page")
+        pages: list[str] = []
+
+        def has_page() -> bool:
+            with urlopen(f"http://127.0.0.1:{port}/json/list", timeout=HANG_S) as reply:
+                targets = json.load(reply)
+            pages.extend(target["webSocketDebuggerUrl"] for target in targets if target["type"] == "page")
+            return bool(pages)
+
+        wait_for(has_page, "Chromium's page")
+        return pages[0]
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Call a method of the protocol; events received meanwhile are processed."""
         self._count += 1
         self._socket.send(json.dumps({"id": self._count, "method": method, "params": parameters}))
         while True:
-            answer = json.loads(self._socket.recv(timeout=LIMIT_S))
+            answer = json.loads(self._socket.recv(timeout=HANG_S))
             if answer.get("id") == self._count:
                 if "navigated" in str(answer.get("error", "")):
                     raise NavigatedError(method)
@@ -167,9 +172,9 @@ class Browser:
 
     def wait(self, expression: str, what: str, limit_s: float = LIMIT_S) -> None:
         """Wait until an expression is true in the page."""
-        deadline = time.monotonic() + limit_s
+        deadline = idle_s() + limit_s
         while not self._true(expression):
-            assert time.monotonic() < deadline, f"not within {limit_s:g} s: {what}; it says {self.text('status')!r}"
+            assert idle_s() < deadline, f"not within {limit_s:g} s: {what}; it says {self.text('status')!r}"
             time.sleep(0.05)
 
     def _true(self, expression: str) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from polysight.page.watch import Watch
 from polysight_simulators.scene import decode_scene, simulate
 from tests.support.page.chromium import Browser, find_chromium
 from tests.support.page.live_view import GrowingScan
+from tests.support.processes import wait_for
 from tests.support.products import unrendered
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, PET, scene_of
@@ -44,14 +44,9 @@ def growing(finished: Path, tmp_path: Path) -> GrowingScan:
 class Watched(Watch):
     """A watch whose snapshots are waited for."""
 
-    def wait_for(self, condition: Callable[[dict[str, Any]], bool], limit_s: float) -> bool:
-        """Wait until a snapshot meets a condition; False after the limit."""
-        deadline = time.monotonic() + limit_s
-        while not condition(json.loads(self.state.data)):
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(0.05)
-        return True
+    def wait_for(self, condition: Callable[[dict[str, Any]], bool]) -> None:
+        """Wait until a snapshot meets a condition."""
+        wait_for(lambda: condition(json.loads(self.state.data)), "a snapshot")
 
 
 @pytest.fixture

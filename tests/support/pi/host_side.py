@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,9 @@ from polysight_shared import messages as m
 from polysight_shared.config import Instrument
 from polysight_shared.raster import plan_raster
 from polysight_shared.sockets import requester, subscriber
+from tests.support.processes import LIMIT_S, idle_s, wait_for
 
-LIMIT_S = 60.0
+POLL_MS = 100
 
 
 class HostSide:
@@ -39,7 +39,7 @@ class HostSide:
     def ask(self, command: Any) -> Any:
         """The reply to a command, or to bytes."""
         self.commands.send(command if isinstance(command, bytes) else m.pack(command))
-        assert self.commands.poll(int(self.limit_s * 1e3)), f"no reply to {command}"
+        wait_for(lambda: self.commands.poll(POLL_MS) != 0, f"a reply to {command}", self.limit_s)
         return m.unpack_reply(self.commands.recv())
 
     def accepted(self, command: Any) -> m.Accepted:
@@ -72,20 +72,21 @@ class HostSide:
         self.until_state("ready")
 
     def until_state(self, *states: str) -> m.StatusReply:
-        deadline = time.monotonic() + self.limit_s
-        while time.monotonic() < deadline:
-            status = self.ask(m.Status())
-            if status.state in states:
-                return status
-            time.sleep(0.005)
-        raise AssertionError(f"never in {states}: {self.ask(m.Status())}")
+        seen: list[m.StatusReply] = []
+
+        def there() -> bool:
+            seen.append(self.ask(m.Status()))
+            return seen[-1].state in states
+
+        wait_for(there, f"a state of {states}", self.limit_s)
+        return seen[-1]
 
     def wait(self, kind: type, where: Callable[[Any], bool] = lambda _: True, limit_s: float | None = None) -> Any:
         """The next event of a kind."""
         limit_s = self.limit_s if limit_s is None else limit_s
-        deadline = time.monotonic() + limit_s
-        while (left := deadline - time.monotonic()) > 0:
-            if self.subscriber.poll(int(left * 1e3) + 1):
+        deadline = idle_s() + limit_s
+        while idle_s() < deadline:
+            if self.subscriber.poll(POLL_MS):
                 event = m.unpack_event(self.subscriber.recv_multipart()[-1])
                 self.events.append(event)
                 if isinstance(event, kind) and where(event):

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from polysight_shared.errors import DeviceError
 from polysight_shared.wires import WireClient, WireEdge
 from polysight_simulators import gpio
 from tests.support.paths import REPO
+from tests.support.processes import HANG_S, wait_for
 
 PROGRAM = (sys.executable, "-m", "polysight_pi")
 
@@ -43,7 +43,7 @@ class Process:
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
         """Its exit status and what else it said."""
         self.popen.send_signal(number)
-        out = self.popen.communicate(timeout=60)
+        out = self.popen.communicate(timeout=HANG_S)
         return self.popen.returncode, *out
 
     def __enter__(self) -> Process:
@@ -52,7 +52,7 @@ class Process:
     def __exit__(self, *_: object) -> None:
         if self.popen.poll() is None:
             self.popen.kill()
-        self.popen.communicate(timeout=60)
+        self.popen.communicate(timeout=HANG_S)
 
 
 def require_stand_in_chip() -> None:
@@ -73,15 +73,11 @@ def run(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:
         [*PROGRAM, *map(str, args)],
         capture_output=True,
         text=True,
-        timeout=120,
         cwd=REPO,
         env={**os.environ, **environment},
     )
     assert "Traceback" not in done.stderr
     return done
-
-
-LIMIT_S = 60.0
 
 
 class WiresLog:
@@ -112,10 +108,7 @@ class WiresLog:
         self._client.send(*edges)
 
     def until(self, condition: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + LIMIT_S
-        while not condition():
-            assert time.monotonic() < deadline, f"not seen on the wires; the last edges: {self.edges[-5:]}"
-            time.sleep(0.005)
+        wait_for(condition, "edges on the wires")
 
     def close(self) -> None:
         self._closed = True

@@ -15,8 +15,8 @@ from polysight_shared.stage_line import Command, Immediate, Parameter, Reply
 from polysight_shared.wires import WireEdge, WireMessage, WireMotion, parse
 from polysight_simulators.stage import NS_PER_TICK, TICK_HZ, PythonStage, Rig
 from polysight_simulators.uno import HZ, EmulatedUno, PinEdge
+from tests.support.processes import HANG_S, LIMIT_S, idle_s
 
-LIMIT_S = 60.0
 LIMIT_TICKS = 600 * TICK_HZ
 TICKS_PER_MS = TICK_HZ // 1000
 
@@ -135,7 +135,7 @@ class FirmwareDriver(Driver):
                 self.received += bytes.fromhex(rest)
             else:
                 self.wires.append(parse(line))
-        raise ProtocolError(f"the stage program ended with status {self._process.wait(10)}")
+        raise ProtocolError(f"the stage program ended with status {self._process.wait(HANG_S)}")
 
     def _do(self, line: str) -> None:
         assert self._process.stdin is not None
@@ -166,7 +166,7 @@ class FirmwareDriver(Driver):
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.close()
-        status = self._process.wait(10)
+        status = self._process.wait(HANG_S)
         self._process.stdout.close()
         assert status == 0, "a sanitizer has found something, or the program crashed: see its standard error"
 
@@ -221,7 +221,7 @@ class UnoDriver(Driver):
         super().__init__()
         link = folder / "ttyUNO"
         self.uno = EmulatedUno(program, image, pty=link)
-        self._port = serial.Serial(str(link), 115200, timeout=10)
+        self._port = serial.Serial(str(link), 115200, timeout=HANG_S)
         self._written = self._read = 0
         self._stood = self.uno.motors
         self._collect()
@@ -299,9 +299,9 @@ class PortDriver(Driver):
         self.received = self.received[self.received.index(b"polysight-stage") :]
 
     def until(self, there: Callable[[], bool]) -> None:
-        limit = time.monotonic() + LIMIT_S
+        limit = idle_s() + LIMIT_S
         while not there():
-            if time.monotonic() > limit:
+            if idle_s() > limit:
                 raise ProtocolError(f"not within {LIMIT_S:g} s; received {self.received!r}")
             self._listen()
 
@@ -322,8 +322,8 @@ class PortDriver(Driver):
 
     def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
         """Request the status until the stage rests; these answers are not kept."""
-        limit = time.monotonic() + max(limit_ticks / TICK_HZ / self._speed, LIMIT_S)
-        while time.monotonic() < limit:
+        limit = idle_s() + max(limit_ticks / TICK_HZ / self._speed, LIMIT_S)
+        while idle_s() < limit:
             if self.status().fields["state"] in ("idle", "alarm", "hold"):
                 return
             self._listen(0.1 / self._speed)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from polysight_shared.wires import WireEdge, WireMessage, WireMotion, parse
 from tests.support.paths import REPO, RIG_FILE
+from tests.support.processes import HANG_S, LIMIT_S, idle_s
 
-LIMIT_S = 60.0
 # The commands of a stage: the sketch for this machine, its Python stand-in, machine code on an emulated UNO.
 COMMANDS = {"pc": ("stage",), "python": ("stage", "--python"), "uno": ("uno",)}
 
@@ -37,7 +37,7 @@ class StageProcess:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
             listener.bind(str(folder / "wires"))
             listener.listen()
-            listener.settimeout(LIMIT_S)
+            listener.settimeout(HANG_S)
             pipe = subprocess.PIPE
             self.process = subprocess.Popen(list(map(str, command)), stdout=pipe, stderr=pipe, text=True, cwd=REPO)
             self._listener = threading.Thread(target=self._listen, daemon=True)
@@ -63,8 +63,8 @@ class StageProcess:
     def end(self, number: int = signal.SIGTERM) -> list[WireMessage]:
         """End it with a signal; everything that came over the wires."""
         self.process.send_signal(number)
-        assert self.process.wait(LIMIT_S) == 0
-        self._listener.join(LIMIT_S)
+        assert self.process.wait(HANG_S) == 0
+        self._listener.join(HANG_S)
         assert not self.link.is_symlink()
         return self.messages
 
@@ -72,7 +72,7 @@ class StageProcess:
         self.process.kill()
         self.process.communicate()
         if self._listener.ident:
-            self._listener.join(LIMIT_S)
+            self._listener.join(HANG_S)
 
 
 PARENT = """
@@ -93,9 +93,9 @@ def outlives_its_parent(command: Sequence[str | Path], standard_input: str = "")
         assert parent.stdout is not None
         child = int(parent.stdout.readline())
         parent.kill()
-    limit = time.monotonic() + LIMIT_S
+    limit = idle_s() + LIMIT_S
     while runs(child):
-        if time.monotonic() > limit:
+        if idle_s() > limit:
             return True
         time.sleep(0.02)
     return False

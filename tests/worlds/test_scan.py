@@ -45,6 +45,7 @@ def facets_of(surface: Surface, plate: Plate, rig: Rig) -> Facets:
         ({"tilt_x_deg": 8.0, "tilt_y_deg": -5.0}, 8e-2),
         ({"waviness_mm": 0.15}, 1e-2),
         ({"roughness_mm": 0.1}, 3e-2),
+        ({"bow_mm": (0.2, -0.1)}, 1e-2),
     ],
 )
 @pytest.mark.parametrize("channel", ["h", "v"])

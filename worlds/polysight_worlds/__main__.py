@@ -1,6 +1,6 @@
 """Draw a scene and write its images: `python -m polysight_worlds --seed 1 --out scene.npz`.
 
-Writes the arrays h, v, x_m, y_m and, beside them, a JSON file of what is true.
+Writes the arrays h, v, x_m, y_m, incidence_deg, simulated and, beside them, a JSON file of what is true.
 """
 
 from __future__ import annotations
@@ -18,7 +18,15 @@ from polysight_worlds.world import NUISANCES, draw_nuisances, draw_world
 
 def save(images: ImagePair, file: Path) -> None:
     """Write `file` (.npz) and the truth beside it (.json)."""
-    np.savez(file, h=images.h, v=images.v, x_m=images.x_m, y_m=images.y_m)
+    np.savez(
+        file,
+        h=images.h,
+        v=images.v,
+        x_m=images.x_m,
+        y_m=images.y_m,
+        incidence_deg=np.array(images.incidence_deg),
+        simulated=np.array(True),
+    )
     file.with_suffix(".json").write_text(json.dumps(images.truth(), indent=1), encoding="utf-8")
 
 

@@ -23,8 +23,8 @@ from polysight_worlds.world import Nuisances, Plate, World, disturb_plates
 class ImagePair:
     """Images of one scan in the rig frame, and what is true.
 
-    h, v: complex64 [ny, nx], row 0 at the smallest y, relative to the direct path; phases grow with the path (IF
-    convention), so H / V of a plate over that of metal is the conjugate of r_s / r_p for eps' - j eps''.
+    h, v: complex64 [ny, nx], row 0 at the smallest y, relative to the direct path. Phases fall with the path, as fields
+    of exp(+j omega t) do: H / V of a plate over that of metal is r_s / r_p, and a lossy permittivity eps' - j eps''.
     `world`: as it was scanned, with the plates' drawn heights and tilts.
     """
 
@@ -40,7 +40,7 @@ class ImagePair:
     def ratio_of(self, plate: Plate) -> complex:
         """H / V of a plate over that of metal, without any disturbance, at the middle of band and picture."""
         r_s, r_p = reflect(plate.stack, self.frequencies_hz.mean(), np.cos(np.radians(self.incidence_deg)))
-        return complex(np.conj(r_s / r_p))
+        return complex(r_s / r_p)
 
     def truth(self) -> dict:
         """What is true, for JSON; complex numbers as [real, imaginary]."""
@@ -57,7 +57,7 @@ class ImagePair:
             plates.append(written)
         return {
             "simulated": True,
-            "phase": "grows with the path",
+            "phase": "falls with the path",
             "incidence_deg": self.incidence_deg,
             "frequencies_hz": self.frequencies_hz.tolist(),
             "nuisances": asdict(self.nuisances),
@@ -241,8 +241,7 @@ def pixel_centres(rig: Rig, pixels: int) -> tuple[NDArray, NDArray]:
 def backproject(rig: Rig, rx: Antenna, data: NDArray, pixels: int, kaiser_beta: float = 0.0) -> NDArray:
     """Matched filter of complex64 `data` [frequencies, rows, columns] on the object plane: complex64 [pixels, pixels].
 
-    I(v) = sum over offsets u and frequencies of w(u) data(u, f) exp(+jk (path(v - u) - direct)), divided by the sum of
-    w, and conjugated: phases of the result grow with the path.
+    I(v) = sum over offsets u and frequencies of w(u) data(u, f) exp(+jk (path(v - u) - direct)), over the sum of w.
     """
     window = np.outer(np.kaiser(rig.rows, kaiser_beta), np.kaiser(rig.columns, kaiser_beta)).astype(np.float32)
     shape = fast_length(rig.rows + pixels - 1), fast_length(rig.columns + pixels - 1)
@@ -259,7 +258,7 @@ def backproject(rig: Rig, rx: Antenna, data: NDArray, pixels: int, kaiser_beta: 
         kernel = np.exp(1j * k * excess_m).astype(np.complex64)
         spectrum += fft2(window * data[index], shape) * fft2(kernel)
     image = ifft2(spectrum)[:pixels, :pixels] / (window.sum() * len(rig.frequencies_hz))
-    return np.conj(image).astype(np.complex64)
+    return image.astype(np.complex64)
 
 
 def _distance(antenna: Antenna, x: NDArray, y: NDArray, z: float) -> NDArray:

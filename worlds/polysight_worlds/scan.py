@@ -55,6 +55,9 @@ def make_surface(plate: Plate, step_m: float, rng: np.random.Generator) -> Surfa
     for rms_mm, length_m in ((plate.roughness_mm, ROUGHNESS_LENGTH_M), (plate.waviness_mm, WAVINESS_LENGTH_M)):
         if rms_mm:
             rough += rms_mm / 1000 * _draw_surface(rng, rough.shape, length_m / step_m)
+    bows = (np.square(2 * places / size) for size, places in zip(plate.size_m, (x, y), strict=True))
+    bow_x, bow_y = (bow_mm / 1000 * bow for bow_mm, bow in zip(plate.bow_mm, bows, strict=True))
+    rough = rough + bow_x + bow_y[:, None]
     slopes = None
     if rough.any():
         slopes = np.asarray(np.gradient(rough, step_m, axis=1)), np.asarray(np.gradient(rough, step_m, axis=0))
@@ -91,6 +94,7 @@ class PlateEchoes:
 
     def __init__(self, rig: Rig, rx: Antenna, plate: Plate, surface: Surface) -> None:
         self._rig, self._surface = rig, surface
+        self._brightness = plate.brightness
         rows, columns = surface.cover.shape
         self._shape = fast_length(rig.rows + rows - 1), fast_length(rig.columns + columns - 1)
         points = self._points(plate)
@@ -140,7 +144,7 @@ class PlateEchoes:
             r_s, r_p = self._tables[index].look_up(response.cos_incidence)
             terms.append(r_s * response.s_weight + r_p * response.p_weight)
         kernel = (common * terms[0]).astype(np.complex64)
-        mask = surface.cover * np.exp(-1j * k * self._path_mean)
+        mask = self._brightness * surface.cover * np.exp(-1j * k * self._path_mean)
         spectrum = self._multiply(mask, kernel)
         if surface.rough_slopes is not None:
             for slope, varied in zip(surface.rough_slopes, terms[1:], strict=True):

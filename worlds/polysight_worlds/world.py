@@ -40,7 +40,8 @@ TABLE_2: dict[str, complex] = {
 class Plate:
     """A flat piece. `height_mm`: its surface above the object plane, towards the antennas. Tilts rise z along x and y.
 
-    `roughness_mm` and `waviness_mm`: rms of its surface with correlation lengths of 5 and 20 mm. `round_`: a disc.
+    `roughness_mm` and `waviness_mm`: rms of its surface with correlation lengths of 5 and 20 mm. `bow_mm`: how much
+    farther away the edges are than the middle, along x and y. `brightness`: factor on H and V alike. `round_`: a disc.
     """
 
     name: str
@@ -52,6 +53,8 @@ class Plate:
     tilt_y_deg: float = 0.0
     roughness_mm: float = 0.0
     waviness_mm: float = 0.0
+    bow_mm: tuple[float, float] = (0.0, 0.0)
+    brightness: float = 1.0
     round_: bool = False
 
     @property
@@ -88,7 +91,7 @@ class Nuisances:
     | --- | --- |
     | tx_turn_deg, h_turn_deg, v_turn_deg | a board was turned about its own place after the calibration |
     | misplaced_mm | each board stands so far from where the rig file says |
-    | height_mm | plates other than the first metal are 0 to this thick |
+    | height_mm | surfaces of plates lie up to this above the object plane |
     | tilt_deg | plates lie tilted by up to this in x and y |
     | drift, drift_deg | change of the gain of V against H during the scan: share, phase |
     | multipath | share of a second path beside the direct path: fringes in amplitude and phase |
@@ -97,6 +100,8 @@ class Nuisances:
     | interference | share of positions with a burst of another radar |
     | clipping | share of the largest amplitude of direct path and echo that is cut off |
     | roughness_mm, waviness_mm | rms of all plates' surfaces, correlated over 5 and 20 mm |
+    | bow_mm | plates are bent by up to this, either way in x and y |
+    | brightness | plates are brighter or darker by up to 1 plus this, as in the published picture; no cause is known |
     | leakage | magnitude of the other polarisation in H and V |
     | border | share of the picture's width by which the scene is shifted |
     | aperture | share of the grid, in each direction, that was not scanned |
@@ -119,6 +124,8 @@ class Nuisances:
     clipping: float = 0.0
     roughness_mm: float = 0.0
     waviness_mm: float = 0.0
+    bow_mm: float = 0.0
+    brightness: float = 0.0
     leakage: float = 0.0
     border: float = 0.0
     aperture: float = 0.0
@@ -145,6 +152,8 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "clipping": {"clipping": (0.1, 0.5)},
     "roughness": {"roughness_mm": (0.1, 0.3)},
     "waviness": {"waviness_mm": (0.05, 0.2)},
+    "bow": {"bow_mm": (0.05, 0.3)},
+    "brightness": {"brightness": (0.3, 1.0)},
     "leakage": {"leakage": (0.02, 0.1)},
     "border": {"border": (0.25, 0.31)},
     "aperture": {"aperture": (0.2, 0.45)},
@@ -232,7 +241,8 @@ def disturb_plates(world: World, nuisances: Nuisances) -> World:
     rng = np.random.default_rng([nuisances.seed, 1])
     disturbed = []
     for plate in world.plates:
-        heights, tilts = rng.uniform(0, 1), rng.uniform(-1, 1, 2)
+        heights, tilts, bows = rng.uniform(0, 1), rng.uniform(-1, 1, 2), rng.uniform(-1, 1, 2)
+        brightness = (1 + nuisances.brightness) ** rng.uniform(-1, 1)
         if plate.name == "table":
             disturbed.append(plate)
             continue
@@ -245,6 +255,11 @@ def disturb_plates(world: World, nuisances: Nuisances) -> World:
             tilt_y_deg=plate.tilt_y_deg + tilts[1] * nuisances.tilt_deg,
             roughness_mm=float(roughness_mm),
             waviness_mm=float(waviness_mm),
+            brightness=plate.brightness * float(brightness),
+            bow_mm=(
+                plate.bow_mm[0] + float(bows[0]) * nuisances.bow_mm,
+                plate.bow_mm[1] + float(bows[1]) * nuisances.bow_mm,
+            ),
         )
         disturbed.append(moved)
     return World(tuple(disturbed))

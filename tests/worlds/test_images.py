@@ -48,7 +48,7 @@ def test_a_dielectric_beside_metal_has_the_ratio_of_fresnel(undisturbed):
     plate = Plate("plate", CENTRE_M, (0.06, 0.06), DIELECTRIC)
     images = simulate(World((plate,)))
     measured = ratio(images, plate) / ratio(undisturbed, undisturbed.world.plates[0])
-    assert measured == pytest.approx(images.ratio_of(plate), rel=0.02)
+    assert measured == pytest.approx(images.ratio_of(plate), rel=0.01)
 
 
 @pytest.mark.parametrize("name", [*NUISANCES, "all"])

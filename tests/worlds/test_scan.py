@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight_worlds import Plate, Rig, Stack, World, load_rig, published_rig, record
+from polysight_worlds import Body, Plate, Rig, Stack, World, load_rig, published_rig, record
 from polysight_worlds.optics import Facets, scatter
 from polysight_worlds.scan import Surface, make_surface
 
@@ -69,7 +69,7 @@ def test_the_rig_file_is_the_published_rig():
         one, other = getattr(loaded, name), getattr(built, name)
         assert one.position == pytest.approx(other.position, abs=1e-5)
         assert one.polarisation == pytest.approx(other.polarisation, abs=1e-5)
-    assert loaded.incidence_deg == pytest.approx(55, abs=0.1)
+    assert loaded.incidence_deg("h") == pytest.approx(55, abs=0.1)
     # TX2 as the rig's description has it.
     assert loaded.tx.position == pytest.approx([-0.7055, 0.0974, 0.0130], abs=1e-4)
 
@@ -85,3 +85,12 @@ def test_cells_cover_the_plates_area():
         plate = Plate("plate", (0, 0), size_m, LAYER, round_=round_)
         area_m2 = make_surface(plate, 0.002, np.random.default_rng(0)).cover.sum() * 0.002**2
         assert area_m2 == pytest.approx(size_m[0] * size_m[1] * (np.pi / 4 if round_ else 1), rel=0.01)
+
+
+def test_a_body_of_facets_is_the_plate_that_it_copies(rig):
+    plate = Plate("plate", (0.01, 0.09), (0.040, 0.030), LAYER)
+    facets = facets_of(make_surface(plate, rig.step_m, np.random.default_rng(0)), plate, rig)
+    small = replace(rig, columns=9, rows=7)
+    whole = record(small, small.h, World((plate,)))
+    by_facets = record(small, small.h, World((), (Body("plate", facets, LAYER),)))
+    assert np.abs(whole - by_facets).max() < 1e-4 * np.abs(whole).max()

@@ -11,6 +11,7 @@ from polysight_worlds.scan import record
 from polysight_worlds.world import (
     NUISANCES,
     TABLE_2,
+    Body,
     Nuisances,
     Plate,
     World,
@@ -25,6 +26,7 @@ __all__ = [
     "METAL",
     "NUISANCES",
     "TABLE_2",
+    "Body",
     "ImagePair",
     "Nuisances",
     "Plate",

@@ -25,7 +25,7 @@ class ImagePair:
 
     h, v: complex64 [ny, nx], row 0 at the smallest y, relative to the direct path. Phases fall with the path, as fields
     of exp(+j omega t) do: H / V of a plate over that of metal is r_s / r_p, and a lossy permittivity eps' - j eps''.
-    `world`: as it was scanned, with the plates' drawn heights and tilts.
+    `world`: as it was scanned, with the plates' drawn heights and tilts. `rig`: the nominal one.
     """
 
     h: NDArray
@@ -34,12 +34,18 @@ class ImagePair:
     y_m: NDArray
     world: World
     nuisances: Nuisances
-    incidence_deg: float
-    frequencies_hz: NDArray
+    rig: Rig
+
+    @property
+    def incidence_deg(self) -> float:
+        """Mean of the angles of incidence of H and V, a tenth of a degree apart."""
+        return (self.rig.incidence_deg("h") + self.rig.incidence_deg("v")) / 2
 
     def ratio_of(self, plate: Plate) -> complex:
-        """H / V of a plate over that of metal, without any disturbance, at the middle of band and picture."""
-        r_s, r_p = reflect(plate.stack, self.frequencies_hz.mean(), np.cos(np.radians(self.incidence_deg)))
+        """H / V of a plate over that of metal, without any disturbance, at the middle of the band."""
+        cos_h, cos_v = (np.cos(np.radians(self.rig.incidence_deg(channel))) for channel in ("h", "v"))
+        r_s, _ = reflect(plate.stack, self.rig.frequencies_hz.mean(), cos_h)
+        _, r_p = reflect(plate.stack, self.rig.frequencies_hz.mean(), cos_v)
         return complex(r_s / r_p)
 
     def truth(self) -> dict:
@@ -59,7 +65,7 @@ class ImagePair:
             "simulated": True,
             "phase": "falls with the path",
             "incidence_deg": self.incidence_deg,
-            "frequencies_hz": self.frequencies_hz.tolist(),
+            "frequencies_hz": self.rig.frequencies_hz.tolist(),
             "nuisances": asdict(self.nuisances),
             "active": self.nuisances.active(),
             "plates": plates,
@@ -101,8 +107,7 @@ def simulate(
         y_m=y_m,
         world=true_world,
         nuisances=nuisances,
-        incidence_deg=nominal.incidence_deg,
-        frequencies_hz=nominal.frequencies_hz,
+        rig=nominal,
     )
 
 
@@ -145,7 +150,7 @@ def _shift_world(world: World, nuisances: Nuisances, width_m: float) -> World:
     for plate in world.plates:
         x, y = plate.centre_m
         plates.append(replace(plate, centre_m=(x + dx, y + dy)))
-    return World(tuple(plates))
+    return replace(world, plates=tuple(plates))
 
 
 def _draw_bad_positions(rng: Generator, rig: Rig, nuisances: Nuisances) -> NDArray:

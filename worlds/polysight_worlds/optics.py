@@ -208,13 +208,17 @@ def rectangle(centre: NDArray, edge_a: NDArray, edge_b: NDArray, facet_m: float)
     return Facets(centres, np.outer(edge_a, repeated) / count_a, np.outer(edge_b, repeated) / count_b)
 
 
-def ellipsoid(centre: NDArray, radii: NDArray, facet_m: float) -> Facets:
-    """Facets of the half of an ellipsoid that faces the antennas (smaller z). One large radius gives a cylinder."""
+def ellipsoid(centre: NDArray, radii: NDArray, facet_m: float, half_widths: NDArray | None = None) -> Facets:
+    """Facets of the half of an ellipsoid that faces the antennas (smaller z).
+
+    A large radius in x or y makes a cylinder; `half_widths` in x and y then say where it ends.
+    """
     # Tangent parallelograms over a regular grid in x and y, as far as the surface is not too steep.
     radii = np.asarray(radii, float)
-    counts = np.ceil(2 * radii[:2] / facet_m).astype(int)
-    step = 2 * radii[:2] / counts
-    x, y = (np.arange(n) * d - r + d / 2 for n, d, r in zip(counts, step, radii[:2], strict=True))
+    half_widths = radii[:2] if half_widths is None else np.asarray(half_widths, float)
+    counts = np.ceil(2 * half_widths / facet_m).astype(int)
+    step = 2 * half_widths / counts
+    x, y = (np.arange(n) * d - w + d / 2 for n, d, w in zip(counts, step, half_widths, strict=True))
     x, y = (grid.ravel() for grid in np.meshgrid(x, y))
     inside = (x / radii[0]) ** 2 + (y / radii[1]) ** 2 < 0.97
     x, y = x[inside], y[inside]

@@ -39,10 +39,10 @@ class Rig:
         """x, y at which TX and H see the object plane as a mirror at stage offset zero; the picture's middle."""
         return find_mirror_point(self.tx.position, self.h.position, self.plane_m)[:2]
 
-    @property
-    def incidence_deg(self) -> float:
-        """Angle of incidence at the picture's middle."""
-        way = np.array([*self.centre_m, self.plane_m]) - self.tx.position
+    def incidence_deg(self, channel: str) -> float:
+        """Angle of incidence at the mirror point of receiver "h" or "v": the same wherever a plate lies."""
+        mirror_point = find_mirror_point(self.tx.position, getattr(self, channel).position, self.plane_m)
+        way = mirror_point - self.tx.position
         return float(np.degrees(np.arccos(way[2] / np.linalg.norm(way))))
 
     def offsets_m(self) -> tuple[NDArray, NDArray]:

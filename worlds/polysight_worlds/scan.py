@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from polysight_worlds.media import LIGHT_M_PER_S, ReflectionTable
-from polysight_worlds.optics import Antenna, integrate_phase, respond
+from polysight_worlds.optics import Antenna, integrate_phase, respond, scatter
 from polysight_worlds.rig import Rig
 from polysight_worlds.world import Plate, World
 
@@ -209,4 +209,9 @@ def record(rig: Rig, rx: Antenna, world: World, seed: int = 0) -> NDArray:
         echoes = PlateEchoes(rig, rx, plate, make_surface(plate, rig.step_m, rng))
         for index in range(len(rig.frequencies_hz)):
             echoes.add_to(data[index], index)
+    x, y = (grid.ravel() for grid in np.meshgrid(*rig.offsets_m()))
+    offsets = np.stack([x, y, np.zeros_like(x)], axis=1)
+    for body in world.bodies:
+        sums = scatter(rig.tx, rx, body.facets, body.stack, rig.frequencies_hz, offsets)
+        data += sums.T.reshape(data.shape).astype(np.complex64)
     return data

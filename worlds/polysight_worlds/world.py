@@ -9,6 +9,7 @@ import numpy as np
 from numpy.random import Generator
 
 from polysight_worlds.media import METAL, Stack
+from polysight_worlds.optics import Facets
 
 # Table 2 of the POLySIGHT paper, solids: estimated permittivity at 76 to 81 GHz.
 TABLE_2: dict[str, complex] = {
@@ -65,10 +66,20 @@ class Plate:
 
 
 @dataclass(frozen=True)
+class Body:
+    """A piece of any form (`optics.ellipsoid`): summed facet by facet, a microsecond for each facet and position."""
+
+    name: str
+    facets: Facets
+    stack: Stack
+
+
+@dataclass(frozen=True)
 class World:
     """What lies before the rig: all pieces, seen without shadows of each other."""
 
     plates: tuple[Plate, ...]
+    bodies: tuple[Body, ...] = ()
 
 
 def table(stack: Stack, *, behind_mm: float, centre_m: tuple[float, float], tilt_deg: float = 0.0) -> Plate:
@@ -262,4 +273,4 @@ def disturb_plates(world: World, nuisances: Nuisances) -> World:
             ),
         )
         disturbed.append(moved)
-    return World(tuple(disturbed))
+    return replace(world, plates=tuple(disturbed))

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
-from polysight.materials.inversion import PatchMeasurement, RigPrior, metal_evidence
+from polysight.materials.inversion import PatchMeasurement, RigPrior
+from polysight.materials.kinds import Kinds
+from polysight.materials.metal import metal_evidence
 
 THETA = np.radians(55.0)
+KINDS = Kinds((), float(THETA))
 EPS = [
     2.6 - 0.01j, 2.05 - 0.01j, 3.78 - 0.7j, 4.0 - 0.4j, 4.54 - 0.56j, 4.69 - 0.7j, 5.06 - 1.11j, 3.52 - 0.82j,
     4.75 - 2.43j, 3.66 - 0.43j, 6.3 - 0.2j, 7.5 - 0.3j, 9.4 - 0.1j, 9.37 - 18.0j, 1.3 - 0.01j,
@@ -45,7 +48,7 @@ def scenes(request):
 def test_no_dielectric_is_taken_for_metal(plates, scenes):
     for seed in range(scenes):
         seen, _, channel = scene(np.random.default_rng([plates, seed]), plates, False)
-        assert not metal_evidence(seen, RigPrior(3e-3), channel).enough
+        assert not metal_evidence(seen, RigPrior(3e-3), channel, KINDS).enough
 
 
 @pytest.mark.parametrize(("plates", "least"), [(2, 0.6), (4, 0.8), (8, 0.9)])
@@ -54,12 +57,12 @@ def test_metal_among_dielectrics_is_mostly_recognised(plates, least, scenes):
     for seed in range(scenes):
         seen, metal, channel = scene(np.random.default_rng([plates, seed]), plates, True)
         assert metal
-        found.append(metal_evidence(seen, RigPrior(3e-3), channel).enough)
+        found.append(metal_evidence(seen, RigPrior(3e-3), channel, KINDS).enough)
     assert np.mean(found) >= least
 
 
 def test_alone_nothing_is_shown():
-    evidence = metal_evidence([], RigPrior(3e-3), 1.0 + 0j)
+    evidence = metal_evidence([], RigPrior(3e-3), 1.0 + 0j, KINDS)
     assert not evidence.enough
     assert evidence.others == 0
 
@@ -67,6 +70,6 @@ def test_alone_nothing_is_shown():
 def test_a_patch_that_looks_the_same_is_no_witness():
     """Water beside water looks like metal beside metal."""
     alike = [PatchMeasurement(1.01 - 0.02j, 0.005, THETA, 1.02)] * 5
-    evidence = metal_evidence(alike, RigPrior(3e-3), 1.0 + 0j)
+    evidence = metal_evidence(alike, RigPrior(3e-3), 1.0 + 0j, KINDS)
     assert evidence.others == 0
     assert not evidence.enough

@@ -41,8 +41,8 @@ def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
     result = analyse(pair, optics, KnownScene(found, labels["metal"]))
     rows = {r.label: r for r in result.rows()}
     left, nowhere = rows[labels["left"]], rows[labels["nowhere"]]
-    assert abs(left.amplitude_h - abs(complex(fresnel(LEFT, THETA)[0]))) < 1e-5
-    assert abs(left.permittivity.value - LEFT) < 1e-3
+    assert abs(left.amplitude_h - abs(complex(fresnel(LEFT, THETA)[0]))) < 5e-4
+    assert abs(left.permittivity.value - LEFT) < 0.5 * left.permittivity.real_std
     assert nowhere.interior_pixels == 0
     assert not nowhere.metal_like
     assert nowhere.permittivity is None

@@ -14,25 +14,41 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.imaging import Image, Images, correct_tilt
-from polysight.materials.classify import UNKNOWN, Classifier, NamedPatch, add_explanation, features_of
-from polysight.materials.inversion import Inversion, PatchMeasurement, RigPrior, invert, metal_evidence
+from polysight.materials.classify import (
+    DISCRIMINANT,
+    UNKNOWN,
+    Classifier,
+    NamedPatch,
+    add_explanation,
+    features_of,
+    name_patch,
+)
+from polysight.materials.inversion import MOVED, Inversion, PatchMeasurement, RigPrior, at_angle, invert
+from polysight.materials.kinds import Kinds
 from polysight.materials.labels import TruthPlate, match_truth
 from polysight.materials.library import SceneErrors
 from polysight.materials.measure import (
     AMPLIFIES,
     BELOW_AIR,
     LEAST_STD,
-    MetalReference,
     Permittivity,
+    Scatter,
     background,
     check_patches,
-    find_metal,
+    common_gradient,
     measure_patch,
+    permittivity_of_patch,
+    relative_errors,
+    scatter_of,
+    usual_scatter,
+)
+from polysight.materials.metal import (
+    MetalReference,
+    find_metal,
     metal_by_label,
+    metal_evidence,
     metal_in_box,
     no_metal,
-    permittivity_of_patch,
-    reference_std,
 )
 from polysight.materials.result import MaterialsResult, PatchResult, Tilts
 from polysight.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
@@ -42,7 +58,6 @@ from polysight.polarimetry import (
     PlaneReference,
     calibrate,
     divide_by_metal,
-    fresnel,
     inverse_spread,
     permittivity_from_ratio,
     ratio,
@@ -96,6 +111,7 @@ class Optics:
             leakage_std=max(leakage_std, LEAST_LEAKAGE_STD),
             leakage_measured=p.leakage_std is not None,
             channels_known=channels_known,
+            moved=0.0 if p.leakage_std is None else MOVED,
         )
         return cls(angles.used_rad, prior, p.smooth_px)
 
@@ -170,29 +186,30 @@ def analyse(
     raw = to_metal(images, reference, plane)
     rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
     refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
-    std = reference_std(reference_spread(rh, rv, reference, plane))
-    common, local = (std, 0.0) if plane is None else (LEAST_STD, std)
-    prior = replace(optics.prior, reference_std=common)
     judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
-    measured = [measure_patch(p, rh, rv, _angle(theta, p), local) for p in judged]
+    seen = Seen.of((rh, rv), judged, reference, plane, images)
+    prior = seen.prior(optics.prior)
+    measured = [seen.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
+    kinds = _kinds(classifier, float(np.mean(theta)))
     if plane is None:
         channel = _channel_ratio(images, reference) if prior.channels_known else None
-        reference = replace(reference, evidence=metal_evidence(measured, prior, channel))
-    inversion = invert(measured, prior)
+        evidence = metal_evidence(measured, prior, channel, _kinds(None, float(np.mean(theta))))
+        reference = replace(reference, evidence=evidence)
+    inversion = invert(measured, prior, kinds)
     calibrated = remove_leakage(raw, inversion.leakage)
     sh, sv = (smooth_inside(c, found, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
     labels = [p.label for p in judged]
     estimates = dict(zip(labels, inversion.patches, strict=True))
-    off = dict(zip(labels, (inversion.misfit * inversion.brightness_std).tolist(), strict=True))
+    off = dict(zip(labels, inversion.brightness_off.tolist(), strict=True))
     patches = {
         p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _angle(theta, p), estimates.get(p.label))
         for p in found.patches
     }
     refused |= {label: why for label, e in patches.items() if (why := _no_material(e)) is not None}
     errors = scene_errors(inversion, prior, measured) if judged else None
-    named = _names(classifier, (sh, sv, sp), inversion, judged, errors, float(np.mean(theta)))
+    named = _names(classifier, kinds, (sh, sv, sp), inversion, judged, theta)
     truth = match_truth(found.patches, known.plates)
     results = tuple(
         PatchResult(p, patches[p.label], named.get(p.label), truth.get(p.label), refused.get(p.label))
@@ -206,36 +223,95 @@ def analyse(
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Seen:
+    """How V / H scatters over the plates of a scene, the metal among them, and what the scene says of its own errors.
+
+    Attributes
+    ----------
+    scatter
+        Patch number to how it scatters; patches of too few pixels are missing.
+    usual
+        Usual scatter of ln|V / H| and of its phase in this scene.
+    metal
+        Scatter of the metal reference; None if it was scanned separately.
+    metal_spread
+        Relative spread of the pixels of metal that was scanned separately; None: it is in the scene.
+    """
+
+    scatter: Mapping[int, Scatter]
+    usual: tuple[float, float]
+    metal: Scatter | None
+    metal_spread: float | None
+
+    @classmethod
+    def of(
+        cls,
+        channels: tuple[Image, Image],
+        judged: Sequence[Patch],
+        reference: MetalReference,
+        plane: PlaneReference | None,
+        images: Images,
+    ) -> Seen:
+        """Measure the scatter of the judged patches and of the metal; `channels` are relative to metal, smoothed."""
+        every = {p.label: scatter_of(p.interior, *channels, images.x_m, images.y_m) for p in judged}
+        scatter = {label: s for label, s in every.items() if s is not None}
+        metal = None
+        if plane is None and reference.mask.any():
+            metal = scatter_of(reference.mask, *channels, images.x_m, images.y_m)
+        known = [*scatter.values(), *([] if metal is None else [metal])]
+        return cls(scatter, usual_scatter(known), metal, None if plane is None else plane.spread)
+
+    def prior(self, prior: RigPrior) -> RigPrior:
+        """Return the prior of the rig's errors with what the plates show: the metal's error and the common gradient."""
+        if self.metal_spread is not None:
+            return replace(prior, reference_std=LEAST_STD)
+        gradient, gradient_std = common_gradient(
+            [*self.scatter.values(), *([] if self.metal is None else [self.metal])]
+        )
+        amplitude, phase = relative_errors(self.metal, self.usual)
+        std = float(np.hypot(np.hypot(amplitude, phase) / np.sqrt(2), LEAST_STD))
+        return replace(prior, reference_std=std, gradient=gradient, gradient_std=gradient_std)
+
+    def measure(self, patch: Patch, channels: tuple[Image, Image], theta_rad: float) -> PatchMeasurement:
+        """Measure one patch relative to metal."""
+        metal_m = None if self.metal is None else self.metal.centre_m
+        local_std = self.metal_spread or 0.0
+        scatter = self.scatter.get(patch.label)
+        return measure_patch(patch, *channels, theta_rad, scatter, self.usual, metal_m, local_std)
+
+
+def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
+    """Return what the patches may be: the library's materials at the library's angle, if there is one, and others."""
+    if classifier is None or len(classifier.angles_deg) != 1:
+        return Kinds((), theta_rad)
+    return Kinds(classifier.kinds, float(np.radians(classifier.angles_deg[0])))
+
+
 def _names(
     classifier: Classifier | None,
+    kinds: Kinds,
     channels: tuple[Image, Image, Image],
     inversion: Inversion,
     judged: list[Patch],
-    errors: SceneErrors | None,
-    theta_rad: float,
+    theta: npt.NDArray[np.float64],
 ) -> dict[int, NamedPatch]:
-    """Name the judged patches, with the scene's error budget; return patch number to name."""
+    """Name the judged patches from the joint inversion; return patch number to name."""
     if classifier is None or not judged:
         return {}
     h, v, p = channels
-    features = []
+    named = {}
     for patch, estimate in zip(judged, inversion.patches, strict=True):
         at = patch.interior
-        by_h, by_q = _to_angle(estimate.permittivity, theta_rad + inversion.theta_error_rad, classifier.angles_deg)
-        features.append(features_of(np.abs(h[at]) * by_h, np.abs(v[at]) * by_h * abs(by_q), p[at] / by_q))
-    named = classifier.scan(features, errors)
-    return {
-        patch.label: add_explanation(name, e.permittivity, e.covariance, classifier)
-        for patch, name, e in zip(judged, named, inversion.patches, strict=True)
-    }
-
-
-def _to_angle(permittivity: complex | None, theta_rad: float, angles_deg: Sequence[float]) -> tuple[float, complex]:
-    """Return the factors of |H| and of V / H that convert a half space from the scan's angle to the library's."""
-    if permittivity is None or len(angles_deg) != 1 or permittivity.real < 1:
-        return 1.0, 1.0 + 0j
-    (s, p), (own_s, own_p) = (fresnel(permittivity, angle) for angle in (np.radians(angles_deg[0]), theta_rad))
-    return float(abs(s / own_s)), complex((p / s) / (own_p / own_s))
+        inverse = at_angle(
+            1 / p[at].astype(np.complex128), _angle(theta, patch) + inversion.theta_error_rad, kinds.theta_rad
+        )
+        if classifier.model == DISCRIMINANT:
+            name = name_patch(kinds, estimate, inverse)
+        else:
+            (name,) = classifier.scan([features_of(np.abs(h[at]), np.abs(v[at]), 1 / inverse)])
+        named[patch.label] = add_explanation(name, estimate.permittivity, estimate.covariance, classifier)
+    return named
 
 
 def _no_material(e: Permittivity) -> Finding | None:
@@ -400,7 +476,7 @@ def scene_errors(found: Inversion, prior: RigPrior, seen: Sequence[PatchMeasurem
     covariance[7, 7] = REFERENCE_BRIGHTNESS_STD**2
     own_h = np.zeros((len(t), 3, 3))
     own_h[:, :2, :2] = found.brightness_std**2
-    noise = np.array([s.std for s in seen]) / softened(t)
+    noise = np.sqrt([np.trace(s.covariance) / 2 for s in seen]) / softened(t)
     return SceneErrors(own_h + noise[:, None, None] ** 2 * np.diag([0.0, 1.0, 1.0]), design, covariance)
 
 

@@ -29,6 +29,8 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.materials.discriminant import ErrorDiscriminant
+from polysight.materials.inversion import PatchEstimate
+from polysight.materials.kinds import Kind, Kinds, pair
 from polysight.materials.library import (
     Library,
     Model,
@@ -313,6 +315,8 @@ INCLUSIONS = 0.05
 """Share of a patch's pixels that may be of another material; a pixel's prior is its patch's name otherwise."""
 LIKELY = 0.005
 """Materials of less probability are not listed."""
+REGION_99 = 9.21
+"""Chi-square of two degrees of freedom that 1 % exceed."""
 
 
 MODELS: dict[str, Callable[[str], Model]] = {
@@ -433,6 +437,21 @@ class Classifier:
         """Material to the permittivity of the library's patches as half spaces; without metals."""
         return self.distributions.permittivities
 
+    @property
+    def kinds(self) -> list[Kind]:
+        """The library's materials as half spaces, with the spread of their specimens and the error of their mean."""
+        spread = dict(zip(self.distributions.names.tolist(), np.sqrt(self.distributions.spread), strict=True))
+        out = []
+        for name in self.library.names:
+            eps = self.permittivities.get(name)
+            if eps is None:
+                out.append(Kind(name, None))
+                continue
+            count = sum(e.name == name for e in self.library.entries)
+            real, loss = (float(s) * float(np.sqrt(1 + 1 / count)) for s in spread[name])
+            out.append(Kind(name, eps, (real, loss)))
+        return out
+
     def scan(self, patches: Sequence[Real], errors: SceneErrors | None = None) -> list[NamedPatch]:
         """Name the patches of one scan, or of several scans of the same patches, together.
 
@@ -483,6 +502,78 @@ class Classifier:
         order = sorted(zip(kinds, count, strict=True), key=lambda i: (-i[1], i[0]))
         votes = {str(k): c / every.size for k, c in order}
         return NamedPatch(every, relative, replace(name, votes=votes, pixels=int(good.sum())))
+
+
+def name_patch(kinds: Kinds, estimate: PatchEstimate, inverse_ratios: npt.NDArray[np.complex128]) -> NamedPatch:
+    """Name a patch and its pixels from the joint inversion.
+
+    The patch's name is the kind of the largest probability; a material of the library whose value lies outside the
+    patch's own 99 % region (errors and specimens together) is never the name. A pixel is, but for `INCLUSIONS`, of its
+    patch's material.
+
+    Parameters
+    ----------
+    kinds
+        What patches may be.
+    estimate
+        The patch, with the probabilities of these kinds.
+    inverse_ratios
+        complex [n]: V / H of the pixels at the kinds' angle, NaN where not usable.
+    """
+    good = np.isfinite(inverse_ratios)
+    if estimate.kinds is None or not good.any():
+        return NamedPatch(
+            np.full(good.size, UNKNOWN), np.full(good.size, np.inf), PatchName(UNKNOWN, 0.0, {}, np.inf, 0)
+        )
+    middle = complex(np.median(inverse_ratios[good].real), np.median(inverse_ratios[good].imag))
+    inverse = np.linalg.inv(kinds.covariance + estimate.inverse_ratio_covariance)
+    off = pair(middle - kinds.t)
+    distance = np.sqrt(np.einsum("ki,kij,kj->k", off, inverse, off) / REGION_99)
+    probability = np.where(distance <= 1, estimate.kinds[:-1], 0.0)
+    ours = kinds.ours
+    names = np.array(kinds.names)
+    nearest = int(np.argmin(np.where(ours, distance, np.inf)))
+    none = 1 - float(probability[ours].sum())
+    best = int(np.argmax(np.where(ours, probability, -1.0)))
+    likely = {str(names[k]): round(float(probability[k]), 4) for k in np.flatnonzero(ours & (probability >= LIKELY))}
+    likely[UNKNOWN] = round(none, 4)
+    name, confidence, of = str(names[best]), float(probability[best]), best
+    if confidence <= none:
+        name, confidence, of = UNKNOWN, none, nearest
+    verdict = PatchName(
+        name,
+        confidence,
+        {},
+        float(distance[of]),
+        int(good.sum()),
+        dict(sorted(likely.items(), key=lambda item: -item[1])),
+        nearest=str(names[nearest]),
+    )
+    pixel_names, far, sure = _name_pixels(kinds, estimate, inverse_ratios, np.where(ours, probability, 0.0))
+    count = dict(zip(*np.unique(pixel_names, return_counts=True), strict=True))
+    votes = {str(n): int(c) / pixel_names.size for n, c in sorted(count.items(), key=lambda i: (-i[1], i[0]))}
+    return NamedPatch(pixel_names, far, replace(verdict, votes=votes), sure)
+
+
+def _name_pixels(
+    kinds: Kinds, estimate: PatchEstimate, t: npt.NDArray[np.complex128], of_patch: Real
+) -> tuple[npt.NDArray, Real, Real]:
+    """Return name, distance over the threshold, and probability of the name of each pixel, [n] each."""
+    good = np.isfinite(t)
+    ours = kinds.ours
+    pixel = np.cov(pair(t[good]).T) if good.sum() > 2 else np.zeros((2, 2))
+    both = kinds.covariance[ours] + estimate.inverse_ratio_covariance + pixel
+    inverse = np.linalg.inv(both)
+    off = pair(np.where(good, t, 0)[:, None] - kinds.t[ours])
+    distance2 = np.einsum("nki,kij,nkj->nk", off, inverse, off)
+    prior = (1 - INCLUSIONS) * of_patch[ours] + INCLUSIONS / ours.sum()
+    likelihood = prior * np.sqrt(np.linalg.det(inverse)) * np.exp(-0.5 * np.minimum(distance2, 1400))
+    best = likelihood.argmax(axis=1)
+    row = np.arange(t.size)
+    far = np.where(good, np.sqrt(distance2[row, best] / REGION_99), np.inf)
+    share = likelihood[row, best] / np.maximum(likelihood.sum(axis=1), 1e-300)
+    names = np.where(far <= 1, np.array(kinds.names)[ours][best], UNKNOWN)
+    return names, far, np.where(good, share * min(1.0, float(of_patch.sum()) + INCLUSIONS), 0.0)
 
 
 def features_of(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:

@@ -2,61 +2,55 @@
 
 Relative to metal, a patch of true inverse ratio t = r_p / r_s = 1 / P is measured as
 
-    V / H = (1 + rho) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
+    V / H = (1 + rho) exp(g x) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
 
-with a, b the leakage of p into H and of s into V, rho the error of the metal reference, kappa the patch's brightness
-relative to an ideal one (roughness, tilt, edges). r_s and r_p follow from t and the incidence angle by Eq. 2 and 3.
-Unknown are a, b, rho, the angle's error, and t of every patch. The data are the measured ratios and brightnesses with
-their standard deviations; all that was not measured has a prior of zero mean and stated width. The solution is the
-maximum of the posterior (least squares, scipy), its covariance the inverse of the information matrix there.
+with a, b the leakage of p into H and of s into V, rho the error of the metal reference, g the common change of
+ln(V / H) over the plane (drift, boards out of place), x the place relative to the metal, kappa the patch's brightness
+relative to an ideal one (thickness, roughness, tilt, illumination). r_s and r_p follow from t and the incidence angle
+by Eq. 2 and 3. Unknown are a, b, rho, g, the angle's error, the usual size of ln kappa, and t of every patch.
 
-If brightness and ratio of several patches determine the leakage, the scene has measured it; otherwise the prior
-remains. Each source of data or prior has a share in the variance of each permittivity; the shares add up to it: with J
-the Jacobian of all residuals and C the covariance, source s contributes C J_s' J_s C.
-
-`metal_evidence` judges whether a patch is metal by everything but itself: two explanations of the whole scene are
-fitted to the same data. The patch is metal (r_s = r_p = -1), or it is some dielectric. Each explanation determines the
-other patches relative to it, and these must then be possible materials: brightness |H| that agrees with their ratio
-(Eq. 2 and 3), no gain, a permittivity from 1 to about ten. Each also predicts V / H of the patch itself relative to the
-direct path, which reaches both boards with equal strength: metal reflects both polarisations fully, a dielectric loses
-most of p at these angles. The score is the difference of both best sums of squares, dielectric minus metal: positive
-values support metal. It is half of minus twice the log likelihood ratio up to the priors of leakage, angle and
-brightness, which both share.
+The evidence is that of |V / H| and its phase; brightness is a nuisance of each plate, whose usual size the scene tells.
+Other evidence on the common errors is that every patch has to be some material (`Kinds`): the library's, the
+literature's, or at least passive. The posterior of the common errors is sampled (sequential Monte Carlo with tempering;
+Del Moral, Doucet and Jasra, J. R. Stat. Soc. B 68, 2006). A patch's permittivity and name come from one posterior, that
+of the common errors without the evidence of what this patch itself may be: its permittivity is measured, not drawn to
+the nearest material, and its name is the kind that fits this measurement.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.materials.specimens import (
-    METAL_PIECE,
-    METAL_UNLIKE,
-    METAL_WITHOUT_BRIGHTNESS,
-    METAL_WITHOUT_PERMITTIVITY,
-)
-from polysight.polarimetry import fresnel, permittivity_from_ratio, ratio_from_permittivity
+from polysight.materials.kinds import DensityMap, Kinds, pair, turned
+from polysight.materials.specimens import METAL_WITHOUT_BRIGHTNESS, METAL_WITHOUT_PERMITTIVITY
+from polysight.polarimetry import permittivity_from_ratio
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
-BRIGHTNESS_STD = 0.05
-"""Prior of ln kappa: plates rough by 0.2 mm lose 7 %, edges and tilts change |H| by some per cent."""
-BRIGHTNESS_FREEDOM = 4.0
-"""Weight of that prior against the patches' own scatter, in number of patches."""
-OUTLIER = 3.0
-"""Standard deviations of brightness beyond which a patch (a thin sheet, a shadow) loses weight (Cauchy)."""
+BRIGHTNESS_RANGE = (0.03, 0.7)
+"""Range of the standard deviation of ln kappa in a scene, uniform on a logarithmic scale: flat simulated plates differ
+by 3 %, thin, tilted, unevenly lit ones by a factor of two (published pictures)."""
+ODD_BRIGHTNESS, ODD_BRIGHTNESS_STD = 0.1, 1.2
+"""Share of patches whose brightness is none of a half space (thin sheets, shadows), and their ln kappa's spread."""
+METAL_BRIGHTNESS_STD = 0.5
+"""Prior standard deviation of the metal's own ln kappa."""
+LIBRARY_SHARE = (0.05, 0.95)
+"""Range of the share of a scene's patches that are of the library's materials; the scene tells it."""
+MOVED, MOVED_STD = 0.1, 0.025
+"""Probability that the mount has moved since its leakage was measured, and the leakage's error then: 1 to 3 degrees."""
 LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
-SOURCES = ("noise", "metal reference", "leakage", "incidence", "brightness")
-_NUISANCES = 8  # a, b (2 each), rho (2), angle, brightness of the metal
-_BENT = 0.1  # standard deviation over radius of curvature of Eq. 3 above which errors are sampled, not propagated
-_DRAWS = 4000
-_LEAST_STD = 1e-6  # of a ratio: below it the information matrix has no inverse in double precision
+SOURCES = ("noise", "metal reference", "leakage", "incidence")
+_GROUPS = {"metal reference": (4, 5, 10, 11, 12, 13), "leakage": (0, 1, 2, 3, 9), "incidence": (6,)}
+_WIDTH = 15  # a, b, rho (2 each), angle, metal's brightness, size of brightness, moved, g (4), library's share
+_PARTICLES, _MOVES, _DRAWS = 600, 6, 8
+_LEAST_STD = 1e-6  # of a ratio: below it a covariance has no inverse in double precision
 
 
 @dataclass(frozen=True)
@@ -68,17 +62,29 @@ class PatchMeasurement:
     inverse_ratio
         V / H.
     std
-        Standard deviation of its real part and of its imaginary part: noise, speckle, edges.
+        Standard deviation of its real part and of its imaginary part: noise, sidelobes.
     theta_rad
         Nominal incidence angle.
     brightness
         |H|; None if it is not used.
+    relative_std
+        Standard deviations of ln|V / H| and of its phase by what scatters over the plate: edges, ripple, tilt.
+    place_m
+        Centre relative to the metal's, x and y.
     """
 
     inverse_ratio: complex
     std: float
     theta_rad: float
     brightness: float | None = None
+    relative_std: tuple[float, float] = (0.0, 0.0)
+    place_m: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def covariance(self) -> Real:
+        """Covariance of real and imaginary part of V / H, float64 [2, 2]."""
+        own = max(self.std, _LEAST_STD)
+        return own**2 * np.eye(2) + turned(self.inverse_ratio, np.diag(np.square(self.relative_std)))
 
 
 @dataclass(frozen=True)
@@ -99,8 +105,13 @@ class RigPrior:
         True if the images' amplitudes are relative to the direct path.
     reference_std
         Relative standard deviation of metal's V / H, each part.
-    brightness_std
-        Standard deviation of ln |H| relative to Eq. 2, of single patches.
+    brightness_range
+        Range of the standard deviation of ln |H| relative to Eq. 2, of single patches.
+    gradient, gradient_std
+        Change of ln(V / H) along x and y, per metre, as the plates show it, and its standard deviation: real parts
+        of the amplitude, imaginary parts of the phase.
+    moved
+        Probability that a mount whose leakage was measured has moved since.
     """
 
     theta_std_rad: float
@@ -109,7 +120,10 @@ class RigPrior:
     leakage_measured: bool = False
     channels_known: bool = False
     reference_std: float = 0.01
-    brightness_std: float = BRIGHTNESS_STD
+    brightness_range: tuple[float, float] = BRIGHTNESS_RANGE
+    gradient: tuple[complex, complex] = (0j, 0j)
+    gradient_std: tuple[complex, complex] = (0j, 0j)
+    moved: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -128,6 +142,8 @@ class PatchEstimate:
         float64 [2, 2] of its real and its imaginary part; None if metal-like.
     shares
         Source to its share of the covariance's trace; the sum is 1.
+    kinds
+        float64 [kind + 1]: probability of each of the kinds, and last of any other material; None without kinds.
     """
 
     inverse_ratio: complex
@@ -135,6 +151,7 @@ class PatchEstimate:
     permittivity: complex | None
     covariance: Real | None
     shares: Mapping[str, float]
+    kinds: Real | None = None
 
     @property
     def dominated_by(self) -> str | None:
@@ -158,12 +175,14 @@ class Inversion:
         The same of the prior.
     theta_error_rad, theta_std_rad
         True minus nominal incidence angle, and its standard deviation.
-    misfit
-        Brightness minus the model's, in standard deviations, of each patch; NaN if it was not used.
+    brightness_off
+        ln of |H| over Eq. 2's of each patch, relative to the scene's; NaN if it was not used.
     brightness_std
-        Standard deviation of ln |H| from the patches' scatter and the prior.
-    cost
-        Sum of squared residuals at the solution, priors included.
+        Usual size of the same in this scene.
+    gradient
+        Change of ln(V / H) along x and y, per metre.
+    nuisance_covariance
+        float64 [7, 7] of a, b, rho (real and imaginary parts) and the angle, in standard deviations of their prior.
     """
 
     patches: tuple[PatchEstimate, ...]
@@ -172,9 +191,9 @@ class Inversion:
     prior_std: float
     theta_error_rad: float
     theta_std_rad: float
-    misfit: Real
+    brightness_off: Real
     brightness_std: float
-    cost: float
+    gradient: tuple[complex, complex]
     nuisance_covariance: Real = field(repr=False)
 
     @property
@@ -183,184 +202,293 @@ class Inversion:
         return max(self.leakage_std) < 0.5 * self.prior_std
 
 
-def true_ratio(inverse: npt.ArrayLike, a: complex, b: complex, rho: complex = 0j) -> Complex:
-    """Return t of a measured V / H: the first formula of the module's docstring, solved for t."""
-    c = np.asarray(inverse, np.complex128) * (1 + b) / ((1 + a) * (1 + rho))
-    return (c - b) / (1 - a * c)
+def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: npt.ArrayLike = 0j) -> Complex:
+    """Return t of a measured V / H: the first formula of the module's docstring, solved for t, at the metal's place."""
+    a, b = np.asarray(a, np.complex128), np.asarray(b, np.complex128)
+    c = np.asarray(inverse, np.complex128) * (1 + b) / ((1 + a) * (1 + np.asarray(rho)))
+    return np.asarray((c - b) / (1 - a * c), np.complex128)
 
 
 def measured_ratio(
     t: npt.ArrayLike, a: Complex | complex, b: Complex | complex, rho: Complex | complex = 0j
 ) -> Complex:
-    """Return V / H of a true t: the first formula of the module's docstring."""
+    """Return V / H of a true t: the first formula of the module's docstring, at the metal's place."""
     t = np.asarray(t, np.complex128)
     return (1 + rho) * (1 + a) / (1 + b) * (t + b) / (1 + a * t)
 
 
-def slope(t: npt.ArrayLike, theta_rad: float) -> Complex:
+def slope(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
     """Return d eps / d t of Eq. 3 with t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
     t = np.asarray(t, np.complex128)
     return 4 * np.sin(theta_rad) ** 2 * np.tan(theta_rad) ** 2 * (1 + t) / (1 - t) ** 3
 
 
-def forward_differences(f: Callable[[Real], Real], x: Real) -> Real:
-    """Return the Jacobian of f at x, [value, parameter]; f is called once, with x of shape [step, parameter]."""
-    step = np.sqrt(np.finfo(np.float64).eps) * np.maximum(1.0, np.abs(x))
-    at = f(np.concatenate([x[None], x + np.diag(step)]))
-    return ((at[1:] - at[0]) / step[:, None]).T
+def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None = None) -> Inversion:
+    """Solve for all patches of a scene together.
 
-
-class _Model:
-    """Residuals of the fit. Parameters are deviations from the prior's mean in its standard deviations.
-
-    Those of a patch are the deviation of t from the measured ratio, in its standard deviations.
+    `seen` are the patches without the metal reference. With `kinds` the patches get probabilities of them.
     """
+    model = _Scene(seen, prior, kinds)
+    rng = np.random.default_rng(0)
+    start = rng.standard_normal((_PARTICLES, _WIDTH))
+    nothing, everything = np.zeros(model.n + 1), np.ones(model.n + 1)
+    posterior = _anneal(model, start, nothing, everything, rng)
+    patches = []
+    for i in range(model.n):
+        without = everything.copy()
+        without[i + 1] = 0.0
+        patches.append(_estimate(model, _anneal(model, posterior, everything, without, rng), i, rng))
+    return _solution(model, posterior, tuple(patches))
 
-    def __init__(self, seen: Sequence[PatchMeasurement], prior: RigPrior, brightness_std: float) -> None:
-        self.prior, self.n, self.brightness_std = prior, len(seen), brightness_std
+
+class _Scene:
+    """Likelihood of the common errors. They are deviations from the prior's mean in its standard deviations."""
+
+    def __init__(self, seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None) -> None:
+        self.prior, self.kinds, self.n = prior, kinds, len(seen)
         self.q = np.array([s.inverse_ratio for s in seen], np.complex128)
-        self.std = np.maximum(np.array([s.std for s in seen], np.float64), _LEAST_STD)
+        self.place = np.array([s.place_m for s in seen], np.float64).reshape(-1, 2)
+        self.theta = np.array([s.theta_rad for s in seen], np.float64)
         level = np.array([np.nan if s.brightness is None else s.brightness for s in seen], np.float64)
         # Metal-like patches have |H| = 1 with any leakage: they give no information on it.
         self.bright = np.isfinite(level) & (level > 0) & (np.abs(self.q - 1) > METAL_WITHOUT_BRIGHTNESS)
         self.log_level = np.log(np.where(self.bright, level, 1.0))
-        self.start = true_ratio(self.q, *prior.leakage)
-        self.theta = np.array([s.theta_rad for s in seen], np.float64)
+        self.own = self._own_covariances(seen)
+        self.maps = () if kinds is None else self._maps(kinds)
 
-    def nuisances(self, x: Real) -> tuple[Complex, Complex, Complex, Real]:
-        """Return a, b, rho and the angle's error; [..., parameter] to [..., 1] each."""
-        p, u = self.prior, [x[..., k, None] for k in range(7)]
-        a = p.leakage[0] + p.leakage_std * (u[0] + 1j * u[1])
-        b = p.leakage[1] + p.leakage_std * (u[2] + 1j * u[3])
-        return a, b, p.reference_std * (u[4] + 1j * u[5]), p.theta_std_rad * u[6]
+    def _own_covariances(self, seen: Sequence[PatchMeasurement]) -> Real:
+        """Return the covariance of each patch's t by its own errors, [patch, 2, 2]: those of V / H, to first order."""
+        if not seen:
+            return np.zeros((0, 2, 2))
+        nominal = np.zeros((1, _WIDTH))
+        step = 1e-4 * np.maximum(np.abs(self.q), 1e-3)
+        before = self.ratios(nominal)[0]
+        self.q = self.q + step
+        after = self.ratios(nominal)[0]
+        self.q = self.q - step
+        return turned((after - before) / step, np.stack([s.covariance for s in seen]))
 
-    def ratios(self, x: Real) -> Complex:
+    def _maps(self, kinds: Kinds) -> tuple[DensityMap, ...]:
+        """Return the density of each patch's ratio over its possible values."""
+        drawn = self.ratios(np.random.default_rng(1).standard_normal((_PARTICLES, _WIDTH)))
+        maps = []
+        for i in range(self.n):
+            t = drawn[np.isfinite(drawn[:, i]) & (np.abs(drawn[:, i]) < 3.0), i]
+            if not t.size:
+                t = np.zeros(1, np.complex128)
+            # The particles may wander a little beyond the first ones.
+            reach = 3 * np.sqrt(np.trace(self.own[i])) + 0.3 * float(np.abs(t - t.mean()).max()) + 1e-3
+            low = complex(t.real.min() - reach, t.imag.min() - reach)
+            high = complex(t.real.max() + reach, t.imag.max() + reach)
+            maps.append(kinds.density_map(low, high, self.own[i]))
+        return tuple(maps)
+
+    def leakage(self, z: Real) -> tuple[Complex, Complex]:
+        """Return a and b, [..., 1] each."""
+        p = self.prior
+        moved = (
+            z[..., 9, None] > scipy.special.ndtri(1 - p.moved) if p.moved > 0 else np.zeros((*z.shape[:-1], 1), bool)
+        )
+        scale = np.where(moved, max(MOVED_STD, p.leakage_std), p.leakage_std)
+        a = p.leakage[0] + scale * (z[..., 0, None] + 1j * z[..., 1, None])
+        b = p.leakage[1] + scale * (z[..., 2, None] + 1j * z[..., 3, None])
+        return a, b
+
+    def gradient(self, z: Real) -> Complex:
+        """Return the change of ln(V / H) along x and y, per metre, [..., 2]."""
+        mean = np.array(self.prior.gradient)
+        std = pair(self.prior.gradient_std)
+        return mean + std[:, 0] * z[..., 10:12] + 1j * std[:, 1] * z[..., 12:14]
+
+    def angle(self, z: Real) -> Real:
+        """Return the true angles, [..., patch]."""
+        return self.theta + self.prior.theta_std_rad * z[..., 6, None]
+
+    def ratios(self, z: Real) -> Complex:
         """Return t of every patch, [..., patch]."""
-        real, imag = np.split(x[..., _NUISANCES:], 2, axis=-1)
-        return self.start + self.std * (real + 1j * imag)
+        a, b = self.leakage(z)
+        rho = self.prior.reference_std * (z[..., 4, None] + 1j * z[..., 5, None])
+        return true_ratio(self.q * np.exp(-(self.gradient(z) @ self.place.T)), a, b, rho)
 
-    def misfit(self, x: Real) -> Real:
-        """Return brightness minus the model's in standard deviations, [..., patch]; 0 if it is not used."""
-        a, _, _, error = self.nuisances(x)
-        t, theta = self.ratios(x), self.theta + error
-        r_s = fresnel(permittivity_from_ratio(t, theta), theta)[0]
+    def ratios_of_kinds(self, z: Real, kinds: Kinds) -> Complex:
+        """Return t that each patch would have at the angle of the kinds, [..., patch]."""
+        return at_angle(self.ratios(z), self.angle(z), kinds.theta_rad)
+
+    def permittivities(self, z: Real, ratios: Complex | None = None) -> Complex:
+        """Return the permittivity of every patch, [..., patch]."""
+        t = self.ratios(z) if ratios is None else ratios
+        return np.asarray(permittivity_from_ratio(t, self.angle(z)), np.complex128)
+
+    def brightness_off(self, z: Real) -> Real:
+        """Return ln |H| of every patch minus that of Eq. 2 and the metal's, [..., patch]."""
+        a, _ = self.leakage(z)
+        t, cosine, sine2 = self.ratios(z), np.cos(self.angle(z)), np.sin(self.angle(z)) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
-            model = np.log(np.abs(r_s * (1 + a * t) / (1 + a)))
-            off = (self.log_level - model) / self.brightness_std - x[..., 7, None]
-        return np.where(self.bright & np.isfinite(off), np.clip(off, -1e3, 1e3), 0.0)
+            q = (1 + t) / (1 - t) * sine2 / cosine
+            model = np.log(np.abs((cosine - q) / (cosine + q) * (1 + a * t) / (1 + a)))
+        off = self.log_level - model - METAL_BRIGHTNESS_STD * z[..., 7, None]
+        return np.where(np.isfinite(off), np.clip(off, -10, 10), 10.0)
 
-    def residuals(self, x: Real) -> Real:
-        """Return residuals of the priors, of ratios, and of brightness; [..., parameter] to [..., residual]."""
-        a, b, rho, _ = self.nuisances(x)
-        off = (measured_ratio(self.ratios(x), a, b, rho) - self.q) / self.std
-        misfit = self.misfit(x)
-        robust = np.sign(misfit) * OUTLIER * np.sqrt(np.log1p((misfit / OUTLIER) ** 2))
-        return np.concatenate([x[..., :_NUISANCES], off.real, off.imag, robust], axis=-1)
+    def brightness_std(self, z: Real) -> Real:
+        """Return the usual size of ln kappa, [...]."""
+        low, high = self.prior.brightness_range
+        return low * (high / low) ** scipy.special.ndtr(z[..., 8])
 
-    def jacobian(self, x: Real) -> Real:
-        """[residual, parameter]."""
-        return forward_differences(self.residuals, x)
+    def library_share(self, z: Real) -> Real:
+        """Return the share of the library's materials in this scene, [...]; uniform."""
+        if self.kinds is None or not self.kinds.ours.any():
+            return np.full(z.shape[:-1], 1e-12)
+        low, high = LIBRARY_SHARE
+        return low + (high - low) * scipy.special.ndtr(z[..., 14])
 
-    def source_rows(self) -> dict[str, npt.NDArray[np.intp]]:
-        """Return source to the indices of its residuals."""
-        ratios = np.arange(_NUISANCES, _NUISANCES + 2 * self.n)
-        bright = np.concatenate([[7], np.arange(_NUISANCES + 2 * self.n, _NUISANCES + 3 * self.n)])
-        rows = {"noise": ratios, "metal reference": np.array([4, 5]), "leakage": np.arange(4)}
-        return rows | {"incidence": np.array([6]), "brightness": bright.astype(np.intp)}
+    def log_likelihoods(self, z: Real) -> Real:
+        """Return log likelihoods [..., 1 + patch]: of all brightnesses, and of each patch to be some material."""
+        size = self.brightness_std(z)[..., None]
+        off = self.brightness_off(z)
+        usual = (1 - ODD_BRIGHTNESS) / size * np.exp(-0.5 * (off / size) ** 2)
+        odd = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (off / ODD_BRIGHTNESS_STD) ** 2)
+        bright = np.where(self.bright, np.log(usual + odd + 1e-300), 0.0).sum(axis=-1, keepdims=True)
+        if self.kinds is None:
+            return np.concatenate([bright, np.zeros((*bright.shape[:-1], self.n))], axis=-1)
+        if not self.maps:
+            return bright
+        t = self.ratios_of_kinds(z, self.kinds)
+        ours = np.log(self.library_share(z))
+        others = np.log1p(-self.library_share(z))
+        some = []
+        for i, density in enumerate(self.maps):
+            of_library, of_others = density.at(t[..., i])
+            some.append(np.logaddexp(ours + of_library, others + of_others))
+        return np.concatenate([bright, np.stack(some, axis=-1)], axis=-1)
 
 
-def invert(seen: Sequence[PatchMeasurement], prior: RigPrior) -> Inversion:
-    """Solve for all patches of a scene together.
+def at_angle(t: Complex, theta_rad: npt.ArrayLike, other_rad: float) -> Complex:
+    """Return t of the same half space at another angle.
 
-    The standard deviation of brightness is estimated in two steps: the patches' scatter about the first solution
-    corrects its prior (mean of a scaled inverse chi-square; Gelman et al., Bayesian Data Analysis, section 2.6).
-
-    `seen` are the patches without the metal reference.
+    With u = (1 + t) / (1 - t) Eq. 3 is sqrt(eps - sin^2) = u sin^2 / cos.
     """
-    first = _Model(seen, prior, prior.brightness_std)
-    start = _least_squares(first, np.zeros(_NUISANCES + 2 * first.n))
-    off = np.minimum(np.abs(first.misfit(start.x)[first.bright]), OUTLIER) * prior.brightness_std
-    freedom = BRIGHTNESS_FREEDOM + max(off.size - 4, 0)  # four numbers of leakage are fitted to them
-    level = float(np.sqrt((BRIGHTNESS_FREEDOM * prior.brightness_std**2 + np.sum(off**2)) / freedom))
-    model = _Model(seen, prior, level)
-    found = _least_squares(model, start.x)
-    return _solution(model, found)
+    sine2, other2 = np.sin(theta_rad) ** 2, np.sin(other_rad) ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        q = (1 + t) / (1 - t) * sine2 / np.cos(theta_rad)
+        there = np.sqrt(q**2 + sine2 - other2)
+        there = np.where((there * np.conj(q)).real < 0, -there, there) * np.cos(other_rad) / other2
+        moved = (there - 1) / (there + 1)
+    return np.where(np.isfinite(moved), moved, t)
 
 
-def _least_squares(model: _Model, start: Real) -> scipy.optimize.OptimizeResult:
-    options = {"jac": model.jacobian, "method": "lm", "xtol": 1e-10, "ftol": 1e-10}
-    return scipy.optimize.least_squares(model.residuals, start, **options)
+def _anneal(model: _Scene, z: Real, before: Real, after: Real, rng: np.random.Generator) -> Real:
+    """Move particles of one posterior to another; `before`, `after` [1 + patch] weigh the log likelihoods."""
+    parts, weight = model.log_likelihoods(z), before
+    change = after - before
+    done = 0.0
+    while done < 1:
+        gain = parts @ change
+        step = _step(gain, 1 - done)
+        done = 1.0 if step >= 1 - done else done + step
+        weight = before + done * change
+        chosen = _resample(np.exp(step * (gain - gain.max())), rng)
+        z, parts = z[chosen], parts[chosen]
+        spread = np.linalg.cholesky(np.cov(z.T) + 1e-9 * np.eye(_WIDTH)) * 2.0 / np.sqrt(_WIDTH)
+        for _ in range(_MOVES):
+            tried = z + rng.standard_normal(z.shape) @ spread.T
+            there = model.log_likelihoods(tried)
+            odds = (there - parts) @ weight - 0.5 * np.sum(tried**2 - z**2, axis=1)
+            accepted = np.log(rng.random(len(z))) < odds
+            z, parts = np.where(accepted[:, None], tried, z), np.where(accepted[:, None], there, parts)
+    return z
 
 
-def _solution(model: _Model, found: scipy.optimize.OptimizeResult) -> Inversion:
-    x, jac, prior, n = found.x, found.jac, model.prior, model.n
-    covariance = np.linalg.inv(jac.T @ jac)
-    (a,), (b,), _, (error,) = model.nuisances(x)
-    a, b, error = complex(a), complex(b), float(error)
-    spread = prior.leakage_std * np.sqrt(np.diag(covariance)[:4])
-    t = model.ratios(x)
-    patches = tuple(
-        _estimate(model, x, jac, covariance, i, complex(t[i]), float(model.theta[i] + error)) for i in range(n)
-    )
+def _step(gain: Real, most: float) -> float:
+    """Return the largest step of the temperature that leaves half of the particles' weight effective."""
+
+    def effective(step: float) -> float:
+        weight = np.exp(step * (gain - gain.max()))
+        return float(weight.sum() ** 2 / np.sum(weight**2)) / gain.size
+
+    if effective(most) >= 0.5:
+        return most
+    low, high = 0.0, most
+    for _ in range(30):
+        middle = (low + high) / 2
+        low, high = (middle, high) if effective(middle) >= 0.5 else (low, middle)
+    return max(low, 1e-6)
+
+
+def _resample(weight: Real, rng: np.random.Generator) -> npt.NDArray[np.intp]:
+    """Return indices of particles in proportion to their weights (systematic resampling)."""
+    places = (rng.random() + np.arange(weight.size)) / weight.size
+    return np.minimum(np.searchsorted(np.cumsum(weight) / weight.sum(), places), weight.size - 1)
+
+
+def _solution(model: _Scene, z: Real, patches: tuple[PatchEstimate, ...]) -> Inversion:
+    prior = model.prior
+    a, b = (leak[:, 0] for leak in model.leakage(z))
+    unit = max(prior.leakage_std, 1e-12)
+    parts = np.stack([a.real, a.imag, b.real, b.imag], axis=1) / unit
+    everything = np.cov(np.concatenate([parts, z[:, 4:7]], axis=1).T)
+    spread = unit * np.sqrt(np.diag(everything)[:4])
+    off = np.where(model.bright, np.median(model.brightness_off(z), axis=0), np.nan)
+    gx, gy = (complex(g) for g in model.gradient(z).mean(axis=0))
     return Inversion(
         patches,
-        (a, b),
+        (complex(a.mean()), complex(b.mean())),
         (float(np.hypot(*spread[:2]) / np.sqrt(2)), float(np.hypot(*spread[2:]) / np.sqrt(2))),
         prior.leakage_std,
-        error,
-        float(prior.theta_std_rad * np.sqrt(covariance[6, 6])),
-        np.where(model.bright, model.misfit(x), np.nan),
-        model.brightness_std,
-        float(2 * found.cost),
-        covariance[:_NUISANCES, :_NUISANCES],
+        float(prior.theta_std_rad * z[:, 6].mean()),
+        float(prior.theta_std_rad * np.std(z[:, 6])),
+        np.asarray(off, np.float64),
+        float(np.exp(np.log(model.brightness_std(z)).mean())),
+        (gx, gy),
+        everything,
     )
 
 
-def _estimate(model: _Model, x: Real, jac: Real, covariance: Real, i: int, t: complex, theta: float) -> PatchEstimate:
-    """Estimate one patch: ratio and permittivity with covariance, and the shares of the sources."""
-    at = [_NUISANCES + i, _NUISANCES + model.n + i]
-    unit = model.std[i]
-    of_ratio = unit**2 * covariance[np.ix_(at, at)]
-    distance = min(abs(t - 1), abs(1 / t - 1) if t else np.inf)
+def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> PatchEstimate:
+    """Estimate one patch from particles of the common errors: ratio, permittivity, shares of the sources, kinds."""
+    t = model.ratios(z)[:, i]
+    middle = complex(t.mean())
+    of_ratio = np.cov(pair(t).T) + model.own[i]
+    kinds = None if model.kinds is None else _probabilities(model, model.kinds, z, i)
+    distance = min(abs(middle - 1), abs(1 / middle - 1) if middle else np.inf)
     if not distance >= max(METAL_WITHOUT_PERMITTIVITY, LEAST_DISTANCE * np.sqrt(np.trace(of_ratio) / 2)):
-        return PatchEstimate(t, of_ratio, None, None, {})
-    value = complex(permittivity_from_ratio(t, theta))
-    by_t = complex(slope(t, theta)) * unit
-    step = 1e-5
-    by_theta = (
-        complex(permittivity_from_ratio(t, theta + step) - permittivity_from_ratio(t, theta - step))
-        / (2 * step)
-        * model.prior.theta_std_rad
-    )
-    # The permittivity's real and imaginary part by all parameters, [2, parameter].
-    gradient = np.zeros((2, x.size))
-    gradient[:, at[0]], gradient[:, at[1]] = (by_t.real, by_t.imag), (-by_t.imag, by_t.real)
-    gradient[:, 6] = by_theta.real, by_theta.imag
-    linear = gradient @ covariance @ gradient.T
-    total = float(np.trace(linear))
-    shares = {}
-    for source, rows in model.source_rows().items():
-        part = jac[rows] @ covariance @ gradient.T
-        shares[source] = float(np.sum(part**2)) / total
-    bend = 3 * np.sqrt(np.trace(of_ratio) / 2) / abs(1 - t)
-    if bend > _BENT:
-        linear = _drawn(t, theta, covariance[np.ix_([*at, 6], [*at, 6])], unit, model.prior.theta_std_rad)
-    return PatchEstimate(t, of_ratio, value, linear, shares)
+        return PatchEstimate(middle, of_ratio, None, None, {}, kinds)
+    theta = float(model.angle(z)[:, i].mean())
+    value = complex(permittivity_from_ratio(middle, theta))
+    noise = rng.multivariate_normal(np.zeros(2), model.own[i], (_DRAWS, len(z)), method="cholesky")
+    drawn_t = t + noise[..., 0] + 1j * noise[..., 1]
+    drawn = np.asarray(permittivity_from_ratio(drawn_t, model.angle(z)[:, i]), np.complex128)
+    # Near metal the moments of the far tail do not exist: three standard deviations of the ratio are kept.
+    off = pair(drawn_t - middle)
+    kept = np.einsum("...i,ij,...j->...", off, np.linalg.inv(of_ratio), off) < 11.8
+    parts = pair(drawn[kept] - value)
+    covariance = np.asarray(parts.T @ parts / len(parts), np.float64)
+    return PatchEstimate(middle, of_ratio, value, covariance, _shares(model, z, i, value), kinds)
 
 
-def _drawn(t: complex, theta: float, covariance: Real, unit: float, theta_std: float) -> Real:
-    """Return the covariance of the permittivity by sampling ratio and angle, if Eq. 3 bends within the error.
+def _shares(model: _Scene, z: Real, i: int, value: complex) -> dict[str, float]:
+    """Return the share of each source in the variance of a permittivity, to first order; they add up to 1."""
+    mean = np.tile(z.mean(axis=0), (len(z), 1))
+    together = model.permittivities(z)[:, i] - value
+    out = {"noise": float(abs(slope(model.ratios(mean[:1])[0, i], model.theta[i])) ** 2 * np.trace(model.own[i]))}
+    for source, columns in _GROUPS.items():
+        alone = mean.copy()
+        alone[:, columns] = z[:, columns]
+        effect = model.permittivities(alone)[:, i] - model.permittivities(mean[:1])[0, i]
+        out[source] = max(0.0, float(np.mean((np.conj(effect) * together).real)))
+    total = sum(out.values())
+    return {source: out[source] / total for source in SOURCES} if np.isfinite(total) and total > 0 else {}
 
-    Samples beyond three standard deviations are dropped: near metal the moments of the far tail do not exist.
-    """
-    rng = np.random.default_rng(0)
-    drawn = rng.multivariate_normal(np.zeros(3), covariance, _DRAWS, method="cholesky")
-    keep = np.sum(np.linalg.solve(covariance, drawn.T).T * drawn, axis=1) < 14.2  # 99.7 % of three dimensions
-    drawn = drawn[keep]
-    value = permittivity_from_ratio(t + unit * (drawn[:, 0] + 1j * drawn[:, 1]), theta + theta_std * drawn[:, 2])
-    away = value - complex(permittivity_from_ratio(t, theta))
-    parts = np.stack([away.real, away.imag])
-    return (parts @ parts.T / parts.shape[1]).astype(np.float64)
+
+def _probabilities(model: _Scene, kinds: Kinds, z: Real, i: int) -> Real:
+    """Return the probability of each kind, and last of any other material, [kind + 1]."""
+    each, other = kinds.densities(model.ratios_of_kinds(z, kinds)[:, i], model.own[i])
+    ours = model.library_share(z)
+    each = each * np.where(kinds.ours, ours[:, None], 1 - ours[:, None])
+    weights = np.append(each.mean(axis=0), ((1 - ours) * other).mean())
+    total = float(weights.sum())
+    if not total > 0:
+        return np.append(np.zeros(len(each[0])), 1.0)
+    return weights / total
 
 
 def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:
@@ -372,162 +500,11 @@ def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real
     t = np.asarray(t, np.complex128)
     scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
     by = np.stack([-(1 - t) * t, -(1 - t), -t], axis=-1) * scale
-    turned = np.stack([by, 1j * by], axis=-1).reshape(*t.shape, 6)
+    both = np.stack([by, 1j * by], axis=-1).reshape(*t.shape, 6)
     values, vectors = np.linalg.eigh(estimate.nuisance_covariance[:6, :6])
-    return np.stack([turned.real, turned.imag], axis=-2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    return np.stack([both.real, both.imag], axis=-2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def ratio_error(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:
     """Return the standard deviation of 1 / P at t by leakage and reference: root mean variance of both parts."""
     return np.sqrt(np.sum(ratio_slopes(estimate, prior, t) ** 2, axis=(-2, -1)) / 2)
-
-
-CHANNEL_RATIO_STD_DB = 2.5
-"""Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
-SURE_SCORE = 3.5
-WEAK_V_DB = -3.0
-"""V / H relative to the direct path below which a patch is hardly metal: metal has 0 dB, bare water -4 dB."""
-_LARGEST = 10.0  # |eps| of common materials; larger values are penalised
-_STARTS = [
-    complex(real, -real * loss) for real in (2.0, 2.6, 3.2, 4.0, 5.0, 7.0, 10.0) for loss in (0.01, 0.15, 0.4, 1.2)
-]
-_REFINED = 3
-_LARGEST_RESIDUAL = 1e3
-
-
-@dataclass(frozen=True)
-class MetalEvidence:
-    """Evidence for and against a patch being metal.
-
-    Attributes
-    ----------
-    score
-        Sum of squares of the best dielectric minus that of metal; positive values support metal.
-    others
-        Number of other patches that differ from the judged one. Similar patches give no evidence: metal beside metal
-        looks like water beside water.
-    channel_ratio_db
-        V / H of the patch relative to the direct path; None if not known.
-    """
-
-    score: float
-    others: int
-    channel_ratio_db: float | None
-
-    @property
-    def needed(self) -> float:
-        """Least score to count as metal; it rises with fewer other patches.
-
-        Limits are from random scenes with and without metal, of common and of very lossy materials
-        (see tests/materials/test_metal_evidence.py).
-        """
-        if self.others == 0:
-            return np.inf
-        if self.others == 1:
-            return 1.5
-        return 0.5 if self.others < 6 else -2.0
-
-    @property
-    def sure(self) -> bool:
-        """True if it is certainly metal: very lossy dielectrics (wet, conducting) come close to metal."""
-        return self.enough and self.score >= SURE_SCORE
-
-    @property
-    def against(self) -> bool:
-        """True if the data contradict metal, even if the user declares it."""
-        weak = self.channel_ratio_db is not None and self.channel_ratio_db < WEAK_V_DB
-        return weak or (self.others > 0 and self.score < -1.0)
-
-    @property
-    def enough(self) -> bool:
-        """True if the patch is shown to be metal."""
-        return self.score >= self.needed
-
-
-def metal_evidence(seen: list[PatchMeasurement], prior: RigPrior, channel_ratio: complex | None) -> MetalEvidence:
-    """Compare the explanations of a patch as metal and as a dielectric.
-
-    `seen` are the other patches, relative to the judged one; `channel_ratio` is V / H of the patch itself in images
-    referenced to the direct path, None for other images.
-    """
-    level = None if channel_ratio is None or not abs(channel_ratio) > 0 else 20 * float(np.log10(abs(channel_ratio)))
-    if not seen:
-        return MetalEvidence(0.0, 0, level)
-    metal = _Explanation(seen, prior, level)
-    as_metal = _best(metal, np.zeros(8))
-    starts = np.array([[0.0] * 8 + [np.log(e.real), np.log(-e.imag)] for e in _STARTS])
-    starts = starts[np.argsort(np.sum(metal.residuals(starts) ** 2, axis=-1), kind="stable")]
-    as_dielectric = min(_best(metal, x) for x in starts[:_REFINED])
-    unlike = sum(abs(s.inverse_ratio - 1) > METAL_UNLIKE for s in seen)
-    return MetalEvidence(as_dielectric - as_metal, unlike, level)
-
-
-def _best(model: _Explanation, start: Real) -> float:
-    """Return the least sum of squares from one start."""
-    limit = 40 * start.size
-    found = scipy.optimize.least_squares(model.residuals, start, jac=model.jacobian, method="lm", max_nfev=limit)
-    return 2 * float(found.cost)
-
-
-class _Explanation:
-    """Residuals of the other patches if the judged one is metal (8 parameters) or has a permittivity (2 more)."""
-
-    def __init__(self, seen: list[PatchMeasurement], prior: RigPrior, level_db: float | None) -> None:
-        self.prior, self.level_db = prior, level_db
-        self.q = np.array([s.inverse_ratio for s in seen], np.complex128)
-        levels = np.array([np.nan if s.brightness is None else s.brightness for s in seen], np.float64)
-        self.bright = np.isfinite(levels) & (levels > 0)
-        self.log_level = np.log(np.where(self.bright, levels, 1.0))
-        self.loose = np.array([s.std for s in seen])
-        self.theta = np.array([s.theta_rad for s in seen], np.float64)
-
-    def residuals(self, x: Real) -> Real:
-        """Return priors, brightness, and violations of possible permittivities; [..., parameter] to [..., residual]."""
-        p = self.prior
-        u = [x[..., k, None] for k in range(x.shape[-1])]
-        a = p.leakage[0] + p.leakage_std * (u[0] + 1j * u[1])
-        b = p.leakage[1] + p.leakage_std * (u[2] + 1j * u[3])
-        theta = self.theta + p.theta_std_rad * u[4]
-        own, own_s, bounds = np.ones((1,), np.complex128), -np.ones((1,), np.complex128), []
-        if len(u) > 8:
-            eps, middle = (
-                np.exp(np.minimum(u[8], 4.0)) - 1j * np.exp(np.minimum(u[9], 4.0)),
-                theta.mean(-1, keepdims=True),
-            )
-            own, own_s = 1 / ratio_from_permittivity(eps, middle), fresnel(eps, middle)[0]
-            large = [u[8] - np.log(30), u[9] - np.log(30), -u[8]]
-            bounds = [np.maximum(0.0, beyond) / 0.1 for beyond in large]
-            bounds.append(np.maximum(0.0, np.log(np.abs(eps) / _LARGEST)) / 0.6)  # such dielectrics are rare
-        c = self.q * (own + b) / (1 + a * own) / (1 + p.reference_std * (u[5] + 1j * u[6]))
-        t = (c - b) / (1 - a * c)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            eps_of = permittivity_from_ratio(t, theta)
-            r_s = fresnel(eps_of, theta)[0]
-            model = np.log(np.abs(r_s * (1 + a * t) / (own_s * (1 + a * own))))
-            brightness = np.where(self.bright, (self.log_level - model) / BRIGHTNESS_STD - u[7], 0.0)
-            size = np.abs(eps_of)
-            impossible = [
-                np.maximum(0.0, 1 - eps_of.real) / 0.1,
-                np.maximum(0.0, eps_of.imag - 0.02) / (0.1 + 0.1 * size),
-                np.maximum(0.0, np.log(size / _LARGEST)) / 0.5,
-            ]
-        metal, slack = np.abs(t - 1) < METAL_PIECE, 1 + 10 * self.loose
-        patches = [brightness, *(np.where(metal, 0.0, part) / slack for part in impossible)]
-        channel = [] if self.level_db is None else [(self._level(own, a, b) - self.level_db) / CHANNEL_RATIO_STD_DB]
-        return np.concatenate([x[..., :8], _robust(np.concatenate(patches, -1)), *channel, *bounds], -1)
-
-    def jacobian(self, x: Real) -> Real:
-        """[residual, parameter]."""
-        return forward_differences(self.residuals, x)
-
-    @staticmethod
-    def _level(own: Complex, a: Complex, b: Complex) -> Real:
-        """Return V / H relative to the direct path, dB; the direct path has the factors 1 + a and 1 + b."""
-        return 20 * np.log10(np.maximum(np.abs((own + b) / (1 + a * own) * (1 + a) / (1 + b)), 1e-6))
-
-
-def _robust(r: Real) -> Real:
-    """Apply Cauchy's loss, so that one odd patch does not decide; NaN counts as a large residual."""
-    top = _LARGEST_RESIDUAL
-    r = np.clip(np.nan_to_num(r, nan=top, posinf=top, neginf=-top), -top, top)
-    return np.sign(r) * OUTLIER * np.sqrt(np.log1p((r / OUTLIER) ** 2))

@@ -1,13 +1,12 @@
-"""Measure patches: ratio, brightness and their errors, the metal reference, and the permittivity.
+"""Measure patches: ratio, brightness and their errors, and the permittivity.
 
 `measure_patch` gives the input of the joint inversion, `permittivity_of_patch` combines its result with the percentiles
-of the pixels. `check_patches` refuses patches that are no flat plates. `MetalReference` is the region that everything
-is divided by: given as a box or a patch, or found.
+of the pixels. `check_patches` refuses patches that are no flat plates.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,23 +15,25 @@ import scipy
 
 from polysight.imaging import Image, Mask
 from polysight.materials.inversion import (
-    MetalEvidence,
     PatchEstimate,
     PatchMeasurement,
     slope,
 )
-from polysight.materials.segment import Box, Patch, Segmentation, box_mask
+from polysight.materials.segment import Patch, Segmentation
 from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import inverse_spread, permittivity_from_ratio
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
 from polysight_shared.findings import Finding
 
-SPREAD_SHARE = 0.40
-"""Error of a patch's V / H over the spread of its pixels: speckle averages out, edges and neighbours do not.
+AMPLITUDE_SHARE, PHASE_SHARE = 0.5, 0.7
+"""Error of a plate's ln|V / H| and of its phase over the scatter of its pixels.
 
-This and the next two are fitted to simulated scenes (benchmarks/coverage).
+Speckle averages out; edges, neighbours and ripple are correlated over 10 to 20 mm and do not. On the published picture
+the plates' |P| differ from Table 2's by half of their scatter, the phases by once to twice theirs.
 """
+USUAL_BLOCKS = 2.0
+"""Weight of the scene's usual scatter against a plate's own, in independent places of the plate."""
+BLOCK_M = 0.012
+"""Length over which the errors of V / H within a plate are correlated."""
 LEAST_STD = 1.4e-3
 """Least error of V / H, even with uniform pixels: H and V are illuminated from points some 15 mm apart."""
 TILT_STD = 0.004
@@ -40,6 +41,10 @@ TILT_STD = 0.004
 
 A tilted plate is illuminated from other points, different for H and V; one degree of tilt spreads the phase by 0.3 rad.
 """
+GRADIENT_STD = 0.3 + 0.3j
+"""Prior standard deviation of the change of ln(V / H) over the plane, per metre: 10 % and 5 degrees over 300 mm."""
+Real = npt.NDArray[np.float64]
+
 LEAST_PIXELS = 12
 FLAT_CONTRAST = 0.4
 """Largest standard deviation of |H| over its mean in a patch: noise or speckle has 0.52, plates less than 0.25."""
@@ -127,20 +132,140 @@ def halves_apart(h: Image, v: Image, at: Mask) -> float:
     return largest
 
 
-def measure_patch(patch: Patch, h: Image, v: Image, theta_rad: float, local_std: float = 0.0) -> PatchMeasurement:
-    """Measure a patch's ratio with its standard deviation, and its brightness.
+@dataclass(frozen=True)
+class Scatter:
+    """How ln(V / H) varies over a plate.
 
-    `local_std` is the relative error of a metal reference that varies over the plane; 0 if it is a single number.
+    Attributes
+    ----------
+    amplitude, phase
+        Standard deviations of ln|V / H| and of its phase over the pixels (1.48 times the median deviation).
+    blocks
+        Number of independent places on the plate.
+    slope, slope_std
+        Its change per metre along x and y, complex [2], and the standard deviation of either part's, [2] each complex.
+    centre_m
+        Centre of the pixels, x and y.
+    """
+
+    amplitude: float
+    phase: float
+    blocks: float
+    slope: npt.NDArray[np.complex128]
+    slope_std: npt.NDArray[np.complex128]
+    centre_m: tuple[float, float]
+
+
+def scatter_of(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Scatter | None:
+    """Return how V / H scatters over the pixels of a mask; None with fewer than `LEAST_PIXELS` usable ones."""
+    at = mask & np.isfinite(h) & np.isfinite(v) & (h != 0) & (v != 0)
+    rows, columns = np.nonzero(at)
+    if rows.size < LEAST_PIXELS:
+        return None
+    inverse = np.asarray(v[at].astype(np.complex128) / h[at], np.complex128)
+    middle = complex(np.median(inverse.real), np.median(inverse.imag))
+    if middle == 0:
+        return None
+    off = np.asarray(np.log(inverse / middle), np.complex128)
+    amplitude, phase = (1.4826 * float(np.median(np.abs(part - np.median(part)))) for part in (off.real, off.imag))
+    places = np.stack([x_m[columns], y_m[rows]], axis=1)
+    centred = places - places.mean(axis=0)
+    pixel_m2 = abs((x_m[1] - x_m[0]) * (y_m[1] - y_m[0]))
+    blocks = max(1.0, rows.size * pixel_m2 / BLOCK_M**2)
+    information = centred.T @ centred + 1e-12 * np.eye(2)
+    # Robust against bright strips at edges: deviations beyond three standard deviations are cut.
+    cut = np.clip(off.real, -3 * amplitude, 3 * amplitude) + 1j * np.clip(off.imag, -3 * phase, 3 * phase)
+    slope_of = np.linalg.solve(information, centred.T @ cut)
+    unit = np.sqrt(np.diag(np.linalg.inv(information)) * rows.size / blocks)
+    x, y = places.mean(axis=0).tolist()
+    return Scatter(amplitude, phase, blocks, slope_of, unit * complex(amplitude, phase), (x, y))
+
+
+def usual_scatter(all_plates: Sequence[Scatter]) -> tuple[float, float]:
+    """Return the usual scatter of ln|V / H| and of its phase in a scene: the medians over its plates."""
+    if not all_plates:
+        return 0.0, 0.0
+    return float(np.median([s.amplitude for s in all_plates])), float(np.median([s.phase for s in all_plates]))
+
+
+def common_gradient(all_plates: Sequence[Scatter]) -> tuple[tuple[complex, complex], tuple[complex, complex]]:
+    """Return the change of ln(V / H) per metre that all plates of a scene share, along x and y, and its deviation.
+
+    It is the mean of the plates' slopes, weighted with their precision and that of the prior (zero, `GRADIENT_STD`).
+    Slopes that scatter more than they should make it less certain.
+    """
+    mean, deviation = [], []
+    for axis in (0, 1):
+        parts = []
+        for part, prior_std in ((np.real, GRADIENT_STD.real), (np.imag, GRADIENT_STD.imag)):
+            slopes = np.array([part(s.slope[axis]) for s in all_plates])
+            precision = np.array([1 / max(part(s.slope_std[axis]), 1e-6) ** 2 for s in all_plates])
+            total = precision.sum() + prior_std**-2
+            value = float((precision * slopes).sum() / total)
+            excess = 1.0
+            if slopes.size > 1:
+                excess = max(1.0, float((precision * (slopes - value) ** 2).sum()) / (slopes.size - 1))
+            std = min(float(np.sqrt(excess / total)), prior_std)
+            parts.append((value, std))
+        mean.append(complex(parts[0][0], parts[1][0]))
+        deviation.append(complex(parts[0][1], parts[1][1]))
+    return (mean[0], mean[1]), (deviation[0], deviation[1])
+
+
+def relative_errors(own: Scatter | None, usual: tuple[float, float]) -> tuple[float, float]:
+    """Return the standard errors of a plate's ln|V / H| and phase, from its own scatter and the scene's usual one."""
+    amplitude, phase = usual
+    if own is not None:
+        weight = USUAL_BLOCKS + own.blocks
+        amplitude = float(np.sqrt((USUAL_BLOCKS * amplitude**2 + own.blocks * own.amplitude**2) / weight))
+        phase = float(np.sqrt((USUAL_BLOCKS * phase**2 + own.blocks * own.phase**2) / weight))
+    return AMPLITUDE_SHARE * amplitude, PHASE_SHARE * phase
+
+
+def measure_patch(
+    patch: Patch,
+    h: Image,
+    v: Image,
+    theta_rad: float,
+    scatter: Scatter | None = None,
+    usual: tuple[float, float] = (0.0, 0.0),
+    metal_m: tuple[float, float] | None = None,
+    local_std: float = 0.0,
+) -> PatchMeasurement:
+    """Measure a patch's ratio with its errors, and its brightness.
+
+    Parameters
+    ----------
+    patch
+        The patch.
+    h, v
+        complex [ny, nx], relative to metal, smoothed inside patches.
+    theta_rad
+        Its angle of incidence.
+    scatter, usual
+        The patch's :func:`scatter_of`, and the scene's :func:`usual_scatter`.
+    metal_m
+        Centre of the metal reference; None if the reference covers the plane.
+    local_std
+        Relative error of a metal reference that varies over the plane; 0 if it is a single number.
     """
     at = patch.interior
     ratio = median_ratio(h[at], v[at])
     inverse = 1 / ratio if ratio else complex(np.inf, 0.0)
-    spread = inverse_spread(h[at], v[at])
     level = np.abs(h[at])
     level = level[np.isfinite(level)]
-    parts = (SPREAD_SHARE * spread, LEAST_STD, TILT_STD * _phase_spread(h[at]), local_std * abs(inverse))
-    std = float(np.sqrt(np.sum(np.square(parts)))) if np.isfinite(spread) else float("inf")
-    return PatchMeasurement(inverse, std, theta_rad, float(np.median(level)) if level.size else None)
+    std = float(np.hypot(LEAST_STD, TILT_STD * _phase_spread(h[at])))
+    amplitude, phase = relative_errors(scatter, usual)
+    relative = float(np.hypot(amplitude, local_std)), float(np.hypot(phase, local_std))
+    place = (0.0, 0.0)
+    if scatter is not None and metal_m is not None:
+        place = (scatter.centre_m[0] - metal_m[0], scatter.centre_m[1] - metal_m[1])
+    return PatchMeasurement(inverse, std, theta_rad, float(np.median(level)) if level.size else None, relative, place)
+
+
+def own_std(h: Image, v: Image) -> float:
+    """Return the standard error of V / H of a patch's pixels [n], each part, by what scatters over the plate."""
+    return float(np.hypot(AMPLITUDE_SHARE * inverse_spread(h, v), np.hypot(LEAST_STD, TILT_STD * _phase_spread(h))))
 
 
 def _phase_spread(h: Image) -> float:
@@ -148,11 +273,6 @@ def _phase_spread(h: Image) -> float:
     h = h[np.isfinite(h)].astype(np.complex128)
     coherent = abs(h.sum()) / max(float(np.abs(h).sum()), 1e-300)
     return float(np.sqrt(-2 * np.log(min(max(coherent, 1e-3), 1.0))))
-
-
-def reference_std(spread: float) -> float:
-    """Return the relative standard deviation of metal's V / H from the spread of its pixels."""
-    return float(np.hypot(SPREAD_SHARE * spread, LEAST_STD)) if np.isfinite(spread) else LEAST_STD
 
 
 def check_patches(
@@ -340,106 +460,3 @@ def permittivity_of_patch(
         covariance=estimate.covariance,
         shares=estimate.shares,
     )
-
-
-@dataclass(frozen=True)
-class MetalReference:
-    """The metal region and its origin.
-
-    Attributes
-    ----------
-    mask
-        bool [ny, nx], interior of the region.
-    label
-        Patch number; None for a given box outside all patches.
-    how
-        One sentence for the report.
-    given
-        True if the user or a calibration declares it metal.
-    evidence
-        Evidence of the rest of the scene; None if it was not computed.
-    """
-
-    mask: Mask
-    label: int | None
-    how: str
-    given: bool = False
-    evidence: MetalEvidence | None = None
-
-    @property
-    def certain(self) -> bool:
-        """True if the rest of the scene shows that it is metal, or it is given and nothing contradicts it."""
-        if self.evidence is None:
-            return self.given
-        return self.evidence.enough or (self.given and not self.evidence.against)
-
-
-def metal_in_box(
-    box_mm: Box, segmentation: Segmentation, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: Mask | None = None
-) -> MetalReference:
-    """Take the metal reference from a box (x0, y0, x1, y1), millimetres from the image centre.
-
-    If the box overlaps a found patch, only that patch's interior inside the box is used, so that the box may be too
-    large. Raises DataError if the box has no valid pixel.
-    """
-    mask = box_mask(box_mm, x_m, y_m)
-    if valid is not None:
-        mask &= valid
-    overlaps = [(int((p.interior & mask).sum()), p) for p in segmentation.patches]
-    count, patch = max(overlaps, key=lambda o: o[0], default=(0, None))
-    label = None
-    if patch is not None and count >= 9:
-        mask, label = mask & patch.interior, patch.label
-    if not mask.any():
-        raise DataError(
-            f"the metal box {tuple(round(b, 1) for b in box_mm)} mm holds no valid pixel",
-            "it lies outside the image; boxes are in millimetres from the image centre",
-            "give --metal x,y,w,h inside the image",
-            code=ErrorCode.NO_DATA,
-        )
-    where = "" if label is None else f", inside patch {label}"
-    return MetalReference(
-        mask, label, f"given as a box around ({', '.join(f'{b:.0f}' for b in box_mm)}) mm{where}", given=True
-    )
-
-
-def metal_by_label(label: int, segmentation: Segmentation) -> MetalReference:
-    """Take this patch as the metal reference. Raises DataError if there is no such patch."""
-    for p in segmentation.patches:
-        if p.label == label:
-            return MetalReference(p.interior, label, f"given as patch {label}", given=True)
-    raise DataError(
-        f"there is no patch {label} to take as metal",
-        f"{len(segmentation.patches)} patches were found",
-        code=ErrorCode.NO_DATA,
-    )
-
-
-def no_metal(usable: Mask) -> MetalReference:
-    """Return the reference of a scene without patches: images are scaled by their own mean brightness."""
-    return MetalReference(usable, None, "none: no patch was found")
-
-
-def find_metal(h: Image, v: Image, segmentation: Segmentation) -> MetalReference | None:
-    """Return the patch that is brightest in both channels; None without patches.
-
-    The measure is median |H||V| over the interior. Metal reflects both polarisations fully (|r_s| = |r_p| = 1), every
-    dielectric loses most of p at these angles; the product does not depend on the unknown gains of H and V. The
-    brightest patch of a scene without metal is a dielectric: whether it is metal is another question
-    (:func:`metal_evidence`).
-    """
-    scores = sorted(
-        (
-            (float(np.median(np.abs(h[p.interior]) * np.abs(v[p.interior]))), p)
-            for p in segmentation.patches
-            if p.interior.any()
-        ),
-        key=lambda s: -s[0],
-    )
-    if not scores:
-        return None
-    best, patch = scores[0]
-    margin = best / scores[1][0] if len(scores) > 1 and scores[1][0] > 0 else float("inf")
-    beside = "the only patch found" if len(scores) == 1 else f"|H||V| {margin:.1f} times the next"
-    how = f"chosen as the patch that is brightest in both channels ({beside})"
-    return MetalReference(patch.interior, patch.label, how)

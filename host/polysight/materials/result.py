@@ -25,7 +25,8 @@ from polysight.materials.classify import NamedPatch, PatchName, features_of
 from polysight.materials.inversion import Inversion, RigPrior, ratio_error
 from polysight.materials.labels import Labels, TruthPlate
 from polysight.materials.library import Real, SceneErrors
-from polysight.materials.measure import MetalReference, Permittivity, background, ratio_sigma
+from polysight.materials.measure import Permittivity, background, ratio_sigma
+from polysight.materials.metal import MetalReference
 from polysight.materials.segment import Box, Patch, Segmentation, axis_mm
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, PermittivityFigures, TruthFigures
 from polysight.store import open_npz
@@ -55,7 +56,6 @@ SHRINKS = {
     "metal reference": "a larger metal plate, or `polysight calibrate metal`",
     "leakage": "measure leakage with metal strips: `polysight leakage`",
     "incidence": "measure where the antennas are: `polysight calibrate direct-path`",
-    "brightness": "measure leakage with metal strips: `polysight leakage`",
 }
 """Source of error to the measurement that reduces it."""
 

@@ -34,7 +34,7 @@ from polysight.materials.analyse import Optics, level, reference_spread, smooth_
 from polysight.materials.inversion import ratio_slopes
 from polysight.materials.layers import METAL, THICKNESS_RANGE_M, Bands, Layer, LayerFit, Spectrum, fit_layer
 from polysight.materials.library import Library
-from polysight.materials.measure import NOT_PASSIVE, measure_patch, median_ratio
+from polysight.materials.measure import NOT_PASSIVE, median_ratio, own_std
 from polysight.materials.result import MaterialsResult
 from polysight.polarimetry import PlaneReference, inverse_spread, remove_leakage
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, ScanMaterials
@@ -127,7 +127,7 @@ def band_rows(
             at = r.patch.interior & made.valid
             whole = (found.h[at], found.v[at])
             parts[r.patch.label].append(_measure_band(band, h[at], v[at], whole, error))
-    common = {r.patch.label: measure_patch(r.patch, found.h, found.v, 0.0).std for r in found.patches}
+    common = {r.patch.label: own_std(found.h[r.patch.interior], found.v[r.patch.interior]) for r in found.patches}
     return {label: _with_covariance(rows, found, common[label]) for label, rows in parts.items()}
 
 

@@ -1,0 +1,225 @@
+"""The metal reference: the region that everything is divided by, and the evidence that it is metal.
+
+It is given as a box or a patch, or it is the patch that is brightest in both channels. Evidence is its own: V / H
+against the direct path, which reaches both boards with equal strength. Metal reflects both polarisations fully, a
+dielectric loses most of p at these angles. A declared metal is contradicted by nothing else.
+
+The other patches give evidence on a metal that nobody declared. If the patch is metal, their ratios relative to it are
+those of materials. If it is a dielectric of inverse ratio t0, their true ratios are q t0, and the density of the
+measured q is that of materials at q t0, times |t0|^2: dielectrics would have to lie close together. The score is the
+logarithm of the ratio of both evidences, the second integrated over every material that the patch may be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from polysight.imaging import Image, Mask
+from polysight.materials.inversion import PatchMeasurement, RigPrior
+from polysight.materials.kinds import Kinds
+from polysight.materials.segment import Box, Segmentation, box_mask
+from polysight.materials.specimens import METAL_UNLIKE
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+
+CHANNEL_RATIO_STD_DB = 2.5
+"""Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
+WEAK_V_DB = -3.0
+"""V / H relative to the direct path below which a patch is hardly metal: metal has 0 dB, bare water -4 dB."""
+SURE_SCORE = 6.0
+CONFLICT_SCORE = -3.0
+_CELLS, _EDGE = 128, 1.15
+_ODD_PATCH = 0.05  # share of other patches that are nothing known, and their density of t
+_ODD_DENSITY = 0.1
+
+
+@dataclass(frozen=True)
+class MetalEvidence:
+    """Evidence for and against a patch being metal.
+
+    Attributes
+    ----------
+    score
+        Logarithm of the ratio of the evidences of metal and of a dielectric; positive values support metal.
+    others
+        Number of other patches that differ from the judged one. Similar patches give no evidence: metal beside metal
+        looks like water beside water.
+    channel_ratio_db
+        V / H of the patch relative to the direct path; None if not known.
+    culprit
+        Index of the other patch that fits metal least, if the score speaks against metal; None otherwise.
+    """
+
+    score: float
+    others: int
+    channel_ratio_db: float | None
+    culprit: int | None = None
+
+    @property
+    def needed(self) -> float:
+        """Least score to count as metal; it rises with fewer other patches (tests/materials/test_metal_evidence.py)."""
+        if self.others == 0:
+            return np.inf
+        return 4.0 if self.others == 1 else 2.0
+
+    @property
+    def sure(self) -> bool:
+        """True if it is certainly metal: very lossy dielectrics (wet, conducting) come close to metal."""
+        return self.enough and self.score >= SURE_SCORE
+
+    @property
+    def against(self) -> bool:
+        """True if its own V / H contradicts metal, even if the user declares it."""
+        return self.channel_ratio_db is not None and self.channel_ratio_db < WEAK_V_DB
+
+    @property
+    def enough(self) -> bool:
+        """True if the patch is shown to be metal."""
+        return self.score >= self.needed and not self.against
+
+
+def metal_evidence(
+    seen: Sequence[PatchMeasurement], prior: RigPrior, channel_ratio: complex | None, kinds: Kinds
+) -> MetalEvidence:
+    """Weigh the explanations of a patch as metal and as a dielectric.
+
+    `seen` are the other patches, relative to the judged one; `channel_ratio` is V / H of the patch itself in images
+    referenced to the direct path, None for other images; `kinds` are the materials that the other patches may be.
+    """
+    level = None if channel_ratio is None or not abs(channel_ratio) > 0 else 20 * float(np.log10(abs(channel_ratio)))
+    unlike = [i for i, s in enumerate(seen) if abs(s.inverse_ratio - 1) > METAL_UNLIKE]
+    if not unlike:
+        return MetalEvidence(0.0, 0, level)
+    q = np.array([seen[i].inverse_ratio for i in unlike], np.complex128)
+    own = np.median([np.trace(seen[i].covariance) / 2 for i in unlike])
+    blur = float(own + 2 * prior.leakage_std**2 + prior.reference_std**2 * np.median(np.abs(q)) ** 2)
+    corner = complex(_EDGE, _EDGE)
+    density = kinds.density_map(-corner, corner, blur * np.eye(2), _CELLS)
+    axis = np.linspace(-_EDGE, _EDGE, _CELLS)
+    t0 = axis[None, :] + 1j * axis[:, None]
+
+    def other_patches(own_t: npt.NDArray[np.complex128]) -> npt.NDArray[np.float64]:
+        """Return log densities of the measured q if the judged patch has t [...], [..., patch]."""
+        usual = np.exp(density.at(own_t[..., None] * q)[1]) * np.abs(own_t[..., None]) ** 2
+        return np.log((1 - _ODD_PATCH) * usual + _ODD_PATCH * _ODD_DENSITY)
+
+    as_metal = other_patches(np.asarray(1.0 + 0j))
+    dielectric = density.log_density[1] + other_patches(t0).sum(axis=-1)
+    metal = float(as_metal.sum())
+    if level is not None:
+        metal += -0.5 * (level / CHANNEL_RATIO_STD_DB) ** 2
+        level_of_t0 = 20 * np.log10(np.maximum(np.abs(t0), 1e-3))
+        dielectric = dielectric - 0.5 * ((level_of_t0 - level) / CHANNEL_RATIO_STD_DB) ** 2
+    dielectric = np.where((np.abs(t0 - 1) < METAL_UNLIKE) | (np.abs(t0) > 1), -np.inf, dielectric)
+    top = float(dielectric.max())
+    cell = (axis[1] - axis[0]) ** 2
+    score = metal - (top + float(np.log(np.exp(dielectric - top).sum() * cell)))
+    culprit = unlike[int(np.argmin(as_metal))] if score < CONFLICT_SCORE else None
+    return MetalEvidence(score, len(unlike), level, culprit)
+
+
+@dataclass(frozen=True)
+class MetalReference:
+    """The metal region and its origin.
+
+    Attributes
+    ----------
+    mask
+        bool [ny, nx], interior of the region.
+    label
+        Patch number; None for a given box outside all patches.
+    how
+        One sentence for the report.
+    given
+        True if the user or a calibration declares it metal.
+    evidence
+        Evidence of the rest of the scene; None if it was not computed.
+    """
+
+    mask: Mask
+    label: int | None
+    how: str
+    given: bool = False
+    evidence: MetalEvidence | None = None
+
+    @property
+    def certain(self) -> bool:
+        """True if the rest of the scene shows that it is metal, or it is given and nothing contradicts it."""
+        if self.evidence is None:
+            return self.given
+        return self.evidence.enough or (self.given and not self.evidence.against)
+
+
+def metal_in_box(
+    box_mm: Box, segmentation: Segmentation, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: Mask | None = None
+) -> MetalReference:
+    """Take the metal reference from a box (x0, y0, x1, y1), millimetres from the image centre.
+
+    If the box overlaps a found patch, only that patch's interior inside the box is used, so that the box may be too
+    large. Raises DataError if the box has no valid pixel.
+    """
+    mask = box_mask(box_mm, x_m, y_m)
+    if valid is not None:
+        mask &= valid
+    overlaps = [(int((p.interior & mask).sum()), p) for p in segmentation.patches]
+    count, patch = max(overlaps, key=lambda o: o[0], default=(0, None))
+    label = None
+    if patch is not None and count >= 9:
+        mask, label = mask & patch.interior, patch.label
+    if not mask.any():
+        raise DataError(
+            f"the metal box {tuple(round(b, 1) for b in box_mm)} mm holds no valid pixel",
+            "it lies outside the image; boxes are in millimetres from the image centre",
+            "give --metal x,y,w,h inside the image",
+            code=ErrorCode.NO_DATA,
+        )
+    where = "" if label is None else f", inside patch {label}"
+    return MetalReference(
+        mask, label, f"given as a box around ({', '.join(f'{b:.0f}' for b in box_mm)}) mm{where}", given=True
+    )
+
+
+def metal_by_label(label: int, segmentation: Segmentation) -> MetalReference:
+    """Take this patch as the metal reference. Raises DataError if there is no such patch."""
+    for p in segmentation.patches:
+        if p.label == label:
+            return MetalReference(p.interior, label, f"given as patch {label}", given=True)
+    raise DataError(
+        f"there is no patch {label} to take as metal",
+        f"{len(segmentation.patches)} patches were found",
+        code=ErrorCode.NO_DATA,
+    )
+
+
+def no_metal(usable: Mask) -> MetalReference:
+    """Return the reference of a scene without patches: images are scaled by their own mean brightness."""
+    return MetalReference(usable, None, "none: no patch was found")
+
+
+def find_metal(h: Image, v: Image, segmentation: Segmentation) -> MetalReference | None:
+    """Return the patch that is brightest in both channels; None without patches.
+
+    The measure is median |H||V| over the interior. Metal reflects both polarisations fully (|r_s| = |r_p| = 1), every
+    dielectric loses most of p at these angles; the product does not depend on the unknown gains of H and V. The
+    brightest patch of a scene without metal is a dielectric: whether it is metal is another question
+    (:func:`metal_evidence`).
+    """
+    scores = sorted(
+        (
+            (float(np.median(np.abs(h[p.interior]) * np.abs(v[p.interior]))), p)
+            for p in segmentation.patches
+            if p.interior.any()
+        ),
+        key=lambda s: -s[0],
+    )
+    if not scores:
+        return None
+    best, patch = scores[0]
+    margin = best / scores[1][0] if len(scores) > 1 and scores[1][0] > 0 else float("inf")
+    beside = "the only patch found" if len(scores) == 1 else f"|H||V| {margin:.1f} times the next"
+    how = f"chosen as the patch that is brightest in both channels ({beside})"
+    return MetalReference(patch.interior, patch.label, how)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from polysight.materials.inversion import PatchMeasurement, RigPrior
-from polysight.materials.kinds import Kinds
+from polysight.materials.kinds import Kinds, literature
 from polysight.materials.metal import metal_evidence
 
 THETA = np.radians(55.0)
-KINDS = Kinds((), float(THETA))
+KINDS = Kinds(literature(), float(THETA))
 EPS = [
     2.6 - 0.01j, 2.05 - 0.01j, 3.78 - 0.7j, 4.0 - 0.4j, 4.54 - 0.56j, 4.69 - 0.7j, 5.06 - 1.11j, 3.52 - 0.82j,
     4.75 - 2.43j, 3.66 - 0.43j, 6.3 - 0.2j, 7.5 - 0.3j, 9.4 - 0.1j, 9.37 - 18.0j, 1.3 - 0.01j,

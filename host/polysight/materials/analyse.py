@@ -24,7 +24,7 @@ from polysight.materials.classify import (
     name_patch,
 )
 from polysight.materials.inversion import MOVED, Inversion, PatchMeasurement, RigPrior, at_angle, invert
-from polysight.materials.kinds import Kinds
+from polysight.materials.kinds import Kinds, literature
 from polysight.materials.labels import TruthPlate, match_truth
 from polysight.materials.library import SceneErrors
 from polysight.materials.measure import (
@@ -284,8 +284,9 @@ class Seen:
 def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
     """Return what the patches may be: the library's materials at the library's angle, if there is one, and others."""
     if classifier is None or len(classifier.angles_deg) != 1:
-        return Kinds((), theta_rad)
-    return Kinds(classifier.kinds, float(np.radians(classifier.angles_deg[0])))
+        return Kinds(literature(), theta_rad)
+    own = classifier.kinds
+    return Kinds([*own, *literature(classifier.library.names)], float(np.radians(classifier.angles_deg[0])))
 
 
 def _names(

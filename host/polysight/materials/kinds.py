@@ -7,7 +7,7 @@ measured ratio under all of them is the prior of the joint inversion, and its pa
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from polysight.materials.catalogue import load_catalogue, same_material
 from polysight.materials.specimens import LOSS_RANGE, PUBLISHED_SPREAD, REAL_RANGE, SOFT_LOSS
 from polysight.polarimetry import permittivity_from_ratio, ratio_from_permittivity
 
@@ -170,14 +171,13 @@ class DensityMap:
         )
 
 
-def kinds_of(
-    permittivities: Mapping[str, complex | None],
-    spread: Mapping[str, tuple[float, float]] | None = None,
-    source: Source = "library",
-) -> list[Kind]:
-    """Return the kinds of materials by name; None as permittivity is metal."""
-    known = spread or {}
-    return [Kind(n, e, known.get(n, PUBLISHED_SPREAD), source) for n, e in permittivities.items()]
+def literature(library: Collection[str] = ()) -> list[Kind]:
+    """Return the materials of the catalogue, but for those that a library of these names has measured itself."""
+    return [
+        Kind(material.name, material.permittivity, material.spread, "literature")
+        for material in load_catalogue()
+        if not any(same_material(material.name, name) for name in library)
+    ]
 
 
 def _mean(kind: Kind, theta_rad: float) -> complex:

@@ -17,14 +17,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 from polysight.imaging import Image, Mask
-from polysight.materials.inversion import PatchMeasurement, RigPrior
+from polysight.materials.inversion import BRIGHTNESS_RANGE, METAL_BRIGHTNESS_STD, PatchMeasurement, RigPrior
 from polysight.materials.kinds import Kinds
 from polysight.materials.segment import Box, Segmentation, box_mask
 from polysight.materials.specimens import METAL_UNLIKE
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
+
+Real = npt.NDArray[np.float64]
 
 CHANNEL_RATIO_STD_DB = 2.5
 """Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
@@ -33,8 +36,8 @@ WEAK_V_DB = -3.0
 SURE_SCORE = 6.0
 CONFLICT_SCORE = -3.0
 _CELLS, _EDGE = 128, 1.15
-_ODD_PATCH = 0.05  # share of other patches that are nothing known, and their density of t
-_ODD_DENSITY = 0.1
+_ODD_PATCH = 0.1  # share of other patches that are nothing known, and their density of t
+_ODD_DENSITY = 0.5
 
 
 @dataclass(frozen=True)
@@ -107,9 +110,13 @@ def metal_evidence(
         usual = np.exp(density.at(own_t[..., None] * q)[1]) * np.abs(own_t[..., None]) ** 2
         return np.log((1 - _ODD_PATCH) * usual + _ODD_PATCH * _ODD_DENSITY)
 
+    theta = np.array([seen[i].theta_rad for i in unlike])
+    dull = float(np.hypot(BRIGHTNESS_RANGE[0], 1.5 * prior.leakage_std))
+    level_of = [seen[i].brightness for i in unlike]
+    brightness = np.array([np.nan if value is None else value for value in level_of], np.float64)
     as_metal = other_patches(np.asarray(1.0 + 0j))
-    dielectric = density.log_density[1] + other_patches(t0).sum(axis=-1)
-    metal = float(as_metal.sum())
+    dielectric = density.log_density[1] + other_patches(t0).sum(axis=-1) + _brightness(t0, q, brightness, theta, dull)
+    metal = float(as_metal.sum()) + float(_brightness(np.asarray(1.0 + 0j), q, brightness, theta, dull))
     if level is not None:
         metal += -0.5 * (level / CHANNEL_RATIO_STD_DB) ** 2
         level_of_t0 = 20 * np.log10(np.maximum(np.abs(t0), 1e-3))
@@ -120,6 +127,36 @@ def metal_evidence(
     score = metal - (top + float(np.log(np.exp(dielectric - top).sum() * cell)))
     culprit = unlike[int(np.argmin(as_metal))] if score < CONFLICT_SCORE else None
     return MetalEvidence(score, len(unlike), level, culprit)
+
+
+def _brightness(
+    own_t: npt.NDArray[np.complex128], q: npt.NDArray[np.complex128], level: Real, theta: Real, least_std: float
+) -> Real:
+    """Return the log evidence of the other patches' |H| [patch] if the judged patch has t [...], [...].
+
+    Their ln |H| scatters about Eq. 2's by an unknown amount, `least_std` or more; the judged patch has its own error.
+    """
+    known = np.isfinite(level) & (level > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        expected = _log_r_s(own_t[..., None] * q[known], theta[known]) - _log_r_s(own_t, theta.mean())[..., None]
+        off = np.log(level[known]) - expected
+    off = np.clip(np.nan_to_num(off, nan=5.0, posinf=5.0, neginf=-5.0), -5, 5)
+    n = int(known.sum())
+    size2 = np.geomspace(least_std, BRIGHTNESS_RANGE[1], 8) ** 2
+    total = (off.sum(axis=-1) ** 2)[..., None]
+    squares = (off**2).sum(axis=-1)[..., None]
+    common2 = METAL_BRIGHTNESS_STD**2
+    # Patches share the judged patch's own error: the covariance is size^2 I + common^2 1 1'.
+    distance2 = (squares - common2 * total / (size2 + n * common2)) / size2
+    evidence = -0.5 * (distance2 + (n - 1) * np.log(size2) + np.log(size2 + n * common2))
+    return np.asarray(scipy.special.logsumexp(evidence, axis=-1) - np.log(size2.size), np.float64)
+
+
+def _log_r_s(t: npt.NDArray[np.complex128], theta: npt.ArrayLike) -> Real:
+    """Return ln|r_s| of half spaces with t = r_p / r_s [...]; 0 of metal."""
+    cosine = np.cos(theta)
+    q = (1 + t) / (1 - t) * np.sin(theta) ** 2 / cosine
+    return np.where(np.abs(1 - t) < 1e-9, 0.0, np.log(np.abs((cosine - q) / (cosine + q))))
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,9 @@ def test_slope_is_the_derivative(tr, ti):
 
 def test_without_errors_the_truth_comes_back():
     leak = (0.04 + 0.02j, -0.03j)
-    found = invert(world(np.random.default_rng(0), leak, 1e-9, 0.0), RigPrior(1e-6, leak, 1e-6, True, reference_std=1e-6))
+    found = invert(
+        world(np.random.default_rng(0), leak, 1e-9, 0.0), RigPrior(1e-6, leak, 1e-6, True, reference_std=1e-6)
+    )
     for p, truth in zip(found.patches, EPS, strict=True):
         assert p.permittivity == pytest.approx(truth, rel=2e-5)
 

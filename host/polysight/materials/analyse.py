@@ -194,7 +194,8 @@ def analyse(
     kinds = _kinds(classifier, float(np.mean(theta)))
     if plane is None:
         channel = _channel_ratio(images, reference) if prior.channels_known else None
-        evidence = metal_evidence(measured, prior, channel, _kinds(None, float(np.mean(theta))))
+        others = dict(zip([p.label for p in judged], measured, strict=True))
+        evidence = metal_evidence(others, prior, channel, _kinds(None, float(np.mean(theta))))
         reference = replace(reference, evidence=evidence)
     inversion = invert(measured, prior, kinds)
     calibrated = remove_leakage(raw, inversion.leakage)

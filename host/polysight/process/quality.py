@@ -377,7 +377,7 @@ def scene_reasons(found: MaterialsResult, plane: PlaneEstimate | None, classifie
     if found.patches and metal.evidence is not None:
         e, patch = metal.evidence, "the given box" if metal.label is None else f"patch {metal.label}"
         enough = e.enough and (metal.given or metal.label not in refused)
-        reasons += metal_reasons(patch, enough, enough and e.sure, metal.given, e.against, e.others == 0)
+        reasons += metal_reasons(patch, enough, enough and e.sure, metal.given, e.against, e.others == 0, e.culprit)
     if found.prior.channels_known:
         gains = {"H": found.calibrated.metal_h, "V": found.calibrated.metal_v}
         reasons += level_reasons({channel: _median_level(gain) for channel, gain in gains.items()})

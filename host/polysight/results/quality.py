@@ -297,11 +297,18 @@ def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Finding]:
 
 
 def metal_reasons(
-    patch: str, likely: bool, certain: bool, given: bool, contradicted: bool, only_patch: bool
+    patch: str,
+    likely: bool,
+    certain: bool,
+    given: bool,
+    contradicted: bool,
+    only_patch: bool,
+    culprit: int | None = None,
 ) -> list[Finding]:
     """Judge the metal reference `patch` ("patch 3").
 
-    By the other patches it is `likely` or `certain` to be metal, or `contradicted`; `only_patch`: there are no others.
+    By the other patches it is `likely` or `certain` to be metal; `contradicted`: by its own V / H against the direct
+    path; `only_patch`: there are no others; `culprit`: the other patch that fits it least, if they speak against it.
     `given`: the user chose it.
     """
     do = "lay a metal plate into the scene and name it (--metal X,Y,W,H), or use `polysight calibrate metal`"
@@ -309,7 +316,13 @@ def metal_reasons(
         return [reason(
             "care" if likely or only_patch else "none",
             f"the given metal reference ({patch}) does not look like metal",
-            "it reflects H and V differently, or relative to it the other patches are impossible materials", do, 8.0,
+            "relative to the direct path it reflects far less of V than of H, as no metal does", do, 8.0,
+        )]  # fmt: skip
+    if given and culprit is not None and not likely:
+        return [reason(
+            "care", f"patch {culprit} and others are unusual materials beside the given metal reference ({patch})",
+            "a thin or layered plate, a dish of liquid, or H and V of different places look so; or it is not metal",
+            f"look at patch {culprit}: fit it as a layer, or leave it out; check that {patch} is bare metal", 2.6,
         )]  # fmt: skip
     if given or certain:
         return []

@@ -218,7 +218,27 @@ def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, ca
         true = 1 if e.name == "Metal" else complex(ratio_from_permittivity(eps, np.radians(e.incidence_deg)))
         assert np.median(e.p.real) + 1j * np.median(e.p.imag) == pytest.approx(true, rel=0.08)
         np.testing.assert_allclose(abs(e.p), e.h / e.v, rtol=1e-5)
-    assert "unobtainium" in capsys.readouterr().err
+    shown = capsys.readouterr()
+    assert "unobtainium" in shown.err
+    assert "60 degrees: on scans left out" in shown.out
+
+
+def test_training_on_one_scan_of_each_material_claims_no_accuracy(tmp_path, capsys, monkeypatch):
+    """Metal stands in both scans, and is what all is relative to: that it is recognised says nothing."""
+    monkeypatch.setattr(classify, "GRID", (1.0,))
+    for k, other in enumerate((3, 12)):
+        for number in (1, other):
+            write_material(tmp_path / "materials", material(number), 60, f"set{k}", 30, ERRORS, 10 * k + number)
+    out = tmp_path / "library.npz"
+    assert main(["train", "--authors", str(tmp_path), "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert "1.0" not in shown
+    assert "100" not in shown
+    assert "{" not in shown
+    assert "accuracy not known" in shown
+    library = Library.load(out)
+    assert library.fit["angles"]["60"]["pixel_accuracy"] is None
+    assert "100.0 %" not in classify.classifier_sentence(classify.Classifier(library))
 
 
 @pytest.mark.parametrize(

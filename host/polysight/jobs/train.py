@@ -6,7 +6,6 @@ scan. Rows are processed as by `polysight process`; if the raw rows are deleted,
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 import tempfile
@@ -28,6 +27,7 @@ from polysight.materials import (
     MaterialsResult,
     Optics,
     TrainingScan,
+    accuracy_lines,
     analyse,
     check_labels,
     make_library,
@@ -252,8 +252,7 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
     )
     library = make_library(with_unique_names(scans), note)
     library.save(out)
-    print_lines(_summary(out, library))
-    sys.stdout.write(f"{json.dumps(library.fit, indent=1)}\n")
+    print_lines([*_summary(out, library), *accuracy_lines(library)])
     return 0
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from polysight.imaging import Images, PlaneEstimate
 from polysight.materials import (
     PATCHES,
-    UNKNOWN,
     Classifier,
     MaterialsResult,
     TruthPlate,
@@ -210,16 +209,11 @@ def _result_lines(scan: ProcessedScan, found: MaterialsResult) -> tuple[str, ...
     head = (
         f"{'simulated ' if scan.simulated else ''}scan {scan.scan_id}: {len(patches)} patches; metal {found.metal.how}"
     )
-    named = [(patch, patch.truth) for patch in patches if patch.truth and patch.name and not patch.metal_reference]
-    # What the library does not hold, and was called unknown, is neither right nor wrong.
-    judged = [(patch, truth) for patch, truth in named if patch.name != UNKNOWN or truth.in_library]
-    parts = []
-    if judged:
-        right = sum(patch.name == truth.name for patch, truth in judged)
-        parts.append(f"{right} of {len(judged)} plates named right{_pixels_right(found)}")
-    if len(judged) < len(named):
-        parts.append(f"{len(named) - len(judged)} not in the library, and called unknown")
-    return (head, "; ".join(parts)) if parts else (head,)
+    count = scan.plates_named
+    if count is None:
+        return (head,)
+    aside = f"; {count.strange} not in the library, and called unknown" if count.strange else ""
+    return (head, f"{count.right} of {count.plates} plates named right{_pixels_right(found)}{aside}")
 
 
 def _pixels_right(found: MaterialsResult) -> str:

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Required, Self, TypedDict, Unpack
+from typing import Any, NamedTuple, Required, Self, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from msgspec import UNSET
 from polysight.imaging import Image, Images
 from polysight.materials import (
     PATCHES,
+    UNKNOWN,
     MaterialsResult,
     ScanPatches,
     TruthPlate,
@@ -64,6 +65,15 @@ _ARRAYS = {
     "p_sigma": np.float32,
 }
 _OPTIONAL = ("p_sigma",)  # arrays of image.npz that earlier releases did not write
+
+
+class PlatesNamed(NamedTuple):
+    """Plates of a simulated scene: named right, of so many; `strange` more are rightly called unknown."""
+
+    right: int
+    plates: int
+    strange: int
+
 
 Labels = npt.NDArray[np.int32]
 Mask = npt.NDArray[np.bool_]
@@ -270,6 +280,22 @@ class ProcessedScan:
     def expected_accuracy(self) -> float | None:
         """Share of pixels that the best classifier is expected to name right; None for saved products."""
         return None if self.found is None else expected_pixel_accuracy(self.found)
+
+    @property
+    def plates_named(self) -> PlatesNamed | None:
+        """Count the plates of the scene by their names, also those that were not found; None without truth or names.
+
+        Metal is the reference, not a result. What the library does not hold, and was called unknown, is neither right
+        nor wrong.
+        """
+        if not self.plates or not any(patch.name for patch in self.segments):
+            return None
+        found = [patch for patch in self.segments if not patch.metal_reference]
+        judged = [(patch.name, patch.truth) for patch in found if patch.truth and patch.truth.permittivity]
+        right = sum(name == truth.name for name, truth in judged)
+        strange = sum(name == UNKNOWN and not truth.in_library for name, truth in judged)
+        plates = sum(plate.permittivity is not None for plate in self.plates)
+        return PlatesNamed(right, plates - strange, strange)
 
     @property
     def segments(self) -> list[PatchFigures]:

@@ -317,12 +317,9 @@ def key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[st
     def add(value: str, what: str) -> None:
         out.append({"value": value, "text": what})
 
-    if scan.plates and any(patch.name for patch in scan.segments):
-        right = sum(r["right"] and r["true_real"] != "metal" for r in rows)  # metal is the reference, not a result
-        strange = sum(r["strange"] for r in rows)
-        plates = sum(plate.permittivity is not None for plate in scan.plates) - strange
-        aside = f", {strange} recognised as not in the library" if strange else ""
-        add(f"{right} of {plates}", f"plates named right{aside}")
+    if count := scan.plates_named:
+        aside = f", {count.strange} recognised as not in the library" if count.strange else ""
+        add(f"{count.right} of {count.plates}", f"plates named right{aside}")
     elif rows:
         add(str(len(rows)), "patches found")
     accuracy = scan.materials and scan.materials.pixel_accuracy

@@ -6,7 +6,6 @@ Each source is judged separately. Materials get the names of Table 2's rows, if 
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 import zipfile
@@ -17,11 +16,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from polysight.jobs.output import print_lines
 from polysight.materials import (
     METALS,
     Entry,
     LabelledScan,
     Library,
+    accuracy_lines,
     angle_in_text,
     entries_of_boxes,
     fit_library,
@@ -334,11 +335,8 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
         )
     library = Library(tuple(fitted), {"angles": fits}, library.note)
     library.save(out)
-    scores = {a: {k: f[k] for k in ("model", "pixel_accuracy", "patch_accuracy")} for a, f in fits.items()}
-    sys.stdout.write(
-        f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans\n"
-        f"{json.dumps(scores, indent=1)}\n"
-    )
+    head = f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans"
+    print_lines([head, *accuracy_lines(library)])
     return 0
 
 

@@ -50,6 +50,15 @@ def test_other_files_are_refused(tmp_path, content):
         inspect_bin(path)
 
 
+@pytest.mark.parametrize("size", [5000, 1 << 16, 1 << 20])
+@pytest.mark.parametrize("layout", [Layout(), Layout(lanes=2), Layout(samples=64)])
+def test_random_bytes_are_no_recording(tmp_path, size, layout):
+    path = tmp_path / "x.bin"
+    path.write_bytes(np.random.default_rng(size).bytes(size))
+    with refused(ErrorCode.FILE_FOREIGN, str(path)):
+        inspect_bin(path, layout)
+
+
 def test_zeros_have_their_own_exit_status(tmp_path, capsys):
     (tmp_path / "x.bin").write_bytes(bytes(1 << 16))
     assert inspect_file(tmp_path / "x.bin", None, None, "", as_json=False) == DataError.exit_status

@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 
 import pytest
+from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 
 from polysight.cli.main import build_parser, main
@@ -74,6 +75,24 @@ def refusal(*words: str) -> str:
 )
 def test_a_number_that_is_none_is_refused_in_words(words, rule, text):
     assert refusal(*words[:-1], f"{words[-1]}={text}").endswith(f"{text} is not {rule}")
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "-inf", "1e5"])
+@pytest.mark.parametrize("place", ["{},0,40,40", "0,{},40,40", "0,0,{},40", "0,0,40,{}"])
+def test_a_metal_box_is_a_place_on_the_image(text, place):
+    assert place.format(text) in refusal("process", "s", "--out", "o", f"--metal={place.format(text)}")
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "0.499", "19.9", "10001", "-200"])
+def test_an_object_distance_is_one_in_the_lab(text):
+    assert refusal("plan", f"--object-distance-mm={text}").endswith(f"{text} is not a distance from 20 to 10000 mm")
+
+
+@pytest.mark.parametrize("words", ["--columns 1", "--rows 1", "--width-mm 0.5", "--height-mm 0.9", "--step-x-mm 5000"])
+def test_a_plan_without_an_aperture_is_refused(words):
+    args = build_parser().parse_args(["plan", "--config", str(RIG_FILE), *words.split()])
+    with refused(ErrorCode.VALUE_INVALID, "positions"):
+        args.run(args)
 
 
 @pytest.mark.parametrize("text", ["nan", "inf", "-inf", "1e9"])

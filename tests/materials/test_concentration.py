@@ -1,9 +1,12 @@
 """A line from polarisation angle to concentration: recovered, judged on what it has not seen, with honest intervals."""
 
+import json
+
 import numpy as np
 import pytest
 from tests.support.refusals import refused
 
+from polysight.cli.main import main
 from polysight.materials import Entry, Library
 from polysight.materials.sub_bands import Line, concentrations, fit_concentration, polarisation_angle_rad
 from polysight_shared.error_codes import ErrorCode
@@ -74,3 +77,22 @@ def test_what_cannot_be_fitted_is_refused():
         fit_concentration(Library(tuple(mixed)))
     with refused(ErrorCode.NOT_ENOUGH_DATA):
         Line.through([1.0, 1.0, 1.0], [0.0, 1.0, 2.0])
+
+
+def test_a_material_that_is_not_used_is_named(tmp_path, capsys):
+    path = tmp_path / "library.npz"
+    known = library()
+    Library((*known.entries, entry("copper", 0.785), entry("water", 0.7)), {}, "").save(path)
+    assert main(["concentration", str(path), "--value", "water=0"]) == 0
+    (note,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note")]
+    assert "copper" in note
+    assert "water" not in note
+    assert main(["concentration", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["without_concentration"] == ["copper", "water"]
+
+
+@pytest.mark.parametrize("text", ["water=nan", "water=inf", "water=-1", "water=101", "water=", "water"])
+def test_a_concentration_is_a_percentage(capsys, text):
+    with pytest.raises(SystemExit):
+        main(["concentration", "library.npz", f"--value={text}"])
+    assert text in capsys.readouterr().err

@@ -34,6 +34,7 @@ _FULL_SCALE = 32767  # ADC counts
 _PCAP_HEADS = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\n\r\r\n")
 _UDP_HEADER_BYTES = 8
 _MAX_PCAP_BYTES = 4 << 30  # half an hour of three boards
+_CLEAR_PEAK_DB = 10.0
 _MUCH_DC = 0.05 * _FULL_SCALE
 MAGIC = {
     b"\x7fELF": "a program", b"\x89PNG": "a picture (PNG)", b"\xff\xd8\xff": "a picture (JPEG)", b"%PDF": "a PDF",
@@ -209,6 +210,14 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
         profile_db=profile,
         rx_profile_db=each,
     )
+    # Evenly spread values of 16 bits have 0.8 of full scale; a receiver with such a level clips, and has a peak.
+    if report.peak_db < _CLEAR_PEAK_DB and min(report.rx_rms) > 0.5 * _FULL_SCALE:
+        raise DataError(
+            f"{path}: not a recording: its values fill the whole range of 16 bits, without a peak in the range profile",
+            "random, compressed or encrypted data, or text",
+            "give a row (.bin) or a packet capture (.pcap)",
+            code=ErrorCode.FILE_FOREIGN,
+        )
     report.remarks = _remarks(report, is_mirrored(mean))
     return report
 
@@ -237,7 +246,7 @@ def _remarks(r: Report, mirrored: bool) -> list[str]:
         found.append(f"{r.left_over_bytes} bytes after the last complete chirp: truncated, or another layout")
     if max(r.rx_dc) > _MUCH_DC:
         found.append(f"constant offset of {max(r.rx_dc):.0f} counts, which this radar's high-pass filter would remove")
-    if r.peak_db < 10:
+    if r.peak_db < _CLEAR_PEAK_DB:
         found.append("no clear peak in the range profile: noise, or a wrong layout (--lanes, --samples)")
     return found
 

@@ -75,8 +75,8 @@ def _layer(text: str) -> Layer:
 def _value(text: str) -> tuple[str, float]:
     name, _, number = text.rpartition("=")
     try:
-        return name, float(number)
-    except ValueError:
+        return name, _percent(number)
+    except argparse.ArgumentTypeError:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=PERCENT, e.g. water=0") from None
 
 

@@ -16,6 +16,7 @@ from polysight_shared.errors import ConfigError
 
 RIG = Path("instrument.toml")
 _FIRST = 3  # options before "more options"
+_FARTHEST_MM = 10_000
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -141,6 +142,8 @@ def box(text: str) -> tuple[float, float, float, float]:
         raise argparse.ArgumentTypeError(
             f"{text!r} is not of the form x,y,width,height in mm, e.g. 0,0,40,40"
         ) from None
+    if not all(abs(value) <= _FARTHEST_MM for value in (x, y, w, h)):
+        raise argparse.ArgumentTypeError(f"{text!r} is no place on the image: numbers of at most {_FARTHEST_MM} mm")
     if w <= 0 or h <= 0:
         raise argparse.ArgumentTypeError(f"width and height of {text!r} must be positive")
     return x - w / 2, y - h / 2, x + w / 2, y + h / 2

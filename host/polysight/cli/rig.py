@@ -29,6 +29,8 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 
 _bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
+# Nearer than a few wavelengths (4 mm) no antenna sees a plane wave.
+_distance = number(float, "a distance from 20 to 10000 mm", lambda value: 20 <= value <= 10_000)
 _seconds = number(float, "a number of seconds from 0 to 3600", lambda value: 0 <= value <= 3600)
 
 
@@ -52,7 +54,7 @@ _NUMBERS = (
     ("--step-y-mm", positive, "distance of rows; the aperture keeps its size"),
     ("--width-mm", positive, "aperture in x"),
     ("--height-mm", positive, "aperture in y"),
-    ("--object-distance-mm", positive, "z of the object plane"),
+    ("--object-distance-mm", _distance, "z of the object plane"),
     ("--speed-mm-s", positive, "stage speed in a row"),
     ("--accel-mm-s2", positive, "acceleration of the stage"),
     ("--pulses", count, "chirps a position"),

@@ -31,6 +31,7 @@ from polysight.materials import (
     NamedPatch,
     PatchName,
     ScanPatches,
+    concentrations,
     fit_concentration,
     fit_row,
     format_permittivity,
@@ -196,12 +197,14 @@ def concentration(data: Path, given: Mapping[str, float], confidence: float, as_
             f"{data}: no material {unknown[0]!r}", f"it holds {', '.join(library.names)}", "correct --value"
         )
     result = fit_concentration(library, given, confidence)
+    left_out = sorted(set(library.names) - set(concentrations(library.names, given)))
     source = "simulated" if library.simulated else "measured"
     if as_json:
         content = {
             "source": source,
             "line": asdict(result.line),
             "left_out": [asdict(r) for r in result.left_out],
+            "without_concentration": left_out,
             "median_error_percent": result.median_error,
             "covered": result.covered,
         }
@@ -218,6 +221,10 @@ def concentration(data: Path, given: Mapping[str, float], confidence: float, as_
         f"median error {result.median_error:.3f} percent by weight; the {100 * confidence:.0f} % intervals hold the"
         f" truth in {100 * result.covered:.0f} % of the patches\n"
     )
+    if left_out:
+        print_lines(
+            [f"note: not used, no percentage in the name: {', '.join(left_out)} (--value NAME=PERCENT gives it)"]
+        )
     return 0
 
 

@@ -87,6 +87,13 @@ class Changes:
             extent = (grid[count] - 1) * grid[step] if size is None else size
             grid[step] = getattr(self, step) or grid[step]
             grid[count] = getattr(self, count) or 1 + round(extent / grid[step])
+        if min(grid["columns"], grid["rows"]) < 2:
+            raise ConfigError(
+                f"{grid['columns']} x {grid['rows']} positions",
+                "an image needs an aperture in both directions",
+                "plan two rows of two positions, or more",
+                code=ErrorCode.VALUE_INVALID,
+            )
         for section, key in (
             ("stage", "speed_mm_s"),
             ("stage", "accel_mm_s2"),

@@ -175,6 +175,24 @@ def test_notes_damage_nothing(whole):
     assert "0009.part" in str(found)
 
 
+def test_a_scan_that_is_being_recorded_has_not_ended(whole):
+    """Rows to come, the row that is recorded now and a line half written are no faults; a damaged row is one."""
+    lines = (whole / "manifest.jsonl").read_bytes().splitlines(keepends=True)
+    (whole / "manifest.jsonl").write_bytes(b"".join(lines[:3]))
+    (whole / "raw/RH/0002.part").write_bytes(b"half")
+    with ScanFolder.load(whole).writer():
+        with (whole / "manifest.jsonl").open("ab") as f:
+            f.write(lines[3][:20])
+        with (whole / "events.msgpack").open("ab") as f:
+            f.write(b"\x84\xa4")
+        (note,) = validate(whole)
+        assert note.level == "note"
+        assert "2 of 4 rows" in note.what
+        flip(whole / "raw/RH/0001.bin")
+        assert [f.level for f in validate(whole)] == ["error", "note"]
+    assert any("resume" in f.do for f in validate(whole)), "the program has ended: rows are missing"
+
+
 def test_read_row_refuses_damage(whole):
     flip(whole / "raw/RH/0002.bin")
     scan = ScanFolder.load(whole)

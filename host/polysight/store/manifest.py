@@ -11,6 +11,7 @@ lines are found. Lines of earlier releases have no chain and are still read.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import zlib
@@ -24,7 +25,7 @@ import msgspec
 from polysight.store.logs import AppendFile, LogDigest
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError, PolysightError, no_such
-from polysight_shared.files import MAX_JSON_BYTES, read_bounded
+from polysight_shared.files import MAX_JSON_BYTES, open_regular, read_bounded
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan
 
@@ -461,6 +462,19 @@ def read(path: Path) -> Manifest:
 
 
 # --- the writer ---
+
+
+def is_being_written(path: Path) -> bool:
+    """True if another program holds the manifest: it records the scan, or changes it."""
+    with open_regular(path) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:
+            # A network disk without locks: no program can have one.
+            return False
+    return False
 
 
 class ManifestWriter:

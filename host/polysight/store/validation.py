@@ -63,6 +63,7 @@ def _note(where: str, what: str, do: str = "") -> Finding:
 def validate(path: Path) -> list[Finding]:
     """List the faults of a scan folder; empty if it is complete and undamaged. Raises DataError if it is no scan."""
     content = manifest.read(path / MANIFEST)
+    being_written = manifest.is_being_written(path / MANIFEST)
     found = []
     if content.torn:
         found.append(_note(MANIFEST, "the last line is torn by a kill or power cut", "resume cuts it off"))
@@ -77,6 +78,10 @@ def validate(path: Path) -> list[Finding]:
         found.append(_error(MANIFEST, "the plan is not that of the rig file's grid"))
     for row in rows.values():
         found += _row(scan, row)
+    if being_written:
+        # Files of the row that is being recorded, and its events, are not complete yet.
+        what = f"a program is recording this scan: {len(rows)} of {scan.plan.rows} rows are committed"
+        return [f for f in found if f.level == "error"] + [_note(MANIFEST, what, "validate again when it has ended")]
     found += _dropped(scan)
     found += _strays(scan, rows)
     found += _events(scan)

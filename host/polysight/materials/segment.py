@@ -2,14 +2,15 @@
 
 Plates parallel to the stage are mirrors: the image is bright inside a plate and dark elsewhere. In dB, speckle is
 additive noise and plates are constant with steps between them: total variation removes the former and keeps the latter.
-Levels of plates differ by more than 10 dB (wood against metal), so one threshold finds the bright plates and another
-one, on the remaining pixels, the dim ones. A common threshold cannot give the edges: each region is cut again at half
-of its own amplitude, the position of the edge of a band-limited step.
+Levels of plates differ by 25 dB (thin wood against metal), so a common threshold cannot give their edges. The threshold
+falls from the brightest level instead, and each region that grows with it is cut at half of its own amplitude, the
+position of the edge of a band-limited step. A region is a patch if it stands out from the background; bright ones that
+do not are counted (`Segmentation.left_out`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,18 @@ from polysight_shared.errors import DataError
 Real = npt.NDArray[np.float64]
 Box = tuple[float, float, float, float]
 _LEAST_WEIGHT = 0.1  # dB
-_TURNS = 3  # thresholds: metal, dielectrics, the dimmest
+EDGE_DB = 6.0
+"""A plate's edge is at half of its amplitude, the edge of a band-limited step."""
+OVERFLOW = 1.5
+"""Growth within one step of the threshold by which a region runs into its background."""
+MOST_SCATTER_DB = 4.0
+"""Largest scatter of a background's level: that of a real picture is 3.8 dB; with more, plates are among the pixels."""
+SMALLEST_SHARE = 0.75
+"""Least area of a patch, relative to a square of the least width: a corner of a skirt has 0.6."""
+BODY = 0.65
+"""Parts of a region narrower than this share of its width do not belong to it."""
+STEP_DB = 1.0
+"""Step of the falling threshold."""
 
 
 @dataclass(frozen=True)
@@ -44,18 +56,21 @@ class SegmentSettings:
     floor_db
         Levels below this, relative to the brightest, count as equally dark.
     dimmest_db
-        Pixels beside bright patches below this level, relative to the brightest, count as sidelobes.
+        Regions below this level, relative to the brightest, count as sidelobes.
     least_contrast_db
-        Least difference of bright and dark; with less there are no (further) patches.
+        Least difference between a patch and what is around it.
+    least_scatter
+        The same relative to the scatter of the background's level, standard deviations.
     """
 
     smallest_mm: float = 14.0
     margin_mm: float = 9.0
     smooth_px: float = 1.0
     speckle_db: float = 3.0
-    floor_db: float = -32.0
-    dimmest_db: float = -24.0
+    floor_db: float = -35.0
+    dimmest_db: float = -26.0
     least_contrast_db: float = 5.0
+    least_scatter: float = 3.0
 
 
 @dataclass(frozen=True)
@@ -76,6 +91,8 @@ class Patch:
         Number of pixels inside the outline.
     mask, interior
         bool [ny, nx]: the patch, and its inside without the edges.
+    cut
+        True if it was found and the border of the image or of its valid pixels cuts it.
     """
 
     label: int
@@ -84,6 +101,7 @@ class Patch:
     pixels: int
     mask: Mask
     interior: Mask
+    cut: bool = False
 
     @property
     def centre_mm(self) -> tuple[float, float]:
@@ -94,10 +112,11 @@ class Patch:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """Label image int32 [ny, nx] (0: no patch), and its patches."""
+    """Label image int32 [ny, nx] (0: no patch), its patches, and the number of bright regions that are none."""
 
     labels: npt.NDArray[np.int32]
     patches: tuple[Patch, ...]
+    left_out: int = 0
 
 
 def axis_mm(axis_m: npt.ArrayLike) -> Real:
@@ -138,16 +157,17 @@ def make_patch(
     return Patch(label, box, skimage.measure.approximate_polygon(outline, pixel / 2), int(mask.sum()), mask, interior)
 
 
-def level_db(h: Image, v: Image, usable: Mask, smooth_px: float) -> Real:
+def level_db(h: Image, v: Image, usable: Mask, smooth_px: float, plate_px: float) -> Real:
     """Return the smoothed level of the stronger channel, dB below that channel's brightest, float64 [ny, nx].
 
-    Each channel is scaled by its brightest part, so that an unknown gain between H and V has no effect. The larger of
-    both is used instead of the sum, because V is only noise where it nearly vanishes.
+    Each channel is scaled by its brightest part of half a plate's width, `plate_px` (bright strips at edges do not
+    count), so that an unknown gain between H and V has no effect. The larger of both is used instead of the sum,
+    because V is only noise where it nearly vanishes.
     """
     power = np.zeros(h.shape)
     for channel in (h, v):
         p = scipy.ndimage.gaussian_filter(np.where(usable, np.abs(channel).astype(np.float64) ** 2, 0.0), smooth_px)
-        top = float(np.percentile(p[usable], 99.5))
+        top = float(scipy.ndimage.gaussian_filter(p, plate_px)[usable].max())
         if top > 0:
             power = np.maximum(power, p / top)
     return 10 * np.log10(np.maximum(power, 1e-12))
@@ -163,10 +183,8 @@ def segment(
 ) -> Segmentation:
     """Find the patches of an image pair.
 
-    The steps are total variation against speckle, Otsu's threshold on the level in dB, morphological opening, connected
-    components (scikit-image), each cut again at half of its own amplitude. The rest of a component is searched again,
-    so that a dim plate touching the skirt of a bright one is found. All is repeated on the pixels away from the found
-    patches until bright and dark cannot be separated.
+    The steps are total variation against speckle, a falling threshold on the level in dB, morphological opening,
+    connected components (scikit-image), each cut at half of its own amplitude. Otsu's threshold gives the background.
 
     `h` and `v` complex [ny, nx] are flattened by the footprint; their gains may differ. `valid` bool [ny, nx] are the
     pixels to use, None all finite ones. The result has no patches if bright and dark cannot be separated.
@@ -186,14 +204,43 @@ def segment(
             "the image has no valid pixel", "nothing was recorded, or all of it was masked", code=ErrorCode.NO_DATA
         )
     pixel_mm = abs(float(axis_mm(x_m)[1] - axis_mm(x_m)[0]))
-    level = np.maximum(level_db(h, v, usable, cfg.smooth_px), cfg.floor_db)
-    masks = _regions(_without_speckle(level, usable, cfg, pixel_mm), usable, cfg, pixel_mm)
+    level = np.maximum(level_db(h, v, usable, cfg.smooth_px, cfg.smallest_mm / pixel_mm / 2), cfg.floor_db)
+    even = _without_speckle(level, usable, cfg, pixel_mm)
+    least_db = _least_level_db(even[usable], cfg)
+    masks: list[Mask] = []
+    left_out = 0
+    for mask in _regions(even, usable, cfg, pixel_mm):
+        own_db = float(np.median(even[mask]))
+        is_large = float(mask.sum()) * pixel_mm**2 >= SMALLEST_SHARE * cfg.smallest_mm**2
+        if is_large and own_db >= least_db:
+            masks.append(mask)
+        elif is_large and own_db >= cfg.dimmest_db:
+            left_out += 1
     labels = np.zeros(h.shape, np.int32)
     patches = []
     for mask in sorted(masks, key=lambda mask: _reading_order(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
         labels[mask] = len(patches) + 1
-        patches.append(make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable))
-    return Segmentation(labels, tuple(patches))
+        patch = make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable)
+        patches.append(replace(patch, cut=_is_cut(mask, usable, cfg.smallest_mm / pixel_mm)))
+    return Segmentation(labels, tuple(patches), left_out)
+
+
+def _is_cut(mask: Mask, usable: Mask, smallest_px: float) -> bool:
+    """Return true if more than half of the smallest patch's width lies at the border of the usable pixels."""
+    inner = np.asarray(scipy.ndimage.binary_erosion(usable), bool)
+    return float((mask & ~inner).sum()) > smallest_px
+
+
+def _least_level_db(level: Real, cfg: SegmentSettings) -> float:
+    """Return the least level of a patch, dB: above the background by its scatter; infinite if all is background."""
+    if np.ptp(level) == 0:
+        return float("inf")
+    bright = level > skimage.filters.threshold_otsu(level)
+    if not _separate(level, bright, cfg.least_contrast_db):
+        return float("inf")
+    background = float(np.median(level[~bright]))
+    scatter = min(1.4826 * float(np.median(np.abs(level[~bright] - background))), MOST_SCATTER_DB)
+    return max(background + max(cfg.least_contrast_db, cfg.least_scatter * scatter), cfg.dimmest_db)
 
 
 def _reading_order(mask: Mask, y_mm: Real, row_pitch_mm: float) -> tuple[float, float]:
@@ -215,11 +262,8 @@ def whole_plane(usable: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm:
     return Segmentation(usable.astype(np.int32), (patch,))
 
 
-def _without_speckle(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> tuple[Real, Real]:
-    """Return the level after total variation, dB: with the weight for the bright plates' speckle, and a medium weight.
-
-    The second is for the remaining dim plates: they have more speckle than bright ones, and no bright neighbour.
-    """
+def _without_speckle(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> Real:
+    """Return the level after total variation, dB, with the weight for the speckle of the bright plates."""
 
     def even(weight: float) -> Real:
         return np.asarray(skimage.restoration.denoise_tv_chambolle(level, weight=weight, max_num_iter=100))
@@ -227,37 +271,14 @@ def _without_speckle(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: 
     strongest = even(cfg.speckle_db)
     inside = strongest[usable]
     if np.ptp(inside) == 0:
-        return strongest, strongest
+        return strongest
     bright = (strongest > skimage.filters.threshold_otsu(inside)) & usable
     middle = np.asarray(scipy.ndimage.distance_transform_edt(bright)) > cfg.margin_mm / pixel_mm
     if not middle.any():
-        return strongest, strongest
+        return strongest
     difference = (level - strongest)[middle]
     speckle = 1.4826 * float(np.median(np.abs(difference - np.median(difference))))
-    return even(min(cfg.speckle_db, max(speckle, _LEAST_WEIGHT))), even(cfg.speckle_db / 2)
-
-
-def _regions(levels: tuple[Real, Real], usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> list[Mask]:
-    """Return the masks of all patches, bright ones first."""
-    radius = max(1, round((cfg.smallest_mm / pixel_mm - 1) / 2))
-    around = np.asarray(skimage.morphology.disk(max(1, round(cfg.margin_mm / pixel_mm))), bool)
-    found: list[Mask] = []
-    rest = usable.copy()
-    for turn in range(_TURNS):
-        level = levels[0] if turn == 0 else np.maximum(levels[1], cfg.dimmest_db)
-        inside = level[rest]
-        if inside.size == 0 or np.ptp(inside) == 0:
-            break
-        threshold = float(skimage.filters.threshold_otsu(inside))
-        bright = inside > threshold
-        if not bright.any() or bright.all() or not _separate(inside, bright, cfg.least_contrast_db):
-            break
-        new = _cut(10 ** (level / 20), (level > threshold) & rest, radius)
-        if not new:
-            break
-        found += new
-        rest &= ~np.asarray(scipy.ndimage.binary_dilation(np.logical_or.reduce(new), around), bool)
-    return found
+    return even(min(cfg.speckle_db, max(speckle, _LEAST_WEIGHT)))
 
 
 def _separate(level: Real, bright: Mask, least_contrast_db: float) -> bool:
@@ -272,36 +293,76 @@ def _separate(level: Real, bright: Mask, least_contrast_db: float) -> bool:
     return gap >= least_contrast_db and two
 
 
-def _cut(amplitude: Real, mask: Mask, radius: int) -> list[Mask]:
-    """Return the connected regions of a mask, each cut at half of its own amplitude."""
-    disk = np.asarray(skimage.morphology.disk(radius), bool)
-    skirt = np.asarray(skimage.morphology.disk(radius + 1), bool)
-    found: list[Mask] = []
-    queue = _components(_opened(mask, disk))
-    while queue:
-        region = queue.pop()
-        own = float(np.percentile(amplitude[region], 70))
-        core = _opened(region & (amplitude > own / 2), disk)
-        parts = _components(core)
-        if not parts:
-            continue
-        near = np.asarray(scipy.ndimage.binary_dilation(core, skirt), bool)
-        queue += _components(_opened(region & ~near, disk))
-        if len(parts) == 1:
-            found.append(_smooth_outline(parts[0]))
-        else:
-            queue += parts
-    return found
+@dataclass(frozen=True, eq=False)
+class _Growing:
+    """A region that grows while the threshold falls: its mask at each threshold, and its median level, dB."""
+
+    masks: tuple[tuple[float, Mask], ...]
+    level_db: float
+
+    @property
+    def mask(self) -> Mask:
+        """The mask at the last threshold."""
+        return self.masks[-1][1]
+
+    def cut(self, around_db: float) -> Mask:
+        """Return the mask at the mean of its own amplitude and that of what is around it."""
+        edge_db = 20 * float(np.log10((10 ** (self.level_db / 20) + 10 ** (around_db / 20)) / 2))
+        return min(self.masks, key=lambda step: abs(step[0] - edge_db))[1]
+
+
+def _regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> list[Mask]:
+    """Return the masks of all regions that stand out from what surrounds them, bright ones first.
+
+    The threshold falls from the brightest level, and connected regions grow with it. A region is complete when its
+    median lies `EDGE_DB` above the threshold (half of its own amplitude), or before it runs into another region or into
+    a background that is not that far below. It is taken out with its skirt; the threshold goes on falling for the rest.
+    """
+    opening_px = (cfg.smallest_mm / pixel_mm - 1) / 2
+    skirt_px = max(1.0, cfg.margin_mm / pixel_mm)
+    rest = usable.copy()
+    taken: list[Mask] = []
+    growing: list[_Growing] = []
+
+    def take(mask: Mask) -> None:
+        taken.append(_smooth_outline(mask))
+        rest[np.asarray(scipy.ndimage.distance_transform_edt(~mask)) <= skirt_px] = False
+
+    for threshold in np.arange(float(level[usable].max()), cfg.floor_db, -STEP_DB) - STEP_DB:
+        grown: list[_Growing] = []
+        for region in _components(_opened((level > threshold) & rest, opening_px)):
+            inside = [node for node in growing if (node.mask & region).any()]
+            complete = [node for node in inside if node.level_db - threshold >= cfg.least_contrast_db]
+            overflows = any(region.sum() > OVERFLOW * node.mask.sum() for node in complete)
+            own_db = float(np.median(level[region]))
+            if len(complete) > 1 or overflows:
+                for node in complete:
+                    take(node.cut(float(threshold)))
+                grown += [node for node in inside if node not in complete]
+            elif own_db - threshold >= EDGE_DB:
+                take(region)
+            else:
+                earlier = max(inside, key=lambda node: int(node.mask.sum())).masks if inside else ()
+                grown.append(_Growing((*earlier, (float(threshold), region)), own_db))
+        growing = grown
+    return taken
 
 
 def _smooth_outline(mask: Mask) -> Mask:
-    """Fill the holes of a region and smooth its outline, which ringing along the edges makes jagged."""
-    filled = np.asarray(scipy.ndimage.binary_fill_holes(mask), float)
-    return np.asarray(scipy.ndimage.gaussian_filter(filled, 1.0) > 0.5, bool)
+    """Fill the holes of a region and cut off what is narrower than half of it: speckle, and bridges to a neighbour."""
+    filled = np.asarray(scipy.ndimage.binary_fill_holes(mask), bool)
+    half_width = float(np.asarray(scipy.ndimage.distance_transform_edt(np.pad(filled, 1))).max())
+    body = max(_components(_opened(filled, BODY * half_width)), key=lambda part: int(part.sum()), default=filled)
+    return np.asarray(scipy.ndimage.gaussian_filter(body.astype(float), 1.0) > 0.5, bool)
 
 
-def _opened(mask: Mask, element: npt.NDArray) -> Mask:
-    return np.asarray(scipy.ndimage.binary_opening(mask, element), bool)
+def _opened(mask: Mask, radius_px: float) -> Mask:
+    """Remove what is narrower than a disk of this radius (morphological opening, by distances)."""
+    depth = np.asarray(scipy.ndimage.distance_transform_edt(np.pad(mask, 1)))[1:-1, 1:-1]
+    core = depth > radius_px
+    if not core.any():
+        return core
+    return mask & (np.asarray(scipy.ndimage.distance_transform_edt(~core)) <= radius_px)
 
 
 def _components(mask: Mask) -> list[Mask]:

@@ -371,7 +371,8 @@ def scene_reasons(found: MaterialsResult, plane: PlaneEstimate | None, classifie
         for r in found.patches
         if r.refused is not None and r.refused.what in NOT_PASSIVE and r.permittivity.value is not None
     }
-    reasons += signal_reasons({k: v for k, v in refused.items() if k not in gaining}, len(found.patches))
+    no_plates = {k: v for k, v in refused.items() if k not in gaining}
+    reasons += signal_reasons(no_plates, len(found.patches), found.segmentation.left_out)
     reasons += passivity_reasons(gaining)
     metal = found.metal
     if found.patches and metal.evidence is not None:

@@ -267,8 +267,11 @@ def level_reasons(levels: Mapping[str, float | None]) -> list[Finding]:
     return out
 
 
-def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Finding]:
-    """Judge the patches; `refused` maps numbers of patches that are no plates to why (noise, several materials)."""
+def signal_reasons(refused: Mapping[int, str], patches: int, left_out: int = 0) -> list[Finding]:
+    """Judge the patches; `refused` maps numbers of patches that are no plates to why (noise, several materials).
+
+    `left_out` bright regions of a plate's size do not stand out enough from the background to be patches.
+    """
     if patches == 0:
         return [reason(
             "none", "no patch was found", "nothing in the image stands out from its background",
@@ -284,7 +287,12 @@ def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Finding]:
     by_reason: dict[str, list[int]] = {}
     for label, what in refused.items():
         by_reason.setdefault(what, []).append(label)
-    return [
+    aside = [reason(
+        "good", f"{left_out} region{'s' * (left_out > 1)} of a plate's size within 25 dB of the brightest: no patch",
+        "no brighter than the background scatters: sidelobes, clutter or very weak plates",
+        "draw a box where a plate lies (polysight label; process --labels)", 0.5,
+    )] if left_out else []  # fmt: skip
+    return aside + [
         reason(
             "care",
             f"patch{'es' * (len(labels) > 1)} {', '.join(map(str, labels))} not judged: {what}",

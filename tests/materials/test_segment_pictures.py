@@ -1,0 +1,166 @@
+"""Segmentation of pictures as real rigs make them: rippled, unevenly lit plates with bright strips and narrow gaps."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from polysight.materials.labels import patches_from_labels
+from polysight.materials.measure import background, check_patch, halves_apart
+from polysight.materials.segment import segment
+
+PIXEL_MM = 2.0
+SIDE = 150
+AXIS = (np.arange(SIDE) - (SIDE - 1) / 2) * PIXEL_MM / 1e3
+COPPER = 1.0 + 0j
+PUBLISHED = os.environ.get("POLYSIGHT_PUBLISHED_IMAGES")
+"""Folder of the published rig's own picture and its boxes, which is no part of the repository."""
+
+
+def ripple(rng, amplitude, phase_rad):
+    """A multiplicative error of these standard deviations, correlated over some 15 mm."""
+    fields = [ndimage.gaussian_filter(rng.standard_normal((SIDE, SIDE)), 7.5 / PIXEL_MM) for _ in range(2)]
+    real, imag = (field / field.std() for field in fields)
+    return np.exp(amplitude * real + 1j * phase_rad * imag)
+
+
+def draw(seed, plates, strips=1.8, amplitude=0.25, phase_deg=13.0, background_db=-35.0):
+    """H and V of plates: (x0, y0, x1, y1) in pixels to (level of H in dB, V / H); strips of 4 mm along two edges."""
+    rng = np.random.default_rng(seed)
+    h, v = np.zeros((2, SIDE, SIDE), complex)
+    for (x0, y0, x1, y1), (level_db, ratio) in plates.items():
+        lit = np.full((y1 - y0, x1 - x0), 10 ** (level_db / 20), complex)
+        lit[:2] *= strips
+        lit[:, -2:] *= strips
+        h[y0:y1, x0:x1] = lit
+        v[y0:y1, x0:x1] = ratio * lit
+    # The ripple of V / H is what a metal plate shows; both channels have their half of it.
+    share = np.sqrt(0.5)
+    out = []
+    for channel in (h, v):
+        rippled = channel * ripple(rng, share * amplitude, share * np.radians(phase_deg))
+        noise = (rng.standard_normal((SIDE, SIDE)) + 1j * rng.standard_normal((SIDE, SIDE))) * 10 ** (
+            background_db / 20
+        )
+        blurred = [ndimage.gaussian_filter(part, 1.2) for part in (rippled.real, rippled.imag)]
+        out.append(blurred[0] + 1j * blurred[1] + noise)
+    return out
+
+
+def raster(levels_db, ratios, gap_px):
+    """Plates of 46 mm in rows of three, `gap_px` apart."""
+    size = 23
+    first = (SIDE - 3 * size - 2 * gap_px) // 2
+    boxes = [(first + (size + gap_px) * (i % 3), first + (size + gap_px) * (i // 3)) for i in range(len(levels_db))]
+    return {
+        (x, y, x + size, y + size): (level, ratio)
+        for (x, y), level, ratio in zip(boxes, levels_db, ratios, strict=True)
+    }
+
+
+def boxes_px(found):
+    return [tuple(round(b / PIXEL_MM + SIDE / 2) for b in patch.box_mm) for patch in found.patches]
+
+
+def assert_found(found, plates, tolerance_px=4):
+    boxes = boxes_px(found)
+    assert len(boxes) == len(plates), boxes
+    for plate in plates:
+        assert any(np.abs(np.subtract(plate, box)).max() <= tolerance_px for box in boxes), (plate, boxes)
+
+
+RATIOS = [COPPER, 0.2, 0.22 + 0.05j, 0.3, 0.35 - 0.1j, 0.19, 0.5, 0.28, 0.2]
+
+
+@pytest.mark.parametrize("gap_px", [6, 8])
+@pytest.mark.parametrize("seed", range(4))
+def test_rippled_plates_with_bright_strips_and_narrow_gaps_are_found(seed, gap_px):
+    """Levels as in a real picture: 1.2 times metal's to a quarter of it."""
+    levels = np.random.default_rng(seed).permutation([0.0, 1.0, -4.0, 1.5, 1.0, -6.0, 1.5, -8.0, -11.0])
+    plates = raster(levels, RATIOS, gap_px)
+    assert_found(segment(*draw(seed, plates), AXIS, AXIS), plates)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_plates_25_db_below_the_brightest_are_found(seed):
+    plates = raster([0.0, -12.0, -25.0, -18.0, -1.0, -22.0], RATIOS[:6], 10)
+    assert_found(segment(*draw(seed, plates, amplitude=0.12, background_db=-48.0), AXIS, AXIS), plates)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sheets_that_only_h_shows_are_found(seed):
+    plates = raster([0.0, -6.0, -16.0, -3.0], [COPPER, 0.0, 0.0, 0.2], 10)
+    assert_found(segment(*draw(seed, plates, background_db=-40.0), AXIS, AXIS), plates)
+
+
+@pytest.mark.parametrize(("x0", "cut"), [(0, True), (130, True), (8, False)])
+def test_a_plate_at_the_border_is_cut_and_refused(x0, cut):
+    plates = {(60, 60, 84, 84): (0.0, COPPER), (x0, 20, min(x0 + 24, SIDE), 44): (-2.0, 0.25)}
+    h, v = draw(1, plates)
+    found = segment(h, v, AXIS, AXIS)
+    assert_found(found, plates)
+    patch = min(found.patches, key=lambda p: p.centre_mm[1])
+    assert patch.cut is cut
+    why = check_patch(patch, h, v, background(h, v, found, np.ones(h.shape, bool)), 0.0)
+    assert (why is not None and "border" in why.what) is cut
+
+
+def test_the_border_of_the_valid_pixels_cuts_too():
+    plates = {(60, 60, 84, 84): (0.0, COPPER), (20, 60, 44, 84): (0.0, 0.25)}
+    valid = np.ones((SIDE, SIDE), bool)
+    valid[:, :30] = False
+    found = segment(*draw(1, plates), AXIS, AXIS, valid)
+    assert sorted(p.cut for p in found.patches) == [False, True]
+
+
+def refusal(h, v, box, amplitude_of_metal=0.0):
+    found, _ = patches_from_labels({"plate": box}, AXIS, AXIS)
+    patch = found.patches[0]
+    uneven = max(amplitude_of_metal, halves_apart(h, v, patch.interior) if amplitude_of_metal else 0.0)
+    return check_patch(patch, h, v, background(h, v, found, np.ones(h.shape, bool)), uneven)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_metal_that_ripples_as_real_metal_does_is_one_material(seed):
+    """25 % and 13 degrees; its halves are compared with its own, as for a metal reference."""
+    plates = {(60, 60, 88, 88): (0.0, COPPER)}
+    h, v = draw(seed, plates, strips=1.0)
+    assert refusal(h, v, (64, 64, 84, 84), amplitude_of_metal=0.1) is None
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("other", [0.2, 0.35 - 0.1j])
+def test_metal_and_a_dielectric_in_one_box_are_not(seed, other):
+    plates = {(60, 60, 74, 88): (0.0, COPPER), (74, 60, 88, 88): (0.0, other)}
+    h, v = draw(seed, plates, strips=1.0, amplitude=0.1, phase_deg=5.0)
+    assert refusal(h, v, (62, 62, 86, 86)) is not None
+
+
+def test_clutter_of_a_plates_size_is_counted_but_no_patch():
+    rng = np.random.default_rng(3)
+    plates = raster([0.0, 0.0, -3.0], [COPPER, 0.25, 0.25], 10)
+    h, v = draw(3, plates)
+    field = ndimage.gaussian_filter(rng.standard_normal((SIDE, SIDE)), 6)
+    clutter = 10 ** ((-24 + 4 * field / field.std()) / 20)
+    found = segment(h + clutter, v + 0.3 * clutter, AXIS, AXIS)
+    assert_found(found, plates)
+    assert found.left_out > 0
+
+
+@pytest.mark.skipif(PUBLISHED is None, reason="POLYSIGHT_PUBLISHED_IMAGES is not set: the folder of the real picture")
+def test_the_nine_plates_of_the_published_rigs_picture_are_found_and_nothing_else():
+    folder = Path(PUBLISHED or "")
+    boxes = json.loads((folder / "20250612_142257_multi.json").read_text())["boxes_px"]
+    with np.load(folder / "20250612_142257_multi.npz") as z:
+        h, v = z["h"], z["v"]
+    found = segment(h, v, AXIS, AXIS)
+    assert len(found.patches) == len(boxes) == 9
+    for name, (x0, y0, x1, y1) in boxes.items():
+        drawn = np.zeros(h.shape, bool)
+        drawn[y0:y1, x0:x1] = True
+        best = max(found.patches, key=lambda p: int((p.mask & drawn).sum()))
+        assert (best.mask & drawn).sum() >= 0.85 * drawn.sum(), name
+        assert not best.cut

@@ -1,4 +1,4 @@
-"""Options of the whole test suite, and the one fixture that many folders share."""
+"""Options of the whole test suite, and the fixtures that many folders share."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 pytest.register_assert_rewrite("tests.support")  # before the first import of it: its asserts show their values
 
 from tests.support import preloaded  # noqa: E402
+from tests.support.page.chromium import Browser, find_chromium  # noqa: E402
 from tests.support.rigs import published_rig  # noqa: E402
 from tests.support.suite import ByFile, Costs, longest_first  # noqa: E402
 
@@ -101,3 +102,12 @@ def _composed_figures(request: pytest.FixtureRequest) -> Iterator[None]:
 def rig() -> Instrument:
     """The published rig. Folders whose tests need another one have a fixture of the same name."""
     return published_rig()
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """One for all tests of a worker."""
+    if find_chromium() is None:
+        pytest.skip("no chromium here: sudo apt-get install chromium")
+    with Browser(tmp_path_factory.mktemp("browser")) as made:
+        yield made

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 from tests.support.page.chromium import DESK, PHONE, Browser
-from tests.support.page.fixtures import browser
 from tests.support.processes import Program
 from tests.support.scenes import small_scene
 from tests.support.simulated_rig import Rig, running
@@ -22,7 +21,6 @@ from polysight.store import ScanFolder, validate
 
 ROWS = 40
 SCENE = small_scene(10, ROWS, step_mm=(10.0, 5.0))
-__all__ = ["browser"]
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rig")]
 
 

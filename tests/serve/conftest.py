@@ -1,5 +1,5 @@
-"""Small scans to look at, watches, and a browser."""
+"""Small scans to look at, and watches."""
 
-from tests.support.page.fixtures import browser, finished, growing, processed, samples, watching
+from tests.support.page.fixtures import finished, growing, processed, samples, watching
 
-__all__ = ["browser", "finished", "growing", "processed", "samples", "watching"]
+__all__ = ["finished", "growing", "processed", "samples", "watching"]

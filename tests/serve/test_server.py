@@ -11,7 +11,6 @@ from typing import get_args
 import pytest
 from tests.support.page.asking import TOKEN, ask
 from tests.support.page.live_view import open_control, served
-from tests.support.processes import LIMIT_S
 
 from polysight.acquisition.control import ScanCommand
 from polysight.cli.main import build_parser
@@ -98,7 +97,7 @@ def test_a_page_that_never_reads_holds_nobody_up(growing, watching):
             deaf.append(one)
         for rows in range(3):
             growing.grow_to("row_committed")
-            assert watch.wait_for(lambda s, n=rows + 1: (s.get("pictures") or {}).get("rows") == n, LIMIT_S)
+            watch.wait_for(lambda s, n=rows + 1: (s.get("pictures") or {}).get("rows") == n)
             assert json.loads(ask(view, "/api/state")[1])["pictures"]["rows"] == rows + 1
         for one in deaf:
             one.close()

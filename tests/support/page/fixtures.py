@@ -1,4 +1,4 @@
-"""Small scans to look at, watches, and a browser: fixtures of the rooms `page` and `serve`."""
+"""Small scans to look at, and watches: fixtures of the rooms `page` and `serve`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import pytest
 from polysight.jobs.process import process
 from polysight.page.watch import Watch
 from polysight_simulators.scene import decode_scene, simulate
-from tests.support.page.chromium import Browser, find_chromium
 from tests.support.page.live_view import GrowingScan
 from tests.support.processes import wait_for
 from tests.support.products import unrendered
@@ -62,14 +61,6 @@ def watching() -> Iterator[Callable[..., Watched]]:
     yield watch
     for one in made:
         one.close()
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    if find_chromium() is None:
-        pytest.skip("no chromium here: sudo apt-get install chromium")
-    with Browser(tmp_path_factory.mktemp("browser")) as made:
-        yield made
 
 
 @pytest.fixture(scope="session")

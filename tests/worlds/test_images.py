@@ -85,3 +85,7 @@ def test_the_program_writes_images_and_truth(tmp_path):
     truth = json.loads((tmp_path / "scene.json").read_text())
     assert set(truth["active"]) == {"tilt_deg", "drift", "drift_deg"}
     assert len(truth["plates"]) == 9
+    # The file is a label file too: boxes inside the picture, in mm from its middle.
+    assert len(truth["labels"]) == 9
+    assert truth["metal"] in truth["labels"]
+    assert max(abs(edge) for box in truth["labels"].values() for edge in box) < 150

@@ -48,8 +48,21 @@ class ImagePair:
         _, r_p = reflect(plate.stack, self.rig.frequencies_hz.mean(), cos_v)
         return complex(r_s / r_p)
 
+    def label_boxes(self) -> dict:
+        """Boxes of the plates inside the picture as a label file: mm from the picture's middle, y up."""
+        middle_m = np.array([self.x_m.mean(), self.y_m.mean()] * 2)
+        half_mm = 1000 * (self.x_m[-1] - self.x_m[0]) / 2
+        boxes = {}
+        for number, plate in enumerate(self.world.plates):
+            box_mm = 1000 * (np.array(plate.box_m) - middle_m)
+            if np.abs(box_mm).max() <= half_mm:
+                boxes[f"{plate.name}#{number}"] = np.round(box_mm, 2).tolist()
+        metal = [f"{p.name}#{i}" for i, p in enumerate(self.world.plates) if p.stack.is_metal]
+        metal = [name for name in metal if name in boxes]
+        return {"unit": "mm", "by_hand": True, "labels": boxes, "metal": metal[0] if metal else None}
+
     def truth(self) -> dict:
-        """What is true, for JSON; complex numbers as [real, imaginary]."""
+        """What is true, for JSON; complex numbers as [real, imaginary]. Also a label file for the instrument."""
         plates = []
         for plate in self.world.plates:
             written = asdict(plate)
@@ -62,6 +75,7 @@ class ImagePair:
             written["ratio"] = [ratio.real, ratio.imag]
             plates.append(written)
         return {
+            **self.label_boxes(),
             "simulated": True,
             "phase": "falls with the path",
             "incidence_deg": self.incidence_deg,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.measure import one_thread_each
 
-NAMES = ("capture", "sync", "image", "whole", "waits", "scaling", "accuracy", "coverage", "layers", "pi")
+NAMES = ("capture", "sync", "image", "whole", "waits", "scaling", "accuracy", "coverage", "layers", "picture", "pi")
 
 
 def main(argv: list[str]) -> int:

@@ -1,6 +1,8 @@
 """Images of another program go through the same analysis as a recorded scan, and say what had to be assumed."""
 
 import json
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from tests.support.refusals import refused
 
 from polysight import open_scan
 from polysight.cli.main import main
+from polysight.materials import Labels
 from polysight.process import Inputs, analyse_given_images, read_given_images
 from polysight.products import ProcessedScan
 from polysight.settings import Settings
@@ -215,3 +218,34 @@ def test_all_images_of_a_folder_are_processed(labels_folder, tmp_path):
     out = tmp_path / "out"
     assert main(["process", str(folder), "--out", str(out), "--jobs", "1"]) == 0
     assert [len(ProcessedScan(out / name).segments) for name in ("one", "two")] == [5, 5]
+
+
+PUBLISHED = os.environ.get("POLYSIGHT_PUBLISHED_IMAGES")
+"""Folder of the published rig's own picture and its boxes, which is no part of the repository."""
+
+
+@pytest.mark.skipif(PUBLISHED is None, reason="POLYSIGHT_PUBLISHED_IMAGES is not set: the folder of the real picture")
+@pytest.mark.parametrize("with_boxes", [True, False])
+@pytest.mark.parametrize("form", ["npz", "labels"])
+def test_the_published_picture_has_nine_plates_and_copper_is_the_reference(rig, tmp_path, form, with_boxes):
+    source = Path(PUBLISHED or "") / "20250612_142257_multi.npz"
+    boxes = json.loads(source.with_suffix(".json").read_text())["boxes_px"]
+    path, drawn = source, None
+    if form == "npz" and with_boxes:
+        drawn = Labels({name: (b[0], b[1], b[2], b[3]) for name, b in boxes.items()})
+    if form == "labels":
+        path = tmp_path / "multi"
+        path.mkdir()
+        with np.load(source) as arrays:
+            for name in "hv":
+                np.save(path / f"sar_{name}.npy", arrays[name])
+        (path / "multi.json").write_text(json.dumps({"labels": boxes if with_boxes else {}}))
+    pair = read_given_images(path, rig)
+    settings = Settings(incidence_deg=ANGLE)
+    scan = analyse_given_images(pair, settings, Inputs(labels=drawn), rig)[0]
+    assert len(scan.segments) == 9
+    assert scan.verdict.level == "care"
+    (metal,) = (s for s in scan.segments if s.metal_reference)
+    x0, y0, x1, y1 = boxes["copper"]
+    row = 150 - (y0 + y1) / 2 if form == "labels" else (y0 + y1) / 2  # a folder has its top row first
+    assert (metal.centre_x_mm, metal.centre_y_mm) == pytest.approx((x0 + x1 - 150, 2 * row - 150), abs=4)

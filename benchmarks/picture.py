@@ -1,0 +1,150 @@
+"""The published rig's own picture: patches, permittivities, names and verdict, in every form it can be given.
+
+The picture is no part of the repository: `--images DIR` or POLYSIGHT_PUBLISHED_IMAGES names its folder, with
+`<name>.npz` (h, v) and `<name>.json` (`boxes_px`). It is processed as `.npz` and as the published `labels/<scan>`, with
+its boxes and without. Table 2 of the paper stands beside the figures; the incidence angle, which is not given, is 55
+degrees.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from polysight.data import packaged
+from polysight.materials import Labels
+from polysight.process import Inputs, analyse_given_images, read_given_images
+from polysight.products import ProcessedScan
+from polysight.results import PatchFigures
+from polysight.settings import Settings, path_text
+from polysight_shared.config import load_instrument
+
+FOLDER = "POLYSIGHT_PUBLISHED_IMAGES"
+ANGLE_DEG = 55.0
+TABLE_2 = {
+    "rubber": ("rubber", 5.06, 1.11),
+    "cardboard_rough": ("cardboard (rough)", 4.54, 0.56),
+    "silicone_rubber": ("silicone rubber", 3.52, 0.82),
+    "PET_0.5mm": ("PET (0.5 mm)", 3.78, 0.70),
+    "ceramic": ("ceramic", 4.75, 2.43),
+    "acrylic_3mm": ("acrylic (3 mm)", 4.00, 0.40),
+    "PCB": ("glass fiber", 4.69, 0.70),
+    "wood_thin": ("wood (thin, smooth)", 2.61, 0.01),
+}
+"""Box to the paper's name, real part and loss."""
+METAL_BOX = "copper"
+SURE = 0.8
+TWO_SIDED_95 = 1.96
+
+
+@dataclass(frozen=True)
+class Form:
+    """One way to give the picture: file or folder, with its boxes or without."""
+
+    name: str
+    path: Path
+    with_boxes: bool
+
+
+def forms_of(source: Path, boxes: dict[str, list[int]], scratch: Path) -> list[Form]:
+    """Write the picture in its four forms."""
+    with np.load(source) as arrays:
+        h, v = arrays["h"], arrays["v"]
+    out = []
+    for with_boxes in (True, False):
+        kind = "with boxes" if with_boxes else "without boxes"
+        folder = scratch / kind.replace(" ", "-")
+        folder.mkdir()
+        np.save(folder / "sar_h.npy", h)
+        np.save(folder / "sar_v.npy", v)
+        content = {"description": "", "labels": boxes if with_boxes else {}}
+        (folder / f"{folder.name}.json").write_text(json.dumps(content))
+        top_first = np.arange(h.shape[0])[::-1] * 2e-3
+        archive = scratch / f"{folder.name}.npz"
+        np.savez(archive, h=h, v=v, x_m=top_first[::-1], y_m=top_first)
+        out += [Form(f".npz {kind}", archive, with_boxes), Form(f"labels/ {kind}", folder, with_boxes)]
+    return out
+
+
+def process(form: Form, boxes: dict[str, list[int]], library: Path | None) -> tuple[ProcessedScan, dict[str, int]]:
+    """Process one form; return the result, and the patch number of each box."""
+    rig = load_instrument(packaged(Path("instrument.toml")))
+    pair = read_given_images(form.path, rig)
+    drawn = None
+    if form.with_boxes and pair.labels is None:
+        drawn = Labels({name: (b[0], b[1], b[2], b[3]) for name, b in boxes.items()})
+    settings = Settings(incidence_deg=ANGLE_DEG, library=path_text(library))
+    scan, _, _ = analyse_given_images(pair, settings, Inputs(labels=drawn), rig)
+    labels = scan.labels[::-1]  # row 0 of the boxes is the top
+    patch_of = {}
+    for name, (x0, y0, x1, y1) in boxes.items():
+        inside = labels[y0:y1, x0:x1]
+        found = np.bincount(inside[inside > 0], minlength=1)
+        patch_of[name] = int(found.argmax()) if found.sum() > 0.5 * inside.size else 0
+    return scan, patch_of
+
+
+def line(box: str, patch: PatchFigures | None) -> tuple[str, bool, bool, bool, bool]:
+    """Return the text of a plate; if its region holds Table 2, and if its name is right, sure and wrong."""
+    name, real, loss = TABLE_2[box]
+    if patch is None:
+        return f"  {box:16} not found", False, False, False, False
+    if patch.refused is not None:
+        return f"  {box:16} {real:5.2f} {loss:5.2f}   refused: {patch.refused.what}", False, False, False, False
+    e = patch.permittivity
+    inside, estimate = False, "no permittivity"
+    if e is not None and e.spread is not None:
+        inside = abs(e.real - real) <= TWO_SIDED_95 * e.spread.real_std
+        estimate = f"{e.real:5.2f} +- {e.spread.real_std:4.2f}  {e.loss:5.2f} +- {e.spread.loss_std:4.2f}"
+    sure = patch.confidence or 0.0
+    right = patch.name == name
+    wrong = not right and patch.name not in (None, "unknown") and sure >= SURE
+    mark = "in" if inside else "OUT"
+    text = f"  {box:16} {real:5.2f} {loss:5.2f}   {estimate:32} {mark:3}  {patch.name} {sure:.2f}"
+    return text, inside, right, wrong, e is not None
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument("--images", type=Path, default=os.environ.get(FOLDER), help=f"folder (default: ${FOLDER})")
+    parser.add_argument("--library", type=Path, help="library (default: the simulated one)")
+    parser.add_argument("--reasons", type=int, default=4, help="reasons of the verdict to print (default: 4)")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print a table for each form; skipped, and said, without the picture."""
+    sources = sorted(Path(args.images).glob("*.npz")) if args.images else []
+    if not sources:
+        print(f"picture: skipped (1): no picture; give --images DIR or set {FOLDER}")
+        return 0
+    boxes = json.loads(sources[0].with_suffix(".json").read_text())["boxes_px"]
+    figures = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        for form in forms_of(sources[0], boxes, Path(scratch)):
+            scan, patch_of = process(form, boxes, args.library)
+            by_number = {patch.label: patch for patch in scan.segments}
+            lines = [line(box, by_number.get(patch_of[box])) for box in TABLE_2]
+            metal = by_number.get(patch_of[METAL_BOX])
+            extra = len(by_number) - len({n for n in patch_of.values() if n})
+            held, right, wrong, estimated = (sum(row[k] for row in lines) for k in (1, 2, 3, 4))
+            level = scan.verdict.text if scan.verdict else ""
+            reference = "copper" if metal is not None and metal.metal_reference else "NOT copper"
+            figures[form.name] = {
+                "patches": len(by_number), "not_plates": extra, "reference": reference, "verdict": level,
+                "regions_hold_table_2": held, "estimated": estimated, "names_right": right, "sure_and_wrong": wrong,
+            }  # fmt: skip
+            print(f"{form.name}: " + ", ".join(f"{k.replace('_', ' ')} {v}" for k, v in figures[form.name].items()))
+            print("  plate            Table 2       permittivity +- std, loss +- std         name")
+            print("\n".join(row[0] for row in lines))
+            for why in (scan.verdict.reasons if scan.verdict else ())[: args.reasons]:
+                print(f"  - {why.what}")
+    if args.json:
+        args.json.write_text(json.dumps(figures, indent=1))
+    return 0

@@ -29,8 +29,8 @@ def facets_of(surface: Surface, plate: Plate, rig: Rig) -> Facets:
     x, y = (grid.ravel() for grid in np.meshgrid(x, y))
     z = rig.plane_m - plate.height_mm / 1000 + surface.height_m.ravel()
     slope_x, slope_y = (np.full(x.shape, slope) for slope in surface.mean_slopes)
-    if surface.rough_slopes is not None:
-        slope_x, slope_y = slope_x + surface.rough_slopes[0].ravel(), slope_y + surface.rough_slopes[1].ravel()
+    if surface.local_slopes is not None:
+        slope_x, slope_y = slope_x + surface.local_slopes[0].ravel(), slope_y + surface.local_slopes[1].ravel()
     step, flat = np.full(x.shape, rig.step_m), np.zeros(x.shape)
     edges = np.stack([flat, step, step * slope_y]), np.stack([step, flat, step * slope_x])
     return Facets(np.stack([x, y, z]), *edges)

@@ -28,13 +28,16 @@ SLOPE_STEP = 0.01
 
 @dataclass(frozen=True)
 class Surface:
-    """Cells of a plate: coordinates of the first (metres), cover 0..1, height above the reference plane and slopes."""
+    """Cells of a plate: coordinates of the first (metres), cover 0..1, z beyond the reference plane, slopes.
+
+    `local_slopes` are those of bow, waviness and roughness, without the mean ones; None on a flat plate.
+    """
 
     x0_m: float
     y0_m: float
     cover: NDArray
     height_m: NDArray
-    rough_slopes: tuple[NDArray, NDArray] | None
+    local_slopes: tuple[NDArray, NDArray] | None
     mean_slopes: tuple[float, float]
 
 
@@ -51,23 +54,23 @@ def make_surface(plate: Plate, step_m: float, rng: np.random.Generator) -> Surfa
         from_rim = 0.5 - np.hypot(x / plate.size_m[0], y[:, None] / plate.size_m[1])
         cover = np.clip(from_rim * min(plate.size_m) / step_m + 0.5, 0, 1)
     mean_slopes = np.tan(np.radians(plate.tilt_x_deg)), np.tan(np.radians(plate.tilt_y_deg))
-    rough = np.zeros((rows, columns))
+    bumps = np.zeros((rows, columns))
     for rms_mm, length_m in ((plate.roughness_mm, ROUGHNESS_LENGTH_M), (plate.waviness_mm, WAVINESS_LENGTH_M)):
         if rms_mm:
-            rough += rms_mm / 1000 * _draw_surface(rng, rough.shape, length_m / step_m)
+            bumps += rms_mm / 1000 * _draw_surface(rng, bumps.shape, length_m / step_m)
     bows = (np.square(2 * places / size) for size, places in zip(plate.size_m, (x, y), strict=True))
     bow_x, bow_y = (bow_mm / 1000 * bow for bow_mm, bow in zip(plate.bow_mm, bows, strict=True))
-    rough = rough + bow_x + bow_y[:, None]
+    bumps = bumps + bow_x + bow_y[:, None]
     slopes = None
-    if rough.any():
-        slopes = np.asarray(np.gradient(rough, step_m, axis=1)), np.asarray(np.gradient(rough, step_m, axis=0))
-    height = rough + mean_slopes[0] * x + mean_slopes[1] * y[:, None]
+    if bumps.any():
+        slopes = np.asarray(np.gradient(bumps, step_m, axis=1)), np.asarray(np.gradient(bumps, step_m, axis=0))
+    height = bumps + mean_slopes[0] * x + mean_slopes[1] * y[:, None]
     return Surface(
         x0_m=plate.centre_m[0] + x[0],
         y0_m=plate.centre_m[1] + y[0],
         cover=cover,
         height_m=height,
-        rough_slopes=slopes,
+        local_slopes=slopes,
         mean_slopes=mean_slopes,
     )
 
@@ -100,7 +103,7 @@ class PlateEchoes:
         points = self._points(plate)
         slopes = surface.mean_slopes
         variations = [slopes]
-        if surface.rough_slopes is not None:
+        if surface.local_slopes is not None:
             variations += [(slopes[0] + SLOPE_STEP, slopes[1]), (slopes[0], slopes[1] + SLOPE_STEP)]
         self._responses = [respond(rig.tx, rx, points, _normal(varied)) for varied in variations]
         self._tables = [ReflectionTable(plate.stack, f) for f in rig.frequencies_hz]
@@ -146,8 +149,8 @@ class PlateEchoes:
         kernel = (common * terms[0]).astype(np.complex64)
         mask = self._brightness * surface.cover * np.exp(-1j * k * self._path_mean)
         spectrum = self._multiply(mask, kernel)
-        if surface.rough_slopes is not None:
-            for slope, varied in zip(surface.rough_slopes, terms[1:], strict=True):
+        if surface.local_slopes is not None:
+            for slope, varied in zip(surface.local_slopes, terms[1:], strict=True):
                 spectrum += self._multiply(mask * slope, common * (varied - terms[0]) / SLOPE_STEP)
         for order in range(1, self._orders):
             mask = mask * surface.height_m

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polysight.calibration.estimates import BIN_HZ, MIN_CHIRPS, binned
+from polysight.calibration.direct_signal import BIN_HZ, MIN_CHIRPS, binned
 from polysight.calibration.files import FilterFile, load_calibration, read_calibration
 from polysight.cli.main import main
 from polysight.pipeline import Pipeline

@@ -6,8 +6,8 @@ import tomli_w
 from tests.support.processes import output_of
 from tests.support.refusals import refused
 
-from polysight.calibration.estimates import Prior, TargetPoint, fit_places, load_echoes, places_file, read_target
 from polysight.calibration.files import Calibration, PlacesFile, load_calibration, open_raw, read_calibration
+from polysight.calibration.places import Prior, TargetPoint, fit_places, load_echoes, places_file, read_target
 from polysight.imaging.geometry import Antennas
 from polysight.jobs.calibrate import with_places_of
 from polysight_shared.error_codes import ErrorCode
@@ -111,7 +111,7 @@ def few_echoes(case):
     """Samples at few positions."""
     folder, _, believed, _ = case
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("polysight.calibration.estimates.POSITIONS", 60)
+        patch.setattr("polysight.calibration.places.POSITIONS", 60)
         return load_echoes(open_raw(folder), believed)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.calibration.estimates import by_geometry, fit_start, start_of, unwrapped
+from polysight.calibration.direct_signal import by_geometry, fit_start, start_of, unwrapped
 from polysight.calibration.files import StartFile, open_raw, read_calibration
 from polysight.cli.main import main
 from polysight.radar.commands import direct_if_hz

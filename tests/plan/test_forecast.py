@@ -141,9 +141,9 @@ def test_the_published_plan_is_possible_and_takes_two_hours(rig):
 )
 def test_a_plan_with_a_fault_has_one_warning_about_it(rig, changes, topic, value, refused):
     warnings = find_warnings(changes.apply(rig), Noise())
-    found = [w for w in warnings if w.topic == topic and value in w.text]
-    assert [w.refused for w in found] == [refused], warnings
-    assert [w.refused for w in warnings] == sorted((w.refused for w in warnings), reverse=True)
+    found = [w for w in warnings if w.where == topic and value in w.what]
+    assert [w.level == "error" for w in found] == [refused], warnings
+    assert [w.level for w in warnings] == sorted(w.level for w in warnings)
 
 
 def test_proposals_keep_the_time_and_are_possible(rig):
@@ -153,7 +153,7 @@ def test_proposals_keep_the_time_and_are_possible(rig):
     for plan in plans:
         assert plan.possible
         assert plan.time.minutes <= 30.0
-        assert not [w for w in plan.warnings if w.topic in ("aliasing", "motion")]
+        assert not [w for w in plan.warnings if w.where in ("aliasing", "motion")]
     # More time never gives a worse image.
     assert propose(rig, 60.0, count=1)[0].noise.image_db > plans[0].noise.image_db
 
@@ -170,6 +170,6 @@ def test_a_burst_of_one_pulse_with_many_chirps_is_kept(rig):
     )
     planned = forecast(rig)
     assert planned.possible
-    assert "burst" not in [w.topic for w in planned.warnings]
+    assert "burst" not in [w.where for w in planned.warnings]
     for proposal in propose(rig, minutes=60.0):
         assert proposal.rig.burst == burst

@@ -14,10 +14,10 @@ def test_a_library_with_another_angle_is_a_warning(rig, distance_mm, known):
     geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=distance_mm)
     moved = msgspec.structs.replace(rig, geometry=geometry)
     angle = incidence_deg(moved, moved.receivers[0])
-    warnings = [w for w in forecast(moved).warnings if w.topic == "library"]
+    warnings = [w for w in forecast(moved).warnings if w.where == "library"]
     finding = check_library(context_of(moved))
     assert (not warnings, finding.level) == (known, "ok" if known else "warning")
     assert finding.facts["incidence_deg"] == pytest.approx(angle)
-    for text in [finding.what, *(w.text for w in warnings)]:
+    for text in [finding.what, *(w.what for w in warnings)]:
         assert f"{angle:.1f} degrees" in text
-    assert not any(w.refused for w in warnings)
+    assert not any(w.level == "error" for w in warnings)

@@ -22,7 +22,7 @@ from polysight.cli.main import main
 from polysight.jobs.live_scan import resume
 from polysight.jobs.process import make_products, process, processed_rows
 from polysight.jobs.scans import drop_raw, processed_digests
-from polysight.products import REPORT, making_products
+from polysight.products import REPORT, making_products, write_json
 from polysight.results import NoResult
 from polysight.settings import DEFAULT
 from polysight.store import locked_samples
@@ -70,6 +70,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
+    quality = scan / "products" / "quality.json"
+    write_json(quality, {**json.loads(quality.read_text()), "key_of_a_later_release": 1})
     products, digests = contents(scan / "products"), processed_digests(scan / "products")
     assert len(payloads(scan)) == ROWS * BOARDS
     done = polysight("drop-raw", scan, typed="drop\n")

@@ -16,7 +16,7 @@ from tests.support.store.plain_scan import write_scan
 
 from polysight.store import manifest
 from polysight.store.logs import EventWriter, crc32, read_events
-from polysight.store.manifest import ManifestWriter, ScanResumed, encode_line, parse
+from polysight.store.manifest import ManifestWriter, RowCommitted, ScanResumed, encode_line, parse
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.source import RawSource, pieces_of
 from polysight.store.validation import to_json, validate
@@ -144,6 +144,18 @@ def test_validate_names_each_damage(whole, kind):
     damage(whole)
     found = [f for f in validate(whole) if f.level == "error"]
     assert any(where in f.where and what in f.what for f in found), to_json(found)
+
+
+def test_events_behind_the_last_commit_may_be_damaged_by_a_power_cut(undisturbed, tmp_path):
+    """They were not synced, and the Pi's journal has them; what was committed may not be damaged."""
+    scan = undisturbed.copy(tmp_path / "scan")
+    log = scan.path / "events.msgpack"
+    committed = ScanFolder.load(scan.path).facts(RowCommitted)[-1].events.bytes
+    assert log.stat().st_size > committed
+    flip(log, committed + 1)
+    assert {f.level for f in validate(scan.path)} == {"note"}
+    flip(log, committed - 1)
+    assert "error" in {f.level for f in validate(scan.path)}
 
 
 @pytest.mark.parametrize(

@@ -6,19 +6,14 @@ dated calibration file. The rig file names the files that apply; a new scan gets
 filters and the metal reference.
 """
 
-from polysight.calibration.estimates import (
+from polysight.calibration.direct_signal import (
     FULL_SCALE,
     DirectSignal,
-    Prior,
     band_hz,
     find_direct,
     fit_filter,
-    fit_places,
     fit_start,
     jitter_hz,
-    load_echoes,
-    places_file,
-    read_target,
     unwrapped,
 )
 from polysight.calibration.files import (
@@ -38,6 +33,7 @@ from polysight.calibration.files import (
     write_calibration,
     write_metal,
 )
+from polysight.calibration.places import Prior, fit_places, load_echoes, places_file, read_target
 
 __all__ = [
     "FULL_SCALE",

@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +40,7 @@ from polysight.radar import constraints
 from polysight.settings import DEFAULT
 from polysight_shared.config import CARD_TAIL_S, Instrument
 from polysight_shared.errors import ConfigError
+from polysight_shared.findings import Finding
 from polysight_shared.raster import Grid, Stage, burst_duration_s, check_burst_fits, plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
@@ -158,14 +158,6 @@ def scan_time(rig: Instrument, row_overhead_s: float = ROW_OVERHEAD_S) -> ScanTi
     )
 
 
-class PlanWarning(NamedTuple):
-    """Something to know before the scan. `refused`: stage, Pi or radars would refuse the plan."""
-
-    topic: str
-    text: str
-    refused: bool = False
-
-
 @dataclass(frozen=True)
 class Noise:
     """Assumed power of the direct path over noise (one channel, sample and chirp), dB, and its source."""
@@ -235,12 +227,12 @@ class Forecast:
     field: FieldLimits
     noise: NoiseForecast
     noise_source: str
-    warnings: tuple[PlanWarning, ...]
+    warnings: tuple[Finding, ...]
 
     @property
     def possible(self) -> bool:
         """False if stage, Pi or radars would refuse the plan."""
-        return not any(w.refused for w in self.warnings)
+        return not any(w.level == "error" for w in self.warnings)
 
 
 def forecast(
@@ -320,10 +312,11 @@ def predict_noise(rig: Instrument, noise: Noise) -> NoiseForecast:
 # --- warnings ---
 
 
-def find_warnings(
-    rig: Instrument, noise: Noise, scene_mm: tuple[float, float] | None = None
-) -> tuple[PlanWarning, ...]:
-    """Return every warning about a plan, refusals first; much faster than the whole forecast."""
+def find_warnings(rig: Instrument, noise: Noise, scene_mm: tuple[float, float] | None = None) -> tuple[Finding, ...]:
+    """Return every warning about a plan; much faster than the whole forecast.
+
+    First those of level "error": stage, Pi or radars would refuse the plan. `where` is the topic.
+    """
     image_mm = (rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm)
     scene_mm = scene_mm or image_mm
     found = [
@@ -336,25 +329,33 @@ def find_warnings(
     phase = predict_noise(rig, noise).direct_phase_rad
     if phase > _PUBLISHED_PHASE_RAD:
         text = f"standard deviation of the direct path's phase {phase:.3f} rad (published rig after all stages:"
-        found.append(PlanWarning("noise", f"{text} {_PUBLISHED_PHASE_RAD}): use more pulses a position"))
+        found.append(_note("noise", f"{text} {_PUBLISHED_PHASE_RAD}): use more pulses a position"))
     if text := why_unnamed(DEFAULT, rig):
-        found.append(PlanWarning("library", text.replace("was named", "will be named", 1)))
-    return tuple(sorted(found, key=lambda w: not w.refused))
+        found.append(_note("library", text.replace("was named", "will be named", 1)))
+    return tuple(sorted(found, key=lambda w: w.level != "error"))
 
 
-def _stage_warnings(rig: Instrument) -> Iterator[PlanWarning]:
+def _note(topic: str, text: str) -> Finding:
+    return Finding("note", text, where=topic)
+
+
+def _refusal(topic: str, text: str) -> Finding:
+    return Finding("error", text, where=topic)
+
+
+def _stage_warnings(rig: Instrument) -> Iterator[Finding]:
     stage, grid = rig.stage, rig.grid
     rate, limit = stage.speed_mm_s * stage.steps_per_mm, MAX_STEPS_PER_S / stage.steps_per_mm
     if rate > MAX_STEPS_PER_S:
         text = f"{stage.speed_mm_s:g} mm/s are {rate:g} steps/s; the maximum of the stage is {limit:g} mm/s"
-        yield PlanWarning("speed", text, True)
+        yield _refusal("speed", text)
     for axis, step in (("x", grid.step_x_mm), ("y", grid.step_y_mm)):
         steps = step * stage.steps_per_mm
         if abs(steps - round(steps)) > 1e-6:
             text = f"a step of {step:g} mm in {axis} is {steps:g} motor steps, not a whole number"
-            yield PlanWarning(f"step {axis}", text, True)
+            yield _refusal(f"step {axis}", text)
     if stage.speed_mm_s > _PUBLISHED_SPEED_MM_S:
-        yield PlanWarning(
+        yield _note(
             "speed",
             f"faster than the published rig's {_PUBLISHED_SPEED_MM_S:g} mm/s: vibration of a real stage at"
             f" {stage.speed_mm_s:g} mm/s was not measured (a jitter of 0.2 mm towards the object costs 0.9 dB,"
@@ -362,16 +363,16 @@ def _stage_warnings(rig: Instrument) -> Iterator[PlanWarning]:
         )
 
 
-def _burst_warnings(rig: Instrument, burst: BurstForecast) -> Iterator[PlanWarning]:
+def _burst_warnings(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
     max_pulses = int(1e3 * burst.between_ms / rig.burst.period_us)
     try:
         check_burst_fits(rig.grid, rig.burst, rig.stage)
     except ConfigError as e:
         remedy = f"at most {1e3 * rig.grid.step_x_mm / burst.duration_ms:.3g} mm/s"
         remedy += f", or at most {max_pulses} pulses" if max_pulses else ""
-        yield PlanWarning("burst", f"too fast for the burst: {e.what}; {remedy}", True)
+        yield _refusal("burst", f"too fast for the burst: {e.what}; {remedy}")
     if burst.edge_loss_db > _MAX_BURST_LOSS_DB:
-        yield PlanWarning(
+        yield _note(
             "motion",
             f"the stage moves {burst.travel_mm:.2f} mm ({burst.travel_wavelengths:.2f} wavelengths) during a burst:"
             f" echoes at the aperture's ends lose {burst.edge_loss_db:.1f} dB in the average; use fewer or faster"
@@ -379,18 +380,18 @@ def _burst_warnings(rig: Instrument, burst: BurstForecast) -> Iterator[PlanWarni
         )
     if rig.burst.pulses > 1 and burst.duty < 0.5:
         text = f"the radars are idle for {1 - burst.duty:.0%} of a row: up to {max_pulses} pulses a position take no"
-        yield PlanWarning("idle", f"{text} extra time")
+        yield _note("idle", f"{text} extra time")
     if rig.burst.chirps_a_position == 1:
         text = "with one chirp a position, noise and the residual of the alignment cannot be measured"
-        yield PlanWarning("burst", text)
+        yield _note("burst", text)
 
 
-def _card_warnings(rig: Instrument) -> Iterator[PlanWarning]:
+def _card_warnings(rig: Instrument) -> Iterator[Finding]:
     if tail := tail_s(rig):
         fits = int(1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us)
         whole = [n for n in range(2, fits + 1) if rig.burst.chirps == 1 and whole_packets(rig, n)]
         nearest = min(whole, key=lambda n: abs(n - rig.burst.pulses), default=0)
-        yield PlanWarning(
+        yield _note(
             "card",
             f"a row of {rig.row_bytes} bytes does not fill whole packets of {rig.card.payload_bytes}: the card delays"
             f" its last packet, {tail * rig.grid.rows / 60:.1f} min in total"
@@ -400,18 +401,19 @@ def _card_warnings(rig: Instrument) -> Iterator[PlanWarning]:
     frame_us = rig.frame_bytes / rig.card.payload_bytes * packet_us
     if frame_us > rig.burst.period_us:
         text = f"a card needs {frame_us:.0f} us to send a frame and gets one every {rig.burst.period_us:g} us"
-        yield PlanWarning("card", text)
+        yield _note("card", text)
 
 
-def _radar_warnings(rig: Instrument) -> Iterator[PlanWarning]:
+def _radar_warnings(rig: Instrument) -> Iterator[Finding]:
     native = rig.radar.control == "native"
     offsets_known = native or any(b.start_offset_hz for b in rig.boards)
     for c in constraints(rig, rig.grid.columns * rig.burst.pulses):
         about_if = c.name.startswith("IF")
         if not c.holds and (offsets_known or not about_if):
-            yield PlanWarning("IF" if about_if else "radar", f"{c}: {c.remedy}", native)
+            found = _refusal if native else _note
+            yield found("IF" if about_if else "radar", f"{c}: {c.remedy}")
     if not offsets_known:
-        yield PlanWarning(
+        yield _note(
             "IF",
             "the rig file has no start_offset_hz, so the IF depends on the program that configures the radars: the"
             f" direct path needs a margin of {rig.chirp.slope_hz_per_s * 5e-9 / 1e3:.0f} kHz for 5 ns of trigger"
@@ -419,23 +421,21 @@ def _radar_warnings(rig: Instrument) -> Iterator[PlanWarning]:
         )
 
 
-def _field_warnings(
-    rig: Instrument, scene_mm: tuple[float, float], image_mm: tuple[float, float]
-) -> Iterator[PlanWarning]:
+def _field_warnings(rig: Instrument, scene_mm: tuple[float, float], image_mm: tuple[float, float]) -> Iterator[Finding]:
     grid, field = rig.grid, field_limits(rig)
     axes = (("x", grid.step_x_mm, grid.columns), ("y", grid.step_y_mm, grid.rows))
     for i, (axis, step, count) in enumerate(axes):
         scene, free, zone, size = scene_mm[i], field.alias_free_mm[i], field.mirror_zone_mm[i], (count - 1) * step
         need = (scene + image_mm[i]) / 2
         if free < need:
-            yield PlanWarning(
+            yield _note(
                 "aliasing",
                 f"in {axis}, steps of {step:g} mm make ghosts {free:.0f} mm from each object; a scene of {scene:.0f} mm"
                 f" in an image of {image_mm[i]:.0f} mm needs {need:.0f} mm: use steps of at most"
                 f" {step * free / need:.2g} mm, a smaller image, or `polysight process --sparse`",
             )
         if (good := max(0.0, size - 2 * zone)) < scene:
-            yield PlanWarning(
+            yield _note(
                 "aperture",
                 f"flat plates are mirrors: an aperture of {size:.0f} mm in {axis} images {good:.0f} mm of them well"
                 f" ({zone:.0f} mm of margin on either side); the scene has {scene:.0f} mm",

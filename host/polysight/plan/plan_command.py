@@ -26,7 +26,6 @@ from polysight.plan.forecast import (
     ROW_OVERHEAD_S,
     Forecast,
     Noise,
-    PlanWarning,
     find_warnings,
     forecast,
     predict_burst,
@@ -43,6 +42,7 @@ from polysight.sync import BoardSetup, synchronise_row
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.findings import Finding
 from polysight_shared.messages import Capture
 from polysight_shared.tables import decode, to_builtins
 
@@ -153,8 +153,8 @@ def propose(
     return [forecast(p, noise, row_overhead_s, scene_mm) for p in islice(usable, count)]
 
 
-def _excludes(warning: PlanWarning) -> bool:
-    return warning.refused or warning.topic == "aliasing"
+def _excludes(warning: Finding) -> bool:
+    return warning.level == "error" or warning.where == "aliasing"
 
 
 def _grids(rig: Instrument) -> Iterator[Instrument]:
@@ -276,8 +276,8 @@ def describe(f: Forecast) -> str:
     ]
     out = [f"{name:11s}{text}" for name, text in lines]
     for warning in f.warnings:
-        kind = "REFUSED" if warning.refused else "note"
-        out += textwrap.wrap(f"{kind}, {warning.topic}: {warning.text}", _WIDTH, subsequent_indent="  ")
+        kind = "REFUSED" if warning.level == "error" else "note"
+        out += textwrap.wrap(f"{kind}, {warning.where}: {warning.what}", _WIDTH, subsequent_indent="  ")
     return "\n".join(out) + "\n"
 
 
@@ -335,7 +335,7 @@ def forecast_values(f: Forecast) -> dict[str, Any]:
         "direct_phase_rad": f.noise.direct_phase_rad,
         "image_snr_db": f.noise.image_db,
         "noise_source": f.noise_source,
-        "warnings": [w._asdict() for w in f.warnings],
+        "warnings": [{"topic": w.where, "text": w.what, "refused": w.level == "error"} for w in f.warnings],
     }
 
 

@@ -10,7 +10,7 @@ import msgspec
 
 from polysight.capture import PACKETS, read_index
 from polysight.store import manifest
-from polysight.store.logs import crc32, read_events
+from polysight.store.logs import LogDigest, crc32, read_events
 from polysight.store.manifest import MANIFEST, BoardRow, RowCommitted, ScanEnded
 from polysight.store.scan_folder import (
     EVENTS,
@@ -267,27 +267,30 @@ def _events(scan: ScanFolder) -> list[Finding]:
     found = []
     if log.torn:
         found.append(_note(EVENTS, "the last event is torn by a kill or power cut", _FETCHED))
+    commits = [(fact.row, fact.events) for fact in scan.facts(RowCommitted) if fact.events is not None]
+    row, committed = commits[-1] if commits else (0, LogDigest(0, ""))
+    # Behind the last commit nothing was synced for certain, and a power cut may leave any of it. Rows of earlier
+    # releases, and simulated ones, do not say how many events were committed.
+    is_known = bool(commits) or not scan.facts(RowCommitted)
+    is_committed_damage = bool(log.damage) and not (is_known and log.length >= committed.bytes)
     if log.damage:
-        found.append(_error(EVENTS, log.damage, _FETCHED))
+        found.append((_error if is_committed_damage else _note)(EVENTS, log.damage, _FETCHED))
     if {e.scan_id for e in log.events} - {scan.scan_id}:
         found.append(_error(EVENTS, "holds events of another scan"))
     if [e.seq for e in log.events] != list(range(1, len(log.events) + 1)):
         found.append(_error(EVENTS, "the sequence of the events has gaps"))
-    commits = [fact for fact in scan.facts(RowCommitted) if fact.events is not None]
-    if commits and not log.damage:
-        found += _committed_events(path, log.length, commits[-1])
+    if commits and not is_committed_damage:
+        found += _committed_events(path, log.length, row, committed)
     return found
 
 
-def _committed_events(path: Path, length: int, commit: RowCommitted) -> list[Finding]:
-    """Compare the event log with its digest at the last commit."""
-    if commit.events is None:
-        return []
-    size = commit.events.bytes
-    when = f"row {commit.row} was committed"
+def _committed_events(path: Path, length: int, row: int, committed: LogDigest) -> list[Finding]:
+    """Compare the event log, of `length` good bytes, with its digest when a row was committed."""
+    size = committed.bytes
+    when = f"row {row} was committed"
     if length < size:
         return [_error(EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
     with path.open("rb") as f:
-        whole = f"{crc32(f.read(size)):08x}" == commit.events.crc32
+        whole = f"{crc32(f.read(size)):08x}" == committed.crc32
     what = f"not the events that were there when {when} (CRC)"
     return [] if whole else [_error(EVENTS, what, "restore it from a copy")]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from polysight.calibration.estimates import find_direct
+from polysight.calibration.direct_signal import find_direct
 from polysight.doctor.context import CheckContext, DoctorOptions, LoadResult, System
 from polysight.sync import BoardSetup
 from polysight_simulators.scene import SimulatedRig, decode_scene

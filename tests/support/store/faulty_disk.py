@@ -23,6 +23,8 @@ Fault = Literal["full", "short", "killed", "killed within", "power cut", "worst 
 SEEN = ("open", "pwrite", "fsync", "mkdir", "rename", "replace", "unlink", "ftruncate", "posix_fallocate")
 REAL_OPEN = io.open
 REAL = SimpleNamespace(**{name: getattr(os, name) for name in SEEN})
+# Smaller than a real disk's 512 bytes, for the files of the tests are small.
+SECTOR_BYTES = 64
 GROWS = ("write", "pwrite", "posix_fallocate", "create", "mkdir", "rename", "fsync")
 
 
@@ -40,8 +42,9 @@ class FaultyDisk:
     killed, killed within
         The program ends before it, or in the middle of it.
     power cut
-        The same, and what was not synced may be lost: contents may be the old ones, the new ones, or zeros; names made
-        or moved may not be there.
+        The same, and what was not synced may be lost: a file may have its old size or its new one, and each of its
+        sectors may be old, new or, behind the old end, zero; names made, moved or removed may be as before. Bytes that
+        were synced and not written again are always there.
     worst power cut
         The same, and all that was not synced is lost.
     """
@@ -95,12 +98,18 @@ class FaultyDisk:
         for path, durable in self._durable.items():
             if path.exists():
                 now = path.read_bytes()
-                torn = durable + bytes(max(0, len(now) - len(durable)))
-                left = [durable, now, torn, now[: self._random.randint(0, len(now))]]
-                path.write_bytes(durable if worst else self._random.choice(left))
+                path.write_bytes(durable if worst else self._draw_content(durable, now))
         names_left = 0 if worst else self._random.randint(0, len(self._undo))
         for _, back in reversed(self._undo[names_left:]):
             back()
+
+    def _draw_content(self, durable: bytes, now: bytes) -> bytes:
+        """Draw what is left of a file: old, new, written in order up to some byte, or each sector old or new."""
+        written = self._random.randint(0, len(now))
+        before = durable + bytes(max(0, len(now) - len(durable)))
+        sectors = (slice(k, k + SECTOR_BYTES) for k in range(0, len(now), SECTOR_BYTES))
+        mixed = b"".join((now if self._random.random() < 0.5 else before[: len(now)])[sector] for sector in sectors)
+        return self._random.choice([durable, now, before, now[:written] + durable[written:], mixed])
 
     # --- the operations ---
 
@@ -118,7 +127,7 @@ class FaultyDisk:
                 yield self
         finally:  # Killed passes through here
             # Drawn losses ("power cut") were never applied; with them two tests find foreign events after a resume.
-            if self._dead and self._fault == "worst power cut":
+            if self._dead and self._fault in ("power cut", "worst power cut"):
                 self.lose_power()
 
     def _opened(self, file: Any, mode: str = "r", buffering: int = -1, *more: Any, **named: Any) -> Any:
@@ -185,9 +194,13 @@ class FaultyDisk:
         self._undo.append((b.parent, back))
 
     def _unlink(self, path: Any, **named: Any) -> None:
-        self._hit("unlink", Path(path))
+        path = Path(path)
+        seen = str(path).startswith(self._folder) and path.exists()
+        self._hit("unlink", path)
+        content = self._durable.pop(path, path.read_bytes()) if seen else b""
         REAL.unlink(path, **named)
-        self._durable.pop(Path(path), None)
+        if seen:
+            self._undo.append((path.parent, lambda: path.write_bytes(content)))
 
 
 class _SeenFile(io.FileIO):

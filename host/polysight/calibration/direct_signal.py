@@ -1,0 +1,291 @@
+"""The direct path in recorded bursts: start offset, delay and crystal error, and the receivers' high-pass filters.
+
+IF of the direct path with delay tau, start delay dt of the board relative to the transmitter, and relative frequency
+error p of the board's crystal:
+
+    f = K tau + start offset + p (f_0 + 2 K t) - K dt        (docs/spec/scene-file.md)
+
+A crystal error makes the IF drift by 2 p K within a chirp, which separates it from dt. `fit_start` estimates the start
+offset that puts the direct path in the middle of the IF band.
+
+`fit_filter` fits a high-pass filter to scans of one scene at several start frequencies: each puts the direct path at
+another IF, and trigger jitter spreads it by about 200 kHz. The direct path itself does not change, so its level over IF
+is the frequency response of the filter (paper, Fig. 9).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.calibration.files import (
+    BoardFilter,
+    BoardStart,
+    board_rows,
+    places_crc32,
+)
+from polysight.radar import direct_if_hz
+from polysight.store import RawSource
+from polysight.sync import (
+    FOLD,
+    AlignedRow,
+    BoardSetup,
+    HighPass,
+    align_row,
+    cis,
+    fit_high_pass,
+    noise_power,
+    reference,
+    whole_blocks,
+)
+from polysight_shared.config import Board, Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+
+Real = NDArray[np.float64]
+
+FULL_SCALE = 32767
+# Of the sample rate.
+PASSBAND = 0.9
+# Rows of a scan used by `fit_start`, and by `fit_filter`.
+ROWS = 4
+FILTER_ROWS = 6
+# Smallest share of chirps with a direct path.
+MIN_FOUND = 0.25
+# Bins of the filter's response; chirps and SNR (power ratio) that each needs.
+BIN_HZ = 10e3
+MIN_CHIRPS = 6
+MIN_SNR = 20.0
+
+
+@dataclass(frozen=True)
+class DirectSignal:
+    """The direct path of one board.
+
+    Attributes
+    ----------
+    if_hz
+        float64 [chirp]: IF in the chirps with a direct path; within the receiver's band, so it may be aliased.
+    power, noise_power
+        float64 [chirp]: squared amplitude as recorded (high-pass filter not compensated, noise included), and the
+        noise power in it; ADC counts squared.
+    expected_hz
+        IF expected from geometry and start offsets in the rig file.
+    drift_hz_per_s
+        Change of the IF within a chirp.
+    chirps
+        Number of chirps received whole.
+    """
+
+    if_hz: NDArray[np.float64]
+    power: NDArray[np.float64]
+    noise_power: NDArray[np.float64]
+    expected_hz: float
+    drift_hz_per_s: float
+    chirps: int
+
+    @property
+    def found(self) -> bool:
+        """True if most chirps have a direct path."""
+        return 2 * self.if_hz.size > self.chirps > 0
+
+    def crystal_ppm(self, rig: Instrument) -> float:
+        """Return the frequency error of the board's crystal relative to the transmitter's, ppm, from the drift."""
+        return self.drift_hz_per_s / (2e-6 * rig.chirp.slope_hz_per_s)
+
+    def start_delay_s(self, rig: Instrument) -> tuple[float, float]:
+        """Return the mean start delay of the board relative to the transmitter, and its standard error; seconds."""
+        chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
+        middle_hz = chirp.first_sample_hz + 2 * chirp.hz_per_sample * (a + b - 1) / 2
+        expected = self.expected_hz + self.crystal_ppm(rig) * 1e-6 * middle_hz
+        delay = (expected - unwrapped(self.if_hz, rig)) / chirp.slope_hz_per_s
+        return float(delay.mean()), float(delay.std(ddof=1) / np.sqrt(delay.size)) if delay.size > 1 else np.inf
+
+
+def band_hz(rig: Instrument) -> tuple[float, float]:
+    """Return the IF band of the receiver, Hz: 0 to 0.9 sample rates (complex 1x) or +-0.45 (complex 2x)."""
+    width = PASSBAND * rig.chirp.sample_rate_hz
+    return (0.0, width) if rig.chirp.if_mode == "complex1x" else (-width / 2, width / 2)
+
+
+def unwrapped(if_hz: NDArray[np.float64], rig: Instrument) -> NDArray[np.float64]:
+    """Unwrap the IFs [chirp] of one direct path around their circular mean, where jitter crosses the band edge."""
+    rate = rig.chirp.sample_rate_hz
+    middle = np.angle(np.exp(2j * np.pi * if_hz / rate).sum()) * rate / (2 * np.pi)
+    middle += rate * round((if_hz.mean() - middle) / rate)
+    return middle + (if_hz - middle + rate / 2) % rate - rate / 2
+
+
+def jitter_hz(rig: Instrument) -> float:
+    """Return the IF change due to 5 ns of trigger uncertainty, Hz."""
+    return rig.chirp.slope_hz_per_s * 5e-9
+
+
+def find_direct(
+    rig: Instrument, board: Board, words: NDArray[Any], valid: NDArray[np.bool_], setup: BoardSetup | None = None
+) -> DirectSignal:
+    """Find the direct path in bursts: words int16 [frame, sample, 2, rx], `valid` bool [frame] those received whole.
+
+    `setup` is that of the board, if it exists already.
+    """
+    setup, chirp = setup or BoardSetup.of(rig, board), rig.chirp
+    shape = (len(words) // setup.pulses, setup.pulses)
+    aligned = align_row(
+        words.reshape(*shape, *words.shape[1:]), valid.reshape(shape), chirp.linear_samples, setup.equaliser, FULL_SCALE
+    )
+    # The drift estimate is linearised: the first pass finds 2 ppm within a tenth, the second the rest.
+    drift, time = reference(aligned, setup.path, chirp).drift, np.arange(aligned.halves.shape[-1]) * float(FOLD)
+    time -= time.mean()
+    flat = aligned._replace(halves=aligned.halves * cis(-0.5 * drift * time**2))
+    done = reference(flat, setup.path, chirp)
+    good = aligned.good & done.found[:, None]
+    cycles = (done.frequency[:, None] + aligned.frequency)[good]
+    power = _power(words[good.ravel()], cycles, setup, drift + done.drift)
+    noise = _recorded_noise(aligned) * (np.abs(setup.path.estimator[0]) ** 2).sum() / FOLD
+    cycles = cycles % 1.0 if chirp.if_mode == "complex1x" else (cycles + 0.5) % 1.0 - 0.5
+    rate = chirp.sample_rate_hz
+    return DirectSignal(
+        cycles * rate,
+        power,
+        np.full(power.size, noise),
+        direct_if_hz(rig, board),
+        (drift + done.drift) * rate**2 / (2 * np.pi),  # its phase is `drift t^2 / 2`, t in samples
+        int(valid.sum()),
+    )
+
+
+def _recorded_noise(aligned: AlignedRow) -> float:
+    """Return the noise power of a recorded sample: the estimate divided by the gain of the filter compensation."""
+    raised = (aligned.gain**2 * aligned.good).sum(axis=1) / np.maximum(aligned.good.sum(axis=1), 1)
+    recorded = noise_power(aligned) / np.maximum(raised, 1e-12)
+    return float(np.nanmedian(recorded)) if np.isfinite(recorded).any() else 0.0
+
+
+def _power(
+    words: NDArray[np.int16], cycles: NDArray[np.float64], setup: BoardSetup, drift: float
+) -> NDArray[np.float64]:
+    """Return the power of the direct path in each chirp [chirp], by the estimator that suppresses the object."""
+    if not len(words):
+        return np.zeros(0)
+    a, b = whole_blocks(setup.chirp.linear_samples)
+    n, path = b - a, setup.path
+    time = np.arange(n) - (n - 1) / 2
+    raw = words[:, a:b, 0] + 1j * words[:, a:b, 1].astype(np.float32)  # [chirp, sample, rx]
+    still = raw * cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
+    folded = still.reshape(len(words), n // FOLD, FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
+    return np.abs(folded.reshape(len(words), -1) @ path.estimator[0]) ** 2
+
+
+def fit_start(source: RawSource, board_name: str) -> BoardStart:
+    """Estimate the start offset of a board from the IF of its direct path.
+
+    Raises DataError if too few chirps have a direct path; the error gives the offset from geometry alone.
+    """
+    rig = source.instrument
+    board = rig.by_name(board_name)
+    setup = BoardSetup.of(rig, board)
+    found = [find_direct(rig, board, words, ok, setup) for _, words, ok in board_rows(source, board_name, ROWS)]
+    if_hz, chirps = np.concatenate([s.if_hz for s in found]), sum(s.chirps for s in found)
+    expected = direct_if_hz(rig, board)
+    if if_hz.size < max(2, MIN_FOUND * chirps):
+        raise DataError(
+            f"{source.scan_id}: only {if_hz.size} of {chirps} chirps show the direct path of {board_name}",
+            "it lies outside the IF band and is filtered out, or something blocks it",
+            f"by geometry alone start_offset_hz = {by_geometry(rig, board):.0f} for {board_name}; scan again with it",
+            code=ErrorCode.NO_DATA,
+        )
+    if_hz = unwrapped(if_hz, rig)
+    return start_of(rig, board, expected, float(if_hz.mean()), float(if_hz.std() / np.sqrt(if_hz.size)), if_hz.size)
+
+
+def start_of(
+    rig: Instrument, board: Board, expected_hz: float, seen_hz: float, error_hz: float, chirps: int
+) -> BoardStart:
+    """Return the start offset that moves a direct path, aliased to `seen_hz`, to the middle of the IF band."""
+    rate, middle = rig.chirp.sample_rate_hz, sum(band_hz(rig)) / 2
+    alias = round((expected_hz - seen_hz) / rate)
+    offset = board.start_offset_hz + middle - (seen_hz + alias * rate)
+    return BoardStart(
+        float(round(offset)), board.start_offset_hz, seen_hz, error_hz, expected_hz, middle, alias, chirps
+    )
+
+
+def by_geometry(rig: Instrument, board: Board) -> float:
+    """Return the start offset from the rig file's geometry alone, Hz."""
+    return board.start_offset_hz + sum(band_hz(rig)) / 2 - direct_if_hz(rig, board)
+
+
+def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
+    """Fit the high-pass filter of a receiving board to scans of one scene at different start frequencies.
+
+    Raises DataError if the direct path is not found, or the sweep does not determine the corners.
+    """
+    setups: dict[str, BoardSetup] = {}
+    found = [_power_of_scan(scan, scan.instrument.by_name(board_name), setups) for scan in scans]
+    if_hz, power, noise_power = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    middles, levels = binned(if_hz, power, noise_power)
+    if middles.size == 0:
+        raise DataError(
+            f"no direct path of {board_name}", "see `polysight doctor`", "measure again", code=ErrorCode.NO_DATA
+        )
+    model = fit_high_pass(middles, levels)
+    corners = np.array(model.corners_hz)
+    errors, residual = _errors(middles, levels, corners)
+    chirp = scans[0].instrument.chirp
+    return BoardFilter(
+        [float(c / 1e3) for c in corners],
+        [float(e / 1e3) for e in errors],
+        [chirp.hpf1_khz, chirp.hpf2_khz],
+        float(middles[0] / 1e3),
+        float(middles[-1] / 1e3),
+        int(if_hz.size),
+        residual,
+    )
+
+
+def _power_of_scan(scan: RawSource, board: Board, setups: dict[str, BoardSetup]) -> tuple[Real, Real, Real]:
+    """Return IF (Hz), power and noise power (ADC counts squared) of the direct path in the chirps of some rows."""
+    rig = scan.instrument
+    key = f"{places_crc32(rig)} {rig.chirp} {rig.burst!r}"  # scans of one sweep share the setup
+    if key not in setups:
+        setups[key] = BoardSetup.of(rig, board)
+    found = [
+        find_direct(rig, board, words, ok, setups[key]) for _, words, ok in board_rows(scan, board.name, FILTER_ROWS)
+    ]
+    return (
+        np.concatenate([s.if_hz for s in found]),
+        np.concatenate([s.power for s in found]),
+        np.concatenate([s.noise_power for s in found]),
+    )
+
+
+def binned(if_hz: Real, power: Real, noise_power: Real) -> tuple[Real, Real]:
+    """Return mean IF and level without noise, in bins of `BIN_HZ` with enough chirps and signal; IF ascending.
+
+    The level comes from the median power, so that chirps with a wrong direct path do not count.
+    """
+    bins = np.floor(if_hz / BIN_HZ).astype(int)
+    groups = [(bins == b) & (if_hz > 0) for b in np.unique(bins)]
+    means = [(if_hz[g].mean(), np.median(power[g]), noise_power[g].mean()) for g in groups if g.sum() >= MIN_CHIRPS]
+    means = [(f, p - n) for f, p, n in means if p > MIN_SNR * n]
+    return np.array([f for f, _ in means]), np.sqrt([s for _, s in means])
+
+
+def _errors(if_hz: Real, level: Real, corners_hz: Real) -> tuple[Real, float]:
+    """Return the standard errors of the corners (Hz), and the residual of the log levels (dB, RMS)."""
+
+    def residual(logs: Real) -> Real:
+        out = np.log(level) - np.log(np.abs(HighPass(tuple(np.exp(logs))).response(if_hz)))
+        return out - out.mean()
+
+    logs, step = np.log(corners_hz), 1e-4
+    slopes = np.stack(
+        [(residual(logs + d) - residual(logs - d)) / (2 * step) for d in step * np.eye(logs.size)], axis=1
+    )
+    rest = residual(logs)
+    variance = float(rest @ rest) / max(1, rest.size - logs.size - 1)
+    errors = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)) * variance)
+    return errors * corners_hz, float(np.sqrt(np.mean(rest**2)) * 20 / np.log(10))

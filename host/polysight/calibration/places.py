@@ -1,0 +1,327 @@
+"""Positions of the receivers and of the object plane, from a scan of points at known positions.
+
+Samples are referenced to the direct path, so the echo of a point at v, at stage offset u, has the phase
+2 pi f d / c with the excess path
+
+    d = |v - u - tx| + |v - u - rx| - |tx - rx|
+
+The position of the transmitter in the rig file defines the frame. Unknowns are the shift of each receiving board (3),
+the distance of the plane (1), and position (2) and rotation (1) of the target. The amplitude of each point is a free
+complex number per board, eliminated by variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973), so that
+only phase differences over aperture and frequency count. Least squares over positions, RX and frequencies, with
+whitened noise. Each unknown has a prior (the accuracy of a ruler): an unknown that the scan does not determine stays
+near the rig file, with the prior as its standard error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from polysight.calibration.files import (
+    BoardPlace,
+    PlacesFile,
+    SourceScan,
+    Vector,
+    board_rows,
+    header,
+    places_crc32,
+)
+from polysight.imaging import Antennas, image_grid, reduction, row_offsets_m, scene_gate_m
+from polysight.store import RawSource
+from polysight.sync import (
+    BoardSetup,
+    HighPass,
+    synchronise_row,
+)
+from polysight_shared.config import Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+from polysight_shared.geometry import specular_midpoint_m
+from polysight_shared.raster import plan_raster
+from polysight_shared.tables import decode, read_toml
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+Real = NDArray[np.float64]
+
+# Largest deviation of the plane from the rig file.
+DEPTH_M = 0.02
+# Positions used by the fit (more take longer and add little), and by the search for the target.
+POSITIONS = 400
+_SEARCH_POSITIONS = 100
+# Range of the search and its step, less than half a resolution cell.
+_REACH_MM = 12.0
+_STEP_MM = 1.5
+# Noise power of a component of the reduced samples, relative to the largest, below which it is empty.
+_MIN_NOISE = 1e-3
+# Part of the power that the points must explain.
+_MIN_EXPLAINED = 0.3
+
+
+class TargetPoint(msgspec.Struct, frozen=True):
+    """A scatterer of the target, millimetres along x and y from its middle."""
+
+    position_mm: tuple[float, float]
+    name: str = ""
+
+
+class Target(msgspec.Struct, frozen=True):
+    """A target file: `[[points]]`. Other keys are ignored, so that a scene file can be used too."""
+
+    points: tuple[TargetPoint, ...] = ()
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior standard deviations of the unknowns."""
+
+    board_mm: float = 5.0
+    plane_mm: float = 5.0
+    target_mm: float = 10.0
+    turn_deg: float = 2.0
+
+    def scale(self, boards: int) -> Real:
+        """Return the standard deviation of each unknown."""
+        return np.array([self.board_mm] * 3 * boards + [self.plane_mm, *2 * [self.target_mm], self.turn_deg])
+
+
+@dataclass
+class BoardEchoes:
+    """Whitened samples of one board, from :func:`load_echoes`.
+
+    Attributes
+    ----------
+    antennas
+        Antennas by the rig file.
+    samples
+        complex128 [rx, position, k]: whitened samples, k their components.
+    echo
+        complex128 [k, frequency]: maps a spectrum to the components.
+    offsets_m
+        float64 [position, 3]: stage offsets.
+    frequencies_hz
+        float64 [frequency], evenly spaced.
+    """
+
+    antennas: Antennas
+    samples: NDArray[np.complex128]
+    echo: NDArray[np.complex128]
+    offsets_m: Real
+    frequencies_hz: Real
+
+
+@dataclass
+class PlacesFit:
+    """Estimated unknowns (millimetres, degrees), their covariance, and the explained share of the power."""
+
+    values: Real
+    covariance: Real
+    explained: float
+    boards: list[str] = field(default_factory=list)
+
+    @property
+    def errors(self) -> Real:
+        """Standard errors of the unknowns."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def read_target(path: Path) -> list[TargetPoint]:
+    """Read the points of a target file. Raises ConfigError, and DataError for fewer than three."""
+    points = list(decode(read_toml(path), Target, str(path)).points)
+    if len(points) < 3:
+        raise DataError(
+            f"{path}: {len(points)} points",
+            "two points do not separate rotation from shift",
+            "give three or more [[points]] with position_mm = [x, y]",
+            code=ErrorCode.NOT_ENOUGH_DATA,
+        )
+    return points
+
+
+def load_echoes(
+    source: RawSource, rig: Instrument, filters: dict[str, HighPass | None] | None = None
+) -> dict[str, BoardEchoes]:
+    """Load the whitened samples of a scan by receiving board; `filters` are measured ones. Raises DataError."""
+    return {b.name: _load_board(source, rig, b.name, (filters or {}).get(b.name)) for b in rig.receivers}
+
+
+def fit_places(
+    echoes: dict[str, BoardEchoes], rig: Instrument, points: list[TargetPoint], prior: Prior = Prior()
+) -> PlacesFit:
+    """Estimate the positions of boards, plane and target, starting from the rig file's, of standard deviation `prior`.
+
+    `echoes` are those of :func:`load_echoes`.
+    """
+    mm = np.array([p.position_mm for p in points])
+    centre = np.array(specular_midpoint_m(rig, rig.receivers[0]))
+    scale = prior.scale(len(echoes))
+    boards = list(echoes.values())
+
+    def misfit(unknown: Real, sigma: float) -> Real:
+        parts = [_residual(b, unknown[3 * i : 3 * i + 3], _places_m(centre, mm, unknown)) for i, b in enumerate(boards)]
+        flat = np.concatenate([p.ravel() for p in parts]) / sigma
+        return np.concatenate([flat.real, flat.imag, unknown / scale])
+
+    start = np.zeros(scale.size)
+    start[-3:-1] = _find_target(boards, centre, mm)
+    size = sum(b.samples.size for b in boards)
+    sigma = float(np.sqrt(np.mean(misfit(start, 1.0)[: 2 * size] ** 2)))
+    found: Any = None
+    for tolerance in (1e-3, 1e-6, 1e-8):  # each fit improves the estimate of the noise
+        found = scipy.optimize.least_squares(
+            misfit, start, args=(sigma,), method="lm", x_scale=scale / 10, ftol=tolerance, xtol=tolerance
+        )
+        start = found.x
+        sigma *= float(np.sqrt(np.mean(found.fun[: 2 * size] ** 2)))
+    power = sum(float((np.abs(b.samples) ** 2).sum()) for b in boards)
+    explained = 1 - 2 * size * sigma**2 / power
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    return PlacesFit(found.x, covariance, explained, list(echoes))
+
+
+def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass | None) -> BoardEchoes:
+    """Synchronise a board's scan, reduce it to the range gate, equalise its RX and whiten its noise."""
+    board, plan = rig.by_name(name), plan_raster(rig.grid)
+    setup = BoardSetup.of(rig, board, model=model)
+    every = tuple(Antennas.of(rig, b) for b in rig.receivers)
+    gate = scene_gate_m(every, plan, image_grid(rig), DEPTH_M)
+    maps = reduction(rig.chirp, gate)
+    reduced, direct, offsets = [], [], []
+    stride = max(1, int(np.ceil(np.sqrt(plan.positions / POSITIONS))))
+    for row, words, valid in board_rows(source, name):
+        if row % stride:
+            continue
+        synced = synchronise_row(words, valid, setup)
+        keep = np.flatnonzero(synced.valid)[::stride]
+        reduced.append(synced.samples[:, keep] @ maps.matrix.T)
+        direct.append(synced.samples[:, keep] @ maps.direct)
+        offsets.append(row_offsets_m(rig, plan.row(row))[keep])
+    samples, gains = np.concatenate(reduced, axis=1), np.concatenate(direct, axis=1).mean(axis=1)
+    if not samples.size or np.any(gains == 0):
+        raise DataError(
+            f"{source.scan_id}: no direct path of {name}",
+            "see `polysight sync-report`",
+            "scan again",
+            code=ErrorCode.NO_DATA,
+        )
+    # Noise is white in the raw samples, so its covariance in the reduced samples is that of the reduction.
+    power, directions = scipy.linalg.eigh(maps.matrix @ maps.matrix.conj().T)
+    kept = power > _MIN_NOISE * power[-1]
+    white = directions[:, kept].conj().T / np.sqrt(power[kept])[:, None]
+    samples = (samples / gains[:, None, None]) @ white.T
+    flat = np.concatenate(offsets)
+    places = np.column_stack([flat, np.zeros(len(flat))])
+    return BoardEchoes(Antennas.of(rig, board), samples, white @ maps.model, places, maps.frequencies_hz)
+
+
+def _places_m(centre: Real, mm: Real, unknown: Real) -> Real:
+    """Return the positions of the target's points, metres [point, 3], rig frame."""
+    depth, x, y, turn = unknown[-4:]
+    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    flat = mm @ np.array([[c, s], [-s, c]]) + [x, y]
+    return centre + np.column_stack([flat, np.full(len(mm), depth)]) / 1e3
+
+
+def _design(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
+    """Return the echo of each point with amplitude one, complex [rx * position * k, point]."""
+    tx, rx = board.antennas.tx_m, board.antennas.rx_m + np.asarray(shift_mm) / 1e3
+    away = places_m[None] - board.offsets_m[:, None]  # [position, point, 3]
+    out = np.linalg.norm(away - tx, axis=-1)
+    back = np.linalg.norm(away[None] - rx[:, None, None], axis=-1)
+    path = out + back - np.linalg.norm(rx - tx, axis=-1)[:, None, None]
+    f = board.frequencies_hz / SPEED_OF_LIGHT_M_S
+    step = _turns(path * (f[-1] - f[0]) / (f.size - 1))
+    tones = np.empty((*path.shape, f.size), np.complex128)
+    tones[..., 0] = _turns(path * f[0]) / (out * back)
+    for k in range(1, f.size):  # evenly spaced
+        np.multiply(tones[..., k - 1], step, out=tones[..., k])
+    echoes = tones.reshape(-1, f.size) @ board.echo.T
+    return echoes.reshape(*path.shape, -1).transpose(0, 1, 3, 2).reshape(-1, len(places_m))
+
+
+def _turns(cycles: Real) -> NDArray[np.complex128]:
+    """Return exp(2j pi cycles), accurate for many cycles."""
+    return np.exp(2j * np.pi * (cycles - np.round(cycles)))
+
+
+def _residual(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
+    """Return the samples minus the best-fitting sum of the points' echoes."""
+    design, samples = _design(board, shift_mm, places_m), board.samples.reshape(-1)
+    amplitude = np.linalg.lstsq(design.conj().T @ design, design.conj().T @ samples, rcond=1e-9)[0]
+    return samples - design @ amplitude
+
+
+def _find_target(boards: list[BoardEchoes], centre: Real, mm: Real) -> tuple[float, float]:
+    """Return the position of the target on a coarse grid, millimetres: maximum of the power at all points."""
+    best, found = -1.0, (0.0, 0.0)
+    few = [_subset(b) for b in boards]
+    steps = np.arange(-_REACH_MM, _REACH_MM + _STEP_MM / 2, _STEP_MM)
+    for x in steps:
+        for y in steps:
+            places = _places_m(centre, mm, np.array([0.0, x, y, 0.0]))
+            total = 0.0
+            for board in few:
+                design = _design(board, np.zeros(3), places)
+                answer = design.conj().T @ board.samples.reshape(-1)
+                total += float((np.abs(answer) ** 2 / (np.abs(design) ** 2).sum(axis=0)).sum())
+            if total > best:
+                best, found = total, (float(x), float(y))
+    return found
+
+
+def _subset(b: BoardEchoes) -> BoardEchoes:
+    """Return the samples of one RX at some positions."""
+    at = slice(None, None, -(-len(b.offsets_m) // _SEARCH_POSITIONS))
+    antennas = Antennas(b.antennas.tx_m, b.antennas.rx_m[:1])
+    return BoardEchoes(antennas, b.samples[:1, at], b.echo, b.offsets_m[at], b.frequencies_hz)
+
+
+def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[SourceScan]) -> PlacesFile:
+    """Return a fit as a calibration file. Raises DataError if the points explain too little of the data."""
+    if fit.explained < _MIN_EXPLAINED:
+        raise DataError(
+            f"the points explain {100 * fit.explained:.0f} % of the echoes",
+            "another target was scanned, it lay more than a centimetre off the middle, or other objects reflect too",
+            "check the target file; cover other reflecting objects",
+            code=ErrorCode.MISMATCH,
+        )
+    errors, boards = fit.errors, {}
+    for i, name in enumerate(fit.boards):
+        own = slice(3 * i, 3 * i + 3)
+        antennas = Antennas.of(rig, rig.by_name(name))
+        before = antennas.rx_m[0] - antennas.tx_m
+        after = before + fit.values[own] / 1e3
+        along = after / np.linalg.norm(after)
+        boards[name] = BoardPlace(
+            _vector(fit.values[own]),
+            _vector(errors[own]),
+            float(np.linalg.norm(after) * 1e3),
+            float(np.linalg.norm(before) * 1e3),
+            float(np.sqrt(along @ fit.covariance[own, own] @ along)),
+        )
+    depth, x, y, turn = (float(v) for v in fit.values[-4:])
+    return PlacesFile(
+        **header("direct_path", sources),
+        rig_crc32=places_crc32(rig),
+        boards=boards,
+        object_distance_mm=rig.geometry.object_distance_mm + depth,
+        object_distance_was_mm=rig.geometry.object_distance_mm,
+        object_distance_standard_error_mm=float(errors[-4]),
+        target_mm=(x, y),
+        target_standard_error_mm=(float(errors[-3]), float(errors[-2])),
+        target_turn_deg=turn,
+        target_turn_standard_error_deg=float(errors[-1]),
+        explained=fit.explained,
+        points=points,
+    )
+
+
+def _vector(values: Real) -> Vector:
+    x, y, z = (float(v) for v in values)
+    return x, y, z

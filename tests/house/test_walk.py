@@ -51,12 +51,14 @@ def walk(tmp_path_factory) -> tuple[list[tuple[str, str]], set[str]]:
     that are passed within the pipeline's steps from raw row to name.
     """
     from polysight.jobs.process import process
+    from polysight.materials import load_catalogue
     from polysight.pipeline import Pipeline
     from polysight_simulators.__main__ import main
 
     folder = tmp_path_factory.mktemp("walk")
     command = ["simulate", str(ROOT / "examples" / "own-scene.toml"), "--config", str(ROOT / "instrument.toml")]
     assert main([*command, "--out", str(folder / "scan")]) == 0
+    load_catalogue()  # it is read once for all scans
     calls: dict[tuple[str, str], None] = {}
     files: set[str] = set()
     steps = {getattr(Pipeline, name).__code__: name for name in ROW_TO_NAME}

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from polysight.capture import raw_words, row_words, valid_frames
 from polysight.store import CubeRow, RowData, Source
 from polysight.sync import high_pass_filter as hpf
+from polysight.sync import loops
 from polysight.sync.align import AlignedRow, align_pieces, whole_blocks
 from polysight.sync.direct_path import DirectPath, Referenced, excess_path_m, prepare, reference
 from polysight.sync.loops import FOLD, Complex, Real, block_edges, block_times, cis, phasor, refine
@@ -244,6 +245,8 @@ class RowSynchroniser:
     """
 
     def __init__(self, source: Source, rig: Instrument, filters: Mapping[str, hpf.HighPass | None]) -> None:
+        # Loaded now, with its warning, and not by the first of several threads.
+        loops.library()
         self._source = source
         self.setups = {b.name: BoardSetup.of(rig, b, model=filters.get(b.name)) for b in rig.receivers}
         self._forms: dict[str, CubeForm] = {}

@@ -19,7 +19,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.results import Recording
 from polysight.store.source import CubeRow, RowData, pieces_of
 from polysight_shared import files
 from polysight_shared.config import Board, Instrument, MountStep
@@ -591,6 +590,9 @@ class PublishedScan(_Published):
 
     def recording_facts(self) -> dict[str, Any]:
         """Return the losses of the rows read so far and the number of missing rows, by board."""
+        # A scan that is only recorded loads nothing of the results.
+        from polysight.results import Recording
+
         boards = {}
         for board in self._instrument.receivers:
             rows = [asdict(r) for r in self._losses[board.name].values()]
@@ -647,4 +649,6 @@ class PublishedCubes(_Published):
 
     def recording_facts(self) -> dict[str, Any]:
         """Return the direction and the notices."""
+        from polysight.results import Recording
+
         return {"recording": Recording(direction=self._settings.moving_direction, notices=list(self.notices))}

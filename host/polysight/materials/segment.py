@@ -210,11 +210,13 @@ def segment(
     masks: list[Mask] = []
     left_out = 0
     for mask in _regions(even, usable, cfg, pixel_mm):
+        # Smoothing its outline may have left nothing of it.
+        if float(mask.sum()) * pixel_mm**2 < SMALLEST_SHARE * cfg.smallest_mm**2:
+            continue
         own_db = float(np.median(even[mask]))
-        is_large = float(mask.sum()) * pixel_mm**2 >= SMALLEST_SHARE * cfg.smallest_mm**2
-        if is_large and own_db >= least_db:
+        if own_db >= least_db:
             masks.append(mask)
-        elif is_large and own_db >= cfg.dimmest_db:
+        elif own_db >= cfg.dimmest_db:
             left_out += 1
     labels = np.zeros(h.shape, np.int32)
     patches = []

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import UNSET
 from tests.support.drawn_files import Errors, Material, write_labels
 from tests.support.refusals import refused
 
@@ -196,6 +197,28 @@ def test_every_reader_of_products_reads_them(saved, tmp_path, capsys):
     assert scan.materials().sizes["patch"] == 5
     with pytest.raises(PolysightError):
         _ = scan.rig
+
+
+def test_the_tilt_of_a_plate_is_read_from_its_phase(saved, pair, rig):
+    """A mirror's echo from TX over the plate to RX grows by (cos + cos) of both legs times the height."""
+    degrees = (0.6, -0.8)
+    axis = np.arange(150) * 2e-3
+    height_m = np.tan(np.radians(degrees[0])) * axis[None, :] + np.tan(np.radians(degrees[1])) * axis[:, None]
+    wave = 2 * np.pi * 78.0e9 / 299792458.0
+    ramp = np.exp(-2j * np.pi * np.add.outer(*2 * [np.arange(150) / 31.0]))  # that of the drawn files, see write_labels
+    pair = {name: image * ramp for name, image in pair.items()}
+    tilted = {name: image * np.exp(-2j * wave * np.cos(np.radians(ANGLE)) * height_m) for name, image in pair.items()}
+    level, rising = (
+        analysed(saved(name, x_m=axis, y_m=axis, **images), rig, incidence_deg=ANGLE)
+        for name, images in (("level", pair), ("rising", tilted))
+    )
+    changes = [
+        b.tilt_across_deg - a.tilt_across_deg
+        for a, b in zip(level.segments, rising.segments, strict=True)
+        if not (a.tilt_across_deg is UNSET or b.tilt_across_deg is UNSET)
+    ]
+    assert len(changes) >= 3
+    assert np.median(changes) == pytest.approx(degrees[1], abs=0.05)
 
 
 def test_a_plate_over_the_plane_is_the_reference_of_every_pixel(saved, pair, tmp_path):

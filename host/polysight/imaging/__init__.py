@@ -21,6 +21,7 @@ from polysight.imaging.geometry import (
 from polysight.imaging.images import (
     AS_IN_RIG_FILE,
     TAPERS,
+    Illumination,
     Image,
     ImageBuilder,
     ImagedWith,
@@ -31,6 +32,7 @@ from polysight.imaging.images import (
     SubBandImages,
     View,
     correct_tilt,
+    illumination_geometry,
     needed_gate_m,
     sub_bands,
 )
@@ -55,6 +57,7 @@ __all__ = [
     "Aperture",
     "FieldLimits",
     "Focus",
+    "Illumination",
     "Image",
     "ImageBuilder",
     "ImageGrid",
@@ -75,6 +78,7 @@ __all__ = [
     "fill_missing",
     "fill_sub_bands",
     "focus_sweep",
+    "illumination_geometry",
     "image_grid",
     "imaging_facts",
     "move_to_plane",

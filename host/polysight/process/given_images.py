@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.imaging import UNKNOWN_PLANE, Images
+from polysight.imaging import UNKNOWN_PLANE, Antennas, Illumination, Images, illumination_geometry
 from polysight.materials import (
     Labels,
     Optics,
@@ -334,11 +334,29 @@ def choose_angle(pair: GivenPair, settings: Settings, rig: Instrument) -> Angle:
     return Angle(float(np.degrees(specular_incidence_rad(rig))), "rig file")
 
 
+def illumination_of(images: Images, rig: Instrument) -> Illumination:
+    """Return what the phase of a plate says about its tilt, for a rig; the footprints are not known, and taken as even.
+
+    A row of phases gives the tilt (`Illumination.rise`); nothing is divided out.
+    """
+    chirp = rig.chirp
+    middle_hz = chirp.first_sample_hz + chirp.hz_per_sample * float(np.mean(chirp.linear_samples))
+    plane_m = rig.geometry.object_distance_mm / 1e3
+    boards = [illumination_geometry(Antennas.of(rig, board), plane_m, middle_hz) for board in rig.receivers]
+    pitch_m = float(images.x_m[1] - images.x_m[0])
+    return Illumination(
+        footprints=np.ones((2, *images.h.shape), np.complex64),
+        moved_m=np.stack([moved for moved, _ in boards]),
+        steepness_rad_m=np.array([steepness for _, steepness in boards]),
+        pixel_m=(pitch_m, pitch_m),
+    )
+
+
 def given_reasons(pair: GivenPair, angle: Angle) -> list[Finding]:
     """Return what limits the verdict on given images: no direct path, an assumed geometry, an assumed angle."""
     out = [reason(
         "care", "the images were given: there is no direct path beside them",
-        "gains of H against V, the recording, the plane and tilts of plates cannot be checked",
+        "gains of H against V, the recording and the plane of the plates cannot be checked",
         "process the recorded scan where there is one", 2.4,
     )]  # fmt: skip
     if pair.assumed:
@@ -375,7 +393,7 @@ def analyse_given_images(
     angle = choose_angle(pair, settings, rig)
     rig = rig_at(rig, angle.deg)
     classifier = load_classifier(settings, rig)
-    images = pair.images
+    images = replace(pair.images, illumination=illumination_of(pair.images, rig))
     boxed = replace(inputs, labels=pair.boxes(inputs.labels))
     known = boxes_as_patches(settings, boxed, images.x_m, images.y_m)
     plane = inputs.reference

@@ -15,7 +15,7 @@ from benchmarks.measure import Line, Seconds, add_arguments, one_core, show, wri
 from benchmarks.published import Synchroniser
 from polysight.imaging import ImageBuilder
 from polysight.pipeline import Pipeline
-from polysight.sync import direct_path
+from polysight.sync import chain
 from polysight_shared.config import Instrument
 
 __all__ = ["add_arguments", "run"]
@@ -28,17 +28,17 @@ LIMITS = {"decode and align": (80.0, 120.0), "direct path": (60.0, 80.0)}
 @contextmanager
 def direct_path_timed(into: Seconds) -> Iterator[None]:
     """Times every call of the chain's direct-path stage."""
-    original = direct_path.reference
+    original = chain.reference
 
     def timed(*args: Any, **kwargs: Any) -> Any:
         with into.timed():
             return original(*args, **kwargs)
 
-    direct_path.reference = timed
+    chain.reference = timed
     try:
         yield
     finally:
-        direct_path.reference = original
+        chain.reference = original
 
 
 class _NoImage:

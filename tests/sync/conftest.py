@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from polysight.capture.dca1000 import raw_words
-from polysight.sync.align import AlignedRow, align_row
+from polysight.sync.offsets import AlignedRow, align_row
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polysight.sync.align import align_row
+from polysight.sync.offsets import align_row
 
 LINEAR = (0, 192)
 CENTRE = 95.5

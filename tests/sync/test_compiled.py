@@ -14,10 +14,10 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from polysight.sync import build, direct_path
+from polysight.sync import build, offsets
 from polysight.sync import loops as sync_loops
-from polysight.sync.align import AlignedRow, align_in_numpy, align_pieces, align_row
 from polysight.sync.high_pass_filter import Equaliser, HighPass, high_pass
+from polysight.sync.offsets import AlignedRow, align_in_numpy, align_pieces, align_row
 
 WIDTHS = (128, 256, 512)
 
@@ -196,9 +196,9 @@ def test_the_direct_path(loops, rig, paths, noise, counts):
     words, valid = counts(frames.transpose(2, 0, 1, 3)), np.ones((37, 4), bool)
     valid[11] = False
     aligned = align(align_in_numpy, words, valid, rig.chirp.linear_samples, equaliser_of(rig))
-    path = direct_path.prepare(rig, board)
-    expected = direct_path.reference(aligned, path, rig.chirp, sync_loops.NumpyLoops)
-    got = direct_path.reference(aligned, path, rig.chirp, loops)
+    path = offsets.prepare(rig, board)
+    expected = offsets.reference(aligned, path, rig.chirp, sync_loops.NumpyLoops)
+    got = offsets.reference(aligned, path, rig.chirp, loops)
     np.testing.assert_array_equal(got.found, expected.found)
     assert 30 < got.found.sum() < 37
     found = got.found
@@ -229,7 +229,7 @@ def test_three_receivers_are_aligned_in_numpy():
 def test_the_compiled_loops_are_used_if_available(library_file, monkeypatch):
     found = sync_loops.Library(library_file)
     monkeypatch.setattr(sync_loops, "library", lambda: found)
-    monkeypatch.setattr("polysight.sync.align.align_in_numpy", None)
+    monkeypatch.setattr("polysight.sync.offsets.align_in_numpy", None)
     assert align_row(bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
 
 

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.sync.direct_path import prepare, reference
+from polysight.sync.offsets import prepare, reference
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 

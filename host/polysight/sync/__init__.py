@@ -7,12 +7,11 @@ every row of a source, and converts cubes that another program has synchronised.
 otherwise in NumPy with equal results. `estimate_backlash` measures the backlash of the stage from the echoes.
 """
 
-from polysight.sync.align import AlignedRow, align_row, whole_blocks
 from polysight.sync.backlash import estimate_backlash, object_filter
 from polysight.sync.chain import STAGES, BoardSetup, RowSynchroniser, SyncedRow, noise_power, synchronise_row
-from polysight.sync.direct_path import reference
 from polysight.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
 from polysight.sync.loops import FOLD, cis
+from polysight.sync.offsets import AlignedRow, align_row, reference, whole_blocks
 
 __all__ = [
     "FOLD",

@@ -29,9 +29,17 @@ from polysight.capture import raw_words, row_words, valid_frames
 from polysight.store import CubeRow, RowData, Source
 from polysight.sync import high_pass_filter as hpf
 from polysight.sync import loops
-from polysight.sync.align import AlignedRow, align_pieces, whole_blocks
-from polysight.sync.direct_path import DirectPath, Referenced, excess_path_m, prepare, reference
 from polysight.sync.loops import FOLD, Complex, Real, block_edges, block_times, cis, phasor, refine
+from polysight.sync.offsets import (
+    AlignedRow,
+    DirectPath,
+    Referenced,
+    align_pieces,
+    excess_path_m,
+    prepare,
+    reference,
+    whole_blocks,
+)
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError

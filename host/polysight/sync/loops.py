@@ -1,10 +1,10 @@
 """The loops of synchronisation in two forms with equal results: compiled, and in NumPy, which is the readable one.
 
 * Tones: frequency and phase of a tone in many short records, at the Cramer-Rao bound (`signal.h`).
-* Three passes over the raw samples of a burst: `match`, `against_others`, `average` (`passes.h`); `align.py` decides
+* Three passes over the raw samples of a burst: `match`, `against_others`, `average` (`passes.h`); `offsets.py` decides
   between them. Words are int16 [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing multiplies
   by `exp(-j 2 pi f (n - centre))`, with f in cycles per sample and `centre` the middle of the linear samples.
-* `NumpyLoops`: loops over positions that find the direct path (`direct_path.c`); `direct_path.py` has the method.
+* `NumpyLoops`: loops over positions that find the direct path (`direct_path.c`); `offsets.py` has the method.
 * `Library` calls `burst.c` and `direct_path.c` through ctypes, which releases the interpreter. :func:`library` returns
   it, or None and one warning if nothing was compiled; then the slower NumPy form is used.
 """
@@ -357,7 +357,7 @@ def _fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
 class NumpyLoops:
     """Loops over positions that find the direct path; the same methods as :class:`Library`.
 
-    Halves are complex64 [position, 2, rx, block] from burst alignment (`align.AlignedRow`); frequencies are in cycles
+    Halves are complex64 [position, 2, rx, block] from burst alignment (`offsets.AlignedRow`); frequencies are in cycles
     per sample.
     """
 
@@ -430,7 +430,7 @@ class NumpyLoops:
         steering
             complex64 [rx, block].
         estimator
-            complex64 [2 or 3, rx * block]: see `direct_path.DirectPath`.
+            complex64 [2 or 3, rx * block]: see `offsets.DirectPath`.
         frequency
             [position]: starting values.
 
@@ -539,7 +539,7 @@ class Library:
         full_scale: int,
         into: Sequence[NDArray[Any]],
     ) -> None:
-        """Align positions into the fields of an `align.AlignedRow`; parameters as in `align.align_in_numpy`."""
+        """Align positions into the fields of an `offsets.AlignedRow`; parameters as in `offsets.align_in_numpy`."""
         positions, chirps, samples, _, _ = words.shape
         a, b = linear
         filters = [0.0, 0.0, 0.0]

@@ -1,0 +1,539 @@
+"""Estimate and remove offsets of frequency and phase: of each chirp in its burst, then of each position.
+
+Burst alignment (`align_row`). A board samples SYNC_IN with its own clock, so each chirp is the same signal times
+`exp(j(2 pi df t + dphi))` (paper, eq. 4). The conjugate product with a reference chirp, summed over the RX, is a tone
+with the positive envelope `|s(t)|^2`; the maximum of its spectrum is the maximum-likelihood offset for any signal `s`.
+The paper divides by the reference chirp instead, which amplifies noise where direct path and object cancel.
+
+After mixing each chirp to zero frequency, its signal fills only a few range bins, so four consecutive samples can be
+averaged. Filter compensation and a second estimate (each chirp against the sum of all others) use these averages. Only
+the final average of the chirps is computed at the full sample rate.
+
+Direct path from TX to RX (`reference`): found in the average of every position, its frequency and phase are removed.
+The object's echo is as strong as the direct path and lies only 3.5 IF bins above it, so the estimate of the direct path
+must suppress the object. Both are known from the geometry: the direct path has fixed delays along the RX array, and the
+object lies on the object plane. With the object as coloured noise of covariance R, the best linear unbiased estimate of
+a direct path `A exp(j w t)` near `w = 0`, with the model `x = A g + A w (jt g)`, is
+
+    [A, A w] = (G^H R^-1 G)^-1 G^H R^-1 x,   G = [g, j t g]
+
+(generalised least squares; Kay 1993, section 6.4). This is a fixed 2 x (4 RX x samples) matrix: a beamformer in space
+and frequency with nulls at the object. Gauss-Newton steps `w += Re(A w / A)` converge. Its input is the average after
+burst alignment: mixed to zero frequency, with four consecutive samples averaged.
+
+The crystals of the boards differ by some ppm, and with them the chirp slopes, so the IF drifts by some kilohertz within
+a chirp, equally for all paths and positions. A third column `jt^2/2 g` estimates this drift; its median over the row is
+removed first.
+
+The amplitude of the direct path is constant during a scan. If a position's amplitude is an outlier in its row, the
+second of the two strongest peaks is tried. Nothing is smoothed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from polysight.sync import high_pass_filter as hpf
+from polysight.sync import loops
+from polysight.sync.loops import FOLD, Library, NumpyLoops, Real, Tone, cis, complex64
+from polysight_shared.config import Board, Chirp, Instrument
+from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+
+# Burst alignment: reference chirps tried per position.
+_REFERENCES = 4
+# A good chirp has at least this part of the coherence of the position's median chirp.
+_GOOD = 0.5
+
+# Direct path: size of the search FFT, over averaged samples.
+_FFT = 256
+# Standard deviation in x and y of the echoes' origin, around the mirror point.
+_SPREAD_M = 0.1
+# Relative gain and phase differences of the RX that the nulls tolerate.
+_GAIN_SPREAD = 0.3
+# Noise power of a sample relative to an echo as strong as the direct path.
+_NOISE = 1e-2
+# A second peak this strong, one object distance below the first, is the direct path.
+_COMPARABLE = 0.35
+# Smallest amplitude of a direct path, relative to the row's median.
+_LOST = 0.3
+# Standard deviations from the row's amplitude.
+_OUTLIER = 5.0
+# Smallest power of a direct path relative to the noise; noise reaches 12 once in 100,000 positions.
+_PRESENT = 30.0
+
+Loops = Library | type[NumpyLoops]
+"""Loops that find the direct path."""
+
+
+class AlignedRow(NamedTuple):
+    """The averaged chirps of every position of a row, mixed down by `centre`.
+
+    Attributes
+    ----------
+    mean
+        complex64 [position, rx, sample], in the frame of each position's reference chirp.
+    halves
+        complex64 [position, 2, rx, block]: contributions of alternate good chirps to `mean`, averaged over blocks of
+        `FOLD` linear samples.
+    centre
+        float64 [position]: middle of the signal's band in the reference chirp, cycles per sample.
+    good
+        bool [position, chirp]: chirps in the average.
+    frequency, phase
+        float64 [position, chirp]: offset of each chirp from the average, cycles per sample, and radians at the
+        centre of the linear samples.
+    amplitude
+        float64 [position, chirp]: amplitude relative to the average, after compensation.
+    gain
+        float64 [position, chirp]: gain of the filter compensation at the chirp's centre.
+    error
+        float64 [position, 2, chirp]: frequency (cycles per sample) and phase (rad) error of a chirp after alignment:
+        half the difference between two halves of the RX; zero where not good.
+    coherence
+        float64 [position, chirp]: normalised correlation with the average, 0..1.
+    peak
+        int32 [position, chirp]: largest |I| or |Q|, ADC counts.
+    """
+
+    mean: NDArray[np.complex64]
+    halves: NDArray[np.complex64]
+    centre: NDArray[np.float64]
+    good: NDArray[np.bool_]
+    frequency: NDArray[np.float64]
+    phase: Real
+    amplitude: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    error: NDArray[np.float64]
+    coherence: NDArray[np.float64]
+    peak: NDArray[np.int32]
+
+    def part(self, positions: slice) -> AlignedRow:
+        """Return views of some positions."""
+        return AlignedRow._make(field[positions] for field in self)
+
+
+Align = Callable[
+    [NDArray[np.int16], NDArray[np.bool_], tuple[int, int], hpf.Equaliser | None, int, AlignedRow],
+    None,
+]
+"""Aligns positions: words, valid, linear samples in whole blocks, filter compensation, full scale; into a row."""
+
+
+def align_row(
+    words: NDArray[np.int16],
+    valid: NDArray[np.bool_],
+    linear: tuple[int, int],
+    equaliser: hpf.Equaliser | None = None,
+    full_scale: int = 32767,
+) -> AlignedRow:
+    """Align and average the burst of every position: compiled (`burst.c`) if possible, otherwise in NumPy.
+
+    Parameters
+    ----------
+    words
+        int16 [position, chirp, sample, 2, rx]: raw frames, I before Q.
+    valid
+        bool [position, chirp]: chirps received whole.
+    linear
+        Samples `[a, b)` in which the chirp is linear; estimates use only these, the average all samples.
+    equaliser
+        Compensates the receiver's high-pass filter; None: no compensation.
+    full_scale
+        Value of a clipped sample; clipped chirps are left out, for clipping creates false tones.
+    """
+    return align_pieces([words], valid, linear, equaliser, full_scale)
+
+
+def align_pieces(
+    pieces: Iterable[NDArray[np.int16]],
+    valid: NDArray[np.bool_],
+    linear: tuple[int, int],
+    equaliser: hpf.Equaliser | None = None,
+    full_scale: int = 32767,
+    by: Align | None = None,
+) -> AlignedRow:
+    """Align and average a row that comes in pieces of some positions; parameters as of :func:`align_row`.
+
+    A piece is not used after the next one is taken, so all may share their memory. `by` is compiled or
+    :func:`align_in_numpy`, with equal results; None: compiled if possible.
+
+    Raises
+    ------
+    ValueError
+        if there is no piece, or the pieces are not the positions of `valid`.
+    """
+    linear, row, done = whole_blocks(linear), None, 0
+    for words in pieces:
+        if row is None:
+            row = _empty_row(valid.shape, words.shape, (linear[1] - linear[0]) // FOLD)
+        here = slice(done, done + len(words))
+        if words.shape[:2] != valid[here].shape:
+            raise ValueError(f"bursts {words.shape[:2]} at position {done} of {valid.shape}")
+        align = by or _choose_loop(words.shape[-1])
+        align(words, valid[here], linear, equaliser, full_scale, row.part(here))
+        done = here.stop
+    if row is None or done != len(valid):
+        raise ValueError(f"{done} of {len(valid)} positions")
+    return row
+
+
+def _choose_loop(rx: int) -> Align:
+    library = loops.library() if rx == loops.RX else None
+    return library.align if library else align_in_numpy
+
+
+def align_in_numpy(
+    words: NDArray[np.int16],
+    valid: NDArray[np.bool_],
+    linear: tuple[int, int],
+    equaliser: hpf.Equaliser | None,
+    full_scale: int,
+    into: AlignedRow,
+) -> None:
+    """Align and average positions in NumPy, for any number of RX: the readable form of `burst.c`."""
+    words = np.ascontiguousarray(words)
+    for i in range(0, len(valid), loops.CHUNK):
+        here = slice(i, i + loops.CHUNK)
+        for field, values in zip(into, _align(words[here], valid[here], linear, equaliser, full_scale), strict=True):
+            field[here] = values
+
+
+def _empty_row(bursts: tuple[int, ...], words: tuple[int, ...], blocks: int) -> AlignedRow:
+    """Return memory for the row: bursts [position, chirp], words [position, chirp, sample, 2, rx]."""
+    (positions, chirps), samples, rx = bursts, words[2], words[-1]
+    return AlignedRow(
+        mean=np.empty((positions, rx, samples), np.complex64),
+        halves=np.empty((positions, 2, rx, blocks), np.complex64),
+        centre=np.empty(positions),
+        good=np.empty(bursts, np.bool_),
+        frequency=np.empty(bursts),
+        phase=np.empty(bursts),
+        amplitude=np.empty(bursts),
+        gain=np.empty(bursts),
+        error=np.empty((positions, 2, chirps)),
+        coherence=np.empty(bursts),
+        peak=np.empty(bursts, np.int32),
+    )
+
+
+def _align(
+    words: NDArray[np.int16],
+    valid: NDArray[np.bool_],
+    linear: tuple[int, int],
+    equaliser: hpf.Equaliser | None,
+    full_scale: int,
+) -> AlignedRow:
+    """Align and average a few positions."""
+    first, centre, coherence, usable, peak = _against_one(words, valid, linear, full_scale)
+    good = _coherent(coherence, usable)
+    frequency = centre[:, None] + first.frequency
+    taps = _taps(equaliser, frequency)
+    start = np.angle(first.amplitude * taps.sum(axis=-1))
+
+    # Second pass: each chirp against the sum of the others.
+    turned = taps * cis(-start)[..., None]
+    off, product, own, level, apart = loops.against_others(words, frequency, complex64(turned), good, linear)
+    n = good.sum(axis=1)
+    level = np.maximum(level / np.maximum(n, 1) ** 2, 1e-30)[:, None]
+    others = n[:, None] - good
+    # A single chirp is the mean itself.
+    amplitude = np.where(others > 0, np.abs(product) / np.maximum(others, 1) / level, 1.0)
+    # The difference from the mean of all chirps is smaller than that from the mean of the others.
+    part = others / np.maximum(n, 1)[:, None]
+    correction, shift = part * off, part * np.angle(product)
+    coherence = amplitude * np.sqrt(level / np.maximum(own, 1e-30))
+    good = _coherent(coherence, usable)
+
+    # Filtering and then turning by the correction equals turning and then filtering with turned taps.
+    lag = np.arange(taps.shape[-1]) - taps.shape[-1] // 2
+    turned *= cis(2 * np.pi * FOLD * lag * correction[..., None] - shift[..., None])
+    weights = turned * (good / np.maximum(good.sum(axis=1), 1)[:, None])[..., None]
+    second_half = np.cumsum(good, axis=1) % 2 == 0
+    mean, halves = loops.average(words, frequency + correction, complex64(weights), second_half, linear)
+    return AlignedRow(
+        mean,
+        halves,
+        centre,
+        good,
+        first.frequency + correction,
+        np.angle(cis(start + shift)),
+        amplitude,
+        np.abs(taps.sum(axis=-1)),
+        _centred(apart / 2, good).swapaxes(0, 1),
+        coherence,
+        peak,
+    )
+
+
+def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
+    """Return the linear samples that fill whole blocks of `FOLD`; estimates count time from their middle."""
+    a, b = linear
+    return a, b - (b - a) % FOLD
+
+
+def _against_one(
+    words: NDArray[np.int16], valid: NDArray[np.bool_], linear: tuple[int, int], full_scale: int
+) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32]]:
+    """Estimate offsets relative to one chirp per position; try another one if it is unusable or matches few others.
+
+    Returns the offsets, the middle of the signal's band [position], and [position, chirp]: coherence with the reference
+    chirp, usable chirps (received whole, not clipped, not silent), and the largest count.
+    """
+    positions, chirps = valid.shape
+    # Threshold for two records of noise: four times the RMS of a sum of random phases.
+    noise = 4.0 / np.sqrt(words.shape[-1] * (linear[1] - linear[0]))
+    order = np.argsort(~valid, axis=1, kind="stable")  # the valid ones, first to last
+    reference, todo, every = order[:, 0], np.arange(positions), np.arange(positions)
+    frequency, amplitude, centre = np.zeros(valid.shape), np.zeros(valid.shape, complex), np.zeros(positions)
+    coherence, usable, peak = np.zeros(valid.shape), valid, np.zeros(valid.shape, np.int32)
+    best_sum = np.full(positions, -1.0)
+    for attempt in range(min(_REFERENCES, chirps)):
+        tried = order[todo, attempt]
+        offset, product, middle, energy, highest = loops.match(words if attempt == 0 else words[todo], tried, linear)
+        if attempt == 0:
+            usable, peak = valid & (highest < full_scale) & (energy > 0), highest
+            rank = np.where(usable, 1, 2)
+            rank[every, tried] = 0
+            order = np.argsort(rank, axis=1, kind="stable")  # the one tried, then the usable ones
+        at = np.arange(todo.size), tried
+        c = np.abs(product) / np.sqrt(np.maximum(energy * energy[at][:, None], 1e-30)) * usable[todo]
+        c[at] = 0  # a chirp always matches itself
+        total = np.where(usable[todo, tried], c.sum(axis=1), -1.0)
+        better = total >= best_sum[todo]
+        won = todo[better]
+        reference[won], coherence[won], best_sum[won] = tried[better], c[better], total[better]
+        frequency[won], amplitude[won], centre[won] = offset[better], product[better], middle[better]
+        count, matching = usable[todo].sum(axis=1), (c > noise).sum(axis=1)
+        todo = todo[(count > 0) & (~usable[todo, tried] | (2 * matching < count - 1))]
+        if todo.size == 0:
+            break
+    best = coherence.max(axis=1)
+    coherence[every, reference] = np.where(usable[every, reference], best, 0)  # as good as its best match
+    return Tone(frequency, amplitude), centre, coherence, usable, peak
+
+
+def _taps(equaliser: hpf.Equaliser | None, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return the filter taps of every chirp, [position, chirp, tap]; one tap without an equaliser."""
+    return np.ones((*frequency.shape, 1), complex) if equaliser is None else equaliser.taps(frequency)
+
+
+def _coherent(coherence: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the usable chirps with at least `_GOOD` of the median coherence of their position."""
+    rising = np.sort(np.where(usable, coherence, np.inf), axis=1)
+    middle = np.maximum(usable.sum(axis=1) - 1, 0) // 2
+    median = np.take_along_axis(rising, middle[:, None], axis=1)
+    return usable & (coherence >= _GOOD * median)
+
+
+def _centred(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Subtract the mean over a position's good chirps from values [..., position, chirp]; zero where not good."""
+    mean = (values * good).sum(axis=-1) / np.maximum(good.sum(axis=-1), 1)
+    return (values - mean[..., None]) * good
+
+
+class DirectPath(NamedTuple):
+    """Steering and estimators for a board's direct path, from geometry alone; fixed for a scan.
+
+    Attributes
+    ----------
+    steering
+        complex64 [rx, sample]: `exp(-j 2 pi f(t) (tau_r - tau_0))`, after which all RX share the direct path's tone.
+    folded_steering
+        complex64 [rx, block]: steering at the middle of each block of `FOLD` linear samples.
+    estimator
+        complex128 [2, rx * block]: rows give A and A w (w in radians per sample) of the steered, demodulated samples.
+    drift_estimator
+        complex128 [3, rx * block]: A, A w and A q, q the drift in radians per sample squared.
+    half_estimators
+        complex128 [2, 2, rx / 2 * block]: A and A w from every other RX alone.
+    beam
+        complex64 [rx]: weights of the steered RX for the search, sum 1, with low gain towards the object.
+    object_bins
+        IF distance of the nearest and farthest echo from the direct path, in bins of the search FFT.
+    """
+
+    steering: NDArray[np.complex64]
+    folded_steering: NDArray[np.complex64]
+    estimator: NDArray[np.complex128]
+    drift_estimator: NDArray[np.complex128]
+    half_estimators: NDArray[np.complex128]
+    beam: NDArray[np.complex64]
+    object_bins: tuple[float, float]
+
+
+class Referenced(NamedTuple):
+    """Samples referenced to the direct path.
+
+    Attributes
+    ----------
+    samples
+        complex64 [rx, position, sample]: an echo of excess path d is `exp(j 2 pi f(t) d / c)`, the direct path a
+        constant.
+    frequency
+        float64 [position]: IF of the direct path in cycles per sample, 0..1 (complex 1x) or -1/2..1/2.
+    amplitude
+        complex128 [position]: its amplitude, phase at the centre of the linear samples.
+    found
+        bool [position]: False without a credible direct path.
+    drift
+        IF drift of the row, radians per sample squared.
+    halves
+        complex64 [position, 2, rx, block]: the two halves of the burst, referenced like `samples`.
+    """
+
+    samples: NDArray[np.complex64]
+    frequency: NDArray[np.float64]
+    amplitude: NDArray[np.complex128]
+    found: NDArray[np.bool_]
+    drift: float
+    halves: NDArray[np.complex64]
+
+
+def excess_path_m(
+    tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], points_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return `|v - tx| + |v - rx| - |tx - rx|`, metres, [rx, point], for rx [rx, 3] and points [point, 3]."""
+    out = np.linalg.norm(points_m - tx_m, axis=-1) + np.linalg.norm(points_m[None] - rx_m[:, None], axis=-1)
+    return out - np.linalg.norm(rx_m - tx_m, axis=-1)[:, None]
+
+
+def prepare(rig: Instrument, board: Board) -> DirectPath:
+    """Return steering, search beam and estimators of a board, from geometry alone."""
+    chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
+    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    middles = sweep[a:b].reshape(-1, FOLD).mean(axis=1)
+    direct = np.linalg.norm(rx - tx, axis=-1)
+    lag_s = (direct - direct[0])[:, None] / SPEED_OF_LIGHT_M_S
+
+    # Echoes in the steered, demodulated samples: a tone at the excess path, with the object's phases at the RX.
+    grid = np.linspace(-3, 3, 25) * _SPREAD_M
+    dx, dy = (m.ravel() for m in np.meshgrid(grid, grid))
+    weight = np.sqrt(np.exp(-(dx**2 + dy**2) / (2 * _SPREAD_M**2)))
+    points = np.array(specular_midpoint_m(rig, board)) + np.stack([dx, dy, 0 * dx], axis=1)
+    excess = excess_path_m(tx, rx, points)
+    echoes = np.exp(2j * np.pi * middles * excess.T[:, :, None] / SPEED_OF_LIGHT_M_S)
+    echoes *= (weight / np.linalg.norm(weight))[:, None, None]
+    n_rx, n = len(rx), middles.size
+    flat = echoes.reshape(len(points), n_rx * n)
+    same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
+    noise = _NOISE / FOLD * np.eye(n_rx * n)
+    covariance = (flat.T @ flat.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + noise
+    time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
+    model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
+    own = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]
+
+    centre = echoes[:, :, n // 2]
+    spatial = (centre.T @ centre.conj()) * (1 + _GAIN_SPREAD**2 * np.eye(n_rx)) + _NOISE * np.eye(n_rx)
+    beam = np.linalg.solve(spatial, np.ones(n_rx)).conj()
+    bins = chirp.hz_per_sample * FOLD * _FFT / SPEED_OF_LIGHT_M_S
+    return DirectPath(
+        cis(-2 * np.pi * sweep * lag_s),
+        cis(-2 * np.pi * middles * lag_s),
+        _least_squares(model[:, :2], covariance),
+        _least_squares(model, covariance),
+        np.stack([_least_squares(model[at, :2], covariance[np.ix_(at, at)]) for at in own]),
+        (beam / beam.sum()).astype(np.complex64),
+        (float(excess.min() * bins), float(excess.max() * bins)),
+    )
+
+
+def _least_squares(model: NDArray[np.complex128], covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return `(G^H R^-1 G)^-1 G^H R^-1` for a model G [sample, parameter] and a covariance R."""
+    whitened = np.asarray(scipy.linalg.solve(covariance, model, assume_a="pos"), np.complex128)
+    return np.linalg.solve(model.conj().T @ whitened, whitened.conj().T).astype(np.complex128)
+
+
+def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | None = None) -> Referenced:
+    """Find the direct path of every position and remove its frequency and phase from all RX.
+
+    Parameters
+    ----------
+    aligned
+        Aligned averages of a row. Positions without a good chirp are not found.
+    path
+        From :func:`prepare`.
+    chirp
+        The chirp the samples were taken with.
+    by
+        Its loops, with equal results; None: compiled where that is possible.
+    """
+    run = by or (loops.library() if len(path.beam) == loops.RX else None) or NumpyLoops
+    a, b = whole_blocks(chirp.linear_samples)
+    n = (b - a) // FOLD
+    usable: NDArray[np.bool_] = np.any(aligned.good, axis=1)
+    window = np.hanning(n + 2)[1:-1].astype(np.float32)
+    nearest, farthest = int(path.object_bins[0] * 0.9), int(path.object_bins[1] * 1.1)
+    beam = complex64(path.beam[:, None] * path.folded_steering * window)
+    bins, median = run.search(aligned.halves, beam, _FFT, (nearest, farthest), _COMPARABLE)
+    peaks = ((bins + _FFT // 2) % _FFT - _FFT // 2) / _FFT / FOLD
+    floor = median**2 / np.log(2) / (window**2).sum()  # from the median bin, for tones fill few bins
+    three, two = complex64(path.drift_estimator), complex64(path.estimator)
+    frequency, estimate, _ = run.refine(aligned.halves, path.folded_steering, three, peaks[0])
+    drifts = _ratio(estimate[:, 2], estimate[:, 0])[usable]
+    drift = float(np.median(drifts)) if usable.any() else 0.0
+    flat = complex64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
+    frequency, estimate, step = run.refine(aligned.halves, flat, two, frequency)
+    _try_others(aligned.halves, peaks, usable, (run, flat, two), frequency, estimate, step)
+
+    # An IF outside the receiver's band is an alias; if the last step is large, no tone was found.
+    amplitude = estimate[:, 0] * np.sinc(frequency) / np.sinc(frequency * FOLD)  # averaging attenuated the tone
+    heard = aligned.centre + frequency
+    heard = heard % 1.0 if chirp.if_mode == "complex1x" else (heard + 0.5) % 1.0 - 0.5
+    band = heard < 0.9 if chirp.if_mode == "complex1x" else np.abs(heard) < 0.45
+    strength = np.abs(amplitude)
+    chirps = np.maximum(aligned.good.sum(axis=1), 1)
+    # All chirps of a row have the same noise.
+    floor = np.median((floor * chirps)[usable]) / chirps if usable.any() else floor
+    noise = floor / (np.abs(path.beam) ** 2).sum()  # noise power of an averaged sample of one RX
+    present = strength**2 > _PRESENT * noise * (np.abs(path.estimator[0]) ** 2).sum()
+    found = usable & band & present & (np.abs(step) < 0.02 / (b - a))
+    if found.any():
+        found &= strength > _LOST * np.median(strength[found])
+
+    origin = (a + b - 1) / 2
+    steering = complex64(path.steering * cis(-0.5 * drift * (np.arange(chirp.samples) - origin) ** 2))
+    samples, halves = run.turn(
+        aligned.mean, aligned.halves, steering, flat, origin, frequency, np.angle(amplitude), found
+    )
+    return Referenced(samples, heard, amplitude, found, drift, halves)
+
+
+def _try_others(
+    halves: NDArray[np.complex64],
+    peaks: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    how: tuple[Loops, NDArray[np.complex64], NDArray[np.complex64]],
+    *found: NDArray[np.generic],
+) -> None:
+    """Use the second peak where the amplitude is an outlier in its row; changes `found` in place.
+
+    `how` are the loops, the steering and the estimator; `found` are frequency, estimate and last step from `refine`.
+    An outlier is beyond `_OUTLIER` standard deviations, estimated from the median absolute deviation of the row.
+    """
+    level = np.log(np.maximum(np.abs(found[1][:, 0]), 1e-30))
+    if not usable.any():
+        return
+    middle = np.median(level[usable])
+    spread = 1.4826 * np.median(np.abs(level[usable] - middle))  # of a normal distribution
+    odd = np.flatnonzero(usable & (np.abs(level - middle) > _OUTLIER * spread) & (peaks[0] != peaks[1]))
+    if odd.size == 0:
+        return
+    run, steering, estimator = how
+    other = run.refine(halves[odd], steering, estimator, peaks[1, odd])
+    other_level = np.log(np.maximum(np.abs(other[1][:, 0]), 1e-30))
+    better = np.abs(other_level - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
+    for whole, part in zip(found, other, strict=True):
+        whole[odd[better]] = part[better]
+
+
+def _ratio(moment: NDArray[np.complex128], amplitude: NDArray[np.complex128]) -> NDArray[np.float64]:
+    ratio = np.zeros(amplitude.shape, complex)
+    np.divide(moment, amplitude, out=ratio, where=amplitude != 0)
+    return np.real(ratio)

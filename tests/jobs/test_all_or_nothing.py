@@ -14,8 +14,8 @@ from tests.support.products import PIXEL, judged_products
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 
 import polysight.catalogue
+import polysight.report
 from polysight.cli.main import main
-from polysight.jobs import label
 from polysight.materials import SIMULATED_LIBRARY, Library
 from polysight.products import exports
 from polysight_shared.errors import PolysightError
@@ -57,7 +57,7 @@ def before(tmp_path_factory) -> Path:
 @pytest.fixture(autouse=True)
 def quick(monkeypatch) -> None:
     """Nothing is drawn or compressed again for every fault."""
-    monkeypatch.setattr(label, "label_figure", lambda *_: PIXEL)
+    monkeypatch.setattr(polysight.report, "label_figure", lambda *_: PIXEL)
     drawn = type("Drawn", (), {"png": PIXEL})
     monkeypatch.setattr(polysight.catalogue, "draw_comparison", lambda *_: drawn)
     for pack in ("pack_netcdf", "pack_mat"):

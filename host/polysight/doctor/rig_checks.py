@@ -546,7 +546,7 @@ def check_level(context: CheckContext, board: Board) -> Finding:
             **facts,
         )
     if rms.min() < _MIN_RMS:
-        remedy = "check the RX mask of the profile; `polysight card reset --radar`, and arm it again"
+        remedy = f"check the RX mask of the profile; `polysight card reset {board.name} --radar`, and arm it again"
         return error(observed, "an RX is off, or the radar sends zeros", remedy, **facts)
     return ok(observed, **facts)
 

@@ -41,7 +41,6 @@ from polysight.products import (
     find_products,
     label_folder,
 )
-from polysight.report import label_figure
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.files import write_together
@@ -156,6 +155,8 @@ def save_labels(place: Path, products: ProcessedScan, labels: Labels) -> tuple[L
     checked = replace(
         checked, by_hand=True, description=f"boxes of scan {products.scan_id}, in mm from the image centre"
     )
+    from polysight.report import label_figure  # matplotlib, which is not needed to list or to refuse
+
     picture = label_figure(products, checked.boxes, checked.metal)
     # The boxes last: where they are, their picture is.
     write_together({place / LABELS_PICTURE: picture, place / LABELS: pack_labels(checked)})
@@ -379,5 +380,5 @@ def _listing(
         lines += [f"  {f.number:>3}  {format_box(f.box)}  {f.description}" for f in found]
         metal = next((f.number for f in found if f.description == REFERENCE), "NUMBER")
         lines.append(f"to name them: polysight label {folder} --from-patches --metal {metal} --rename NUMBER=NAME ...")
-    lines.append(f"to draw one:  polysight label {folder} --box NAME=x0,y0,x1,y1 (mm)")
+    lines.append(f"to draw one:  polysight label {folder} --box oak=-20,-20,20,20 (x0,y0,x1,y1 in mm)")
     return "".join(f"{line}\n" for line in lines)

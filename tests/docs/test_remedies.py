@@ -1,0 +1,84 @@
+"""Commands in messages: each names a command and options that there are; one with its arguments, pasted, is parsed."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.support.paths import RIG_FILE
+
+from docs.check.commands import PROGRAMS, command_faults, mention_faults, parser_of
+
+ROOT = RIG_FILE.parent
+SUBCOMMANDS = {
+    name
+    for module in PROGRAMS.values()
+    for action in parser_of(module)._actions
+    if isinstance(action, argparse._SubParsersAction)
+    for name in action.choices
+}
+SOURCES = [
+    path
+    for folder in ("host", "papers", "pi_controller", "shared", "simulators")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+    if "build" not in path.parts
+]
+# A value that is put into a message: it may be a path, a name or a number.
+PLACEHOLDER = "8"
+# In backticks; else from the name of the program to the end of the phrase.
+QUOTED = re.compile(r"`((?:sudo )?polysight(?:-pi)? [^`]+)`")
+PLAIN = re.compile(r"(?<![`\w/-])(polysight(?:-pi)? [a-z][a-z-]+(?: (?![a-z]+\b)(?:[^;,:()`\s]|,(?=\S))+)*)")
+ACTIONS = ("calibrate", "card", "radar")
+
+
+def texts_of(path: Path) -> Iterator[tuple[int, str]]:
+    """Strings of a file that are no docstrings, with their lines; a value that is put in is PLACEHOLDER."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    parts: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            parts |= {id(value) for value in node.values}
+            pieces = [v.value if isinstance(v, ast.Constant) else PLACEHOLDER for v in node.values]
+            yield node.lineno, "".join(map(str, pieces))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs | parts:
+            yield node.lineno, node.value
+
+
+def commands_in(text: str) -> list[str]:
+    """Command lines that a message names; a sentence about a program names none."""
+    phrases = [phrase for phrase in PLAIN.findall(QUOTED.sub("", text)) if phrase.split()[1] in SUBCOMMANDS]
+    return QUOTED.findall(text) + phrases
+
+
+def is_whole(command: str) -> bool:
+    """True if a command has its arguments; False if it is named alone, or with an option only."""
+    words = command.removeprefix("sudo ").split()[2:]
+    if command.split()[1] in ACTIONS:
+        words = words[1:]
+    return bool(words) and not words[0].startswith("-")
+
+
+def test_commands_are_found_in_messages():
+    assert commands_in("do: `polysight process 8 --out DIR`, then go") == ["polysight process 8 --out DIR"]
+    assert commands_in("polysight label 8 --metal NAME, or measure") == ["polysight label 8 --metal NAME"]
+    assert commands_in("polysight label 8 --box A=1,2,3,4; then go") == ["polysight label 8 --box A=1,2,3,4"]
+    assert commands_in("the polysight of today") == []
+    every = [command for path in SOURCES for _, text in texts_of(path) for command in commands_in(text)]
+    assert len(every) > 100
+    assert sum(map(is_whole, every)) > 50
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_command_that_a_message_names_is_one(path):
+    faults = []
+    for line, text in texts_of(path):
+        for command in commands_in(text):
+            pasted = command.removesuffix("...").replace("COMMAND", "scan")
+            found = command_faults(pasted) if is_whole(command) else mention_faults(pasted)
+            faults += [f"{path}:{line}: {command}: {fault}" for fault in found]
+    assert not faults, "\n".join(faults)

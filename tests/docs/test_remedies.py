@@ -9,9 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.support.paths import RIG_FILE
-
 from docs.check.commands import PROGRAMS, command_faults, mention_faults, parser_of
+from tests.support.paths import RIG_FILE
 
 ROOT = RIG_FILE.parent
 SUBCOMMANDS = {

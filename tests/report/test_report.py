@@ -17,7 +17,7 @@ from polysight.report import write_report
 from polysight.report.figures import coverage_figure, masked_positions
 from polysight.report.report import imaging_table, pretty, quality_tables, render, text
 from polysight.report.style import colours_of, png
-from polysight.results import RxGain, ScanFacts, ScanQuality
+from polysight.results import RxGain, ScanFacts, ScanMaterials, ScanQuality
 from polysight_shared.raster import RasterPlan
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -309,3 +309,34 @@ def test_it_is_part_of_the_quality_tables_and_absent_without_data():
     assert any("Imaging" in t["caption"] for t in tables)
     assert imaging_table(None) is None
     assert imaging_table({}) is None
+
+
+def with_every_number(content, value):
+    """The content with each number that is no count replaced."""
+    if isinstance(content, dict):
+        # What is made of a number that is none has no permittivity and no ratio.
+        given = ("permittivity", "ratio", "seconds_per_stage")
+        return {key: item if key in given else with_every_number(item, value) for key, item in content.items()}
+    if isinstance(content, list):
+        return [with_every_number(item, value) for item in content]
+    return value if isinstance(content, float) else content
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_none_are_shown_as_not_known(scan, value):
+    """Just computed figures may be nan or inf; products have null in their place."""
+    figures = with_every_number({"segments": MATERIALS, "quality": QUALITY}, value)
+    strange = changed(
+        scan,
+        materials=ScanMaterials.decode(
+            {"segments": figures["segments"], "pixel_accuracy": value, "library": "", "model": "knn",
+             "metal_reference": {"how": "given"}}
+        ),
+        quality=ScanQuality.decode(figures["quality"]),
+        expected_accuracy=value,
+    )  # fmt: skip
+    with unrendered():
+        html = render(strange, {})
+    words = re.findall(r"[\w.]+", Page(html).words.lower())
+    assert not {"nan", "inf", "infinity"} & set(words), [w for w in words if w in ("nan", "inf")]
+    assert text(value) == "–"

@@ -1,6 +1,8 @@
 """The verdict: the worst reason decides, reasons come in order of weight, and JSON gives back what was written."""
 
 import itertools
+import math
+import re
 
 import pytest
 
@@ -18,6 +20,7 @@ from polysight.results.quality import (
     plane_reasons,
     read_verdict,
     reason,
+    reconstruction_reasons,
     recording_reasons,
     signal_reasons,
     tilt_reasons,
@@ -293,3 +296,30 @@ def order(*reasons):
     """Parts of the reasons' texts as the verdict lists them, given in reverse."""
     listed = verdict_of([r for group in reversed(reasons) for r in group]).reasons
     return [next(part for part in PARTS if part in r.what) for r in listed]
+
+
+STRANGE = (math.nan, math.inf, -math.inf, 0.0, None)
+
+
+@pytest.mark.parametrize("x", STRANGE)
+def test_no_verdict_shows_a_number_that_is_none(x):
+    """Each rule with a figure that is not finite: what is not known is said so, or not judged."""
+    number = 0.0 if x is None else x
+    found = [
+        *direct_path_reasons("RH", x, x, 1.0),
+        *direct_path_reasons("RH", x, 0.2, 1.0),
+        *level_reasons({"H": x, "V": 30.0}),
+        *leakage_reasons(False, False, number),
+        *plane_reasons(True, number, (0.0, 0.0), 0.1),
+        *plane_reasons(True, 1.0, (number, 0.0), 0.1),
+        *plane_reasons(True, 1.0, (0.0, number), 0.1),
+        *plane_reasons(False, 1.0, (0.0, 0.0), number),
+        *tilt_reasons({1: number, 2: 3.0}),
+        *brightness_reasons({1: number, 2: 0.4}),
+        *incidence_reasons(number, 55.0),
+        *incidence_reasons(55.0, x),
+        *reconstruction_reasons([("RH", 0.3, x)]),
+    ]
+    assert len(found) > 4
+    shown = " ".join(verdict_of(found).lines())
+    assert not re.search(r"\b(nan|inf)\b", shown), shown

@@ -380,5 +380,5 @@ def _listing(
         lines += [f"  {f.number:>3}  {format_box(f.box)}  {f.description}" for f in found]
         metal = next((f.number for f in found if f.description == REFERENCE), "NUMBER")
         lines.append(f"to name them: polysight label {folder} --from-patches --metal {metal} --rename NUMBER=NAME ...")
-    lines.append(f"to draw one:  polysight label {folder} --box oak=-20,-20,20,20 (x0,y0,x1,y1 in mm)")
+    lines.append(f"to draw one:  polysight label {folder} --box NAME=-20,-20,20,20 (x0,y0,x1,y1 in mm)")
     return "".join(f"{line}\n" for line in lines)

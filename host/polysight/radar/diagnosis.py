@@ -394,7 +394,10 @@ def _trace_line(file: Path, number: int, value: object) -> TraceLine:
 
 def _invalid(file: Path, what: str) -> ConfigError:
     return ConfigError(
-        f"{file}: {what}", "another file", "give a file of `polysight radar check BOARD --trace FILE`", code=ErrorCode.FILE_FOREIGN
+        f"{file}: {what}",
+        "another file",
+        "give a file of `polysight radar check BOARD --trace FILE`",
+        code=ErrorCode.FILE_FOREIGN,
     )
 
 

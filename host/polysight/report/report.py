@@ -209,7 +209,7 @@ def _row(patch: PatchFigures, colours: dict[str, str]) -> dict[str, Any]:
         "strange": truth is not None and patch.name == UNKNOWN and not truth.in_library,
         "right": truth is not None and (truth.name == patch.name or (patch.metal_reference and truth.metal)),
         "why": patch.why,
-        "votes": DASH if patch.confidence is None else f"{100 * patch.confidence:.0f} %",
+        "votes": _share(patch.confidence, 0),
         "real": "metal-like" if patch.metal_like else DASH,
         "loss": DASH,
         **dict.fromkeys(("real_error", "loss_error", "real_range", "loss_range", "dominated_by", "share", "do"), ""),
@@ -272,8 +272,17 @@ def imaging_table(imaging: Any) -> Table | None:
     return {"caption": caption, "head": ["Board", *map(str, boards)], "rows": rows}
 
 
+def _is_unknown(value: Any) -> bool:
+    """True for None, and for numbers that are not finite: just computed figures have them where files have null."""
+    return value is None or (isinstance(value, float | np.floating) and not np.isfinite(value))
+
+
+def _share(value: float | None, digits: int) -> str:
+    return "–" if value is None or _is_unknown(value) else f"{100 * value:.{digits}f} %"
+
+
 def _number(value: Any, between: str = " × ") -> str:
-    if value is None:
+    if _is_unknown(value):
         return "–"
     if isinstance(value, list | tuple):
         return between.join(_number(v) for v in value)
@@ -282,7 +291,7 @@ def _number(value: Any, between: str = " × ") -> str:
 
 def text(value: Any) -> str:
     """Format a value for reading: grouped thousands, few digits, yes and no, lists with commas."""
-    if value is None:
+    if _is_unknown(value):
         return "–"
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
@@ -325,8 +334,8 @@ def key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[st
     accuracy = scan.materials and scan.materials.pixel_accuracy
     if accuracy is not None:
         expected = scan.expected_accuracy
-        aside = "" if expected is None else f"; their own confidence expects {100 * expected:.1f} %"
-        add(f"{100 * accuracy:.1f} %", f"of interior pixels named right{aside}")
+        aside = "" if expected is None else f"; their own confidence expects {_share(expected, 1)}"
+        add(_share(accuracy, 1), f"of interior pixels named right{aside}")
     errors = [abs(r["relative_error"]) for r in rows if r["relative_error"] is not None]
     if errors:
         add(f"{100 * float(np.median(errors)):.1f} %", f"median error of ε′, worst {100 * max(errors):.1f} %")

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
 import msgspec
 import numpy as np
@@ -37,6 +37,11 @@ class NoResult(PolysightError):  # noqa: N818 (a result that ends a command like
     """The data do not support any material or permittivity; images are kept. Sets the exit status of commands."""
 
     exit_status = 7
+
+
+def is_known(value: float | None) -> TypeGuard[float]:
+    """True for a finite number: one that is nan or inf is not known, and never shown."""
+    return value is not None and bool(np.isfinite(value))
 
 
 def reason(level: Level, what: str, why: str, do: str, weight: float = 1.0) -> Finding:
@@ -212,7 +217,7 @@ def reconstruction_reasons(boards: Iterable[tuple[str, float, float | None]]) ->
     for board, missing_share, image_error in boards:
         if missing_share <= SOME_POSITIONS:
             continue
-        if image_error is None:
+        if not is_known(image_error):
             level = "none"
             error = "too few rows were recorded to measure its error"
         else:
@@ -228,20 +233,20 @@ def reconstruction_reasons(boards: Iterable[tuple[str, float, float | None]]) ->
 
 def direct_path_reasons(board: str, snr_db: float | None, phase_rad: float | None, found_share: float) -> list[Finding]:
     """Judge one board's direct path: its level over noise, the residual phase, and the share of positions with one."""
-    if found_share < FEW_POSITIONS or (snr_db is not None and snr_db < DIRECT_SNR_NONE_DB):
+    if found_share < FEW_POSITIONS or (is_known(snr_db) and snr_db < DIRECT_SNR_NONE_DB):
         return [reason(
             "none", f"{board}: the direct path is missing ({100 * found_share:.0f} % of the positions have one)",
             "without it no position is synchronised, and the images are meaningless",
             "clear the line of sight from transmitter to receiver; check that the transmitter is on", 10.0,
         )]  # fmt: skip
     out = []
-    if snr_db is not None and snr_db < DIRECT_SNR_CARE_DB:
+    if is_known(snr_db) and snr_db < DIRECT_SNR_CARE_DB:
         out.append(reason(
             "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise in one chirp (5 dB are usual)",
             "it is partly blocked, or the antennas point elsewhere; it is the reference of all phases",
             "clear the line of sight; check the antennas' direction", 3.0,
         ))  # fmt: skip
-    if phase_rad is not None and phase_rad > DIRECT_PHASE_CARE_RAD:
+    if is_known(phase_rad) and phase_rad > DIRECT_PHASE_CARE_RAD:
         out.append(reason(
             "care", f"{board}: residual phase {phase_rad:.3f} rad from position to position (0.004 is usual)",
             "a weak direct path, or a strong reflector near it", "look at the synchronisation table of the report", 2.5,
@@ -253,7 +258,7 @@ def level_reasons(levels: Mapping[str, float | None]) -> list[Finding]:
     """Judge metal's brightness relative to the direct path in each channel (None: not known)."""
     out = []
     for channel, level in levels.items():
-        if level is not None and not DIRECT_LEVELS[0] <= level <= DIRECT_LEVELS[1]:
+        if is_known(level) and level > 0 and not DIRECT_LEVELS[0] <= level <= DIRECT_LEVELS[1]:
             weak = level > DIRECT_LEVELS[1]
             state = "weak" if weak else "strong"
             what = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+.0f} dB relative to it"
@@ -350,9 +355,12 @@ def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> 
     if measured or relative_error < LEAKAGE_SHARE:
         return []
     source = "estimated from the scene" if determined else "never measured; its prior is used"
+    share = (
+        f"uncertain by {100 * relative_error:.0f} %" if is_known(relative_error) else "uncertain by an unknown share"
+    )
     return [reason(
         "care",
-        f"leakage was {source}: permittivities are uncertain by {100 * relative_error:.0f} %, names less reliable",
+        f"leakage was {source}: permittivities are uncertain by {share}, names less reliable",
         "the rig file has no leakage_std: leakage up to 0.1 of any phase is possible",
         "measure it once with metal strips: `polysight leakage` (docs/how-to/calibration.md)", 1.5,
     )]  # fmt: skip
@@ -360,10 +368,11 @@ def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> 
 
 def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], theta_std_deg: float) -> list[Finding]:
     """Judge the position of the plates' plane against the rig file."""
-    if not known:
+    if not known or not all(map(is_known, (offset_mm, *tilt_deg))):
+        error = f", +-{theta_std_deg:.2f} degrees" if is_known(theta_std_deg) else ""
         return [reason(
             "care",
-            f"the plane was not found; the angle is the rig file's, +-{theta_std_deg:.2f} degrees",
+            f"the plane was not found; the angle is the rig file's{error}",
             "no patch has a clear echo", "measure the plane's distance, or scan a flat plate (polysight focus)", 2.0,
         )]  # fmt: skip
     if abs(offset_mm) > PLANE_GATE_MM:
@@ -390,7 +399,7 @@ def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], 
 
 def tilt_reasons(across_deg: Mapping[int, float]) -> list[Finding]:
     """Judge the tilts of plates across the plane of incidence: patch number to degrees."""
-    tilted = {label: angle for label, angle in across_deg.items() if abs(angle) > PLATE_ACROSS_DEG}
+    tilted = {label: angle for label, angle in across_deg.items() if is_known(angle) and abs(angle) > PLATE_ACROSS_DEG}
     if not tilted:
         return []
     worst = max(tilted, key=lambda label: abs(tilted[label]))
@@ -418,7 +427,7 @@ def brightness_reasons(off: Mapping[int, float]) -> list[Finding]:
     """Judge brightness: patch number to ln of |H| over that of a half space of its permittivity."""
     out = []
     for label, ln in off.items():
-        if abs(ln) > BRIGHTNESS_CARE:
+        if is_known(ln) and abs(ln) > BRIGHTNESS_CARE:
             share, than = 100 * abs(float(np.expm1(ln))), "brighter" if ln > 0 else "darker"
             out.append(reason(
                 "care", f"patch {label} is {share:.0f} % {than} than a half space of its permittivity",
@@ -430,7 +439,7 @@ def brightness_reasons(off: Mapping[int, float]) -> list[Finding]:
 
 def incidence_reasons(angle_deg: float, library_deg: float | None) -> list[Finding]:
     """Judge the incidence angle against the library's."""
-    if library_deg is None or abs(angle_deg - library_deg) <= LIBRARY_ANGLE_DEG:
+    if not is_known(library_deg) or not is_known(angle_deg) or abs(angle_deg - library_deg) <= LIBRARY_ANGLE_DEG:
         return []
     return [reason(
         "care", f"the scan has an incidence angle of {angle_deg:.2f} degrees, the library {library_deg:.2f}",

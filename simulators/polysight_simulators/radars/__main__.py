@@ -74,7 +74,7 @@ def main() -> int:
         epilog="example:\n  python -m polysight_simulators.radars first-day.jsonl",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("trace", type=Path, metavar="TRACE", help="a file of `polysight radar check BOARD --trace FILE`")
+    parser.add_argument("trace", type=Path, metavar="TRACE", help="file of `polysight radar check BOARD --trace FILE`")
     parser.add_argument("--empty-flash", action="store_true", help="simulate a new board")
     args = parser.parse_args()
     flash = b"" if args.empty_flash else make_image()

@@ -70,7 +70,7 @@ class SegmentSettings:
     floor_db: float = -35.0
     dimmest_db: float = -26.0
     least_contrast_db: float = 5.0
-    least_scatter: float = 3.0
+    least_scatter: float = 2.5
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from polysight.materials.copies import find_copies
 from polysight.materials.labels import patches_from_labels
 from polysight.materials.measure import background, check_patch, halves_apart
 from polysight.materials.segment import segment
@@ -148,6 +149,19 @@ def test_clutter_of_a_plates_size_is_counted_but_no_patch():
     found = segment(h + clutter, v + 0.3 * clutter, AXIS, AXIS)
     assert_found(found, plates)
     assert found.left_out > 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_copies_of_the_plates_by_a_second_path_are_recognised(seed):
+    """Fringes over the scan shift the whole picture; each channel's copies have a place of their own."""
+    plates = raster([0.0, -3.0, 0.0, -2.0, -1.0, 0.0], RATIOS[:6], 8)
+    h, v = draw(seed, plates, amplitude=0.1, phase_deg=6.0)
+    assert find_copies(segment(h, v, AXIS, AXIS).patches, h, v, PIXEL_MM) is None
+    doubled = h + 0.16 * np.roll(h, (30, 45), axis=(0, 1))
+    copies = find_copies(segment(doubled, v, AXIS, AXIS).patches, doubled, v, PIXEL_MM)
+    assert copies is not None
+    assert copies.shift_mm == pytest.approx((90.0, 60.0), abs=6.0)
+    assert copies.level_db == pytest.approx(-16.0, abs=2.0)
 
 
 @pytest.mark.skipif(PUBLISHED is None, reason="POLYSIGHT_PUBLISHED_IMAGES is not set: the folder of the real picture")

@@ -37,6 +37,7 @@ from polysight.materials.classify import (
     PatchName,
     classifier_sentence,
 )
+from polysight.materials.copies import Copies, find_copies
 from polysight.materials.discriminant import REJECTED
 from polysight.materials.labels import (
     METALS,
@@ -140,6 +141,7 @@ __all__ = [
     "CatalogueMaterial",
     "Classifier",
     "ConcentrationResult",
+    "Copies",
     "Entry",
     "KnownScene",
     "LabelledScan",
@@ -177,6 +179,7 @@ __all__ = [
     "estimate_permittivity",
     "expected_pixel_accuracy",
     "feature_matrix",
+    "find_copies",
     "find_material",
     "find_truth",
     "fit_concentration",

@@ -20,7 +20,7 @@ from msgspec import UNSET
 from numpy.typing import NDArray
 
 from polysight.imaging import ImageBuilder, Images, PlaneEstimate, imaging_facts
-from polysight.materials import NOT_PASSIVE, Classifier, MaterialsResult, permittivity_change
+from polysight.materials import NOT_PASSIVE, Classifier, MaterialsResult, find_copies, permittivity_change
 from polysight.polarimetry import IncidenceChoice, PlaneReference
 from polysight.results import (
     Backlash,
@@ -38,6 +38,7 @@ from polysight.results import (
     ScanQuality,
     Verdict,
     brightness_reasons,
+    copies_reasons,
     direct_path_reasons,
     incidence_reasons,
     leakage_reasons,
@@ -373,6 +374,10 @@ def scene_reasons(found: MaterialsResult, plane: PlaneEstimate | None, classifie
     }
     no_plates = {k: v for k, v in refused.items() if k not in gaining}
     reasons += signal_reasons(no_plates, len(found.patches), found.segmentation.left_out)
+    pixel_mm = abs(float(found.calibrated.x_m[1] - found.calibrated.x_m[0])) * 1e3
+    copies = find_copies([r.patch for r in found.patches], found.calibrated.h, found.calibrated.v, pixel_mm)
+    if copies is not None:
+        reasons += copies_reasons(copies.labels, copies.shift_mm, copies.level_db)
     reasons += passivity_reasons(gaining)
     metal = found.metal
     if found.patches and metal.evidence is not None:

@@ -11,7 +11,7 @@ is `{"level": ..., "reasons": [{"what", "why", "do"}]}`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeGuard
 
@@ -395,6 +395,18 @@ def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], 
             "lay the plates parallel to the stage", 1.4,
         ))  # fmt: skip
     return out
+
+
+def copies_reasons(labels: Sequence[int], shift_mm: tuple[float, float], level_db: float) -> list[Finding]:
+    """Judge patches that are shifted, weaker copies of the plates; none without `labels`."""
+    if not labels:
+        return []
+    place = f"x {shift_mm[0]:+.0f}, y {shift_mm[1]:+.0f} mm away and {-level_db:.0f} dB weaker"
+    return [reason(
+        "care", f"patches {', '.join(map(str, labels))} repeat the plates, {place}",
+        "a second path beside the direct path (multipath) modulates the scan; the plates are disturbed by it as much",
+        "take reflectors away from the line between transmitter and receivers, or cover them with absorber", 4.5,
+    )]  # fmt: skip
 
 
 def tilt_reasons(across_deg: Mapping[int, float]) -> list[Finding]:

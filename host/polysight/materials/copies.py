@@ -1,0 +1,91 @@
+"""Weak copies of the plates beside them: the mark of a second path beside the direct path.
+
+Samples are divided by the direct path. A second path beside it makes fringes over the scan, and fringes copy the whole
+image: shifted, and weaker by the second path's share, in each channel to its own place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from polysight.imaging import Image, Mask
+from polysight.materials.segment import Patch
+
+WEAK_DB, WEAKEST_DB = -12.0, -30.0
+"""Levels of copies relative to the brightest plate: shares of a quarter to a thirtieth."""
+LEAST_OVERLAP = 0.6
+"""Share of a copy that a shifted plate covers, and of the shifted plates that copies cover."""
+SAME_DB = 3.0
+"""Largest deviation of a copy's level from the others', relative to its plate."""
+SKIRT_PX = 4
+
+
+@dataclass(frozen=True)
+class Copies:
+    """Patch numbers that are copies, their shift in millimetres (x, y), and their level relative to their plates."""
+
+    labels: tuple[int, ...]
+    shift_mm: tuple[float, float]
+    level_db: float
+
+
+def find_copies(patches: Sequence[Patch], h: Image, v: Image, pixel_mm: float) -> Copies | None:
+    """Find weak patches that repeat the brighter ones, all with one shift and one level; None without two of them.
+
+    `h`, `v` complex [ny, nx] are the images that the patches were found in.
+    """
+    found = [copies for channel in (h, v) if (copies := _copies_in(patches, np.abs(channel), pixel_mm)) is not None]
+    return max(found, key=lambda copies: len(copies.labels), default=None)
+
+
+def _copies_in(patches: Sequence[Patch], amplitude: np.ndarray, pixel_mm: float) -> Copies | None:
+    """Find the copies of one channel, of `amplitude` float [ny, nx]."""
+    if len(patches) < 4:
+        return None
+    level_db = [20 * np.log10(max(float(np.median(amplitude[p.mask])), 1e-30)) for p in patches]
+    below_db = np.array(level_db) - max(level_db)
+    weak = [p for p, below in zip(patches, below_db, strict=True) if WEAKEST_DB < below < WEAK_DB]
+    bright = [p for p, below in zip(patches, below_db, strict=True) if below >= WEAK_DB]
+    if len(weak) < 2:
+        return None
+    plates = np.logical_or.reduce([p.mask for p in bright])
+    hidden = np.asarray(scipy.ndimage.binary_dilation(plates, iterations=SKIRT_PX), bool)
+    best: Copies | None = None
+    for copy in weak:
+        for plate in bright:
+            dx, dy = ((a - b) for a, b in zip(copy.centre_mm, plate.centre_mm, strict=True))
+            shift_px = (round(dy / pixel_mm), round(dx / pixel_mm))
+            copies = _copies_at(weak, plates, hidden, amplitude, shift_px, pixel_mm)
+            if copies is not None and (best is None or len(copies.labels) > len(best.labels)):
+                best = copies
+    return best
+
+
+def _copies_at(
+    weak: Sequence[Patch],
+    plates: Mask,
+    hidden: Mask,
+    amplitude: np.ndarray,
+    shift_px: tuple[int, int],
+    pixel_mm: float,
+) -> Copies | None:
+    """Return the copies with this shift (rows, columns), None if fewer than two fit."""
+    expected = np.asarray(scipy.ndimage.shift(plates.astype(np.uint8), shift_px, order=0), bool) & ~hidden
+    observed = np.logical_or.reduce([p.mask for p in weak])
+    if not expected.any() or float((expected & observed).sum()) < LEAST_OVERLAP * float(expected.sum()):
+        return None
+    source = np.asarray(scipy.ndimage.shift(amplitude, shift_px, order=0))
+    levels_db = {}
+    for patch in weak:
+        both = patch.mask & expected
+        if float(both.sum()) >= LEAST_OVERLAP * float(patch.mask.sum()):
+            levels_db[patch.label] = 20 * float(np.log10(np.median(amplitude[both]) / np.median(source[both])))
+    middle_db = float(np.median(list(levels_db.values()))) if levels_db else 0.0
+    labels = tuple(label for label, level in levels_db.items() if abs(level - middle_db) <= SAME_DB)
+    if len(labels) < 2 or middle_db > WEAK_DB:
+        return None
+    return Copies(labels, (shift_px[1] * pixel_mm, shift_px[0] * pixel_mm), middle_db)

@@ -16,6 +16,7 @@ from tests.support.paths import POLYSIGHT, RIG_FILE
 from tests.support.refusals import refused
 from tests.support.scenes import small_scene
 from tests.support.store.facts import facts_of
+from tests.support.store.faulty_disk import FaultyDisk
 from tests.support.store.plain_scan import errors
 
 from polysight.cli.main import main
@@ -253,6 +254,18 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
     assert not payloads(scan)
     assert errors(scan) == []
     assert [f["row"] for f in facts_of(scan, "raw_dropped")] == list(range(ROWS))
+
+
+def test_what_remains_is_on_the_disk_before_raw_data_is_deleted(scan):
+    """Samples are written without waiting for the disk: a power cut must not take them and the raw data."""
+    disk = FaultyDisk(scan)
+    with disk():
+        drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
+    first = next(at for at, what in enumerate(disk.done) if what.startswith("unlink") and what.endswith(".bin"))
+    synced = {what.removeprefix("fsync ") for what in disk.done[:first] if what.startswith("fsync ")}
+    remains = {file.name for name in ("samples", "products") for file in (scan / name).iterdir() if file.is_file()}
+    assert {"rows.jsonl", "RH.npy", "image.npz"} < remains
+    assert remains | {"samples", "products"} <= synced
 
 
 def test_a_line_torn_anywhere_drops_nothing(scan):

@@ -92,7 +92,8 @@ def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # who is killed closes nothing
-def test_a_kill_while_rows_are_replaced_loses_nothing(tmp_path):
+@pytest.mark.parametrize("fault", ["killed within", "power cut", "worst power cut"])
+def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fault):
     scan, data = scan_with(tmp_path / "count" / "scan", lost=9, wrong=True)
     counting = FaultyDisk(tmp_path / "count")
     with counting():
@@ -100,7 +101,7 @@ def test_a_kill_while_rows_are_replaced_loses_nothing(tmp_path):
     for at in range(1, len(counting.done) + 1):
         folder = tmp_path / str(at)
         scan, data = scan_with(folder / "scan", lost=9, wrong=True)
-        with pytest.raises(Killed), FaultyDisk(folder, "killed within", at)():
+        with pytest.raises(Killed), FaultyDisk(folder, fault, at, seed=at)():
             replace_rows(scan)
         scan = ScanFolder.load(scan.path)
         assert errors(scan.path) == [], counting.done[at - 1]

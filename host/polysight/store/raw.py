@@ -8,6 +8,7 @@ afterwards. A crash at any moment leaves either the old or the new row.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,12 +24,13 @@ from polysight.capture import (
     read_packets,
     valid_frames,
     write_durably,
+    write_error,
     write_index,
     write_packets,
 )
 from polysight.store.logs import crc32
 from polysight.store.manifest import BoardRow, DroppedFile, ManifestWriter, RawDropped, RowCommitted
-from polysight.store.scan_folder import ScanFolder, dropped_files, utc_now
+from polysight.store.scan_folder import SAMPLES, ScanFolder, dropped_files, utc_now
 from polysight.store.validation import board_faults, to_text
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError, ScanError
@@ -111,7 +113,9 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
     DeviceError
         if the scan is in use, or the disk fails; the next call deletes the rest.
     """
-    sync_folder(products)  # a power cut must not lose the products
+    # A power cut must lose neither the products nor the samples, which are written without waiting for the disk.
+    _make_durable(products)
+    _make_durable(scan.path / SAMPLES)
     inside = products.resolve().is_relative_to(scan.path.resolve())
     where = str(products.resolve().relative_to(scan.path.resolve()) if inside else products.resolve())
     with scan.writer() as writer:
@@ -133,6 +137,21 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
         for folder in {path.parent for files in found.files.values() for path in files.values()}:
             sync_folder(folder)
     scan.reload()
+
+
+def _make_durable(folder: Path) -> None:
+    """Make the files of a folder and their names durable, if there is one. Raises DeviceError."""
+    if not folder.is_dir():
+        return
+    for path in folder.iterdir():
+        if not path.is_file():
+            continue
+        try:
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+        except OSError as e:
+            raise write_error(path, "made durable", e) from None
+    sync_folder(folder)
 
 
 def _fact(row: RowCommitted, boards: list[str], products: str) -> RawDropped:

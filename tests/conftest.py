@@ -105,9 +105,16 @@ def rig() -> Instrument:
 
 
 @pytest.fixture(scope="session")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """One for all tests of a worker."""
+def _browser_of_worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     if find_chromium() is None:
         pytest.skip("no chromium here: sudo apt-get install chromium")
     with Browser(tmp_path_factory.mktemp("browser")) as made:
         yield made
+
+
+@pytest.fixture(scope="module")
+def browser(_browser_of_worker: Browser) -> Iterator[Browser]:
+    """One for all tests of a worker."""
+    yield _browser_of_worker
+    # The page of a server that has ended asks for it again and again.
+    _browser_of_worker.open("about:blank")

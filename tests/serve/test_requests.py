@@ -1,0 +1,140 @@
+"""What POST requests ask for, without a browser: limits just inside and outside, and the command line of each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.support.page.asking import TOKEN, post
+from tests.support.page.live_view import served_folder
+from tests.support.paths import RIG_FILE
+from tests.support.products import judged_products
+from tests.support.refusals import refused
+
+from polysight.cli.main import build_parser
+from polysight.cli.options import joined
+from polysight.serve.control import (
+    MAX_POSITIONS,
+    ExportRequest,
+    LabelRequest,
+    NotesRequest,
+    PlanRequest,
+    StartRequest,
+    TrainRequest,
+)
+from polysight.serve.site import Programs
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.tables import decode
+
+BOX = (0.0, 0.0, 10.0, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "inside", "outside"),
+    [
+        (PlanRequest, {"columns": 1}, {"columns": 0}),
+        (PlanRequest, {"rows": MAX_POSITIONS}, {"rows": MAX_POSITIONS + 1}),
+        (PlanRequest, {"step_x_mm": 1e-3}, {"step_x_mm": 0.0}),
+        (PlanRequest, {"speed_mm_s": 1e5}, {"speed_mm_s": 100001.0}),
+        (PlanRequest, {"pulses": 1}, {"pulses": 0}),
+        (PlanRequest, {"pulses": 65535}, {"pulses": 65536}),
+        (StartRequest, {"name": 200 * "a"}, {"name": 201 * "a"}),
+        (StartRequest, {"metal": (-1e6, 0.0, 1e6, 1.0)}, {"metal": (-1000001.0, 0.0, 1.0, 1.0)}),
+        (StartRequest, {"notes": 10_000 * "a"}, {"notes": 10_001 * "a"}),
+        (StartRequest, {"tags": 20 * ["a"]}, {"tags": 21 * ["a"]}),
+        (LabelRequest, {"boxes": {f"{k}": BOX for k in range(200)}}, {"boxes": {f"{k}": BOX for k in range(201)}}),
+        (LabelRequest, {"boxes": {200 * "a": BOX}}, {"boxes": {201 * "a": BOX}}),
+        (LabelRequest, {"boxes": {}, "specimens": {f"{k}": "" for k in range(200)}},
+         {"boxes": {}, "specimens": {f"{k}": "" for k in range(201)}}),
+        (NotesRequest, {"notes": 20_000 * "a"}, {"notes": 20_001 * "a"}),
+        (NotesRequest, {"tags": 100 * ["a"]}, {"tags": 101 * ["a"]}),
+        (NotesRequest, {"tags": [1000 * "a"]}, {"tags": [1001 * "a"]}),
+        (TrainRequest, {"name": "a", "scans": ["s"]}, {"name": "a", "scans": []}),
+        (TrainRequest, {"name": "a", "scans": 500 * ["s"]}, {"name": "a", "scans": 501 * ["s"]}),
+        (TrainRequest, {"name": 61 * "a", "scans": ["s"]}, {"name": 62 * "a", "scans": ["s"]}),
+        (TrainRequest, {"name": "a.b -c", "scans": ["s"]}, {"name": "a/b", "scans": ["s"]}),
+        (TrainRequest, {"name": "a", "scans": ["s"]}, {"name": ".a", "scans": ["s"]}),
+        (ExportRequest, {"formats": ["csv"]}, {"formats": []}),
+    ],
+)  # fmt: skip
+def test_a_limit_holds_just_inside_and_not_just_outside(kind, inside, outside):
+    decode(inside, kind, "the request")
+    with refused(ErrorCode.VALUE_INVALID):
+        decode(outside, kind, "the request")
+
+
+def test_a_plan_of_the_page_has_at_most_so_many_positions_after_its_steps():
+    """A smaller step makes more positions of the same area of 698 mm."""
+    within = PlanRequest(step_x_mm=0.35, speed_mm_s=5.0).apply(RIG_FILE)
+    assert within.grid.columns == 1995
+    with refused(ErrorCode.VALUE_INVALID, MAX_POSITIONS):
+        PlanRequest(step_x_mm=0.348, speed_mm_s=5.0).apply(RIG_FILE)
+
+
+@pytest.fixture
+def root(tmp_path) -> Path:
+    folder = tmp_path / "scans"
+    judged_products(folder / "one", "good")
+    (folder / "libraries").mkdir()
+    (folder / "libraries" / "mine.npz").touch()
+    return folder
+
+
+@pytest.fixture
+def started(root, monkeypatch) -> Iterator[tuple[Any, list[list[str]]]]:
+    """A server, and the command lines of the programs that it would start."""
+    found: list[list[str]] = []
+
+    def start(_self: Programs, _folder: Path, _kind: str, words: list[str | Path]) -> None:
+        found.append([str(word) for word in words])
+
+    monkeypatch.setattr(Programs, "start", start)
+    with served_folder(root, TOKEN, config=RIG_FILE) as view:
+        yield view, found
+
+
+def plain(value: Any, root: Path) -> Any:
+    """Paths as text, `%` for the folder of scans."""
+    if isinstance(value, list):
+        return [plain(item, root) for item in value]
+    return str(value).replace(str(root), "%") if isinstance(value, str | Path) else value
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "values"),
+    [
+        ("doctor", {}, {"config": RIG_FILE, "out": "%"}),
+        ("start", {"name": "new", "keep_incomplete": True, "metal": [-30, -10, 10, 40], "library": "mine"},
+         {"out": "%/new", "config": RIG_FILE, "keep_incomplete": True, "metal": (-30, -10, 10, 40),
+          "library": "%/libraries/mine.npz"}),
+        ("start", {"name": "new"}, {"out": "%/new", "keep_incomplete": False, "metal": None, "library": None}),
+        ("resume?scan=one", {"keep_incomplete": True, "library": "mine"},
+         {"folder": "%/one", "keep_incomplete": True, "library": "%/libraries/mine.npz"}),
+        ("resume?scan=one", {}, {"folder": "%/one", "keep_incomplete": False, "library": None}),
+        ("process?scan=one", {"metal": [0, 0, 5, 8]}, {"out": "%/one/products", "metal": (0, 0, 5, 8), "labels": None}),
+        ("train", {"name": "own", "scans": ["one"]}, {"data": ["%/one"], "out": "%/libraries/own.npz"}),
+        ("export?scan=one", {"formats": ["csv", "netcdf"]},
+         {"products": "%/one", "csv": True, "netcdf": True, "mat": False, "out": "%/one/export"}),
+    ],
+)  # fmt: skip
+def test_a_request_is_a_command_line_that_the_parser_takes(started, root, path, body, values):
+    view, commands = started
+    status, answer = post(view, f"/api/{path}", body)
+    assert status == 200, answer
+    (words,) = commands
+    assert words[0] == path.partition("?")[0].replace("start", "scan")
+    given = vars(build_parser(words[0]).parse_args(joined(words)))
+
+    shown = {name: plain(given[name], root) for name in values}
+    assert shown == {name: plain(value, root) for name, value in values.items()}
+
+
+def test_boxes_drawn_on_the_page_are_used_when_it_processes(started, root):
+    view, commands = started
+    status, saved = post(view, "/api/labels?scan=one", {"boxes": {"oak": [0, 0, 10, 10]}, "specimens": {"oak": "7"}})
+    assert status == 200, saved
+    assert post(view, "/api/process?scan=one", {"labels": True})[0] == 200
+    assert commands[0][-2:] == ["--labels", saved["file"]]
+    assert Path(saved["file"]).is_relative_to(root / "one")

@@ -194,6 +194,13 @@ def test_a_row_of_noise_has_no_direct_path(rig, noise, prepared, align_single, b
     assert not reference(align_single(received, np.ones(400, bool)), prepared[board.name], rig.chirp).found.any()
 
 
+@pytest.mark.parametrize(("snr_db", "least", "most"), [(-17, 0.0, 0.05), (-13.5, 0.1, 0.9), (-10.5, 0.95, 1.0)])
+def test_a_direct_path_is_found_from_15_db_over_the_noise_of_its_estimate(run, board, snr_db, least, most):
+    """-13.5 dB in a sample of one RX: averaged over 4 RX and 192 samples in a window, 15 dB."""
+    done, _, _ = run(board, echo=0.0, snr_db=snr_db, positions=300)
+    assert least <= done.found.mean() <= most
+
+
 def test_an_if_outside_the_band_is_masked(rig, paths, prepared, align_single, board):
     signal, _ = paths(board, 4, 1.0, np.random.default_rng(2))
     base = rig.chirp.hz_per_sample * 1.39 / SPEED_OF_LIGHT_M_S

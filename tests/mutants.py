@@ -35,7 +35,17 @@ PACKAGES = {
 TESTS_OF_PACKAGE = {"polysight_shared": "shared", "polysight_pi": "pi", "polysight_papers": "papers"}
 TIMEOUT_S = 900
 # `|` and `&` stand in annotations, decorators are properties: their mutants are equivalent or do not import.
-UNUSED_OPERATORS = ("BitOr", "BitAnd", "BitXor", "RShift", "LShift", "Decorator", "ReplaceUnaryOperator_Delete")
+# Operators on variables need the names of two.
+UNUSED_OPERATORS = (
+    "BitOr",
+    "BitAnd",
+    "BitXor",
+    "RShift",
+    "LShift",
+    "Decorator",
+    "ReplaceUnaryOperator_Delete",
+    "Variable",
+)
 
 
 @dataclass(frozen=True)

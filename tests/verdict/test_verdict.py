@@ -17,6 +17,7 @@ from polysight.results.quality import (
     level_reasons,
     metal_reasons,
     passivity_reasons,
+    percent,
     plane_reasons,
     read_verdict,
     reason,
@@ -40,6 +41,10 @@ def test_the_worst_reason_decides_and_weight_orders(order):
     assert verdict.level == "none"
     assert [r.what for r in verdict.reasons] == ["c", "b", "a"]
     assert verdict_of(r for r in order if r.level == "warning").level == "care"
+
+
+def test_only_no_result_hides_names_and_permittivities():
+    assert [verdict_of(ALL[:n]).usable for n in range(4)] == [True, True, True, False]
 
 
 def test_without_reasons_all_is_good():
@@ -323,3 +328,20 @@ def test_no_verdict_shows_a_number_that_is_none(x):
     assert len(found) > 4
     shown = " ".join(verdict_of(found).lines())
     assert not re.search(r"\b(nan|inf)\b", shown), shown
+
+
+def test_a_terminal_shows_the_heaviest_reasons_and_how_many_more_there_are():
+    assert verdict_of(ALL).lines(1)[1:] == ["  - c: because", "    do: do c", "  - and 2 more, see the report"]
+    assert verdict_of(ALL).lines(3) == verdict_of(ALL).lines()
+    assert "more" not in "".join(verdict_of(ALL).lines())
+
+
+@pytest.mark.parametrize(
+    ("part", "whole", "digits", "shown"),
+    [
+        (1, 1, 0, "100 %"), (2, 1, 0, "100 %"), (0, 0, 1, "100 %"), (0, 7, 1, "0.0 %"), (1, 3, 2, "33.33 %"),
+        (99_999, 100_000, 0, "99 %"), (99_999, 100_000, 1, "99.9 %"), (99_999, 100_000, 2, "99.99 %"),
+    ],
+)  # fmt: skip
+def test_100_percent_is_shown_only_if_nothing_is_missing(part, whole, digits, shown):
+    assert percent(part, whole, digits) == shown

@@ -110,6 +110,7 @@ def plain(value: Any, root: Path) -> Any:
          {"out": "%/new", "config": RIG_FILE, "keep_incomplete": True, "metal": (-30, -10, 10, 40),
           "library": "%/libraries/mine.npz"}),
         ("start", {"name": "new"}, {"out": "%/new", "keep_incomplete": False, "metal": None, "library": None}),
+        ("start", {"name": "new", "plan": {"rows": 3}}, {"config": "%/new/program/instrument.toml"}),
         ("resume?scan=one", {"keep_incomplete": True, "library": "mine"},
          {"folder": "%/one", "keep_incomplete": True, "library": "%/libraries/mine.npz"}),
         ("resume?scan=one", {}, {"folder": "%/one", "keep_incomplete": False, "library": None}),

@@ -1,8 +1,7 @@
 """Geometry of an aperture: positions of pixels, antennas and stage, and the `Aperture` that imagers take.
 
-Input of an imager: antennas, stage positions, frequencies and pixels; regularity checks; windows.
-
-Also functions of the array API (namespace, transforms, device), so that imagers run on NumPy, PyTorch and CuPy.
+With it: checks of regularity, windows, and functions of the array API (namespace, transforms, device), so that imagers
+run on NumPy, PyTorch and CuPy.
 """
 
 from __future__ import annotations

@@ -1,22 +1,19 @@
 """Distance and tilt of the object plane: from the sharpness of the image, and from the echoes of flat plates.
 
-Autofocus: find distance and tilt of the object plane by the sharpness of the image.
+Sharpness (`focus_sweep`). The scene is imaged on a stack of planes parallel to the stage. Any plane, also a tilted one,
+is a cut through this volume, so one stack is enough for the whole search.
 
-The scene is imaged on a stack of planes parallel to the stage. Any plane, also a tilted one, is a cut through this
-volume, so one stack is enough for the whole search.
-
-Sharpness is `sum I^2 / (sum I)^2` of the intensities I (Fienup and Miller, J. Opt. Soc. Am. A 20, 2003), counted per
+It is `sum I^2 / (sum I)^2` of the intensities I (Fienup and Miller, J. Opt. Soc. Am. A 20, 2003), counted per
 resolution cell instead of per pixel: cells grow with the distance of the plane, so that otherwise the nearest plane
 would be the sharpest. Points and edges determine the focus, the inside of a plate does not. A wrong depth causes a
 phase error that grows with the square of the aperture's length: a wide scan resolves a tenth of a millimetre, a narrow
 one does not.
 
-Estimate distance and tilt of the object plane from the echoes of flat plates.
-
-A plate's echo gives its range in two ways: coarse but unambiguous from the change of the image's amplitude with range
-(bandwidth of the sweep), and fine but ambiguous by half a wavelength of height from its phase. The first gives the
-plane within about a millimetre and resolves the second. Both are compared with a mirror on the rig file's plane, seen
-from the same positions, so that aperture, taper and masked positions have no influence.
+Echoes of flat plates (`move_to_plane`). A plate's echo gives its range in two ways: coarse but unambiguous from the
+change of the image's amplitude with range (bandwidth of the sweep), and fine but ambiguous by half a wavelength of
+height from its phase. The first gives the plane within about a millimetre and resolves the second. Both are compared
+with a mirror on the rig file's plane, seen from the same positions, so that aperture, taper and masked positions have
+no influence.
 
 One plane is fitted to all plates; the height of each plate is returned too.
 """

@@ -4,14 +4,13 @@
 selects. The samples of an ideal mirror on the object plane (`mirror_samples`) give the footprint, by which images are
 divided.
 
-Range gate: reduce 192 fast-time samples to the few frequency samples that describe the scene; motion in a burst.
-
-A pixel is the matched filter `S(d) = sum_t w_t x_t exp(-j 2 pi f_t d / c)` at its excess path d. All d lie in a gate
-`[d_1, d_2]` of few range cells. The functions `exp(-j 2 pi f d / c)` of d in this gate, f in the swept band B, span a
-space of about `B (d_2 - d_1) / c + 1` dimensions (Landau and Pollak 1962), so each is a combination of those at a few
-evenly spaced f_m: `exp(-j 2 pi f_t d / c) w_t = sum_m M_mt exp(-j 2 pi f_m d / c)`, with M from least squares over the
-gate. Then `S(d) = sum_m (M x)_m exp(-j 2 pi f_m d / c)`, and `M x` is computed once per position; the imagers use only
-M x at f_m. Six samples more than the time-bandwidth product make the error 1e-6 of the peak (derivation:
+Range gate (`reduction`): 192 fast-time samples become the few frequency samples that describe the scene. A pixel is the
+matched filter `S(d) = sum_t w_t x_t exp(-j 2 pi f_t d / c)` at its excess path d. All d lie in a gate `[d_1, d_2]` of
+few range cells. The functions `exp(-j 2 pi f d / c)` of d in this gate, f in the swept band B, span a space of about `B
+(d_2 - d_1) / c + 1` dimensions (Landau and Pollak 1962), so each is a combination of those at a few evenly spaced f_m:
+`exp(-j 2 pi f_t d / c) w_t = sum_m M_mt exp(-j 2 pi f_m d / c)`, with M from least squares over the gate. Then `S(d) =
+sum_m (M x)_m exp(-j 2 pi f_m d / c)`, and `M x` is computed once per position; the imagers use only M x at f_m. Six
+samples more than the time-bandwidth product make the error 1e-6 of the peak (derivation:
 docs/decisions/0002-imaging.md).
 
 The direct path is a constant in x, close to the gate. Windowing alone does not remove it, so its amplitude is estimated

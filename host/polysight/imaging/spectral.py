@@ -7,10 +7,8 @@ the spectrum, and one inverse transform gives the image.
 Along y, rows and pixels share a lattice on which the kernel is sampled, without interpolation. Along x each row has its
 own shift (travel of the stage within a burst, backlash), a phase ramp in the spectrum.
 
-Common lattice of regular positions and pixels for the spectral imagers (docs/decisions/0002-imaging.md).
-
-A `Lattice` has the periods, pitches and strides. The spectra of the kernels along x are computed here and cached in
-memory, for one aperture is imaged many times.
+A `Lattice` has the periods, pitches and strides of regular positions and pixels (docs/decisions/0002-imaging.md). The
+spectra of the kernels along x are computed here and cached in memory, for one aperture is imaged many times.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-/* Burst alignment, position by position: `align.align_in_numpy` in one pass over the card's words. The words of a
-   position (64 KB) come from the cache, where they were read to (`rows.py`). The method is described in `align.py` and
-   `numpy_passes.py`. */
+/* Burst alignment, position by position: `offsets.align_in_numpy` in one pass over the card's words. The words of a
+   position (64 KB) come from the cache, where they were read to (`chain.py`). The method is described in `offsets.py` and
+   `loops.py`. */
 #include "passes.h"
 
-#define REFERENCES 4       /* `align.REFERENCES` */
-#define GOOD 0.5           /* `align.GOOD` */
+#define REFERENCES 4       /* `offsets._REFERENCES` */
+#define GOOD 0.5           /* `offsets._GOOD` */
 #define SMALLEST_GAIN 0.25 /* `high_pass_filter.SMALLEST_GAIN` */
 
 /* `high_pass_filter.Equaliser`; without corners there is one tap, 1. */
@@ -61,7 +61,7 @@ typedef struct {
     int32_t *peak;
 } Aligned;
 
-/* `align._coherent`: usable chirps with at least GOOD of the median coherence of their position. */
+/* `offsets._coherent`: usable chirps with at least GOOD of the median coherence of their position. */
 static void choose_coherent(const double *coherence, const uint8_t *usable, int chirps, double *sorted, uint8_t *good)
 {
     int count = 0;
@@ -86,7 +86,7 @@ static void put_first(int *order, const uint8_t *kind, int chirps, int fixed)
                 order[at++] = k;
 }
 
-/* `align._against_one`: offsets relative to one chirp; try another one if it is not usable or matches few of the others.
+/* `offsets._against_one`: offsets relative to one chirp; try another if it is not usable or matches few of the others.
    Returns the middle of the signal's band. */
 static double against_one(Work *w, Chirps *c, const uint8_t *valid, int full_scale, const int32_t *peak)
 {
@@ -266,7 +266,7 @@ static void prepare(Work *w)
         w->part_times[p] = FOLD * (w->edges[p] + w->edges[p + 1] - w->blocks) / 2.0;
 }
 
-/* `align.align_row` for four RX. words: int16 [position][chirp][sample][2][RX]; valid [position][chirp]; [a, b): linear
+/* `offsets.align_row` for four RX. words: int16 [position][chirp][sample][2][RX]; valid [position][chirp]; [a, b): linear
    samples, a whole number of blocks; size: of the transform; filter: sample rate, reach, IF signed, corners; equalise:
    compensate the filter. Returns 0, or 1 if there is not enough memory. */
 int NAME(align)(const int16_t *words, const uint8_t *valid, int positions, int chirps, int samples, int a, int b,

@@ -1,8 +1,8 @@
-/* Direct path of every position: `numpy_direct_path.py` in C, with the same names. Complex arrays have real and imaginary
+/* Direct path of every position: `NumpyLoops` of `loops.py` in C, with the same names. Complex arrays have real and imaginary
    parts interleaved. */
 #include "signal.h"
 
-#define STEPS 3 /* `numpy_direct_path.STEPS` */
+#define STEPS 3 /* `loops._STEPS` */
 
 /* Sum of a position's two halves, [rx][block], times weights, as real part x and imaginary part y. */
 static inline void weighted(const float *restrict halves, const float *restrict weights, int count, float *restrict x,
@@ -46,7 +46,7 @@ static inline void medians(const int32_t *restrict powers, int size, double *res
     }
 }
 
-/* `numpy_direct_path.search` for one spectrum: power [size]. */
+/* `NumpyLoops.search` for one spectrum: power [size]. */
 static void choose_peaks(const float *power, int size, int nearest, int farthest, float comparable, int32_t *first,
                          int32_t *second)
 {
@@ -68,7 +68,7 @@ static void choose_peaks(const float *power, int size, int nearest, int farthest
     *second = is_object ? top : lower;
 }
 
-/* `numpy_direct_path.search`. halves: [position][2][rx][block]; weights [rx][block]: beam, steering and window; the
+/* `NumpyLoops.search`. halves: [position][2][rx][block]; weights [rx][block]: beam, steering and window; the
    object is nearest..farthest bins above the direct path. Results: bins [2][position], median magnitude [position].
    Returns 0, or 1 if there is not enough memory. */
 int NAME(search)(const float *halves, const float *weights, int positions, int blocks, int size, int nearest,
@@ -128,7 +128,7 @@ static void estimate_at(const float *g_re, const float *g_im, int rows, int bloc
     }
 }
 
-/* `numpy_direct_path.refine`: steering [rx][block], estimator [row][rx][block]; changes frequency [position]. */
+/* `NumpyLoops.refine`: steering [rx][block], estimator [row][rx][block]; changes frequency [position]. */
 int NAME(refine)(const float *halves, const float *steering, const float *estimator, int positions, int blocks, int rows,
                  double *frequency, double *estimates, double *steps)
 {
@@ -180,7 +180,7 @@ static inline void turned(const float *restrict values, const float *restrict we
     }
 }
 
-/* `numpy_direct_path.turn`: mean [position][rx][sample] to out [rx][position][sample], zero where not found, and halves
+/* `NumpyLoops.turn`: mean [position][rx][sample] to out [rx][position][sample], zero where not found, and halves
    to halves_out; phase in turns at the sample origin. */
 int NAME(turn)(const float *mean, const float *halves, const float *steering, const float *folded_steering,
                int positions, int samples, int blocks, const double *origin, const double *frequency,

@@ -1,12 +1,12 @@
-/* Three passes over the words of a burst, `numpy_passes.py` in C, for one position at a time. Words are int16
+/* Three passes over the words of a burst, `loops.py` in C, for one position at a time. Words are int16
    [chirp][sample][2][RX]; x + j y are the samples of a chirp, in the order described in `signal.h`. */
 #ifndef PASSES_H
 #define PASSES_H
 
 #include "signal.h"
 
-#define BAND_BINS 9 /* `numpy_passes.BAND_BINS` */
-#define PARTS 8     /* `tone._BLOCKS` */
+#define BAND_BINS 9 /* `loops.BAND_BINS` */
+#define PARTS 8     /* `loops._BLOCKS` */
 
 /* Sizes, tables and work arrays. */
 typedef struct {
@@ -59,7 +59,7 @@ static inline Complex bin_value(const float *re, const float *im, int place)
     return (Complex){re[LANES * place], im[LANES * place]};
 }
 
-/* `tone.strongest`: the tone at the strongest bin of a spectrum; frequency in cycles per sample. */
+/* `loops.strongest`: the tone at the strongest bin of a spectrum; frequency in cycles per sample. */
 static inline Complex interpolated(const Work *w, const float *re, const float *im, int at, double *frequency)
 {
     int size = w->size, top = w->bin[at];
@@ -127,7 +127,7 @@ static double centre_of_band(Work *w, const float *restrict x, const float *rest
     return (double)((maximum(w->power, size) + 3 * (width / 2)) % size) / size;
 }
 
-/* First pass: the tone between each chirp and a reference chirp; see `numpy_passes.match`. Returns the centre. */
+/* First pass: the tone between each chirp and a reference chirp; see `loops.match`. Returns the centre. */
 static double match(Work *w, int reference, double *frequency, Complex *product, float *energy)
 {
     int n = w->n, chirp = RX * w->samples, start = RX * w->a;
@@ -238,7 +238,7 @@ static inline void correlate_part(const float *restrict re, const float *restric
 }
 
 /* Second pass: the tone between each chirp, mixed down, folded and filtered, and the sum of the good others; see
-   `numpy_passes.against_others`. Returns the energy of that sum. */
+   `loops.against_others`. Returns the energy of that sum. */
 static float against_others(Work *w, const double *frequency, const Complex *taps, int count,
                             const uint8_t *good, double *found, Complex *tone, float *energy, double *apart_f,
                             double *apart_phase)
@@ -318,7 +318,7 @@ static inline void mix(Work *w, const float *restrict x, const float *restrict y
 }
 
 /* Third pass: the sum of the chirps, mixed down and filtered, and the contributions of two halves; see
-   `numpy_passes.average`. mean is complex [RX][sample], halves complex [2][RX][block]. */
+   `loops.average`. mean is complex [RX][sample], halves complex [2][RX][block]. */
 static void average(Work *w, const double *frequency, const Complex *weights, int count,
                     const uint8_t *good, const uint8_t *second_half, float *mean, float *halves)
 {

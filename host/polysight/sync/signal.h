@@ -15,7 +15,7 @@
 #include <string.h>
 
 #define RX 4    /* of an AWR2243 */
-#define FOLD 4  /* samples averaged before fine estimates, `numpy_passes.FOLD` */
+#define FOLD 4  /* samples averaged before fine estimates, `loops.FOLD` */
 #define LANES 16  /* FOLD x RX; also the number of records transformed together */
 
 #define JOIN(name, width) name##_##width
@@ -103,7 +103,7 @@ static inline int maximum(const double *values, int count)
 }
 
 /* exp(-j 2 pi (frequency (step m - origin) + turns)) for m < count, as an outer product of coarse and fine steps like
-   `tone.phasor`. Writes up to seven more values. */
+   `loops.phasor`. Writes up to seven more values. */
 static inline void ramp(double frequency, double turns, int step, double origin, int count, float *restrict c,
                         float *restrict s)
 {
@@ -237,7 +237,7 @@ static inline void interleave(const float *restrict records, float *restrict spa
     memset(out + LANES * n, 0, sizeof *out * LANES * (size - n));
 }
 
-/* A step of Newton's method on the periodograms of records [part][record], `tone.refine`: changes the frequency, cycles
+/* A step of Newton's method on the periodograms of records [part][record], `loops.refine`: changes the frequency, cycles
    per sample. `first`: the frequency is still zero. */
 static inline void newton_step(const double *restrict re, const double *restrict im, const double *restrict t, int parts,
                                int count, int first, double *restrict f, Complex *restrict tone)

@@ -31,8 +31,9 @@ Real = npt.NDArray[np.float64]
 
 CHANNEL_RATIO_STD_DB = 2.5
 """Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
-WEAK_V_DB = -3.0
-"""V / H relative to the direct path below which a patch is hardly metal: metal has 0 dB, bare water -4 dB."""
+WEAK_V_DB = -7.0
+"""V / H relative to the direct path below which a patch is no metal: half spaces of eps' up to 10 have -8 dB or less,
+metal 0 dB, but for the patterns of the antennas (-4 dB with those of an independent generator)."""
 SURE_SCORE = 3.0
 CONFLICT_SCORE = -3.0
 """Score below which the other patch that fits metal least is told."""

@@ -20,6 +20,7 @@ from polysight.imaging.geometry import (
 )
 from polysight.imaging.images import (
     AS_IN_RIG_FILE,
+    MAX_RISE,
     TAPERS,
     Illumination,
     Image,
@@ -34,6 +35,7 @@ from polysight.imaging.images import (
     correct_tilt,
     illumination_geometry,
     needed_gate_m,
+    phase_rise,
     sub_bands,
 )
 from polysight.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, Focus, PlaneEstimate, focus_sweep, move_to_plane
@@ -50,6 +52,7 @@ from polysight.imaging.sparse import fill_missing, fill_sub_bands
 
 __all__ = [
     "AS_IN_RIG_FILE",
+    "MAX_RISE",
     "PLANE_REACH_M",
     "TAPERS",
     "UNKNOWN_PLANE",
@@ -83,6 +86,7 @@ __all__ = [
     "imaging_facts",
     "move_to_plane",
     "needed_gate_m",
+    "phase_rise",
     "point_response",
     "project",
     "reduction",

@@ -118,13 +118,9 @@ class Illumination:
         `h`, `v` complex [ny, nx] are reflectivities (conjugates of the samples), `mask` bool [ny, nx] is the inside of
         the patch.
         """
-        out = []
-        for along in (0, 1):
-            # The phase of the conjugate falls where the plate rises.
-            step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in (h, v)) / 2
-            slope = float(np.angle(step)) / self.pixel_m[along] / float(self.steepness_rad_m.mean())
-            out.append(slope if abs(step) > _COHERENT and abs(slope) < MAX_RISE else 0.0)
-        return out[0], out[1]
+        rise = phase_rise(h, v, mask, self.pixel_m, float(self.steepness_rad_m.mean()))
+        x, y = (slope if abs(slope) < MAX_RISE else 0.0 for slope in rise)
+        return x, y
 
     def to_level(self, mask: Mask, rise: Rise) -> NDArray[np.float64]:
         """Return factors [2, n] that convert H and V of a patch's pixels to those of a level plate.
@@ -252,6 +248,29 @@ def correct_tilt(images: Images, masks: Sequence[Mask], rises: Sequence[Rise]) -
         h[mask] *= factor_h
         v[mask] *= factor_v
     return replace(images, h=h, v=v)
+
+
+def phase_rise(h: Image, v: Image, mask: Mask, pixel_m: tuple[float, float], steepness_rad_m: float) -> Rise:
+    """Estimate the rise of a patch along x and y from its phase, radians; NaN where the phase is not even.
+
+    Parameters
+    ----------
+    h, v
+        complex [ny, nx]: reflectivities (conjugates of the samples).
+    mask
+        bool [ny, nx]: the inside of the patch.
+    pixel_m
+        Pixel along x and y.
+    steepness_rad_m
+        Phase per metre of height, 2 k cos(theta).
+    """
+    out = []
+    for along in (0, 1):
+        # The phase of the conjugate falls where the plate rises.
+        step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in (h, v)) / 2
+        slope = float(np.angle(step)) / pixel_m[along] / steepness_rad_m
+        out.append(slope if abs(step) > _COHERENT else float("nan"))
+    return out[0], out[1]
 
 
 def _step(image: Image, mask: Mask, axis: int) -> complex:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.imaging import Image, Images, correct_tilt
+from polysight.imaging import MAX_RISE, Image, Images, Rise, correct_tilt, phase_rise
 from polysight.materials.classify import (
     DISCRIMINANT,
     UNKNOWN,
@@ -23,7 +23,16 @@ from polysight.materials.classify import (
     features_of,
     name_patch,
 )
-from polysight.materials.inversion import MOVED, Inversion, PatchMeasurement, RigPrior, at_angle, invert
+from polysight.materials.inversion import (
+    EVEN_LIGHT,
+    MOVED,
+    UNEVEN_LIGHT,
+    Inversion,
+    PatchMeasurement,
+    RigPrior,
+    at_angle,
+    invert,
+)
 from polysight.materials.kinds import Kinds, literature
 from polysight.materials.labels import TruthPlate, match_truth
 from polysight.materials.library import SceneErrors
@@ -67,6 +76,7 @@ from polysight.polarimetry import (
 from polysight_shared.config import Instrument
 from polysight_shared.errors import DataError
 from polysight_shared.findings import Finding
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 LEAST_LEAKAGE_STD = 5e-4
 """Least standard deviation of the leakage, whatever the rig file says."""
@@ -87,11 +97,14 @@ class Optics:
     smooth_px
         Width (standard deviation, pixels) of the filter against speckle before permittivity and classification,
         inside each patch.
+    steepness_rad_m
+        Phase per metre of height, 2 k cos(theta), to estimate tilts in images without illumination; None: not known.
     """
 
     theta_rad: npt.ArrayLike
     prior: RigPrior = MEASURED_RIG
     smooth_px: float = 2.0
+    steepness_rad_m: float | None = None
 
     @classmethod
     def of(
@@ -113,7 +126,8 @@ class Optics:
             channels_known=channels_known,
             moved=0.0 if p.leakage_std is None else MOVED,
         )
-        return cls(angles.used_rad, prior, p.smooth_px)
+        wave = 2 * np.pi * (rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2) / SPEED_OF_LIGHT_M_S
+        return cls(angles.used_rad, prior, p.smooth_px, float(2 * wave * np.cos(np.mean(angles.used_rad))))
 
 
 @dataclass(frozen=True)
@@ -145,21 +159,47 @@ class KnownScene:
         return self.metal if isinstance(self.metal, PlaneReference) else None
 
 
-def level(images: Images, found: Segmentation, tilts: Tilts | None = None) -> tuple[Images, Tilts]:
-    """Correct each patch for its tilt; return the images and the tilts, as given or estimated from the phase.
+def level(
+    images: Images, found: Segmentation, tilts: Tilts | None = None, steepness_rad_m: float | None = None
+) -> tuple[Images, Tilts]:
+    """Correct the illumination of each patch for its tilt; return the images and the tilts, as given or estimated.
 
-    Without the illumination of the plane the images are returned unchanged.
+    Tilts are estimated from the phase. Without the illumination of the plane the images are returned unchanged; the
+    tilts are those of `steepness_rad_m`, the phase per metre of height, if it is known.
     """
-    if images.illumination is None:
-        return images, Tilts({}, 1)
+    illumination = images.illumination
+    if illumination is None:
+        return images, tilts or _tilts(images, found, steepness_rad_m)
     if tilts is None:
-        rises = {p.label: images.illumination.rise(images.h, images.v, p.interior) for p in found.patches}
-        tilts = Tilts(rises, images.illumination.across)
+        tilts = replace(_tilts(images, found, float(illumination.steepness_rad_m.mean())), across=illumination.across)
     there = [p for p in found.patches if p.label in tilts.rises]
     masks, own = [p.mask for p in there], [tilts.rises[p.label] for p in there]
     return correct_tilt(images, masks, own), tilts
 
 
+def _tilts(images: Images, found: Segmentation, steepness_rad_m: float | None) -> Tilts:
+    """Estimate the rise of each patch; patches that are steeper than what is modelled, or uneven, are marked."""
+    if steepness_rad_m is None:
+        return Tilts({}, 1)
+    pixel_m = abs(float(images.x_m[1] - images.x_m[0])), abs(float(images.y_m[1] - images.y_m[0]))
+    rises = {p.label: phase_rise(images.h, images.v, p.interior, pixel_m, steepness_rad_m) for p in found.patches}
+    steep = frozenset(label for label, rise in rises.items() if max(map(abs, rise)) > MAX_RISE)
+    known = {label: (_modelled(x), _modelled(y)) for label, (x, y) in rises.items()}
+    return Tilts(known, 1, steep)
+
+
+def _modelled(rise: float) -> float:
+    """Return a rise, 0 if it is not known or steeper than what is modelled."""
+    return rise if abs(rise) < MAX_RISE else 0.0
+
+
+STEEP = Finding(
+    "error",
+    "tilted or curved beyond what is modelled",
+    f"its phase rises by more than {np.degrees(MAX_RISE):.1f} degrees: H and V see other places, turned polarisations",
+    "lay it flat; `polysight focus` shows the plane of the scene",
+)
+"""Why a steep patch gets no permittivity."""
 FILLED = 0.1
 """Least |H| relative to metal at which an image without edges counts as filled with one material."""
 ACTIVE = 2.0
@@ -181,14 +221,15 @@ def analyse(
         plane.check_axes(images.x_m, images.y_m)
         images = images.within(plane.valid)
     found = _patches(images, known)
-    images, tilts = level(images, found)
+    images, tilts = level(images, found, steepness_rad_m=optics.steepness_rad_m)
     reference = _reference(images, known, found)
     raw = to_metal(images, reference, plane)
     rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
     refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
+    refused |= {p.label: STEEP for p in found.patches if p.label in tilts.steep and p.label != reference.label}
     judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
-    seen = Seen.of((rh, rv), judged, reference, plane, images)
+    seen = Seen.of((rh, rv), judged, reference, plane, images, tilts)
     prior = seen.prior(optics.prior)
     measured = [seen.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
     kinds = _kinds(classifier, float(np.mean(theta)))
@@ -238,12 +279,21 @@ class Seen:
         Scatter of the metal reference; None if it was scanned separately.
     metal_spread
         Relative spread of the pixels of metal that was scanned separately; None: it is in the scene.
+    tilts
+        Tilts of the plates.
+    lit_evenly
+        True if the illumination of tilted plates was corrected.
+    metal_rise
+        Rise of the metal along x and across the plane of incidence, radians.
     """
 
     scatter: Mapping[int, Scatter]
     usual: tuple[float, float]
     metal: Scatter | None
     metal_spread: float | None
+    tilts: Tilts
+    lit_evenly: bool
+    metal_rise: Rise
 
     @classmethod
     def of(
@@ -253,6 +303,7 @@ class Seen:
         reference: MetalReference,
         plane: PlaneReference | None,
         images: Images,
+        tilts: Tilts,
     ) -> Seen:
         """Measure the scatter of the judged patches and of the metal; `channels` are relative to metal, smoothed."""
         every = {p.label: scatter_of(p.interior, *channels, images.x_m, images.y_m) for p in judged}
@@ -261,10 +312,15 @@ class Seen:
         if plane is None and reference.mask.any():
             metal = scatter_of(reference.mask, *channels, images.x_m, images.y_m)
         known = [*scatter.values(), *([] if metal is None else [metal])]
-        return cls(scatter, usual_scatter(known), metal, None if plane is None else plane.spread)
+        spread = None if plane is None else plane.spread
+        metal_rise = (0.0, 0.0) if reference.label is None else tilts.in_plane(reference.label)
+        evenly = images.illumination is not None
+        return cls(scatter, usual_scatter(known), metal, spread, tilts, evenly, metal_rise)
 
     def prior(self, prior: RigPrior) -> RigPrior:
         """Return the prior of the rig's errors with what the plates show: the metal's error and the common gradient."""
+        light = EVEN_LIGHT if self.lit_evenly else UNEVEN_LIGHT
+        prior = replace(prior, metal_rise=self.metal_rise, lighting_std=light)
         if self.metal_spread is not None:
             return replace(prior, reference_std=LEAST_STD)
         gradient, gradient_std = common_gradient(
@@ -279,7 +335,8 @@ class Seen:
         metal_m = None if self.metal is None else self.metal.centre_m
         local_std = self.metal_spread or 0.0
         scatter = self.scatter.get(patch.label)
-        return measure_patch(patch, *channels, theta_rad, scatter, self.usual, metal_m, local_std)
+        rise = self.tilts.in_plane(patch.label)
+        return measure_patch(patch, *channels, theta_rad, scatter, self.usual, metal_m, local_std, rise)
 
 
 def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:

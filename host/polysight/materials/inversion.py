@@ -2,12 +2,16 @@
 
 Relative to metal, a patch of true inverse ratio t = r_p / r_s = 1 / P is measured as
 
-    V / H = (1 + rho) exp(g x) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
+    V / H = (1 + rho) exp(g x + G w) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
 
 with a, b the leakage of p into H and of s into V, rho the error of the metal reference, g the common change of
-ln(V / H) over the plane (drift, boards out of place), x the place relative to the metal, kappa the patch's brightness
-relative to an ideal one (thickness, roughness, tilt, illumination). r_s and r_p follow from t and the incidence angle
-by Eq. 2 and 3. Unknown are a, b, rho, g, the angle's error, the usual size of ln kappa, and t of every patch.
+ln(V / H) over the plane (drift, boards out of place), x the place relative to the metal, w the rise of the plate
+relative to the metal's and G its effect on ln(V / H) (H and V are lit from other points), kappa the patch's brightness
+relative to an ideal one (thickness, roughness, illumination). A plate that rises by w across the plane of incidence
+turns the polarisations: it has a and b of its own, larger and smaller by `turn` w. (With the plate's normal in the
+plane of x and k, s turns by w, and both waves meet it at sin(theta) w; metal is not changed.) r_s and r_p follow from t
+and the incidence angle by Eq. 2 and 3. Unknown are a, b, rho, g, G, the turn, the angle's error, the usual size of
+ln kappa, and t of every patch.
 
 The evidence is that of |V / H| and its phase; brightness is a nuisance of each plate, whose usual size the scene tells.
 Other evidence on the common errors is that every patch has to be some material (`Kinds`): the library's, the
@@ -44,11 +48,23 @@ LIBRARY_SHARE = (0.05, 0.95)
 """Range of the share of a scene's patches that are of the library's materials; the scene tells it."""
 MOVED, MOVED_STD = 0.1, 0.025
 """Probability that the mount has moved since its leakage was measured, and the leakage's error then: 1 to 3 degrees."""
+TURN, TURN_STD = -1.0, 0.25
+"""Leakage by a plate's rise across the plane of incidence, for the published rig: between sin(theta) = 0.82 and 1.03 as
+an independent generator of its fields has it; a transmitter turned to the other side has the other sign."""
+UNEVEN_LIGHT, EVEN_LIGHT = (1.0, 4.0), (0.3, 0.7)
+"""Change of ln(V / H) per radian of rise, along x and across, by the patterns of boards that see the plate from other
+points: without and with the correction of the plate's illumination."""
 LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
-SOURCES = ("noise", "metal reference", "leakage", "incidence")
-_GROUPS = {"metal reference": (4, 5, 10, 11, 12, 13), "leakage": (0, 1, 2, 3, 9), "incidence": (6,)}
-_WIDTH = 15  # a, b, rho (2 each), angle, metal's brightness, size of brightness, moved, g (4), library's share
+SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
+_GROUPS = {
+    "metal reference": (4, 5, 10, 11, 12, 13),
+    "leakage": (0, 1, 2, 3, 9),
+    "incidence": (6,),
+    "tilt": (15, 16, 17, 18),
+}
+# a, b, rho (2 each), angle, metal's brightness, size of brightness, moved, g (4), library's share, turn, G (3).
+_WIDTH = 19
 _PARTICLES, _MOVES, _DRAWS = 600, 6, 8
 _LEAST_STD = 1e-6  # of a ratio: below it a covariance has no inverse in double precision
 
@@ -71,6 +87,8 @@ class PatchMeasurement:
         Standard deviations of ln|V / H| and of its phase by what scatters over the plate: edges, ripple, tilt.
     place_m
         Centre relative to the metal's, x and y.
+    rise
+        Rise of the plate along x and across the plane of incidence, radians.
     """
 
     inverse_ratio: complex
@@ -79,6 +97,7 @@ class PatchMeasurement:
     brightness: float | None = None
     relative_std: tuple[float, float] = (0.0, 0.0)
     place_m: tuple[float, float] = (0.0, 0.0)
+    rise: tuple[float, float] = (0.0, 0.0)
 
     @property
     def covariance(self) -> Real:
@@ -112,6 +131,12 @@ class RigPrior:
         of the amplitude, imaginary parts of the phase.
     moved
         Probability that a mount whose leakage was measured has moved since.
+    metal_rise
+        Rise of the metal reference along x and across the plane of incidence, radians.
+    turn, turn_std
+        Leakage by the rise across the plane of incidence, per radian, and its standard deviation.
+    lighting_std
+        Standard deviation of G along x and across: per radian of a plate's rise.
     """
 
     theta_std_rad: float
@@ -124,6 +149,10 @@ class RigPrior:
     gradient: tuple[complex, complex] = (0j, 0j)
     gradient_std: tuple[complex, complex] = (0j, 0j)
     moved: float = 0.0
+    metal_rise: tuple[float, float] = (0.0, 0.0)
+    turn: float = TURN
+    turn_std: float = TURN_STD
+    lighting_std: tuple[float, float] = UNEVEN_LIGHT
 
 
 @dataclass(frozen=True)
@@ -248,6 +277,7 @@ class _Scene:
         self.prior, self.kinds, self.n = prior, kinds, len(seen)
         self.q = np.array([s.inverse_ratio for s in seen], np.complex128)
         self.place = np.array([s.place_m for s in seen], np.float64).reshape(-1, 2)
+        self.rise = np.array([s.rise for s in seen], np.float64).reshape(-1, 2)
         self.theta = np.array([s.theta_rad for s in seen], np.float64)
         level = np.array([np.nan if s.brightness is None else s.brightness for s in seen], np.float64)
         # Metal-like patches have |H| = 1 with any leakage: they give no information on it.
@@ -294,6 +324,19 @@ class _Scene:
         b = p.leakage[1] + scale * (z[..., 2, None] + 1j * z[..., 3, None])
         return a, b
 
+    def leakage_of_patches(self, z: Real) -> tuple[Complex, Complex]:
+        """Return a and b of each patch as its rise turns the polarisations, [..., patch] each."""
+        a, b = self.leakage(z)
+        turned_by = (self.prior.turn + self.prior.turn_std * z[..., 15, None]) * self.rise[:, 1]
+        return a + turned_by, b - turned_by
+
+    def lighting(self, z: Real) -> Complex:
+        """Return the change of ln(V / H) of each patch by its rise relative to the metal's, [..., patch]."""
+        along, across = self.prior.lighting_std
+        rise = self.rise - np.array(self.prior.metal_rise)
+        by_across = across * (z[..., 16, None] + 0.1j * z[..., 17, None])
+        return along * z[..., 18, None] * rise[:, 0] + by_across * rise[:, 1]
+
     def gradient(self, z: Real) -> Complex:
         """Return the change of ln(V / H) along x and y, per metre, [..., 2]."""
         mean = np.array(self.prior.gradient)
@@ -306,9 +349,9 @@ class _Scene:
 
     def ratios(self, z: Real) -> Complex:
         """Return t of every patch, [..., patch]."""
-        a, b = self.leakage(z)
+        a, b = self.leakage_of_patches(z)
         rho = self.prior.reference_std * (z[..., 4, None] + 1j * z[..., 5, None])
-        return true_ratio(self.q * np.exp(-(self.gradient(z) @ self.place.T)), a, b, rho)
+        return true_ratio(self.q * np.exp(-(self.gradient(z) @ self.place.T) - self.lighting(z)), a, b, rho)
 
     def ratios_of_kinds(self, z: Real, kinds: Kinds) -> Complex:
         """Return t that each patch would have at the angle of the kinds, [..., patch]."""
@@ -321,7 +364,7 @@ class _Scene:
 
     def brightness_off(self, z: Real) -> Real:
         """Return ln |H| of every patch minus that of Eq. 2 and the metal's, [..., patch]."""
-        a, _ = self.leakage(z)
+        a, _ = self.leakage_of_patches(z)
         t, cosine, sine2 = self.ratios(z), np.cos(self.angle(z)), np.sin(self.angle(z)) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
             q = (1 + t) / (1 - t) * sine2 / cosine

@@ -241,6 +241,7 @@ def measure_patch(
     usual: tuple[float, float] = (0.0, 0.0),
     metal_m: tuple[float, float] | None = None,
     local_std: float = 0.0,
+    rise: tuple[float, float] = (0.0, 0.0),
 ) -> PatchMeasurement:
     """Measure a patch's ratio with its errors, and its brightness.
 
@@ -258,6 +259,8 @@ def measure_patch(
         Centre of the metal reference; None if the reference covers the plane.
     local_std
         Relative error of a metal reference that varies over the plane; 0 if it is a single number.
+    rise
+        Its rise along x and across the plane of incidence, radians.
     """
     at = patch.interior
     ratio = median_ratio(h[at], v[at])
@@ -270,7 +273,8 @@ def measure_patch(
     place = (0.0, 0.0)
     if scatter is not None and metal_m is not None:
         place = (scatter.centre_m[0] - metal_m[0], scatter.centre_m[1] - metal_m[1])
-    return PatchMeasurement(inverse, std, theta_rad, float(np.median(level)) if level.size else None, relative, place)
+    brightness = float(np.median(level)) if level.size else None
+    return PatchMeasurement(inverse, std, theta_rad, brightness, relative, place, rise)
 
 
 def own_std(h: Image, v: Image) -> float:
@@ -452,6 +456,8 @@ def permittivity_of_patch(
     inversion; None for a patch that it did not include, which gets no permittivity.
     """
     alone = estimate_permittivity(h, v, theta_rad)
+    if estimate is not None and alone.ratio and np.isfinite(alone.ratio):
+        alone = estimate_permittivity(h, v * complex(estimate.inverse_ratio * alone.ratio), theta_rad)
     if estimate is None or estimate.permittivity is None or estimate.covariance is None:
         return Permittivity.not_estimated(alone.ratio, alone.inverse_std, alone.metal_distance, alone.pixels)
     ratio = 1 / estimate.inverse_ratio if estimate.inverse_ratio else complex(np.inf, 0.0)

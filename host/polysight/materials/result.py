@@ -39,11 +39,17 @@ from polysight_shared.findings import Finding
 class Tilts:
     """Tilts of the plates: patch number to rise along x and y, radians; patches without an estimate are missing.
 
-    `across` is the index of the axis across the plane of incidence.
+    `across` is the index of the axis across the plane of incidence; `steep` are the patches beyond what is modelled.
     """
 
     rises: dict[int, Rise]
     across: int
+    steep: frozenset[int] = frozenset()
+
+    def in_plane(self, label: int) -> Rise:
+        """Return the rise of a patch along the plane of incidence and across it, radians; 0 if it is not known."""
+        rise = self.rises.get(label, (0.0, 0.0))
+        return rise[1 - self.across], rise[self.across]
 
     def across_rad(self, label: int) -> float:
         """Return the rise of a patch across the plane of incidence, radians; 0 if it is not known."""
@@ -55,6 +61,7 @@ SHRINKS = {
     "noise": "a larger plate, a finer grid or more pulses a position",
     "metal reference": "a larger metal plate, or `polysight calibrate metal`",
     "leakage": "measure leakage with metal strips: `polysight leakage`",
+    "tilt": "lay the plates flat",
     "incidence": "measure where the antennas are: `polysight calibrate direct-path`",
 }
 """Source of error to the measurement that reduces it."""

@@ -40,11 +40,12 @@ from polysight.materials.measure import (
     AMPLIFIES,
     BELOW_AIR,
     LEAST_STD,
+    CommonChange,
     Permittivity,
     Scatter,
     background,
     check_patches,
-    common_gradient,
+    common_change,
     measure_patch,
     permittivity_of_patch,
     relative_errors,
@@ -277,6 +278,8 @@ class Seen:
         Usual scatter of ln|V / H| and of its phase in this scene.
     metal
         Scatter of the metal reference; None if it was scanned separately.
+    change
+        Common change of ln(V / H) over the plane; None with metal that was scanned separately.
     metal_spread
         Relative spread of the pixels of metal that was scanned separately; None: it is in the scene.
     tilts
@@ -290,6 +293,7 @@ class Seen:
     scatter: Mapping[int, Scatter]
     usual: tuple[float, float]
     metal: Scatter | None
+    change: CommonChange | None
     metal_spread: float | None
     tilts: Tilts
     lit_evenly: bool
@@ -315,28 +319,25 @@ class Seen:
         spread = None if plane is None else plane.spread
         metal_rise = (0.0, 0.0) if reference.label is None else tilts.in_plane(reference.label)
         evenly = images.illumination is not None
-        return cls(scatter, usual_scatter(known), metal, spread, tilts, evenly, metal_rise)
+        change = None if metal is None else common_change(known, metal.centre_m)
+        return cls(scatter, usual_scatter(known), metal, change, spread, tilts, evenly, metal_rise)
 
     def prior(self, prior: RigPrior) -> RigPrior:
-        """Return the prior of the rig's errors with what the plates show: the metal's error and the common gradient."""
+        """Return the prior of the rig's errors with what the plates show: the metal's error and tilt."""
         light = EVEN_LIGHT if self.lit_evenly else UNEVEN_LIGHT
         prior = replace(prior, metal_rise=self.metal_rise, lighting_std=light)
         if self.metal_spread is not None:
             return replace(prior, reference_std=LEAST_STD)
-        gradient, gradient_std = common_gradient(
-            [*self.scatter.values(), *([] if self.metal is None else [self.metal])]
-        )
         amplitude, phase = relative_errors(self.metal, self.usual)
         std = float(np.hypot(np.hypot(amplitude, phase) / np.sqrt(2), LEAST_STD))
-        return replace(prior, reference_std=std, gradient=gradient, gradient_std=gradient_std)
+        return replace(prior, reference_std=std)
 
     def measure(self, patch: Patch, channels: tuple[Image, Image], theta_rad: float) -> PatchMeasurement:
         """Measure one patch relative to metal."""
-        metal_m = None if self.metal is None else self.metal.centre_m
         local_std = self.metal_spread or 0.0
         scatter = self.scatter.get(patch.label)
         rise = self.tilts.in_plane(patch.label)
-        return measure_patch(patch, *channels, theta_rad, scatter, self.usual, metal_m, local_std, rise)
+        return measure_patch(patch, *channels, theta_rad, scatter, self.usual, self.change, local_std, rise)
 
 
 def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:

@@ -2,15 +2,14 @@
 
 Relative to metal, a patch of true inverse ratio t = r_p / r_s = 1 / P is measured as
 
-    V / H = (1 + rho) exp(g x + G w) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
+    V / H = (1 + rho) exp(G w) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
 
-with a, b the leakage of p into H and of s into V, rho the error of the metal reference, g the common change of
-ln(V / H) over the plane (drift, boards out of place), x the place relative to the metal, w the rise of the plate
+with a, b the leakage of p into H and of s into V, rho the error of the metal reference, w the rise of the plate
 relative to the metal's and G its effect on ln(V / H) (H and V are lit from other points), kappa the patch's brightness
 relative to an ideal one (thickness, roughness, illumination). A plate that rises by w across the plane of incidence
 turns the polarisations: it has a and b of its own, larger and smaller by `turn` w. (With the plate's normal in the
 plane of x and k, s turns by w, and both waves meet it at sin(theta) w; metal is not changed.) r_s and r_p follow from t
-and the incidence angle by Eq. 2 and 3. Unknown are a, b, rho, g, G, the turn, the angle's error, the usual size of
+and the incidence angle by Eq. 2 and 3. Unknown are a, b, rho, G, the turn, the angle's error, the usual size of
 ln kappa, and t of every patch.
 
 The evidence is that of |V / H| and its phase; brightness is a nuisance of each plate, whose usual size the scene tells.
@@ -58,13 +57,13 @@ LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
 _GROUPS = {
-    "metal reference": (4, 5, 10, 11, 12, 13),
+    "metal reference": (4, 5),
     "leakage": (0, 1, 2, 3, 9),
     "incidence": (6,),
-    "tilt": (15, 16, 17, 18),
+    "tilt": (11, 12, 13, 14),
 }
-# a, b, rho (2 each), angle, metal's brightness, size of brightness, moved, g (4), library's share, turn, G (3).
-_WIDTH = 19
+# a, b, rho (2 each), angle, metal's brightness, size of brightness, moved, library's share, turn, G (3).
+_WIDTH = 15
 _PARTICLES, _MOVES, _DRAWS = 600, 6, 8
 _LEAST_STD = 1e-6  # of a ratio: below it a covariance has no inverse in double precision
 
@@ -85,8 +84,6 @@ class PatchMeasurement:
         |H|; None if it is not used.
     relative_std
         Standard deviations of ln|V / H| and of its phase by what scatters over the plate: edges, ripple, tilt.
-    place_m
-        Centre relative to the metal's, x and y.
     rise
         Rise of the plate along x and across the plane of incidence, radians.
     """
@@ -96,7 +93,6 @@ class PatchMeasurement:
     theta_rad: float
     brightness: float | None = None
     relative_std: tuple[float, float] = (0.0, 0.0)
-    place_m: tuple[float, float] = (0.0, 0.0)
     rise: tuple[float, float] = (0.0, 0.0)
 
     @property
@@ -126,9 +122,6 @@ class RigPrior:
         Relative standard deviation of metal's V / H, each part.
     brightness_range
         Range of the standard deviation of ln |H| relative to Eq. 2, of single patches.
-    gradient, gradient_std
-        Change of ln(V / H) along x and y, per metre, as the plates show it, and its standard deviation: real parts
-        of the amplitude, imaginary parts of the phase.
     moved
         Probability that a mount whose leakage was measured has moved since.
     metal_rise
@@ -146,8 +139,6 @@ class RigPrior:
     channels_known: bool = False
     reference_std: float = 0.01
     brightness_range: tuple[float, float] = BRIGHTNESS_RANGE
-    gradient: tuple[complex, complex] = (0j, 0j)
-    gradient_std: tuple[complex, complex] = (0j, 0j)
     moved: float = 0.0
     metal_rise: tuple[float, float] = (0.0, 0.0)
     turn: float = TURN
@@ -208,8 +199,6 @@ class Inversion:
         ln of |H| over Eq. 2's of each patch, relative to the scene's; NaN if it was not used.
     brightness_std
         Usual size of the same in this scene.
-    gradient
-        Change of ln(V / H) along x and y, per metre.
     nuisance_covariance
         float64 [7, 7] of a, b, rho (real and imaginary parts) and the angle, in standard deviations of their prior.
     """
@@ -222,7 +211,6 @@ class Inversion:
     theta_std_rad: float
     brightness_off: Real
     brightness_std: float
-    gradient: tuple[complex, complex]
     nuisance_covariance: Real = field(repr=False)
 
     @property
@@ -276,7 +264,6 @@ class _Scene:
     def __init__(self, seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None) -> None:
         self.prior, self.kinds, self.n = prior, kinds, len(seen)
         self.q = np.array([s.inverse_ratio for s in seen], np.complex128)
-        self.place = np.array([s.place_m for s in seen], np.float64).reshape(-1, 2)
         self.rise = np.array([s.rise for s in seen], np.float64).reshape(-1, 2)
         self.theta = np.array([s.theta_rad for s in seen], np.float64)
         level = np.array([np.nan if s.brightness is None else s.brightness for s in seen], np.float64)
@@ -327,21 +314,15 @@ class _Scene:
     def leakage_of_patches(self, z: Real) -> tuple[Complex, Complex]:
         """Return a and b of each patch as its rise turns the polarisations, [..., patch] each."""
         a, b = self.leakage(z)
-        turned_by = (self.prior.turn + self.prior.turn_std * z[..., 15, None]) * self.rise[:, 1]
+        turned_by = (self.prior.turn + self.prior.turn_std * z[..., 11, None]) * self.rise[:, 1]
         return a + turned_by, b - turned_by
 
     def lighting(self, z: Real) -> Complex:
         """Return the change of ln(V / H) of each patch by its rise relative to the metal's, [..., patch]."""
         along, across = self.prior.lighting_std
         rise = self.rise - np.array(self.prior.metal_rise)
-        by_across = across * (z[..., 16, None] + 0.1j * z[..., 17, None])
-        return along * z[..., 18, None] * rise[:, 0] + by_across * rise[:, 1]
-
-    def gradient(self, z: Real) -> Complex:
-        """Return the change of ln(V / H) along x and y, per metre, [..., 2]."""
-        mean = np.array(self.prior.gradient)
-        std = pair(self.prior.gradient_std)
-        return mean + std[:, 0] * z[..., 10:12] + 1j * std[:, 1] * z[..., 12:14]
+        by_across = across * (z[..., 12, None] + 0.1j * z[..., 13, None])
+        return along * z[..., 14, None] * rise[:, 0] + by_across * rise[:, 1]
 
     def angle(self, z: Real) -> Real:
         """Return the true angles, [..., patch]."""
@@ -351,7 +332,7 @@ class _Scene:
         """Return t of every patch, [..., patch]."""
         a, b = self.leakage_of_patches(z)
         rho = self.prior.reference_std * (z[..., 4, None] + 1j * z[..., 5, None])
-        return true_ratio(self.q * np.exp(-(self.gradient(z) @ self.place.T) - self.lighting(z)), a, b, rho)
+        return true_ratio(self.q * np.exp(-self.lighting(z)), a, b, rho)
 
     def ratios_of_kinds(self, z: Real, kinds: Kinds) -> Complex:
         """Return t that each patch would have at the angle of the kinds, [..., patch]."""
@@ -382,7 +363,7 @@ class _Scene:
         if self.kinds is None or not self.kinds.ours.any():
             return np.full(z.shape[:-1], 1e-12)
         low, high = LIBRARY_SHARE
-        return low + (high - low) * scipy.special.ndtr(z[..., 14])
+        return low + (high - low) * scipy.special.ndtr(z[..., 10])
 
     def log_likelihoods(self, z: Real) -> Real:
         """Return log likelihoods [..., 1 + patch]: of all brightnesses, and of each patch to be some material."""
@@ -471,7 +452,6 @@ def _solution(model: _Scene, z: Real, patches: tuple[PatchEstimate, ...]) -> Inv
     everything = np.cov(np.concatenate([parts, z[:, 4:7]], axis=1).T)
     spread = unit * np.sqrt(np.diag(everything)[:4])
     off = np.where(model.bright, np.median(model.brightness_off(z), axis=0), np.nan)
-    gx, gy = (complex(g) for g in model.gradient(z).mean(axis=0))
     return Inversion(
         patches,
         (complex(a.mean()), complex(b.mean())),
@@ -481,7 +461,6 @@ def _solution(model: _Scene, z: Real, patches: tuple[PatchEstimate, ...]) -> Inv
         float(prior.theta_std_rad * np.std(z[:, 6])),
         np.asarray(off, np.float64),
         float(np.exp(np.log(model.brightness_std(z)).mean())),
-        (gx, gy),
         everything,
     )
 

@@ -41,8 +41,11 @@ TILT_STD = 0.004
 
 A tilted plate is illuminated from other points, different for H and V; one degree of tilt spreads the phase by 0.3 rad.
 """
-GRADIENT_STD = 0.3 + 0.3j
-"""Prior standard deviation of the change of ln(V / H) over the plane, per metre: 10 % and 5 degrees over 300 mm."""
+SLOPE_STD, BEND_STD = 0.3, 3.0
+"""Prior standard deviations of the change of ln|V / H| and of its phase over the plane, per metre: 10 % and 5 degrees
+over 300 mm, and of its own change, per square metre: as much over 100 mm."""
+RIPPLE_M = 0.03
+"""Error of a plate's ln(V / H) by ripple of the scene, over the scatter of the plates' slopes: half a plate's width."""
 Real = npt.NDArray[np.float64]
 
 LEAST_PIXELS = 12
@@ -198,28 +201,68 @@ def usual_scatter(all_plates: Sequence[Scatter]) -> tuple[float, float]:
     return float(np.median([s.amplitude for s in all_plates])), float(np.median([s.phase for s in all_plates]))
 
 
-def common_gradient(all_plates: Sequence[Scatter]) -> tuple[tuple[complex, complex], tuple[complex, complex]]:
-    """Return the change of ln(V / H) per metre that all plates of a scene share, along x and y, and its deviation.
+@dataclass(frozen=True)
+class CommonChange:
+    """How ln(V / H) changes over the plane alike for all plates: drift of the gains, boards out of place.
 
-    It is the mean of the plates' slopes, weighted with their precision and that of the prior (zero, `GRADIENT_STD`).
-    Slopes that scatter more than they should make it less certain.
+    Attributes
+    ----------
+    slope, bend
+        complex [2]: per metre along x and y at `origin_m`, and their own change per metre.
+    slope_std, bend_std
+        complex [2]: standard deviations of the real and of the imaginary parts.
+    ripple
+        Scatter of the plates' slopes about it beyond their errors, per metre: real and imaginary part.
+    origin_m
+        Where `slope` holds, x and y: the metal.
     """
-    mean, deviation = [], []
+
+    slope: npt.NDArray[np.complex128]
+    bend: npt.NDArray[np.complex128]
+    slope_std: npt.NDArray[np.complex128]
+    bend_std: npt.NDArray[np.complex128]
+    ripple: complex
+    origin_m: tuple[float, float]
+
+    def at(self, place_m: tuple[float, float]) -> tuple[complex, tuple[float, float]]:
+        """Return ln(V / H) at a place relative to the origin, and the standard deviations of both of its parts."""
+        off = np.array(place_m) - np.array(self.origin_m)
+        value = complex(np.sum(self.slope * off + self.bend * off**2 / 2))
+        parts = [np.hypot(part(self.slope_std) * off, part(self.bend_std) * off**2 / 2) for part in (np.real, np.imag)]
+        ripple = self.ripple.real, self.ripple.imag
+        amplitude, phase = (
+            float(np.hypot(np.sqrt(np.sum(p**2)), RIPPLE_M * r)) for p, r in zip(parts, ripple, strict=True)
+        )
+        return value, (amplitude, phase)
+
+
+def common_change(plates: Sequence[Scatter], origin_m: tuple[float, float]) -> CommonChange:
+    """Return what the slopes of all plates of a scene tell of the change of ln(V / H) over the plane.
+
+    Along each axis the slope is a line, fitted to the plates' slopes with their precision and a prior of zero.
+    """
+    fits = np.zeros((2, 2, 2))
+    deviations = np.zeros((2, 2, 2))
+    ripple2 = np.zeros(2)
     for axis in (0, 1):
-        parts = []
-        for part, prior_std in ((np.real, GRADIENT_STD.real), (np.imag, GRADIENT_STD.imag)):
-            slopes = np.array([part(s.slope[axis]) for s in all_plates])
-            precision = np.array([1 / max(part(s.slope_std[axis]), 1e-6) ** 2 for s in all_plates])
-            total = precision.sum() + prior_std**-2
-            value = float((precision * slopes).sum() / total)
-            excess = 1.0
-            if slopes.size > 1:
-                excess = max(1.0, float((precision * (slopes - value) ** 2).sum()) / (slopes.size - 1))
-            std = min(float(np.sqrt(excess / total)), prior_std)
-            parts.append((value, std))
-        mean.append(complex(parts[0][0], parts[1][0]))
-        deviation.append(complex(parts[0][1], parts[1][1]))
-    return (mean[0], mean[1]), (deviation[0], deviation[1])
+        place = np.array([s.centre_m[axis] - origin_m[axis] for s in plates])
+        design = np.stack([np.ones_like(place), place], axis=1)
+        for k, part in enumerate((np.real, np.imag)):
+            slopes = np.array([part(s.slope[axis]) for s in plates])
+            std = np.maximum([part(s.slope_std[axis]) for s in plates], 1e-6)
+            weighed = design / np.square(std)[:, None]
+            information = weighed.T @ design + np.diag([SLOPE_STD**-2, BEND_STD**-2])
+            covariance = np.linalg.inv(information)
+            fits[k, axis] = covariance @ (weighed.T @ slopes)
+            left = slopes - design @ fits[k, axis]
+            freedom = max(slopes.size - 2, 1)
+            ripple2[k] += max(0.0, float(np.sum(left**2 - std**2)) / freedom) / 2
+            excess = max(1.0, float(np.sum((left / std) ** 2)) / freedom)
+            deviations[k, axis] = np.minimum(np.sqrt(excess * np.diag(covariance)), [SLOPE_STD, BEND_STD])
+    value = fits[0] + 1j * fits[1]
+    std = deviations[0] + 1j * deviations[1]
+    ripple = complex(*np.sqrt(ripple2))
+    return CommonChange(value[:, 0], value[:, 1], std[:, 0], std[:, 1], ripple, origin_m)
 
 
 def relative_errors(own: Scatter | None, usual: tuple[float, float]) -> tuple[float, float]:
@@ -239,7 +282,7 @@ def measure_patch(
     theta_rad: float,
     scatter: Scatter | None = None,
     usual: tuple[float, float] = (0.0, 0.0),
-    metal_m: tuple[float, float] | None = None,
+    change: CommonChange | None = None,
     local_std: float = 0.0,
     rise: tuple[float, float] = (0.0, 0.0),
 ) -> PatchMeasurement:
@@ -255,8 +298,8 @@ def measure_patch(
         Its angle of incidence.
     scatter, usual
         The patch's :func:`scatter_of`, and the scene's :func:`usual_scatter`.
-    metal_m
-        Centre of the metal reference; None if the reference covers the plane.
+    change
+        Common change of ln(V / H) over the plane, which is removed; None if the reference covers the plane.
     local_std
         Relative error of a metal reference that varies over the plane; 0 if it is a single number.
     rise
@@ -269,12 +312,13 @@ def measure_patch(
     level = level[np.isfinite(level)]
     std = float(np.hypot(LEAST_STD, TILT_STD * _phase_spread(h[at])))
     amplitude, phase = relative_errors(scatter, usual)
+    if scatter is not None and change is not None:
+        common, (more_amplitude, more_phase) = change.at(scatter.centre_m)
+        inverse *= complex(np.exp(-common))
+        amplitude, phase = float(np.hypot(amplitude, more_amplitude)), float(np.hypot(phase, more_phase))
     relative = float(np.hypot(amplitude, local_std)), float(np.hypot(phase, local_std))
-    place = (0.0, 0.0)
-    if scatter is not None and metal_m is not None:
-        place = (scatter.centre_m[0] - metal_m[0], scatter.centre_m[1] - metal_m[1])
     brightness = float(np.median(level)) if level.size else None
-    return PatchMeasurement(inverse, std, theta_rad, brightness, relative, place, rise)
+    return PatchMeasurement(inverse, std, theta_rad, brightness, relative, rise)
 
 
 def own_std(h: Image, v: Image) -> float:

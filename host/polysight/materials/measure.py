@@ -41,9 +41,9 @@ TILT_STD = 0.004
 
 A tilted plate is illuminated from other points, different for H and V; one degree of tilt spreads the phase by 0.3 rad.
 """
-SLOPE_STD, BEND_STD = 0.3, 3.0
-"""Prior standard deviations of the change of ln|V / H| and of its phase over the plane, per metre: 10 % and 5 degrees
-over 300 mm, and of its own change, per square metre: as much over 100 mm."""
+CHANGES = ((0.05, 0.3), (0.15, 1.0), (0.5, 4.0))
+"""Prior standard deviations of the change of ln|V / H| and of its phase over the plane, per metre, and of its own
+change, per square metre: of a stable rig, of the usual one, and of one that drifts by 15 % and 9 degrees in 300 mm."""
 RIPPLE_M = 0.03
 """Error of a plate's ln(V / H) by ripple of the scene, over the scatter of the plates' slopes: half a plate's width."""
 Real = npt.NDArray[np.float64]
@@ -239,30 +239,41 @@ class CommonChange:
 def common_change(plates: Sequence[Scatter], origin_m: tuple[float, float]) -> CommonChange:
     """Return what the slopes of all plates of a scene tell of the change of ln(V / H) over the plane.
 
-    Along each axis the slope is a line, fitted to the plates' slopes with their precision and a prior of zero.
+    Along each axis the slope is a line. How large the change may be is not known before: the posteriors under each of
+    `CHANGES` are averaged with the evidence of each.
     """
-    fits = np.zeros((2, 2, 2))
-    deviations = np.zeros((2, 2, 2))
+    value = np.zeros((2, 2), np.complex128)
+    std = np.zeros((2, 2), np.complex128)
     ripple2 = np.zeros(2)
     for axis in (0, 1):
         place = np.array([s.centre_m[axis] - origin_m[axis] for s in plates])
         design = np.stack([np.ones_like(place), place], axis=1)
-        for k, part in enumerate((np.real, np.imag)):
-            slopes = np.array([part(s.slope[axis]) for s in plates])
-            std = np.maximum([part(s.slope_std[axis]) for s in plates], 1e-6)
-            weighed = design / np.square(std)[:, None]
-            information = weighed.T @ design + np.diag([SLOPE_STD**-2, BEND_STD**-2])
-            covariance = np.linalg.inv(information)
-            fits[k, axis] = covariance @ (weighed.T @ slopes)
-            left = slopes - design @ fits[k, axis]
-            freedom = max(slopes.size - 2, 1)
-            ripple2[k] += max(0.0, float(np.sum(left**2 - std**2)) / freedom) / 2
-            excess = max(1.0, float(np.sum((left / std) ** 2)) / freedom)
-            deviations[k, axis] = np.minimum(np.sqrt(excess * np.diag(covariance)), [SLOPE_STD, BEND_STD])
-    value = fits[0] + 1j * fits[1]
-    std = deviations[0] + 1j * deviations[1]
+        for k, (part, unit) in enumerate(((np.real, 1), (np.imag, 1j))):
+            slopes = np.array([part(s.slope[axis]) for s in plates], np.float64)
+            noise = np.maximum([part(s.slope_std[axis]) for s in plates], 1e-6)
+            fit, deviation = _averaged_line(design, slopes, noise)
+            value[axis] += unit * fit
+            std[axis] += unit * deviation
+            left = slopes - design @ fit
+            ripple2[k] += max(0.0, float(np.sum(left**2 - noise**2)) / max(slopes.size - 2, 1)) / 2
     ripple = complex(*np.sqrt(ripple2))
     return CommonChange(value[:, 0], value[:, 1], std[:, 0], std[:, 1], ripple, origin_m)
+
+
+def _averaged_line(design: Real, slopes: Real, noise: Real) -> tuple[Real, Real]:
+    """Return mean and standard deviation [2] of the coefficients of a line, over the priors of `CHANGES`."""
+    fits, variances, evidences = [], [], []
+    for prior in CHANGES:
+        total = np.diag(noise**2) + design * np.square(prior) @ design.T
+        gain = np.square(prior)[:, None] * design.T @ np.linalg.inv(total)
+        fits.append(gain @ slopes)
+        variances.append(np.diag(np.diag(np.square(prior)) - gain @ design * np.square(prior)))
+        evidences.append(-0.5 * float(slopes @ np.linalg.solve(total, slopes)) - 0.5 * np.linalg.slogdet(total)[1])
+    weight = np.exp(np.array(evidences) - max(evidences))
+    weight /= weight.sum()
+    mean = weight @ np.array(fits)
+    square = weight @ (np.array(variances) + np.square(fits))
+    return mean, np.sqrt(np.maximum(square - mean**2, 0.0))
 
 
 def relative_errors(own: Scatter | None, usual: tuple[float, float]) -> tuple[float, float]:

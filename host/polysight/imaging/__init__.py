@@ -35,7 +35,6 @@ from polysight.imaging.images import (
     correct_tilt,
     illumination_geometry,
     needed_gate_m,
-    phase_rise,
     sub_bands,
 )
 from polysight.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, Focus, PlaneEstimate, focus_sweep, move_to_plane
@@ -86,7 +85,6 @@ __all__ = [
     "imaging_facts",
     "move_to_plane",
     "needed_gate_m",
-    "phase_rise",
     "point_response",
     "project",
     "reduction",

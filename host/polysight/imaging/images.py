@@ -118,9 +118,18 @@ class Illumination:
         `h`, `v` complex [ny, nx] are reflectivities (conjugates of the samples), `mask` bool [ny, nx] is the inside of
         the patch.
         """
-        rise = phase_rise(h, v, mask, self.pixel_m, float(self.steepness_rad_m.mean()))
-        x, y = (slope if abs(slope) < MAX_RISE else 0.0 for slope in rise)
-        return x, y
+        out = []
+        for along in (0, 1):
+            # The phase of the conjugate falls where the plate rises.
+            step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in (h, v)) / 2
+            slope = float(np.angle(step)) / self.pixel_m[along] / float(self.steepness_rad_m.mean())
+            out.append(slope if abs(step) > _COHERENT else 0.0)
+        return out[0], out[1]
+
+    @property
+    def known(self) -> bool:
+        """True if the footprints are those of a recorded scan, not taken as even."""
+        return bool(np.ptp(np.abs(self.footprints)) > 0)
 
     def to_level(self, mask: Mask, rise: Rise) -> NDArray[np.float64]:
         """Return factors [2, n] that convert H and V of a patch's pixels to those of a level plate.
@@ -215,7 +224,8 @@ class Images:
         """Return the images with the tilt of one plate, bool [ny, nx], corrected."""
         if self.illumination is None:
             return self
-        return correct_tilt(self, [plate], [self.illumination.rise(self.h, self.v, plate)])
+        rise = self.illumination.rise(self.h, self.v, plate)
+        return correct_tilt(self, [plate], [rise]) if max(map(abs, rise)) <= MAX_RISE else self
 
 
 def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -> tuple[NDArray[np.float64], float]:
@@ -248,29 +258,6 @@ def correct_tilt(images: Images, masks: Sequence[Mask], rises: Sequence[Rise]) -
         h[mask] *= factor_h
         v[mask] *= factor_v
     return replace(images, h=h, v=v)
-
-
-def phase_rise(h: Image, v: Image, mask: Mask, pixel_m: tuple[float, float], steepness_rad_m: float) -> Rise:
-    """Estimate the rise of a patch along x and y from its phase, radians; NaN where the phase is not even.
-
-    Parameters
-    ----------
-    h, v
-        complex [ny, nx]: reflectivities (conjugates of the samples).
-    mask
-        bool [ny, nx]: the inside of the patch.
-    pixel_m
-        Pixel along x and y.
-    steepness_rad_m
-        Phase per metre of height, 2 k cos(theta).
-    """
-    out = []
-    for along in (0, 1):
-        # The phase of the conjugate falls where the plate rises.
-        step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in (h, v)) / 2
-        slope = float(np.angle(step)) / pixel_m[along] / steepness_rad_m
-        out.append(slope if abs(step) > _COHERENT else float("nan"))
-    return out[0], out[1]
 
 
 def _step(image: Image, mask: Mask, axis: int) -> complex:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.imaging import MAX_RISE, Image, Images, Rise, correct_tilt, phase_rise
+from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise, correct_tilt
 from polysight.materials.classify import (
     DISCRIMINANT,
     UNKNOWN,
@@ -77,7 +77,6 @@ from polysight.polarimetry import (
 from polysight_shared.config import Instrument
 from polysight_shared.errors import DataError
 from polysight_shared.findings import Finding
-from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 LEAST_LEAKAGE_STD = 5e-4
 """Least standard deviation of the leakage, whatever the rig file says."""
@@ -98,14 +97,11 @@ class Optics:
     smooth_px
         Width (standard deviation, pixels) of the filter against speckle before permittivity and classification,
         inside each patch.
-    steepness_rad_m
-        Phase per metre of height, 2 k cos(theta), to estimate tilts in images without illumination; None: not known.
     """
 
     theta_rad: npt.ArrayLike
     prior: RigPrior = MEASURED_RIG
     smooth_px: float = 2.0
-    steepness_rad_m: float | None = None
 
     @classmethod
     def of(
@@ -127,8 +123,7 @@ class Optics:
             channels_known=channels_known,
             moved=0.0 if p.leakage_std is None else MOVED,
         )
-        wave = 2 * np.pi * (rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2) / SPEED_OF_LIGHT_M_S
-        return cls(angles.used_rad, prior, p.smooth_px, float(2 * wave * np.cos(np.mean(angles.used_rad))))
+        return cls(angles.used_rad, prior, p.smooth_px)
 
 
 @dataclass(frozen=True)
@@ -160,33 +155,26 @@ class KnownScene:
         return self.metal if isinstance(self.metal, PlaneReference) else None
 
 
-def level(
-    images: Images, found: Segmentation, tilts: Tilts | None = None, steepness_rad_m: float | None = None
-) -> tuple[Images, Tilts]:
+def level(images: Images, found: Segmentation, tilts: Tilts | None = None) -> tuple[Images, Tilts]:
     """Correct the illumination of each patch for its tilt; return the images and the tilts, as given or estimated.
 
-    Tilts are estimated from the phase. Without the illumination of the plane the images are returned unchanged; the
-    tilts are those of `steepness_rad_m`, the phase per metre of height, if it is known.
+    Without the illumination of the plane the images are returned unchanged, and no tilt is known.
     """
-    illumination = images.illumination
-    if illumination is None:
-        return images, tilts or _tilts(images, found, steepness_rad_m)
+    if images.illumination is None:
+        return images, Tilts({}, 1)
     if tilts is None:
-        tilts = replace(_tilts(images, found, float(illumination.steepness_rad_m.mean())), across=illumination.across)
+        tilts = _tilts(images, images.illumination, found)
     there = [p for p in found.patches if p.label in tilts.rises]
     masks, own = [p.mask for p in there], [tilts.rises[p.label] for p in there]
     return correct_tilt(images, masks, own), tilts
 
 
-def _tilts(images: Images, found: Segmentation, steepness_rad_m: float | None) -> Tilts:
-    """Estimate the rise of each patch; patches that are steeper than what is modelled, or uneven, are marked."""
-    if steepness_rad_m is None:
-        return Tilts({}, 1)
-    pixel_m = abs(float(images.x_m[1] - images.x_m[0])), abs(float(images.y_m[1] - images.y_m[0]))
-    rises = {p.label: phase_rise(images.h, images.v, p.interior, pixel_m, steepness_rad_m) for p in found.patches}
+def _tilts(images: Images, illumination: Illumination, found: Segmentation) -> Tilts:
+    """Estimate the rise of each patch from its phase; patches that are steeper than what is modelled are marked."""
+    rises = {p.label: illumination.rise(images.h, images.v, p.interior) for p in found.patches}
     steep = frozenset(label for label, rise in rises.items() if max(map(abs, rise)) > MAX_RISE)
     known = {label: (_modelled(x), _modelled(y)) for label, (x, y) in rises.items()}
-    return Tilts(known, 1, steep)
+    return Tilts(known, illumination.across, steep)
 
 
 def _modelled(rise: float) -> float:
@@ -222,7 +210,7 @@ def analyse(
         plane.check_axes(images.x_m, images.y_m)
         images = images.within(plane.valid)
     found = _patches(images, known)
-    images, tilts = level(images, found, steepness_rad_m=optics.steepness_rad_m)
+    images, tilts = level(images, found)
     reference = _reference(images, known, found)
     raw = to_metal(images, reference, plane)
     rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
@@ -318,7 +306,7 @@ class Seen:
         known = [*scatter.values(), *([] if metal is None else [metal])]
         spread = None if plane is None else plane.spread
         metal_rise = (0.0, 0.0) if reference.label is None else tilts.in_plane(reference.label)
-        evenly = images.illumination is not None
+        evenly = images.illumination is not None and images.illumination.known
         change = None if metal is None else common_change(known, metal.centre_m)
         return cls(scatter, usual_scatter(known), metal, change, spread, tilts, evenly, metal_rise)
 

@@ -70,17 +70,17 @@ def test_tilts_follow_a_transposed_image(tilted):
         assert np.sort(swapped, axis=1) == pytest.approx(np.sort(factors, axis=1), rel=1e-6)
 
 
-def test_noise_and_too_steep_phases_give_no_tilt():
+def test_noise_gives_no_tilt_and_steep_phases_are_told():
     rng = np.random.default_rng(1)
     flat = np.ones((2, 40, 40), np.complex64)
     lit = Illumination(flat, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))
     mask = np.ones((40, 40), bool)
     noise = rng.standard_normal((40, 80)).view(np.complex128)
     assert lit.rise(noise, noise, mask) == (0.0, 0.0)
-    for slope, expected in ((0.02, 0.02), (0.08, 0.0)):
+    for slope in (0.02, 0.08):
         along = np.exp(-1j * slope * 1900 * 2e-3 * np.arange(40))
         image = np.tile(along, (40, 1)).astype(np.complex128)
-        assert lit.rise(image, image, mask) == pytest.approx((expected, 0.0))
+        assert lit.rise(image, image, mask) == pytest.approx((slope, 0.0))
 
 
 def test_correction_factors_stay_finite_at_the_edge_of_the_illumination():

@@ -128,7 +128,8 @@ def write_labels(
         0.001 * (rng.standard_normal((PIXELS, PIXELS)) + 1j * rng.standard_normal((PIXELS, PIXELS))) for _ in "hv"
     ]
     gains = [rng.uniform(0.5, 2.0) * np.exp(2j * np.pi * rng.uniform()) for _ in "hv"]
-    distance = np.exp(2j * np.pi * np.add.outer(*2 * [np.arange(PIXELS) / 31.0]))  # a phase common to both channels
+    # A phase common to both channels: the scene is tilted by a tenth of a degree.
+    distance = np.exp(2j * np.pi * np.add.outer(*2 * [np.arange(PIXELS) / 900.0]))
     for name, (x0, y0, x1, y1) in boxes.items():
         h, v = draw_pixels(materials[name], angle_deg, (x1 - x0) * (y1 - y0), errors, rng)
         for image, pixels in zip(images, (h, v), strict=True):

@@ -31,9 +31,10 @@ Real = npt.NDArray[np.float64]
 
 CHANNEL_RATIO_STD_DB = 2.5
 """Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
-WEAK_V_DB = -7.0
-"""V / H relative to the direct path below which a patch is no metal: half spaces of eps' up to 10 have -8 dB or less,
-metal 0 dB, but for the patterns of the antennas (-4 dB with those of an independent generator)."""
+DOUBTFUL_V_DB, WEAK_V_DB = -4.5, -7.0
+"""V / H relative to the direct path below which a patch that nobody declared is no metal, and below which even a
+declared one is none: half spaces of eps' up to 10 have -8 dB or less, bare water -4 dB, metal 0 dB, but for the
+patterns of the antennas (-4 dB with those of an independent generator)."""
 SURE_SCORE = 3.0
 CONFLICT_SCORE = -3.0
 """Score below which the other patch that fits metal least is told."""
@@ -86,7 +87,8 @@ class MetalEvidence:
     @property
     def enough(self) -> bool:
         """True if the patch is shown to be metal."""
-        return self.score >= self.needed and not self.against
+        doubtful = self.channel_ratio_db is not None and self.channel_ratio_db < DOUBTFUL_V_DB
+        return self.score >= self.needed and not doubtful
 
 
 def metal_evidence(

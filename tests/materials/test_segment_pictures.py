@@ -109,14 +109,6 @@ def test_a_plate_at_the_border_is_cut_and_refused(x0, cut):
     assert (why is not None and "border" in why.what) is cut
 
 
-def test_the_border_of_the_valid_pixels_cuts_too():
-    plates = {(60, 60, 84, 84): (0.0, COPPER), (20, 60, 44, 84): (0.0, 0.25)}
-    valid = np.ones((SIDE, SIDE), bool)
-    valid[:, :30] = False
-    found = segment(*draw(1, plates), AXIS, AXIS, valid)
-    assert sorted(p.cut for p in found.patches) == [False, True]
-
-
 def refusal(h, v, box, amplitude_of_metal=0.0):
     found, _ = patches_from_labels({"plate": box}, AXIS, AXIS)
     patch = found.patches[0]

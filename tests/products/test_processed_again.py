@@ -22,14 +22,14 @@ from polysight_shared.tables import to_builtins
 from polysight_simulators.scene import decode_scene, simulate
 
 SCENE = scene_of(
-    {"name": "copper", "centre_mm": [-40.0, 0.0], "size_mm": [50.0, 60.0], "metal": True},
-    {"name": "mine", "centre_mm": [40.0, 0.0], "size_mm": [50.0, 60.0], "permittivity": [4.0, 0.4]},
+    {"name": "copper", "centre_mm": [-34.0, 0.0], "size_mm": [46.0, 60.0], "metal": True},
+    {"name": "mine", "centre_mm": [34.0, 0.0], "size_mm": [46.0, 60.0], "permittivity": [4.0, 0.4]},
     columns=14,
     rows=10,
     step_mm=(14.0, 12.0),
     image={"columns": 40, "rows": 30, "pixel_mm": 4.0},
 )
-METAL = ["--metal", "-40,0,30,40"]  # the leading minus does not make it an option
+METAL = ["--metal", "-36,0,30,40"]  # the leading minus does not make it an option
 
 
 @pytest.fixture(scope="module")

@@ -228,7 +228,8 @@ def analyse(
         evidence = metal_evidence(others, prior, channel, _kinds(None, float(np.mean(theta))))
         reference = replace(reference, evidence=evidence)
     inversion = invert(measured, prior, kinds)
-    calibrated = remove_leakage(raw, inversion.leakage)
+    # Of the pixels only leakage is removed that is known: an undetermined estimate leans on what the patches may be.
+    calibrated = remove_leakage(raw, inversion.leakage if inversion.leakage_determined else prior.leakage)
     sh, sv = (smooth_inside(c, found, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
     labels = [p.label for p in judged]

@@ -92,7 +92,7 @@ class Patch:
     mask, interior
         bool [ny, nx]: the patch, and its inside without the edges.
     cut
-        True if it was found and the border of the image or of its valid pixels cuts it.
+        True if it was found and the border of the image cuts it.
     """
 
     label: int
@@ -223,14 +223,18 @@ def segment(
     for mask in sorted(masks, key=lambda mask: _reading_order(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
         labels[mask] = len(patches) + 1
         patch = make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable)
-        patches.append(replace(patch, cut=_is_cut(mask, usable, cfg.smallest_mm / pixel_mm)))
+        patches.append(replace(patch, cut=_is_cut(mask, cfg.smallest_mm / pixel_mm)))
     return Segmentation(labels, tuple(patches), left_out)
 
 
-def _is_cut(mask: Mask, usable: Mask, smallest_px: float) -> bool:
-    """Return true if more than half of the smallest patch's width lies at the border of the usable pixels."""
-    inner = np.asarray(scipy.ndimage.binary_erosion(usable), bool)
-    return float((mask & ~inner).sum()) > smallest_px
+def _is_cut(mask: Mask, smallest_px: float) -> bool:
+    """Return true if more than the smallest patch's width lies at the border of the image.
+
+    Where the scan ends within the image, the footprint falls slowly: interiors end before it.
+    """
+    at_border = mask.copy()
+    at_border[1:-1, 1:-1] = False
+    return float(at_border.sum()) > smallest_px
 
 
 def _least_level_db(level: Real, cfg: SegmentSettings) -> float:

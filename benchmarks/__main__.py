@@ -9,7 +9,20 @@ from pathlib import Path
 
 from benchmarks.measure import one_thread_each
 
-NAMES = ("capture", "sync", "image", "whole", "waits", "scaling", "accuracy", "coverage", "layers", "picture", "pi")
+NAMES = (
+    "capture",
+    "sync",
+    "image",
+    "whole",
+    "waits",
+    "scaling",
+    "accuracy",
+    "coverage",
+    "layers",
+    "picture",
+    "worlds",
+    "pi",
+)
 
 
 def main(argv: list[str]) -> int:

@@ -293,7 +293,7 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
         )
         labels = read_labels(scans / name / "labels.json")
         assert labels.metal == "copper"
-        assert labels.boxes["my plastic"] == pytest.approx([28, -22, 52, 2], abs=1.5)
+        assert labels.boxes["my plastic"] == pytest.approx([24, -6, 48, 18], abs=1.5)
         page.whole()
     page.open("/")
     page.browser.value("document.querySelectorAll('#list input').forEach(i => i.click())")

@@ -1,0 +1,75 @@
+"""Error bars, names and metal in scenes of the independent generator, whose physics is not the simulator's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from benchmarks.worlds import CHI2_95, analyse_world, judge_world
+
+from polysight.materials import UNKNOWN
+from polysight_worlds import METAL, Plate, Stack, World, published_rig, simulate
+from polysight_worlds.world import nine_places
+
+SIZE_M = (0.046, 0.046)
+
+
+def world(*stacks: Stack, **of_last: float) -> World:
+    """Copper and plates of these stacks, side by side; `of_last` changes the last one."""
+    places = nine_places(tuple(published_rig().centre_m))
+    plates = [Plate("copper", places[4], SIZE_M, METAL)]
+    for number, (stack, place) in enumerate(zip(stacks, [places[3], places[5], places[1], places[7]], strict=False)):
+        plates.append(Plate(f"plate {number}", place, SIZE_M, stack))
+    plates[-1] = replace(plates[-1], **of_last)
+    return World(tuple(plates))
+
+
+def half_space(permittivity: complex) -> Stack:
+    return Stack(below=permittivity)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("nuisance", "least"), [("none", 0.85), ("tilt", 0.8), ("leakage", 0.8), ("height", 0.8)])
+def test_regions_hold_the_truth_and_sure_names_are_right(nuisance, least):
+    patches = [p for seed in (20, 21) for p in judge_world(nuisance, seed)]
+    distances = np.array([p.distance2 for p in patches if p.distance2 is not None])
+    assert distances.size >= 0.8 * len(patches)
+    assert np.mean(distances < CHI2_95) >= least
+    wrong = [p for p in patches if p.name not in (UNKNOWN, p.material) and p.confidence >= 0.9]
+    assert not wrong
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", [(5.0, 0.0), (0.0, 5.0)], ids=["along", "across"])
+def test_a_plate_tilted_beyond_what_is_modelled_gets_no_permittivity(degrees):
+    scene = world(half_space(3.5 - 0.3j), half_space(4 - 0.4j), tilt_x_deg=degrees[0], tilt_y_deg=degrees[1])
+    found, plates = analyse_world(simulate(scene))
+    for patch in found.patches:
+        if plates[patch.patch.label].name == "plate 1":
+            assert patch.refused is not None
+            assert "tilted" in patch.refused.what
+        elif plates[patch.patch.label].name == "plate 0":
+            assert patch.refused is None
+            assert abs(patch.permittivity.value - (3.5 - 0.3j)) < 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "beside",
+    [
+        Stack(((2.6 - 0.02j, 0.8e-3),), 1.0),
+        Stack(((5.0 - 0.1j, 3e-3),), 9.4 - 18j),
+        half_space(12 - 9j),
+    ],
+    ids=["a thin sheet", "liquid behind glass", "a lossy plate"],
+)
+def test_declared_copper_is_never_withdrawn(beside):
+    found, _ = analyse_world(simulate(world(half_space(4 - 0.4j), beside)))
+    assert not found.metal.evidence.against
+    assert found.metal.certain or found.metal.evidence.culprit is not None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("eps", [2.6 - 0.01j, 4 - 0.4j, 5 - 1.1j])
+def test_a_dielectric_declared_as_metal_is_found_out(eps):
+    found, _ = analyse_world(simulate(world(half_space(3.0 - 0.1j), half_space(eps))), declared="plate 1")
+    assert found.metal.evidence.against

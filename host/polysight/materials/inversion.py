@@ -521,7 +521,8 @@ def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real
     """
     t = np.asarray(t, np.complex128)
     scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
-    by = np.stack([-(1 - t) * t, -(1 - t), -t], axis=-1) * scale
+    with np.errstate(invalid="ignore"):  # pixels without a ratio stay so
+        by = np.stack([-(1 - t) * t, -(1 - t), -t], axis=-1) * scale
     both = np.stack([by, 1j * by], axis=-1).reshape(*t.shape, 6)
     values, vectors = np.linalg.eigh(estimate.nuisance_covariance[:6, :6])
     return np.stack([both.real, both.imag], axis=-2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))

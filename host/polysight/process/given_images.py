@@ -23,6 +23,7 @@ import scipy
 from polysight.imaging import UNKNOWN_PLANE, Antennas, Illumination, Images, illumination_geometry
 from polysight.materials import (
     Labels,
+    MaterialsResult,
     Optics,
     TruthPlate,
     analyse,
@@ -373,6 +374,22 @@ def given_reasons(pair: GivenPair, angle: Angle) -> list[Finding]:
     return out
 
 
+CONJUGATED = reason(
+    "care", "the phases of the images have the other sign: they were conjugated",
+    "with their own sign the patches fit materials less well: some would amplify",
+    "save the images with the phase of r_s / r_p for eps' - j eps''", 1.2,
+)  # fmt: skip
+BETTER_SIGN = 1.0
+"""Difference of the metal reference's log evidence by which the other sign of the phases is taken."""
+
+
+def fits_better(one: MaterialsResult, other: MaterialsResult) -> bool:
+    """Return true if the patches of one result are clearly more plausible materials beside the metal reference."""
+    if one.metal.evidence is None or other.metal.evidence is None:
+        return False
+    return one.metal.evidence.score > other.metal.evidence.score + BETTER_SIGN
+
+
 def reference_of(pair: GivenPair) -> PlaneReference:
     """Return the metal reference that given images of a plate make. Raises DataError if they show none."""
     return plane_reference(pair.images, name=pair.scan_id)
@@ -404,8 +421,14 @@ def analyse_given_images(
     optics = Optics.of(
         rig, IncidenceChoice("one", everywhere, everywhere), theta_std_rad=UNKNOWN_PLANE.incidence_std_rad(rig)
     )
-    found = analyse(images, optics, replace(known, plates=plates), classifier)
-    verdict = verdict_of([*given_reasons(pair, angle), *scene_reasons(found, None, classifier)])
+    known = replace(known, plates=plates)
+    found = analyse(images, optics, known, classifier)
+    turned = replace(images, h=images.h.conj(), v=images.v.conj())
+    otherwise = analyse(turned, optics, known, classifier)
+    sign: list[Finding] = []
+    if fits_better(otherwise, found):
+        found, images, sign = otherwise, turned, [CONJUGATED]
+    verdict = verdict_of([*given_reasons(pair, angle), *sign, *scene_reasons(found, None, classifier)])
     shown = found if verdict.usable else found.without_result()
     findings = Findings(images, shown, verdict, UNKNOWN_PLANE, classifier, plates)
     quality = ScanQuality(

@@ -47,6 +47,7 @@ from polysight.materials.measure import (
     check_patches,
     common_change,
     measure_patch,
+    median_ratio,
     permittivity_of_patch,
     relative_errors,
     scatter_of,
@@ -352,9 +353,10 @@ def _names(
     named = {}
     for patch, estimate in zip(judged, inversion.patches, strict=True):
         at = patch.interior
-        inverse = at_angle(
-            1 / p[at].astype(np.complex128), _angle(theta, patch) + inversion.theta_error_rad, kinds.theta_rad
-        )
+        # Pixels get the corrections of their patch: leakage, tilt, and the common change over the plane.
+        corrected = estimate.inverse_ratio * median_ratio(h[at], v[at])
+        angle = _angle(theta, patch) + inversion.theta_error_rad
+        inverse = at_angle(corrected / p[at].astype(np.complex128), angle, kinds.theta_rad)
         if classifier.model == DISCRIMINANT:
             name = name_patch(kinds, estimate, inverse)
         else:

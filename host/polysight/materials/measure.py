@@ -44,7 +44,7 @@ A tilted plate is illuminated from other points, different for H and V; one degr
 CHANGES = ((0.05, 0.3), (0.15, 1.0), (0.5, 4.0))
 """Prior standard deviations of the change of ln|V / H| and of its phase over the plane, per metre, and of its own
 change, per square metre: of a stable rig, of the usual one, and of one that drifts by 15 % and 9 degrees in 300 mm."""
-RIPPLE_M = 0.03
+RIPPLE_M = 0.02
 """Error of a plate's ln(V / H) by ripple of the scene, over the scatter of the plates' slopes: half a plate's width."""
 Real = npt.NDArray[np.float64]
 

@@ -167,6 +167,7 @@ def line_of(title: str, patches: Sequence[PatchFigures]) -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the benchmark."""
     parser.add_argument("--scenes", type=int, default=1, help="scenes for each nuisance")
+    parser.add_argument("--first", type=int, default=100, help="seed of the first scene")
     parser.add_argument("--nuisances", default=",".join(("none", *NUISANCES, "all")), help="separated by commas")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--json", type=Path, default=None, help="write the figures of each patch there")
@@ -174,7 +175,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Judge worlds of each nuisance; print the table."""
-    jobs = [(name, seed) for name in args.nuisances.split(",") for seed in range(args.scenes)]
+    jobs = [(name, seed) for name in args.nuisances.split(",") for seed in range(args.first, args.first + args.scenes)]
     with ProcessPoolExecutor(args.jobs) as pool:
         patches = [p for scene in pool.map(_judge, jobs) for p in scene]
     print(__doc__)

@@ -31,7 +31,7 @@ Real = npt.NDArray[np.float64]
 
 CHANNEL_RATIO_STD_DB = 2.5
 """Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis."""
-DOUBTFUL_V_DB, WEAK_V_DB = -4.5, -7.0
+DOUBTFUL_V_DB, WEAK_V_DB = -3.0, -7.0
 """V / H relative to the direct path below which a patch that nobody declared is no metal, and below which even a
 declared one is none: half spaces of eps' up to 10 have -8 dB or less, bare water -4 dB, metal 0 dB, but for the
 patterns of the antennas (-4 dB with those of an independent generator)."""
@@ -72,7 +72,7 @@ class MetalEvidence:
             return np.inf
         if self.channel_ratio_db is None:  # the verdict is never good without a direct path
             return 1.0 if self.others == 1 else 0.5
-        return 0.3 if self.others == 1 else 0.75
+        return 0.5 if self.others == 1 else 0.75
 
     @property
     def sure(self) -> bool:

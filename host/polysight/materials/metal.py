@@ -72,7 +72,7 @@ class MetalEvidence:
             return np.inf
         if self.channel_ratio_db is None:  # the verdict is never good without a direct path
             return 1.0 if self.others == 1 else 0.5
-        return 0.5 if self.others == 1 else 0.75
+        return 0.4 if self.others == 1 else 0.75
 
     @property
     def sure(self) -> bool:

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.store.source import CubeRow, RowData, pieces_of
+from polysight.store.source import HEADER_LOCK, CubeRow, RowData, pieces_of
 from polysight_shared import files
 from polysight_shared.config import Board, Instrument, MountStep
 from polysight_shared.error_codes import ErrorCode
@@ -635,7 +635,8 @@ class PublishedCubes(_Published):
         """Read one board's row with the authors' reference. Raises DataError if it is missing or of a wrong shape."""
         file = self.path / f"{board_name}{SYNCED}"
         try:
-            cube = np.load(file, mmap_mode="r", allow_pickle=False)
+            with HEADER_LOCK:
+                cube = np.load(file, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError) as e:
             what = f"{file}: not a cube: {e}"
             raise DataError(what, "the download is not complete", code=ErrorCode.FILE_DAMAGED) from None

@@ -47,7 +47,7 @@ from polysight.store.manifest import (
     ScanStarted,
     manifest_fault,
 )
-from polysight.store.source import RowData
+from polysight.store.source import HEADER_LOCK, RowData
 from polysight_shared import __version__
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
@@ -418,7 +418,8 @@ def read_sample_rows(folder: Path, start: int = 0) -> tuple[dict[int, dict[str, 
 def open_records(path: Path) -> NDArray[Any] | None:
     """Return a board's records, memory-mapped, one per row; None if the file cannot be read."""
     try:
-        return np.load(path, mmap_mode="r", allow_pickle=False)
+        with HEADER_LOCK:
+            return np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError):
         return None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +23,10 @@ Pieces = Callable[[int], Iterator[NDArray[np.uint8]]]
 
 Raises DataError if the payload cannot be read or is damaged, at the latest after the last piece.
 """
+
+HEADER_LOCK = threading.Lock()
+"""Held while numpy reads the head of a file: it parses it as Python, and the parser of CPython 3.11 fails now and then
+("AST constructor recursion depth mismatch") when two threads are in it."""
 
 
 def pieces_of(payload: NDArray[np.uint8]) -> Pieces:

@@ -250,7 +250,7 @@ def analyse(
     )
     return MaterialsResult(
         calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, tilts=tilts,
-        boxes=dict(known.names), library=() if classifier is None else classifier.library.names,
+        boxes=dict(known.names), library=() if classifier is None else classifier.names,
         brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
         errors=None if errors is None else (tuple(labels), errors),
     )  # fmt: skip
@@ -334,8 +334,7 @@ def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
     """Return what the patches may be: the library's materials at the library's angle, if there is one, and others."""
     if classifier is None or len(classifier.angles_deg) != 1:
         return Kinds(literature(), theta_rad)
-    own = classifier.kinds
-    return Kinds([*own, *literature(classifier.library.names)], float(np.radians(classifier.angles_deg[0])))
+    return Kinds(classifier.kinds, float(np.radians(classifier.angles_deg[0])))
 
 
 def _names(

@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from polysight.materials.discriminant import ErrorDiscriminant
 from polysight.materials.inversion import PatchEstimate
-from polysight.materials.kinds import Kind, Kinds, pair
+from polysight.materials.kinds import Kind, Kinds, literature, pair
 from polysight.materials.library import (
     Library,
     Model,
@@ -430,16 +430,14 @@ class Classifier:
             samples = samples.joined(Samples.of(part))
         self._model.fit(samples)
         self.distributions = self._model.distributions
+        self.names = library.names
+        # Of the library's patches as half spaces; without metals.
+        self.permittivities: dict[str, complex] = self.distributions.permittivities
+        self.kinds = (*self._library_kinds(), *literature(library.names))
         self._width = max(len(UNKNOWN), *(len(n) for n in library.names))
 
-    @property
-    def permittivities(self) -> dict[str, complex]:
-        """Material to the permittivity of the library's patches as half spaces; without metals."""
-        return self.distributions.permittivities
-
-    @property
-    def kinds(self) -> list[Kind]:
-        """The library's materials as half spaces, with the spread of their specimens and the error of their mean."""
+    def _library_kinds(self) -> tuple[Kind, ...]:
+        """Return the library's materials as half spaces, with the spread of their specimens and the mean's error."""
         spread = dict(zip(self.distributions.names.tolist(), np.sqrt(self.distributions.spread), strict=True))
         out = []
         for name in self.library.names:
@@ -450,7 +448,7 @@ class Classifier:
             count = sum(e.name == name for e in self.library.entries)
             real, loss = (float(s) * float(np.sqrt(1 + 1 / count)) for s in spread[name])
             out.append(Kind(name, eps, (real, loss)))
-        return out
+        return tuple(out)
 
     def scan(self, patches: Sequence[Real], errors: SceneErrors | None = None) -> list[NamedPatch]:
         """Name the patches of one scan, or of several scans of the same patches, together.

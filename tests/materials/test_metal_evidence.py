@@ -51,7 +51,7 @@ def test_no_dielectric_is_taken_for_metal(plates, scenes):
         assert not metal_evidence(dict(enumerate(seen)), RigPrior(3e-3), channel, KINDS).enough
 
 
-@pytest.mark.parametrize(("plates", "least"), [(2, 0.6), (4, 0.7), (8, 0.7)])
+@pytest.mark.parametrize(("plates", "least"), [(2, 0.6), (4, 0.8), (8, 0.8)])
 def test_metal_among_dielectrics_is_mostly_recognised(plates, least, scenes):
     found = []
     for seed in range(scenes):

@@ -30,6 +30,8 @@ def test_a_scan_is_named_again_as_it_was_named(synthetic, library, tmp_path):
     for r in found.patches:
         if r.named is not None:
             assert again[r.patch.label].name == r.named.verdict.name
+            # The discriminant, which names several angles, knows nothing of the share of the library's materials.
+            assert again[r.patch.label].confidence == pytest.approx(r.named.verdict.confidence, abs=0.25)
 
 
 @pytest.mark.parametrize("gain", [0.8, 0.9, 1.1, 1.25])

@@ -2,8 +2,9 @@
 
 `analyse` takes the images, the `Optics` and known facts of the scene (`KnownScene`, the metal reference among them); it
 returns a `MaterialsResult`. On the way: `segment.py` finds patches, `measure.py` measures
-them, `inversion.py` solves for all permittivities and the rig's errors together, `classify.py` names patches by a
-`Library`, with the materials' distributions of `discriminant.py`. `sub_bands.py` and `layers.py` fit thin layers.
+them, `metal.py` finds and judges the metal reference, `inversion.py` solves for all permittivities and the rig's errors
+together, `kinds.py` says what a patch may be, `classify.py` names patches by a `Library`; `discriminant.py` holds the
+materials' distributions, and names scans of several angles. `sub_bands.py` and `layers.py` fit thin layers.
 `make_library` makes a library of scans, `fit_concentration` a line through solutions. `labels.py` reads boxes with
 names and true plates, `catalogue.py` the permittivities of the literature, `train.py` the published data set.
 """

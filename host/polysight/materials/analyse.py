@@ -216,7 +216,7 @@ def analyse(
     raw = to_metal(images, reference, plane)
     rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
     refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
-    refused |= {p.label: STEEP for p in found.patches if p.label in tilts.steep and p.label != reference.label}
+    refused |= {p.label: STEEP for p in found.patches if p.label in tilts.steep}
     judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
     seen = Seen.of((rh, rv), judged, reference, plane, images, tilts)

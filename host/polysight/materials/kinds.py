@@ -36,16 +36,12 @@ _STEP = 1e-4
 
 @dataclass(frozen=True)
 class Kind:
-    """One material: its name, permittivity (None: metal), the standard deviations of ln eps' and ln eps'', and weight.
-
-    `weight` is its prior probability relative to the other kinds of the same source.
-    """
+    """One material: its name, permittivity (None: metal), and the standard deviations of ln eps' and ln eps''."""
 
     name: str
     permittivity: complex | None
     spread: tuple[float, float] = PUBLISHED_SPREAD
     source: Source = "library"
-    weight: float = 1.0
 
 
 def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
@@ -201,7 +197,6 @@ def _covariance(kind: Kind, theta_rad: float) -> Real:
 
 def _shares(kinds: Sequence[Kind]) -> tuple[Real, float]:
     """Return the share of each kind in the library or in the rest, and that of any other half space in the rest."""
-    weight = np.array([kind.weight for kind in kinds])
     ours = np.array([kind.source == "library" for kind in kinds])
     metal = np.array([kind.permittivity is None for kind in kinds]) & ~ours
     literature = ~ours & ~metal
@@ -209,5 +204,5 @@ def _shares(kinds: Sequence[Kind]) -> tuple[Real, float]:
     out = np.zeros(len(kinds))
     for mask, share in ((ours, 1.0), (metal, METAL_SHARE), (literature, share_literature)):
         if mask.any():
-            out[mask] = share * weight[mask] / weight[mask].sum()
+            out[mask] = share / mask.sum()
     return out, 1 - METAL_SHARE - share_literature

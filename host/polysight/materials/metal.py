@@ -6,7 +6,8 @@ dielectric loses most of p at these angles. A declared metal is contradicted by 
 
 The other patches give evidence on a metal that nobody declared. If the patch is metal, their ratios relative to it are
 those of materials. If it is a dielectric of inverse ratio t0, their true ratios are q t0, and the density of the
-measured q is that of materials at q t0, times |t0|^2: dielectrics would have to lie close together. The score is the
+measured q is that of materials at q t0, times |t0|^2: dielectrics would have to lie close together. In either case
+their |H| has to be that of these materials (Eq. 2), as far as brightness in this scene says anything. The score is the
 logarithm of the ratio of both evidences, the second integrated over every material that the patch may be.
 """
 

@@ -40,8 +40,6 @@ METAL_WITHOUT_ERROR = 0.25
 """Median |V/H - 1| of a patch below which it has no error of its own, and gives no information on common errors."""
 METAL_UNLIKE = 0.2
 """|V/H - 1| above which a patch is evidence for the metal beside it; metal looks like water beside water."""
-METAL_PIECE = 0.12
-"""|V/H - 1| below which another patch may be a second piece of metal, and need not be a possible dielectric."""
 METAL_SPECIMENS = 0.1
 """|V/H - 1| below which a material is metal, whose specimens do not differ."""
 SOFT = 0.05

@@ -418,7 +418,7 @@ def tilt_reasons(across_deg: Mapping[int, float]) -> list[Finding]:
     more = "" if len(tilted) == 1 else f" ({len(tilted)} patches in all)"
     return [reason(
         "care", f"patch {worst} rises by {tilted[worst]:+.1f} degrees across the plane of incidence{more}",
-        "the polarisation turns with it: 5 to 13 % of a permittivity per degree",
+        "the polarisation turns with it: 5 to 13 % of a permittivity per degree, corrected to about a quarter",
         "lay plates and metal flat; shim the tilted one", 1.3,
     )]  # fmt: skip
 

@@ -1,13 +1,17 @@
 """Images of simulated scenes by vector physical optics: an opinion of its own about what the instrument sees.
 
-`draw_world` and `draw_nuisances` make a scene and what disturbs its scan, `simulate` gives the pair of images. Only
-numpy and scipy are used, nothing of the instrument or its simulators, so that tests may compare the two.
+`draw_world` and `draw_nuisances` make a scene and what disturbs its scan, `simulate` gives the pair of images. Curved
+and tilted pieces (`sphere`, `cylinder`, `bottle`, `plate`) are seen by `record_shapes`: the samples of both boards
+after synchronisation, at any stage positions; `Shape.project` tells where their surface is. Only numpy and scipy are
+used, nothing of the instrument or its simulators, so that tests may compare the two.
 """
 
 from polysight_worlds.images import ImagePair, backproject, simulate
 from polysight_worlds.media import COPPER, METAL, Stack, reflect
-from polysight_worlds.rig import Rig, load_rig, published_rig
+from polysight_worlds.rig import Boards, Rig, load_boards, load_rig, published_boards, published_rig
 from polysight_worlds.scan import record
+from polysight_worlds.shape_echoes import record_shapes
+from polysight_worlds.shapes import Shape, bottle, cylinder, plate, sphere
 from polysight_worlds.world import (
     NUISANCES,
     TABLE_2,
@@ -26,21 +30,30 @@ __all__ = [
     "METAL",
     "NUISANCES",
     "TABLE_2",
+    "Boards",
     "Body",
     "ImagePair",
     "Nuisances",
     "Plate",
     "Rig",
+    "Shape",
     "Stack",
     "World",
     "backproject",
+    "bottle",
+    "cylinder",
     "dish",
     "draw_nuisances",
     "draw_world",
+    "load_boards",
     "load_rig",
+    "plate",
+    "published_boards",
     "published_rig",
     "record",
+    "record_shapes",
     "reflect",
     "simulate",
+    "sphere",
     "table",
 ]

@@ -9,7 +9,7 @@ mixture. A stage offset of zero is the middle of the grid.
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -128,3 +128,42 @@ def published_rig() -> Rig:
     h = np.array([0.685843, 0.104606, 0.011526]), np.array([-0.819152, 0.0, 0.573576])
     v = np.array([0.683008, 0.136290, 0.009475]), np.array([-0.950993, -0.130885, 0.280145])
     return build_rig(tx, h, v, plane_m=0.499)
+
+
+@dataclass(frozen=True)
+class Boards:
+    """All antennas at stage offset zero: TX, and the RX of both receiving boards."""
+
+    tx: Antenna
+    h: tuple[Antenna, ...]
+    v: tuple[Antenna, ...]
+
+    def receivers(self) -> dict[str, tuple[Antenna, ...]]:
+        """Return the receiving boards by channel."""
+        return {"h": self.h, "v": self.v}
+
+
+def spread_receivers(rig: Rig, step_h_m: NDArray, step_v_m: NDArray, count: int = 4) -> Boards:
+    """Return boards whose `count` RX lie `step` [3] apart about the mean places of `rig`."""
+    places = np.arange(count) - (count - 1) / 2
+    h = tuple(replace(rig.h, position=rig.h.position + place * step_h_m) for place in places)
+    v = tuple(replace(rig.v, position=rig.v.position + place * step_v_m) for place in places)
+    return Boards(rig.tx, h, v)
+
+
+def load_boards(file: Path) -> Boards:
+    """Return the boards of an `instrument.toml`."""
+    content = tomllib.loads(file.read_text(encoding="utf-8"))
+    rig = load_rig(file)
+    steps = {}
+    for board in content["boards"]:
+        places = [place(board["mount"], antenna_mm)[0] for antenna_mm in content["antennas"]["rx_mm"]]
+        steps[board["role"]] = (places[-1] - places[0]) / (len(places) - 1)
+    return spread_receivers(rig, steps["receive_h"], steps["receive_v"], len(content["antennas"]["rx_mm"]))
+
+
+def published_boards() -> Boards:
+    """Return the boards of the published rig: RX half a wavelength (1.9 mm) apart along each board."""
+    step_h_m = np.array([0.00100684, 0.00072709, 0.00143791])
+    step_v_m = np.array([-0.00041705, 0.00175540, -0.00059560])
+    return spread_receivers(published_rig(), step_h_m, step_v_m)

@@ -1,0 +1,132 @@
+"""Shapes: what is true of them, and echoes against geometrical optics, facets and each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from polysight_worlds import (
+    METAL,
+    Boards,
+    Shape,
+    Stack,
+    cylinder,
+    plate,
+    published_boards,
+    published_rig,
+    record_shapes,
+    sphere,
+)
+from polysight_worlds.media import LIGHT_M_PER_S, reflect
+from polysight_worlds.optics import Antenna
+from polysight_worlds.shapes import find_specular, follow_path
+
+BOARDS = published_boards()
+FREQUENCIES_HZ = np.linspace(76.3e9, 79.7e9, 9)
+CENTRE_M = np.array([*published_rig().centre_m, 0.499])
+DIELECTRIC = Stack(below=4 - 0.4j)
+OFFSETS_M = np.array([[0.0, 0, 0], [0.05, 0.02, 0], [-0.1, 0.06, 0], [0.12, -0.05, 0]])
+
+
+def behind(depth_m: float) -> tuple[float, float, float]:
+    x, y, z = CENTRE_M
+    return x, y, z + depth_m
+
+
+SHAPES = [
+    sphere("sphere", METAL, behind(0.1), 0.1),
+    cylinder("cylinder", DIELECTRIC, behind(0.1), 0.1, 0.6, axis=(0.3, 1.0, 0.1)),
+    cylinder("cone", DIELECTRIC, behind(0.09), 0.09, 0.6, slope=-0.15),
+    plate("saddle", METAL, behind(0.0), (0.3, 0.3), bends=(7.0, -6.0, 1.0)),
+    plate("tilted", DIELECTRIC, behind(0.0), (0.9, 0.9), tilt_deg=(4.0, -2.0), is_soft=True),
+]
+
+
+def geometrical_optics(shape: Shape, tx: Antenna, rx: Antenna, offset_m: np.ndarray, frequency_hz: float) -> complex:
+    """Ray at the specular point: Fresnel's coefficients, spreading by the path's second derivatives."""
+    places = (antenna.position[:, None] + offset_m[:, None] for antenna in (tx, rx))
+    tx_m, rx_m = places
+    patch = shape.at(*find_specular(shape, tx_m, rx_m))
+    path = follow_path(patch, tx_m, rx_m)
+    out, back = patch.point - tx_m, rx_m - patch.point
+    out_m, back_m = np.linalg.norm(out), np.linalg.norm(back)
+    incident, scattered, normal = out[:, 0] / out_m, back[:, 0] / back_m, patch.normal[:, 0]
+    s_axis = np.cross(incident, normal) / np.linalg.norm(np.cross(incident, normal))
+    cosine = -incident @ normal
+    basis = patch.tangents()[..., 0]
+    bends = np.linalg.eigvalsh(basis @ path.hessian[..., 0] @ basis.T)
+    spread = cosine / (out_m * back_m * np.sqrt(np.abs(np.prod(bends))))
+    turned = 1 if np.all(bends > 0) else 1j
+    r_s, r_p = reflect(shape.stack, frequency_hz, cosine)
+    sent = tx.field(incident[:, None])[:, 0]
+    received = rx.field(-scattered[:, None])[:, 0]
+    s_part = r_s * (sent @ s_axis) * (received @ s_axis)
+    p_part = r_p * (sent @ np.cross(s_axis, incident)) * (received @ np.cross(scattered, s_axis))
+    wave = (s_part + p_part) * spread * turned
+    direct_m = np.linalg.norm(rx.position - tx.position)
+    phase = 2 * np.pi * frequency_hz / LIGHT_M_PER_S * (path.length_m[0] - direct_m)
+    return complex(np.conj(wave) * np.exp(1j * phase))
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.name)
+def test_a_shape_reflects_by_geometrical_optics_but_for_a_few_per_cent(shape):
+    cubes = record_shapes([shape], BOARDS, FREQUENCIES_HZ, OFFSETS_M)
+    for channel, receivers in BOARDS.receivers().items():
+        expected = np.array([geometrical_optics(shape, BOARDS.tx, receivers[2], u, 76.3e9) for u in OFFSETS_M])
+        assert np.abs(cubes[channel][2, 0] - expected).max() < 0.04 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.name)
+def test_a_surface_knows_its_points_normals_and_derivatives(shape):
+    a, b = np.array([0.02, -0.03]), np.array([0.01, 0.04])
+    patch = shape.at(a, b)
+    step = 1e-5
+    along_a = (shape.at(a + step, b).point - shape.at(a - step, b).point) / (2 * step)
+    mixed = (shape.at(a, b + step).d_a - shape.at(a, b - step).d_a) / (2 * step)
+    assert patch.d_a == pytest.approx(along_a, abs=1e-8)
+    assert patch.d_ab == pytest.approx(mixed, abs=1e-8)
+    # A millimetre in front of the surface.
+    distances, near_a, near_b = shape.project((patch.point + 1e-3 * patch.normal).T)
+    assert distances == pytest.approx(1e-3, abs=1e-9)
+    assert shape.at(near_a, near_b).point == pytest.approx(patch.point, abs=1e-9)
+    assert np.all(patch.normal[2] < 0)
+
+
+def test_curvatures_are_those_of_the_solids():
+    ball, pipe, saddle = SHAPES[0], SHAPES[1], SHAPES[3]
+    assert np.linalg.eigvalsh(ball.at(0.1, 0.2).curvature()) == pytest.approx([10, 10])
+    assert np.linalg.eigvalsh(pipe.at(0.1, 0.2).curvature()) == pytest.approx([0, 10], abs=1e-9)
+    assert saddle.at(0.0, 0.0).curvature() == pytest.approx(np.array([[7, 1], [1, -6]]))
+
+
+@pytest.mark.parametrize("shape", SHAPES[:3], ids=lambda shape: shape.name)
+def test_a_whole_scan_is_that_of_its_single_positions(shape):
+    x = 0.002 * np.arange(-30, 30)
+    offsets = np.stack([*np.meshgrid(x, x), np.zeros((60, 60))], axis=-1)
+    one_rx = Boards(BOARDS.tx, BOARDS.h[:1], BOARDS.v[:1])
+    whole = record_shapes([shape], one_rx, FREQUENCIES_HZ, offsets)
+    some = record_shapes([shape], one_rx, FREQUENCIES_HZ, offsets[::20, ::20])
+    for channel in whole:
+        difference = np.abs(whole[channel][..., ::20, ::20] - some[channel]).max()
+        assert difference < 5e-3 * np.abs(some[channel]).max()
+
+
+def test_a_large_flat_plate_is_the_same_in_facets_and_in_zones():
+    # The mean over Fresnel zones of the edges: plates of growing size swing around the one without edges.
+    widths_m = np.linspace(0.5, 0.56, 9)
+    sharp = [plate("sharp", DIELECTRIC, behind(0.0), (w, w), tilt_deg=(4.0, -2.0)) for w in widths_m]
+    few = OFFSETS_M[:2]
+    one_rx = Boards(BOARDS.tx, BOARDS.h[:1], BOARDS.v[:1])
+    first = [record_shapes([piece], one_rx, FREQUENCIES_HZ[:1], few)["h"] for piece in sharp]
+    second = record_shapes([SHAPES[4]], one_rx, FREQUENCIES_HZ[:1], few)["h"]
+    assert np.mean(first, axis=0) == pytest.approx(second, rel=0.03)
+
+
+def test_the_phase_is_that_of_the_path_beyond_the_direct_one():
+    rx = BOARDS.h[0]
+    direct_m = np.linalg.norm(rx.position - BOARDS.tx.position)
+    echo = record_shapes([SHAPES[0]], BOARDS, FREQUENCIES_HZ, OFFSETS_M[:1])["h"][0, :, 0]
+    slope_m = np.ptp(np.unwrap(np.angle(echo))) / (2 * np.pi * np.ptp(FREQUENCIES_HZ)) * LIGHT_M_PER_S
+    tx_m, rx_m = BOARDS.tx.position[:, None], rx.position[:, None]
+    path = follow_path(SHAPES[0].at(*find_specular(SHAPES[0], tx_m, rx_m)), tx_m, rx_m)
+    assert slope_m == pytest.approx(path.length_m[0] - direct_m, abs=2e-4)

@@ -1,15 +1,17 @@
-"""Do error bars and names hold in physics that is not the simulator's? Scenes of the independent generator.
+"""Do error bars, names and verdicts hold in physics that is not the simulator's? Scenes of the independent generator.
 
 Each scene is one of `polysight_worlds`: vector physical optics, with one nuisance, all together, or none. The copper is
-declared, boxes are given, the library holds Table 2 as half spaces. All is simulated, by a generator that shares no
-code with the host. For each nuisance: how many 95 % regions hold the true permittivity, rms z of both parts, the
-relative half width, the error, and how many names are right.
+declared, boxes are given or patches are searched for, the library holds Table 2 as half spaces. All is simulated, by a
+generator that shares no code with the host. For each nuisance: how many 95 % regions hold the true permittivity, rms z
+of both parts, the relative half width, the error, and how many names are right; how many verdicts are `good`, how many
+regions hold under those, and in how many scenes a reason names the nuisance, among the first two or at all.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -21,12 +23,26 @@ import numpy.typing as npt
 
 from polysight.data import packaged
 from polysight.imaging import Antennas, Illumination, Images, illumination_geometry
-from polysight.materials import UNKNOWN, Classifier, Entry, KnownScene, Library, MaterialsResult, Optics, analyse
+from polysight.materials import (
+    UNKNOWN,
+    Classifier,
+    Entry,
+    KnownScene,
+    Library,
+    MaterialsResult,
+    Optics,
+    analyse,
+    axis_mm,
+)
 from polysight.materials.inversion import MOVED, RigPrior
 from polysight.materials.kinds import inverse_ratio
 from polysight.materials.labels import patches_from_labels
+from polysight.materials.result import PatchResult
+from polysight.materials.segment import Segmentation
 from polysight.materials.train import fit_library
 from polysight.polarimetry import fresnel
+from polysight.process.quality import scene_reasons
+from polysight.results import verdict_of
 from polysight_shared.config import load_instrument
 from polysight_worlds import NUISANCES, TABLE_2, ImagePair, Plate, draw_nuisances, draw_world, published_rig, simulate
 
@@ -38,6 +54,30 @@ MARGIN_MM = 6.0
 LEAST_PIXELS = 8
 """Least width and height of a plate's part within the picture."""
 CHI2_95 = 5.991
+FIRST_REASONS = 2
+CAUSES = {
+    "h_turn": "turned|moved",
+    "v_turn": "turned|moved",
+    "tx_turn": "turned|moved",
+    "misplaced": "out of place",
+    "height": "high",
+    "tilt": "tilted|rises by",
+    "drift": "drift",
+    "multipath": "second path",
+    "stage_scale": "stage",
+    "noise": "noise",
+    "interference": "interference",
+    "clipping": "clip",
+    "roughness": "rough",
+    "waviness": "rough|uneven",
+    "bow": "bent|uneven",
+    "brightness": "brighter|darker",
+    "leakage": "leakage",
+    "border": "border",
+    "aperture": "aperture",
+    "dark": "masked",
+}
+"""Nuisance to the words (regular expression) by which a reason names it as found or as a likely cause."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +95,34 @@ class PatchFigures:
     name: str
     confidence: float
     refused: str
+
+    @property
+    def inside(self) -> bool | None:
+        """True if the 95 % region holds the true permittivity; None without one."""
+        return None if self.distance2 is None else self.distance2 < CHI2_95
+
+
+@dataclass(frozen=True)
+class SceneFigures:
+    """One judged scene: the verdict's level and reasons, its patches without the metal, and how they were found.
+
+    `missed` plates were not found, `stray` patches are no plate; both 0 with given boxes.
+    """
+
+    nuisance: str
+    seed: int
+    level: str
+    reasons: tuple[str, ...]
+    patches: tuple[PatchFigures, ...]
+    missed: int = 0
+    stray: int = 0
+
+    def named_at(self, nuisance: str) -> int | None:
+        """Place of the first reason that names a nuisance as a cause, from 0; None without one."""
+        cause = CAUSES.get(nuisance)
+        if cause is None:
+            return None
+        return next((i for i, text in enumerate(self.reasons) if re.search(cause, text)), None)
 
 
 @cache
@@ -88,69 +156,123 @@ def illumination_of_worlds(shape: tuple[int, int], pixel_m: float) -> Illuminati
     return Illumination(np.ones((2, *shape), np.complex64), moved, steep, (pixel_m, pixel_m))
 
 
-def analyse_world(
-    pair: ImagePair, declared: str = "copper", measured: bool = True, classifier: Classifier | None = None
-) -> tuple[MaterialsResult, dict[int, Plate]]:
-    """Analyse the images of a world with given boxes; return the result, and patch number to true plate.
+def pixel_boxes(pair: ImagePair) -> list[tuple[Plate, tuple[int, int, int, int]]]:
+    """Return the plates within the picture with their boxes in pixels: left, bottom, right, top."""
+    out = []
+    for plate in pair.world.plates:
+        x0, y0, x1, y1 = plate.box_m
+        left, right = np.searchsorted(pair.x_m, [x0, x1]).tolist()
+        bottom, top = np.searchsorted(pair.y_m, [y0, y1]).tolist()
+        if plate.name != "table" and min(right - left, top - bottom) >= LEAST_PIXELS:
+            out.append((plate, (left, bottom, right, top)))
+    return out
 
-    `declared` is the plate that is given as the metal reference; `measured`: the rig's leakage was measured.
+
+def analyse_world(
+    pair: ImagePair,
+    declared: str | None = "copper",
+    measured: bool = True,
+    classifier: Classifier | None = None,
+    searched: bool = False,
+) -> tuple[MaterialsResult, dict[int, Plate]]:
+    """Analyse the images of a world; return the result, and patch number to true plate.
+
+    `declared` is the plate that is given as the metal reference; None: it is looked for. `measured`: the rig's leakage
+    was measured. `searched`: patches are searched for instead of given as boxes.
     """
     h, v = pair.h.astype(np.complex64), pair.v.astype(np.complex64)
     usable: npt.NDArray[np.bool_] = np.isfinite(h) & np.isfinite(v) & (h != 0) & (v != 0)
     light = illumination_of_worlds(h.shape, float(pair.x_m[1] - pair.x_m[0]))
     images = Images(h, v, pair.x_m, pair.y_m, usable, illumination=light)
-    boxes: dict[str, tuple[float, float, float, float]] = {}
-    plates = {}
-    for i, plate in enumerate(pair.world.plates):
-        x0, y0, x1, y1 = plate.box_m
-        left, right = np.searchsorted(pair.x_m, [x0, x1]).tolist()
-        bottom, top = np.searchsorted(pair.y_m, [y0, y1]).tolist()
-        if plate.name != "table" and min(right - left, top - bottom) >= LEAST_PIXELS:
-            boxes[f"{plate.name} {i}"] = (left, bottom, right, top)
-            plates[f"{plate.name} {i}"] = plate
-    segmentation, names = patches_from_labels(boxes, pair.x_m, pair.y_m, margin_mm=MARGIN_MM)
-    metal = next(label for label, name in names.items() if plates[name].name == declared)
+    plates = {f"{plate.name} {i}": (plate, box) for i, (plate, box) in enumerate(pixel_boxes(pair))}
+    metal_name = next((name for name, (plate, _) in plates.items() if plate.name == declared), None)
+    known = KnownScene()
+    if not searched:
+        boxes: dict[str, tuple[float, float, float, float]] = {}
+        for name, (_, (left, bottom, right, top)) in plates.items():
+            boxes[name] = (left, bottom, right, top)
+        segmentation, names = patches_from_labels(boxes, pair.x_m, pair.y_m, margin_mm=MARGIN_MM)
+        metal = next((label for label, name in names.items() if name == metal_name), None)
+        known = KnownScene(segmentation, metal, names)
+    elif metal_name is not None:
+        known = KnownScene(metal=box_in_mm(plates[metal_name][1], pair))
     prior = RigPrior(THETA_STD_RAD, channels_known=True)
     if measured:
         prior = replace(prior, leakage_std=0.003, leakage_measured=True, moved=MOVED)
-    optics = Optics(np.radians(pair.incidence_deg), prior)
-    found = analyse(images, optics, KnownScene(segmentation, metal, names), classifier)
-    return found, {label: plates[name] for label, name in names.items()}
+    found = analyse(images, Optics(np.radians(pair.incidence_deg), prior), known, classifier)
+    if not searched:
+        return found, {label: plates[name][0] for label, name in known.names.items()}
+    return found, plates_of(found.segmentation, list(plates.values()))
 
 
-def judge_world(nuisance: str, seed: int) -> list[PatchFigures]:
-    """Draw, scan and judge one world; return the figures of its patches without the copper."""
-    rng = np.random.default_rng([seed, sum(map(ord, nuisance))])
-    rig = published_rig()
-    world = draw_world(rng, tuple(rig.centre_m), half_spaces=True)
-    pair = simulate(world, draw_nuisances(rng, nuisance), rig)
-    classifier = table_2_classifier(float(np.radians(pair.incidence_deg)))
-    found, plates = analyse_world(pair, measured=nuisance not in UNMEASURED, classifier=classifier)
-    out = []
-    for patch in found.patches:
-        plate = plates[patch.patch.label]
-        if plate.stack.is_metal:
-            continue
-        e, name = patch.permittivity, patch.verdict
-        refused = "" if patch.refused is None else patch.refused.what
-        distance2, half_width, error = None, None, None
-        if e.value is not None and e.covariance is not None and not refused:
-            away = e.value - plate.stack.below
-            parts = np.array([away.real, away.imag])
-            distance2 = float(parts @ np.linalg.solve(e.covariance, parts))
-            half_width = 1.96 * float(np.sqrt(np.trace(e.covariance) / 2)) / abs(e.value)
-            error = abs(away) / abs(plate.stack.below)
-        said = (UNKNOWN, 0.0) if name is None else (name.name, name.confidence)
-        out.append(PatchFigures(nuisance, plate.name, distance2, half_width, error, *said, refused))
+def box_in_mm(box: tuple[int, int, int, int], pair: ImagePair) -> tuple[float, float, float, float]:
+    """Return a box in pixels as millimetres from the picture's middle, x0, y0, x1, y1."""
+    left, bottom, right, top = box
+    x_mm, y_mm = axis_mm(pair.x_m), axis_mm(pair.y_m)
+    return float(x_mm[left]), float(y_mm[bottom]), float(x_mm[right - 1]), float(y_mm[top - 1])
+
+
+def plates_of(
+    segmentation: Segmentation, plates: Sequence[tuple[Plate, tuple[int, int, int, int]]]
+) -> dict[int, Plate]:
+    """Return patch number to the plate that most of the patch lies on; patches without one are missing."""
+    out = {}
+    for patch in segmentation.patches:
+        for plate, (left, bottom, right, top) in plates:
+            if patch.mask[bottom:top, left:right].sum() > patch.mask.sum() / 2:
+                out[patch.label] = plate
     return out
 
 
-def _judge(job: tuple[str, int]) -> list[PatchFigures]:
+def draw_pair(nuisance: str, seed: int) -> ImagePair:
+    """Draw and scan one world: eight materials of Table 2 as half spaces, and copper."""
+    rng = np.random.default_rng([seed, sum(map(ord, nuisance))])
+    rig = published_rig()
+    world = draw_world(rng, tuple(rig.centre_m), half_spaces=True)
+    return simulate(world, draw_nuisances(rng, nuisance), rig)
+
+
+def judge_world(nuisance: str, seed: int, searched: bool = False) -> SceneFigures:
+    """Draw, scan and judge one world."""
+    pair = draw_pair(nuisance, seed)
+    classifier = table_2_classifier(float(np.radians(pair.incidence_deg)))
+    found, plates = analyse_world(pair, measured=nuisance not in UNMEASURED, classifier=classifier, searched=searched)
+    verdict = verdict_of(scene_reasons(found, None, classifier))
+    judged = [(patch, plates[patch.patch.label]) for patch in found.patches if patch.patch.label in plates]
+    return SceneFigures(
+        nuisance,
+        seed,
+        verdict.level,
+        tuple(f"{r.what}: {r.why}" for r in verdict.reasons),
+        tuple(figures_of(nuisance, patch, plate) for patch, plate in judged if not plate.stack.is_metal),
+        missed=len(pixel_boxes(pair)) - len({plate.centre_m for _, plate in judged}),
+        stray=len(found.patches) - len(judged),
+    )
+
+
+def figures_of(nuisance: str, patch: PatchResult, plate: Plate) -> PatchFigures:
+    """Compare one patch with its plate."""
+    e = patch.permittivity
+    refused = "" if patch.refused is None else patch.refused.what
+    distance2, half_width, error = None, None, None
+    if e.value is not None and e.covariance is not None and not refused:
+        away = e.value - plate.stack.below
+        parts = np.array([away.real, away.imag])
+        distance2 = float(parts @ np.linalg.solve(e.covariance, parts))
+        half_width = 1.96 * float(np.sqrt(np.trace(e.covariance) / 2)) / abs(e.value)
+        error = abs(away) / abs(plate.stack.below)
+    name = UNKNOWN if patch.verdict is None else patch.verdict.name
+    confidence = 0.0 if patch.verdict is None else patch.verdict.confidence
+    return PatchFigures(nuisance, plate.name, distance2, half_width, error, name, confidence, refused)
+
+
+def _judge(job: tuple[str, int, bool]) -> SceneFigures:
     return judge_world(*job)
 
 
-def line_of(title: str, patches: Sequence[PatchFigures]) -> str:
-    """Return one line of the table."""
+def line_of(title: str, scenes: Sequence[SceneFigures]) -> str:
+    """Return one line of the table of patches."""
+    patches = [p for scene in scenes for p in scene.patches]
     distances = np.array([p.distance2 for p in patches if p.distance2 is not None])
     widths = [p.half_width for p in patches if p.half_width is not None]
     errors = [p.error for p in patches if p.error is not None]
@@ -159,9 +281,44 @@ def line_of(title: str, patches: Sequence[PatchFigures]) -> str:
     cells.append(f"{np.sqrt(distances.mean() / 2):>8.2f}{100 * np.median(widths):>9.1f}{100 * np.median(errors):>8.1f}")
     cells.append(f"{100 * right:>9.1f}")
     for low, high in ((0.5, 0.8), (0.8, 0.95), (0.95, 1.01)):
-        said = [p.name == p.material for p in patches if p.name != UNKNOWN and low <= p.confidence < high]
-        cells.append(f"{100 * np.mean(said):>6.0f} ({len(said)})" if said else f"{'-':>6}    ")
+        named = [p for p in patches if p.name != UNKNOWN and low <= p.confidence < high]
+        said = np.mean([p.confidence for p in named]) if named else np.nan
+        correct = np.mean([p.name == p.material for p in named]) if named else np.nan
+        cells.append(f"{100 * said:>6.0f}{100 * correct:>4.0f} ({len(named)})")
     return "".join(cells)
+
+
+def verdict_line(title: str, scenes: Sequence[SceneFigures], undisturbed: Sequence[SceneFigures]) -> str:
+    """Return one line of the table of verdicts."""
+    good = [scene for scene in scenes if scene.level == "good"]
+    under_good = [p.inside for scene in good for p in scene.patches if p.inside is not None]
+    cells = [f"{title:<14}{len(scenes):>7}{100 * len(good) / len(scenes):>8.0f}"]
+    cells.append(f"{100 * np.mean(under_good):>10.1f}" if under_good else f"{'-':>10}")
+    cells.append(f"{sum(scene.level == 'none' for scene in scenes):>6}")
+    places = [scene.named_at(title) for scene in scenes]
+    early = np.mean([place is not None and place < FIRST_REASONS for place in places])
+    ever = np.mean([place is not None for place in places])
+    false = np.mean([scene.named_at(title) is not None for scene in undisturbed]) if undisturbed else np.nan
+    cells.append(f"{100 * early:>9.0f}{100 * ever:>6.0f}{100 * false:>13.0f}" if title in CAUSES else f"{'-':>9}")
+    refused = sum(bool(p.refused) for scene in scenes for p in scene.patches)
+    cells.append(f"   refused {refused}, missed {sum(s.missed for s in scenes)}, stray {sum(s.stray for s in scenes)}")
+    return "".join(cells)
+
+
+def print_tables(scenes: Sequence[SceneFigures]) -> None:
+    """Print both tables."""
+    names = list(dict.fromkeys(scene.nuisance for scene in scenes))
+    by_name = {name: [scene for scene in scenes if scene.nuisance == name] for name in names}
+    print(f"{'nuisance':<14}{'patches':>8}{'in 95 %':>9}{'rms z':>8}{'half %':>9}{'err %':>8}{'right %':>9}"
+          "  names said %, right % (number) at 0.5, 0.8, 0.95")  # fmt: skip
+    for name in names:
+        print(line_of(name, by_name[name]))
+    print(line_of("together", scenes))
+    print(f"\n{'nuisance':<14}{'scenes':>7}{'good %':>8}{'in good %':>10}{'none':>6}{'first 2 %':>10}{'ever':>6}"
+          f"{'undisturbed':>13}  the cause among the reasons")  # fmt: skip
+    for name in names:
+        print(verdict_line(name, by_name[name], by_name.get("none", [])))
+    print(verdict_line("together", scenes, []))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -169,21 +326,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", type=int, default=1, help="scenes for each nuisance")
     parser.add_argument("--first", type=int, default=100, help="seed of the first scene")
     parser.add_argument("--nuisances", default=",".join(("none", *NUISANCES, "all")), help="separated by commas")
+    parser.add_argument("--searched", action="store_true", help="search for patches instead of giving boxes")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--json", type=Path, default=None, help="write the figures of each patch there")
+    parser.add_argument("--json", type=Path, default=None, help="write the figures of each scene there")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Judge worlds of each nuisance; print the table."""
-    jobs = [(name, seed) for name in args.nuisances.split(",") for seed in range(args.first, args.first + args.scenes)]
+    """Judge worlds of each nuisance; print the tables."""
+    seeds = range(args.first, args.first + args.scenes)
+    jobs = [(name, seed, args.searched) for name in args.nuisances.split(",") for seed in seeds]
     with ProcessPoolExecutor(args.jobs) as pool:
-        patches = [p for scene in pool.map(_judge, jobs) for p in scene]
+        scenes = list(pool.map(_judge, jobs))
     print(__doc__)
-    print(f"{'nuisance':<14}{'patches':>8}{'in 95 %':>9}{'rms z':>8}{'half %':>9}{'err %':>8}{'right %':>9}"
-          "  names right % (said) at 0.5, 0.8, 0.95")  # fmt: skip
-    for name in dict.fromkeys(p.nuisance for p in patches):
-        print(line_of(name, [p for p in patches if p.nuisance == name]))
-    print(line_of("together", patches))
+    print_tables(scenes)
     if args.json is not None:
-        args.json.write_text(json.dumps([asdict(p) for p in patches], indent=1), encoding="utf-8")
+        args.json.write_text(json.dumps([asdict(scene) for scene in scenes], indent=1), encoding="utf-8")
     return 0

@@ -14,7 +14,7 @@ from polysight.cli.main import main
 from polysight.materials import PATCHES
 from polysight.materials.result import PATCHES_FORMAT
 from polysight.results import NoResult
-from polysight.results.quality import LEVELS
+from polysight.results.verdict import LEVELS
 
 NUMBERS = ("2.9", "0.2", "3.0")
 

@@ -42,7 +42,7 @@ from polysight.report.figures import (
 from polysight.report.report import budget_table
 from polysight.report.style import shorten_labels
 from polysight.results import ErrorBudget, PermittivityFigures
-from polysight.results.quality import LEVELS
+from polysight.results.verdict import LEVELS
 
 RESULTS = (*NAMES, "2.90", "± 0.20", "ε′ ±")
 

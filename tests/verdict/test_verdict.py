@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from polysight.results.quality import (
+from polysight.results.verdict import (
     Coverage,
     NoResult,
     Verdict,

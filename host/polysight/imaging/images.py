@@ -58,6 +58,8 @@ MAX_RISE = 0.06
 """Largest tilt of a plate (3.4 degrees); a steeper phase has another cause."""
 MIN_RISE = 2e-3
 """Smallest tilt that is corrected (0.11 degrees); smaller ones may come from sidelobes of neighbours."""
+_FEEBLE = 0.12
+"""Level of V relative to H below which its phase is not used: permittivities below 2.8 at 55 degrees."""
 _COHERENT = 0.5
 """Smallest coherence of the phase steps between pixels (1: all equal)."""
 _MAX_CHANGE = 2.0
@@ -116,12 +118,15 @@ class Illumination:
         """Estimate the rise of a patch along x and y from its phase, radians; zero if undetermined.
 
         `h`, `v` complex [ny, nx] are reflectivities (conjugates of the samples), `mask` bool [ny, nx] is the inside of
-        the patch.
+        the patch. A channel that nearly vanishes there (V of a low permittivity) is left out: its phase is that of the
+        neighbours' sidelobes.
         """
+        level_h, level_v = (float(np.nanmedian(np.abs(channel[mask]))) if mask.any() else 0.0 for channel in (h, v))
+        channels = [h] if level_v < _FEEBLE * level_h else [h, v]
         out = []
         for along in (0, 1):
             # The phase of the conjugate falls where the plate rises.
-            step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in (h, v)) / 2
+            step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in channels) / len(channels)
             slope = float(np.angle(step)) / self.pixel_m[along] / float(self.steepness_rad_m.mean())
             out.append(slope if abs(step) > _COHERENT else 0.0)
         return out[0], out[1]

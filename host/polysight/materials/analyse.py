@@ -54,7 +54,10 @@ from polysight.materials.measure import (
     usual_scatter,
 )
 from polysight.materials.metal import (
+    NO_HALO,
+    Halo,
     MetalReference,
+    find_halo,
     find_metal,
     metal_by_label,
     metal_evidence,
@@ -62,7 +65,7 @@ from polysight.materials.metal import (
     no_metal,
 )
 from polysight.materials.result import MaterialsResult, PatchResult, Tilts
-from polysight.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
+from polysight.materials.segment import Box, Patch, Segmentation, SegmentSettings, align, axis_mm, segment, whole_plane
 from polysight.materials.specimens import features, relative, softened
 from polysight.polarimetry import (
     IncidenceChoice,
@@ -190,6 +193,9 @@ STEEP = Finding(
     "lay it flat; `polysight focus` shows the plane of the scene",
 )
 """Why a steep patch gets no permittivity."""
+HALO_OF_METAL, HALO_OF_PATCH = 4.0, 3.0
+"""Error of the metal's V / H, and of V on a plate, over the halo of V around them: clipped scenes of an independent
+generator (by 10 to 50 %)."""
 FILLED = 0.1
 """Least |H| relative to metal at which an image without edges counts as filled with one material."""
 ACTIVE = 2.0
@@ -210,6 +216,7 @@ def analyse(
     if plane is not None:
         plane.check_axes(images.x_m, images.y_m)
         images = images.within(plane.valid)
+    images, apart_mm = align(images)
     found = _patches(images, known)
     images, tilts = level(images, found)
     reference = _reference(images, known, found)
@@ -219,7 +226,7 @@ def analyse(
     refused |= {p.label: STEEP for p in found.patches if p.label in tilts.steep}
     judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
-    seen = Seen.of((rh, rv), judged, reference, plane, images, tilts)
+    seen = Seen.of((rh, rv), judged, found, reference, plane, images, tilts)
     prior = seen.prior(optics.prior)
     measured = [seen.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
     kinds = _kinds(classifier, float(np.mean(theta)))
@@ -252,7 +259,8 @@ def analyse(
         calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, tilts=tilts,
         boxes=dict(known.names), library=() if classifier is None else classifier.names,
         brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
-        errors=None if errors is None else (tuple(labels), errors),
+        errors=None if errors is None else (tuple(labels), errors), apart_mm=apart_mm,
+        drift=seen.change, halo=seen.halo.level,
     )  # fmt: skip
 
 
@@ -269,7 +277,8 @@ class Seen:
     metal
         Scatter of the metal reference; None if it was scanned separately.
     change
-        Common change of ln(V / H) over the plane; None with metal that was scanned separately.
+        Drift of ln(V / H) over the scan at the plates of `scatter`, in their order; None with metal that was scanned
+        separately.
     metal_spread
         Relative spread of the pixels of metal that was scanned separately; None: it is in the scene.
     tilts
@@ -278,6 +287,8 @@ class Seen:
         True if the illumination of tilted plates was corrected.
     metal_rise
         Rise of the metal along x and across the plane of incidence, radians.
+    halo
+        Halo of V around the metal.
     """
 
     scatter: Mapping[int, Scatter]
@@ -288,12 +299,14 @@ class Seen:
     tilts: Tilts
     lit_evenly: bool
     metal_rise: Rise
+    halo: Halo = NO_HALO
 
     @classmethod
     def of(
         cls,
         channels: tuple[Image, Image],
         judged: Sequence[Patch],
+        found: Segmentation,
         reference: MetalReference,
         plane: PlaneReference | None,
         images: Images,
@@ -310,7 +323,8 @@ class Seen:
         metal_rise = (0.0, 0.0) if reference.label is None else tilts.in_plane(reference.label)
         evenly = images.illumination is not None and images.illumination.known
         change = None if metal is None else common_change(known, metal.centre_m)
-        return cls(scatter, usual_scatter(known), metal, change, spread, tilts, evenly, metal_rise)
+        halo = NO_HALO if metal is None else find_halo(reference.mask, found.patches, images)
+        return cls(scatter, usual_scatter(known), metal, change, spread, tilts, evenly, metal_rise, halo)
 
     def prior(self, prior: RigPrior) -> RigPrior:
         """Return the prior of the rig's errors with what the plates show: the metal's error and tilt."""
@@ -320,14 +334,21 @@ class Seen:
             return replace(prior, reference_std=LEAST_STD)
         amplitude, phase = relative_errors(self.metal, self.usual)
         std = float(np.hypot(np.hypot(amplitude, phase) / np.sqrt(2), LEAST_STD))
-        return replace(prior, reference_std=std)
+        return replace(prior, reference_std=float(np.hypot(std, HALO_OF_METAL * self.halo.level)))
 
     def measure(self, patch: Patch, channels: tuple[Image, Image], theta_rad: float) -> PatchMeasurement:
         """Measure one patch relative to metal."""
         local_std = self.metal_spread or 0.0
         scatter = self.scatter.get(patch.label)
         rise = self.tilts.in_plane(patch.label)
-        return measure_patch(patch, *channels, theta_rad, scatter, self.usual, self.change, local_std, rise)
+        change = None
+        if scatter is not None and self.change is not None:
+            change = self.change.of(list(self.scatter).index(patch.label))
+        seen = measure_patch(patch, *channels, theta_rad, scatter, self.usual, change, local_std, rise)
+        around = HALO_OF_PATCH * self.halo.around.get(patch.label, 0.0)
+        if not around or not seen.brightness:
+            return seen
+        return replace(seen, std=float(np.hypot(seen.std, around / seen.brightness)))
 
 
 def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:

@@ -41,9 +41,14 @@ TILT_STD = 0.004
 
 A tilted plate is illuminated from other points, different for H and V; one degree of tilt spreads the phase by 0.3 rad.
 """
-CHANGES = ((0.05, 0.3), (0.15, 1.0), (0.5, 4.0))
-"""Prior standard deviations of the change of ln|V / H| and of its phase over the plane, per metre, and of its own
-change, per square metre: of a stable rig, of the usual one, and of one that drifts by 15 % and 9 degrees in 300 mm."""
+DRIFTS = (0.002, 0.02, 0.06)
+"""Prior standard deviations of the drift of ln(V / H) over a scan, each part: of a stable rig, of a usual one, and of
+one that drifts by 15 % and 9 degrees."""
+DRIFT_M = 0.07
+"""Length over which a drift changes, along the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
+COMMON_SLOPES = (0.1, 1.0)
+"""Prior standard deviations of the slope of ln(V / H) that all plates have by themselves, per metre: H and V that see
+the same place, and images some millimetres apart (their edges differ)."""
 RIPPLE_M = 0.02
 """Error of a plate's ln(V / H) by ripple of the scene, over the scatter of the plates' slopes: half a plate's width."""
 Real = npt.NDArray[np.float64]
@@ -203,77 +208,84 @@ def usual_scatter(all_plates: Sequence[Scatter]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class CommonChange:
-    """How ln(V / H) changes over the plane alike for all plates: drift of the gains, boards out of place.
+    """How ln(V / H) changes over the scan, alike for all plates: drift of the gains of H and V.
 
     Attributes
     ----------
-    slope, bend
-        complex [2]: per metre along x and y at `origin_m`, and their own change per metre.
-    slope_std, bend_std
-        complex [2]: standard deviations of the real and of the imaginary parts.
+    value
+        complex [plate]: ln(V / H) at each plate relative to the origin.
+    std
+        complex [plate]: standard deviations of its real and of its imaginary part.
     ripple
         Scatter of the plates' slopes about it beyond their errors, per metre: real and imaginary part.
-    origin_m
-        Where `slope` holds, x and y: the metal.
     """
 
-    slope: npt.NDArray[np.complex128]
-    bend: npt.NDArray[np.complex128]
-    slope_std: npt.NDArray[np.complex128]
-    bend_std: npt.NDArray[np.complex128]
+    value: npt.NDArray[np.complex128]
+    std: npt.NDArray[np.complex128]
     ripple: complex
-    origin_m: tuple[float, float]
 
-    def at(self, place_m: tuple[float, float]) -> tuple[complex, tuple[float, float]]:
-        """Return ln(V / H) at a place relative to the origin, and the standard deviations of both of its parts."""
-        off = np.array(place_m) - np.array(self.origin_m)
-        value = complex(np.sum(self.slope * off + self.bend * off**2 / 2))
-        parts = [np.hypot(part(self.slope_std) * off, part(self.bend_std) * off**2 / 2) for part in (np.real, np.imag)]
-        ripple = self.ripple.real, self.ripple.imag
-        amplitude, phase = (
-            float(np.hypot(np.sqrt(np.sum(p**2)), RIPPLE_M * r)) for p, r in zip(parts, ripple, strict=True)
-        )
-        return value, (amplitude, phase)
+    def of(self, plate: int) -> tuple[complex, tuple[float, float]]:
+        """Return ln(V / H) of a plate relative to the origin, and the standard deviations of both of its parts."""
+        std = complex(self.std[plate])
+        amplitude = float(np.hypot(std.real, RIPPLE_M * self.ripple.real))
+        phase = float(np.hypot(std.imag, RIPPLE_M * self.ripple.imag))
+        return complex(self.value[plate]), (amplitude, phase)
 
 
 def common_change(plates: Sequence[Scatter], origin_m: tuple[float, float]) -> CommonChange:
-    """Return what the slopes of all plates of a scene tell of the change of ln(V / H) over the plane.
+    """Return what the slopes of all plates of a scene tell of a drift of ln(V / H) over the scan.
 
-    Along each axis the slope is a line. How large the change may be is not known before: the posteriors under each of
-    `CHANGES` are averaged with the evidence of each.
+    Rows are scanned one after the other, so that a drift is a function of y; the stage moves the whole rig, so that
+    nothing else changes ln(V / H) over a plane (Gaussian process with its derivative; Rasmussen and Williams, Gaussian
+    Processes for Machine Learning, 2006, 9.4). A slope that all plates have alike may be theirs: edges of images that
+    are not in the same place.
     """
-    value = np.zeros((2, 2), np.complex128)
-    std = np.zeros((2, 2), np.complex128)
+    y_m = np.array([s.centre_m[1] for s in plates], np.float64)
+    value = np.zeros(y_m.size, np.complex128)
+    std = np.zeros(y_m.size, np.complex128)
     ripple2 = np.zeros(2)
     for axis in (0, 1):
-        place = np.array([s.centre_m[axis] - origin_m[axis] for s in plates])
-        design = np.stack([np.ones_like(place), place], axis=1)
         for k, (part, unit) in enumerate(((np.real, 1), (np.imag, 1j))):
             slopes = np.array([part(s.slope[axis]) for s in plates], np.float64)
-            noise = np.maximum([part(s.slope_std[axis]) for s in plates], 1e-6)
-            fit, deviation = _averaged_line(design, slopes, noise)
-            value[axis] += unit * fit
-            std[axis] += unit * deviation
-            left = slopes - design @ fit
+            noise = np.maximum([part(s.slope_std[axis]) for s in plates], 1e-3)
+            left = slopes - np.median(slopes)
+            if axis == 1:
+                change, deviation, drift_slopes = _averaged_drift(y_m, origin_m[1], slopes, noise)
+                value += unit * change
+                std += unit * deviation
+                left = slopes - drift_slopes
             ripple2[k] += max(0.0, float(np.sum(left**2 - noise**2)) / max(slopes.size - 2, 1)) / 2
-    ripple = complex(*np.sqrt(ripple2))
-    return CommonChange(value[:, 0], value[:, 1], std[:, 0], std[:, 1], ripple, origin_m)
+    return CommonChange(value, std, complex(*np.sqrt(ripple2)))
 
 
-def _averaged_line(design: Real, slopes: Real, noise: Real) -> tuple[Real, Real]:
-    """Return mean and standard deviation [2] of the coefficients of a line, over the priors of `CHANGES`."""
-    fits, variances, evidences = [], [], []
-    for prior in CHANGES:
-        total = np.diag(noise**2) + design * np.square(prior) @ design.T
-        gain = np.square(prior)[:, None] * design.T @ np.linalg.inv(total)
-        fits.append(gain @ slopes)
-        variances.append(np.diag(np.diag(np.square(prior)) - gain @ design * np.square(prior)))
-        evidences.append(-0.5 * float(slopes @ np.linalg.solve(total, slopes)) - 0.5 * np.linalg.slogdet(total)[1])
+def _averaged_drift(y_m: Real, origin_m: float, slopes: Real, noise: Real) -> tuple[Real, Real, Real]:
+    """Return mean and standard deviation of a drift [plate] relative to the origin, and its expected slopes [plate].
+
+    They are averaged over `DRIFTS` and `COMMON_SLOPES` with the evidence of each.
+    """
+    apart = y_m[:, None] - y_m
+    near = np.exp(-0.5 * (apart / DRIFT_M) ** 2)
+    from_origin = y_m - origin_m
+    near_origin = np.exp(-0.5 * (from_origin / DRIFT_M) ** 2)
+    # Covariances of a drift of variance 1, relative to the origin: of its slopes, with its slopes, of itself.
+    of_slopes = near * (1 - (apart / DRIFT_M) ** 2) / DRIFT_M**2
+    with_slopes = (apart * near + (from_origin * near_origin)[None, :]) / DRIFT_M**2
+    of_itself = 2 - 2 * near_origin
+    means, variances, fitted, evidences = [], [], [], []
+    for drift in DRIFTS:
+        for common in COMMON_SLOPES:
+            explained = drift**2 * of_slopes + common**2
+            total = explained + np.diag(noise**2)
+            gain = drift**2 * with_slopes @ np.linalg.inv(total)
+            means.append(gain @ slopes)
+            variances.append(drift**2 * of_itself - np.sum(gain * drift**2 * with_slopes, axis=1))
+            fitted.append(explained @ np.linalg.solve(total, slopes))
+            evidences.append(-0.5 * float(slopes @ np.linalg.solve(total, slopes)) - 0.5 * np.linalg.slogdet(total)[1])
     weight = np.exp(np.array(evidences) - max(evidences))
     weight /= weight.sum()
-    mean = weight @ np.array(fits)
-    square = weight @ (np.array(variances) + np.square(fits))
-    return mean, np.sqrt(np.maximum(square - mean**2, 0.0))
+    mean = weight @ np.array(means)
+    square = weight @ (np.array(variances) + np.square(means))
+    return mean, np.sqrt(np.maximum(square - mean**2, 0.0)), weight @ np.array(fitted)
 
 
 def relative_errors(own: Scatter | None, usual: tuple[float, float]) -> tuple[float, float]:
@@ -293,7 +305,7 @@ def measure_patch(
     theta_rad: float,
     scatter: Scatter | None = None,
     usual: tuple[float, float] = (0.0, 0.0),
-    change: CommonChange | None = None,
+    change: tuple[complex, tuple[float, float]] | None = None,
     local_std: float = 0.0,
     rise: tuple[float, float] = (0.0, 0.0),
 ) -> PatchMeasurement:
@@ -310,7 +322,8 @@ def measure_patch(
     scatter, usual
         The patch's :func:`scatter_of`, and the scene's :func:`usual_scatter`.
     change
-        Common change of ln(V / H) over the plane, which is removed; None if the reference covers the plane.
+        Drift of ln(V / H) at the patch relative to the metal, which is removed, and its standard deviations
+        (:meth:`CommonChange.of`); None if the reference covers the plane.
     local_std
         Relative error of a metal reference that varies over the plane; 0 if it is a single number.
     rise
@@ -323,8 +336,8 @@ def measure_patch(
     level = level[np.isfinite(level)]
     std = float(np.hypot(LEAST_STD, TILT_STD * _phase_spread(h[at])))
     amplitude, phase = relative_errors(scatter, usual)
-    if scatter is not None and change is not None:
-        common, (more_amplitude, more_phase) = change.at(scatter.centre_m)
+    if change is not None:
+        common, (more_amplitude, more_phase) = change
         inverse *= complex(np.exp(-common))
         amplitude, phase = float(np.hypot(amplitude, more_amplitude)), float(np.hypot(phase, more_phase))
     relative = float(np.hypot(amplitude, local_std)), float(np.hypot(phase, local_std))

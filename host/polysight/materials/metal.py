@@ -9,21 +9,24 @@ those of materials. If it is a dielectric of inverse ratio t0, their true ratios
 measured q is that of materials at q t0, times |t0|^2: dielectrics would have to lie close together. In either case
 their |H| has to be that of these materials (Eq. 2), as far as brightness in this scene says anything. The score is the
 logarithm of the ratio of both evidences, the second integrated over every material that the patch may be.
+
+Metal is the strongest echo of V by far, in H it is one of many. An overdriven receiver (clipping) loses part of it and
+spreads the rest around the metal, in V more than in H (`find_halo`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.imaging import Image, Mask
+from polysight.imaging import Image, Images, Mask
 from polysight.materials.inversion import BRIGHTNESS_RANGE, METAL_BRIGHTNESS_STD, PatchMeasurement, RigPrior
 from polysight.materials.kinds import Kinds
-from polysight.materials.segment import Box, Segmentation, box_mask
+from polysight.materials.segment import Box, Patch, Segmentation, box_mask
 from polysight.materials.specimens import METAL_UNLIKE
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -39,6 +42,13 @@ patterns of the antennas (-4 dB with those of an independent generator)."""
 SURE_SCORE = 3.0
 CONFLICT_SCORE = -3.0
 """Score below which the other patch that fits metal least is told."""
+HALO_MM = (6.0, 36.0)
+"""Distances from the metal's edge at which its halo is measured."""
+AROUND_MM = (4.0, 14.0)
+"""The same for the other plates."""
+HALO_EXCESS = 1.6
+"""Power of V beside the metal relative to H's, each relative to metal, above which it is a halo: 2 dB; undisturbed
+scenes of an independent generator have -7 to 0 dB, clipped ones 2 to 8 dB."""
 _CELLS, _EDGE = 128, 1.15
 _ODD_PATCH = 0.1  # share of other patches that are nothing known, and their density of t
 _ODD_DENSITY = 0.5
@@ -268,3 +278,54 @@ def find_metal(h: Image, v: Image, segmentation: Segmentation) -> MetalReference
     beside = "the only patch found" if len(scores) == 1 else f"|H||V| {margin:.1f} times the next"
     how = f"chosen as the patch that is brightest in both channels ({beside})"
     return MetalReference(patch.interior, patch.label, how)
+
+
+@dataclass(frozen=True)
+class Halo:
+    """Halo of V around the metal.
+
+    Attributes
+    ----------
+    level
+        Its amplitude relative to the metal; 0 without one.
+    around
+        Patch number to its amplitude around that patch, relative to the metal; empty without one.
+    """
+
+    level: float = 0.0
+    around: Mapping[int, float] = field(default_factory=dict)
+
+
+NO_HALO = Halo()
+
+
+def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
+    """Find a halo of V around the metal, which is given by its interior."""
+    pixel_mm = abs(float(images.x_m[1] - images.x_m[0])) * 1e3
+    levels = [float(np.median(np.abs(channel[metal]))) if metal.any() else 0.0 for channel in (images.h, images.v)]
+    if min(levels) <= 0:
+        return Halo()
+    relative = [np.abs(channel) / level for channel, level in zip((images.h, images.v), levels, strict=True)]
+    own = next((p.mask for p in patches if (p.mask & metal).any()), metal)
+    plates = np.logical_or.reduce([own, *(p.mask for p in patches)])
+    free = images.usable & (_distance_mm(plates, pixel_mm) > AROUND_MM[0])
+    level = _excess(relative, free, own, HALO_MM, pixel_mm)
+    if level == 0:
+        return Halo()
+    return Halo(level, {p.label: _excess(relative, free, p.mask, AROUND_MM, pixel_mm) for p in patches})
+
+
+def _excess(
+    relative: Sequence[np.ndarray], free: Mask, plate: Mask, reach_mm: tuple[float, float], pixel_mm: float
+) -> float:
+    """Return the amplitude of V beside a plate beyond what H has there; 0 if it is no larger, or nothing is free."""
+    distance = _distance_mm(plate, pixel_mm)
+    ring = free & (distance > reach_mm[0]) & (distance <= reach_mm[1])
+    if not ring.any():
+        return 0.0
+    power_h, power_v = (float(np.median(channel[ring])) ** 2 for channel in relative)
+    return float(np.sqrt(max(0.0, power_v - HALO_EXCESS * power_h)))
+
+
+def _distance_mm(mask: Mask, pixel_mm: float) -> np.ndarray:
+    return np.asarray(scipy.ndimage.distance_transform_edt(~mask)) * pixel_mm

@@ -25,7 +25,7 @@ from polysight.materials.classify import NamedPatch, PatchName, features_of
 from polysight.materials.inversion import Inversion, RigPrior, ratio_error
 from polysight.materials.labels import Labels, TruthPlate
 from polysight.materials.library import Real, SceneErrors
-from polysight.materials.measure import Permittivity, background, ratio_sigma
+from polysight.materials.measure import CommonChange, Permittivity, background, ratio_sigma
 from polysight.materials.metal import MetalReference
 from polysight.materials.segment import Box, Patch, Segmentation, axis_mm
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, PermittivityFigures, TruthFigures
@@ -135,6 +135,12 @@ class MaterialsResult:
         Numbers of the judged patches, and their errors for naming by the error budget; None without judged patches.
     brightness_off
         Patch number to ln of |H| over that of a half space of its permittivity; not for metal-like patches.
+    apart_mm
+        Where the image of V lay relative to that of H (x, y) before it was moved onto it.
+    drift
+        Drift of V / H over the scan at the plates, which is removed; None if it is not known.
+    halo
+        Amplitude of V around the metal beyond what H has there, relative to the metal.
     """
 
     calibrated: Images
@@ -154,6 +160,9 @@ class MaterialsResult:
     tilts: Tilts = LEVEL
     brightness_off: Mapping[int, float] = field(default_factory=dict)
     errors: tuple[tuple[int, ...], SceneErrors] | None = None
+    apart_mm: tuple[float, float] = (0.0, 0.0)
+    drift: CommonChange | None = None
+    halo: float = 0.0
 
     def rows(self) -> list[PatchFigures]:
         """Return the figures of each patch, for materials.json."""

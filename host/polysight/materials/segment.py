@@ -11,6 +11,7 @@ do not are counted (`Segmentation.left_out`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +37,13 @@ BODY = 0.65
 """Parts of a region narrower than this share of its width do not belong to it."""
 STEP_DB = 1.0
 """Step of the falling threshold."""
+LEAST_APART_MM, MOST_APART_MM = 0.4, 10.0
+"""Distances between the images of H and V that are corrected: smaller ones are below its error (0.2 mm), and larger
+ones have no such cause."""
+EDGE_FLOOR = 0.05
+"""Level relative to the brightest below which edges do not count."""
+ALIKE = 0.5
+"""Least correlation of the edges in H and V once they lie on each other: images of noise have less than 0.1."""
 
 
 @dataclass(frozen=True)
@@ -374,3 +382,35 @@ def _opened(mask: Mask, radius_px: float) -> Mask:
 def _components(mask: Mask) -> list[Mask]:
     labels = np.asarray(skimage.measure.label(mask, connectivity=1))
     return [labels == i for i in range(1, int(labels.max()) + 1)]
+
+
+def align(images: Images) -> tuple[Images, tuple[float, float]]:
+    """Move V onto H; return the images, and where V lay relative to H, millimetres (x, y).
+
+    The images are returned unchanged if they lie on each other, or show no edges to compare.
+    """
+    edges_h = _edges(images.h, images.usable)
+    edges_v = _edges(images.v, images.usable)
+    if not edges_h.any() or not edges_v.any():
+        return images, (0.0, 0.0)
+    # None is documented; the stub takes the default's type.
+    options: dict[str, Any] = {"upsample_factor": 20, "normalization": None}
+    found = skimage.registration.phase_cross_correlation(edges_h, edges_v, **options)
+    back_px = np.asarray(found[0], np.float64)
+    pixel_mm = abs(float(images.x_m[1] - images.x_m[0])) * 1e3
+    apart_mm = -back_px[::-1] * pixel_mm
+    moved = np.asarray(scipy.ndimage.shift(edges_v, back_px, order=1))
+    alike = float(np.corrcoef(edges_h.ravel(), moved.ravel())[0, 1])
+    if not LEAST_APART_MM <= float(np.hypot(*apart_mm)) <= MOST_APART_MM or alike < ALIKE:
+        return images, (0.0, 0.0)
+    usable_v = np.where(images.usable, images.v, 0).astype(np.complex128)
+    v = np.asarray(scipy.ndimage.shift(usable_v, back_px, order=3, mode="nearest"))
+    return replace(images, v=v.astype(images.v.dtype)), (float(apart_mm[0]), float(apart_mm[1]))
+
+
+def _edges(channel: Image, usable: Mask) -> np.ndarray:
+    """Return how steeply the level of one channel changes, float [ny, nx]; 0 far below its brightest part."""
+    amplitude = np.where(usable, np.abs(channel), 0.0)
+    level = np.log(amplitude + EDGE_FLOOR * max(float(amplitude.max()), 1e-30))
+    rows, columns = np.gradient(scipy.ndimage.gaussian_filter(level, 1.0))
+    return np.hypot(rows, columns)

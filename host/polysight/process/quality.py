@@ -37,9 +37,12 @@ from polysight.results import (
     Residual,
     ScanQuality,
     Verdict,
+    apart_reasons,
     brightness_reasons,
     copies_reasons,
     direct_path_reasons,
+    drift_reasons,
+    halo_reasons,
     incidence_reasons,
     leakage_reasons,
     level_reasons,
@@ -378,13 +381,19 @@ def scene_reasons(found: MaterialsResult, plane: PlaneEstimate | None, classifie
     copies = find_copies([r.patch for r in found.patches], found.calibrated.h, found.calibrated.v, pixel_mm)
     if copies is not None:
         reasons += copies_reasons(copies.labels, copies.shift_mm, copies.level_db)
+    reasons += apart_reasons(found.apart_mm)
+    if found.drift is not None and found.drift.value.size:
+        change = found.drift.value
+        reasons += drift_reasons(float(np.abs(change.real).max()), float(np.abs(change.imag).max()))
+    reasons += halo_reasons(found.halo)
     reasons += passivity_reasons(gaining)
     metal = found.metal
     if found.patches and metal.evidence is not None:
         e, patch = metal.evidence, "the given box" if metal.label is None else f"patch {metal.label}"
         enough = e.enough and (metal.given or metal.label not in refused)
         reasons += metal_reasons(patch, enough, enough and e.sure, metal.given, e.against, e.others == 0, e.culprit)
-    if found.prior.channels_known:
+    light = found.calibrated.illumination
+    if found.prior.channels_known and (light is None or light.known):
         gains = {"H": found.calibrated.metal_h, "V": found.calibrated.metal_v}
         reasons += level_reasons({channel: _median_level(gain) for channel, gain in gains.items()})
     reasons += leakage_reasons(found.prior.leakage_measured, found.inversion.leakage_determined, _leakage_error(found))

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
 from polysight.results.json_files import convert, one_line, read_object
-from polysight.results.quality import Verdict, read_verdict
+from polysight.results.verdict import Verdict, read_verdict
 from polysight_shared.findings import Finding
 
 Pair = tuple[float | None, float | None]

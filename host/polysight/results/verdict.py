@@ -1,0 +1,493 @@
+"""The verdict: the level of trust in a result, its reasons in order of weight, and the rules that find them.
+
+Each function `*_reasons` turns one kind of evidence into findings (what was found, why it matters, what to do), none if
+the evidence is good; `verdict_of` joins them. All limits are constants of this module. In files and messages a verdict
+is `{"level": ..., "reasons": [{"what", "why", "do"}]}`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal, TypeGuard
+
+import msgspec
+import numpy as np
+
+from polysight.results.json_files import plain
+from polysight_shared.errors import PolysightError
+from polysight_shared.findings import Finding
+from polysight_shared.findings import Level as FindingLevel
+
+Level = Literal["good", "care", "none"]
+LEVELS: dict[Level, str] = {"good": "good", "care": "usable with care", "none": "no result"}
+"""Level to its text."""
+_FINDING_LEVELS: dict[Level, FindingLevel] = {"good": "note", "care": "warning", "none": "error"}
+_ORDER: tuple[FindingLevel, ...] = ("error", "warning", "note")
+
+
+class NoResult(PolysightError):  # noqa: N818 (a result that ends a command like an error)
+    """The data do not support any material or permittivity; images are kept. Sets the exit status of commands."""
+
+    exit_status = 7
+
+
+def is_known(value: float | None) -> TypeGuard[float]:
+    """True for a finite number: one that is nan or inf is not known, and never shown."""
+    return value is not None and bool(np.isfinite(value))
+
+
+def reason(level: Level, what: str, why: str, do: str, weight: float = 1.0) -> Finding:
+    """Return a finding that allows at most this level; reasons of one level are listed by falling weight."""
+    return Finding(_FINDING_LEVELS[level], what, why, do, weight=weight)
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """Level of trust in a result, and its reasons."""
+
+    level: Level
+    reasons: tuple[Finding, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """`good`, `usable with care` or `no result`."""
+        return LEVELS[self.level]
+
+    @property
+    def usable(self) -> bool:
+        """True if names and permittivities may be shown."""
+        return self.level != "none"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict as files and messages hold it."""
+        return plain(self)
+
+    def lines(self, most: int | None = None) -> list[str]:
+        """Return text for a terminal: the level, then each reason and remedy; at most `most` reasons."""
+        shown = self.reasons[:most]
+        out = [f"verdict:  {self.text}"]
+        for r in shown:
+            out.append(f"  - {r.what}: {r.why}" if r.why else f"  - {r.what}")
+            if r.do:
+                out.append(f"    do: {r.do}")
+        if len(shown) < len(self.reasons):
+            out.append(f"  - and {len(self.reasons) - len(shown)} more, see the report")
+        return out
+
+    def error(self, kept: str = "") -> NoResult:
+        """Return the error that ends a command without a result; `kept` says where the images are."""
+        first = self.reasons[0] if self.reasons else reason("none", "no result", "", "")
+        remedy = "; ".join(part for part in (first.do, kept) if part)
+        return NoResult(f"no result: {first.what}", first.why, remedy)
+
+
+def verdict_of(reasons: Iterable[Finding]) -> Verdict:
+    """Join reasons to a verdict; its level is the worst of theirs, `good` without reasons."""
+    ordered = tuple(sorted(reasons, key=lambda r: (_ORDER.index(r.level), -r.weight)))
+    if not ordered:
+        return Verdict("good")
+    levels: list[Level] = [level for level in LEVELS if _FINDING_LEVELS[level] == ordered[0].level]
+    return Verdict(levels[0], ordered)
+
+
+def read_verdict(content: Mapping[str, Any]) -> Verdict | None:
+    """Read the verdict in the content of quality.json or materials.json; None without one of a known level."""
+    raw = content.get("verdict")
+    if not isinstance(raw, Mapping):
+        return None
+    levels: list[Level] = [level for level in LEVELS if level == raw.get("level")]
+    if not levels:
+        return None
+    level = levels[0]
+    listed = raw.get("reasons")
+    reasons = [
+        reason(level, str(r.get("what", "")), str(r.get("why", "")), str(r.get("do", "")))
+        for r in (listed if isinstance(listed, list) else [])
+        if isinstance(r, Mapping)
+    ]
+    return Verdict(level, tuple(reasons))
+
+
+FEW_POSITIONS = 0.5
+"""Share of absent or masked positions above which there is no result."""
+SOME_POSITIONS = 0.005
+"""Share of masked positions above which the result needs care."""
+RECONSTRUCTION_NONE = 0.15
+"""Expected error of an image with reconstructed positions, above which there is no result. True errors of points stay
+below twice the expected ones (tests/imaging/test_sparse.py); of nine simulated plates they were 0.1 to 1.2 times."""
+DIRECT_SNR_NONE_DB = -14.0
+"""Direct path over noise in one sample of one chirp and channel, below which it counts as missing."""
+DIRECT_SNR_CARE_DB = 0.0
+"""Same, below which it counts as weak. The simulated rig has 5.5 dB, as the paper's phase errors suggest."""
+DIRECT_LEVELS = (0.4, 3.0)
+"""Range of metal's brightness relative to the direct path; in published data both are equal within a factor of 1.5."""
+DIRECT_PHASE_CARE_RAD = 0.05
+"""Standard deviation of the object's phase from position to position; usually 0.004."""
+PLANE_FAR_MM, PLANE_TILT_DEG = 3.0, 0.5
+"""Distance and tilt of the plates' plane against the rig file, above which the result needs care."""
+PLANE_GATE_MM = 13.0
+"""Distance at which the plates lie at the edge of the range gate."""
+APART_MM = 1.0
+"""Distance of the images of H and V above which boards are out of place; undisturbed scenes have up to 0.6 mm."""
+DRIFT_CARE = 0.03
+"""Drift of ln(V / H) between plates above which the result needs care, each part."""
+HALO_CARE = 0.005
+"""Halo of V around the metal above which a receiver is overdriven."""
+PLATE_ACROSS_DEG = 0.5
+"""Tilt of a plate across the plane of incidence; turns the polarisation by 0.4 degrees: 3 to 6 % of a permittivity."""
+BRIGHTNESS_CARE = 0.2
+"""ln of |H| over that of a half space: rough, tilted, high plates stay within 0.13 (simulated), thin sheets to 0.5."""
+LEAKAGE_SHARE = 0.02
+"""Relative error of permittivities by leakage, above which the result needs care."""
+LIBRARY_ANGLE_DEG = 0.3
+"""Difference from the library's angle; the ratio of a material changes by 3 % in 0.3 degrees."""
+
+
+def percent(part: int, whole: int, digits: int) -> str:
+    """Format a share; "100 %" only if nothing is missing."""
+    if part >= whole:
+        return "100 %"
+    return f"{min(100 * part / whole, 100 - 10**-digits):.{digits}f} %"
+
+
+class Coverage(msgspec.Struct, frozen=True):
+    """Recorded rows, positions and frames beside the plan, and the faults of the manifest.
+
+    `rows_absent` are their numbers; frames and positions of absent rows count as not received.
+    """
+
+    rows_planned: int
+    rows_recorded: int
+    frames_planned: int
+    frames_received: int
+    manifest: tuple[str, ...] = ()
+    rows_absent: tuple[int, ...] = ()
+    positions_planned: int = 0
+    positions_absent: int = 0
+
+    @property
+    def damage(self) -> str:
+        """The faults of the manifest as a sentence; "" without any."""
+        if not self.manifest:
+            return ""
+        return f"The manifest is damaged: {'; '.join(self.manifest)}. `polysight validate` lists the losses."
+
+    def lines(self) -> tuple[str, ...]:
+        """Return text for a terminal: rows and frames beside the plan, and faults of the manifest."""
+        rows = f"rows: {self.rows_recorded} of {self.rows_planned} recorded"
+        if self.positions_absent:
+            rows += f" ({100 * self.positions_absent / self.positions_planned:.1f} % of positions absent)"
+        received = f"{rows}; frames: {percent(self.frames_received, self.frames_planned, 1)}"
+        counts = f"{received} of {self.frames_planned} planned"
+        return (counts, self.damage) if self.damage else (counts,)
+
+
+def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Finding]:
+    """Judge rows, frames and manifest against the plan; `masked_share` of the recorded positions is masked."""
+    out = []
+    absent = 1 - coverage.rows_recorded / coverage.rows_planned if coverage.rows_planned else 1.0
+    if coverage.rows_recorded < coverage.rows_planned:
+        level = "none" if absent > FEW_POSITIONS else "care"
+        missing = coverage.rows_planned - coverage.rows_recorded
+        out.append(reason(
+            level, f"{missing} of {coverage.rows_planned} rows are absent ({100 * absent:.1f} % of the positions)",
+            "the scan was stopped, or rows were lost; plates there are missing or distorted",
+            "`polysight resume SCAN` records the missing rows", 5 + absent,
+        ))  # fmt: skip
+    out += [
+        reason("care", fault, "a recorded row is missing in the images", "run `polysight validate SCAN`", 6.0)
+        for fault in coverage.manifest
+    ]
+    frames = 1 - coverage.frames_received / coverage.frames_planned if coverage.frames_planned else 1.0
+    lost = max(masked_share, frames - absent)
+    if lost > SOME_POSITIONS:
+        out.append(reason(
+            "none" if lost > FEW_POSITIONS else "care",
+            f"{100 * lost:.1f} % of the recorded positions or frames are masked",
+            "packets were lost, or the direct path was not found there",
+            "look at each board's frames in the report; `polysight doctor` checks the network", 4 + lost,
+        ))  # fmt: skip
+    return out
+
+
+def reconstruction_reasons(boards: Iterable[tuple[str, float, float | None]]) -> list[Finding]:
+    """Judge reconstructed positions by board: its name, their share, and the expected error of its image."""
+    out = []
+    for board, missing_share, image_error in boards:
+        if missing_share <= SOME_POSITIONS:
+            continue
+        if not is_known(image_error):
+            level = "none"
+            error = "too few rows were recorded to measure its error"
+        else:
+            level = "none" if image_error > RECONSTRUCTION_NONE else "care"
+            error = f"its image is expected to be wrong by {100 * image_error:.1f} %"
+        out.append(reason(
+            level, f"{100 * missing_share:.1f} % of the positions of {board} were reconstructed: {error}",
+            "a reconstruction is right only where the scene is mostly empty, such as separate plates",
+            "record the missing rows, or scan with a smaller step (`polysight plan`)", 3 + missing_share,
+        ))  # fmt: skip
+    return out
+
+
+def direct_path_reasons(board: str, snr_db: float | None, phase_rad: float | None, found_share: float) -> list[Finding]:
+    """Judge one board's direct path: its level over noise, the residual phase, and the share of positions with one."""
+    if found_share < FEW_POSITIONS or (is_known(snr_db) and snr_db < DIRECT_SNR_NONE_DB):
+        return [reason(
+            "none", f"{board}: the direct path is missing ({100 * found_share:.0f} % of the positions have one)",
+            "without it no position is synchronised, and the images are meaningless",
+            "clear the line of sight from transmitter to receiver; check that the transmitter is on", 10.0,
+        )]  # fmt: skip
+    out = []
+    if is_known(snr_db) and snr_db < DIRECT_SNR_CARE_DB:
+        out.append(reason(
+            "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise in one chirp (5 dB are usual)",
+            "it is partly blocked, or the antennas point elsewhere; it is the reference of all phases",
+            "clear the line of sight; check the antennas' direction", 3.0,
+        ))  # fmt: skip
+    if is_known(phase_rad) and phase_rad > DIRECT_PHASE_CARE_RAD:
+        out.append(reason(
+            "care", f"{board}: residual phase {phase_rad:.3f} rad from position to position (0.004 is usual)",
+            "a weak direct path, or a strong reflector near it", "look at the synchronisation table of the report", 2.5,
+        ))  # fmt: skip
+    return out
+
+
+def level_reasons(levels: Mapping[str, float | None]) -> list[Finding]:
+    """Judge metal's brightness relative to the direct path in each channel (None: not known)."""
+    out = []
+    for channel, level in levels.items():
+        if is_known(level) and level > 0 and not DIRECT_LEVELS[0] <= level <= DIRECT_LEVELS[1]:
+            weak = level > DIRECT_LEVELS[1]
+            state = "weak" if weak else "strong"
+            what = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+.0f} dB relative to it"
+            why = (
+                "something in its way weakens the direct path; the object disturbs its estimate"
+                if weak
+                else "the object is far weaker than the direct path: the antennas point elsewhere, or it is not metal"
+            )
+            do = "clear the line of sight from transmitter to receivers, and check the antennas' direction"
+            out.append(reason("care", what, why, do, 3.5))
+    return out
+
+
+def signal_reasons(refused: Mapping[int, str], patches: int, left_out: int = 0) -> list[Finding]:
+    """Judge the patches; `refused` maps numbers of patches that are no plates to why (noise, several materials).
+
+    `left_out` bright regions of a plate's size do not stand out enough from the background to be patches.
+    """
+    if patches == 0:
+        return [reason(
+            "none", "no patch was found", "nothing in the image stands out from its background",
+            "check that the object lies on the plane and in the image (polysight image)", 9.0,
+        )]  # fmt: skip
+    if len(refused) == patches:
+        why = sorted(set(refused.values()))
+        return [reason(
+            "none", f"none of the {patches} patches is a plate: {'; '.join(why)}",
+            "there is no flat object on the plane, or the data are noise",
+            "look at the images; check the direct path and the range profile (polysight doctor)", 9.0,
+        )]  # fmt: skip
+    by_reason: dict[str, list[int]] = {}
+    for label, what in refused.items():
+        by_reason.setdefault(what, []).append(label)
+    aside = [reason(
+        "good", f"{left_out} region{'s' * (left_out > 1)} of a plate's size within 25 dB of the brightest: no patch",
+        "no brighter than the background scatters: sidelobes, clutter or very weak plates",
+        "draw a box where a plate lies (polysight label; process --labels)", 0.5,
+    )] if left_out else []  # fmt: skip
+    return aside + [
+        reason(
+            "care",
+            f"patch{'es' * (len(labels) > 1)} {', '.join(map(str, labels))} not judged: {what}",
+            "results hold for one flat plate per patch",
+            "move the plates apart, or draw their boxes (polysight label; process --labels)",
+            2.0,
+        )
+        for what, labels in by_reason.items()
+    ]
+
+
+def metal_reasons(
+    patch: str,
+    likely: bool,
+    certain: bool,
+    given: bool,
+    contradicted: bool,
+    only_patch: bool,
+    culprit: int | None = None,
+) -> list[Finding]:
+    """Judge the metal reference `patch` ("patch 3").
+
+    By the other patches it is `likely` or `certain` to be metal; `contradicted`: by its own V / H against the direct
+    path; `only_patch`: there are no others; `culprit`: the other patch that fits it least, if they speak against it.
+    `given`: the user chose it.
+    """
+    do = "lay a metal plate into the scene and name it (--metal X,Y,W,H), or use `polysight calibrate metal`"
+    if given and contradicted:
+        return [reason(
+            "care" if likely or only_patch else "none",
+            f"the given metal reference ({patch}) does not look like metal",
+            "relative to the direct path it reflects far less of V than of H, as no metal does", do, 8.0,
+        )]  # fmt: skip
+    if given and culprit is not None and not likely:
+        return [reason(
+            "care", f"patch {culprit} and others are unusual materials beside the given metal reference ({patch})",
+            "a thin or layered plate, a dish of liquid, or H and V of different places look so; or it is not metal",
+            f"look at patch {culprit}: fit it as a layer, or leave it out; check that {patch} is bare metal", 2.6,
+        )]  # fmt: skip
+    if given or certain:
+        return []
+    if likely:
+        return [reason(
+            "care", f"the metal reference ({patch}) is likely metal, not certainly",
+            "a wet or conducting plate could look like it; all permittivities depend on it", do, 2.8,
+        )]  # fmt: skip
+    why = "relative to it the other patches are impossible materials, or too few of them give evidence"
+    if only_patch:
+        why = "nothing else in the scene can show that it is metal"
+    return [reason("none", f"no metal reference: {patch} is not shown to be metal", why, do, 8.0)]
+
+
+def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> list[Finding]:
+    """Judge leakage that was not measured; `relative_error` is its median effect on the permittivities."""
+    if measured or relative_error < LEAKAGE_SHARE:
+        return []
+    source = "estimated from the scene" if determined else "never measured; its prior is used"
+    share = (
+        f"uncertain by {100 * relative_error:.0f} %" if is_known(relative_error) else "uncertain by an unknown share"
+    )
+    return [reason(
+        "care",
+        f"leakage was {source}: permittivities are uncertain by {share}, names less reliable",
+        "the rig file has no leakage_std: leakage up to 0.1 of any phase is possible",
+        "measure it once with metal strips: `polysight leakage` (docs/how-to/calibration.md)", 1.5,
+    )]  # fmt: skip
+
+
+def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], theta_std_deg: float) -> list[Finding]:
+    """Judge the position of the plates' plane against the rig file."""
+    if not known or not all(map(is_known, (offset_mm, *tilt_deg))):
+        error = f", +-{theta_std_deg:.2f} degrees" if is_known(theta_std_deg) else ""
+        return [reason(
+            "care",
+            f"the plane was not found; the angle is the rig file's{error}",
+            "no patch has a clear echo", "measure the plane's distance, or scan a flat plate (polysight focus)", 2.0,
+        )]  # fmt: skip
+    if abs(offset_mm) > PLANE_GATE_MM:
+        return [reason(
+            "none", f"the plates lie {offset_mm:+.0f} mm off the rig file's plane",
+            "they are at the edge of the range gate",
+            "measure geometry.object_distance_mm and correct the rig file", 7.0,
+        )]  # fmt: skip
+    out, tilt = [], max(abs(t) for t in tilt_deg)
+    if abs(offset_mm) > PLANE_FAR_MM:
+        out.append(reason(
+            "care", f"the plates lie {offset_mm:+.1f} mm off the rig file's plane; the angle was corrected for it",
+            "the object is at another distance, or object_distance_mm is wrong",
+            "correct geometry.object_distance_mm in the rig file", 1.6,
+        ))  # fmt: skip
+    if tilt > PLANE_TILT_DEG:
+        out.append(reason(
+            "care", f"the plates' plane is tilted by {tilt:.1f} degrees",
+            "tilted plates reflect past the scanned positions",
+            "lay the plates parallel to the stage", 1.4,
+        ))  # fmt: skip
+    return out
+
+
+def copies_reasons(labels: Sequence[int], shift_mm: tuple[float, float], level_db: float) -> list[Finding]:
+    """Judge patches that are shifted, weaker copies of the plates; none without `labels`."""
+    if not labels:
+        return []
+    place = f"x {shift_mm[0]:+.0f}, y {shift_mm[1]:+.0f} mm away and {-level_db:.0f} dB weaker"
+    return [reason(
+        "care", f"patches {', '.join(map(str, labels))} repeat the plates, {place}",
+        "a second path beside the direct path (multipath) modulates the scan; the plates are disturbed by it as much",
+        "take reflectors away from the line between transmitter and receivers, or cover them with absorber", 4.5,
+    )]  # fmt: skip
+
+
+def apart_reasons(apart_mm: tuple[float, float]) -> list[Finding]:
+    """Judge where the image of V lay relative to that of H (x, y)."""
+    distance = float(np.hypot(*apart_mm))
+    if not is_known(distance) or distance <= APART_MM:
+        return []
+    return [reason(
+        "care",
+        f"the images of H and V lay {distance:.1f} mm apart (x {apart_mm[0]:+.1f}, y {apart_mm[1]:+.1f} mm)",
+        "boards are out of place by a few millimetres, or all plates lie high; the images were laid on each other",
+        "measure where the antennas are (`polysight calibrate direct-path`) and correct the rig file", 1.9,
+    )]  # fmt: skip
+
+
+def drift_reasons(amplitude: float, phase_rad: float) -> list[Finding]:
+    """Judge the drift of V / H over the scan: largest differences between plates and metal."""
+    if not (is_known(amplitude) and is_known(phase_rad)) or max(amplitude, phase_rad) <= DRIFT_CARE:
+        return []
+    return [reason(
+        "care", f"V / H drifts by {100 * amplitude:.0f} % and {np.degrees(phase_rad):.0f} degrees between the plates",
+        "the gains of the boards change during the scan (temperature); it is corrected to about a half",
+        "let the boards warm up for half an hour; put the metal into the middle of the scan", 2.7,
+    )]  # fmt: skip
+
+
+def halo_reasons(level: float) -> list[Finding]:
+    """Judge the halo of V around the metal: its amplitude relative to the metal."""
+    if not is_known(level) or level <= HALO_CARE:
+        return []
+    return [reason(
+        "care", f"V has a halo around the metal, {20 * np.log10(level):.0f} dB, that H does not have",
+        "the receiver of V is overdriven (clipping): the metal's V is too weak, its neighbours are disturbed",
+        "lower the gain of the receivers (rx_gain_db), or use a smaller piece of metal", 4.2,
+    )]  # fmt: skip
+
+
+def tilt_reasons(across_deg: Mapping[int, float]) -> list[Finding]:
+    """Judge the tilts of plates across the plane of incidence: patch number to degrees."""
+    tilted = {label: angle for label, angle in across_deg.items() if is_known(angle) and abs(angle) > PLATE_ACROSS_DEG}
+    if not tilted:
+        return []
+    worst = max(tilted, key=lambda label: abs(tilted[label]))
+    more = "" if len(tilted) == 1 else f" ({len(tilted)} patches in all)"
+    return [reason(
+        "care", f"patch {worst} rises by {tilted[worst]:+.1f} degrees across the plane of incidence{more}",
+        "the polarisation turns with it: 5 to 13 % of a permittivity per degree, corrected to about a quarter",
+        "lay plates and metal flat; shim the tilted one", 1.3,
+    )]  # fmt: skip
+
+
+def passivity_reasons(gaining: Mapping[int, str]) -> list[Finding]:
+    """Judge patches whose permittivity is impossible for a passive material: number to the fault."""
+    return [
+        reason(
+            "care", f"patch {label} has no permittivity: {what}",
+            "it points to leakage, a layered plate, a wrong metal reference, or H and V not on the same place",
+            "measure leakage; if the plate is thin, fit it as a layer (polysight permittivity --layer)", 2.2,
+        )
+        for label, what in gaining.items()
+    ]  # fmt: skip
+
+
+def brightness_reasons(off: Mapping[int, float]) -> list[Finding]:
+    """Judge brightness: patch number to ln of |H| over that of a half space of its permittivity."""
+    out = []
+    for label, ln in off.items():
+        if is_known(ln) and abs(ln) > BRIGHTNESS_CARE:
+            share, than = 100 * abs(float(np.expm1(ln))), "brighter" if ln > 0 else "darker"
+            out.append(reason(
+                "care", f"patch {label} is {share:.0f} % {than} than a half space of its permittivity",
+                "it may be thin, layered, rough, or partly in a shadow; the permittivity of a thin plate is then wrong",
+                "fit it as a layer (polysight permittivity --layer), or lay it flat and free", 1.7,
+            ))  # fmt: skip
+    return out
+
+
+def incidence_reasons(angle_deg: float, library_deg: float | None) -> list[Finding]:
+    """Judge the incidence angle against the library's."""
+    if not is_known(library_deg) or not is_known(angle_deg) or abs(angle_deg - library_deg) <= LIBRARY_ANGLE_DEG:
+        return []
+    return [reason(
+        "care", f"the scan has an incidence angle of {angle_deg:.2f} degrees, the library {library_deg:.2f}",
+        "the ratio of a material changes by 10 % in a degree: names may be wrong",
+        "make a library at this angle, or move the plane", 1.8,
+    )]  # fmt: skip

@@ -1,15 +1,16 @@
-"""Echoes of shapes as a receiver sees them after synchronisation: physical optics about the specular point.
+"""Echoes of shapes as a receiver sees them after synchronisation.
 
-Around the specular point of each stage position the surface is sampled in units of its Fresnel zone and summed under a
-smooth window: the trapezoidal rule of a smooth integrand converges exponentially. What lies outside adds nothing but
-edges and shadow boundaries, which physical optics has wrong. What is left after the phase of the specular path is
-smooth, so a coarse lattice of stage positions and a few frequencies are enough; the path itself is exact everywhere.
-Flat plates keep their sharp edges: they are summed facet by facet at every position.
+Spheres and cylinders of one medium have exact series (`series`). For all other surfaces it is physical optics about the
+specular point of each stage position: the surface is sampled in units of its Fresnel zone and summed under a smooth
+window; the trapezoidal rule of a smooth integrand converges exponentially. What lies outside adds nothing but edges and
+shadow boundaries, which physical optics has wrong. What is left after the phase of the specular path is smooth, so a
+coarse lattice of stage positions and a few frequencies are enough; the path itself is exact everywhere. Flat plates
+keep their sharp edges: they are summed facet by facet at every position.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -19,7 +20,8 @@ from scipy import ndimage
 from polysight_worlds.media import LIGHT_M_PER_S, reflect
 from polysight_worlds.optics import CHUNK, Antenna, Response, integrate_phase, rectangle, respond
 from polysight_worlds.rig import Boards
-from polysight_worlds.shapes import Shape, Sphere, find_specular, follow_path
+from polysight_worlds.series import Pair, scatter_cylinder, scatter_sphere
+from polysight_worlds.shapes import Revolved, Shape, Sphere, find_specular, follow_path
 
 # Window exp(-x) (1 + x + .. + x^4 / 24), x = (distance / WIDTH)^2 / 2, in units of the Fresnel zone, sqrt(1 / (k second
 # derivative)). It is entire and flat to tenth order: of a quadratic phase it misses 945 / (120 (2 WIDTH^2)^5), 7e-4.
@@ -30,9 +32,11 @@ SPACING = 0.62
 LEAST_BEND_PER_M = 0.8
 # Currents fade out from this cosine of incidence on: they do not end at the shadow's edge.
 GRAZING = 0.3
-# What edges diffract turns by a wave in 13 mm of the stage's way, relative to the specular path. A sphere has none.
+# What edges diffract turns by a wave in 13 mm of the stage's way, relative to the specular path. The series has none.
 LATTICE_M = 0.005
-LATTICE_OF_SPHERES_M = 0.012
+LATTICE_OF_SERIES_M = 0.012
+# Echoes from the inside of a body below this share of its front's are left out.
+INSIDE_LEVEL = 1e-3
 # Splines are poor at the ends of their lattice.
 PADDING = 4
 # Facets of a flat plate: the path bends by 3 / m, so its phase leaves the facet's plane by 0.04 rad.
@@ -73,20 +77,95 @@ def echo_of(
     """Wave of one shape at one RX, complex64 [frequencies, offsets], with exp(-jk (path - direct_m))."""
     if shape.is_flat_plate:
         return _sum_facets(shape, tx, rx, frequencies_hz, offsets, direct_m)
-    step_m = LATTICE_OF_SPHERES_M if isinstance(shape, Sphere) else LATTICE_M
-    lattice, coordinates = _make_lattice(offsets, step_m)
+    solution = choose_solution(shape)
     nodes_hz, expand = _frequency_nodes(frequencies_hz)
+    lattice, coordinates = _make_lattice(offsets, LATTICE_M if solution is sum_window else LATTICE_OF_SERIES_M)
+    if shows_inside(shape):
+        # What crossed the body has paths of its own: no lattice of positions or frequencies holds it.
+        lattice, nodes_hz, expand = None, frequencies_hz, np.eye(len(frequencies_hz))
     if lattice is None:
         places = find_specular(shape, *_antennas(tx, rx, offsets))
-        slow = sum_window(shape, tx, rx, nodes_hz, offsets, places)
+        slow = solution(shape, tx, rx, nodes_hz, offsets, places)
     else:
         coarse = lattice.reshape(-1, 3)
         coarse_places = find_specular(shape, *_antennas(tx, rx, coarse))
-        coarse_slow = sum_window(shape, tx, rx, nodes_hz, coarse, coarse_places)
+        coarse_slow = solution(shape, tx, rx, nodes_hz, coarse, coarse_places)
         places = tuple(_interpolate(p.reshape(lattice.shape[:2]), coordinates) for p in coarse_places)
         slow = np.stack([_interpolate(s.reshape(lattice.shape[:2]), coordinates) for s in coarse_slow])
-    path_m = follow_path(shape.at(*places), *_antennas(tx, rx, offsets)).length_m
-    return _add_carrier(slow, path_m - direct_m, frequencies_hz, expand)
+    path = follow_path(shape.at(*places), *_antennas(tx, rx, offsets))
+    if solution is solve_cylinder:
+        slow = slow * _end_factors(shape, path.hessian, places[0], nodes_hz)
+    return _add_carrier(slow, path.length_m - direct_m, frequencies_hz, expand)
+
+
+Solution = Callable[[Shape, Antenna, Antenna, NDArray, NDArray, tuple[NDArray, ...]], NDArray]
+
+
+def choose_solution(shape: Shape) -> Solution:
+    """Exact series for spheres and cylinders of one medium; physical optics for all else."""
+    if not shape.stack.layers and isinstance(shape, Sphere):
+        return solve_sphere
+    if not shape.stack.layers and isinstance(shape, Revolved) and not shape.slope and not shape.bulge:
+        return solve_cylinder
+    return sum_window
+
+
+def shows_inside(shape: Shape) -> bool:
+    """True if a wave that crosses the body twice comes back with more than INSIDE_LEVEL."""
+    if choose_solution(shape) is sum_window or shape.stack.is_metal:
+        return False
+    loss = abs(np.sqrt(shape.stack.below).imag)
+    across_m = 4 * shape.scale_m()[1]
+    return bool(np.exp(-2 * np.pi * 78e9 / LIGHT_M_PER_S * loss * across_m) > INSIDE_LEVEL)
+
+
+def _medium(shape: Shape) -> complex | None:
+    return None if shape.stack.is_metal else shape.stack.below
+
+
+def solve_sphere(
+    shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
+) -> NDArray:
+    """Mie's series, without the specular path's phase: [frequencies, offsets]."""
+    patch = shape.at(*places)
+    path_m = follow_path(patch, *_antennas(tx, rx, offsets)).length_m
+    pair = Pair.aimed(tx, rx, offsets, np.asarray(shape.place_m), patch.point)
+    waves = []
+    for frequency_hz in frequencies_hz:
+        wave = scatter_sphere(pair, shape.scale_m()[0], _medium(shape), frequency_hz, with_inside=shows_inside(shape))
+        waves.append(wave * np.exp(2j * np.pi * frequency_hz / LIGHT_M_PER_S * path_m))
+    return np.stack(waves)
+
+
+def solve_cylinder(
+    shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
+) -> NDArray:
+    """Series of the endless cylinder, without the specular path's phase: [frequencies, offsets]."""
+    patch = shape.at(*places)
+    path_m = follow_path(patch, *_antennas(tx, rx, offsets)).length_m
+    pair = Pair.aimed(tx, rx, offsets, np.asarray(shape.place_m), patch.point).turned(shape.axes)
+    across_m = np.sqrt(path_m**2 - (pair.rx_m[0] - pair.tx_m[0]) ** 2)
+    waves = []
+    for frequency_hz in frequencies_hz:
+        wave = scatter_cylinder(
+            pair, shape.scale_m()[1], _medium(shape), frequency_hz, across_m, with_inside=shows_inside(shape)
+        )
+        waves.append(wave * np.exp(2j * np.pi * frequency_hz / LIGHT_M_PER_S * path_m))
+    return np.stack(waves)
+
+
+def _end_factors(shape: Shape, hessian: NDArray, along: NDArray, frequencies_hz: NDArray) -> NDArray:
+    """What a cylinder's ends leave of the endless one's echo, [frequencies, offsets]: a Fresnel integral along it."""
+    bend = hessian[0, 0] - hessian[0, 1] ** 2 / hessian[1, 1]
+    units = _window_units()
+    weights = _window(units) * np.exp(-0.5j * units**2)
+    weights /= weights.sum()
+    factors = []
+    for frequency_hz in frequencies_hz:
+        zone_m = 1 / np.sqrt(2 * np.pi * frequency_hz / LIGHT_M_PER_S * bend)
+        places = along[:, None] + zone_m[:, None] * units
+        factors.append(shape.cover(places, np.zeros_like(places)) @ weights)
+    return np.stack(factors)
 
 
 def _add_carrier(slow: NDArray, excess_m: NDArray, frequencies_hz: NDArray, expand: NDArray) -> NDArray:
@@ -133,6 +212,10 @@ def _frequency_nodes(frequencies_hz: NDArray, count: int = 6) -> tuple[NDArray, 
     return middle + half * nodes, wanted @ np.linalg.inv(basis)
 
 
+def _window_units() -> NDArray:
+    return np.arange(-np.floor(END / SPACING), np.floor(END / SPACING) + 1) * SPACING
+
+
 def _window(units: NDArray) -> NDArray:
     """Smooth window over distances in Fresnel zones."""
     x = (units / WIDTH) ** 2 / 2
@@ -152,7 +235,7 @@ def sum_window(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
 ) -> NDArray:
     """Physical optics about the specular points (a, b), without the specular path's phase: [frequencies, offsets]."""
-    units = np.arange(-np.floor(END / SPACING), np.floor(END / SPACING) + 1) * SPACING
+    units = _window_units()
     xi, eta = (grid.ravel() for grid in np.meshgrid(units, units))
     weights = _window(xi) * _window(eta) * SPACING**2
     sums = np.empty((len(frequencies_hz), len(offsets)), complex)

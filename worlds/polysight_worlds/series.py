@@ -1,0 +1,365 @@
+"""Exact echoes of a sphere and of an endless cylinder between two small antennas, by multipole series.
+
+The antennas are dipoles whose field towards the specular point is that of the antenna. Inside this module fields vary
+as exp(-i omega t), as in the books: permittivities are eps' + i eps'', outgoing waves Hankel functions of the first
+kind. Both functions return the wave of the other sign, exp(+j omega t), as the rest of the package.
+
+A body that absorbs shows its front only: its inner wave runs inwards and never comes back (the first term of Debye's
+series). With `with_inside`, what crossed the body is there too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+from scipy import special
+
+from polysight_worlds.media import LIGHT_M_PER_S
+from polysight_worlds.optics import Antenna
+
+# Terms beyond the size parameter x: Wiscombe's criterion for double precision, 4.05 x^(1/3) + 2, and some more.
+MORE_TERMS = 12
+# Places of the integrand over the axial wave number, in units of sqrt(1 / second derivative of the phase).
+PLACES = (-np.sqrt(3), 0.0, np.sqrt(3))
+# Of the polynomials in the path by which a cylinder's coefficients are looked up.
+DEGREE = 23
+
+
+@dataclass(frozen=True)
+class Pair:
+    """TX and RX relative to the body, for several stage offsets: positions and dipoles, each [3, n].
+
+    The dipoles are conjugated, for exp(-i omega t).
+    """
+
+    tx_m: NDArray
+    rx_m: NDArray
+    sent: NDArray
+    received: NDArray
+
+    @staticmethod
+    def aimed(tx: Antenna, rx: Antenna, offsets_m: NDArray, origin_m: NDArray, points_m: NDArray) -> Pair:
+        """Return antennas that send to `points_m` [3, n], relative to a body at `origin_m` [3]."""
+        places = []
+        fields = []
+        for antenna in (tx, rx):
+            place = antenna.position[:, None] + offsets_m.T
+            ray = points_m - place
+            fields.append(np.conj(antenna.field(ray / np.linalg.norm(ray, axis=0))))
+            places.append(place - np.asarray(origin_m)[:, None])
+        return Pair(places[0], places[1], fields[0], fields[1])
+
+    def turned(self, axes: NDArray) -> Pair:
+        """Return the pair in local axes (columns of `axes`)."""
+        return Pair(*(np.einsum("ji,jn->in", axes, part) for part in vars(self).values()))
+
+
+def _dot(a: NDArray, b: NDArray) -> NDArray:
+    return np.einsum("in,in->n", a, b)
+
+
+def orders_of(x: float) -> NDArray:
+    """Orders 0, 1, .. that a body of size parameter x needs."""
+    return np.arange(int(np.ceil(x + 4.05 * x ** (1 / 3) + MORE_TERMS)) + 1)
+
+
+def sphere_coefficients(
+    radius_m: float, k: float, permittivity: complex | None, *, with_inside: bool
+) -> tuple[NDArray, NDArray]:
+    """Mie's coefficients (a_n, b_n) for n = 1, 2, .. (Bohren and Huffman, 4.88); `permittivity` None: metal.
+
+    `permittivity` is eps' - j eps''.
+    """
+    x = k * radius_m
+    orders = orders_of(x)
+    count = len(orders) - 1
+    psi = x * special.spherical_jn(orders, x)
+    xi = psi + 1j * x * special.spherical_yn(orders, x)
+    n = orders[1:]
+    if permittivity is None:
+        psi_rate = psi[:-1] - n / x * psi[1:]
+        xi_rate = xi[:-1] - n / x * xi[1:]
+        return psi_rate / xi_rate, psi[1:] / xi[1:]
+    index = np.sqrt(np.conj(permittivity))
+    rates = _inner_rates(index * x, count, with_inside)
+    pair = []
+    for factor in (1 / index, index):
+        admittance = factor * rates + n / x
+        pair.append((admittance * psi[1:] - psi[:-1]) / (admittance * xi[1:] - xi[:-1]))
+    return pair[0], pair[1]
+
+
+def _inner_rates(y: complex, count: int, with_inside: bool) -> NDArray:
+    """Logarithmic derivatives for n = 1 .. count of y j_n(y), or of the wave that only runs inwards, y h2_n(y)."""
+    rates = np.zeros(count + 1, complex)
+    if not with_inside:
+        rates[0] = -1j
+        for n in range(1, count + 1):
+            rates[n] = 1 / (n / y - rates[n - 1]) - n / y
+        return rates[1:]
+    # Downwards, where the recurrence is stable.
+    rate = 0j
+    for n in range(int(max(count, abs(y))) + 30, 0, -1):
+        if n <= count:
+            rates[n] = rate
+        rate = n / y - 1 / (rate + n / y)
+    return rates[1:]
+
+
+def scatter_sphere(
+    pair: Pair, radius_m: float, permittivity: complex | None, frequency_hz: float, *, with_inside: bool = False
+) -> NDArray:
+    """Echo of a sphere at the origin, complex [n]: dyadic Green's function of the sphere (Tai 1971, section 10-2).
+
+    The sum over azimuthal orders is done by the addition theorem: with c the cosine between the two directions,
+    sum M M' = z z' (r x grad)(r' x grad') P_n(c), and likewise N N'.
+    """
+    k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
+    electric, magnetic = sphere_coefficients(radius_m, k, permittivity, with_inside=with_inside)
+    rx_r, tx_r = np.linalg.norm(pair.rx_m, axis=0), np.linalg.norm(pair.tx_m, axis=0)
+    to_rx, to_tx = pair.rx_m / rx_r, pair.tx_m / tx_r
+    q, p = pair.received, pair.sent
+    c = _dot(to_rx, to_tx)
+    # Products of the dipoles with the derivatives of c by either direction.
+    q_r, p_r = _dot(q, to_rx), _dot(p, to_tx)
+    q_t = _dot(q, to_tx) - c * q_r
+    p_t = _dot(p, to_rx) - c * p_r
+    mixed = _dot(q, p) - _dot(p, to_rx) * q_r - p_r * q_t
+    across = np.cross(q, to_rx, axis=0)
+    m_second = _dot(across, to_tx) * _dot(p, np.cross(to_tx, to_rx, axis=0))
+    m_first = _dot(p, np.cross(to_tx, across, axis=0))
+
+    waves = [_RadialWaves(k * distance) for distance in (rx_r, tx_r)]
+    legendre = _Legendre(c)
+    total = np.zeros(c.shape, complex)
+    for n, (a_n, b_n) in enumerate(zip(electric, magnetic, strict=True), start=1):
+        (z, rate), (z_tx, rate_tx) = (wave.step(n) for wave in waves)
+        value, first, second = legendre.step(n)
+        radial = n * (n + 1) * z / (k * rx_r)
+        radial_tx = n * (n + 1) * z_tx / (k * tx_r)
+        m_part = z * z_tx * (second * m_second + first * m_first)
+        n_part = radial * radial_tx * q_r * p_r * value
+        n_part += (radial * rate_tx * q_r * p_t + rate * radial_tx * p_r * q_t) * first
+        n_part += rate * rate_tx * (second * q_t * p_t + first * mixed)
+        total -= (2 * n + 1) / (n * (n + 1)) * (b_n * m_part + a_n * n_part)
+    return np.conj(1j * k * total)
+
+
+class _RadialWaves:
+    """Outgoing spherical Hankel functions of one argument and (rho h_n)' / rho, order by order upwards."""
+
+    def __init__(self, rho: NDArray) -> None:
+        self._rho = rho
+        self._last = np.exp(1j * rho) / rho
+        self._now = -1j * self._last
+        # h_{-1} = cos + i sin over rho; h_0 = -i exp(i rho) / rho.
+        self._order = 0
+
+    def step(self, n: int) -> tuple[NDArray, NDArray]:
+        """Orders are asked for in turn, from 1."""
+        self._last, self._now = self._now, (2 * n - 1) / self._rho * self._now - self._last
+        return self._now, self._last - n / self._rho * self._now
+
+
+class _Legendre:
+    """P_n(c), its first and second derivative, order by order upwards."""
+
+    def __init__(self, c: NDArray) -> None:
+        self._c = c
+        one, zero = np.ones_like(c), np.zeros_like(c)
+        self._values = one, one
+        self._firsts = zero, zero
+        self._seconds = zero, zero
+        self._last, self._now = (zero, zero, zero), (one, zero, zero)
+
+    def step(self, n: int) -> tuple[NDArray, NDArray, NDArray]:
+        """Orders are asked for in turn, from 1."""
+        value = ((2 * n - 1) * self._c * self._now[0] - (n - 1) * self._last[0]) / n
+        # P_n' = P_{n-2}' + (2 n - 1) P_{n-1}, and once more.
+        first = self._last[1] + (2 * n - 1) * self._now[0]
+        second = self._last[2] + (2 * n - 1) * self._now[1]
+        self._last, self._now = self._now, (value, first, second)
+        return self._now
+
+
+@dataclass(frozen=True)
+class EndlessCylinder:
+    """An endless cylinder about x in local axes."""
+
+    radius_m: float
+    permittivity: complex | None
+    with_inside: bool
+
+    def coefficients(self, k: float, h: NDArray, orders: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Scattered waves for incident ones at axial wave numbers h: (M to M, N to N, M to N and N to M), [orders, h].
+
+        Tangential E and H are continuous at the surface.
+        """
+        eta = np.sqrt(k**2 - h**2)
+        a = self.radius_m
+        n = orders[:, None]
+        x = eta * a
+        j, h1 = special.jv(n, x), special.hankel1(n, x)
+        j_rate, h1_rate = eta * special.jvp(n, x), eta * special.h1vp(n, x)
+        if self.permittivity is None:
+            return -j_rate / h1_rate, -j / h1, np.zeros_like(h1)
+        inside = np.conj(self.permittivity)
+        eta_1 = np.sqrt(inside * k**2 - h**2 + 0j)
+        rate = self._inner_rates(len(orders), eta_1 * a)
+        coupling = h * n / (k * a) * (1 - eta**2 / eta_1**2)
+        u_j, u_h = (slope - eta**2 / eta_1 * rate * value for slope, value in ((j_rate, j), (h1_rate, h1)))
+        v_j, v_h = (slope - inside * eta**2 / eta_1 * rate * value for slope, value in ((j_rate, j), (h1_rate, h1)))
+        # [[u_h, g h1], [g h1, v_h]] (M, N) = -[[u_j, g j], [g j, v_j]] (incident M, N)
+        determinant = u_h * v_h - (coupling * h1) ** 2
+        m_m = -(v_h * u_j - coupling**2 * h1 * j) / determinant
+        n_n = -(u_h * v_j - coupling**2 * h1 * j) / determinant
+        m_n = -coupling * (v_h * j - h1 * v_j) / determinant
+        return m_m, n_n, m_n
+
+    def _inner_rates(self, count: int, y: NDArray) -> NDArray:
+        """J_n' / J_n, or H2_n' / H2_n of a wave that only runs inwards, [count, h]."""
+        rates = np.zeros((count, *y.shape), complex)
+        if not self.with_inside:
+            rates[0] = -special.hankel2(1, y) / special.hankel2(0, y)
+            for n in range(1, count):
+                rates[n] = 1 / ((n - 1) / y - rates[n - 1]) - n / y
+            return rates
+        # Downwards, where the recurrence is stable.
+        rate = np.zeros_like(y)
+        for n in range(int(max(count, np.abs(y).max())) + 30, 0, -1):
+            if n < count:
+                rates[n] = rate
+            rate = (n - 1) / y - 1 / (rate + n / y)
+        rates[0] = rate
+        return rates
+
+
+@lru_cache(maxsize=256)
+def _tabulate(
+    body: EndlessCylinder, k: float, along_m: float, place: float, path_range_m: tuple[float, float]
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Chebyshev series of `EndlessCylinder.coefficients` over the path in the cross-section, [DEGREE + 1, orders].
+
+    `place`: beside the stationary axial wave number, see `_axial_wave_number`.
+    """
+    low, high = path_range_m
+    places = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
+    path_m = (low + high) / 2 + (high - low) / 2 * places
+    h, _ = _axial_wave_number(k, along_m, path_m, place)
+    to_series = np.linalg.inv(chebyshev.chebvander(places, DEGREE))
+    first, second, third = (to_series @ table.T for table in body.coefficients(k, h, orders_of(k * body.radius_m)))
+    return first, second, third
+
+
+def _axial_wave_number(k: float, along_m: float, path_m: NDArray, place: float) -> tuple[NDArray, NDArray]:
+    """Axial wave number at `place` beside the stationary one, and the unit of places."""
+    whole = np.hypot(along_m, path_m)
+    unit = np.sqrt(k * path_m**2 / whole**3)
+    return k * along_m / whole + unit * place, unit
+
+
+def scatter_cylinder(
+    pair: Pair,
+    radius_m: float,
+    permittivity: complex | None,
+    frequency_hz: float,
+    path_m: NDArray,
+    *,
+    with_inside: bool = False,
+) -> NDArray:
+    """Echo of an endless cylinder about local x, complex [n].
+
+    `path_m`: specular path in the cross-section, [n]. Dyadic Green's function of the cylinder (Tai 1971, section 9-2):
+    an integral over axial wave numbers h. Its integrand has the phase h x + sqrt(k^2 - h^2) path_m, stationary at the
+    ray's own h. The rest of the integrand is taken at three real places as a parabola, so the error is of second order
+    in 1 / (k path). (On the path of steepest descent, waves that creep around the body would grow.)
+    """
+    k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
+    along_m = round(float((pair.rx_m[0] - pair.tx_m[0]).mean()), 9)
+    whole = np.hypot(along_m, path_m)
+    low, high = float(np.floor(100 * path_m.min()) / 100), float(np.floor(100 * path_m.max()) / 100) + 0.01
+    body = EndlessCylinder(radius_m, permittivity, with_inside)
+    total = np.zeros(path_m.shape, complex)
+    basis = chebyshev.chebvander((2 * path_m - low - high) / (high - low), DEGREE)
+    # Moments of exp(-i t^2 / 2): 1 and -i for t^2.
+    side = -1j / (2 * PLACES[2] ** 2)
+    for place, weight in zip(PLACES, (side, 1 - 2 * side, side), strict=True):
+        h, unit = _axial_wave_number(k, along_m, path_m, place)
+        if len(h) <= DEGREE:
+            m_m, n_n, m_n = (table.T for table in body.coefficients(k, h, orders_of(k * radius_m)))
+        else:
+            m_m, n_n, m_n = (basis @ table for table in _tabulate(body, k, along_m, place, (low, high)))
+        slow = sum_orders(pair, (m_m, n_n, m_n), k, h, path_m)
+        phase = h * along_m + np.sqrt(k**2 - h**2) * path_m - k * whole
+        total += weight * unit * slow * np.exp(1j * (phase + place**2 / 2))
+    # The integral of exp(-i t^2 / 2) is sqrt(-2 pi i).
+    total *= np.sqrt(2 * np.pi) * np.exp(-0.25j * np.pi)
+    return np.conj(0.5j * total * np.exp(1j * k * whole))
+
+
+def sum_orders(
+    pair: Pair, coefficients: tuple[NDArray, NDArray, NDArray], k: float, h: NDArray, path_m: NDArray
+) -> NDArray:
+    """Integrand at axial wave numbers h [n] over exp(i h x + i sqrt(k^2 - h^2) path_m): sum over azimuthal orders."""
+    eta = np.sqrt(k**2 - h**2)
+    m_m, n_n, m_n = coefficients
+    ends = [_AzimuthalWaves(*end, eta, h, k) for end in _ends(pair)]
+    turn = np.exp(1j * (ends[0].angle - ends[1].angle))
+    # Both ends' waves are scaled by exp(-i eta rho).
+    scale = np.exp(1j * eta * (ends[0].rho + ends[1].rho - path_m)) / eta**2
+    total = np.zeros(h.shape, complex)
+    for n in range(m_m.shape[1]):
+        (z, rate), (z_tx, rate_tx) = (end.step(n) for end in ends)
+        for order in {n, -n}:
+            # Coefficients that couple M and N change sign with the order, the others do not.
+            coupling = m_n[:, n] * (1 if order >= 0 else -1)
+            q_m, q_n = ends[0].products(order, z, rate)
+            p_m, p_n = ends[1].products(order, z_tx, rate_tx)
+            wave = q_m * (m_m[:, n] * p_m + coupling * p_n) + q_n * (n_n[:, n] * p_n + coupling * p_m)
+            total += wave * turn**order
+    return total * scale
+
+
+def _ends(pair: Pair) -> tuple[tuple[NDArray, NDArray, int], tuple[NDArray, NDArray, int]]:
+    return (pair.rx_m, pair.received, 1), (pair.tx_m, pair.sent, -1)
+
+
+class _AzimuthalWaves:
+    """Outgoing waves at one antenna, order by order upwards, and products of its dipole with M and N.
+
+    M = curl (x H_n(eta rho) exp(i n phi + i h x)) and N = curl M / k. For the transmitter the signs of n and h in the
+    exponentials change; they are the same in the products but for `sign`.
+    """
+
+    def __init__(self, place: NDArray, dipole: NDArray, sign: int, eta: NDArray, h: NDArray, k: float) -> None:
+        # Cross-section: local y and z.
+        self.rho = np.hypot(place[1], place[2])
+        self.angle = np.arctan2(place[2], place[1])
+        cosine, sine = place[1] / self.rho, place[2] / self.rho
+        self._radial = dipole[1] * cosine + dipole[2] * sine
+        self._azimuthal = dipole[2] * cosine - dipole[1] * sine
+        self._axial = dipole[0]
+        self._eta, self._h, self._k = eta, h, k
+        self._argument = eta * self.rho
+        self._now = special.hankel1e(0, self._argument)
+        self._last = -special.hankel1e(1, self._argument)
+        self._sign = sign
+
+    def step(self, n: int) -> tuple[NDArray, NDArray]:
+        """H_n and its derivative by the argument, scaled; orders are asked for in turn, from 0."""
+        if n > 0:
+            following = 2 * (n - 1) / self._argument * self._now - self._last
+            self._last, self._now = self._now, following
+        return self._now, self._last - n / self._argument * self._now
+
+    def products(self, n: int, z: NDArray, rate: NDArray) -> tuple[NDArray, NDArray]:
+        """Dipole times M and N of order n."""
+        slope = self._eta * rate
+        around = n / self.rho * z
+        m = 1j * self._sign * around * self._radial - slope * self._azimuthal
+        n_wave = 1j * self._sign * self._h * slope * self._radial - self._h * around * self._azimuthal
+        return m, (n_wave + self._eta**2 * z * self._axial) / self._k

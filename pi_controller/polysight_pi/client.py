@@ -81,7 +81,7 @@ def refuse_beside_service(instrument: Instrument) -> None:
 def home_by_service(instrument: Instrument) -> m.StatusReply | None:
     """Home through the running service and wait for the end; return None if no service runs.
 
-    Raises DeviceError if the service refuses or homing fails.
+    Raises DeviceError if the service refuses, for example because the host of a run is alive, or if homing fails.
     """
     if not _listens(instrument.pi.command_address):
         return None

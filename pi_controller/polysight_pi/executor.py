@@ -1,6 +1,7 @@
 """The executor: one thread that processes commands, replies of the stage and bursts from one queue, in order.
 
-It executes the host's commands and manages the run; machine.py controls stage and row.
+It executes the host's commands and manages the run; machine.py controls stage and row. It waits for no storage: a
+command that has to be journalled is answered by the journal's thread, all others at once.
 docs/spec/wire.md describes each command.
 """
 
@@ -12,11 +13,12 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import msgspec
 
-from polysight_pi.journal import Journal, JournalFullError
+from polysight_pi.journal import Journal, JournalFullError, JournalThread
 from polysight_pi.machine import Machine, RefusedError
 from polysight_pi.stage import StageDriver, StageLost, StageNews
 from polysight_pi.trigger import BurstSent, BurstSpec, LoopFault, TriggerLoop
@@ -29,7 +31,10 @@ from polysight_shared.stage_line import Reply
 from polysight_shared.units import us_to_ns
 
 TURN_TIMEOUT_S = 0.2  # the rest of the queue waits for the next turn, so that a queue that never empties is not a hang
-TURN_S = 1.0  # longest turn without work
+TURN_S = 0.25  # longest turn without work
+# Silence of the executor, the journal or a socket after which motion stops and the watchdog is not fed. An answer of
+# the stage takes up to 2 s; writing to an SD card that tidies up takes about 1 s.
+LATE_S = 3.0
 HUNG_S = 10.0  # time without a turn after which the executor counts as hung
 COMMANDS_WAITING = 64
 REPLAYS_WAITING = 4
@@ -38,6 +43,7 @@ REPLAYED_AT_REST = 1000  # events per reply: half a second on a Pi
 REPLAYED_IN_A_ROW = 20  # events per reply during a row: packing more would delay the trigger thread
 OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)  # commands that count as a heartbeat of the run's host
 OWNED = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)  # commands that only the run's owner may send
+JOURNALLED = (m.BeginRun, m.EndRun, m.RunRow)  # commands that are accepted once their event is on the disk
 
 
 class Request(NamedTuple):
@@ -55,26 +61,44 @@ def make_refusal(number: int, what: str, why: str = "", remedy: str = "") -> m.R
     )
 
 
+def refuse(error: PolysightError | OSError) -> m.Refused:
+    """Return the refusal of a command that raised this error."""
+    if isinstance(error, OSError):
+        why = "the operating system refused it"
+        return make_refusal(PiFault.BAD_REQUEST, os_error(error).what, why, "check the Pi's disk")
+    return make_refusal(getattr(error, "number", PiFault.BAD_REQUEST), error.what, error.why, error.remedy)
+
+
 class Executor:
     """Runs in its own thread; all threads may use :meth:`submit`, :meth:`post`, `status` and `hello`.
 
-    `turned` is called after every turn, at least once a second: it feeds the watchdog.
+    `turned` is called after every turn, at least four times a second, while no part is late: it feeds the watchdog.
+    `find_late` names a part of the program that does not answer, "" for none.
     """
 
     def __init__(
-        self, stage: StageDriver, loop: TriggerLoop, journal: Journal, turned: Callable[[], None] = lambda: None
+        self,
+        stage: StageDriver,
+        loop: TriggerLoop,
+        journal: JournalThread,
+        turned: Callable[[], None] = lambda: None,
+        find_late: Callable[[], str] = lambda: "",
     ) -> None:
         self._loop = loop
-        self._journal = journal
+        self.journal = journal
         self._turned = turned
+        self._find_late = find_late
         self.take_over_key = secrets.token_hex(16)  # accepted as the owner of every run: a person at the Pi
         self._turned_s = time.monotonic()
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._command_slots = threading.Semaphore(COMMANDS_WAITING)
         self._replay_slots = threading.Semaphore(REPLAYS_WAITING)
-        self._machine = Machine(stage, loop, journal, self._inbox.put)
+        self._machine = Machine(stage, loop, self.journal, self._inbox.put)
         self._run: m.BeginRun | None = None
         self._last_row: tuple[int, int] | None = None
+        self._takes: dict[int, int] = {}  # the newest one of each row of this run
+        self._waits_for_journal = False  # a run begins or ends
+        self._deferred: list[Request] = []  # commands behind it
         self._after_row: Request | None = None
         self._replies: list[tuple[Request, m.AnyReply]] = []
         self._pulsing: list[Request] = []
@@ -97,11 +121,11 @@ class Executor:
         if not slots.acquire(blocking=False):
             return False
 
-        def execute() -> None:
+        def release_and_answer(reply: m.AnyReply) -> None:
             slots.release()
-            self._execute(Request(command, answer))
+            answer(reply)
 
-        self._inbox.put(execute)
+        self._inbox.put(lambda: self._execute(Request(command, release_and_answer)))
         return True
 
     @property
@@ -117,11 +141,24 @@ class Executor:
         if run.owner != owner:
             return make_refusal(PiFault.NOT_OWNER, f"run {scan_id} is another program's")
         self._machine.note_host_alive()
-        return m.Accepted(state=self.status.state)
+        return m.Accepted(state=self._status.state)
+
+    @property
+    def status(self) -> m.StatusReply:
+        """The reply to `Status`. From any thread."""
+        scan_id, last_seq = self.journal.position
+        return msgspec.structs.replace(self._status, scan_id=scan_id, last_seq=last_seq)
+
+    @property
+    def hello(self) -> m.HelloReply:
+        """The reply to `Hello`. From any thread."""
+        scan_id, last_seq = self.journal.position
+        return msgspec.structs.replace(self._hello, scan_id=scan_id, last_seq=last_seq, t_unix_ns=time.time_ns())
 
     def start(self) -> None:
-        """Start the thread. The stage has to be connected."""
+        """Start this thread and the journal's. The stage has to be connected."""
         self._refresh()
+        self.journal.start()
         self._thread.start()
 
     def stop(self, timeout_s: float) -> None:
@@ -148,18 +185,39 @@ class Executor:
         except queue.Empty:
             pass
         self._machine.check_deadlines()
-        try:
-            self._journal.commit()
-        except JournalFullError as e:
-            self._machine.happen("lasting fault", e.number, str(e))
-            self._journal.commit()
+        late = self._find_late()
+        if late:
+            self._machine.stop_for(late)
         self._refresh()
-        for request, reply in self._replies:
-            self._count_as_heartbeat(request.command)
-            request.answer(reply)
-        self._replies.clear()
+        self._send_replies()
         self._turned_s = time.monotonic()
-        self._turned()
+        if not late:
+            self._turned()
+
+    def _send_replies(self) -> None:
+        replies = self._replies
+        self._replies = []
+        behind_journal: list[tuple[Request, m.AnyReply]] = []
+        for request, reply in replies:
+            self._count_as_heartbeat(request.command)
+            if isinstance(request.command, JOURNALLED) and isinstance(reply, m.Accepted):
+                behind_journal.append((request, reply))
+            else:
+                request.answer(reply)
+
+        self._commit(behind_journal)
+
+    def _commit(self, behind_journal: list[tuple[Request, m.AnyReply]]) -> None:
+        """Have the events so far written, then these replies sent."""
+
+        def answer(error: PolysightError | OSError | None) -> None:
+            if error is not None:
+                self._inbox.put(lambda: self._machine.happen("lasting fault", PiFault.JOURNAL_FULL, str(error)))
+            for request, reply in behind_journal:
+                request.answer(reply if error is None else refuse(error))
+
+        if behind_journal or self.journal.has_batch:
+            self.journal.commit(answer)
 
     def _count_as_heartbeat(self, command: m.AnyCommand) -> None:
         """Count a command of the run's host as its heartbeat: it sends no `Alive` while it waits for the reply."""
@@ -196,11 +254,8 @@ class Executor:
         """Execute a command. Every error becomes a refusal; no message can end the program."""
         try:
             reply = self._on_command(request)
-        except PolysightError as e:
-            reply = make_refusal(getattr(e, "number", PiFault.BAD_REQUEST), e.what, e.why, e.remedy)
-        except OSError as e:
-            why = "the operating system refused it"
-            reply = make_refusal(PiFault.BAD_REQUEST, os_error(e).what, why, "check the Pi's disk")
+        except (PolysightError, OSError) as e:
+            reply = refuse(e)
         except Exception as e:  # noqa: BLE001 - reported to the client and in the log
             traceback.print_exc()
             reply = make_refusal(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
@@ -213,16 +268,21 @@ class Executor:
         command = request.command
         run = self._run
         if isinstance(command, m.Replay):
-            return self._replay(command)
+            return self._replay(request, command)
         if self._ending:
             raise RefusedError(PiFault.NOT_READY, "polysight-pi is ending", "SIGTERM or SIGINT", "start it again")
-        if run and isinstance(command, OWNED) and command.owner not in (run.owner, self.take_over_key):
+        if self._waits_for_journal and isinstance(command, (*JOURNALLED, m.Pulse)):
+            self._deferred.append(request)
+            return None
+        # A run whose host is gone keeps nobody from homing.
+        owned = isinstance(command, OWNED) or (isinstance(command, m.Home) and self._machine.host_lives)
+        if run and owned and getattr(command, "owner", "") not in (run.owner, self.take_over_key):
             raise RefusedError(PiFault.NOT_OWNER, f"run {run.scan_id} is another program's")
         match command:
             case m.BeginRun():
-                return None if self._postpone(request, command) else self._begin(command)
+                return None if self._postpone(request, command) else self._begin(request, command)
             case m.EndRun():
-                return self._end_run(command)
+                return self._end_run(request, command)
             case m.RunRow():
                 return self._run_row(command)
             case m.Abort():
@@ -232,19 +292,27 @@ class Executor:
             case _:  # Home, Hold, Resume
                 return self._accept(type(command).__name__)
 
-    def _replay(self, command: m.Replay) -> m.ReplayReply:
+    def _replay(self, request: Request, command: m.Replay) -> None:
         limit = min(command.limit, REPLAYED_AT_REST)
         if self._machine.row is not None:
-            if command.scan_id != self._journal.scan_id:  # its whole file would be read
+            scan_id = self.journal.position[0]
+            if command.scan_id != scan_id:  # its whole file would be read
                 raise RefusedError(
                     PiFault.NOT_READY,
-                    f"a row of scan {self._journal.scan_id} runs",
+                    f"a row of scan {scan_id} runs",
                     "reading another scan's journal would delay its pulses",
                     "retry when the row has ended",
                 )
             limit = min(limit, REPLAYED_IN_A_ROW)
-        packed, last_seq = self._journal.read(command.scan_id, command.from_seq, limit)
-        return m.ReplayReply(events=[m.unpack_event(raw) for raw in packed], last_seq=last_seq)
+
+        def read(journal: Journal) -> m.ReplayReply:
+            packed, last_seq = journal.read(command.scan_id, command.from_seq, limit)
+            return m.ReplayReply(events=[m.unpack_event(raw) for raw in packed], last_seq=last_seq)
+
+        def answer(result: m.ReplayReply | PolysightError | OSError) -> None:
+            request.answer(result if isinstance(result, m.ReplayReply) else refuse(result))
+
+        self.journal.call(read, answer)
 
     def _accept(self, event: str = "", *args: Any) -> m.Accepted:
         """Execute a command of the state machine. Raises RefusedError."""
@@ -286,32 +354,65 @@ class Executor:
             self._machine.happen("Abort", f"run {run.scan_id} was begun again")
         return self._machine.row is not None
 
-    def _begin(self, run: m.BeginRun) -> m.Accepted:
-        resumed, lost = self._journal.open(run.scan_id, run.plan, run.last_seq)
-        self._run = self._last_row = None
-        self._machine.happen("EndRun")
-        self._add_synced(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
-        self._run = run
-        return self._accept("BeginRun", run.heartbeat_ms)
+    def _begin(self, request: Request, run: m.BeginRun) -> None:
+        def write(journal: Journal) -> None:
+            resumed, lost = journal.open(run.scan_id, run.plan, run.last_seq)
+            journal.add(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
+            journal.commit()
 
-    def _end_run(self, command: m.EndRun) -> m.Accepted:
-        if self._run is None and command.scan_id == self._journal.scan_id:
+        def begun() -> m.Accepted:
+            self._forget_run()
+            self._run = run
+            return self._accept("BeginRun", run.heartbeat_ms)
+
+        self._write_synced(request, write, begun)
+
+    def _forget_run(self) -> None:
+        self._run = self._last_row = None
+        self._takes.clear()
+        self._machine.happen("EndRun")
+
+    def _end_run(self, request: Request, command: m.EndRun) -> m.Accepted | None:
+        if self._run is None and command.scan_id == self.journal.position[0]:
             return self._accept()  # a repeated request
         self._need_run(command.scan_id)
         self._machine.require("EndRun")
-        self._add_synced(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
-        self._run = None
-        return self._accept("EndRun")
 
-    def _add_synced(self, kind: type[m.RunStarted | m.RunStopped], **fields: Any) -> None:
-        """Write an event that has to be on the disk before its command is accepted. Raises JournalFullError."""
-        self._journal.broken = False  # there may be space again
-        self._journal.add(kind, **fields)
-        try:
-            self._journal.commit()
-        except JournalFullError as e:
-            self._machine.happen("lasting fault", e.number, str(e))
-            raise
+        def write(journal: Journal) -> None:
+            journal.broken = False  # there may be space again
+            journal.add(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
+            journal.commit()
+
+        def ended() -> m.Accepted:
+            self._run = None
+            return self._accept("EndRun")
+
+        return self._write_synced(request, write, ended)
+
+    def _write_synced(
+        self, request: Request, write: Callable[[Journal], None], written: Callable[[], m.Accepted]
+    ) -> None:
+        """Write an event that has to be on the disk before its command is accepted; `written` accepts it."""
+        self._commit([])
+        self._waits_for_journal = True
+
+        def finish(error: PolysightError | OSError | None) -> None:
+            self._waits_for_journal = False
+            if isinstance(error, JournalFullError) and self.journal.is_broken:  # else it was not opened
+                if isinstance(request.command, m.BeginRun):
+                    self._forget_run()
+                self._machine.happen("lasting fault", error.number, str(error))
+            try:
+                reply = written() if error is None else refuse(error)
+            except PolysightError as e:
+                reply = refuse(e)
+            self._replies.append((request, reply))
+            deferred = self._deferred
+            self._deferred = []
+            for waiting in deferred:
+                self._execute(waiting)
+
+        self.journal.call(write, lambda error: self._inbox.put(partial(finish, error)))
 
     def _need_run(self, scan_id: str) -> m.BeginRun:
         if self._run is None or self._run.scan_id != scan_id:
@@ -323,13 +424,18 @@ class Executor:
     def _run_row(self, command: m.RunRow) -> m.Accepted:
         run = self._need_run(command.scan_id)
         running = self._machine.row
-        requested = (command.row_index, command.take)
-        repeated = running is not None and requested == (running.row.index, running.take)
-        if repeated or requested == self._last_row:
+        index = command.row_index
+        repeated = running is not None and (index, command.take) == (running.row.index, running.take)
+        if repeated or (index, command.take) == self._last_row:
             return self._accept()
         self._machine.require("RunRow")
-        _require(command.row_index < run.plan.rows, f"row {command.row_index} is not in the plan of {run.plan.rows}")
-        return self._accept("RunRow", run.plan.row(command.row_index), command.take, read_burst(run), run.speed_mm_s)
+        _require(index < run.plan.rows, f"row {index} is not in the plan of {run.plan.rows}")
+        # A late copy of an old command must not move the stage.
+        newest = self._takes.get(index, 0)
+        _require(command.take > newest, f"take {command.take} of row {index} is not newer than take {newest}")
+        accepted = self._accept("RunRow", run.plan.row(index), command.take, read_burst(run), run.speed_mm_s)
+        self._takes[index] = command.take
+        return accepted
 
     def _row_ended(self, row: tuple[int, int]) -> None:
         self._last_row = row
@@ -344,12 +450,15 @@ class Executor:
         self._ended = not self._machine.terminate()
 
     def _refresh(self) -> None:
-        """Update the replies to Hello and Status; they are replaced as a whole, so other threads may read them."""
+        """Update the replies to Hello and Status; they are replaced as a whole, so other threads may read them.
+
+        Their `scan_id` and `last_seq` are those of the journal when they are sent.
+        """
         machine = self._machine
         stage = machine.stage
         status = m.StatusReply(
             state=machine.wire_state, homed=machine.homed, x_mm=stage.x_mm, y_mm=stage.y_mm,
-            scan_id=self._journal.scan_id, row_index=-1, take=0, points=0, pulses=0, last_seq=self._journal.last_seq,
+            scan_id="", row_index=-1, take=0, points=0, pulses=0, last_seq=0,
             fault=machine.fault, reason=machine.reason, lost_x_mm=machine.lost_mm[0], lost_y_mm=machine.lost_mm[1],
         )  # fmt: skip
         if (row := machine.row) is not None:
@@ -357,11 +466,10 @@ class Executor:
             status = msgspec.structs.replace(
                 status, row_index=row.row.index, take=row.take, points=counts.bursts, pulses=counts.pulses
             )
-        self.status = status
-        self.hello = m.HelloReply(
+        self._status = status
+        self._hello = m.HelloReply(
             pi_release=__version__, firmware=stage.firmware, backend=self._loop.backend, state=machine.wire_state,
-            scan_id=status.scan_id, last_seq=status.last_seq, in_run=self._run is not None,
-            stage=stage.config.placement_settings,
+            scan_id="", last_seq=0, in_run=self._run is not None, stage=stage.config.placement_settings,
         )  # fmt: skip
 
 

@@ -3,7 +3,10 @@
 One append-only file per scan: 8 bytes of magic, then records of `<length, sequence, crc32(sequence + payload)>` (three
 little-endian u32) and the packed event. Sequence numbers count from 1, without gaps unless a journal was lost and
 continues after the host's last event. A torn or damaged tail, as after a power cut, is cut off at the last good record
-when the file is opened. Specification: docs/spec/wire.md. Used by the executor's thread only.
+when the file is opened. Specification: docs/spec/wire.md.
+
+A disk can hang for a minute without an error. So the program uses the journal through `JournalThread`: nobody waits for
+storage, and whatever depends on it is called back.
 """
 
 from __future__ import annotations
@@ -11,21 +14,24 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import queue
 import shutil
 import struct
+import threading
 import time
+import traceback
 import zlib
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
 
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError, ProtocolError
+from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError, ProtocolError
 from polysight_shared.faults import PiFault
 from polysight_shared.raster import RasterPlan
 
@@ -35,6 +41,9 @@ CAPTURE_BYTES = 320  # upper limit of a position's record
 SPARE_BYTES = 4 << 20  # for faults and retakes
 SEARCHED_BYTES = 1 << 20  # length of the search for a good record after damage
 DAMAGED = ".damaged"  # suffix of the copy of a damaged journal
+# Of the thread's queue: jobs, and events that wait for a place in it. A row stops long before (LATE_S).
+JOBS_WAITING = 256
+EVENTS_WAITING = 1000
 _HEAD = struct.Struct("<III")
 
 
@@ -215,6 +224,7 @@ class Journal:
         self._pending = 0  # events of the batch that are to be written
         self.broken = False
         self.scan_id = ""
+        self.position = ("", 0)  # current scan and number of its newest published event; replaced as a whole
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -285,7 +295,9 @@ class Journal:
                 self._file.close()
             self._file = file
             self.scan_id = scan_id
-        return begun is not None or host_seq > 0, file.number_behind(host_seq)
+        lost = file.number_behind(host_seq)
+        self.position = (scan_id, file.last_seq)
+        return begun is not None or host_seq > 0, lost
 
     def check_room(self, scan_id: str, positions: int) -> None:
         """Raise JournalFullError if the disk has no space for the rest of the scan's journal."""
@@ -300,14 +312,14 @@ class Journal:
             room = f"{free / 1e6:.1f} MB free, {needed / 1e6:.1f} MB needed for {positions} positions"
             raise JournalFullError(self.folder, OSError(errno.ENOSPC, room))
 
-    def add(self, kind: type[m.AnyEvent], **fields: Any) -> None:
+    def add(self, kind: type[m.AnyEvent], t_mono_ns: int = 0, **fields: Any) -> None:
         """Number an event and add it to the batch; long texts are shortened to the limit of the messages.
 
-        An event that is not journalled has the number of the last one that is.
+        An event that is not journalled has the number of the last one that is. Default time: now.
         """
         self._pending += issubclass(kind, m.JOURNALLED) and self._file is not None and not self.broken
         fields = {k: v[: m.MAX_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
-        event = kind(scan_id=self.scan_id, seq=self.last_seq, t_mono_ns=time.monotonic_ns(), **fields)
+        event = kind(scan_id=self.scan_id, seq=self.last_seq, t_mono_ns=t_mono_ns or time.monotonic_ns(), **fields)
         self._batch.append((event, m.pack(event)))
 
     def commit(self) -> None:
@@ -333,6 +345,12 @@ class Journal:
                 raise
         if batch:
             self._publish([raw for _, raw in batch])
+            self.position = (self.scan_id, self.last_seq)
+
+    def publish_now(self, kind: type[m.AnyEvent], **fields: Any) -> None:
+        """Publish an event that is not journalled, without waiting for those that are. From any thread."""
+        scan_id, seq = self.position
+        self._publish([m.pack(kind(scan_id=scan_id, seq=seq, t_mono_ns=time.monotonic_ns(), **fields))])
 
     def read(self, scan_id: str, from_seq: int, limit: int) -> tuple[list[bytes], int]:
         """Return packed events of any scan from `from_seq` on and its newest number; ([], 0) without a journal."""
@@ -363,3 +381,124 @@ def _read_plan(file: JournalFile) -> RasterPlan | None:
         if isinstance(event, m.RunStarted):
             return event.plan
     return None
+
+
+class Job(NamedTuple):
+    """Work on the journal, and the callback for its result or error; `asked_s`: when it was asked for."""
+
+    work: Callable[[Journal], Any]
+    then: Callable[[Any], object]
+    asked_s: float
+
+
+class JournalThread:
+    """A thread that alone uses the journal's files. `add` and `commit` are for the executor's thread."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self._events: list[tuple[type[m.AnyEvent], int, dict[str, Any]]] = []
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._busy_since_s: float | None = None  # when the job in work was asked for
+        self._thread = threading.Thread(target=self._work, name="journal", daemon=True)
+        self._closed = False
+
+    @property
+    def position(self) -> tuple[str, int]:
+        """The current scan and the number of its newest published event."""
+        return self._journal.position
+
+    @property
+    def is_broken(self) -> bool:
+        """True since a failed write, until the scan is opened again."""
+        return self._journal.broken
+
+    @property
+    def late_s(self) -> float:
+        """Age of the oldest job that is not finished, seconds."""
+        since_s = self._busy_since_s
+        return 0.0 if since_s is None else time.monotonic() - since_s
+
+    def add(self, kind: type[m.AnyEvent], **fields: Any) -> None:
+        """Add an event to the batch; events that are not journalled are published at once."""
+        if issubclass(kind, m.JOURNALLED):
+            self._events.append((kind, time.monotonic_ns(), fields))
+        else:
+            self._journal.publish_now(kind, **fields)
+
+    def commit(self, then: Callable[[PolysightError | OSError | None], object]) -> None:
+        """Have the batch written and published; then call `then` with None, or with the error.
+
+        While the queue is full the batch waits for a later call; a batch that is too long is given up.
+        """
+        if self._jobs.qsize() >= JOBS_WAITING and len(self._events) < EVENTS_WAITING:
+            return
+        events = self._events
+        self._events = []
+        if len(events) >= EVENTS_WAITING:
+            then(JournalFullError(self._journal.folder, OSError(errno.EIO, "the disk hangs, too many events wait")))
+            return
+
+        def write(journal: Journal) -> None:
+            for kind, t_mono_ns, fields in events:
+                journal.add(kind, t_mono_ns, **fields)
+            journal.commit()
+
+        self.call(write, then)
+
+    @property
+    def has_batch(self) -> bool:
+        """True if events wait for :meth:`commit`."""
+        return bool(self._events)
+
+    def call(self, work: Callable[[Journal], Any], then: Callable[[Any], object]) -> None:
+        """Queue a job; `then` gets its result, or the PolysightError or OSError it raised, in the journal's thread."""
+        self._jobs.put(Job(work, then, time.monotonic()))
+
+    def retry(self) -> None:
+        """Write again from now on: there may be space."""
+
+        def retry(journal: Journal) -> None:
+            journal.broken = False
+
+        self.call(retry, lambda _: None)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def _work(self) -> None:
+        try:
+            while (job := self._jobs.get()) is not None:
+                self._busy_since_s = job.asked_s
+                self.do(job)
+                self._busy_since_s = None
+        except BaseException:
+            # The job never ends, so that the executor sees a journal that is late.
+            traceback.print_exc()
+            raise
+
+    def do(self, job: Job) -> None:
+        """Do a job and pass on its result."""
+        try:
+            result = job.work(self._journal)
+        except (PolysightError, OSError) as e:
+            result = e
+        job.then(result)
+
+    def do_waiting(self) -> None:
+        """Do the jobs that wait, in this thread, instead of :meth:`start`."""
+        while not self._jobs.empty():
+            if (job := self._jobs.get()) is not None:
+                self.do(job)
+
+    def stop(self, timeout_s: float) -> None:
+        """End the thread behind the jobs that wait, and close the journal; leave a hanging disk alone.
+
+        Raises JournalFullError.
+        """
+        self._jobs.put(None)
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
+        if not self._thread.is_alive() and not self._closed:
+            self._closed = True
+            self._journal.close()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
-from polysight_pi.journal import Journal
+from polysight_pi.journal import JournalThread
 from polysight_pi.stage import MAX_MM, StageDriver, StageLostError, StageRefusedError
 from polysight_pi.trigger import BurstSent, BurstSpec, Counts, Job, LoopFault, TriggerLoop, TriggerWatch
 from polysight_shared import messages as m
@@ -146,7 +146,7 @@ class Machine:
         self,
         stage: StageDriver,
         loop: TriggerLoop,
-        journal: Journal,
+        journal: JournalThread,
         post: Callable[[Callable[[], object]], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -250,6 +250,13 @@ class Machine:
             reason = f"no heartbeat of the host for {self._host_timeout_s * 1e3:.0f} ms"
             self.happen("row fault", PiFault.HOST_LOST, reason)
 
+    def stop_for(self, late: str) -> None:
+        """Stop the motion because a part of the program does not answer; `late` names it."""
+        if self.state in ("running", "held"):
+            self.happen("row fault", PiFault.PROGRAM_LATE, late)
+        elif self.state == "homing":
+            self.happen("lasting fault", PiFault.PROGRAM_LATE, late)
+
     # --- events of trigger loop and stage ---------------------------------------------------------------------------
 
     def on_burst(self, sent: BurstSent) -> None:
@@ -339,7 +346,8 @@ class Machine:
         if self._lines_dead:
             remedy = "find out why, then start polysight-pi again"
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self.reason, remedy=remedy)
-        self.homed = self._homing_underway = self._journal.broken = False
+        self.homed = self._homing_underway = False
+        self._journal.retry()
         self._forget_fault()
         self._post(self._home_now)
 

@@ -1,30 +1,29 @@
 """`polysight-pi run`: the two ZeroMQ sockets, and the service that creates all parts and closes them in a safe order.
 
 Events go out on a PUB socket, commands come in on a ROUTER, which keeps each command's envelope, so that `Hello`,
-`Status` and `Alive` are answered while the executor is busy or hangs. Only the server's thread uses the sockets; others
-queue messages and wake it. Specification: docs/spec/wire.md.
+`Status` and `Alive` are answered while the executor is busy or hangs. Each socket has a thread that alone uses it;
+others queue messages. Specification: docs/spec/wire.md.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import queue
 import signal
 import sys
+import threading
 import time
 import traceback
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import zmq
 
 from polysight_pi import system
-from polysight_pi.executor import HUNG_S, Executor, make_refusal
-from polysight_pi.journal import Journal, JournalFullError
+from polysight_pi.executor import HUNG_S, LATE_S, Executor, make_refusal
+from polysight_pi.journal import Journal, JournalFullError, JournalThread
 from polysight_pi.keys import AllowedKeys
 from polysight_pi.lines import open_lines
 from polysight_pi.stage import StageDriver
@@ -37,6 +36,7 @@ from polysight_shared.faults import PiFault
 from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, publisher, replier
 
 LINGER_MS = 200
+POLL_MS = 250
 END_TIMEOUT_S = 0.8
 TAKE_OVER_KEY = "take-over-key"  # file beside the journals with a key that every run accepts from a person at the Pi
 Envelope = tuple[bytes, ...]
@@ -61,17 +61,24 @@ class Server:
         self.event_address = self._events.getsockopt_string(zmq.LAST_ENDPOINT)
         self.ports = {int(address.rpartition(":")[2]) for address in (self.command_address, self.event_address)}
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._out: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
+        self._replies: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
+        self._unsent: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._publisher: threading.Thread | None = None
+        self._turned_s: dict[str, float] = {}  # when each socket's thread last completed a turn
         self._stop = False
 
     def publish(self, events: list[bytes]) -> None:
         """Queue packed events, in order. From any thread; returns at once."""
-        self._queue(*(((), raw) for raw in events))
+        for raw in events:
+            self._unsent.put(raw)
 
-    def _queue(self, *messages: tuple[Envelope, bytes]) -> None:
-        for message in messages:
-            self._out.put(message)
-        os.eventfd_write(self._wake, 1)
+    def find_late(self, limit_s: float) -> str:
+        """Name a socket that has not been served for longer than this; "" if there is none. From any thread."""
+        now = time.monotonic()
+        for name, turned_s in list(self._turned_s.items()):
+            if now - turned_s > limit_s:
+                return f"the {name} socket has not been served for {now - turned_s:.1f} s"
+        return ""
 
     def stop(self) -> None:
         """End :meth:`run`. From any thread or a signal handler."""
@@ -79,37 +86,54 @@ class Server:
         os.eventfd_write(self._wake, 1)
 
     def run(self, executor: Executor) -> None:
-        """Serve until :meth:`stop` or a crash of the executor."""
+        """Serve until :meth:`stop` or a crash of the executor. Events are sent until :meth:`finish`."""
+        self._publisher = threading.Thread(target=self._send_events, args=(executor,), name="events", daemon=True)
+        self._publisher.start()
         poller = zmq.Poller()
-        poller.register(self._wake, zmq.POLLIN)
-        poller.register(self._commands, zmq.POLLIN)
-        poller.register(self._zap, zmq.POLLIN)
-        next_beat = time.monotonic()
+        for source in (self._wake, self._commands, self._zap):
+            poller.register(source, zmq.POLLIN)
         while not self._stop and executor.crash is None:
-            now = time.monotonic()
-            if now >= next_beat:
-                self._beat(executor)
-                next_beat = max(next_beat + self._heartbeat_ms / 1e3, now)
-            ready = dict(poller.poll(max(0, math.ceil((next_beat - now) * 1e3))))
+            self._turned_s["command"] = time.monotonic()
+            ready = dict(poller.poll(POLL_MS))
             if self._wake in ready:
                 os.eventfd_read(self._wake)
-                self.drain()
+            self._send_replies()
             if self._zap in ready:
                 self._authenticate()
             if self._commands in ready:
                 self._receive(executor)
+        self._turned_s.clear()
 
-    def drain(self) -> None:
-        """Send the queued messages. In the thread of :meth:`run`, or after its end."""
+    def _send_events(self, executor: Executor) -> None:
+        """Send queued events and heartbeats.
+
+        In a thread of its own: when subscribers with many topics leave, libzmq cleans up inside a send, for up to
+        minutes (300 with ten topics of 1 kB each: 18 s). Manual mode (XPUB_MANUAL) takes as long.
+        """
+        next_beat = time.monotonic()
         while True:
             try:
-                envelope, raw = self._out.get_nowait()
-            except queue.Empty:
-                return
-            if envelope:
-                self._reply(envelope, raw)
-            else:
+                raw = self._unsent.get(timeout=max(0.0, next_beat - time.monotonic()))
+                if raw is None:
+                    return
                 self._events.send_multipart([EVENT_TOPIC, raw])
+            except queue.Empty:
+                if self._beat(executor):
+                    next_beat = max(next_beat + self._heartbeat_ms / 1e3, time.monotonic())
+            if not self._stop:
+                self._turned_s["event"] = time.monotonic()
+
+    def _send_replies(self) -> None:
+        with suppress(queue.Empty):
+            while True:
+                self._reply(*self._replies.get_nowait())
+
+    def finish(self) -> None:
+        """Send what is queued. After the end of :meth:`run`."""
+        self._send_replies()
+        self._unsent.put(None)
+        if self._publisher is not None:
+            self._publisher.join(END_TIMEOUT_S)
 
     def _authenticate(self) -> None:
         """Answer an authentication request of ZeroMQ (ZAP, RFC 27): a client with an allowed public key may connect.
@@ -150,9 +174,17 @@ class Server:
             return  # the client is gone or does not read; it will retry
 
     def close(self) -> None:
-        """Close the sockets after a moment for messages already sent."""
-        self._context.destroy(linger=LINGER_MS)
-        os.close(self._wake)
+        """Close the sockets after a moment for messages already sent; leave a thread that hangs inside one alone."""
+        self._unsent.put(None)
+        if self._publisher is not None:
+            self._publisher.join(END_TIMEOUT_S)
+        if self._publisher is None or not self._publisher.is_alive():
+            self._context.destroy(linger=LINGER_MS)
+            os.close(self._wake)
+
+    def _queue_reply(self, envelope: Envelope, reply: m.AnyReply) -> None:
+        self._replies.put((envelope, m.pack(reply)))
+        os.eventfd_write(self._wake, 1)
 
     def _answer(self, raw: bytes, envelope: Envelope, executor: Executor) -> m.AnyReply | None:
         """Return the reply to a command, or None if the executor replies later. No message can end the program."""
@@ -169,28 +201,28 @@ class Server:
         if executor.unresponsive_s > HUNG_S:
             return make_refusal(PiFault.PROGRAM, f"the executor has hung for {executor.unresponsive_s:.0f} s")
         if isinstance(command, m.Hello):
-            return msgspec.structs.replace(executor.hello, t_unix_ns=time.time_ns())
+            return executor.hello
         if isinstance(command, m.Status):
             return executor.status
         if isinstance(command, m.Alive):
             return executor.host_alive(command.scan_id, command.owner)
-        if executor.submit(command, lambda reply: self._queue((envelope, m.pack(reply)))):
+        if executor.submit(command, partial(self._queue_reply, envelope)):
             return None
         return make_refusal(PiFault.NOT_READY, "too many commands are waiting", "", "wait for replies")
 
-    def _beat(self, executor: Executor) -> None:
-        """Publish a heartbeat, unless the executor hangs."""
-        if executor.unresponsive_s > HUNG_S:
-            return
-        # Events up to status.last_seq are in the queue by now; sending them first keeps a heartbeat from announcing an
-        # event that was not sent.
+    def _beat(self, executor: Executor) -> bool:
+        """Publish a heartbeat, unless the executor hangs. Return False if an event up to its number is not sent yet."""
         status = executor.status
-        self.drain()
+        if not self._unsent.empty():
+            return False
+        if executor.unresponsive_s > HUNG_S:
+            return True
         beat = m.Heartbeat(
             scan_id=status.scan_id, seq=status.last_seq, t_mono_ns=time.monotonic_ns(), state=status.state,
             period_ms=self._heartbeat_ms,
         )  # fmt: skip
         self._events.send_multipart([EVENT_TOPIC, m.pack(beat)])
+        return True
 
 
 def log(text: str) -> None:
@@ -211,22 +243,30 @@ class Service:
         folder = Path(pi.journal_dir)
         with ExitStack() as opened:
             journal = Journal(folder, lambda events: self.server.publish(events), log)
-            opened.callback(_close, journal)
+            self._journal = JournalThread(journal)
+            opened.callback(self._close_journal)
             # Rights that the thread lacks were reported already for the process.
             prepare = system.prepare_thread if wires is None else lambda: None
             self._loop = TriggerLoop(open_lines(instrument, wires), self._post, prepare)
             opened.callback(self._loop.stop)
             self.server = Server(pi.command_address, pi.event_address, Path(pi.key_dir), pi.heartbeat_ms)
             opened.callback(self.server.close)
-            stage = StageDriver(instrument.stage, self._post)
+            stage = StageDriver(instrument.stage, self._post, lambda: self.executor.unresponsive_s)
             opened.callback(stage.close)
-            self.executor = Executor(stage, self._loop, journal, partial(system.notify_systemd, "WATCHDOG=1"))
+            feed = partial(system.notify_systemd, "WATCHDOG=1")
+            self.executor = Executor(stage, self._loop, self._journal, feed, self._find_late)
             _write_secret(folder / TAKE_OVER_KEY, self.executor.take_over_key)
             stage.connect()
             self._opened = opened.pop_all()
 
     def _post(self, item: Any) -> None:
         self.executor.post(item)
+
+    def _find_late(self) -> str:
+        late_s = self._journal.late_s
+        if late_s > LATE_S:
+            return f"the journal has not answered for {late_s:.1f} s"
+        return self.server.find_late(LATE_S)
 
     def serve(self) -> None:
         """Serve until :meth:`stop`, then stop the stage and end the row. Raises DeviceError after an internal error."""
@@ -237,7 +277,8 @@ class Service:
         self.server.run(self.executor)
         memory.stop()
         self.executor.stop(END_TIMEOUT_S)
-        self.server.drain()
+        self._close_journal()
+        self.server.finish()
         if self.executor.crash is not None:
             what = f"the executor failed: {self.executor.crash!r}"
             raise DeviceError(what, "an internal error", "report it with its trace")
@@ -251,12 +292,11 @@ class Service:
         self._loop.stop()
         self._opened.close()
 
-
-def _close(journal: Journal) -> None:
-    try:
-        journal.close()
-    except JournalFullError as e:
-        log(str(e))
+    def _close_journal(self) -> None:
+        try:
+            self._journal.stop(END_TIMEOUT_S)
+        except JournalFullError as e:
+            log(str(e))
 
 
 def _write_secret(path: Path, secret: str) -> None:

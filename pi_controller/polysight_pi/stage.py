@@ -43,6 +43,7 @@ SILENT_HEARTBEATS = 0.5
 IDLE_STATUS_S = 1.0
 STOP_TIMEOUT_S = 3.0  # from STOP to standstill
 CLEAR_RETRY_S = 0.05
+CALLER_LATE_S = 3.0  # longer than a line and its retries take
 MAX_MM = 1e6  # limit of a position in the messages
 MOTION_TIMEOUT_S = HOMING_TIMEOUT_S  # no motion takes longer than homing
 
@@ -79,6 +80,7 @@ class StatusWatch:
         self._silence_s = SILENT_HEARTBEATS * heartbeat_s
         self._asked_s = now_s
         self._unanswered_since_s: float | None = None
+        self._looked_s = now_s
         self.look_s = min(0.05, heartbeat_s / STATUS_PER_HEARTBEAT / 2)  # interval for calling `is_due` and `silent_s`
         self.interval_s = 0.0  # between status requests; 0: none
 
@@ -96,7 +98,14 @@ class StatusWatch:
         self._unanswered_since_s = None
 
     def silent_s(self, now_s: float) -> float:
-        """Return how long the stage has been silent; 0 while that is within the timeout."""
+        """Return how long the stage has been silent; 0 while that is within the timeout.
+
+        Time in which the caller itself was late does not count.
+        """
+        late_s = now_s - self._looked_s - 2 * self.look_s
+        self._looked_s = now_s
+        if self._unanswered_since_s is not None and late_s > 0:
+            self._unanswered_since_s += late_s
         if self._unanswered_since_s is None or now_s - self._unanswered_since_s <= self._silence_s:
             return 0.0
         return now_s - self._unanswered_since_s
@@ -114,6 +123,9 @@ class StageLink:
         The stage's heartbeat; the stage is lost if a status request is not answered within half of it.
     banner_timeout_s
         Timeout for the banner of a stage that was reset by opening the port; a stage without one is greeted anyway.
+    caller_late_s
+        How long the thread that commands the stage has not completed a turn. A stage in motion is stopped if that, and
+        the time since its last command, exceed `CALLER_LATE_S`: the heartbeat must not speak for a thread that hangs.
     """
 
     def __init__(
@@ -123,9 +135,12 @@ class StageLink:
         news: Callable[[StageNews], None],
         heartbeat_s: float = 2.0,
         banner_timeout_s: float = BANNER_TIMEOUT_S,
+        caller_late_s: Callable[[], float] = lambda: 0.0,
     ) -> None:
         self.port = port
         self._news = news
+        self._caller_late_s = caller_late_s
+        self._commanded_s = time.monotonic()
         self._watch = StatusWatch(heartbeat_s, time.monotonic())
         try:
             self._serial = serial.Serial(port, baud, timeout=self._watch.look_s, write_timeout=1.0, exclusive=True)
@@ -193,6 +208,7 @@ class StageLink:
         while not self._answers.empty():
             self._answers.get()
         for _ in range(TRIES):
+            self._commanded_s = time.monotonic()
             self._write(self._last_line)
             answer = self._answer(sequence)
             if answer is not None and answer.number not in RETRIED:
@@ -264,28 +280,27 @@ class StageLink:
             except (OSError, TypeError) as e:  # pyserial raises TypeError when the port is closed under a read
                 self._lose(f"reading failed: {e}")
                 return
+            *lines, buffer = (buffer + data).split(b"\n")
+            for line in lines:
+                self._take(line + b"\n")
+            buffer = buffer[-MAX_LINE_BYTES:]
             now = time.monotonic()
-            if data:
-                self._watch.heard()
-                *lines, buffer = (buffer + data).split(b"\n")
-                for line in lines:
-                    self._take(line + b"\n")
-                buffer = buffer[-MAX_LINE_BYTES:]
-            elif (silent_s := self._watch.silent_s(now)) and not self._unread():
-                self._lose(f"silent for {silent_s:.1f} s")
+            if silent_s := self._watch.silent_s(now):
+                self._lose(f"silent for {silent_s:.1f} s: no valid line")
                 return
             if self._watch.is_due(now):
                 try:
-                    self._write(bytes([Immediate.STATUS]))
+                    self._ask_status(now)
                 except StageLostError:
                     return
 
-    def _unread(self) -> bool:
-        """True if bytes arrived since the last read: this thread, not the stage, may have been late."""
-        try:
-            return self._serial.in_waiting > 0
-        except (OSError, TypeError):
-            return False
+    def _ask_status(self, now: float) -> None:
+        hung_s = min(self._caller_late_s(), now - self._commanded_s)
+        if hung_s < CALLER_LATE_S or self._watch.interval_s >= IDLE_STATUS_S:
+            self._write(bytes([Immediate.STATUS]))
+        else:
+            self._write(Immediate.STOP.sent)
+            self._lose(f"this program has not commanded it for {hung_s:.1f} s: it was stopped")
 
     def _take(self, line: bytes) -> None:
         try:
@@ -293,6 +308,8 @@ class StageLink:
         except ProtocolError:
             self.bad_lines += 1  # if it was an answer, its line is retried
             return
+        # Only what a stage says is a sign of life; a serial line can chatter without end.
+        self._watch.heard()
         if reply.kind in ("ok", "error"):
             self._answers.put(reply)
         elif reply.kind == "banner" and not self._greeted:
@@ -303,10 +320,13 @@ class StageLink:
 
 
 class StageDriver:
-    """The stage of the [stage] table, used by one thread; `news` as in :class:`StageLink`."""
+    """The stage of the [stage] table, used by one thread; `news` and `caller_late_s` as in :class:`StageLink`."""
 
-    def __init__(self, config: Stage, news: Callable[[StageNews], None]) -> None:
+    def __init__(
+        self, config: Stage, news: Callable[[StageNews], None], caller_late_s: Callable[[], float] = lambda: 0.0
+    ) -> None:
         self.config = config
+        self._caller_late_s = caller_late_s
         self.port = config.port
         self._news = news
         self._open: StageLink | None = None
@@ -321,7 +341,13 @@ class StageDriver:
         if self._open is not None and not self._open.lost:
             return
         self.close()
-        self._open = link = StageLink(self.port, self.config.baud, self._news, self.config.heartbeat_ms / 1e3)
+        self._open = link = StageLink(
+            self.port,
+            self.config.baud,
+            self._news,
+            self.config.heartbeat_ms / 1e3,
+            caller_late_s=self._caller_late_s,
+        )
         if link.steps_per_mm not in ("", f"{self.config.steps_per_mm:g}"):
             self.close()
             raise StageLostError(

@@ -60,6 +60,10 @@ class PiFault(IntEnum):
     VERSION = 114
     NOT_OWNER = 115
     PROGRAM = 116
+    PROGRAM_LATE = 117
+    EDGE_TIME = 118
+    POSITION = 119
+    PULSES_UNSEEN = 120
 
 
 EXPLANATIONS: dict[int, Explanation] = {
@@ -201,6 +205,26 @@ EXPLANATIONS: dict[int, Explanation] = {
         "the Pi's program failed to execute this command",
         "a defect of this program, or it hangs",
         "see `journalctl -u polysight-pi` and report it; systemd restarts a program that hangs",
+    ),
+    PiFault.PROGRAM_LATE: Explanation(
+        "a part of the Pi's program does not answer, so motion was stopped",
+        "a disk or SD card that hangs, or too many connections",
+        "see `dmesg` on the Pi for errors of the card, then retake the row",
+    ),
+    PiFault.EDGE_TIME: Explanation(
+        "a trigger edge came at a wrong time",
+        "a lost or spurious edge: noise on the trigger wire, a loose plug",
+        "the row is retaken; check the trigger wire and its ground",
+    ),
+    PiFault.POSITION: Explanation(
+        "the stage ended the row at another place than commanded",
+        "the sketch lost count, or answered another command",
+        "polysight-pi home, then retake the row; flash the sketch of this release",
+    ),
+    PiFault.PULSES_UNSEEN: Explanation(
+        "the pulses seen at the connector differ from those sent",
+        "buffer or one-shot without supply, a broken SYNC_IN cable, or the return wire is off",
+        "the row is retaken; check the pulse board and the return wire (docs/how-to/wiring.md)",
     ),
 }
 

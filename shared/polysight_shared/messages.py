@@ -208,7 +208,12 @@ class Alive(Command, frozen=True, kw_only=True):
 
 
 class Home(Command, frozen=True, kw_only=True):
-    """Home the stage. Accepted at once; the state is `homing`, then `ready`."""
+    """Home the stage. Accepted at once; the state is `homing`, then `ready`.
+
+    `owner`: that of the run, while one is begun whose host is alive.
+    """
+
+    owner: Owner = ""
 
 
 class RunRow(Command, frozen=True, kw_only=True):

@@ -147,7 +147,7 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
     rng = random.Random(amount)
     wires = WiresLog(hub, *instrument.pi.sync_out)
     host.accepted(host.begin(owner="mine", heartbeat_ms=10_000))
-    host.home()
+    host.home("mine")
     valid = [
         m.Hello(), m.Status(), ALIVE, m.Home(), RUN, PULSE, REPLAY, m.Hold(), m.Resume(), m.Abort(), END,
         host.begin("other"), host.begin(),

@@ -40,6 +40,8 @@ class FakeJournal:
     def add(self, kind: type, **fields: Any) -> None:
         self.events.append(kind(scan_id="", seq=0, t_mono_ns=0, **fields))
 
+    def retry(self) -> None: ...
+
 
 class Bench:
     """A machine with its stage, trigger loop and journal."""

@@ -20,7 +20,7 @@ from polysight_pi import executor as executors
 from polysight_pi import system
 from polysight_pi.client import take_over
 from polysight_pi.executor import REPLAYED_IN_A_ROW, Executor
-from polysight_pi.journal import Journal
+from polysight_pi.journal import Journal, JournalThread
 from polysight_pi.service import TAKE_OVER_KEY
 from polysight_pi.trigger import TriggerLoop
 from polysight_shared import messages as m
@@ -53,15 +53,18 @@ class Bench:
         self.stage = SlowDriver(self)
         loop = TriggerLoop(FakeLines(), lambda _: None, lambda: None)  # not started: no edge comes
         self.journal = Journal(folder, lambda raws: self.events.extend(map(m.unpack_event, raws)))
+        self.journal_thread = JournalThread(self.journal)  # not started: its jobs are done between turns
         stage: Any = self.stage
-        self.executor = Executor(stage, loop, self.journal)
+        self.executor = Executor(stage, loop, self.journal_thread)
         self.executor._machine._clock = lambda: self.t
 
     def turn(self, *items: Any) -> None:
         for item in items:
             self.executor.post(item)
-        self.executor.post(lambda: None)  # so that no turn waits
-        self.executor._turn()
+        for _ in range(2):  # a command that the journal answers
+            self.executor.post(lambda: None)  # so that no turn waits
+            self.executor._turn()
+            self.journal_thread.do_waiting()
 
     def ask(self, command: m.AnyCommand) -> Any:
         replies: list[m.AnyReply] = []
@@ -169,7 +172,7 @@ def owner_in_row(pi, stage):
     """The host that owns the run, during row 0."""
     host = pi.host
     host.accepted(host.begin(owner="mine", heartbeat_ms=10_000))
-    host.home()
+    host.home("mine")
     stage.pace_s = 0.05
     host.start_row(owner="mine")
     host.wait(m.Capture)
@@ -196,12 +199,25 @@ def test_only_the_owner_commands_a_run(owner_in_row):
         for command in (
             m.Hold(owner=owner), m.Resume(owner=owner), m.Abort(owner=owner), m.Alive(scan_id="scan", owner=owner),
             m.EndRun(scan_id="scan", exit_status="abort", owner=owner),
-            m.RunRow(scan_id="scan", row_index=1, take=1, owner=owner),
+            m.RunRow(scan_id="scan", row_index=1, take=1, owner=owner), m.Home(owner=owner),
         ):  # fmt: skip
             assert host.refused(command) == PiFault.NOT_OWNER, command
         assert host.refused(host.begin(owner=owner)) == PiFault.NOT_READY, "its host is alive"
     assert host.wait(m.RowFinished).status == "done"
+    assert host.refused(m.Home(owner="other")) == PiFault.NOT_OWNER, "between two rows as well"
     host.accepted(m.EndRun(scan_id="scan", exit_status="success", owner="mine"))
+
+
+def test_an_old_row_does_not_move_the_stage_again(host, stage):
+    """A late copy of a command, or one of a confused program: takes of a row only increase."""
+    for row, take in ((1, 1), (2, 1), (1, 2), (1, 4)):
+        assert host.row(row, take).status == "done"
+    for row, take in ((1, 1), (1, 2), (1, 3), (2, 1)):
+        old = m.RunRow(scan_id="scan", row_index=row, take=take)
+        assert host.refused(old) == PiFault.BAD_REQUEST
+    host.accepted(m.RunRow(scan_id="scan", row_index=1, take=4))  # repeated: it was the last one
+    assert stage.rows_run == 4
+    assert sum(isinstance(e, m.RowStarted) for e in host.replay()) == 4
 
 
 def test_a_person_at_the_pi_takes_over(pi, owner_in_row, instrument):

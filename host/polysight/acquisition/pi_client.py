@@ -186,8 +186,9 @@ class PiClient:
 
     def home(self) -> None:
         """Start homing; retry without a reply if the stage does not home. Raises RefusedError, DeviceError."""
-        if self._once(Home(), self._timeout_s) is None and self.status().state != "homing":
-            self._ask(Home(), Accepted)
+        command = Home(owner=self._owner)
+        if self._once(command, self._timeout_s) is None and self.status().state != "homing":
+            self._ask(command, Accepted)
 
     def run_row(self, scan_id: str, row_index: int, take: int) -> None:
         """Begin a row. If the reply is lost, check if the row runs before a retry.

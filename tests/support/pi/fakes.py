@@ -116,7 +116,7 @@ class FakeStage:
 
     Wrong behaviour on request: `deaf` (answers nothing), `lose` (swallow so many lines), `damage` (garble so many
     answers), `lose_end` (swallow so many done or alarm lines), `skip` (points without a trigger), `extra` (a trigger
-    too many), `alarm_at` (alarm number at a point), `lost` (steps that homing finds lost), `pace_s` (wall time from
+    too many), `endless` (a row stays at its last point), `alarm_at` (alarm number at a point), `lost` (steps that homing finds lost), `pace_s` (wall time from
     point to point).
     """
 
@@ -132,7 +132,7 @@ class FakeStage:
         self.steps = "200"
         self.lose = self.damage = self.lose_end = 0
         self.skip: set[int] = set()
-        self.extra = False
+        self.extra = self.endless = False
         self.lost = (0, 0)
         self.alarm_at: dict[int, int] = {}
         self.pace_s = 0.0
@@ -311,6 +311,8 @@ class FakeStage:
             self.points += 1
             if i not in self.skip:
                 self._edge(self.t_ns)
+        if self.endless and self._stopping.wait():
+            return StageError.STOPPED
         if self.extra:
             self.t_ns += step_ns
             self._edge(self.t_ns)

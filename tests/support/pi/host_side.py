@@ -67,8 +67,8 @@ class HostSide:
         }
         return m.BeginRun(**{**fields, **changes})
 
-    def home(self) -> None:
-        self.accepted(m.Home())
+    def home(self, owner: str = "") -> None:
+        self.accepted(m.Home(owner=owner))
         self.until_state("ready")
 
     def until_state(self, *states: str) -> m.StatusReply:

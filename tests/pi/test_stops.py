@@ -1,0 +1,274 @@
+"""Stops wait for nothing: neither for a disk that hangs, nor for sockets, nor for a thread that does.
+
+The campaign (`--long`) measures the time to STOP at a hundred moments.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import zmq
+from tests.support.processes import HANG_S, wait_for
+
+from polysight_pi import executor as executors
+from polysight_pi import journal as journals
+from polysight_pi import stage as stages
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
+from polysight_shared.sockets import EVENT_TOPIC
+from polysight_shared.stage_line import Immediate
+
+SAFE_WITHIN_S = 0.5
+LATE_S = 0.6  # instead of 3 s, so that the tests are short
+OWNER = "mine"
+
+
+class FrozenDisk:
+    """Writes and syncs of the journal block until :meth:`thaw`, as on a file system that was frozen (fsfreeze)."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self._frozen = False
+        self._thawed = threading.Event()
+        self.blocked = threading.Event()
+        for name in ("fsync", "pwrite"):
+            patch.setattr(journals.os, name, self._behind_ice(getattr(os, name)))
+
+    def _behind_ice(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def wait_and_call(*args: Any) -> Any:
+            if self._frozen:
+                self.blocked.set()
+                self._thawed.wait(HANG_S)
+            return call(*args)
+
+        return wait_and_call
+
+    def freeze(self) -> None:
+        self.blocked.clear()
+        self._thawed.clear()
+        self._frozen = True
+
+    def thaw(self) -> None:
+        self._frozen = False
+        self._thawed.set()
+
+
+@pytest.fixture
+def disk(monkeypatch) -> Iterator[FrozenDisk]:
+    disk = FrozenDisk(monkeypatch)
+    yield disk
+    disk.thaw()
+
+
+@pytest.fixture
+def owned(pi, stage):
+    """A begun run with an owner; the stage is homed, points are 50 ms apart."""
+    pi.host.accepted(pi.host.begin(owner=OWNER))
+    pi.host.home(OWNER)
+    stage.pace_s = 0.05
+    return pi.host
+
+
+def stop_is_sent(stage) -> bool:
+    return Immediate.STOP in stage.bytes_seen
+
+
+def test_abort_stops_and_is_answered_while_the_disk_hangs(owned, stage, disk):
+    owned.start_row(owner=OWNER)
+    owned.wait(m.Capture)
+    before = len(owned.journalled)
+    disk.freeze()
+    assert disk.blocked.wait(HANG_S)
+    stage.bytes_seen.clear()
+    owned.accepted(m.Abort(owner=OWNER))
+    wait_for(lambda: stop_is_sent(stage), "STOP")
+    owned.until_state("ready")
+    assert not owned.of(m.RowFinished), "what is not journalled is not published"
+    disk.thaw()
+    assert owned.wait(m.RowFinished).status == "aborted"
+    assert [e.seq for e in owned.replay()] == list(range(1, owned.journalled[-1].seq + 1))
+    assert len(owned.journalled) > before
+
+
+@pytest.mark.parametrize("beats", [True, False])
+def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, stage, monkeypatch, beats):
+    """A host that is lost: as always. One that lives: the row ends because of the disk, and the watchdog starves."""
+    monkeypatch.setattr("polysight_pi.service.LATE_S", LATE_S)
+    host = pi.host
+    host.accepted(host.begin(heartbeat_ms=0 if beats else 100, owner=OWNER))
+    host.home(OWNER)
+    stage.pace_s = 0.05
+    stage.endless = True
+    host.start_row(owner=OWNER)
+    disk.freeze()
+    wait_for(lambda: stop_is_sent(stage), "STOP")
+    number = PiFault.PROGRAM_LATE if beats else PiFault.HOST_LOST
+    assert host.until_state("ready").fault == number
+    fed: list[bool] = []
+    monkeypatch.setattr(pi.service.executor, "_turned", lambda: fed.append(True))
+    wait_for(lambda: pi.service._find_late() != "", "that the journal is late")
+    fed.clear()
+    time.sleep(3 * executors.TURN_S)
+    assert not fed, "the watchdog is fed for each part or not at all"
+    disk.thaw()
+    assert host.wait(m.RowFinished).fault == number
+    wait_for(lambda: bool(fed), "that the watchdog is fed again")
+
+
+def test_nothing_is_acknowledged_that_is_not_journalled(disk, pi):
+    """A run begins, a row starts and a run ends for the host when that is on the disk."""
+    host = pi.host
+    commands: list[Any] = [host.begin(), m.RunRow(scan_id="scan", row_index=0, take=1)]
+    commands.append(m.EndRun(scan_id="scan", exit_status="success"))
+    for command in commands:
+        disk.freeze()
+        answers: list[Any] = []
+        assert pi.service.executor.submit(command, answers.append)
+        assert disk.blocked.wait(HANG_S)
+        kinds = {type(e) for e in host.journalled}
+        assert isinstance(host.ask(m.Status()), m.StatusReply), "others are answered"
+        assert not answers
+        disk.thaw()
+        wait_for(lambda: bool(answers), "an answer")  # noqa: B023
+        assert isinstance(answers[0], m.Accepted), answers
+        assert {type(m.unpack_event(raw)) for raw in pi.service._journal._journal.read("scan", 1, 99)[0]} > kinds
+        if isinstance(command, m.BeginRun):
+            host.home()
+        elif isinstance(command, m.RunRow):
+            host.wait(m.RowFinished)
+
+
+def test_a_full_queue_keeps_its_bound(tmp_path):
+    """Events of a hanging disk are given up, with an error, before they fill the memory."""
+    journal = journals.JournalThread(journals.Journal(tmp_path))
+    errors: list[Any] = []
+    for _ in range(journals.JOBS_WAITING + journals.EVENTS_WAITING + 10):
+        journal.add(m.RunStopped, exit_status="abort")
+        journal.commit(errors.append)
+    assert len(errors) == 1
+    assert errors[0].number == PiFault.JOURNAL_FULL
+    journal.do_waiting()
+    journal.stop(0.0)
+
+
+def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
+    """The thread that asks for the status does not speak for it."""
+    monkeypatch.setattr(stages, "CALLER_LATE_S", LATE_S)
+    host = pi.host
+    host.accepted(host.begin())
+    host.home()
+    stage.pace_s = 0.05
+    stage.endless = True
+    host.start_row()
+    host.wait(m.Capture)
+    go_on = threading.Event()
+    pi.service.executor.post(lambda: go_on.wait(HANG_S))
+    wait_for(lambda: stop_is_sent(stage), "STOP")
+    asked = stage.bytes_seen.count(Immediate.STATUS)
+    time.sleep(LATE_S)
+    assert stage.bytes_seen.count(Immediate.STATUS) == asked, "its own heartbeat stops it as well"
+    go_on.set()
+    assert host.wait(m.RowFinished).fault == PiFault.STAGE_LOST
+
+
+@pytest.mark.parametrize("which", ["command", "event"])
+def test_sockets_that_hang_stop_the_motion(pi, stage, monkeypatch, which):
+    monkeypatch.setattr("polysight_pi.service.LATE_S", LATE_S)
+    server, host, go_on = pi.service.server, pi.host, threading.Event()
+    host.accepted(host.begin())
+    host.home()
+    stage.pace_s = 0.05
+    stage.endless = True
+    host.start_row()
+    host.wait(m.Capture)
+    busy = "_send_replies" if which == "command" else "_beat"
+    real = getattr(server, busy)
+    monkeypatch.setattr(server, busy, lambda *a: (go_on.wait(HANG_S), real(*a))[1])
+    wait_for(lambda: stop_is_sent(stage), "STOP")
+    go_on.set()
+    done = host.wait(m.RowFinished)
+    assert (done.fault, which in done.reason) == (PiFault.PROGRAM_LATE, True)
+
+
+def leave_with_topics(address: str, subscribers: int, topics: int, topic_bytes: int) -> None:
+    """Subscribe many times with long topics, then leave at once."""
+    context: Any = zmq.Context(io_threads=1)
+    context.max_sockets = subscribers + 100
+    rng = random.Random(subscribers)
+    sockets = []
+    for _ in range(subscribers):
+        s = context.socket(zmq.SUB)
+        s.connect(address)
+        for _ in range(topics):
+            s.setsockopt(zmq.SUBSCRIBE, EVENT_TOPIC + rng.randbytes(topic_bytes))
+        sockets.append(s)
+    time.sleep(0.5)
+    for s in sockets:
+        s.close(linger=0)
+    context.term()
+
+
+def test_leaving_subscribers_keep_no_command_waiting(pi, request, record_property):
+    """libzmq cleans up behind them inside the publisher's next send, for long."""
+    subscribers = 1000 if request.config.getoption("--long") else 100
+    host = pi.host
+    host.accepted(host.begin(owner=OWNER))
+    thread = threading.Thread(
+        target=leave_with_topics, args=(pi.service.server.event_address, subscribers, 8, 900), daemon=True
+    )
+    thread.start()
+    longest_s = 0.0
+    while thread.is_alive():
+        begin_s = time.monotonic()
+        host.accepted(m.Alive(scan_id="scan", owner=OWNER))
+        longest_s = max(longest_s, time.monotonic() - begin_s)
+        time.sleep(0.005)
+    record_property("longest_answer_to_alive_ms", longest_s * 1e3)
+    if request.config.getoption("--long"):
+        assert longest_s < 0.1
+    else:
+        assert longest_s < HANG_S
+
+
+@pytest.mark.slow
+def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, request, record_property):
+    """From the last heartbeat, or the command to abort, to STOP: within half a second, wherever the disk hangs."""
+    moments = 100 if request.config.getoption("--long") else 4
+    host, rng, longest_s = pi.host, random.Random(36), 0.0
+    heartbeat_ms = 90  # silent for four of these
+    stage.pace_s = 0.02
+    stage.endless = True
+    host.accepted(host.begin(owner=OWNER, heartbeat_ms=heartbeat_ms))
+    host.home(OWNER)
+    for take in range(1, moments + 1):
+        stage.bytes_seen.clear()
+        aborts = rng.random() < 0.5
+        host.accepted(host.begin(owner=OWNER, heartbeat_ms=0 if aborts else heartbeat_ms))
+        freeze_before = rng.random() < 0.3
+        if freeze_before:
+            disk.freeze()
+        answers: list[Any] = []
+        pi.service.executor.submit(m.RunRow(scan_id="scan", row_index=0, take=take, owner=OWNER), answers.append)
+        wait_for(lambda: stage.moving, "motion")
+        time.sleep(rng.uniform(0.0, 0.15))
+        disk.freeze()
+        begin_s = time.monotonic()
+        if aborts:
+            pi.service.executor.submit(m.Abort(owner=OWNER), lambda _: None)
+        else:
+            pi.service.executor.host_alive("scan", OWNER)
+        while not stop_is_sent(stage):
+            time.sleep(0.001)
+            assert time.monotonic() - begin_s < HANG_S
+        longest_s = max(longest_s, time.monotonic() - begin_s)
+        time.sleep(rng.uniform(0.0, 0.05))
+        disk.thaw()
+        host.until_state("ready")
+    record_property("longest_time_to_stop_ms", longest_s * 1e3)
+    if request.config.getoption("--long"):
+        assert longest_s < SAFE_WITHIN_S

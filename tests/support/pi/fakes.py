@@ -116,8 +116,8 @@ class FakeStage:
 
     Wrong behaviour on request: `deaf` (answers nothing), `lose` (swallow so many lines), `damage` (garble so many
     answers), `lose_end` (swallow so many done or alarm lines), `skip` (points without a trigger), `extra` (a trigger
-    too many), `endless` (a row stays at its last point), `alarm_at` (alarm number at a point), `lost` (steps that homing finds lost), `pace_s` (wall time from
-    point to point).
+    too many), `endless` (a row stays at its last point), `alarm_at` (alarm number at a point), `lost` (steps that
+    homing finds lost), `pace_s` (wall time from point to point).
     """
 
     def __init__(self, hub: Path | None, trigger: int = 26) -> None:

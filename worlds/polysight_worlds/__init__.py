@@ -2,8 +2,9 @@
 
 `draw_world` and `draw_nuisances` make a scene and what disturbs its scan, `simulate` gives the pair of images. Curved
 and tilted pieces (`sphere`, `cylinder`, `bottle`, `plate`) are seen by `record_shapes`: the samples of both boards
-after synchronisation, at any stage positions; `Shape.project` tells where their surface is. Only numpy and scipy are
-used, nothing of the instrument or its simulators, so that tests may compare the two.
+after synchronisation, at any stage positions; `Shape.project` tells where their surface is. `draw_shapes`
+and `scan_shapes` draw and disturb such scans. Only numpy and scipy are used, nothing of the instrument or its
+simulators, so that tests may compare the two.
 """
 
 from polysight_worlds.images import ImagePair, backproject, simulate
@@ -11,6 +12,15 @@ from polysight_worlds.media import COPPER, METAL, Stack, reflect
 from polysight_worlds.rig import Boards, Rig, load_boards, load_rig, published_boards, published_rig
 from polysight_worlds.scan import record
 from polysight_worlds.shape_echoes import record_shapes
+from polysight_worlds.shape_scenes import (
+    KINDS,
+    ShapeNuisances,
+    ShapeScene,
+    draw_shapes,
+    reference_sphere,
+    scan_offsets,
+    scan_shapes,
+)
 from polysight_worlds.shapes import Shape, bottle, cylinder, plate, sphere
 from polysight_worlds.world import (
     NUISANCES,
@@ -27,6 +37,7 @@ from polysight_worlds.world import (
 
 __all__ = [
     "COPPER",
+    "KINDS",
     "METAL",
     "NUISANCES",
     "TABLE_2",
@@ -37,6 +48,8 @@ __all__ = [
     "Plate",
     "Rig",
     "Shape",
+    "ShapeNuisances",
+    "ShapeScene",
     "Stack",
     "World",
     "backproject",
@@ -44,6 +57,7 @@ __all__ = [
     "cylinder",
     "dish",
     "draw_nuisances",
+    "draw_shapes",
     "draw_world",
     "load_boards",
     "load_rig",
@@ -52,7 +66,10 @@ __all__ = [
     "published_rig",
     "record",
     "record_shapes",
+    "reference_sphere",
     "reflect",
+    "scan_offsets",
+    "scan_shapes",
     "simulate",
     "sphere",
     "table",

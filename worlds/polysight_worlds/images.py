@@ -130,8 +130,8 @@ def disturb_rig(rig: Rig, nuisances: Nuisances) -> Rig:
     rng = np.random.default_rng([nuisances.seed, 4])
 
     def disturb(antenna: Antenna, turn_deg: float, leakage: float) -> Antenna:
-        axis = _draw_direction(rng)
-        shift_m = _draw_direction(rng) * nuisances.misplaced_mm / 1000
+        axis = draw_direction(rng)
+        shift_m = draw_direction(rng) * nuisances.misplaced_mm / 1000
         phase = rng.uniform(0, 2 * np.pi)
         return antenna.turned(turn(axis, turn_deg), shift_m).with_leakage(leakage * np.exp(1j * phase))
 
@@ -144,7 +144,8 @@ def disturb_rig(rig: Rig, nuisances: Nuisances) -> Rig:
     )
 
 
-def _draw_direction(rng: Generator) -> NDArray:
+def draw_direction(rng: Generator) -> NDArray:
+    """Unit vector [3] in any direction."""
     vector = rng.standard_normal(3)
     return vector / np.linalg.norm(vector)
 

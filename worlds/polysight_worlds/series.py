@@ -203,8 +203,10 @@ class EndlessCylinder:
         a = self.radius_m
         n = orders[:, None]
         x = eta * a
-        j, h1 = special.jv(n, x), special.hankel1(n, x)
-        j_rate, h1_rate = eta * special.jvp(n, x), eta * special.h1vp(n, x)
+        j_below = special.jv(n - 1, x)
+        j = np.concatenate([j_below[1:], special.jv(n[-1:], x)])
+        h1_below, h1 = _hankel(len(orders), x)
+        j_rate, h1_rate = (eta * (below - n / x * value) for below, value in ((j_below, j), (h1_below, h1)))
         if self.permittivity is None:
             return -j_rate / h1_rate, -j / h1, np.zeros_like(h1)
         inside = np.conj(self.permittivity)
@@ -236,6 +238,16 @@ class EndlessCylinder:
             rate = (n - 1) / y - 1 / (rate + n / y)
         rates[0] = rate
         return rates
+
+
+def _hankel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
+    """H1_{n-1}(x) and H1_n(x) for n = 0 .. count - 1, each [count, x]: upwards, where the recurrence is stable."""
+    values = np.empty((count + 1, *x.shape), complex)
+    values[1] = special.hankel1(0, x)
+    values[0] = -special.hankel1(1, x)
+    for n in range(count - 1):
+        values[n + 2] = 2 * n / x * values[n + 1] - values[n]
+    return values[:-1], values[1:]
 
 
 @lru_cache(maxsize=256)
@@ -312,15 +324,17 @@ def sum_orders(
     # Both ends' waves are scaled by exp(-i eta rho).
     scale = np.exp(1j * eta * (ends[0].rho + ends[1].rho - path_m)) / eta**2
     total = np.zeros(h.shape, complex)
+    power = np.ones_like(turn)
     for n in range(m_m.shape[1]):
         (z, rate), (z_tx, rate_tx) = (end.step(n) for end in ends)
-        for order in {n, -n}:
+        for order, phase in ((n, power), (-n, 1 / power)) if n else ((0, power),):
             # Coefficients that couple M and N change sign with the order, the others do not.
             coupling = m_n[:, n] * (1 if order >= 0 else -1)
             q_m, q_n = ends[0].products(order, z, rate)
             p_m, p_n = ends[1].products(order, z_tx, rate_tx)
             wave = q_m * (m_m[:, n] * p_m + coupling * p_n) + q_n * (n_n[:, n] * p_n + coupling * p_m)
-            total += wave * turn**order
+            total += wave * phase
+        power = power * turn
     return total * scale
 
 

@@ -34,7 +34,7 @@ LEAST_BEND_PER_M = 0.8
 GRAZING = 0.3
 # What edges diffract turns by a wave in 13 mm of the stage's way, relative to the specular path. The series has none.
 LATTICE_M = 0.005
-LATTICE_OF_SERIES_M = 0.012
+LATTICE_OF_SERIES_M = 0.018
 # Echoes from the inside of a body below this share of its front's are left out.
 INSIDE_LEVEL = 1e-3
 # Splines are poor at the ends of their lattice.
@@ -200,7 +200,7 @@ def _interpolate(values: NDArray, coordinates: NDArray) -> NDArray:
     return np.asarray(ndimage.map_coordinates(values, coordinates, order=5, mode="nearest"))
 
 
-def _frequency_nodes(frequencies_hz: NDArray, count: int = 6) -> tuple[NDArray, NDArray]:
+def _frequency_nodes(frequencies_hz: NDArray, count: int = 5) -> tuple[NDArray, NDArray]:
     """Chebyshev nodes over the band and the matrix [frequencies, nodes] that interpolates from them."""
     if len(frequencies_hz) <= count:
         return frequencies_hz, np.eye(len(frequencies_hz))
@@ -302,10 +302,9 @@ def _sum_facets(
     middle = np.asarray(shape.place_m)[:, None]
     antennas = _antennas(tx, rx, offsets)
     middle_path_m = np.linalg.norm(middle - antennas[0], axis=0) + np.linalg.norm(middle - antennas[1], axis=0)
-    # Paths over a plate differ by its size at most: so many periods fit into the band.
-    reach_m = 2 * float(np.hypot(*shape.size_m)) / 2
-    periods = reach_m * np.ptp(frequencies_hz) / LIGHT_M_PER_S
-    nodes_hz, expand = _frequency_nodes(frequencies_hz, 8 + int(np.ceil(4 * periods)))
+    # Paths over a plate differ by less than its diagonal: so many radians to either side over half of the band.
+    radians = np.pi / 2 * float(np.hypot(*shape.size_m)) * np.ptp(frequencies_hz) / LIGHT_M_PER_S
+    nodes_hz, expand = _frequency_nodes(frequencies_hz, 5 + int(np.ceil(radians)))
     tables = [CosineTable(shape, f) for f in nodes_hz]
     slow = np.empty((len(nodes_hz), len(offsets)), complex)
     at_once = max(1, CHUNK // len(facets.centres[0]))

@@ -1,0 +1,76 @@
+"""Drawn scenes of shapes and the disturbances of their scans."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from polysight_worlds import (
+    KINDS,
+    Boards,
+    ShapeNuisances,
+    draw_shapes,
+    published_boards,
+    reference_sphere,
+    scan_offsets,
+    scan_shapes,
+)
+from polysight_worlds.shapes import find_specular
+
+WHOLE = published_boards()
+BOARDS = Boards(WHOLE.tx, WHOLE.h[:1], WHOLE.v[:1])
+OFFSETS_M = scan_offsets(every=50)
+FREQUENCIES_HZ = np.linspace(76.3e9, 79.7e9, 3)
+
+
+def scan(nuisances: ShapeNuisances, number: int = 0) -> dict[str, np.ndarray]:
+    return scan_shapes(
+        [reference_sphere()], OFFSETS_M, nuisances, boards=BOARDS, frequencies_hz=FREQUENCIES_HZ, number=number
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_drawn_object_is_seen_and_its_truth_is_where_its_rays_are(kind):
+    scene = draw_shapes(5, kind, with_table=True)
+    samples = scan_shapes(scene.shapes, OFFSETS_M, boards=BOARDS, frequencies_hz=FREQUENCIES_HZ)
+    brightest = np.abs(samples["h"]).max()
+    # Brighter than a thousandth of a mirror, darker than a concave one.
+    assert 6e-4 < brightest < 2
+    middle_m = np.zeros((3, 1))
+    shape = scene.shapes[0]
+    tx_m, rx_m = (antenna.position[:, None] + middle_m for antenna in (BOARDS.tx, BOARDS.h[0]))
+    patch = shape.at(*find_specular(shape, tx_m, rx_m))
+    if kind != "bottle":
+        distances, normals = scene.surface_at(patch.point.T)
+        assert distances == pytest.approx(0, abs=1e-8)
+        assert pytest.approx(patch.normal, abs=1e-6) == normals.T
+    assert scene.permittivity is not None
+    assert 2 <= scene.permittivity.real <= 9
+    assert -1 <= scene.permittivity.imag <= 0
+
+
+def test_a_seed_gives_one_scene():
+    assert repr(draw_shapes(8)) == repr(draw_shapes(8))
+    assert {draw_shapes(seed, metal_share=1.0, kind="sphere").permittivity for seed in range(3)} == {None}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"misplaced_mm": 1.0}, {"axes_deg": 2.0}, {"leakage": 0.05}, {"gain_db": 1.0}],
+    ids=lambda change: next(iter(change)),
+)
+def test_each_disturbance_changes_the_samples_and_repeats(change):
+    quiet = scan(ShapeNuisances(noise=0))
+    nuisances = ShapeNuisances(noise=0, seed=3, **change)
+    disturbed = scan(nuisances)
+    largest = max(np.abs(disturbed[channel] - quiet[channel]).max() / np.abs(quiet[channel]).max() for channel in quiet)
+    assert 0.01 < largest < 2.5
+    again = scan(nuisances)
+    assert all(np.array_equal(disturbed[channel], again[channel]) for channel in quiet)
+
+
+def test_noise_differs_between_scans_of_one_rig():
+    quiet = scan(ShapeNuisances(noise=0))["h"]
+    first, second = (scan(ShapeNuisances(noise=1), number)["h"] - quiet for number in (0, 1))
+    assert np.std(first) == pytest.approx(np.std(second), rel=0.3)
+    assert not np.allclose(first, second)

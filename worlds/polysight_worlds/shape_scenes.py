@@ -1,0 +1,252 @@
+"""Drawn scenes of shapes, what disturbs their scan, and the samples of the scan.
+
+`draw_shapes` makes a scene of one object of a kind, with or without a table behind; `scan_shapes` gives its samples as
+the instrument holds them, with noise and a rig that stands a little otherwise than the nominal one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from polysight_worlds.images import draw_direction
+from polysight_worlds.media import METAL, Stack
+from polysight_worlds.optics import Antenna
+from polysight_worlds.rig import Boards, published_boards, published_rig, turn
+from polysight_worlds.shape_echoes import record_shapes
+from polysight_worlds.shapes import Shape, Sphere, bottle, cylinder, plate, sphere
+
+# The linear part of the published chirp, in as many frequencies as hold a range gate of 0.5 m.
+FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 24)
+# Noise of a position in the published rig: 5.5 dB below the direct path in each of 192 samples of 16 chirps. The direct
+# path is 1.39 m long, and echoes are 1.35 times as strong, as it leaves at the patterns' edge.
+NOISE_A_SAMPLE = 10 ** (-5.5 / 20) / 4 / 1.39 / 1.35
+SAMPLES = 192
+
+
+@dataclass(frozen=True)
+class ShapeScene:
+    """Shapes of one object, and what is true of it.
+
+    `permittivity` is None for metal; `is_uniform` is False for a thin wall, which has no single surface to look at.
+    `background`: a table or nothing.
+    """
+
+    kind: str
+    shapes: tuple[Shape, ...]
+    permittivity: complex | None
+    radius_m: float
+    is_uniform: bool = True
+    background: tuple[Shape, ...] = ()
+
+    def surface_at(self, points_m: NDArray) -> tuple[NDArray, NDArray]:
+        """Signed distances [n] of points [n, 3] from the object's nearest surface, and its normals there [n, 3]."""
+        distances = np.full(len(points_m), np.inf)
+        normals = np.zeros((len(points_m), 3))
+        for shape in self.shapes:
+            found, a, b = shape.project(points_m)
+            nearer = np.abs(found) < np.abs(distances)
+            distances = np.where(nearer, found, distances)
+            normals = np.where(nearer[:, None], shape.at(a, b).normal.T, normals)
+        return distances, normals
+
+
+@dataclass(frozen=True)
+class ShapeNuisances:
+    """What disturbs a scan of shapes; 0 is none. Directions and phases are drawn from `seed`.
+
+    `noise`: of the nominal noise. `misplaced_mm`: each board stands so far from where the rig file says. `axes_deg`:
+    each board's polarisation is turned about its boresight. `leakage`: magnitude of the other polarisation in H and V.
+    `gain_db`: spread of the boards' unknown gains; with any, their phases are drawn too.
+    """
+
+    seed: int = 0
+    noise: float = 1.0
+    misplaced_mm: float = 0.0
+    axes_deg: float = 0.0
+    leakage: float = 0.0
+    gain_db: float = 0.0
+
+
+def disturb_boards(boards: Boards, nuisances: ShapeNuisances) -> Boards:
+    """Return the boards as they really stand."""
+    rng = np.random.default_rng([nuisances.seed, 11])
+
+    def disturb(antennas: tuple[Antenna, ...], leakage: float) -> tuple[Antenna, ...]:
+        shift_m = draw_direction(rng) * nuisances.misplaced_mm / 1000
+        rotation = turn(antennas[0].boresight, nuisances.axes_deg * rng.choice([-1, 1]))
+        other = leakage * np.exp(2j * np.pi * rng.random())
+        return tuple(antenna.turned(rotation, shift_m).with_leakage(other) for antenna in antennas)
+
+    tx = disturb((boards.tx,), 0.0)[0]
+    return Boards(tx, disturb(boards.h, nuisances.leakage), disturb(boards.v, nuisances.leakage))
+
+
+def scan_shapes(
+    shapes: Sequence[Shape],
+    offsets_m: NDArray,
+    nuisances: ShapeNuisances | None = None,
+    *,
+    boards: Boards | None = None,
+    frequencies_hz: NDArray = FREQUENCIES_HZ,
+    number: int = 0,
+) -> dict[str, NDArray]:
+    """Samples of shapes, complex64 [rx, frequency, ...] for "h" and "v", as of `record_shapes`, disturbed.
+
+    Scans of one rig, a reference and an object, have the same nuisances; `number` makes their noise differ.
+    """
+    nuisances = ShapeNuisances() if nuisances is None else nuisances
+    nominal = published_boards() if boards is None else boards
+    true_boards = disturb_boards(nominal, nuisances)
+    cubes = record_shapes(shapes, true_boards, frequencies_hz, offsets_m)
+    gains = np.random.default_rng([nuisances.seed, 12])
+    noise = np.random.default_rng([nuisances.seed, 13, number])
+    # Fewer frequencies than samples of the chirp hold the same signal.
+    sigma = nuisances.noise * NOISE_A_SAMPLE * np.sqrt(len(frequencies_hz) / SAMPLES)
+    for channel, cube in cubes.items():
+        level_db, phase = gains.normal(), gains.uniform(0, 2 * np.pi)
+        if nuisances.gain_db:
+            cube *= np.complex64(10 ** (nuisances.gain_db * level_db / 20) * np.exp(1j * phase))
+        pair = noise.standard_normal((2, *cube.shape), dtype=np.float32)
+        cubes[channel] = cube + np.float32(sigma * np.sqrt(0.5)) * (pair[0] + 1j * pair[1])
+    return cubes
+
+
+def scan_offsets(columns: int = 350, rows: int = 200, step_m: float = 0.002, *, every: int = 1) -> NDArray:
+    """Stage offsets [rows, columns, 3] about the middle of the grid; `every`: of so many positions one, both ways."""
+    x = (np.arange(0, columns, every) - (columns - 1) / 2) * step_m
+    y = (np.arange(0, rows, every) - (rows - 1) / 2) * step_m
+    grid_x, grid_y = np.meshgrid(x, y)
+    return np.stack([grid_x, grid_y, np.zeros_like(grid_x)], axis=-1)
+
+
+def reference_sphere(radius_m: float = 0.125) -> Sphere:
+    """Return a metal sphere whose front is at the middle of the picture."""
+    x, y = published_rig().centre_m
+    return sphere("reference", METAL, (float(x), float(y), 0.499 + radius_m), radius_m)
+
+
+@dataclass(frozen=True)
+class _Draw:
+    """What all kinds draw: a front near the middle of the picture, and a medium."""
+
+    rng: Generator
+    front_m: tuple[float, float, float]
+    stack: Stack
+    axis: tuple[float, float, float]
+
+    def behind(self, depth_m: float) -> tuple[float, float, float]:
+        x, y, z = self.front_m
+        return x, y, z + depth_m
+
+
+def _draw_sphere(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[Shape, ...], float]]:
+    def draw(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
+        radius_m = drawn.rng.uniform(low_m, high_m)
+        return (sphere("sphere", drawn.stack, drawn.behind(radius_m), radius_m),), radius_m
+
+    return draw
+
+
+def _draw_cylinder(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[Shape, ...], float]]:
+    def draw(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
+        radius_m = drawn.rng.uniform(low_m, high_m)
+        return (cylinder("cylinder", drawn.stack, drawn.behind(radius_m), radius_m, 0.4, axis=drawn.axis),), radius_m
+
+    return draw
+
+
+def _draw_plate(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
+    tilt_deg = drawn.rng.uniform(-15, 15, 2)
+    size_m = drawn.rng.uniform(0.14, 0.22, 2)
+    tilts = float(tilt_deg[0]), float(tilt_deg[1])
+    return (plate("plate", drawn.stack, drawn.front_m, (float(size_m[0]), float(size_m[1])), tilt_deg=tilts),), np.inf
+
+
+def _draw_cone(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radius_m = drawn.rng.uniform(0.1, 0.16)
+    slope = float(np.tan(np.radians(drawn.rng.uniform(3, 12))))
+    piece = cylinder("cone", drawn.stack, drawn.behind(radius_m), radius_m, 0.3, axis=drawn.axis, slope=slope)
+    return (piece,), radius_m
+
+
+def _draw_barrel(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radius_m = drawn.rng.uniform(0.1, 0.16)
+    bulge = float(drawn.rng.uniform(1, 6))
+    piece = cylinder("barrel", drawn.stack, drawn.behind(radius_m), radius_m, 0.2, axis=drawn.axis, bulge=bulge)
+    return (piece,), radius_m
+
+
+def _draw_saddle(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radii_m = drawn.rng.uniform(0.1, 0.2, 2)
+    bends = float(1 / radii_m[0]), float(-1 / radii_m[1]), 0.0
+    turn_deg = float(drawn.rng.uniform(0, 180))
+    return (plate("saddle", drawn.stack, drawn.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radii_m.min()
+
+
+def _draw_sheet(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radius_m = drawn.rng.uniform(0.15, 0.6)
+    turn_deg = float(drawn.rng.uniform(0, 180))
+    bends = (1 / radius_m, 0.0, 0.0)
+    return (plate("sheet", drawn.stack, drawn.front_m, (0.24, 0.24), turn_deg=turn_deg, bends=bends),), radius_m
+
+
+def _draw_bottle(drawn: _Draw) -> tuple[tuple[Shape, ...], float]:
+    radius_m = drawn.rng.uniform(0.03, 0.05)
+    wall_m = drawn.rng.uniform(0.5e-3, 3e-3)
+    wall = Stack(((drawn.stack.below, wall_m),), 1.0)
+    return bottle("bottle", wall, drawn.behind(radius_m), radius_m, 0.16, axis=drawn.axis), radius_m
+
+
+KINDS: dict[str, Callable[[_Draw], tuple[tuple[Shape, ...], float]]] = {
+    "plate": _draw_plate,
+    "sphere": _draw_sphere(0.1, 0.2),
+    "cylinder": _draw_cylinder(0.1, 0.2),
+    "sphere 50": _draw_sphere(0.05, 0.05),
+    "cylinder 50": _draw_cylinder(0.05, 0.05),
+    "sphere below 40": _draw_sphere(0.02, 0.04),
+    "cylinder below 40": _draw_cylinder(0.02, 0.04),
+    "bottle": _draw_bottle,
+    "cone": _draw_cone,
+    "barrel": _draw_barrel,
+    "saddle": _draw_saddle,
+    "sheet": _draw_sheet,
+}
+
+
+def draw_shapes(
+    seed: int, kind: str | None = None, *, with_table: bool = False, metal_share: float = 0.0
+) -> ShapeScene:
+    """Draw an object of a kind (None: any of `KINDS`), real part 2 to 9, loss 0 to 1, front near the picture's middle.
+
+    `with_table`: a wooden table stands 120 to 250 mm behind its front. `metal_share`: of scenes whose object is metal.
+    """
+    rng = np.random.default_rng([seed, 21])
+    if kind is None:
+        kind = str(rng.choice(list(KINDS)))
+    medium = complex(rng.uniform(2, 9), -rng.uniform(0, 1))
+    is_metal = rng.random() < metal_share and kind != "bottle"
+    x, y = published_rig().centre_m + rng.uniform(-0.04, 0.04, 2)
+    front_m = float(x), float(y), float(0.499 + rng.uniform(-0.02, 0.03))
+    # Axes lie within 10 degrees of the picture's plane, in any direction of it.
+    around, towards = rng.uniform(0, np.pi), rng.uniform(-0.17, 0.17)
+    axis = float(np.cos(around)), float(np.sin(around)), float(towards)
+    stack = METAL if is_metal else Stack(below=medium)
+    shapes, radius_m = KINDS[kind](_Draw(rng, front_m, stack, axis))
+    background: tuple[Shape, ...] = ()
+    if with_table:
+        wood = Stack(below=complex(rng.uniform(1.8, 3.5), -0.15))
+        place_m = (front_m[0], front_m[1], front_m[2] + rng.uniform(0.12, 0.25))
+        background = (plate("table", wood, place_m, (1.6, 1.2), is_soft=True),)
+    return ShapeScene(
+        kind=kind,
+        shapes=shapes,
+        permittivity=None if is_metal else medium,
+        radius_m=float(radius_m),
+        is_uniform=kind != "bottle",
+        background=background,
+    )

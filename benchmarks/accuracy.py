@@ -209,7 +209,7 @@ def image_error(rig: Instrument, board: Board) -> float:
         if valid.any():
             echoes = point_row(rig, antennas, row, points, sweep, valid)
             received[:, valid] = echoes + 1 / antennas.direct_m[:, None, None]
-        builder.add_row(board.name, row.index, as_synced(received, valid))
+        builder.add_row(board.name, row.index, as_synced(rig, received, valid))
         samples.append(received[:, valid])
         shifts.append(np.pad(row_offsets_m(rig, row)[valid], ((0, 0), (0, 1))))
     image, _, _ = builder.boards[board.name].image()

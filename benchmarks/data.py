@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from polysight.imaging.geometry import Antennas, image_grid, row_offsets_m
 from polysight.imaging.samples import scene_gate_m
 from polysight.store.source import RowData
-from polysight.sync.chain import SyncedRow
+from polysight.sync import SyncedRow, sweep_of
 from polysight_shared.config import Board, Instrument, load_instrument
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan, Row, plan_raster
@@ -166,7 +166,7 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
     cube.flush()
 
 
-def as_synced(samples: NDArray[np.complex64], valid: NDArray[np.bool_] | None = None) -> SyncedRow:
+def as_synced(rig: Instrument, samples: NDArray[np.complex64], valid: NDArray[np.bool_] | None = None) -> SyncedRow:
     """The part of a synchronised row that the imagers read: samples [rx, position, sample] and valid [position]."""
     valid = np.ones(samples.shape[1], bool) if valid is None else valid
-    return cast(SyncedRow, SimpleNamespace(samples=samples, valid=valid, turn=None))
+    return cast(SyncedRow, SimpleNamespace(samples=samples, sweep_hz=sweep_of(rig.chirp), valid=valid, turn=None))

@@ -44,7 +44,7 @@ class Bench:
         """From disk to pixels: all rows, then the image; or an image that every row updates."""
         samples = ImageBuilder(self.rig, live=live).boards[self.board.name]
         for row, met in self._rows():
-            samples.add_row(row, as_synced(met))
+            samples.add_row(row, as_synced(self.rig, met))
         return (samples.current() if live else samples.image())[0]
 
     def _rows(self) -> Iterator[tuple[int, NDArray[np.complex64]]]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from polysight.imaging.geometry import Antennas, row_offsets_m
-from polysight.sync.chain import SyncedRow
+from polysight.sync import SyncedRow, sweep_of
 from polysight_shared.config import Board, Instrument
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -28,7 +28,7 @@ def make_rig(rig):
 
 
 @pytest.fixture(scope="session")
-def synced_row():
+def synced_row(rig):
     """A synchronised row from samples [rx, position, sample]."""
 
     def make(samples, valid=None) -> SyncedRow:
@@ -36,7 +36,7 @@ def synced_row():
         valid = np.ones(n, bool) if valid is None else valid
         zero = np.zeros(n)
         samples = np.where(valid[:, None], samples, 0).astype(np.complex64)
-        return SyncedRow(samples, valid, np.full(n, 16), zero, zero, zero, zero, {})
+        return SyncedRow(samples, sweep_of(rig.chirp), valid, np.full(n, 16), zero, zero, zero, zero, {})
 
     return make
 

@@ -19,7 +19,16 @@ def row(snr_db=7.2, n=4000, seed=0):
     valid, zero = np.ones(n, bool), np.zeros(n)
     noise = np.full(n, 500.0**2 * 10 ** (-snr_db / 10))
     return SyncedRow(
-        np.zeros((4, n, 1), np.complex64), valid, np.full(n, 16), zero, zero + 500, zero, zero, errors, noise
+        np.zeros((4, n, 1), np.complex64),
+        np.zeros(1),
+        valid,
+        np.full(n, 16),
+        zero,
+        zero + 500,
+        zero,
+        zero,
+        errors,
+        noise,
     )
 
 
@@ -68,7 +77,11 @@ def test_files_and_words(tmp_path, simulated):
 
 def test_a_scan_without_a_valid_position_is_reported_as_such(tmp_path):
     empty = SyncedRow(
-        np.zeros((4, 3, 1), np.complex64), np.zeros(3, bool), np.zeros(3, int), *(np.zeros(3) for _ in range(4))
+        np.zeros((4, 3, 1), np.complex64),
+        np.zeros(1),
+        np.zeros(3, bool),
+        np.zeros(3, int),
+        *(np.zeros(3) for _ in range(4)),
     )
     text = write_sync_report(tmp_path, {"RH": report_of(empty)}, "nothing", True)
     assert "0 chirps at 0 positions" in text

@@ -8,6 +8,7 @@ from tests.support.rigs import published_rig
 
 from polysight.pipeline import Pipeline
 from polysight.store.scan_folder import ScanFolder
+from polysight.sync.decimate import flatten, fold
 from polysight_simulators.scene import Scene, decode_scene, reference_cube, simulate, synced_cube
 from polysight_simulators.scene.radar import sample_frequencies_hz
 
@@ -34,21 +35,25 @@ SCENE = decode_scene(
 
 
 def rows_by_the_host(scene: Scene, folder: Path) -> dict[str, np.ndarray]:
-    """Linear samples of a raw scan, synchronised, [rx, row, column, sample] in ADC counts."""
+    """Samples of a raw scan, synchronised, [rx, row, column, block of four samples] in ADC counts."""
     pipeline = Pipeline(ScanFolder.load(simulate(RIG, scene, folder / "scan")))
     found: dict[str, list[np.ndarray]] = {"RH": [], "RV": []}
-    a, b = pipeline.source.instrument.chirp.linear_samples
     for index in pipeline.source.rows():
         for board, row in pipeline.synchronise_row(index).items():
             assert row.valid.all()
             samples = row.samples[:, ::-1] if index % 2 else row.samples
-            found[board].append(samples[..., a:b])
+            found[board].append(samples)
     return {board: np.stack(rows, axis=1) for board, rows in found.items()}
+
+
+def in_blocks(cube: np.ndarray) -> np.ndarray:
+    """Linear samples of a cube in the middle of each block, as the host decimates them."""
+    return flatten(fold(np.ascontiguousarray(cube[..., slice(*RIG.chirp.linear_samples)], np.complex64)))
 
 
 def off_by(raw: np.ndarray, cube: np.ndarray) -> np.ndarray:
     """Deviation from one common factor, relative to the cube."""
-    cube = cube[..., : raw.shape[-1]]
+    cube = in_blocks(cube)
     return raw / (np.vdot(cube, raw) / np.vdot(cube, cube)) - cube
 
 
@@ -67,7 +72,7 @@ def test_a_synced_cube_equals_the_synchronised_raw_scan(tmp_path: Path) -> None:
 def test_the_noise_is_that_of_averaged_bursts(tmp_path: Path) -> None:
     for board, raw in rows_by_the_host(SCENE, tmp_path).items():
         quiet = synced_cube(RIG, SCENE, board, noise=0.0)
-        drawn = (synced_cube(RIG, SCENE, board) - quiet)[..., : raw.shape[-1]]
+        drawn = in_blocks(synced_cube(RIG, SCENE, board) - quiet)
         power = np.mean(np.abs(off_by(raw, quiet)) ** 2)
         assert power == pytest.approx(np.mean(np.abs(drawn) ** 2), rel=0.05)
         ideal = SCENE.with_disturbances(ideal=True)

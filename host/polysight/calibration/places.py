@@ -199,8 +199,9 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
             continue
         synced = synchronise_row(words, valid, setup)
         keep = np.flatnonzero(synced.valid)[::stride]
-        reduced.append(synced.samples[:, keep] @ maps.matrix.T)
-        direct.append(synced.samples[:, keep] @ maps.direct)
+        found = synced.samples[:, keep] @ maps.maps(synced.sweep_hz).T
+        reduced.append(found[..., :-1])
+        direct.append(found[..., -1])
         offsets.append(row_offsets_m(rig, plan.row(row))[keep])
     samples, gains = np.concatenate(reduced, axis=1), np.concatenate(direct, axis=1).mean(axis=1)
     if not samples.size or np.any(gains == 0):

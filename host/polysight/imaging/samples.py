@@ -13,6 +13,9 @@ sum_m (M x)_m exp(-j 2 pi f_m d / c)`, and `M x` is computed once per position; 
 samples more than the time-bandwidth product make the error 1e-6 of the peak (derivation:
 docs/decisions/0002-imaging.md).
 
+Rows of raw chirps come decimated, with one sample for every four (`sync.decimate`). `Reduction.maps` gives the maps for
+their frequencies: those that agree with the maps of all samples on every echo that decimation can tell apart.
+
 The direct path is a constant in x, close to the gate. Windowing alone does not remove it, so its amplitude is estimated
 (generalised least squares with the gate as coloured noise) and subtracted.
 """
@@ -39,13 +42,15 @@ from polysight.imaging.geometry import (
     window_weights,
 )
 from polysight.imaging.spectral import SLACK_M, IncrementalImager, SpectralImager
-from polysight.sync import SyncedRow
+from polysight.sync import SyncedRow, sweep_of
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 from polysight_shared.raster import RasterPlan, plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
+# Least singular value of echoes, relative to the largest, that `Reduction.maps` uses.
+_LEAST_STRENGTH = 1e-5
 _NOISE = 1e-3  # noise power of a sample relative to the gate, for the estimate of the direct path
 REACH = 4  # positions to either side
 _BAND = 0.45  # largest frequency of the filter, cycles per position
@@ -72,6 +77,8 @@ class Reduction:
         complex128 [m, m]: an echo of path d and amplitude 1 becomes `model @ exp(+j 2 pi frequencies_hz d / c)`.
     gate_m
         Smallest and largest excess path in the gate.
+    sweep_hz
+        float64 [sample]: frequency of every sample of the chirp.
     """
 
     frequencies_hz: NDArray[np.float64]
@@ -79,6 +86,22 @@ class Reduction:
     direct: NDArray[np.complex128]
     model: NDArray[np.complex128]
     gate_m: tuple[float, float]
+    sweep_hz: NDArray[np.float64]
+
+    def maps(self, sweep_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return matrix and direct for samples at other evenly spaced frequencies, complex128 [m + 1, sample].
+
+        Least squares over echoes from as much path as these frequencies tell apart, but for a tenth at its ends.
+        """
+        maps = np.vstack([self.matrix, self.direct])
+        if sweep_hz.shape == self.sweep_hz.shape:
+            return maps
+        apart_m = SPEED_OF_LIGHT_M_S / (sweep_hz[1] - sweep_hz[0])
+        middle_m = sum(self.gate_m) / 4  # between the direct path and the gate, as in decimation
+        paths = np.linspace(middle_m - 0.45 * apart_m, middle_m + 0.45 * apart_m, 4 * sweep_hz.size)
+        turns = 2j * np.pi / SPEED_OF_LIGHT_M_S * paths[:, None]
+        wanted = np.exp(turns * self.sweep_hz) @ maps.T
+        return np.linalg.lstsq(np.exp(turns * sweep_hz), wanted, rcond=_LEAST_STRENGTH)[0].T
 
 
 def scene_gate_m(
@@ -112,7 +135,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
         Frequency samples beyond the time-bandwidth product.
     """
     a, b = chirp.linear_samples
-    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(a, b)
+    sweep = sweep_of(chirp)[a:b]
     weight = window_weights(window, b - a)
     weight = weight / weight.sum()
     band = sweep[-1] - sweep[0]
@@ -135,7 +158,8 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
     # Echoes at the samples' frequencies are combinations of echoes at the few frequencies.
     few = np.exp(2j * np.pi * np.outer(d, frequencies))
     from_few = np.linalg.lstsq(few, np.exp(2j * np.pi * np.outer(d, sweep)), rcond=1e-9)[0].T
-    return Reduction(frequencies, matrix, whole, (matrix[:, a:b] @ from_few).astype(np.complex128), gate_m)
+    model = (matrix[:, a:b] @ from_few).astype(np.complex128)
+    return Reduction(frequencies, matrix, whole, model, gate_m, sweep_of(chirp))
 
 
 def burst_filters(rig: Instrument) -> NDArray[np.float32]:
@@ -225,8 +249,7 @@ def choose_imager(aperture: Aperture) -> tuple[Imager, str | None]:
 def mirror_samples(antennas: Antennas, z_m: float, chirp: Chirp) -> NDArray[np.complex128]:
     """Return the referenced samples of a mirror, [rx, sample]; amplitude relative to a direct path of one metre."""
     path = antennas.mirror_m(z_m)
-    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
-    phase = 2j * np.pi * np.outer(path - antennas.direct_m, sweep) / SPEED_OF_LIGHT_M_S
+    phase = 2j * np.pi * np.outer(path - antennas.direct_m, sweep_of(chirp)) / SPEED_OF_LIGHT_M_S
     return (np.exp(phase) / path[:, None]).astype(np.complex128)
 
 
@@ -274,9 +297,9 @@ class BoardSamples:
     ) -> None:
         self.board, self.taper = board, taper
         self._plan, self._grid = plan_raster(rig.grid), grid
-        a, b = rig.chirp.linear_samples
-        self._reduction, self._linear = reduction, slice(2 * a, 2 * b)
-        self._maps = _on_pairs(np.vstack([reduction.matrix, reduction.direct])[:, a:b])
+        self._reduction = reduction
+        # Maps for pairs of real numbers and the samples they use, by the row's number of samples.
+        self._maps: dict[int, tuple[slice, NDArray[np.float32]]] = {}
         self._filters = burst_filters(rig)
         self._antennas, self._chirp = Antennas.of(rig, board), rig.chirp
         self.mirror = mirror_reduced(self._antennas, float(np.mean(grid.z_m)), rig.chirp, reduction)
@@ -345,7 +368,7 @@ class BoardSamples:
                 f"row {index} of board {self.board.name} has {row.valid.size} positions, the plan {self._plan.columns}"
             )
         forward = slice(None, None, self._plan.row(index).direction)
-        reduced = self._reduced(row.samples)
+        reduced = self._reduced(row.samples, row.sweep_hz)
         if row.turn is not None:
             reduced = undo_burst_motion(reduced, row.valid, row.turn, self._filters)
         reduced, valid = reduced[..., forward], row.valid[forward]
@@ -377,15 +400,18 @@ class BoardSamples:
         self._stale.add(index)
         self._show(index, 1)
 
-    def _reduced(self, samples: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    def _reduced(self, samples: NDArray[np.complex64], sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Apply the range gate to a row; return samples and the direct path, [rx, frequency + 1, position]."""
         if samples.strides[1] < 0:  # reversed positions make the product slow
-            return self._reduced(samples[:, ::-1])[..., ::-1]
-        pairs = np.asarray(samples, np.complex64).view(np.float32)[..., self._linear]
-        out = np.empty((*pairs.shape[:2], self._maps.shape[1]), np.float32)
+            return self._reduced(samples[:, ::-1], sweep_hz)[..., ::-1]
+        if sweep_hz.size not in self._maps:
+            self._maps[sweep_hz.size] = _on_pairs(self._reduction.maps(sweep_hz))
+        used, maps = self._maps[sweep_hz.size]
+        pairs = np.asarray(samples, np.complex64).view(np.float32)[..., used]
+        out = np.empty((*pairs.shape[:2], maps.shape[1]), np.float32)
         for first in range(0, pairs.shape[1], _CHUNK):
             part = slice(first, first + _CHUNK)
-            np.matmul(pairs[:, part], self._maps, out=out[:, part])
+            np.matmul(pairs[:, part], maps, out=out[:, part])
         return out.view(np.complex64).mT
 
     def _prepare(self) -> None:
@@ -554,15 +580,18 @@ class BoardSamples:
         return imager, notice
 
 
-def _on_pairs(maps: NDArray[np.complex128]) -> NDArray[np.float32]:
-    """Return complex maps [map, sample] as real ones for pairs (re, im), float32 [2 sample, 2 map].
+def _on_pairs(maps: NDArray[np.complex128]) -> tuple[slice, NDArray[np.float32]]:
+    """Return complex maps [map, sample] as real ones for pairs (re, im), float32 [2 sample, 2 map], and their slice.
 
-    `pairs @ out` are the pairs of `maps @ x`: a real product is 1.5 times as fast as such a narrow complex one.
+    `pairs[..., slice] @ out` are the pairs of `maps @ x`: a real product is 1.5 times as fast as such a narrow complex
+    one. The slice leaves out samples at the ends with weight 0.
     """
+    used = np.flatnonzero(maps.any(axis=0))[[0, -1]]
+    maps = maps[:, used[0] : used[1] + 1]
     out = np.empty((maps.shape[1], 2, maps.shape[0], 2), np.float32)
     out[:, 0, :, 0], out[:, 1, :, 0] = maps.real.T, -maps.imag.T  # contributions to the real part
     out[:, 0, :, 1], out[:, 1, :, 1] = maps.imag.T, maps.real.T
-    return out.reshape(2 * maps.shape[1], -1)
+    return slice(2 * used[0], 2 * used[1] + 2), out.reshape(2 * maps.shape[1], -1)
 
 
 def _wrong_row(what: str) -> DataError:

@@ -110,13 +110,14 @@ def range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]
     samples, Hann-windowed, has it at bin `d N df / c`. Returns dB, float64 [n] as `excess_m`; all at the floor when no
     position is valid.
     """
-    first, end = chirp.linear_samples
-    samples = row.samples[:, row.valid, first:end]
+    first, last = (chirp.first_sample_hz + chirp.hz_per_sample * n for n in chirp.linear_samples)
+    linear = (row.sweep_hz >= first) & (row.sweep_hz < last)
+    samples = row.samples[:, row.valid][..., linear]
     if not samples.size:
         return np.full(excess_m.size, PROFILE_FLOOR_DB)
-    spectrum = np.fft.fft(samples * np.hanning(end - first), FFT_POINTS, axis=-1)
+    spectrum = np.fft.fft(samples * np.hanning(samples.shape[-1]), FFT_POINTS, axis=-1)
     power = (spectrum.real**2 + spectrum.imag**2).mean(axis=(0, 1))
-    bins = excess_m * FFT_POINTS * chirp.hz_per_sample / SPEED_OF_LIGHT_M_S
+    bins = excess_m * FFT_POINTS * (row.sweep_hz[1] - row.sweep_hz[0]) / SPEED_OF_LIGHT_M_S
     level = np.interp(bins % FFT_POINTS, np.arange(FFT_POINTS + 1), np.append(power, power[0]))
     relative = np.maximum(level / max(power[0], 1e-30), 1e-30)
     return np.maximum(10 * np.log10(relative), PROFILE_FLOOR_DB)

@@ -117,9 +117,6 @@ class BoardRows:
     board: Board
     rows: dict[int, RowQuality] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        self._filter = object_filter(self.rig, self.board)
-
     def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:
         """Compute and store the figures of a synchronised row."""
         figures = RowFigures(
@@ -133,7 +130,8 @@ class BoardRows:
             stages=[(name, *spread) for name, spread in synced.stages.items() if np.isfinite(spread).all()],
         )
         direct_hz = np.where(synced.valid, synced.direct_hz, np.nan)
-        self.rows[row] = RowQuality(figures, direct_hz, _direct_snr(synced), synced.through(self._filter))
+        echo = synced.through(object_filter(self.rig, self.board, synced.sweep_hz))
+        self.rows[row] = RowQuality(figures, direct_hz, _direct_snr(synced), echo)
 
     @property
     def figures(self) -> dict[int, RowFigures]:

@@ -9,9 +9,10 @@ otherwise in NumPy with equal results. `estimate_backlash` measures the backlash
 
 from polysight.sync.backlash import estimate_backlash, object_filter
 from polysight.sync.chain import STAGES, BoardSetup, RowSynchroniser, SyncedRow, noise_power, synchronise_row
+from polysight.sync.decimate import FOLD
 from polysight.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
-from polysight.sync.loops import FOLD, cis
-from polysight.sync.offsets import AlignedRow, align_row, reference, whole_blocks
+from polysight.sync.loops import cis
+from polysight.sync.offsets import AlignedRow, align_row, reference, sweep_of, whole_blocks
 
 __all__ = [
     "FOLD",
@@ -29,6 +30,7 @@ __all__ = [
     "noise_power",
     "object_filter",
     "reference",
+    "sweep_of",
     "synchronise_row",
     "whole_blocks",
 ]

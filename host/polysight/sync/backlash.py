@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.sync.offsets import excess_path_m
+from polysight.sync.offsets import excess_path_m, sweep_of
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.raster import mean_burst_travel_mm, plan_raster
@@ -23,15 +23,18 @@ _STEPS = 3  # Gauss-Newton
 _ALIASED = 0.02  # largest share of power in the upper fifth of the spectrum; more means aliasing
 
 
-def object_filter(rig: Instrument, board: Board) -> NDArray[np.complex64]:
-    """Return weights [sample] that select the mirror point's range cell and suppress the direct path."""
-    a, b = rig.chirp.linear_samples
+def object_filter(rig: Instrument, board: Board, sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
+    """Return weights [sample] that select the mirror point's range cell and suppress the direct path.
+
+    `sweep_hz` [sample] is the transmit frequency of each sample; those outside the linear part have weight 0.
+    """
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
     excess = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).mean()
-    n = np.arange(b - a)
-    weights = np.zeros(rig.chirp.samples, np.complex64)
-    weights[a:b] = np.hanning(b - a + 2)[1:-1] / (b - a)
-    weights[a:b] *= np.exp(-2j * np.pi * rig.chirp.hz_per_sample * n * excess / SPEED_OF_LIGHT_M_S)
+    first, last = sweep_of(rig.chirp)[np.array(rig.chirp.linear_samples) - (0, 1)]
+    linear = np.flatnonzero((sweep_hz >= first) & (sweep_hz <= last))
+    weights = np.zeros(sweep_hz.size, np.complex64)
+    weights[linear] = np.hanning(linear.size + 2)[1:-1] / linear.size
+    weights[linear] *= np.exp(-2j * np.pi * (sweep_hz[linear] - first) * excess / SPEED_OF_LIGHT_M_S)
     return weights
 
 

@@ -1,15 +1,20 @@
 /* Burst alignment, position by position: `offsets.align_in_numpy` in one pass over the card's words. The words of a
    position (64 KB) come from the cache, where they were read to (`chain.py`). The method is described in `offsets.py` and
-   `loops.py`. */
+   `loops.py`, the way of the data in docs/compiled-loops.md. */
 #include "passes.h"
 
 #define REFERENCES 4       /* `offsets._REFERENCES` */
 #define GOOD 0.5           /* `offsets._GOOD` */
+#define ROUNDS 4           /* `offsets._ROUNDS` */
+#define UNEXPLAINED 8.0    /* `offsets._UNEXPLAINED` */
+#define NEGLIGIBLE 1e-3    /* `offsets._NEGLIGIBLE` */
+#define LEAST_LIMIT 1024   /* `offsets._LEAST_LIMIT` */
+#define AT_LIMIT 32        /* `offsets._AT_LIMIT` */
 #define SMALLEST_GAIN 0.25 /* `high_pass_filter.SMALLEST_GAIN` */
 
-/* `high_pass_filter.Equaliser`; without corners there is one tap, 1. */
+/* `high_pass_filter.Equaliser`; without corners the outer taps are 0. */
 typedef struct {
-    int taps, is_signed, corners;
+    int is_signed, corners;
     double sample_rate_hz, reach, even, odd; /* even, odd: factors of `find_taps` */
     const double *corners_hz;
 } Equaliser;
@@ -31,8 +36,9 @@ static Complex inverse(const Equaliser *e, double frequency)
 /* `Equaliser.taps`. */
 static void find_taps(const Equaliser *e, double frequency, Complex *taps)
 {
-    if (e->taps == 1) {
-        taps[0] = (Complex){1, 0};
+    if (!e->corners) {
+        taps[0] = taps[2] = (Complex){0, 0};
+        taps[1] = (Complex){1, 0};
         return;
     }
     Complex low = inverse(e, frequency - e->reach), middle = inverse(e, frequency), high = inverse(e, frequency + e->reach);
@@ -43,37 +49,98 @@ static void find_taps(const Equaliser *e, double frequency, Complex *taps)
     taps[2] = (Complex){(both.re + apart.re) / 2, (both.im + apart.im) / 2};
 }
 
-/* Work arrays of one position, per chirp. */
+/* Work arrays of one position, per chirp; padded to whole groups. */
 typedef struct {
     int *order;
-    double *frequency, *found, *coherence, *sorted;
+    double *frequency, *found, *coherence, *sorted, *left, *start, *turns;
     Complex *product, *found_product, *taps;
-    float *energy;
-    uint8_t *usable, *second_half;
+    float *energy, *first, *second;
+    uint8_t *usable, *whole;
 } Chirps;
 
 /* Results, [position][chirp] unless noted. */
 typedef struct {
-    float *mean, *halves; /* complex [position][RX][sample] and [position][2][RX][block] */
-    double *centre;       /* [position] */
+    float *halves;  /* complex [position][2][RX][block] */
+    double *centre; /* [position] */
     uint8_t *good;
     double *frequency, *phase, *amplitude, *gain, *frequency_error, *phase_error, *coherence;
-    int32_t *peak;
+    uint8_t *clipped;
 } Aligned;
 
-/* `offsets._coherent`: usable chirps with at least GOOD of the median coherence of their position. */
-static void choose_coherent(const double *coherence, const uint8_t *usable, int chirps, double *sorted, uint8_t *good)
+/* `offsets.find_clipped` in the received chirps of a burst, words in each. */
+static void find_clipped(const int16_t *burst, const uint8_t *valid, int chirps, int words, int full_scale, int *peak,
+                         uint8_t *clipped)
+{
+    int highest = 0;
+    for (int k = 0; k < chirps; k++) { /* reads all words in order, into the first caches */
+        peak[k] = largest(burst + (size_t)k * words, words);
+        clipped[k] = valid[k] && peak[k] >= full_scale;
+        highest = valid[k] && peak[k] < full_scale && peak[k] > highest ? peak[k] : highest;
+    }
+    const int16_t limit = (int16_t)(highest - highest / 2048), low = (int16_t)-limit;
+    for (int k = 0; k < chirps && highest >= LEAST_LIMIT; k++) {
+        const int16_t *restrict chirp = burst + (size_t)k * words;
+        int at_limit = 0;
+        const int count = valid[k] && peak[k] >= limit ? words : 0;
+        for (int i = 0; i < count; i++)
+            at_limit += (chirp[i] >= limit) | (chirp[i] <= low);
+        clipped[k] |= at_limit > words / AT_LIMIT;
+    }
+}
+
+/* The lower median of the usable values; 0 without any. */
+static double median(const double *values, const uint8_t *usable, int chirps, double *sorted)
 {
     int count = 0;
     for (int k = 0; k < chirps; k++)
         if (usable[k]) {
             int i = count++;
-            for (; i > 0 && sorted[i - 1] > coherence[k]; i--)
+            for (; i > 0 && sorted[i - 1] > values[k]; i--)
                 sorted[i] = sorted[i - 1];
-            sorted[i] = coherence[k];
+            sorted[i] = values[k];
         }
+    return count ? sorted[(count - 1) / 2] : 0;
+}
+
+/* `offsets._coherent`: usable chirps with at least GOOD of the median coherence of their position; returns their number. */
+static int choose_coherent(const double *coherence, const uint8_t *usable, int chirps, double *sorted, uint8_t *good)
+{
+    double least = GOOD * median(coherence, usable, chirps, sorted);
+    int count = 0;
     for (int k = 0; k < chirps; k++)
-        good[k] = usable[k] && coherence[k] >= GOOD * sorted[(count - 1) / 2];
+        count += good[k] = usable[k] && coherence[k] >= least;
+    return count;
+}
+
+/* `offsets._disturbed`: drop chirps from `whole` that the others explain badly in a part; returns their number. */
+static int drop_disturbed(const Work *w, Chirps *c, int count)
+{
+    int chirps = w->chirps, usable = 0, dropped = 0;
+    for (int k = 0; k < chirps; k++)
+        usable += c->usable[k];
+    for (int p = 0; p < w->parts && usable >= 4; p++) {
+        const double *left = c->left + p * chirps;
+        double negligible = NEGLIGIBLE * w->part_energy[p] / (count > 1 ? (double)count * count : 1), least = 1e300, most = 0;
+        for (int k = 0; k < chirps; k++)
+            if (c->usable[k]) {
+                least = left[k] < least ? left[k] : least;
+                most = left[k] > most ? left[k] : most;
+            }
+        if (most <= UNEXPLAINED * least + negligible)
+            continue; /* the usual case, without a median */
+        double middle = median(left, c->usable, chirps, c->sorted);
+        for (int k = 0; k < chirps; k++) {
+            double beside = 1e300; /* least of the two chirps on either side */
+            for (int j = k > 2 ? k - 2 : 0; j <= k + 2 && j < chirps; j++)
+                beside = j != k && c->usable[j] && left[j] < beside ? left[j] : beside;
+            double usual = beside < 1e300 && beside > middle ? beside : middle;
+            if (c->usable[k] && c->whole[k] && left[k] > UNEXPLAINED * usual + negligible) {
+                c->whole[k] = 0;
+                dropped++;
+            }
+        }
+    }
+    return dropped;
 }
 
 /* Chirps of a kind first, then the others, each in order of recording; the first `fixed` stay. */
@@ -88,16 +155,16 @@ static void put_first(int *order, const uint8_t *kind, int chirps, int fixed)
 
 /* `offsets._against_one`: offsets relative to one chirp; try another if it is not usable or matches few of the others.
    Returns the middle of the signal's band. */
-static double against_one(Work *w, Chirps *c, const uint8_t *valid, int full_scale, const int32_t *peak)
+static double against_one(Work *w, Chirps *c, const int16_t *words)
 {
     int chirps = w->chirps, reference = 0, usable = 0;
     double best_sum = -1, best = 0, centre = 0, noise = 4 / sqrt((double)RX * w->n);
-    put_first(c->order, valid, chirps, 0);
+    put_first(c->order, c->whole, chirps, 0);
     for (int attempt = 0; attempt < REFERENCES && attempt < chirps; attempt++) {
         int tried = c->order[attempt], matching = 0;
-        double sum = 0, middle = match(w, tried, c->found, c->found_product, c->energy);
+        double sum = 0, middle = match(w, words, tried, c->found, c->found_product, c->energy);
         for (int k = 0; attempt == 0 && k < chirps; k++)
-            usable += c->usable[k] = valid[k] && peak[k] < full_scale && c->energy[k] > 0;
+            usable += c->usable[k] = c->whole[k] && c->energy[k] > 0;
         if (attempt == 0)
             put_first(c->order, c->usable, chirps, 1);
         for (int k = 0; k < chirps; k++) {
@@ -135,64 +202,70 @@ static void centre_errors(double *values, const uint8_t *good, int chirps, int c
         values[k] = good[k] ? (values[k] - mean) / 2 : 0;
 }
 
-static void align_position(Work *w, Chirps *c, const Equaliser *e, const int16_t *words, const uint8_t *valid,
-                           int full_scale, Aligned out)
+/* `offsets._align`: one round with the whole chirps; returns the number of disturbed ones, dropped from them. */
+static int align_round(Work *w, Chirps *c, const Equaliser *e, const int16_t *words, Aligned out)
 {
-    int chirps = w->chirps, count = 0, half = 0;
-    for (int k = 0; k < chirps; k++) /* reads all words in order, into the first caches */
-        out.peak[k] = largest(words + 2 * RX * k * w->samples, 2 * RX * w->samples);
-    part_iq(words, chirps * w->samples, w->i, w->q);
-    *out.centre = against_one(w, c, valid, full_scale, out.peak);
-    choose_coherent(c->coherence, c->usable, chirps, c->sorted, out.good);
+    int chirps = w->chirps, half = 0;
+    *out.centre = against_one(w, c, words);
+    int count = choose_coherent(c->coherence, c->usable, chirps, c->sorted, out.good);
     for (int k = 0; k < chirps; k++) {
-        Complex *taps = c->taps + k * e->taps, sum = {0, 0};
-        out.frequency[k] = *out.centre + c->frequency[k];
+        Complex *taps = c->taps + 3 * k;
+        c->start[k] = out.frequency[k] = *out.centre + c->frequency[k];
         find_taps(e, out.frequency[k], taps);
-        for (int t = 0; t < e->taps; t++)
-            sum.re += taps[t].re, sum.im += taps[t].im;
+        Complex sum = {taps[0].re + taps[1].re + taps[2].re, taps[0].im + taps[1].im + taps[2].im};
         out.gain[k] = magnitude(sum);
         out.phase[k] = angle(times(c->product[k], sum));
-        for (int t = 0; t < e->taps; t++)
-            taps[t] = times(taps[t], cis(-out.phase[k] / TURN));
-        count += out.good[k];
+        Complex turn = cis(-out.phase[k] / TURN);
+        for (int t = 0; t < 3; t++)
+            taps[t] = times(taps[t], turn);
     }
+    reduce(w, c->start, c->taps);
 
     /* Each chirp against the sum of the others; its difference from the mean of all chirps is smaller. */
-    double level = against_others(w, out.frequency, c->taps, e->taps, out.good, c->found, c->found_product,
-                                  c->energy, out.frequency_error, out.phase_error);
+    double level = against_others(w, out.good, c->found, c->found_product, c->energy, out.frequency_error,
+                                  out.phase_error, c->left);
+    int disturbed = drop_disturbed(w, c, count);
     level /= count > 1 ? (double)count * count : 1;
     level = level > 1e-30 ? level : 1e-30;
     for (int k = 0; k < chirps; k++) {
         int others = count - out.good[k];
         double part = (double)others / (count > 1 ? count : 1), own = c->energy[k] > 1e-30 ? c->energy[k] : 1e-30;
-        double shift = part * angle(c->found_product[k]), correction = part * c->found[k];
+        double shift = part * angle(c->found_product[k]);
+        c->found[k] *= part;
+        c->turns[k] = shift / TURN;
         out.amplitude[k] = others > 0 ? magnitude(c->found_product[k]) / others / level : 1;
         out.coherence[k] = out.amplitude[k] * sqrt(level / own);
         out.phase[k] = remainder(out.phase[k] + shift, TURN);
-        out.frequency[k] += correction;
-        c->frequency[k] += correction;
-        /* Filtering and then turning equals turning and then filtering with turned taps. */
-        for (int t = 0; t < e->taps; t++) {
-            Complex turn = cis(FOLD * (t - e->taps / 2) * correction - shift / TURN);
-            c->taps[k * e->taps + t] = times(c->taps[k * e->taps + t], turn);
-        }
+        out.frequency[k] = c->frequency[k] + c->found[k];
     }
-    choose_coherent(out.coherence, c->usable, chirps, c->sorted, out.good);
-    count = 0;
-    for (int k = 0; k < chirps; k++)
-        count += out.good[k];
+    count = choose_coherent(out.coherence, c->usable, chirps, c->sorted, out.good);
     for (int k = 0; k < chirps; k++) {
         half += out.good[k];
-        c->second_half[k] = half % 2 == 0;
-        for (int t = 0; t < e->taps; t++) {
-            c->taps[k * e->taps + t].re /= count > 1 ? count : 1;
-            c->taps[k * e->taps + t].im /= count > 1 ? count : 1;
-        }
+        float weight = out.good[k] ? 1.0f / count : 0;
+        c->first[k] = half % 2 ? weight : 0;
+        c->second[k] = half % 2 ? 0 : weight;
     }
-    average(w, out.frequency, c->taps, e->taps, out.good, c->second_half, out.mean, out.halves);
-    memcpy(out.frequency, c->frequency, sizeof *c->frequency * chirps);
+    average(w, c->found, c->turns, c->first, c->second, out.halves);
     centre_errors(out.frequency_error, out.good, chirps, count);
     centre_errors(out.phase_error, out.good, chirps, count);
+    return disturbed;
+}
+
+static void align_position(Work *w, Chirps *c, const Equaliser *e, const int16_t *words, const uint8_t *valid,
+                           int full_scale, Aligned out)
+{
+    const int chirp = WORDS * w->samples;
+    find_clipped(words, valid, w->chirps, chirp, full_scale, c->order, out.clipped);
+    for (int k = 0; k < w->chirps; k++)
+        c->whole[k] = valid[k] && !out.clipped[k];
+    for (int g = 0; g < w->groups; g++) {
+        const int16_t *group[LANES];
+        for (int k = 0; k < LANES; k++)
+            group[k] = g * LANES + k < w->chirps ? words + (size_t)(g * LANES + k) * chirp + WORDS * w->a : w->silence;
+        side_by_side(group, WORDS * w->n, w->words + (size_t)g * LANES * WORDS * w->n);
+    }
+    for (int round = 0; round < ROUNDS && align_round(w, c, e, words, out); round++)
+        ; /* again without the disturbed chirps */
 }
 
 /* Reserve space for values of a size in `memory` on its own cache lines; only count it if memory is NULL. */
@@ -204,46 +277,33 @@ static void *room(float *memory, size_t *used, size_t count, size_t size)
 }
 
 /* Assign all arrays to memory; return the number of floats needed. */
-static size_t lay_out(Work *w, Chirps *c, int taps, float *memory)
+static size_t lay_out(Work *w, Chirps *c, float *memory)
 {
-    size_t used = 0, row = (size_t)LANES * (w->samples + 2 * FOLD), chirps = w->chirps, size = w->size;
-    size_t values = (size_t)RX * w->blocks, padded = (size_t)RX * (w->samples + 2 * FOLD);
-    float **rows[] = {&w->row_re, &w->row_im, &w->spare}, **columns[] = {&w->re, &w->im};
-    float **chirp[] = {&w->one_re, &w->one_im, &w->phase_c, &w->phase_s};
-    for (int i = 0; i < 3; i++)
-        *rows[i] = room(memory, &used, row, sizeof(float));
-    for (int i = 0; i < 2; i++)
-        *columns[i] = room(memory, &used, LANES * size, sizeof(float));
-    for (int i = 0; i < 4; i++)
-        *chirp[i] = room(memory, &used, padded, sizeof(float));
-    w->i = room(memory, &used, chirps * RX * w->samples + LANES, sizeof(float));
-    w->q = room(memory, &used, chirps * RX * w->samples + LANES, sizeof(float));
-    w->folded_re = room(memory, &used, whole_lanes(w->chirps) * values, sizeof(float));
-    w->folded_im = room(memory, &used, whole_lanes(w->chirps) * values, sizeof(float));
-    w->all_re = room(memory, &used, values, sizeof(float));
-    w->all_im = room(memory, &used, values, sizeof(float));
-    w->total = room(memory, &used, 4 * (size_t)RX * w->samples, sizeof(float));
-    w->root_c = room(memory, &used, size, sizeof(float));
-    w->root_s = room(memory, &used, size, sizeof(float));
-    w->turn_c = room(memory, &used, RX * size, sizeof(float));
-    w->turn_s = room(memory, &used, RX * size, sizeof(float));
-    w->power = room(memory, &used, 3 * size, sizeof(double));
-    w->smooth = room(memory, &used, 3 * size, sizeof(double));
-    w->sums = room(memory, &used, 6 * PARTS * chirps, sizeof(double));
-    w->tones = room(memory, &used, 5 * chirps, sizeof(double));
+    size_t used = 0, chirps = whole_lanes(w->chirps), size = w->size, values = (size_t)RX * w->blocks, words = (size_t)WORDS * w->n;
+    float **floats[] = {&w->root_c, &w->root_s, &w->turn_c, &w->turn_s, &w->same, &w->turned, &w->re, &w->im, &w->phase_c,
+                        &w->phase_s, &w->row_re, &w->row_im, &w->folded_re, &w->folded_im, &w->all_re, &w->all_im,
+                        &c->energy, &c->first, &c->second};
+    const size_t row = LANES * (values + 2 * RX), counts[] = {
+        size, size, RX * size, RX * size, words, words, LANES * size, LANES * size, LANES * (size_t)w->blocks,
+        LANES * (size_t)w->blocks, row, row, chirps * values, chirps * values, values, values, chirps, chirps, chirps};
+    double **doubles[] = {&w->power, &w->smooth, &w->sums, &w->tones, &c->frequency, &c->found, &c->coherence, &c->sorted,
+                          &c->left, &c->start, &c->turns};
+    const size_t lengths[] = {3 * size, 3 * size, 6 * PARTS * chirps, 5 * chirps, chirps, chirps, chirps, chirps,
+                              PARTS * chirps, chirps, chirps};
+    for (size_t i = 0; i < sizeof counts / sizeof *counts; i++)
+        *floats[i] = room(memory, &used, counts[i], sizeof(float));
+    for (size_t i = 0; i < sizeof lengths / sizeof *lengths; i++)
+        *doubles[i] = room(memory, &used, lengths[i], sizeof(double));
+    w->words = room(memory, &used, chirps * words, sizeof *w->words);
+    w->silence = room(memory, &used, words, sizeof *w->silence);
     w->bin = room(memory, &used, size, sizeof *w->bin);
     w->place = room(memory, &used, size, sizeof *w->place);
     c->order = room(memory, &used, chirps, sizeof *c->order);
-    c->frequency = room(memory, &used, chirps, sizeof(double));
-    c->found = room(memory, &used, chirps, sizeof(double));
-    c->coherence = room(memory, &used, chirps, sizeof(double));
-    c->sorted = room(memory, &used, chirps, sizeof(double));
     c->product = room(memory, &used, chirps, sizeof(Complex));
     c->found_product = room(memory, &used, chirps, sizeof(Complex));
-    c->taps = room(memory, &used, chirps * taps, sizeof(Complex));
-    c->energy = room(memory, &used, chirps, sizeof(float));
+    c->taps = room(memory, &used, 3 * chirps, sizeof(Complex));
     c->usable = room(memory, &used, chirps, 1);
-    c->second_half = room(memory, &used, chirps, 1);
+    c->whole = room(memory, &used, chirps, 1);
     return used;
 }
 
@@ -267,40 +327,30 @@ static void prepare(Work *w)
 }
 
 /* `offsets.align_row` for four RX. words: int16 [position][chirp][sample][2][RX]; valid [position][chirp]; [a, b): linear
-   samples, a whole number of blocks; size: of the transform; filter: sample rate, reach, IF signed, corners; equalise:
-   compensate the filter. Returns 0, or 1 if there is not enough memory. */
+   samples, a whole number of blocks; size: of the transform; filter: sample rate, reach, IF signed, corners (none: no
+   compensation); taps and flat: `decimate.Decimator`. Returns 0, or 1 if there is not enough memory. */
 int NAME(align)(const int16_t *words, const uint8_t *valid, int positions, int chirps, int samples, int a, int b,
-                int size, int full_scale, const double *filter, int corners, int equalise, float *mean, float *halves, double *centre,
-                uint8_t *good, double *frequency, double *phase, double *amplitude, double *gain, double *error,
-                double *coherence, int32_t *peak)
+                int size, int full_scale, const double *filter, int corners, const float *taps, const float *flat,
+                float *halves, double *centre, uint8_t *good, double *frequency, double *phase, double *amplitude,
+                double *gain, double *error, double *coherence, uint8_t *clipped)
 {
     const double reach = TURN * filter[1] * FOLD; /* angle of a tap at this distance */
-    const Equaliser e = {equalise ? 3 : 1, filter[2] != 0, corners, filter[0], filter[1], 1 / (cos(reach) - 1), 1 / (2 * sin(reach)),
-                         filter + 3};
+    const Equaliser e = {filter[2] != 0, corners, filter[0], filter[1], 1 / (cos(reach) - 1), 1 / (2 * sin(reach)), filter + 3};
     const int blocks = (b - a) / FOLD;
-    Work w = {.chirps = chirps, .samples = samples, .a = a, .b = b, .n = b - a, .blocks = blocks, .size = size};
+    Work w = {.chirps = chirps, .samples = samples, .a = a, .n = b - a, .blocks = blocks, .size = size,
+              .groups = (int)(whole_lanes(chirps) / LANES), .taps = taps, .flat = flat};
     Chirps c;
-    float *memory = reserve(lay_out(&w, &c, e.taps, NULL));
+    float *memory = reserve(lay_out(&w, &c, NULL));
     if (!memory)
         return 1;
-    lay_out(&w, &c, e.taps, memory);
+    lay_out(&w, &c, memory);
     w.parts = blocks < PARTS ? blocks : PARTS;
     prepare(&w);
     for (int p = 0; p < positions; p++) {
         size_t at = (size_t)p * chirps;
-        Aligned out = {.mean = mean + 2 * (size_t)p * RX * samples,
-                       .halves = halves + 4 * (size_t)p * RX * blocks,
-                       .centre = centre + p,
-                       .good = good + at,
-                       .frequency = frequency + at,
-                       .phase = phase + at,
-                       .amplitude = amplitude + at,
-                       .gain = gain + at,
-                       .frequency_error = error + 2 * at,
-                       .phase_error = error + 2 * at + chirps,
-                       .peak = peak + at};
-        out.coherence = coherence + at;
-        align_position(&w, &c, &e, words + at * samples * 2 * RX, valid + at, full_scale, out);
+        const Aligned out = {halves + 4 * (size_t)p * RX * blocks, centre + p, good + at, frequency + at, phase + at,
+                             amplitude + at, gain + at, error + 2 * at, error + 2 * at + chirps, coherence + at, clipped + at};
+        align_position(&w, &c, &e, words + at * samples * WORDS, valid + at, full_scale, out);
     }
     release(memory);
     return 0;

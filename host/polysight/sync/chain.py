@@ -29,7 +29,8 @@ from polysight.capture import raw_words, row_words, valid_frames
 from polysight.store import CubeRow, RowData, Source
 from polysight.sync import high_pass_filter as hpf
 from polysight.sync import loops
-from polysight.sync.loops import FOLD, Complex, Real, block_edges, block_times, cis, phasor, refine
+from polysight.sync.decimate import FOLD, decimator, flatten, fold
+from polysight.sync.loops import Complex, Real, block_edges, block_times, cis, phasor, refine
 from polysight.sync.offsets import (
     AlignedRow,
     DirectPath,
@@ -38,6 +39,7 @@ from polysight.sync.offsets import (
     excess_path_m,
     prepare,
     reference,
+    sweep_of,
     whole_blocks,
 )
 from polysight_shared.config import Board, Chirp, Instrument
@@ -113,7 +115,10 @@ class SyncedRow:
     Attributes
     ----------
     samples
-        complex64 [rx, position, sample]: an echo of excess path d is `a exp(+j 2 pi f(t) d / c)`; zero where not valid.
+        complex64 [rx, position, sample]: an echo of excess path d is `a exp(+j 2 pi f d / c)`; zero where not valid.
+    sweep_hz
+        float64 [sample]: transmit frequency f of each. Raw chirps have one sample for every four (`decimate.py`), cubes
+        of other programs all of them.
     valid
         bool [position].
     chirps
@@ -128,11 +133,17 @@ class SyncedRow:
     turn
         float64 [position]: phase change, radians, of the whole signal (direct path and echoes) from one position to
         the next. Burst alignment removes it within a burst, see `imaging.samples.undo_burst_motion`. None: not aligned.
+    chirps_clipped, chirps_disturbed
+        Received chirps that were left out because the receiver clipped, or because they differ from the others of their
+        burst (interference, silence).
+    positions_clipped
+        Positions without data because all their received chirps were clipped.
     errors
         Error samples of the row after each stage (`errors`), {stage: float64 [3, n]}.
     """
 
     samples: NDArray[np.complex64]
+    sweep_hz: NDArray[np.float64]
     valid: NDArray[np.bool_]
     chirps: NDArray[np.int64]
     direct_hz: NDArray[np.float64]
@@ -142,6 +153,9 @@ class SyncedRow:
     errors: Errors = field(default_factory=dict)
     noise: NDArray[np.float64] | None = None
     turn: NDArray[np.float64] | None = None
+    chirps_clipped: int = 0
+    chirps_disturbed: int = 0
+    positions_clipped: int = 0
 
     @property
     def stages(self) -> dict[str, tuple[float, float, float]]:
@@ -179,9 +193,10 @@ def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bo
     """As :func:`synchronise_row`, for a row that comes in pieces of whole bursts; they may share their memory."""
     if valid.size % setup.pulses:
         raise _mismatch(valid.size, setup.path.steering.shape, setup)
+    received = valid.reshape(-1, setup.pulses)
     aligned = align_pieces(
         _bursts(pieces, valid.size, setup),
-        valid.reshape(-1, setup.pulses),
+        received,
         setup.chirp.linear_samples,
         setup.equaliser,
         _FULL_SCALE,
@@ -191,6 +206,7 @@ def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bo
     residual = np.sqrt((aligned.error**2).sum(axis=-1) / np.maximum(chirps, 1)[:, None])
     return SyncedRow(
         done.samples,
+        setup.path.sweep_hz,
         done.found,
         chirps,
         done.frequency * rate,
@@ -200,6 +216,9 @@ def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bo
         errors(aligned, done, setup.path, rate, setup.examined),
         noise_power(aligned),
         _turn_along(done),
+        int(aligned.clipped.sum()),
+        int((received & ~aligned.clipped & ~aligned.good).sum()),
+        int((aligned.clipped.any(axis=1) & (aligned.clipped == received).all(axis=1)).sum()),
     )
 
 
@@ -351,7 +370,7 @@ def noise_power(aligned: AlignedRow) -> NDArray[np.float64]:
     whole = (n[:, None] / np.maximum(parts, 1)).astype(np.float32)[..., None, None]
     apart = aligned.halves[:, 0] * whole[:, 0] - aligned.halves[:, 1] * whole[:, 1]
     power = _energy(apart) / (apart.shape[1] * apart.shape[2])
-    return np.where(n > 1, power * FOLD / (1 / np.maximum(parts, 1)).sum(axis=1), np.nan)
+    return np.where(n > 1, power / decimator().noise / (1 / np.maximum(parts, 1)).sum(axis=1), np.nan)
 
 
 def _energy(signal: NDArray[np.complex64]) -> NDArray[np.float32]:
@@ -443,7 +462,7 @@ class CubeForm:
             samples, valid, hz, amplitude = _referenced(samples, valid, self.path, self.chirp)
         else:
             hz, amplitude = zeros, np.abs(samples.mean(axis=(0, 2))).astype(np.float64)
-        return SyncedRow(samples, valid, np.where(valid, pulses, 0), hz, amplitude, zeros, zeros)
+        return SyncedRow(samples, sweep_of(self.chirp), valid, np.where(valid, pulses, 0), hz, amplitude, zeros, zeros)
 
     def _turned(self, cube: NDArray[np.complex64]) -> NDArray[np.complex64]:
         return ((cube.conj() if self.conjugate else cube) * self.turn[:, None]).astype(np.complex64)
@@ -570,26 +589,30 @@ def _referenced(
 
     Each position of the cube is treated as the average of one chirp.
     """
-    rx, positions, samples = cube.shape
-    a, b = whole_blocks(chirp.linear_samples)
+    samples, (a, b) = cube.shape[2], whole_blocks(chirp.linear_samples)
     power = (np.abs(np.fft.fft(cube[..., a:b], axis=-1)) ** 2).sum(axis=0)
     centre = np.fft.fftfreq(b - a)[np.argmax(power, axis=-1)].astype(np.float64)
-    mixed = cube * np.exp(-2j * np.pi * np.outer(centre, np.arange(samples)))
-    folded = mixed[..., a:b].reshape(rx, positions, -1, FOLD).mean(axis=-1).swapaxes(0, 1) / 2
-    one, none = valid[:, None], np.zeros((positions, 1))
+    middle, still = (a + b - 1) / 2, np.zeros(centre.size)
+    mixed = cube * phasor(-centre, still, samples, middle)
+    halves = flatten(fold(mixed[..., a:b])).swapaxes(0, 1) / 2
+    one, none = valid[:, None], np.zeros((centre.size, 1))
     aligned = AlignedRow(
-        np.ascontiguousarray(mixed.swapaxes(0, 1), np.complex64),
-        np.stack([folded, folded], axis=1).astype(np.complex64),
+        np.ascontiguousarray(np.stack([halves, halves], axis=1), np.complex64),
         centre,
         one,
         none,
         none,
         none + 1,
         none + 1,
-        np.zeros((2, positions, 1)),
+        np.zeros((2, centre.size, 1)),
         none + 1,
-        np.zeros((positions, 1), np.int32),
+        ~one,
     )
     near_zero = bool(abs(np.median(centre)) < 0.4)  # mixed down already, so any IF is within the band
     done = reference(aligned, path, msgspec.structs.replace(chirp, if_mode="complex2x") if near_zero else chirp)
-    return done.samples, done.found, done.frequency * chirp.sample_rate_hz, np.abs(done.amplitude)
+    time = np.arange(samples) - middle
+    steering = path.steering * np.exp(-0.5j * done.drift * time**2)
+    left = (done.frequency - centre + 0.5) % 1.0 - 0.5
+    turn = phasor(-left, -np.angle(done.amplitude), samples, middle) * done.found[:, None]
+    referenced = (mixed * steering[:, None] * turn).astype(np.complex64)
+    return referenced, done.found, done.frequency * chirp.sample_rate_hz, np.abs(done.amplitude)

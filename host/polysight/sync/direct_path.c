@@ -75,15 +75,18 @@ int NAME(search)(const float *halves, const float *weights, int positions, int b
                  int farthest, const double *comparable, int32_t *bins, double *median)
 {
     int count = RX * blocks;
-    float *memory = reserve((size_t)(3 * LANES + 4) * size + 2 * (size_t)count + 64);
+    float *memory = reserve((size_t)(3 * LANES + 5) * size + 2 * (size_t)count + 64);
     if (!memory)
         return 1;
     float *re = memory, *im = re + LANES * size, *c = im + LANES * size, *s = c + size, *power = s + size;
-    float *x = power + size, *y = x + count;
-    int32_t *bin = (int32_t *)(y + count), *bits = bin + size;
+    float *x = power + size, *y = x + count, *nearer = y + count;
+    int32_t *bin = (int32_t *)(nearer + size), *bits = bin + size;
     roots_of_unity(size, c, s);
-    for (int i = 0; i < size; i++)
+    for (int i = 0; i < size; i++) {
         bin[i] = bin_at(i, size);
+        double turn = TURN / 2 * (bin[i] < size / 2 ? bin[i] : bin[i] - size) / size, part = turn == 0 ? 1 : sin(turn) / turn;
+        nearer[i] = (float)(part * part);
+    }
     for (int first = 0; first < positions; first += LANES) {
         int lanes = positions - first < LANES ? positions - first : LANES;
         memset(re, 0, sizeof *re * 2 * LANES * size);
@@ -103,7 +106,7 @@ int NAME(search)(const float *halves, const float *weights, int positions, int b
         for (int k = 0; k < lanes; k++) {
             int p = first + k;
             for (int i = 0; i < size; i++)
-                power[bin[i]] = re[LANES * i + k];
+                power[bin[i]] = re[LANES * i + k] * nearer[i];
             choose_peaks(power, size, nearest, farthest, (float)*comparable, bins + p, bins + positions + p);
             median[p] = middle[k];
         }
@@ -180,29 +183,27 @@ static inline void turned(const float *restrict values, const float *restrict we
     }
 }
 
-/* `NumpyLoops.turn`: mean [position][rx][sample] to out [rx][position][sample], zero where not found, and halves
-   to halves_out; phase in turns at the sample origin. */
-int NAME(turn)(const float *mean, const float *halves, const float *steering, const float *folded_steering,
-               int positions, int samples, int blocks, const double *origin, const double *frequency,
+/* `NumpyLoops.turn`: halves [position][2][RX][block], steering [RX][block], phase in turns; their sum to out
+   [RX][position][block]. */
+int NAME(turn)(const float *halves, const float *steering, int positions, int blocks, const double *frequency,
                const double *phase, const uint8_t *found, float *out, float *halves_out)
 {
-    float *memory = reserve((size_t)2 * samples + 64);
+    float *memory = reserve((size_t)2 * blocks + 64);
     if (!memory)
         return 1;
-    float *c = memory, *s = c + samples + 16;
+    float *c = memory, *s = c + blocks + 16;
     for (int p = 0; p < positions; p++) {
-        size_t at = 4 * (size_t)p * RX * blocks;
+        const size_t values = (size_t)2 * RX * blocks, at = 2 * values * p;
+        float *one = halves_out + at, *other = one + values;
         ramp(frequency[p], phase[p], FOLD, FOLD * (blocks - 1) / 2.0, blocks, c, s);
+        for (int m = 0; m < blocks && !found[p]; m++)
+            c[m] = s[m] = 0;
         for (int i = 0; i < 2 * RX; i++)
-            turned(halves + at + 2 * i * blocks, folded_steering + 2 * (i % RX) * blocks, c, s, blocks,
-                   halves_out + at + 2 * i * blocks);
-        ramp(frequency[p], phase[p], 1, *origin, samples, c, s);
+            turned(halves + at + 2 * i * blocks, steering + 2 * (i % RX) * blocks, c, s, blocks, one + 2 * i * blocks);
         for (int r = 0; r < RX; r++) {
-            float *to = out + 2 * ((size_t)r * positions + p) * samples;
-            if (found[p])
-                turned(mean + 2 * ((size_t)p * RX + r) * samples, steering + 2 * r * samples, c, s, samples, to);
-            else
-                memset(to, 0, sizeof *to * 2 * samples);
+            float *to = out + 2 * ((size_t)r * positions + p) * blocks;
+            for (int i = 0; i < 2 * blocks; i++)
+                to[i] = one[2 * r * blocks + i] + other[2 * r * blocks + i];
         }
     }
     release(memory);

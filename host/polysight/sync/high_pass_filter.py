@@ -95,26 +95,16 @@ class Equaliser:
         return np.stack([(both - apart) / 2, middle - both, (both + apart) / 2], axis=-1)
 
 
-def shifted(terms: NDArray[np.complexfloating], spacing: int) -> NDArray[np.complexfloating]:
-    """Shift each of the terms [position, tap, rx, sample] by its tap; a single tap is not shifted.
-
-    Beyond its ends a term is extrapolated by the parabola through three of its samples.
-    """
-    if terms.shape[1] == 1:
-        return terms
-    out, s = terms.copy(), spacing
-    before, after = terms[:, 0], terms[:, 2]
-    out[:, 0, :, s:] = before[..., :-s]
-    out[:, 0, :, :s] = 3 * (before[..., :s] - before[..., s : 2 * s]) + before[..., 2 * s : 3 * s]
-    out[:, 2, :, :-s] = after[..., s:]
-    out[:, 2, :, -s:] = 3 * (after[..., -s:] - after[..., -2 * s : -s]) + after[..., -3 * s : -2 * s]
-    return out
-
-
 def filtered(signal: NDArray[np.complex64], taps: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """Filter a signal [position, chirp, rx, sample] with taps [position, chirp, tap], one sample apart."""
-    terms = signal[:, :, None] * taps[..., None, None]
-    return shifted(terms.reshape(-1, *terms.shape[2:]), 1).sum(axis=1).reshape(signal.shape)
+    """Filter a signal [position, chirp, rx, block] with taps [position, chirp, 3], one block apart.
+
+    Beyond its ends the signal is extrapolated by the parabola through three of its samples.
+    """
+    before = 3 * (signal[..., :1] - signal[..., 1:2]) + signal[..., 2:3]
+    after = 3 * (signal[..., -1:] - signal[..., -2:-1]) + signal[..., -3:-2]
+    whole = np.concatenate([before, signal, after], axis=-1)
+    t = taps[..., None, None, :]
+    return t[..., 0] * whole[..., :-2] + t[..., 1] * whole[..., 1:-1] + t[..., 2] * whole[..., 2:]
 
 
 def high_pass(chirp: Chirp) -> HighPass:

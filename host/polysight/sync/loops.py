@@ -1,9 +1,10 @@
 """The loops of synchronisation in two forms with equal results: compiled, and in NumPy, which is the readable one.
 
 * Tones: frequency and phase of a tone in many short records, at the Cramer-Rao bound (`signal.h`).
-* Three passes over the raw samples of a burst: `match`, `against_others`, `average` (`passes.h`); `offsets.py` decides
-  between them. Words are int16 [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing multiplies
-  by `exp(-j 2 pi f (n - centre))`, with f in cycles per sample and `centre` the middle of the linear samples.
+* Passes over a burst (`passes.h`): `match` and `reduce_chirps` read the raw samples; `against_others` and `average` use
+  the reduced chirps, one sample for every block of four (`decimate.py`). `offsets.py` decides between them. Words are
+  int16 [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing multiplies by
+  `exp(-j 2 pi f (n - centre))`, with f in cycles per sample and `centre` the middle of the linear samples.
 * `NumpyLoops`: loops over positions that find the direct path (`direct_path.c`); `offsets.py` has the method.
 * `Library` calls `burst.c` and `direct_path.c` through ctypes, which releases the interpreter. :func:`library` returns
   it, or None and one warning if nothing was compiled; then the slower NumPy form is used.
@@ -24,12 +25,10 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.sync import high_pass_filter as hpf
+from polysight.sync.decimate import FOLD, decimator, flatten, fold
 
 CHUNK = 8
 """Positions per chunk: the working set fits in the second-level cache."""
-
-FOLD = 4
-"""Samples averaged before the second estimate: tones 2.7 IF bins off the middle lose 0.8 % of their power."""
 
 BAND_BINS = 9
 """Width in IF bins of the signal's band: direct path and object lie within it."""
@@ -190,7 +189,7 @@ def estimate_tone(z: NDArray[np.complex64], steps: int = 3) -> Tone:
 
 def match(
     words: NDArray[np.int16], reference: NDArray[np.intp], linear: tuple[int, int]
-) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]]:
+) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64], NDArray[np.float32]]:
     """Find the tone between each chirp and a reference chirp: the strongest in their conjugate product over all RX.
 
     Parameters
@@ -213,13 +212,10 @@ def match(
         spectrum of all RX after three passes of a box filter of half `BAND_BINS`.
     energy
         float32 [position, chirp], over RX and linear samples.
-    peak
-        int32 [position, chirp]: largest |I| or |Q| of the whole chirp.
     """
-    frames = _complex(words)
-    n, (positions, chirps, rx, _) = linear[1] - linear[0], frames.shape
+    inside = _complex(words[:, :, slice(*linear)])
+    positions, chirps, rx, n = inside.shape
     size = search_size(n)
-    inside = frames[..., slice(*linear)]
     chosen = np.zeros((positions, rx, size), np.complex64)
     chosen[..., :n] = inside[np.arange(positions), reference]
     products = np.zeros((positions, chirps, size), np.complex64)
@@ -231,19 +227,16 @@ def match(
     for _ in range(3):  # nearly Gaussian: two tones give one peak between them
         power = scipy.ndimage.uniform_filter1d(power, BAND_BINS * size // n // 2, axis=-1, mode="wrap")
     energy = (inside.real**2 + inside.imag**2).sum(axis=(2, 3))
-    parts = frames.view(np.float32)
-    peak = np.maximum(parts.max(axis=(2, 3)), -parts.min(axis=(2, 3))).astype(np.int32)
-    return tone.frequency, tone.amplitude.astype(complex), np.argmax(power, axis=-1) / size, energy, peak
+    return tone.frequency, tone.amplitude.astype(complex), np.argmax(power, axis=-1) / size, energy
 
 
-def against_others(
+def reduce_chirps(
     words: NDArray[np.int16],
     frequency: NDArray[np.float64],
     taps: NDArray[np.complex64],
-    good: NDArray[np.bool_],
     linear: tuple[int, int],
-) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
-    """Mix down, average every `FOLD` samples, filter; find the tone between each chirp and the sum of all others.
+) -> NDArray[np.complex64]:
+    """Return the linear samples of every chirp, mixed down, decimated (`decimate.fold`) and filtered.
 
     Parameters
     ----------
@@ -252,88 +245,92 @@ def against_others(
     frequency
         float64 [position, chirp].
     taps
-        complex64 [position, chirp, tap]: one or three, one averaged sample apart (`high_pass_filter.Equaliser`).
-    good
-        bool [position, chirp]: chirps in the sum.
+        complex64 [position, chirp, 3]: one block apart (`high_pass_filter.Equaliser`).
     linear
         Linear samples `[a, b)`, a multiple of `FOLD` many.
 
     Returns
     -------
-    frequency, amplitude
-        float64 and complex128 [position, chirp]: the tone from `refine`, two Newton steps from zero.
-    energy
-        float32 [position, chirp]: energy of the chirp, over RX and averaged samples.
-    level
-        float32 [position]: energy of the good chirps' sum.
-    apart
-        float64 [2, position, chirp]: difference of the tones from even and from odd RX, with the chirp itself in the
-        sum: cycles per sample, and radians.
+    complex64 [position, chirp, rx, block].
     """
     a, b = linear
     turn = phasor(-frequency, np.zeros(frequency.shape), b - a, (b - a - 1) / 2)
-    folded = hpf.filtered(_fold(_complex(words)[..., a:b] * turn[:, :, None]), taps)
-    positions, chirps, rx, blocks = folded.shape
-    total = (good[:, None].astype(np.complex64) @ folded.reshape(positions, chirps, rx * blocks)).reshape(
+    return hpf.filtered(fold(_complex(words[:, :, a:b]) * turn[:, :, None]), taps)
+
+
+def against_others(
+    reduced: NDArray[np.complex64], good: NDArray[np.bool_]
+) -> tuple[Tone, NDArray[np.float32], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Find the tone between each chirp and the sum of all others, and what that sum does not explain of the chirp.
+
+    Parameters
+    ----------
+    reduced
+        complex64 [position, chirp, rx, block] from :func:`reduce_chirps`.
+    good
+        bool [position, chirp]: chirps in the sum.
+
+    Returns
+    -------
+    tone
+        float64 and complex128 [position, chirp]: the tone from `refine`, two Newton steps from zero.
+    energy
+        float32 [position, chirp]: energy of the chirp, over RX and blocks.
+    level
+        float64 [position, part]: energy of the good chirps' sum, in each of eight parts of a chirp.
+    apart
+        float64 [2, position, chirp]: difference of the tones from even and from odd RX, with the chirp itself in the
+        sum: cycles per sample, and radians.
+    left
+        float64 [position, chirp, part]: energy of a chirp's part that is no multiple of the others' sum.
+    """
+    positions, chirps, rx, blocks = reduced.shape
+    total = (good[:, None].astype(np.complex64) @ reduced.reshape(positions, chirps, rx * blocks)).reshape(
         positions, 1, rx, blocks
     )
     edges = block_edges(blocks)
     times, starts = block_times(edges) * FOLD, edges[:-1]
-    product = folded * total.conj()
+    product = reduced * total.conj()
     halves = np.stack([product[:, :, 0::2].sum(axis=2), product[:, :, 1::2].sum(axis=2)])
     sums = np.add.reduceat(halves, starts, axis=-1).astype(complex)
-    own = np.add.reduceat((folded.real**2 + folded.imag**2).sum(axis=2), starts, axis=-1)
-    tone = refine(sums[0] + sums[1] - np.where(good[..., None], own, 0), times, steps=2)
+    energy = (reduced.real**2 + reduced.imag**2).sum(axis=2)
+    own = np.add.reduceat(energy, starts, axis=-1).astype(np.float64)
+    level = np.add.reduceat((total.real**2 + total.imag**2).sum(axis=(1, 2)), starts, axis=-1).astype(np.float64)
+    both = sums[0] + sums[1]
+    with_others = both - np.where(good[..., None], own, 0)
+    others = level[:, None] - np.where(good[..., None], 2 * both.real - own, 0)
+    left = own - np.divide(np.abs(with_others) ** 2, others, out=own.copy(), where=others > 1e-30)
+    tone = refine(with_others, times, steps=2)
     split = refine(sums * cis(-2 * np.pi * tone.frequency[..., None] * times), times, steps=1)
     apart = split.frequency[0] - split.frequency[1], np.angle(split.amplitude[0] * split.amplitude[1].conj())
-    return (
-        tone.frequency,
-        tone.amplitude.astype(complex),
-        own.sum(axis=-1),
-        (total.real**2 + total.imag**2).sum(axis=(1, 2, 3)),
-        np.stack(apart),
-    )
+    return tone, own.sum(axis=-1).astype(np.float32), level, np.stack(apart), left
 
 
 def average(
-    words: NDArray[np.int16],
+    reduced: NDArray[np.complex64],
     frequency: NDArray[np.float64],
-    weights: NDArray[np.complex64],
-    second_half: NDArray[np.bool_],
-    linear: tuple[int, int],
-) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-    """Return the weighted sum of the chirps, each mixed down.
+    phase: NDArray[np.float64],
+    weights: NDArray[np.float32],
+) -> NDArray[np.complex64]:
+    """Return weighted sums of the reduced chirps, each turned by a frequency and a phase, flat (`decimate.flatten`).
 
     Parameters
     ----------
-    words
-        int16 [position, chirp, sample, 2, rx].
-    frequency
-        float64 [position, chirp].
+    reduced
+        complex64 [position, chirp, rx, block].
+    frequency, phase
+        float64 [position, chirp]: cycles per sample; radians at the middle of the linear samples.
     weights
-        complex64 [position, chirp, tap]: one or three, `FOLD` samples apart.
-    second_half
-        bool [position, chirp]: True for chirps of the second half.
-    linear
-        Linear samples `[a, b)`, a multiple of `FOLD` many.
+        float32 [position, 2, chirp]: of the chirps in each half.
 
     Returns
     -------
-    mean
-        complex64 [position, rx, sample].
-    halves
-        complex64 [position, 2, rx, block]: contribution of each half to the mean, averaged over `FOLD` linear samples.
+    complex64 [position, 2, rx, block].
     """
-    a, b = linear
-    frames = _complex(words)
-    positions, chirps, rx, samples = frames.shape
-    turn = phasor(-frequency, np.zeros(frequency.shape), samples, (a + b - 1) / 2)
-    mixed = (frames * turn[:, :, None]).reshape(positions, chirps, rx * samples)
-    split = np.stack([~second_half, second_half], axis=1)[:, :, None] * weights.swapaxes(1, 2)[:, None]
-    taps = weights.shape[2]
-    terms = (split.reshape(positions, 2 * taps, chirps) @ mixed).reshape(positions * 2, taps, rx, samples)
-    parts = hpf.shifted(terms, FOLD).sum(axis=1).reshape(positions, 2, rx, samples)
-    return parts.sum(axis=1), _fold(parts[..., a:b])
+    positions, chirps, rx, blocks = reduced.shape
+    turned = reduced * phasor(-FOLD * frequency, -phase, blocks, (blocks - 1) / 2)[:, :, None]
+    halves = weights.astype(np.complex64) @ turned.reshape(positions, chirps, rx * blocks)
+    return flatten(halves.reshape(positions, 2, rx, blocks))
 
 
 def _complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
@@ -342,15 +339,6 @@ def _complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
     out = np.empty((positions, chirps, rx, samples), np.complex64)
     out.real = words[..., 0, :].swapaxes(2, 3)
     out.imag = words[..., 1, :].swapaxes(2, 3)
-    return out
-
-
-def _fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """Return the averages of every `FOLD` samples along the last axis."""
-    out = signal[..., ::FOLD].copy()
-    for q in range(1, FOLD):
-        out += signal[..., q::FOLD]
-    out *= np.float32(1 / FOLD)
     return out
 
 
@@ -396,9 +384,10 @@ class NumpyLoops:
         """
         beamed = np.einsum("rn,prn->pn", weights, halves[:, 0] + halves[:, 1])
         spectrum = np.abs(np.asarray(scipy.fft.fft(beamed, size, axis=-1)))
-        middle = np.sort(spectrum, axis=-1)[
-            :, size // 2 - 1 : size // 2 + 1
-        ]  # their mean is the median, ten times as fast
+        # The mean of the middle two is the median, ten times as fast.
+        middle = np.sort(spectrum, axis=-1)[:, size // 2 - 1 : size // 2 + 1]
+        # Of equal peaks, as of a cupboard, the one closer to the middle of the band is preferred.
+        spectrum *= np.sinc(np.fft.fftfreq(size)).astype(np.float32)
         rows = np.arange(len(beamed))
         top = np.argmax(spectrum, axis=-1)
         below = top[:, None] - np.arange(object_bins[0], object_bins[1] + 1)
@@ -456,11 +445,8 @@ class NumpyLoops:
 
     @staticmethod
     def turn(
-        mean: NDArray[np.complex64],
         halves: NDArray[np.complex64],
         steering: NDArray[np.complex64],
-        folded_steering: NDArray[np.complex64],
-        origin: float,
         frequency: NDArray[np.float64],
         phase: NDArray[np.float64],
         found: NDArray[np.bool_],
@@ -469,30 +455,23 @@ class NumpyLoops:
 
         Parameters
         ----------
-        mean
-            complex64 [position, rx, sample].
         halves
-            One block is the average of `FOLD` samples.
-        steering, folded_steering
-            complex64 [rx, sample] and [rx, block].
-        origin
-            Sample at which `phase` is given.
+            Both halves of the averages.
+        steering
+            complex64 [rx, block].
         frequency, phase
-            [position], cycles per sample and radians.
+            [position], cycles per sample; radians at the middle of the linear samples.
         found
             bool [position]: other positions become zero.
 
         Returns
         -------
-        complex64 [rx, position, sample], and the halves.
+        The averages complex64 [rx, position, block], and the halves.
         """
-        n, samples = halves.shape[-1], mean.shape[-1]
-        folded = phasor(-frequency * FOLD, -phase, n, (n - 1) / 2)
-        whole = phasor(-frequency, -phase, samples, origin) * found[:, None]
-        out = np.empty((mean.shape[1], len(mean), samples), np.complex64)
-        np.multiply(mean.swapaxes(0, 1), steering[:, None], out=out)
-        out *= whole
-        return out, (halves * folded_steering * folded[:, None, None]).astype(np.complex64)
+        n = halves.shape[-1]
+        turn = phasor(-frequency * FOLD, -phase, n, (n - 1) / 2) * found[:, None]
+        turned = (halves * steering * turn[:, None, None]).astype(np.complex64)
+        return np.ascontiguousarray((turned[:, 0] + turned[:, 1]).swapaxes(0, 1)), turned
 
 
 class LoadError(Exception):
@@ -549,7 +528,7 @@ class Library:
             "align",
             *(words, valid),
             *(positions, chirps, samples, a, b, search_size(b - a), full_scale),
-            *(np.array(filters), len(filters) - 3, equaliser is not None),
+            *(np.array(filters), len(filters) - 3, decimator().taps, decimator().flat),
             *into,
         )
 
@@ -583,24 +562,18 @@ class Library:
 
     def turn(
         self,
-        mean: NDArray[np.complex64],
         halves: NDArray[np.complex64],
         steering: NDArray[np.complex64],
-        folded_steering: NDArray[np.complex64],
-        origin: float,
         frequency: NDArray[np.float64],
         phase: NDArray[np.float64],
         found: NDArray[np.bool_],
     ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
         """See `NumpyLoops.turn`."""
-        positions, rx, samples = mean.shape
-        out, halves_out = np.empty((rx, positions, samples), np.complex64), np.empty_like(halves)
-        self._call(
-            "turn",
-            *(mean, halves, steering, folded_steering, positions, samples, halves.shape[-1]),
-            *(np.array([origin]), frequency, phase / (2 * np.pi), found, out, halves_out),
-        )
-        return out, halves_out
+        positions, _, rx, blocks = halves.shape
+        out, turned = np.empty((rx, positions, blocks), np.complex64), np.empty_like(halves)
+        turns = phase / (2 * np.pi)
+        self._call("turn", halves, steering, positions, blocks, frequency, turns, found, out, turned)
+        return out, turned
 
     def _call(self, name: str, *arguments: NDArray[Any] | float) -> None:
         """Call a loop with arrays as pointers and numbers as int. Raises MemoryError."""

@@ -5,9 +5,13 @@ Burst alignment (`align_row`). A board samples SYNC_IN with its own clock, so ea
 with the positive envelope `|s(t)|^2`; the maximum of its spectrum is the maximum-likelihood offset for any signal `s`.
 The paper divides by the reference chirp instead, which amplifies noise where direct path and object cancel.
 
-After mixing each chirp to zero frequency, its signal fills only a few range bins, so four consecutive samples can be
-averaged. Filter compensation and a second estimate (each chirp against the sum of all others) use these averages. Only
-the final average of the chirps is computed at the full sample rate.
+After mixing each chirp to zero frequency, its signal fills only a few range bins, so one sample in four is enough
+(`decimate.py`). Filter compensation, a second estimate (each chirp against the sum of all others) and everything after
+it use the decimated samples.
+
+Disturbed chirps are left out. What a chirp has in common with the sum of the others is explained; the rest is compared
+among the chirps of a burst, in eight parts of the chirp: another radar is heard while its chirp crosses the receiver's
+band. A burst with disturbed chirps is aligned again without them, as if they had not been received.
 
 Direct path from TX to RX (`reference`): found in the average of every position, its frequency and phase are removed.
 The object's echo is as strong as the direct path and lies only 3.5 IF bins above it, so the estimate of the direct path
@@ -40,7 +44,8 @@ from numpy.typing import NDArray
 
 from polysight.sync import high_pass_filter as hpf
 from polysight.sync import loops
-from polysight.sync.loops import FOLD, Library, NumpyLoops, Real, Tone, cis, complex64
+from polysight.sync.decimate import FOLD
+from polysight.sync.loops import Library, NumpyLoops, Real, Tone, cis, complex64
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -49,6 +54,16 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 _REFERENCES = 4
 # A good chirp has at least this part of the coherence of the position's median chirp.
 _GOOD = 0.5
+# A chirp is disturbed if the others leave this many times the usual energy of a part of it unexplained; noise leaves
+# twice as much.
+_UNEXPLAINED = 8.0
+# Share of a part's energy that is no disturbance: -30 dB, above the effect of frequencies wrong by 0.1 bins.
+_NEGLIGIBLE = 1e-3
+# Times that a burst is aligned, each without the chirps found disturbed before.
+_ROUNDS = 4
+# Clipping below full scale: least count, and one in so many words at the limit.
+_LEAST_LIMIT = 1024
+_AT_LIMIT = 32
 
 # Direct path: size of the search FFT, over averaged samples.
 _FFT = 256
@@ -72,15 +87,13 @@ Loops = Library | type[NumpyLoops]
 
 
 class AlignedRow(NamedTuple):
-    """The averaged chirps of every position of a row, mixed down by `centre`.
+    """The averaged chirps of every position of a row, mixed down by `centre` and decimated.
 
     Attributes
     ----------
-    mean
-        complex64 [position, rx, sample], in the frame of each position's reference chirp.
     halves
-        complex64 [position, 2, rx, block]: contributions of alternate good chirps to `mean`, averaged over blocks of
-        `FOLD` linear samples.
+        complex64 [position, 2, rx, block]: contributions of alternate good chirps to the average, in the frame of each
+        position's reference chirp; one sample for every `FOLD` linear ones (`decimate.py`).
     centre
         float64 [position]: middle of the signal's band in the reference chirp, cycles per sample.
     good
@@ -97,11 +110,10 @@ class AlignedRow(NamedTuple):
         half the difference between two halves of the RX; zero where not good.
     coherence
         float64 [position, chirp]: normalised correlation with the average, 0..1.
-    peak
-        int32 [position, chirp]: largest |I| or |Q|, ADC counts.
+    clipped
+        bool [position, chirp]: chirps left out because the receiver clipped (:func:`find_clipped`).
     """
 
-    mean: NDArray[np.complex64]
     halves: NDArray[np.complex64]
     centre: NDArray[np.float64]
     good: NDArray[np.bool_]
@@ -111,7 +123,7 @@ class AlignedRow(NamedTuple):
     gain: NDArray[np.float64]
     error: NDArray[np.float64]
     coherence: NDArray[np.float64]
-    peak: NDArray[np.int32]
+    clipped: NDArray[np.bool_]
 
     def part(self, positions: slice) -> AlignedRow:
         """Return views of some positions."""
@@ -141,11 +153,11 @@ def align_row(
     valid
         bool [position, chirp]: chirps received whole.
     linear
-        Samples `[a, b)` in which the chirp is linear; estimates use only these, the average all samples.
+        Samples `[a, b)` in which the chirp is linear; only whole blocks of these are used.
     equaliser
         Compensates the receiver's high-pass filter; None: no compensation.
     full_scale
-        Value of a clipped sample; clipped chirps are left out, for clipping creates false tones.
+        Value of a clipped sample; clipped chirps (:func:`find_clipped`) are left out, for clipping creates false tones.
     """
     return align_pieces([words], valid, linear, equaliser, full_scale)
 
@@ -206,9 +218,8 @@ def align_in_numpy(
 
 def _empty_row(bursts: tuple[int, ...], words: tuple[int, ...], blocks: int) -> AlignedRow:
     """Return memory for the row: bursts [position, chirp], words [position, chirp, sample, 2, rx]."""
-    (positions, chirps), samples, rx = bursts, words[2], words[-1]
+    (positions, chirps), rx = bursts, words[-1]
     return AlignedRow(
-        mean=np.empty((positions, rx, samples), np.complex64),
         halves=np.empty((positions, 2, rx, blocks), np.complex64),
         centre=np.empty(positions),
         good=np.empty(bursts, np.bool_),
@@ -218,7 +229,7 @@ def _empty_row(bursts: tuple[int, ...], words: tuple[int, ...], blocks: int) -> 
         gain=np.empty(bursts),
         error=np.empty((positions, 2, chirps)),
         coherence=np.empty(bursts),
-        peak=np.empty(bursts, np.int32),
+        clipped=np.empty(bursts, np.bool_),
     )
 
 
@@ -229,36 +240,71 @@ def _align(
     equaliser: hpf.Equaliser | None,
     full_scale: int,
 ) -> AlignedRow:
-    """Align and average a few positions."""
-    first, centre, coherence, usable, peak = _against_one(words, valid, linear, full_scale)
+    """Align and average a few positions; bursts with disturbed chirps again without these."""
+    clipped = find_clipped(words, valid, full_scale)
+    whole = valid & ~clipped
+    row, disturbed = _align_round(words, whole, clipped, linear, equaliser)
+    for _ in range(_ROUNDS - 1):
+        again = np.flatnonzero(disturbed.any(axis=1))
+        if again.size == 0:
+            break
+        whole[again] &= ~disturbed[again]
+        redone, left = _align_round(words[again], whole[again], clipped[again], linear, equaliser)
+        disturbed[:] = False
+        disturbed[again] = left
+        for field, values in zip(row, redone, strict=True):
+            field[again] = values
+    return row
+
+
+def find_clipped(words: NDArray[np.int16], valid: NDArray[np.bool_], full_scale: int) -> NDArray[np.bool_]:
+    """Return which of the received chirps [position, chirp] were clipped by the receiver.
+
+    They reach full scale, or one in `_AT_LIMIT` of their words lies within 1/2048 of the burst's largest magnitude, as
+    behind an amplifier that saturates earlier. A tone has two in a hundred words there, fewer with noise or an echo.
+    """
+    magnitude: NDArray[np.int32] = np.abs(words.reshape(*words.shape[:2], -1).astype(np.int32))
+    peak = magnitude.max(axis=-1)
+    highest = np.where(valid & (peak < full_scale), peak, 0).max(axis=1)
+    at_limit = (magnitude >= (highest - highest // 2048)[:, None, None]).sum(axis=-1)
+    piled: NDArray[np.bool_] = (highest >= _LEAST_LIMIT)[:, None] & (at_limit > magnitude.shape[-1] // _AT_LIMIT)
+    return valid & ((peak >= full_scale) | piled)
+
+
+def _align_round(
+    words: NDArray[np.int16],
+    whole: NDArray[np.bool_],
+    clipped: NDArray[np.bool_],
+    linear: tuple[int, int],
+    equaliser: hpf.Equaliser | None,
+) -> tuple[AlignedRow, NDArray[np.bool_]]:
+    """Align and average the whole chirps of a few positions; return which of them are disturbed, too."""
+    first, centre, coherence, usable = _against_one(words, whole, linear)
     good = _coherent(coherence, usable)
     frequency = centre[:, None] + first.frequency
     taps = _taps(equaliser, frequency)
     start = np.angle(first.amplitude * taps.sum(axis=-1))
 
     # Second pass: each chirp against the sum of the others.
-    turned = taps * cis(-start)[..., None]
-    off, product, own, level, apart = loops.against_others(words, frequency, complex64(turned), good, linear)
+    reduced = loops.reduce_chirps(words, frequency, complex64(taps * cis(-start)[..., None]), linear)
+    tone, own, levels, apart, left = loops.against_others(reduced, good)
     n = good.sum(axis=1)
-    level = np.maximum(level / np.maximum(n, 1) ** 2, 1e-30)[:, None]
+    disturbed = whole & _disturbed(left, levels / np.maximum(n, 1)[:, None] ** 2, usable)
+    level = np.maximum(levels.sum(axis=1) / np.maximum(n, 1) ** 2, 1e-30)[:, None]
     others = n[:, None] - good
     # A single chirp is the mean itself.
-    amplitude = np.where(others > 0, np.abs(product) / np.maximum(others, 1) / level, 1.0)
+    amplitude = np.where(others > 0, np.abs(tone.amplitude) / np.maximum(others, 1) / level, 1.0)
     # The difference from the mean of all chirps is smaller than that from the mean of the others.
     part = others / np.maximum(n, 1)[:, None]
-    correction, shift = part * off, part * np.angle(product)
+    correction, shift = part * tone.frequency, part * np.angle(tone.amplitude)
     coherence = amplitude * np.sqrt(level / np.maximum(own, 1e-30))
     good = _coherent(coherence, usable)
 
-    # Filtering and then turning by the correction equals turning and then filtering with turned taps.
-    lag = np.arange(taps.shape[-1]) - taps.shape[-1] // 2
-    turned *= cis(2 * np.pi * FOLD * lag * correction[..., None] - shift[..., None])
-    weights = turned * (good / np.maximum(good.sum(axis=1), 1)[:, None])[..., None]
     second_half = np.cumsum(good, axis=1) % 2 == 0
-    mean, halves = loops.average(words, frequency + correction, complex64(weights), second_half, linear)
-    return AlignedRow(
-        mean,
-        halves,
+    weights = good / np.maximum(good.sum(axis=1), 1)[:, None]
+    split = np.stack([weights * ~second_half, weights * second_half], axis=1).astype(np.float32)
+    row = AlignedRow(
+        loops.average(reduced, correction, shift, split),
         centre,
         good,
         first.frequency + correction,
@@ -267,8 +313,33 @@ def _align(
         np.abs(taps.sum(axis=-1)),
         _centred(apart / 2, good).swapaxes(0, 1),
         coherence,
-        peak,
+        clipped,
     )
+    return row, disturbed
+
+
+def _disturbed(left: NDArray[np.float64], level: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the chirps [position, chirp] with a part that the others explain badly, as with interference.
+
+    `left` [position, chirp, part] is energy that the others' sum does not explain, `level` [position, part] the energy
+    of the average. It is compared with the median, and with the least of the two chirps on either side: the stage's
+    motion leaves more in some chirps, but equally much in those beside.
+    """
+    median = _median(left, usable[..., None], axis=1)[:, None]
+    padded = np.pad(np.where(usable[..., None], left, np.inf), ((0, 0), (2, 2), (0, 0)), constant_values=np.inf)
+    chirps = left.shape[1]
+    beside = np.minimum.reduce([padded[:, k : k + chirps] for k in (0, 1, 3, 4)])
+    usual = np.maximum(median, np.where(np.isfinite(beside), beside, 0.0))
+    enough = usable.sum(axis=1) >= 4
+    return usable & enough[:, None] & (left > _UNEXPLAINED * usual + _NEGLIGIBLE * level[:, None]).any(axis=2)
+
+
+def _median(values: NDArray[np.float64], usable: NDArray[np.bool_], axis: int) -> NDArray[np.float64]:
+    """Return the lower median of the usable values along an axis; 0 without any."""
+    rising = np.sort(np.where(usable, values, np.inf), axis=axis)
+    middle = np.maximum(usable.sum(axis=axis, keepdims=True) - 1, 0) // 2
+    median = np.take_along_axis(rising, np.broadcast_to(middle, (*middle.shape[:2], *values.shape[2:])), axis=axis)
+    return np.where(np.isfinite(median), median, 0.0).squeeze(axis).astype(np.float64)
 
 
 def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
@@ -278,26 +349,26 @@ def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
 
 
 def _against_one(
-    words: NDArray[np.int16], valid: NDArray[np.bool_], linear: tuple[int, int], full_scale: int
-) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32]]:
+    words: NDArray[np.int16], whole: NDArray[np.bool_], linear: tuple[int, int]
+) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Estimate offsets relative to one chirp per position; try another one if it is unusable or matches few others.
 
     Returns the offsets, the middle of the signal's band [position], and [position, chirp]: coherence with the reference
-    chirp, usable chirps (received whole, not clipped, not silent), and the largest count.
+    chirp, and usable chirps (whole, not silent).
     """
-    positions, chirps = valid.shape
+    positions, chirps = whole.shape
     # Threshold for two records of noise: four times the RMS of a sum of random phases.
     noise = 4.0 / np.sqrt(words.shape[-1] * (linear[1] - linear[0]))
-    order = np.argsort(~valid, axis=1, kind="stable")  # the valid ones, first to last
+    order = np.argsort(~whole, axis=1, kind="stable")  # the whole ones, first to last
     reference, todo, every = order[:, 0], np.arange(positions), np.arange(positions)
-    frequency, amplitude, centre = np.zeros(valid.shape), np.zeros(valid.shape, complex), np.zeros(positions)
-    coherence, usable, peak = np.zeros(valid.shape), valid, np.zeros(valid.shape, np.int32)
+    frequency, amplitude, centre = np.zeros(whole.shape), np.zeros(whole.shape, complex), np.zeros(positions)
+    coherence, usable = np.zeros(whole.shape), whole
     best_sum = np.full(positions, -1.0)
     for attempt in range(min(_REFERENCES, chirps)):
         tried = order[todo, attempt]
-        offset, product, middle, energy, highest = loops.match(words if attempt == 0 else words[todo], tried, linear)
+        offset, product, middle, energy = loops.match(words if attempt == 0 else words[todo], tried, linear)
         if attempt == 0:
-            usable, peak = valid & (highest < full_scale) & (energy > 0), highest
+            usable = whole & (energy > 0)
             rank = np.where(usable, 1, 2)
             rank[every, tried] = 0
             order = np.argsort(rank, axis=1, kind="stable")  # the one tried, then the usable ones
@@ -315,20 +386,19 @@ def _against_one(
             break
     best = coherence.max(axis=1)
     coherence[every, reference] = np.where(usable[every, reference], best, 0)  # as good as its best match
-    return Tone(frequency, amplitude), centre, coherence, usable, peak
+    return Tone(frequency, amplitude), centre, coherence, usable
 
 
 def _taps(equaliser: hpf.Equaliser | None, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return the filter taps of every chirp, [position, chirp, tap]; one tap without an equaliser."""
-    return np.ones((*frequency.shape, 1), complex) if equaliser is None else equaliser.taps(frequency)
+    """Return the filter taps of every chirp, [position, chirp, 3]; without an equaliser those of no filter."""
+    if equaliser is None:
+        return np.broadcast_to(np.array([0, 1, 0], complex), (*frequency.shape, 3))
+    return equaliser.taps(frequency)
 
 
 def _coherent(coherence: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the usable chirps with at least `_GOOD` of the median coherence of their position."""
-    rising = np.sort(np.where(usable, coherence, np.inf), axis=1)
-    middle = np.maximum(usable.sum(axis=1) - 1, 0) // 2
-    median = np.take_along_axis(rising, middle[:, None], axis=1)
-    return usable & (coherence >= _GOOD * median)
+    return usable & (coherence >= _GOOD * _median(coherence, usable, axis=1)[:, None])
 
 
 def _centred(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -356,6 +426,8 @@ class DirectPath(NamedTuple):
         complex64 [rx]: weights of the steered RX for the search, sum 1, with low gain towards the object.
     object_bins
         IF distance of the nearest and farthest echo from the direct path, in bins of the search FFT.
+    sweep_hz
+        float64 [block]: transmit frequency at the middle of each block.
     """
 
     steering: NDArray[np.complex64]
@@ -365,6 +437,7 @@ class DirectPath(NamedTuple):
     half_estimators: NDArray[np.complex128]
     beam: NDArray[np.complex64]
     object_bins: tuple[float, float]
+    sweep_hz: NDArray[np.float64]
 
 
 class Referenced(NamedTuple):
@@ -373,8 +446,8 @@ class Referenced(NamedTuple):
     Attributes
     ----------
     samples
-        complex64 [rx, position, sample]: an echo of excess path d is `exp(j 2 pi f(t) d / c)`, the direct path a
-        constant.
+        complex64 [rx, position, block]: an echo of excess path d is `exp(j 2 pi f(t) d / c)`, with t the middle of the
+        block; the direct path is a constant.
     frequency
         float64 [position]: IF of the direct path in cycles per sample, 0..1 (complex 1x) or -1/2..1/2.
     amplitude
@@ -403,11 +476,16 @@ def excess_path_m(
     return out - np.linalg.norm(rx_m - tx_m, axis=-1)[:, None]
 
 
+def sweep_of(chirp: Chirp) -> NDArray[np.float64]:
+    """Return the transmit frequency of every sample of a chirp, Hz."""
+    return chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+
+
 def prepare(rig: Instrument, board: Board) -> DirectPath:
     """Return steering, search beam and estimators of a board, from geometry alone."""
     chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
-    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    sweep = sweep_of(chirp)
     middles = sweep[a:b].reshape(-1, FOLD).mean(axis=1)
     direct = np.linalg.norm(rx - tx, axis=-1)
     lag_s = (direct - direct[0])[:, None] / SPEED_OF_LIGHT_M_S
@@ -441,6 +519,7 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
         np.stack([_least_squares(model[at, :2], covariance[np.ix_(at, at)]) for at in own]),
         (beam / beam.sum()).astype(np.complex64),
         (float(excess.min() * bins), float(excess.max() * bins)),
+        middles,
     )
 
 
@@ -483,7 +562,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     _try_others(aligned.halves, peaks, usable, (run, flat, two), frequency, estimate, step)
 
     # An IF outside the receiver's band is an alias; if the last step is large, no tone was found.
-    amplitude = estimate[:, 0] * np.sinc(frequency) / np.sinc(frequency * FOLD)  # averaging attenuated the tone
+    amplitude = estimate[:, 0]
     heard = aligned.centre + frequency
     heard = heard % 1.0 if chirp.if_mode == "complex1x" else (heard + 0.5) % 1.0 - 0.5
     band = heard < 0.9 if chirp.if_mode == "complex1x" else np.abs(heard) < 0.45
@@ -497,11 +576,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     if found.any():
         found &= strength > _LOST * np.median(strength[found])
 
-    origin = (a + b - 1) / 2
-    steering = complex64(path.steering * cis(-0.5 * drift * (np.arange(chirp.samples) - origin) ** 2))
-    samples, halves = run.turn(
-        aligned.mean, aligned.halves, steering, flat, origin, frequency, np.angle(amplitude), found
-    )
+    samples, halves = run.turn(aligned.halves, flat, frequency, np.angle(amplitude), found)
     return Referenced(samples, heard, amplitude, found, drift, halves)
 
 

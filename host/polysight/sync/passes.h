@@ -1,5 +1,8 @@
-/* Three passes over the words of a burst, `loops.py` in C, for one position at a time. Words are int16
-   [chirp][sample][2][RX]; x + j y are the samples of a chirp, in the order described in `signal.h`. */
+/* Passes over the words of a burst, `loops.py` in C, for one position at a time. Words are int16 [chirp][sample][2][RX].
+
+   Chirps lie side by side, LANES to a group: value LANES i + k of a group is value i of its chirp k. So all loops run over
+   chirps that need the same operations, no sum crosses lanes until chirps are averaged, and words are used as they are:
+   `counts` converts them in registers. */
 #ifndef PASSES_H
 #define PASSES_H
 
@@ -7,37 +10,104 @@
 
 #define BAND_BINS 9 /* `loops.BAND_BINS` */
 #define PARTS 8     /* `loops._BLOCKS` */
+#define TAPS 8      /* `decimate.TAPS` */
+#define FLAT 7      /* `decimate.FLAT` */
+#define BESIDE ((TAPS - FOLD) / 2)
+#define WORDS (2 * RX) /* of a sample */
+
+/* As many floats as the processor handles at once, a part of LANES. */
+typedef float Vector __attribute__((vector_size(WIDTH / 8), aligned(4), may_alias));
+#define STEP (WIDTH / 32)
+
+static inline Vector load(const float *at) { return *(const Vector *)at; }
+static inline void store(float *at, Vector x) { *(Vector *)at = x; }
+
+/* Words as floats. */
+static inline Vector counts(const int16_t *words)
+{
+    typedef int16_t Short __attribute__((vector_size(WIDTH / 16)));
+    typedef int32_t Long __attribute__((vector_size(WIDTH / 8)));
+    Short x;
+    memcpy(&x, words, sizeof x);
+    return __builtin_convertvector(__builtin_convertvector(x, Long), Vector);
+}
 
 /* Sizes, tables and work arrays. */
 typedef struct {
-    int chirps, samples, a, b; /* linear samples [a, b) */
-    int n, blocks, size;       /* number of linear samples, of blocks; size of the transform */
+    int chirps, samples, a, n, blocks, size, groups; /* n linear samples from a; size of the transform; groups of chirps */
     int parts, edges[PARTS + 1];
     double part_times[PARTS];
-    float *i, *q; /* I and Q of the burst: [chirp][sample][RX] each */
-    float *root_c, *root_s, *phase_c, *phase_s;
-    float *turn_c, *turn_s; /* twiddle factors of `spectrum` */
-    float *one_re, *one_im, *row_re, *row_im, *re, *im; /* one chirp; sixteen records in sequence; sixteen interleaved */
-    float *spare, *folded_re, *folded_im, *all_re, *all_im, *total;
+    const float *taps, *flat; /* `decimate.Decimator`: [3][TAPS], [4][FLAT] */
+    int16_t *words, *silence;     /* [group][word][LANES] of the linear samples; a chirp of zeros */
+    float *root_c, *root_s, *turn_c, *turn_s; /* `transform`; twiddle factors of `spectrum` */
+    float *same, *turned;                     /* the reference chirp: its words, and those of -j times it */
+    float *re, *im;                           /* records to transform [size][LANES] */
+    float *phase_c, *phase_s, *row_re, *row_im; /* [block][LANES]; [block][RX][LANES] with a spare block at either end */
+    float *folded_re, *folded_im;               /* reduced chirps, [group][block][RX][LANES] */
+    float *all_re, *all_im;                     /* sum of the good chirps, [block][RX] */
     double *power, *smooth, *sums, *tones;
+    double part_energy[PARTS]; /* of that sum */
     int *bin, *place;
 } Work;
 
-/* A number of chirps, rounded up to whole groups of LANES. */
+/* A number of chirps, rounded up to whole groups. */
 static inline size_t whole_lanes(int chirps) { return (size_t)(chirps + LANES - 1) / LANES * LANES; }
 
-/* Multiply a chirp i + j q by the conjugate of k + j l for every RX; return the energy of the chirp. */
-static inline float correlate(const float *restrict i, const float *restrict q, const float *restrict k,
-                              const float *restrict l, float *restrict re, float *restrict im, int count)
+/* Interleave four records of words. */
+static inline void words_in_turn(const int16_t *const *record, int count, int16_t *restrict out)
 {
-    float energy = 0;
-    for (int j = 0; j < count; j++) {
-        float x = i[j], y = q[j], u = k[j], v = l[j];
-        re[j] = x * u + y * v;
-        im[j] = y * u - x * v;
-        energy += x * x + y * y;
+    const int16_t *a = record[0], *b = record[1], *c = record[2], *d = record[3];
+    for (int i = 0; i < count; i++) {
+        out[4 * i] = a[i];
+        out[4 * i + 1] = b[i];
+        out[4 * i + 2] = c[i];
+        out[4 * i + 3] = d[i];
     }
-    return energy;
+}
+
+/* Put the words of a group's chirps side by side. */
+static inline void side_by_side(const int16_t *const chirp[LANES], int count, int16_t *restrict out)
+{
+    enum { TILE = 128 }; /* stays in the first cache */
+    typedef uint64_t Four __attribute__((may_alias)); /* words, of four chirps */
+    int16_t fours[4][4 * TILE] __attribute__((aligned(64)));
+    for (int first = 0; first < count; first += TILE) {
+        int here = count - first < TILE ? count - first : TILE;
+        for (int g = 0; g < 4; g++) {
+            const int16_t *const record[4] = {chirp[4 * g] + first, chirp[4 * g + 1] + first, chirp[4 * g + 2] + first,
+                                              chirp[4 * g + 3] + first};
+            words_in_turn(record, here, fours[g]);
+        }
+        const Four *a = (Four *)fours[0], *b = (Four *)fours[1], *c = (Four *)fours[2], *d = (Four *)fours[3];
+        Four *restrict to = (Four *)(out + LANES * first);
+        for (int i = 0; i < here; i++) {
+            to[4 * i] = a[i];
+            to[4 * i + 1] = b[i];
+            to[4 * i + 2] = c[i];
+            to[4 * i + 3] = d[i];
+        }
+    }
+}
+
+/* Chirps times the conjugate of the reference chirp, summed over the RX, to [sample][LANES]; and their energies. */
+static inline void correlate(const int16_t *words, const float *same, const float *turned, int samples, float *re,
+                             float *im, float *energy)
+{
+    for (int part = 0; part < LANES; part += STEP) {
+        Vector e = {0};
+        for (int n = 0; n < samples; n++) {
+            Vector a = {0}, b = {0};
+            for (int j = 0; j < WORDS; j++) {
+                Vector x = counts(words + LANES * (WORDS * n + j) + part);
+                a += x * same[WORDS * n + j];
+                b += x * turned[WORDS * n + j];
+                e += x * x;
+            }
+            store(re + LANES * n + part, a);
+            store(im + LANES * n + part, b);
+        }
+        store(energy + part, e);
+    }
 }
 
 /* Index of the strongest bin of each of sixteen spectra. */
@@ -127,30 +197,59 @@ static double centre_of_band(Work *w, const float *restrict x, const float *rest
     return (double)((maximum(w->power, size) + 3 * (width / 2)) % size) / size;
 }
 
-/* First pass: the tone between each chirp and a reference chirp; see `loops.match`. Returns the centre. */
-static double match(Work *w, int reference, double *frequency, Complex *product, float *energy)
+/* First pass: the tone between each chirp and a reference chirp; see `loops.match`. Returns the middle of the band. */
+static double match(Work *w, const int16_t *burst, int reference, double *frequency, Complex *product, float *energy)
 {
-    int n = w->n, chirp = RX * w->samples, start = RX * w->a;
-    const float *u = w->i + reference * chirp + start, *v = w->q + reference * chirp + start;
-    for (int first = 0; first < w->chirps; first += LANES) {
-        int count = w->chirps - first < LANES ? w->chirps - first : LANES;
-        int32_t at[LANES];
-        memset(w->row_re + count * n, 0, sizeof(float) * (LANES - count) * n);
-        memset(w->row_im + count * n, 0, sizeof(float) * (LANES - count) * n);
-        for (int k = 0; k < count; k++) {
-            const float *x = w->i + (first + k) * chirp + start, *y = w->q + (first + k) * chirp + start;
-            energy[first + k] = correlate(x, y, u, v, w->one_re, w->one_im, RX * n);
-            over_rx(w->one_re, w->row_re + k * n, n);
-            over_rx(w->one_im, w->row_im + k * n, n);
+    const int16_t *chosen = burst + WORDS * ((size_t)reference * w->samples + w->a);
+    for (int n = 0; n < w->n; n++)
+        for (int r = 0; r < RX; r++) {
+            float i = chosen[WORDS * n + r], q = chosen[WORDS * n + RX + r];
+            w->same[WORDS * n + r] = i, w->same[WORDS * n + RX + r] = q;
+            w->turned[WORDS * n + r] = -q, w->turned[WORDS * n + RX + r] = i;
         }
-        interleave(w->row_re, w->spare, w->re, n, w->size);
-        interleave(w->row_im, w->spare, w->im, n, w->size);
+    for (int g = 0; g < w->groups; g++) {
+        int first = g * LANES, count = w->chirps - first < LANES ? w->chirps - first : LANES;
+        int32_t at[LANES];
+        correlate(w->words + (size_t)first * WORDS * w->n, w->same, w->turned, w->n, w->re, w->im, energy + first);
+        memset(w->re + LANES * w->n, 0, sizeof(float) * LANES * (w->size - w->n));
+        memset(w->im + LANES * w->n, 0, sizeof(float) * LANES * (w->size - w->n));
         transform(w->re, w->im, w->size, w->root_c, w->root_s, w->size);
         strongest(w->re, w->im, w->size, at);
         for (int k = 0; k < count; k++)
             product[first + k] = interpolated(w, w->re + k, w->im + k, at[k], frequency + first + k);
     }
-    return centre_of_band(w, u, v);
+    part_iq(chosen, w->n, w->row_re, w->row_im);
+    return centre_of_band(w, w->row_re, w->row_im);
+}
+
+/* exp(-j 2 pi (frequency (origin + step m) + turns)) for m < count and the chirps of a group, [m][LANES]; outer products
+   of coarse and fine steps. */
+static inline void ramps(const double *restrict frequency, const double *restrict turns, double origin, double step,
+                         int count, float *restrict c, float *restrict s)
+{
+    enum { FINE = 8 };
+    float fine_c[FINE][LANES], fine_s[FINE][LANES], coarse_c[LANES], coarse_s[LANES];
+    for (int m = 0; m < FINE; m++) {
+        VECTOR
+        for (int k = 0; k < LANES; k++) {
+            Complex z = cis(-frequency[k] * (step * m));
+            fine_c[m][k] = (float)z.re;
+            fine_s[m][k] = (float)z.im;
+        }
+    }
+    for (int first = 0; first < count; first += FINE) {
+        VECTOR
+        for (int k = 0; k < LANES; k++) {
+            Complex z = cis(-frequency[k] * (origin + step * first) - turns[k]);
+            coarse_c[k] = (float)z.re;
+            coarse_s[k] = (float)z.im;
+        }
+        for (int m = 0; m < FINE && first + m < count; m++)
+            for (int k = 0; k < LANES; k++) {
+                c[LANES * (first + m) + k] = coarse_c[k] * fine_c[m][k] - coarse_s[k] * fine_s[m][k];
+                s[LANES * (first + m) + k] = coarse_c[k] * fine_s[m][k] + coarse_s[k] * fine_c[m][k];
+            }
+    }
 }
 
 /* Extrapolate the `count` values that start at signal + s by s values to either side with the parabola through three
@@ -164,124 +263,155 @@ static inline void extend(float *signal, int count, int s)
     }
 }
 
-/* Filter a signal, extended by s values, with one or three taps at a spacing of s, and add it. */
-static inline void add_filtered(const float *restrict re, const float *restrict im, const Complex *taps, int count, int s,
-                                float *restrict to_re, float *restrict to_im, int values)
+/* Mix the chirps of a group by exp(-j 2 pi frequency (n - middle)) and decimate them, `decimate.fold`, to
+   [block][RX][LANES]. */
+static inline void mix_and_fold(Work *w, const int16_t *words, const double *frequency, float *re, float *im)
 {
-    const float *restrict re1 = re + s, *restrict re2 = re + 2 * s, *restrict im1 = im + s, *restrict im2 = im + 2 * s;
-    float a = (float)taps[0].re, b = (float)taps[0].im;
-    if (count == 1) {
-        for (int j = 0; j < values; j++) {
-            to_re[j] += a * re1[j] - b * im1[j];
-            to_im[j] += a * im1[j] + b * re1[j];
+    static const double none[LANES];
+    float c[TAPS * LANES], s[TAPS * LANES];
+    ramps(frequency, none, (FOLD - w->n) / 2.0, FOLD, w->blocks, w->phase_c, w->phase_s);
+    for (int m = 0; m < w->blocks; m++) {
+        const int last = m == w->blocks - 1, from = m == 0 ? BESIDE : 0, to = last ? TAPS - BESIDE : TAPS;
+        if (m < 2 || last) { /* the taps change */
+            const float *taps = w->taps + TAPS * (m == 0 ? 0 : last ? 2 : 1);
+            ramps(frequency, none, -(TAPS - 1) / 2.0, 1, TAPS, c, s);
+            for (int i = 0; i < TAPS * LANES; i++) {
+                c[i] *= taps[i / LANES];
+                s[i] *= taps[i / LANES];
+            }
         }
-        return;
-    }
-    float c = (float)taps[1].re, d = (float)taps[1].im, e = (float)taps[2].re, f = (float)taps[2].im;
-    for (int j = 0; j < values; j++) {
-        to_re[j] += a * re[j] - b * im[j] + c * re1[j] - d * im1[j] + e * re2[j] - f * im2[j];
-        to_im[j] += a * im[j] + b * re[j] + c * im1[j] + d * re1[j] + e * im2[j] + f * re2[j];
-    }
-}
-
-/* Mix a chirp's linear samples x + j y by exp(-j 2 pi frequency (n - middle)) and average every FOLD samples, to
-   [block][RX] with one spare block at either end. */
-static inline void mix_and_fold(Work *w, const float *restrict x, const float *restrict y, double frequency,
-                                float *restrict re, float *restrict im)
-{
-    float c[LANES], s[LANES], *restrict f = w->one_re, *restrict g = w->one_im;
-    const float *restrict block_c = w->phase_c, *restrict block_s = w->phase_s;
-    phases_within(frequency, 1.0 / FOLD, c, s);
-    ramp(frequency, 0, FOLD, (w->n - 1) / 2.0, w->blocks, w->phase_c, w->phase_s);
-    for (int m = 0; m < w->blocks; m++)
-        for (int i = 0; i < LANES; i++) {
-            int j = LANES * m + i;
-            f[j] = x[j] * c[i] - y[j] * s[i];
-            g[j] = x[j] * s[i] + y[j] * c[i];
+        for (int part = 0; part < LANES; part += STEP) {
+            Vector x[RX] = {{0}}, y[RX] = {{0}}, u = load(w->phase_c + LANES * m + part), v = load(w->phase_s + LANES * m + part);
+            for (int q = from; q < to; q++) {
+                const int16_t *sample = words + LANES * WORDS * (FOLD * m - BESIDE + q) + part;
+                Vector f = load(c + LANES * q + part), g = load(s + LANES * q + part);
+                for (int r = 0; r < RX; r++) {
+                    Vector i = counts(sample + LANES * r), j = counts(sample + LANES * (RX + r));
+                    x[r] += i * f;
+                    x[r] -= j * g;
+                    y[r] += i * g;
+                    y[r] += j * f;
+                }
+            }
+            for (int r = 0; r < RX; r++) {
+                store(re + LANES * (RX * m + r) + part, x[r] * u - y[r] * v);
+                store(im + LANES * (RX * m + r) + part, x[r] * v + y[r] * u);
+            }
         }
-    for (int m = 0; m < w->blocks; m++)
-        for (int r = 0; r < RX; r++) {
-            int j = LANES * m + r;
-            float a = (f[j] + f[j + RX]) + (f[j + 2 * RX] + f[j + 3 * RX]);
-            float b = (g[j] + g[j + RX]) + (g[j + 2 * RX] + g[j + 3 * RX]);
-            re[RX * (1 + m) + r] = a * block_c[m] - b * block_s[m];
-            im[RX * (1 + m) + r] = a * block_s[m] + b * block_c[m];
-        }
-}
-
-/* Add one signal to another. */
-static inline void add(const float *restrict re, const float *restrict im, float *restrict to_re, float *restrict to_im,
-                       int values)
-{
-    for (int j = 0; j < values; j++) {
-        to_re[j] += re[j];
-        to_im[j] += im[j];
     }
 }
 
-/* Correlate sixteen records re + j im [value][LANES] with another: sums over the values [from, to), of even and odd RX
-   apart, and the energy of the records. */
-static inline void correlate_part(const float *restrict re, const float *restrict im, const float *restrict all_re,
-                                  const float *restrict all_im, int from, int to, float sums[5][LANES])
+/* Filter with three taps for each chirp, one block apart; the signal has a spare block at either end. */
+static inline void equalise(const float *re, const float *im, const Complex *taps, int values, float *to_re, float *to_im)
 {
-    memset(sums, 0, sizeof *sums * 5);
-    for (int j = from; j < to; j += 2)
+    float f[3][LANES], g[3][LANES];
+    for (int t = 0; t < 3; t++)
         for (int k = 0; k < LANES; k++) {
-            float x = re[LANES * j + k], y = im[LANES * j + k];
-            float u = re[LANES * (j + 1) + k], v = im[LANES * (j + 1) + k];
-            sums[0][k] += x * all_re[j] + y * all_im[j];
-            sums[1][k] += y * all_re[j] - x * all_im[j];
-            sums[2][k] += u * all_re[j + 1] + v * all_im[j + 1];
-            sums[3][k] += v * all_re[j + 1] - u * all_im[j + 1];
-            sums[4][k] += (x * x + y * y) + (u * u + v * v);
+            f[t][k] = (float)taps[3 * k + t].re;
+            g[t][k] = (float)taps[3 * k + t].im;
+        }
+    for (int part = 0; part < LANES; part += STEP)
+        for (int i = 0; i < values; i++) {
+            Vector a = {0}, b = {0};
+            for (int t = 0; t < 3; t++) {
+                Vector x = load(re + LANES * (i + RX * t) + part), y = load(im + LANES * (i + RX * t) + part);
+                Vector u = load(f[t] + part), v = load(g[t] + part);
+                a += x * u - y * v;
+                b += x * v + y * u;
+            }
+            store(to_re + LANES * i + part, a);
+            store(to_im + LANES * i + part, b);
         }
 }
 
-/* Second pass: the tone between each chirp, mixed down, folded and filtered, and the sum of the good others; see
-   `loops.against_others`. Returns the energy of that sum. */
-static float against_others(Work *w, const double *frequency, const Complex *taps, int count,
-                            const uint8_t *good, double *found, Complex *tone, float *energy, double *apart_f,
-                            double *apart_phase)
+/* Reduce all chirps: mix down, decimate, filter; see `loops.reduce_chirps`. frequency and taps are padded to groups. */
+static void reduce(Work *w, const double *frequency, const Complex *taps)
+{
+    int values = RX * w->blocks;
+    for (int g = 0; g < w->groups; g++) {
+        size_t first = (size_t)g * LANES;
+        float *re = w->row_re + LANES * RX, *im = w->row_im + LANES * RX;
+        mix_and_fold(w, w->words + first * WORDS * w->n, frequency + first, re, im);
+        extend(w->row_re, LANES * values, LANES * RX);
+        extend(w->row_im, LANES * values, LANES * RX);
+        equalise(w->row_re, w->row_im, taps + 3 * first, values, w->folded_re + first * values, w->folded_im + first * values);
+    }
+}
+
+/* Sum over the chirps of a group with weights. */
+static inline float weighted_sum(const float *restrict x, const float *restrict weights)
+{
+    float sum = 0;
+    for (int k = 0; k < LANES; k++)
+        sum += x[k] * weights[k];
+    return sum;
+}
+
+/* Correlate the chirps of a group with the sum of all: over the values [from, to), of even and odd RX apart, and the
+   energy of the chirps. */
+static inline void correlate_part(const float *re, const float *im, const float *all_re, const float *all_im, int from,
+                                  int to, float sums[5][LANES])
+{
+    for (int part = 0; part < LANES; part += STEP) {
+        Vector a = {0}, b = {0}, c = {0}, d = {0}, e = {0};
+        for (int j = from; j < to; j += 2) {
+            Vector x = load(re + LANES * j + part), y = load(im + LANES * j + part);
+            Vector u = load(re + LANES * (j + 1) + part), v = load(im + LANES * (j + 1) + part);
+            a += x * all_re[j] + y * all_im[j];
+            b += y * all_re[j] - x * all_im[j];
+            c += u * all_re[j + 1] + v * all_im[j + 1];
+            d += v * all_re[j + 1] - u * all_im[j + 1];
+            e += (x * x + y * y) + (u * u + v * v);
+        }
+        store(sums[0] + part, a), store(sums[1] + part, b), store(sums[2] + part, c), store(sums[3] + part, d);
+        store(sums[4] + part, e);
+    }
+}
+
+/* Second pass: the tone between each reduced chirp and the sum of the good others, and what that sum does not explain of
+   its energy in each part of the chirp, [part][chirp]; see `loops.against_others`. Returns the energy of the sum. */
+static double against_others(Work *w, const uint8_t *good, double *found, Complex *tone, float *energy, double *apart_f,
+                             double *apart_phase, double *left)
 {
     int values = RX * w->blocks, chirps = w->chirps, all = w->parts * chirps;
     double *even_re = w->sums, *even_im = even_re + all, *odd_re = even_im + all, *odd_im = odd_re + all;
-    double *rest_re = odd_im + all, *rest_im = rest_re + all, *odd_f = w->tones;
-    Complex *odd_tone = (Complex *)(odd_f + chirps);
-    float level = 0, *all_re = w->all_re, *all_im = w->all_im;
-    memset(w->folded_re, 0, sizeof(float) * whole_lanes(chirps) * values);
-    memset(w->folded_im, 0, sizeof(float) * whole_lanes(chirps) * values);
+    double *rest_re = odd_im + all, *rest_im = rest_re + all, *odd_f = w->tones, level = 0;
+    Complex *odd_tone = (Complex *)(odd_f + chirps), *even_tone = odd_tone + chirps;
     memset(w->all_re, 0, sizeof(float) * values);
     memset(w->all_im, 0, sizeof(float) * values);
-    for (int k = 0; k < chirps; k++) {
-        float *re = w->folded_re + k * values, *im = w->folded_im + k * values;
-        int start = RX * (k * w->samples + w->a);
-        mix_and_fold(w, w->i + start, w->q + start, frequency[k], w->row_re, w->row_im);
-        extend(w->row_re, values, RX);
-        extend(w->row_im, values, RX);
-        add_filtered(w->row_re, w->row_im, taps + k * count, count, RX, re, im, values);
-        if (good[k])
-            add(re, im, all_re, all_im, values);
+    for (int g = 0; g < w->groups; g++) {
+        float used[LANES];
+        for (int k = 0; k < LANES; k++)
+            used[k] = g * LANES + k < chirps && good[g * LANES + k];
+        for (int i = 0; i < values; i++) {
+            w->all_re[i] += weighted_sum(w->folded_re + LANES * ((size_t)g * values + i), used);
+            w->all_im[i] += weighted_sum(w->folded_im + LANES * ((size_t)g * values + i), used);
+        }
     }
-    for (int j = 0; j < values; j++)
-        level += all_re[j] * all_re[j] + all_im[j] * all_im[j];
     memset(energy, 0, sizeof *energy * chirps);
-    for (int first = 0; first < chirps; first += LANES) {
-        int here = chirps - first < LANES ? chirps - first : LANES;
-        float sums[5][LANES];
-        interleave(w->folded_re + first * values, w->spare, w->re, values, values);
-        interleave(w->folded_im + first * values, w->spare, w->im, values, values);
-        for (int p = 0; p < w->parts; p++) {
-            correlate_part(w->re, w->im, all_re, all_im, RX * w->edges[p], RX * w->edges[p + 1], sums);
-            for (int i = 0; i < here; i++) {
-                int k = first + i, j = p * chirps + k;
-                even_re[j] = sums[0][i];
-                even_im[j] = sums[1][i];
-                odd_re[j] = sums[2][i];
-                odd_im[j] = sums[3][i];
-                rest_re[j] = even_re[j] + odd_re[j] - (good[k] ? sums[4][i] : 0);
-                rest_im[j] = even_im[j] + odd_im[j];
-                energy[k] += sums[4][i];
-            }
+    for (int p = 0; p < w->parts; p++) {
+        int from = RX * w->edges[p], to = RX * w->edges[p + 1];
+        float sums[5][LANES], whole = 0;
+        for (int i = from; i < to; i++)
+            whole += w->all_re[i] * w->all_re[i] + w->all_im[i] * w->all_im[i];
+        w->part_energy[p] = whole;
+        level += whole;
+        for (int k = 0; k < chirps; k++) {
+            int lane = k % LANES, j = p * chirps + k;
+            if (lane == 0)
+                correlate_part(w->folded_re + (size_t)k * values, w->folded_im + (size_t)k * values, w->all_re, w->all_im,
+                               from, to, sums);
+            double own = sums[4][lane], part = good[k] ? own : 0;
+            even_re[j] = sums[0][lane];
+            even_im[j] = sums[1][lane];
+            odd_re[j] = sums[2][lane];
+            odd_im[j] = sums[3][lane];
+            rest_re[j] = even_re[j] + odd_re[j] - part;
+            rest_im[j] = even_im[j] + odd_im[j];
+            double others = whole - (good[k] ? 2 * (even_re[j] + odd_re[j]) - own : 0);
+            double common = rest_re[j] * rest_re[j] + rest_im[j] * rest_im[j];
+            left[j] = own - (others > 1e-30 ? common / others : own);
+            energy[k] += (float)own;
         }
     }
     newton_step(rest_re, rest_im, w->part_times, w->parts, chirps, 1, found, tone);
@@ -289,7 +419,6 @@ static float against_others(Work *w, const double *frequency, const Complex *tap
     for (int p = 0; p < w->parts; p++)
         turn_back(found, w->part_times[p], chirps, even_re + p * chirps, even_im + p * chirps, odd_re + p * chirps,
                   odd_im + p * chirps);
-    Complex *even_tone = odd_tone + chirps;
     newton_step(even_re, even_im, w->part_times, w->parts, chirps, 1, apart_f, even_tone);
     newton_step(odd_re, odd_im, w->part_times, w->parts, chirps, 1, odd_f, odd_tone);
     for (int k = 0; k < chirps; k++) {
@@ -299,53 +428,58 @@ static float against_others(Work *w, const double *frequency, const Complex *tap
     return level;
 }
 
-/* Mix a whole chirp x + j y by exp(-j 2 pi frequency (n - middle of the linear samples)). */
-static inline void mix(Work *w, const float *restrict x, const float *restrict y, double frequency, int blocks,
-                       float *restrict re, float *restrict im)
+/* Undo the attenuation by the decimation in complex averages [block], `decimate.flatten`. */
+static inline void flatten(const float *flat, const float *restrict in, int blocks, float *restrict out)
 {
-    float c[LANES], s[LANES];
-    phases_within(frequency, 1, c, s);
-    ramp(frequency, 0, FOLD, (w->a + w->b - 1) / 2.0, blocks, w->phase_c, w->phase_s);
-    for (int m = 0; m < blocks; m++) {
-        float u = w->phase_c[m], v = w->phase_s[m];
-        for (int i = 0; i < LANES; i++) {
-            int j = LANES * m + i;
-            float f = u * c[i] - v * s[i], g = u * s[i] + v * c[i];
-            re[j] = x[j] * f - y[j] * g;
-            im[j] = x[j] * g + y[j] * f;
-        }
+    const int edge = FLAT / 2;
+    if (blocks < FLAT) {
+        memcpy(out, in, sizeof *in * 2 * blocks);
+        return;
     }
+    const float *inner = flat + FLAT * edge;
+    for (int i = 2 * edge; i < 2 * (blocks - edge); i++) {
+        const float *x = in + i - 2 * edge;
+        out[i] = inner[0] * (x[0] + x[12]) + inner[1] * (x[2] + x[10]) + inner[2] * (x[4] + x[8]) + inner[3] * x[6];
+    }
+    for (int m = 0; m < edge; m++)
+        for (int part = 0; part < 2; part++) {
+            float first = 0, last = 0;
+            for (int t = 0; t < FLAT; t++) {
+                first += flat[FLAT * m + t] * in[2 * t + part];
+                last += flat[FLAT * m + t] * in[2 * (blocks - 1 - t) + part];
+            }
+            out[2 * m + part] = first;
+            out[2 * (blocks - 1 - m) + part] = last;
+        }
 }
 
-/* Third pass: the sum of the chirps, mixed down and filtered, and the contributions of two halves; see
-   `loops.average`. mean is complex [RX][sample], halves complex [2][RX][block]. */
-static void average(Work *w, const double *frequency, const Complex *weights, int count,
-                    const uint8_t *good, const uint8_t *second_half, float *mean, float *halves)
+/* Third pass: the sum of the reduced chirps, turned by frequency and turns, in two halves with the weights first and
+   second of each chirp (all padded to groups), flat; see `loops.average`. halves is complex [2][RX][block]. */
+static void average(Work *w, const double *frequency, const double *turns, const float *first, const float *second,
+                    float *halves)
 {
-    int values = RX * w->samples, blocks = (w->samples + FOLD - 1) / FOLD;
-    memset(w->total, 0, sizeof(float) * 4 * values);
-    for (int k = 0; k < w->chirps; k++) {
-        float *to = w->total + 2 * values * second_half[k];
-        if (!good[k])
-            continue;
-        mix(w, w->i + k * values, w->q + k * values, frequency[k], blocks, w->row_re + LANES, w->row_im + LANES);
-        extend(w->row_re, values, LANES);
-        extend(w->row_im, values, LANES);
-        add_filtered(w->row_re, w->row_im, weights + k * count, count, LANES, to, to + values, values);
+    int values = RX * w->blocks, blocks = w->blocks;
+    float *sums = w->row_re; /* complex [2][RX][block] */
+    memset(sums, 0, sizeof *sums * 4 * values);
+    for (int g = 0; g < w->groups; g++) {
+        size_t from = (size_t)g * LANES;
+        ramps(frequency + from, turns + from, FOLD * (1 - blocks) / 2.0, FOLD, blocks, w->phase_c, w->phase_s);
+        for (int i = 0; i < values; i++) {
+            const float *c = w->phase_c + LANES * (i / RX), *s = w->phase_s + LANES * (i / RX);
+            const float *re = w->folded_re + (from * values + LANES * (size_t)i), *im = w->folded_im + (from * values + LANES * (size_t)i);
+            float a = 0, b = 0, d = 0, e = 0, *to = sums + 2 * (i % RX * blocks + i / RX);
+            for (int k = 0; k < LANES; k++) {
+                float x = re[k] * c[k] - im[k] * s[k], y = re[k] * s[k] + im[k] * c[k];
+                a += x * first[from + k];
+                b += y * first[from + k];
+                d += x * second[from + k];
+                e += y * second[from + k];
+            }
+            to[0] += a, to[1] += b, to[2 * values] += d, to[2 * values + 1] += e;
+        }
     }
-    for (int j = 0; j < values; j++) {
-        w->row_re[j] = w->total[j] + w->total[2 * values + j];
-        w->row_im[j] = w->total[values + j] + w->total[3 * values + j];
-    }
-    by_rx(w->row_re, w->row_im, w->samples, mean, mean + 2 * w->samples, mean + 4 * w->samples, mean + 6 * w->samples);
-    for (int h = 0; h < 2; h++)
-        for (int r = 0; r < RX; r++)
-            for (int m = 0; m < w->blocks; m++)
-                for (int part = 0; part < 2; part++) {
-                    const float *v = w->total + (2 * h + part) * values + RX * (w->a + FOLD * m) + r;
-                    float sum = (v[0] + v[RX]) + (v[2 * RX] + v[3 * RX]);
-                    halves[2 * ((h * RX + r) * w->blocks + m) + part] = sum * (1.0f / FOLD);
-                }
+    for (int i = 0; i < 2 * RX; i++)
+        flatten(w->flat, sums + 2 * i * blocks, blocks, halves + 2 * i * blocks);
 }
 
 #endif

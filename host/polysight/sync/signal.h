@@ -131,19 +131,6 @@ static inline void ramp(double frequency, double turns, int step, double origin,
     }
 }
 
-/* scale exp(-j 2 pi frequency q) for the samples q of a block, for all RX. */
-static inline void phases_within(double frequency, double scale, float *restrict c, float *restrict s)
-{
-    Complex turns[FOLD];
-    VECTOR
-    for (int q = 0; q < FOLD; q++)
-        turns[q] = cis(-frequency * q);
-    for (int i = 0; i < LANES; i++) {
-        c[i] = (float)(turns[i / RX].re * scale);
-        s[i] = (float)(turns[i / RX].im * scale);
-    }
-}
-
 /* exp(-j 2 pi k / size), k < size. */
 static inline void roots_of_unity(int size, float *c, float *s)
 {
@@ -210,33 +197,6 @@ static inline void transform(float *restrict re, float *restrict im, int size, c
             }
 }
 
-/* Sum over the RX. */
-static inline void over_rx(const float *restrict values, float *restrict sums, int samples)
-{
-    for (int n = 0; n < samples; n++)
-        sums[n] = (values[4 * n] + values[4 * n + 1]) + (values[4 * n + 2] + values[4 * n + 3]);
-}
-
-/* Interleave four records that are stored one after the other. */
-static inline void in_turn(const float *restrict values, float *restrict out, int quarter)
-{
-    for (int i = 0; i < quarter; i++) {
-        out[4 * i] = values[i];
-        out[4 * i + 1] = values[quarter + i];
-        out[4 * i + 2] = values[2 * quarter + i];
-        out[4 * i + 3] = values[3 * quarter + i];
-    }
-}
-
-/* Transpose records [LANES][n] to [n][LANES], padded with zeros to [size][LANES]. */
-static inline void interleave(const float *restrict records, float *restrict spare, float *restrict out, int n,
-                              int size)
-{
-    in_turn(records, spare, LANES / 4 * n);
-    in_turn(spare, out, LANES / 4 * n);
-    memset(out + LANES * n, 0, sizeof *out * LANES * (size - n));
-}
-
 /* A step of Newton's method on the periodograms of records [part][record], `loops.refine`: changes the frequency, cycles
    per sample. `first`: the frequency is still zero. */
 static inline void newton_step(const double *restrict re, const double *restrict im, const double *restrict t, int parts,
@@ -277,18 +237,6 @@ static inline void turn_back(const double *restrict frequency, double time, int 
         b[k] = one.re * turn.im + one.im * turn.re;
         c[k] = other.re * turn.re - other.im * turn.im;
         d[k] = other.re * turn.im + other.im * turn.re;
-    }
-}
-
-/* Separate samples of four RX into records of complex values. */
-static inline void by_rx(const float *restrict re, const float *restrict im, int samples, float *restrict a,
-                         float *restrict b, float *restrict c, float *restrict d)
-{
-    for (int n = 0; n < samples; n++) {
-        a[2 * n] = re[RX * n], a[2 * n + 1] = im[RX * n];
-        b[2 * n] = re[RX * n + 1], b[2 * n + 1] = im[RX * n + 1];
-        c[2 * n] = re[RX * n + 2], c[2 * n + 1] = im[RX * n + 2];
-        d[2 * n] = re[RX * n + 3], d[2 * n + 1] = im[RX * n + 3];
     }
 }
 

@@ -1,0 +1,172 @@
+"""Chirps with interference or clipping are left out, as if they had not been received, and counted."""
+
+import numpy as np
+import pytest
+
+from polysight.sync import BoardSetup, align_row, synchronise_row
+from polysight.sync import loops as sync_loops
+from polysight.sync.offsets import align_in_numpy, align_pieces
+
+LINEAR = (0, 192)
+POSITIONS, CHIRPS = 10, 16
+COUNTS = 1000
+
+
+@pytest.fixture(params=["compiled", "numpy"])
+def align(request):
+    """Align bursts in one form of the loops."""
+    if request.param == "numpy":
+        by = align_in_numpy
+    elif sync_loops.library() is None:
+        pytest.skip("no compiled loops: python -m polysight.sync.build")
+    else:
+        by = sync_loops.library().align
+
+    def run(words, valid=None):
+        valid = np.ones(words.shape[:2], bool) if valid is None else valid
+        return align_pieces([words], valid, LINEAR, by=by)
+
+    return run
+
+
+@pytest.fixture
+def received(paths, noise, rig):
+    """Bursts as received, complex [position, chirp, rx, sample], direct path 1."""
+
+    def make(snr_db=8.0, seed=0, echo=1.0):
+        rng = np.random.default_rng(seed)
+        signal, _ = paths(rig.receivers[0], POSITIONS, echo, rng)
+        shape = POSITIONS, CHIRPS, 1, 1
+        n = np.arange(signal.shape[-1])
+        turns = 0.35 * n + rng.uniform(-0.09, 0.09, shape) * n + rng.uniform(size=shape)
+        frames = signal[:, None] * np.exp(2j * np.pi * turns)
+        return frames + noise(frames.shape, -snr_db, rng)
+
+    return make
+
+
+def cross(frames, chosen, level, rng, samples=40):
+    """Add another radar's chirp, which crosses the band of the signal within some samples of the chosen chirps."""
+    out, n = frames.copy(), np.arange(samples) - samples / 2
+    for position, chirp in np.argwhere(chosen):
+        first = rng.integers(0, LINEAR[1] - samples)
+        turns = 0.35 * n + n**2 / samples * rng.uniform(0.15, 0.45) + rng.uniform(size=(4, 1))
+        out[position, chirp, :, first : first + samples] += level * np.exp(2j * np.pi * turns)
+    return out
+
+
+def choose(count, rng):
+    """Mark `count` chirps of every burst."""
+    return rng.permuted(np.arange(CHIRPS) < count + np.zeros((POSITIONS, 1)), axis=1)
+
+
+def words_of(counts, frames):
+    return counts(frames.transpose(2, 0, 1, 3))
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 6])
+@pytest.mark.parametrize("level", [2.0, 8.0])
+def test_bursts_with_disturbed_chirps_give_the_average_of_the_others(align, received, counts, count, level):
+    rng = np.random.default_rng(count)
+    chosen = choose(count, rng)
+    words = words_of(counts, cross(received(), chosen, level, rng))
+    got, expected = align(words), align(words, ~chosen)
+    np.testing.assert_array_equal(got.good, ~chosen)
+    np.testing.assert_array_equal(got.halves, expected.halves)
+    assert not got.clipped.any()
+
+
+@pytest.mark.parametrize("level", [0.2, 0.5, 1.0])
+def test_what_is_not_found_changes_the_average_by_less_than_its_noise(align, received, counts, level):
+    rng = np.random.default_rng(9)
+    chosen = choose(3, rng)
+    quiet = received()
+    got = align(words_of(counts, cross(quiet, chosen, level, rng)))
+    clean = align(words_of(counts, quiet))
+    off = np.abs(got.halves.sum(axis=1)) - np.abs(clean.halves.sum(axis=1))
+    noise = COUNTS * 10 ** (-8 / 20) / np.sqrt(2 * CHIRPS * 4)
+    assert np.sqrt((off**2).mean()) < noise
+
+
+@pytest.mark.parametrize("snr_db", [-3.0, 8.0, 25.0, 60.0])
+@pytest.mark.parametrize("echo", [0.0, 1.0, 3.0])
+def test_no_chirp_of_an_undisturbed_burst_is_left_out(align, received, counts, snr_db, echo):
+    assert align(words_of(counts, received(snr_db, echo=echo))).good.all()
+
+
+@pytest.mark.parametrize("travel_mm", [0.5, 1.0])
+def test_motion_in_a_burst_is_no_disturbance(align, received, counts, travel_mm):
+    """The echo of a plate aside turns by its change of path, up to 1.6 times the travel."""
+    moved = np.linspace(-0.5, 0.5, CHIRPS)[:, None, None] * 1.6 * travel_mm / 3.85
+    direct, both = received(60.0, seed=3, echo=0.0), received(60.0, seed=3)
+    frames = direct + (both - direct) * np.exp(2j * np.pi * moved)
+    assert align(words_of(counts, frames)).good.all()
+
+
+def clip(words, limit):
+    return np.clip(words, -limit, limit)
+
+
+@pytest.mark.parametrize("limit", [0.4, 0.6, 0.75])
+def test_a_burst_whose_chirps_are_all_clipped_is_not_used(align, received, counts, limit):
+    words = words_of(counts, 8 * received(20.0, echo=0.3))
+    low = clip(words, int(limit * np.abs(words).max()))
+    got = align(low)
+    assert got.clipped.all()
+    assert not got.good.any()
+    assert not got.halves.any()
+    full = clip(np.rint(words * (32767 / (limit * np.abs(words).max()))), 32767).astype(np.int16)
+    assert not align(full).good.any()
+
+
+def test_clipped_chirps_among_others_are_left_out(align, received, counts):
+    chosen = choose(5, np.random.default_rng(2))
+    words = words_of(counts, 2.5 * received(20.0))
+    loud = clip(4 * words, 7000)
+    words = np.where(chosen[..., None, None, None], loud, words)
+    got, expected = align(words), align(words, ~chosen)
+    np.testing.assert_array_equal(got.clipped, chosen)
+    np.testing.assert_array_equal(got.good, ~chosen)
+    np.testing.assert_array_equal(got.halves, expected.halves)
+
+
+def test_both_forms_leave_out_the_same(received, counts):
+    library = sync_loops.library()
+    if library is None:
+        pytest.skip("no compiled loops: python -m polysight.sync.build")
+    rng = np.random.default_rng(1)
+    for level in (0.5, 1.0, 2.0, 20.0):
+        words = words_of(counts, cross(received(12.0), rng.random((POSITIONS, CHIRPS)) < 0.3, level, rng))
+        one, other = (
+            align_pieces([words], np.ones(words.shape[:2], bool), LINEAR, by=by)
+            for by in (library.align, align_in_numpy)
+        )
+        np.testing.assert_array_equal(one.good, other.good)
+        largest = np.abs(other.halves).max()
+        np.testing.assert_allclose(one.halves, other.halves, rtol=0, atol=3e-6 * largest)
+
+
+def test_chirps_left_out_are_counted(rig, received, counts):
+    setup = BoardSetup.of(rig, rig.receivers[0], compensate_filter=False)
+    rng = np.random.default_rng(4)
+    chosen = choose(2, rng)
+    chosen[:4] = False
+    words = words_of(counts, cross(received(15.0), chosen, 8.0, rng))
+    words[0] = clip(4 * words[0], int(2.5 * COUNTS))
+    words[1, :3] = 32767
+    valid = np.ones(chosen.size, bool)
+    valid[-3:] = False
+    row = synchronise_row(words.reshape(-1, *words.shape[2:]), valid, setup)
+    assert row.chirps_clipped == CHIRPS + 3
+    assert row.positions_clipped == 1
+    assert row.chirps_disturbed == (chosen.ravel() & valid).sum()
+    assert row.valid.tolist() == [False] + 9 * [True]
+    np.testing.assert_array_equal(row.chirps[1:4], [13, 16, 16])
+
+
+def test_three_chirps_are_too_few_to_call_one_disturbed(align, received, counts):
+    frames = received()[:, :3]
+    rng = np.random.default_rng(5)
+    words = words_of(counts, cross(frames, np.arange(3) == np.full((POSITIONS, 1), 1), 2.0, rng))
+    assert align(words).good.all()
+    assert align_row(words, np.ones((POSITIONS, 3), bool), LINEAR).good.all()

@@ -12,6 +12,7 @@ from polysight.results.verdict import (
     Verdict,
     brightness_reasons,
     direct_path_reasons,
+    disturbance_reasons,
     incidence_reasons,
     leakage_reasons,
     level_reasons,
@@ -118,6 +119,21 @@ def test_direct_path(snr_db, phase, share, want):
     assert level(reasons) == want
     if want == "none":
         assert "direct path is missing" in reasons[0].what
+
+
+@pytest.mark.parametrize(
+    ("clipped", "disturbed", "positions", "want"),
+    [
+        (0.0, 0.0, 0.0, "good"),
+        (0.01, 0.01, 0.0, "good"),
+        (0.1, 0.0, 0.0, "care"),
+        (0.01, 0.0, 0.01, "care"),
+        (0.0, 0.1, 0.0, "care"),
+    ],
+)
+def test_chirps_left_out(clipped, disturbed, positions, want):
+    reasons = disturbance_reasons("RH", clipped, disturbed, positions)
+    assert level(reasons) == want
 
 
 def test_a_weak_direct_path_shows_in_the_metals_level():

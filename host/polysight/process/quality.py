@@ -41,6 +41,7 @@ from polysight.results import (
     brightness_reasons,
     copies_reasons,
     direct_path_reasons,
+    disturbance_reasons,
     drift_reasons,
     halo_reasons,
     incidence_reasons,
@@ -56,7 +57,7 @@ from polysight.results import (
     verdict_of,
 )
 from polysight.store import CubeRow, RowData, Source
-from polysight.sync import SyncedRow, estimate_backlash, object_filter
+from polysight.sync import SyncedRow, block_sweep_of, estimate_backlash, object_filter, sweep_of
 from polysight_shared.config import Board, Instrument
 from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
@@ -74,6 +75,8 @@ class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
         Half-open ranges [start, stop) of masked columns, from the smallest x.
     stages
         Each stage of synchronisation with the standard deviations after it: Hz, rad, and relative amplitude.
+    chirps_clipped, chirps_disturbed, positions_clipped
+        As of `SyncedRow`; 0 in files of earlier releases, which did not look for them.
     """
 
     frames_expected: Count
@@ -84,6 +87,9 @@ class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
     positions_masked: Count
     masked_columns: list[tuple[Count, Count]]
     stages: list[tuple[str, float, float, float]]
+    chirps_clipped: Count = 0
+    chirps_disturbed: Count = 0
+    positions_clipped: Count = 0
 
     @property
     def residuals(self) -> dict[str, tuple[float, float, float]]:
@@ -117,6 +123,10 @@ class BoardRows:
     board: Board
     rows: dict[int, RowQuality] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        sweeps = sweep_of(self.rig.chirp), block_sweep_of(self.rig.chirp)
+        self._filters = {sweep.size: object_filter(self.rig, self.board, sweep) for sweep in sweeps}
+
     def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:
         """Compute and store the figures of a synchronised row."""
         figures = RowFigures(
@@ -128,9 +138,12 @@ class BoardRows:
             positions_masked=int(synced.valid.size - synced.valid.sum()),
             masked_columns=masked_runs(~synced.valid[:: plan_raster(self.rig.grid).row(row).direction]),
             stages=[(name, *spread) for name, spread in synced.stages.items() if np.isfinite(spread).all()],
+            chirps_clipped=synced.chirps_clipped,
+            chirps_disturbed=synced.chirps_disturbed,
+            positions_clipped=synced.positions_clipped,
         )
         direct_hz = np.where(synced.valid, synced.direct_hz, np.nan)
-        echo = synced.through(object_filter(self.rig, self.board, synced.sweep_hz))
+        echo = synced.through(self._filters[synced.sweep_hz.size])
         self.rows[row] = RowQuality(figures, direct_hz, _direct_snr(synced), echo)
 
     @property
@@ -187,6 +200,9 @@ class BoardRows:
             positions=self.positions,
             positions_masked=self.positions_masked,
             frames_masked=self.frames_expected - self.frames_received,
+            chirps_clipped=sum(r.chirps_clipped for r in figures.values()),
+            chirps_disturbed=sum(r.chirps_disturbed for r in figures.values()),
+            positions_clipped=sum(r.positions_clipped for r in figures.values()),
             direct_path_hz=_frequency_range(direct) if direct.size else UNSET,
             direct_path_snr_db=None if snr is None else round(snr, 2),
             stage_backlash_mm=self._backlash() if backlash else None,
@@ -340,9 +356,18 @@ def recording_verdict(quality: Quality) -> list[Finding]:
         missing += direct_path_reasons(
             name, board.direct_snr_db, board.residual("averaged"), share / received if received else 1.0
         )
+        missing += _disturbances(name, list(board.figures.values()))
     recorded = recording_reasons(coverage, masked / positions if positions else 1.0)
     filled = [(board, e.missing_share, e.image_error) for board, e in quality.filled.items()]
     return recorded + missing + reconstruction_reasons(filled)
+
+
+def _disturbances(name: str, rows: list[RowFigures]) -> list[Finding]:
+    """Return reasons from the chirps of a board that were left out."""
+    chirps, positions = sum(r.frames_received for r in rows), sum(r.positions for r in rows)
+    clipped, disturbed = sum(r.chirps_clipped for r in rows), sum(r.chirps_disturbed for r in rows)
+    lost = sum(r.positions_clipped for r in rows)
+    return disturbance_reasons(name, clipped / max(1, chirps), disturbed / max(1, chirps), lost / max(1, positions))
 
 
 def judge(

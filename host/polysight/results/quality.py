@@ -45,6 +45,10 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
+    chirps_clipped, chirps_disturbed
+        Received chirps left out: clipped by the receiver; unlike the others of their burst (another radar, silence).
+    positions_clipped
+        Masked positions of which all chirps were clipped.
     masked_columns
         Row to half-open ranges [start, stop) of masked columns.
     rows_recorded
@@ -61,6 +65,9 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
     positions: int | UnsetType = UNSET
     positions_masked: int | UnsetType = UNSET
     frames_masked: int = 0
+    chirps_clipped: int = 0
+    chirps_disturbed: int = 0
+    positions_clipped: int = 0
     direct_path_hz: FrequencyRange | UnsetType = UNSET
     direct_path_snr_db: float | None = None
     stage_backlash_mm: Backlash | None = None

@@ -111,6 +111,8 @@ FEW_POSITIONS = 0.5
 """Share of absent or masked positions above which there is no result."""
 SOME_POSITIONS = 0.005
 """Share of masked positions above which the result needs care."""
+SOME_CHIRPS = 0.05
+"""Share of chirps left out as clipped or disturbed above which the result needs care."""
 RECONSTRUCTION_NONE = 0.15
 """Expected error of an image with reconstructed positions, above which there is no result. True errors of points stay
 below twice the expected ones (tests/imaging/test_sparse.py); of nine simulated plates they were 0.1 to 1.2 times."""
@@ -225,6 +227,25 @@ def reconstruction_reasons(boards: Iterable[tuple[str, float, float | None]]) ->
             level, f"{100 * missing_share:.1f} % of the positions of {board} were reconstructed: {error}",
             "a reconstruction is right only where the scene is mostly empty, such as separate plates",
             "record the missing rows, or scan with a smaller step (`polysight plan`)", 3 + missing_share,
+        ))  # fmt: skip
+    return out
+
+
+def disturbance_reasons(board: str, clipped: float, disturbed: float, positions_clipped: float) -> list[Finding]:
+    """Judge one board's shares of chirps that were left out, and of positions without data because all were clipped."""
+    out = []
+    if clipped > SOME_CHIRPS or positions_clipped > SOME_POSITIONS:
+        out.append(reason(
+            "care", f"{board}: {100 * clipped:.1f} % of the chirps are clipped, {100 * positions_clipped:.1f} % of the"
+            " positions have no others",
+            "the echo or the direct path overdrives the receiver; bright plates lose their strongest positions",
+            "lower `rx_gain_db` and scan again", 4 + clipped,
+        ))  # fmt: skip
+    if disturbed > SOME_CHIRPS:
+        out.append(reason(
+            "care", f"{board}: {100 * disturbed:.1f} % of the chirps are left out, unlike the others of their burst",
+            "another radar transmits in the same band, a cable is loose, or the direct path is very weak",
+            "switch other radars off; scan again", 3 + disturbed,
         ))  # fmt: skip
     return out
 

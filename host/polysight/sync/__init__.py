@@ -12,7 +12,7 @@ from polysight.sync.chain import STAGES, BoardSetup, RowSynchroniser, SyncedRow,
 from polysight.sync.decimate import FOLD
 from polysight.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
 from polysight.sync.loops import cis
-from polysight.sync.offsets import AlignedRow, align_row, reference, sweep_of, whole_blocks
+from polysight.sync.offsets import AlignedRow, align_row, block_sweep_of, reference, sweep_of, whole_blocks
 
 __all__ = [
     "FOLD",
@@ -23,6 +23,7 @@ __all__ = [
     "RowSynchroniser",
     "SyncedRow",
     "align_row",
+    "block_sweep_of",
     "cis",
     "estimate_backlash",
     "fit_high_pass",

@@ -30,7 +30,8 @@ def object_filter(rig: Instrument, board: Board, sweep_hz: NDArray[np.float64]) 
     """
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
     excess = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).mean()
-    first, last = sweep_of(rig.chirp)[np.array(rig.chirp.linear_samples) - (0, 1)]
+    a, b = rig.chirp.linear_samples
+    first, last = sweep_of(rig.chirp)[[a, b - 1]]
     linear = np.flatnonzero((sweep_hz >= first) & (sweep_hz <= last))
     weights = np.zeros(sweep_hz.size, np.complex64)
     weights[linear] = np.hanning(linear.size + 2)[1:-1] / linear.size

@@ -90,7 +90,7 @@ def _low_pass() -> NDArray[np.float64]:
     basis = pairs[:, :-1] - pairs[:, -1:]
     half = np.linalg.lstsq(weight[:, None] * basis, -weight * pairs[:, -1] / 2, rcond=None)[0]
     half = np.append(half, 0.5 - half.sum())
-    return np.concatenate([half[::-1], half])
+    return np.concatenate([half[::-1], half]).astype(np.float64)
 
 
 def fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:

@@ -104,7 +104,8 @@ def filtered(signal: NDArray[np.complex64], taps: NDArray[np.complex64]) -> NDAr
     after = 3 * (signal[..., -1:] - signal[..., -2:-1]) + signal[..., -3:-2]
     whole = np.concatenate([before, signal, after], axis=-1)
     t = taps[..., None, None, :]
-    return t[..., 0] * whole[..., :-2] + t[..., 1] * whole[..., 1:-1] + t[..., 2] * whole[..., 2:]
+    out = t[..., 0] * whole[..., :-2] + t[..., 1] * whole[..., 1:-1] + t[..., 2] * whole[..., 2:]
+    return out.astype(np.complex64, copy=False)
 
 
 def high_pass(chirp: Chirp) -> HighPass:

@@ -330,7 +330,7 @@ def average(
     positions, chirps, rx, blocks = reduced.shape
     turned = reduced * phasor(-FOLD * frequency, -phase, blocks, (blocks - 1) / 2)[:, :, None]
     halves = weights.astype(np.complex64) @ turned.reshape(positions, chirps, rx * blocks)
-    return flatten(halves.reshape(positions, 2, rx, blocks))
+    return flatten(complex64(halves.reshape(positions, 2, rx, blocks)))
 
 
 def _complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
@@ -507,6 +507,7 @@ class Library:
         except OSError as e:
             raise LoadError(str(e)) from None
         self.bits = bits or int(loaded.vector_bits())
+        self._decimator = decimator()
         self._loaded = loaded
 
     def align(
@@ -528,7 +529,7 @@ class Library:
             "align",
             *(words, valid),
             *(positions, chirps, samples, a, b, search_size(b - a), full_scale),
-            *(np.array(filters), len(filters) - 3, decimator().taps, decimator().flat),
+            *(np.array(filters), len(filters) - 3, self._decimator.taps, self._decimator.flat),
             *into,
         )
 

@@ -478,15 +478,20 @@ def excess_path_m(
 
 def sweep_of(chirp: Chirp) -> NDArray[np.float64]:
     """Return the transmit frequency of every sample of a chirp, Hz."""
-    return chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    return chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples, dtype=np.float64)
+
+
+def block_sweep_of(chirp: Chirp) -> NDArray[np.float64]:
+    """Return the transmit frequency in the middle of every block of linear samples, Hz."""
+    a, b = whole_blocks(chirp.linear_samples)
+    return sweep_of(chirp)[a:b].reshape(-1, FOLD).mean(axis=1)
 
 
 def prepare(rig: Instrument, board: Board) -> DirectPath:
     """Return steering, search beam and estimators of a board, from geometry alone."""
-    chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
+    chirp = rig.chirp
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
-    sweep = sweep_of(chirp)
-    middles = sweep[a:b].reshape(-1, FOLD).mean(axis=1)
+    sweep, middles = sweep_of(chirp), block_sweep_of(chirp)
     direct = np.linalg.norm(rx - tx, axis=-1)
     lag_s = (direct - direct[0])[:, None] / SPEED_OF_LIGHT_M_S
 
@@ -502,7 +507,7 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     flat = echoes.reshape(len(points), n_rx * n)
     same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
     noise = _NOISE / FOLD * np.eye(n_rx * n)
-    covariance = (flat.T @ flat.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + noise
+    covariance = ((flat.T @ flat.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + noise).astype(np.complex128)
     time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
     model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
     own = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]

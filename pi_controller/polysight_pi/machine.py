@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
+from polysight_pi.edges import EdgeTimes
 from polysight_pi.journal import JournalThread
-from polysight_pi.stage import MAX_MM, StageDriver, StageLostError, StageRefusedError
+from polysight_pi.stage import MAX_MM, StageDriver, StageLostError, StageRefusedError, row_end_in_steps
 from polysight_pi.trigger import BurstSent, BurstSpec, Counts, Job, LoopFault, TriggerLoop, TriggerWatch
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
@@ -114,6 +115,8 @@ class RunningRow:
     take: int
     job: Job
     sequence: int  # of the stage's ROW and its `done`
+    end_steps: tuple[int, int]  # x and y where the stage has to end
+    edges: EdgeTimes
     status: m.RowStatus | None = None
     fault: int = 0
     reason: str = ""
@@ -126,7 +129,10 @@ class RunningRow:
         points = self.row.points
         pulses = points * self.job.spec.pulses
         if self.points == points and counts == Counts(points, points, pulses):
-            self.status = "done"
+            wrong = self.edges.judge_holds()
+            self.status = "fault" if wrong else "done"
+            self.fault = int(PiFault.EDGE_TIME) if wrong else 0
+            self.reason = wrong or self.reason
             return
         self.status = "fault"
         self.fault = int(PiFault.POINTS_MISMATCH)
@@ -263,7 +269,12 @@ class Machine:
         """Journal a burst of the row."""
         row = self.row
         record = sent.record
-        if row is None or sent.job is not row.job or not record.pulses:
+        if row is None or sent.job is not row.job:
+            return
+        wrong = row.edges.note(sent.edge_ns)
+        if wrong:
+            self.happen("row fault", PiFault.EDGE_TIME, wrong)
+        if not record.pulses:
             return
         self._journal.add(
             m.Capture, row_index=row.row.index, take=row.take, point=sent.point, column=row.row.column(sent.point),
@@ -314,6 +325,8 @@ class Machine:
         edges = self._loop.counts.edges
         if row is not None and self.state in MOVING:
             row.points = max(0, _number(reply, "points"))
+            if wrong := row.edges.note_status(row.points):
+                self.happen("row fault", PiFault.EDGE_TIME, wrong)
             if self.state != "stopping" and self._watch.is_silent(row.points, edges):
                 reason = f"the stage has passed {row.points} points, {edges} edges were received: wire off?"
                 self.happen("lasting fault", PiFault.TRIGGER_LINE_LOST, reason)
@@ -388,7 +401,9 @@ class Machine:
             elif e.number in POSITION_LOST:
                 self.happen("not homed")
             raise
-        self.row = RunningRow(row, take, job, sequence)
+        end_steps = row_end_in_steps(row, self.stage.config, speed_mm_s)
+        edges = EdgeTimes(row, self.stage.config, speed_mm_s)
+        self.row = RunningRow(row, take, job, sequence, end_steps, edges)
         self.row_timeout_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
         self._rests = 0
         self._watch = TriggerWatch()
@@ -396,6 +411,7 @@ class Machine:
         self._journal.add(m.RowStarted, row=row, take=take)
 
     def _hold(self) -> None:
+        self._current.edges.holds += 1
         self.stage.link.send_byte(Immediate.HOLD)
 
     def _resume(self) -> None:
@@ -471,6 +487,12 @@ class Machine:
         row.points = max(0, _number(reply, "points", row.row.points))
         if _number(reply, "held"):
             row.reason = "held during the row: some positions were passed below full speed"
+        else:
+            row.edges.holds = 0  # held before the first point
+        end_steps = (_number(reply, "x", -1), _number(reply, "y", -1))
+        if end_steps != row.end_steps and row.status is None:
+            self.homed = False
+            self._fail_row(PiFault.POSITION, f"the row ended at {end_steps}, not at {row.end_steps} (x, y in steps)")
         return "ending" if row.bursts >= row.row.points else None
 
     def _note_stopped(self, reply: Reply | None = None) -> None:

@@ -7,6 +7,7 @@ the heartbeat without which a moving stage stops. Protocol: docs/spec/stage-line
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import termios
@@ -44,6 +45,7 @@ IDLE_STATUS_S = 1.0
 STOP_TIMEOUT_S = 3.0  # from STOP to standstill
 CLEAR_RETRY_S = 0.05
 CALLER_LATE_S = 3.0  # longer than a line and its retries take
+MIN_FEED = 31  # steps/s; the stage starts and stops at sqrt(acceleration / 2), but not below this
 MAX_MM = 1e6  # limit of a position in the messages
 MOTION_TIMEOUT_S = HOMING_TIMEOUT_S  # no motion takes longer than homing
 
@@ -457,6 +459,17 @@ def row_in_steps(row: Row, stage: Stage, speed_mm_s: float) -> tuple[int, int, i
     x_start = round((stage.centre_x_mm + row.x_start_mm) * k)
     y = round((stage.centre_y_mm + row.y_mm) * k)
     return x_start, round(row.step_mm * k), row.points, y, round(speed_mm_s * k)
+
+
+def row_end_in_steps(row: Row, stage: Stage, speed_mm_s: float) -> tuple[int, int]:
+    """Return x and y in steps where the stage rests after a row (docs/spec/stage-line.md, "A row")."""
+    x_start, step, points, y, feed = row_in_steps(row, stage, speed_mm_s)
+    accel = round(stage.accel_mm_s2 * stage.steps_per_mm)
+    ramp = 0
+    if feed > max(math.isqrt(accel // 2), MIN_FEED):
+        ramp = -(-(feed**2) // (2 * accel))
+    run_up = ramp + max(abs(step), round(stage.backlash_mm * stage.steps_per_mm))
+    return x_start + (points - 1) * step + row.direction * run_up, y
 
 
 class Position(NamedTuple):

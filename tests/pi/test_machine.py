@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import re
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,7 +19,7 @@ from tests.support.rigs import published_rig
 from polysight.plan.forecast import row_motion_s
 from polysight_pi.executor import check_run, read_burst
 from polysight_pi.machine import RULES, TIMEOUTS_S, WIRE_STATE, Machine, RefusedError, State
-from polysight_pi.stage import STATUS_PER_HEARTBEAT, StatusWatch
+from polysight_pi.stage import STATUS_PER_HEARTBEAT, StatusWatch, row_end_in_steps
 from polysight_pi.trigger import LOOK_UP_S, BurstSent, BurstSpec, Edge, LoopFault, TriggerLoop, TriggerWatch
 from polysight_shared import messages as m
 from polysight_shared.config import Burst
@@ -28,6 +29,7 @@ from polysight_shared.stage_line import Immediate, Reply
 
 SPEC = BurstSpec(2, 1_500_000, 1000)
 ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
+INTERVAL_NS = 100_000_000  # 2 mm at 20 mm/s
 SAFE_WITHIN_S = 0.5
 ROW_STATES = ("running", "held", "stopping", "done", "ending")
 SPEC_PAGE = (REPO / "docs/spec/wire.md").read_text(encoding="utf-8").split("## State machine\n")[1].split("\n## ")[0]
@@ -53,7 +55,8 @@ class Bench:
         self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)  # not started: edges are given to it
         parts: Any = (self.stage, self.loop, self.journal, self.posted.append, lambda: self.t)
         self.machine = Machine(*parts)
-        self.seqno = 0
+        self.seqno = self.edge_ns = 0
+        self.row = ROW
 
     def run_posted(self) -> None:
         while self.posted:
@@ -83,8 +86,9 @@ class Bench:
         assert self.machine.state == "ready"
         return self
 
-    def start(self) -> None:
-        self.machine.command("RunRow", ROW, 1, SPEC, 20.0)
+    def start(self, row: Row = ROW) -> None:
+        self.row = row
+        self.machine.command("RunRow", row, 1, SPEC, 20.0)
         self.row_number = self.stage.number
 
     def stage_says(self, reply: Reply) -> None:
@@ -94,11 +98,21 @@ class Bench:
     def status(self, points: int, state: str = "row") -> None:
         self.stage_says(Reply("status", fields={"state": state, "points": str(points), "x": "0", "y": "0"}))
 
+    def row_done(self, dx: int = 0, dy: int = 0, held: int = 0) -> None:
+        """The stage ends the row, this many steps away from where it should."""
+        x, y = row_end_in_steps(self.row, self.stage.config, 20.0)
+        fields = {"points": str(self.row.points), "x": str(x + dx), "y": str(y + dy), "held": str(held)}
+        self.stage_says(Reply("done", self.stage.number, fields=fields))
+
     def edge(self) -> None:
+        self.edge_at(self.edge_ns + INTERVAL_NS)
+
+    def edge_at(self, t_ns: int) -> None:
         self.seqno += 1
-        self.lines.t += 100_000_000
+        self.edge_ns = t_ns
+        self.lines.t = max(self.lines.t, t_ns)
         with self.loop._lock:
-            self.loop._take(Edge(self.lines.t, self.seqno))
+            self.loop._take(Edge(t_ns, self.seqno))
         self.run_posted()
 
     @property
@@ -120,12 +134,80 @@ def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
     bench.start()
     bench.edge()
     bench.edge()
-    bench.stage_says(Reply("done", bench.row_number, fields={"points": "3"}))
+    bench.row_done()
     assert bench.machine.state == "done"
     bench.later(2.0)
     finished = bench.of(m.RowFinished)[-1]
     assert (finished.status, finished.fault) == ("fault", PiFault.POINTS_MISMATCH)
     assert bench.machine.state == "ready"
+
+
+@pytest.mark.parametrize(("dx", "dy"), [(0, 1), (1, 0), (0, 20_000), (-4000, 0)])
+def test_a_row_that_ends_elsewhere_is_no_row(dx, dy):
+    """The Pi does not take the stage's word for it: the place is compared with the command."""
+    bench = Bench().homed()
+    bench.start()
+    for _ in range(3):
+        bench.edge()
+    bench.row_done(dx, dy)
+    finished = bench.of(m.RowFinished)[-1]
+    assert (finished.status, finished.fault) == ("fault", PiFault.POSITION)
+    assert bench.machine.state == "idle", "its position is not known"
+
+
+LONG_ROW = Row(index=0, y_mm=0.0, x_start_mm=-20.0, step_mm=2.0, points=20)
+
+
+def draw_edge_fault(rng: random.Random, edges_ns: list[int]) -> tuple[str, list[int]]:
+    """Edges with a fault, and its kind."""
+    kind = rng.choice(["lost", "spurious", "lost and spurious", "shifted"])
+    edges = list(edges_ns)
+    if "lost" in kind:
+        del edges[rng.randrange(len(edges))]
+    if "spurious" in kind:
+        begin_ns, end_ns = edges_ns[0] - 2 * INTERVAL_NS, edges_ns[-1] + INTERVAL_NS
+        edges.append(rng.randint(begin_ns, end_ns))
+    if kind == "shifted":
+        edges[rng.randrange(len(edges))] += round(rng.choice([-1, 1]) * rng.uniform(0.02, 0.9) * INTERVAL_NS)
+    return kind, sorted(edges)
+
+
+def run_row(edges_ns: list[int]) -> Any:
+    """A row with these edges and with the statuses of a sound stage; gives its end and the machine's bench."""
+    bench = Bench().homed()
+    bench.start(LONG_ROW)
+    passed_ns = [10**10 + i * INTERVAL_NS for i in range(LONG_ROW.points)]
+    happens = [(t, "edge") for t in edges_ns]
+    happens += [(t + 1, "status") for t in range(passed_ns[0] - 5 * INTERVAL_NS, passed_ns[-1], 125_000_000)]
+    for t_ns, what in sorted(happens):
+        if bench.machine.state != "running":
+            break
+        if what == "edge":
+            bench.edge_at(t_ns)
+        else:
+            bench.status(sum(t <= t_ns for t in passed_ns))
+    if bench.machine.state == "running":
+        bench.row_done()
+        bench.later(2.0)
+    else:
+        bench.stage_says(Reply("alarm", number=StageError.STOPPED))
+    return bench.of(m.RowFinished)[-1]
+
+
+def test_drawn_edge_faults_are_found(request):
+    """Lost, spurious, both, or shifted by 2 % of the interval or more: never `done`, and named."""
+    rows = 1000 if request.config.getoption("--long") else 100
+    rng = random.Random(36)
+    sound_ns = [10**10 + i * INTERVAL_NS for i in range(LONG_ROW.points)]
+    assert run_row(sound_ns).status == "done"
+    for _ in range(rows):
+        within = [t + round(rng.uniform(-0.004, 0.004) * INTERVAL_NS) for t in sound_ns]
+        assert run_row(within).status == "done"
+        kind, edges_ns = draw_edge_fault(rng, sound_ns)
+        finished = run_row(edges_ns)
+        assert finished.status == "fault", (kind, edges_ns)
+        assert finished.fault in (PiFault.EDGE_TIME, PiFault.EDGE_DURING_BURST, PiFault.POINTS_MISMATCH), finished
+        assert finished.reason
 
 
 @pytest.mark.parametrize("held", [False, True])
@@ -254,7 +336,7 @@ ACTIONS: dict[str, Callable[[Bench], object]] = {
     "edge": lambda b: b.edge(),
     "status": lambda b: b.status(len(b.of(m.Capture))),
     "ok": lambda b: b.stage_says(Reply("ok", b.stage.number)),
-    "done": lambda b: b.stage_says(Reply("done", b.stage.number, fields={"points": "3"})),
+    "done": lambda b: b.row_done(),
     "stopped": lambda b: b.stage_says(Reply("alarm", number=StageError.STOPPED)),
     "limit": lambda b: b.stage_says(Reply("alarm", number=StageError.LIMIT_SWITCH)),
     "banner": lambda b: b.stage_says(Reply("banner")),

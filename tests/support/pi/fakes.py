@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import queue
 import select
@@ -109,6 +110,14 @@ def gone() -> DeviceError:
 
 
 STEPS_PER_MM = 200
+ACCEL = 40000  # steps/s^2
+
+
+def _rest_after(row: Command) -> tuple[int, int]:
+    """Where the stage rests after ROW (docs/spec/stage-line.md), without backlash."""
+    x0, dx, points, y, feed = row.args
+    run_up = math.ceil(feed**2 / (2 * ACCEL)) + abs(dx)
+    return x0 + (points - 1) * dx + (run_up if dx > 0 else -run_up), y
 
 
 class FakeStage:
@@ -117,7 +126,7 @@ class FakeStage:
     Wrong behaviour on request: `deaf` (answers nothing), `lose` (swallow so many lines), `damage` (garble so many
     answers), `lose_end` (swallow so many done or alarm lines), `skip` (points without a trigger), `extra` (a trigger
     too many), `endless` (a row stays at its last point), `alarm_at` (alarm number at a point), `lost` (steps that
-    homing finds lost), `pace_s` (wall time from point to point).
+    homing finds lost), `row_end` (where a row ends), `pace_s` (wall time from point to point).
     """
 
     def __init__(self, hub: Path | None, trigger: int = 26) -> None:
@@ -143,6 +152,7 @@ class FakeStage:
         self.seen: list[Command] = []
         self.bytes_seen: list[int] = []
         self.rows_run = 0
+        self.row_end: tuple[int, int] | None = None
         self._last: tuple[int, Reply] | None = None
         self._end: tuple[int, Reply] | None = None
         self._stopping = threading.Event()
@@ -311,6 +321,7 @@ class FakeStage:
             self.points += 1
             if i not in self.skip:
                 self._edge(self.t_ns)
+        self.x, self.y = self.row_end or _rest_after(c)
         if self.endless and self._stopping.wait():
             return StageError.STOPPED
         if self.extra:

@@ -54,6 +54,8 @@ class AdversarialCard(FakeCard):
 
     def _command(self, code: int, sender: tuple[str, int]) -> None:
         super()._command(code, sender)
+        if code == 1:
+            self.adversary.reset_by_host()
         if code in (5, 6):  # before the row runs; after its stop
             self._send(self.adversary.take_late(0.3))
 

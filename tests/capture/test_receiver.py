@@ -21,8 +21,8 @@ from tests.support.refusals import refused
 from polysight.acquisition.capture_rig import record_ended
 from polysight.capture.dca1000 import Status
 from polysight.capture.network import BatchReceiver, bind_udp
-from polysight.capture.placement import read_index
 from polysight.capture.receiver import Progress, ReceiverProcess
+from polysight.capture.row_files import read_index
 from polysight_shared.config import Board
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
@@ -220,13 +220,13 @@ def test_data_dropped_by_the_card_masks_the_row(board, card, tmp_path):
 def test_the_short_last_packet_is_reported_at_once(board, card, tmp_path):
     """Frames were missed: the byte count is never reached, and the card's short tail says that nothing follows."""
     with ReceiverProcess(board, 1 << 20) as receiver:
-        receiver.begin_row(0, 1, 40_960, 4096, tmp_path / "a.part")
+        receiver.begin_row(0, 1, 40_960, 4096, tmp_path / "a.part", after_reset=True)
         send(card, board, encode_packets(noise(36_864, 4), 1, 0))
         wait_for(lambda: receiver.poll().ended, "packets")
         assert not receiver.poll().complete
         row = receiver.end_row()
     assert not row.located
-    assert "4096 bytes (1 frames) early" in row.reason
+    assert "1 frames early" in row.reason
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from tests.support.store.faulty_disk import FaultyDisk, Killed
 from tests.support.store.plain_scan import errors
 
 from polysight.capture import PACKETS, Evidence, place_record, read_packets, write_index, write_packets
-from polysight.capture.record_search import Past
+from polysight.capture.placement import Past
 from polysight.jobs.recordings import inspect_placement, replace_folder
 from polysight.store import ManifestWriter, ScanFolder, replace_rows
 from polysight.store.logs import crc32

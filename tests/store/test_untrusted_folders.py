@@ -19,7 +19,7 @@ from tests.support.store.facts import facts_of
 
 from polysight.calibration import calibration_of_scan
 from polysight.capture import read_index, read_packets
-from polysight.capture.placement import PACKETS, RUN, write_durably
+from polysight.capture.row_files import PACKETS, RUN, write_durably
 from polysight.cli.main import main
 from polysight.materials.labels import read_labels, read_truth
 from polysight.materials.library import Library

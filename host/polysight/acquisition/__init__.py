@@ -2,7 +2,7 @@
 
 `run_scan` and `resume_scan` record every row that is not committed yet (`scan`). For each row (`row`): arm the radars
 and start the cards' records (`capture_rig`), let the Pi run the row (`pi_client`), compare the received data with the
-pulses sent, find pulses that a board missed by arrival times (`missed_pulses`), then commit the row or retake it.
+pulses sent, compare frames with pulses by arrival times (`pulse_times`), then commit the row or retake it.
 `ready` holds the checks before a row: homing, disk space, the Pi's configuration. `control` pauses and stops a running
 scan; `scan` also queues committed rows for processing and reports time left.
 """

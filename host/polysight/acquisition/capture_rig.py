@@ -52,6 +52,7 @@ class CaptureRig:
         self.cards: dict[str, CardClient] = {}
         self.receivers: dict[str, ReceiverProcess] = {}
         self._recording = False
+        self._start_lost = {board.name for board in instrument.recorded}  # it is unknown where their cards count
         with ExitStack() as stack:
             for board in instrument.recorded:
                 card = CardClient(board, instrument.limits.command_timeout_s)
@@ -83,11 +84,21 @@ class CaptureRig:
         return versions
 
     def begin_row(self, row: int, take: int, points: int, folder: Path) -> None:
-        """Arm the receivers, then start the records. Raises DeviceError."""
+        """Arm the receivers, then start the records. Raises DeviceError.
+
+        A card whose counters were lost track of is reset and configured first: it then counts from its first counters.
+        """
         frame_bytes = self._instrument.frame_bytes
         expected = points * self._instrument.burst.pulses * frame_bytes
+        reset = set(self._start_lost)
+        for name in reset:
+            self.cards[name].reset_fpga()
+            self.configure([name])
         for name, receiver in self.receivers.items():
-            receiver.begin_row(row, take, expected, frame_bytes, folder / "raw" / name / f"{row:04d}{PART}")
+            path = folder / "raw" / name / f"{row:04d}{PART}"
+            receiver.begin_row(row, take, expected, frame_bytes, path, after_reset=name in reset)
+            # Lost track of again, unless the row comes to its end.
+            self._start_lost.add(name)
         self._recording = True
         for card in self.cards.values():
             card.record_start()
@@ -123,7 +134,9 @@ class CaptureRig:
             if not receiver.poll().complete:  # nothing follows a complete row
                 self.cards[name].wait_completed(max(0.0, deadline - time.monotonic()))
         statuses = self.statuses()
-        return {name: receiver.end_row(statuses[name], not_before_ns) for name, receiver in self.receivers.items()}
+        rows = {name: receiver.end_row(statuses[name], not_before_ns) for name, receiver in self.receivers.items()}
+        self._start_lost = {name for name, row in rows.items() if row.start_lost}
+        return rows
 
     def stop_records(self) -> None:
         """Stop all records. Raises DeviceError."""

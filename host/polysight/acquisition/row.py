@@ -19,16 +19,16 @@ import zmq
 
 from polysight.acquisition.capture_rig import CaptureRig, record_ended
 from polysight.acquisition.control import StopRequest
-from polysight.acquisition.missed_pulses import (
+from polysight.acquisition.pi_client import PiClient
+from polysight.acquisition.pulse_times import (
     PlacedFrames,
     ReceivedCapture,
     describe,
     find_frames,
-    find_slip,
     first_pulse_ns,
+    frames_to_move,
     rewrite_row,
 )
-from polysight.acquisition.pi_client import PiClient
 from polysight.capture import PACKETS, RowCapture, silent_radar, valid_frames, write_error
 from polysight.radar import BoardState, RadarControl, RadarState
 from polysight.store import (
@@ -111,7 +111,7 @@ class Take:
     events: list[ReceivedCapture] = field(default_factory=list)
     radars: dict[str, BoardState] = field(default_factory=dict)  # latest states
     not_done: list[str] = field(default_factory=list)  # radars that did not confirm the end of all frames
-    placed: dict[str, PlacedFrames] = field(default_factory=dict)  # boards with missed pulses
+    frames: dict[str, PlacedFrames] = field(default_factory=dict)  # by arrival times, of rows with a certain length
 
     def faults(self, pulses_per_point: int) -> list[TakeFault]:
         """List the faults of this take; empty if it is complete."""
@@ -145,19 +145,34 @@ class Take:
             return TakeFault(FaultKind.COUNTS_DIFFER, text)
         return None
 
+    def displaced(self, name: str) -> PlacedFrames | None:
+        """Return where a board's frames are if they are not at their pulses; None if they are, or it is unknown."""
+        frames = self.frames.get(name)
+        if frames is None or frames.reason:
+            return None
+        return frames if self.captures[name].slipped or frames.contradicted else None
+
+    def untimed(self, name: str, pulses_per_point: int) -> int:
+        """Number of a board's frames whose pulse follows from their count alone, not from their arrival times."""
+        frames = self.frames.get(name)
+        if frames is None or frames.reason:
+            return self.row.points * pulses_per_point
+        return frames.uncertain
+
     def _fault_of(self, name: str, capture: RowCapture, pulses_per_point: int) -> TakeFault | None:
         """Return the fault of one board's data; None if it is complete."""
-        placed, radar = self.placed.get(name), self.radars.get(name, BoardState(RadarState.UNKNOWN))
+        placed, radar = self.displaced(name), self.radars.get(name, BoardState(RadarState.UNKNOWN))
         held = "; the row was held, and a card ends its record after 2 s without data" if self.note else ""
         if capture.packets == 0:
             detail = f": its radar was {radar.detail}, and may not have obeyed" if radar.detail else ""
             return TakeFault(FaultKind.NO_DATA, f"no data{detail}", name)
-        if placed is not None and not placed.reason:
+        if placed is not None:
             missed = FaultKind.PULSES_MISSED if placed.slots.size < placed.pulses else FaultKind.SLIPPED
             kind = FaultKind.HELD if held else missed
             return TakeFault(kind, describe(placed, pulses_per_point) + held, name)
         if not capture.located:
-            unplaced = f"; missed pulses cannot be located: {placed.reason}" if placed is not None else ""
+            frames = self.frames.get(name)
+            unplaced = f"; missed pulses cannot be located: {frames.reason}" if frames is not None else ""
             waits = "; the radar still waits for pulses" if radar.state is RadarState.ARMED else ""
             kind = FaultKind.RADAR_WAITS if waits else FaultKind.HELD if held else _unlocated(capture)
             return TakeFault(kind, capture.reason + unplaced + waits + held, name)
@@ -213,10 +228,13 @@ def commit_row(
     boards: dict[str, BoardRow] = {}
     for name, capture in take.captures.items():
         final = scan.row_path(name, take.row.index)
-        placed = take.placed.get(name)
-        if placed is not None and not placed.reason:
-            capture = rewrite_row(final.with_suffix(PART), capture, placed, scan.instrument.frame_bytes)
+        displaced = take.displaced(name)
+        moved = frames_to_move(capture.located, capture.slipped, bool(capture.missing), take.frames.get(name))
+        untimed = take.untimed(name, scan.instrument.burst.pulses)
+        if moved is not None:
+            capture = rewrite_row(final.with_suffix(PART), capture, moved, scan.instrument.frame_bytes)
             take.captures[name] = capture
+            untimed = 0
         try:
             final.with_suffix(PART).rename(final)
         except OSError as e:
@@ -231,7 +249,8 @@ def commit_row(
             crc32=f"{capture.crc32:08x}",
             index_crc32=f"{capture.index_crc32:08x}",
             packets_crc32=f"{capture.packets_crc32:08x}" if capture.packets_crc32 else "",
-            pulses_missed=None if placed is None else placed.pulses - placed.slots.size,
+            pulses_missed=None if displaced is None else displaced.pulses - displaced.slots.size,
+            frames_untimed=untimed if capture.located else 0,
             **_reception(capture),
         )
     writer.append(
@@ -407,7 +426,7 @@ class RowTaker:
         self._end_records(take)
         take.radars = self._radars.states()
         if take.all_pulses_sent:
-            self._find_missed_pulses(take)
+            self._time_frames(take)
         transaction.to(RowState.CHECKING)
         return take
 
@@ -510,14 +529,12 @@ class RowTaker:
                 self._notify("wait", f"row {take.row.index} is not written after {waited_s:.0f} s: the disk is slow")
             take.captures = ending.result()
 
-    def _find_missed_pulses(self, take: Take) -> None:
-        """Place the frames of boards that missed pulses or whose frames slipped; every pulse was sent."""
+    def _time_frames(self, take: Take) -> None:
+        """Compare the frames of boards whose record has a certain length with the pulses; every pulse was sent."""
         for name, capture in take.captures.items():
             path = self._folder / "raw" / name / f"{take.row.index:04d}{PART}"
-            if capture.slipped:
-                take.placed[name] = find_frames(path, take.row, take.events, self._instrument)
-            elif not capture.missing and (slipped := find_slip(path, take.row, take.events, self._instrument)):
-                take.placed[name] = slipped
+            if capture.located or capture.slipped:
+                take.frames[name] = find_frames(path, take.row, take.events, self._instrument, capture.holes)
 
 
 class _SilenceCheck:

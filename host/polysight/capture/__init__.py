@@ -2,8 +2,8 @@
 
 * Control: `CardClient` sends commands to a card over UDP; `survey_cards` checks each hop to it (`card`, `network`).
 * Reception: `ReceiverProcess` drives one process per card (`receiver`, `receiver_process`), which logs packets and
-  writes a row's files (`placement`); `RowCapture` lists missing bytes and counts dropped packets.
-* Placement: `record_search` finds the row's record among its packets, `placement` puts their payload in place.
+  writes a row's files (`row_files`); `RowCapture` lists missing bytes and counts dropped packets.
+* Placement: `placement` decides which packets (`packet_log`) are the row, and where each byte belongs.
 * Formats: `dca1000` has those of the card, `row_words` converts payload to samples; `inspect_bin` and `inspect_pcap`
   examine a recording.
 """
@@ -22,18 +22,7 @@ from polysight.capture.dca1000 import (
 )
 from polysight.capture.inspect import CardReport, Layout, Report, inspect_bin, inspect_pcap, is_pcap, kind_of
 from polysight.capture.network import check_receive_buffer, route_interface, silent_radar
-from polysight.capture.placement import (
-    PACKETS,
-    Evidence,
-    Placed,
-    place_record,
-    read_index,
-    read_packets,
-    write_durably,
-    write_error,
-    write_index,
-    write_packets,
-)
+from polysight.capture.placement import Evidence, Placed, place_record
 from polysight.capture.receiver import (
     PRIORITY_REMEDY,
     Progress,
@@ -41,6 +30,15 @@ from polysight.capture.receiver import (
     RowCapture,
     receiver_cores,
     take_priority,
+)
+from polysight.capture.row_files import (
+    PACKETS,
+    read_index,
+    read_packets,
+    write_durably,
+    write_error,
+    write_index,
+    write_packets,
 )
 
 __all__ = [

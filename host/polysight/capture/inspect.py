@@ -19,9 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.capture import dca1000
-from polysight.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Code, Status, decode_row, decode_two_lane
-from polysight.capture.placement import Placed, place_record
-from polysight.capture.record_search import PacketLog, counter_differences
+from polysight.capture.dca1000 import (
+    MAX_PACKET_BYTES,
+    MAX_PAYLOAD_BYTES,
+    Code,
+    Counters,
+    Status,
+    decode_row,
+    decode_two_lane,
+)
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import Past, Placed, counter_differences, place_record
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, ProtocolError
 from polysight_shared.files import read_bounded
@@ -142,7 +150,8 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
     log = PacketLog(size)
     for packet in packets:
         log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), 0)
-    placed, out = place_record(log)
+    sequence, byte_count = dca1000.decode_packet_header(packets[int(np.argmin(ahead))])
+    placed, out = place_record(log, past=Past(Counters(byte_count, sequence)))
     return out, placed
 
 

@@ -1,41 +1,62 @@
-"""Place the payload of a row's packets when the row has ended, bit-exact, and count its packets.
+"""Which packets are a row, and where each byte belongs: the whole decision (docs/spec/placement.md).
 
-`find_record` selects the row's packets and its start; `place_record` puts their payload in place, compares overlapping
-packets and lists missing bytes. A row that cannot be located with certainty is masked as a whole: data is original or
-masked, never guessed. The model: docs/spec/placement.md.
+A card numbers every byte that it sends. If the counters of the row's first byte are known, each packet says by itself
+where it belongs; packets behind them are left over, packets elsewhere are another record's. So one thing has to be
+known, the start, and one has to be seen, the end: a card that drops bytes before numbering them, or a radar that misses
+or adds a frame, shows it only in the length of the record. A row is *located* if it starts where it must and ends where
+it must. Everything else is masked as a whole; data is original or masked, never guessed.
 
-The three files of one row of one board (docs/spec/scan-folder.md).
-
-`Segment` writes the payload (`.bin`, `.part` before the commit);
-`write_index` the counts, gaps and arrivals (`.idx`); `write_packets` the packets themselves (`.pkt`), from which the
-row can be placed again.
+States (`Past`): nothing came before (*first*), the start is *known*, or it is *lost*. A card whose start is lost is
+reset by the host before the next row, which makes it known again.
 """
 
 from __future__ import annotations
 
-import errno
-import json
-import os
-import zlib
-from contextlib import ExitStack
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.capture.dca1000 import Counters
-from polysight.capture.record_search import CounterView, Found, PacketLog, Past, find_record, line_of, past_after
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, DeviceError
-from polysight_shared.files import open_to_write, read_bounded
+from polysight.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, SEQUENCE_BITS, Counters
+from polysight.capture.packet_log import PacketLog
 
+Bytes = NDArray[np.uint8]
+Counts = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+Gap = tuple[int, int]
 
-PAIR = np.dtype("<i8")
-MAX_INDEX_BYTES = 256 << 20  # sixteen million batches of packets
+SWITCHED_ON = Counters(0, 1)
+"""Counters of the first packet of a card that was switched on or reset."""
+SMALL_RECORD = 16
+"""Packets below which a whole record may come late; a later one is no evidence of where the card counts."""
+JOINS = 2
+"""Records that join a whole one at another place than predicted, after which the card is taken to count there."""
+RESTARTS = 2
+"""Whole records in which the card counts anew, after which it is taken to do so in every record."""
+# Fewer packets with strange counters are damaged ones.
+MIN_PACKETS_OF_A_RECORD = 3
+# Packets by which a network does not delay one behind others.
+_FAR_BEHIND = 64
+# A packet size seen in fewer packets may be that of last packets, which are short.
+_MIN_PACKETS_OF_A_SIZE = 3
+
+
+@dataclass(frozen=True)
+class Past:
+    """Where the next record begins, from the records before it. `Past()` is the state *first*."""
+
+    start: Counters | None = None  # of the next record's first byte; None: unknown
+    lost: bool = False  # unknown, and packets of earlier records may still come
+    restarts: int = 0  # whole records that did not begin where they had to, but with a card's first counters
+    elsewhere: Counters | None = None  # end of a whole record at another place than predicted, alone in its row
+    joined: int = 0  # records that joined it without a gap
+    undelivered: tuple[Gap, ...] = ()  # of the last record, if the next has the same counters: may come with it
+
+    def after_reset(self) -> Past:
+        """Return the knowledge after the host has reset the card: its memory is empty and it counts anew."""
+        return replace(self, start=SWITCHED_ON, lost=False, undelivered=())
 
 
 @dataclass
@@ -55,78 +76,6 @@ class PacketCounts:
     short: int = 0  # placed, not full; normally only the last of a record
     before_pulses: int = 0  # leftover, identified by arrival before the row's first pulse
     clock_jumps: int = 0  # number of times the arrival clock went backwards
-
-
-def count_packets(
-    log: PacketLog, found: Found, past: Past, placed: Flags, duplicate: Flags, conflicting: Flags
-) -> PacketCounts:
-    """Count a row's packets. `placed`, `duplicate`, `conflicting`: bool [packet], disjoint.
-
-    If the card restarted within the row, packets before the restart count as `placed` and later ones as `restarted`,
-    whichever of them the search took for the record: such a row is masked, unless its start was known.
-    """
-    before, after = _restart(log, found, past, conflicting)
-    placed, duplicate = (placed | before) & ~after, duplicate & ~after & ~before
-    conflicting = conflicting & ~after & ~before
-    left = (found.early | found.old) & ~(after | before)
-    rest = ~(placed | duplicate | conflicting | left | after)
-    beyond = (found.offsets >= log.expected) & (found.steps > 0) & (found.offsets < 2 * log.expected)
-    outside = rest & (found.own | beyond)
-    left |= rest & ~outside & (found.offsets < 0) & (found.steps < 0)
-    return PacketCounts(
-        placed=int(placed.sum()),
-        duplicates=int(duplicate.sum()),
-        conflicting=int(conflicting.sum()),
-        leftover=int(left.sum()),
-        restarted=int(after.sum()),
-        outside=int(outside.sum()),
-        disagreeing=int((rest & ~outside & ~left).sum()),
-        malformed=log.malformed,
-        before_pulses=int((found.early & left).sum()),
-        clock_jumps=found.clock_jumps,
-    )
-
-
-def _restart(log: PacketLog, found: Found, past: Past, conflicting: Flags) -> tuple[Flags, Flags]:
-    """Select the row's packets before and after a restart of the card, bool [packet] each; none without a restart.
-
-    After a reset the first packet has sequence 1 and byte count 0. A row may also begin with these counters, so a
-    restart needs other packets of the row before them, or packets with the same counters and other bytes.
-    """
-    nothing, index = np.zeros(log.count, dtype=np.bool_), np.arange(log.count)
-    counts = log.byte_counts
-    switched_on = (counts == found.full * (log.sequences - 1)) & (counts < log.expected) & ~found.early
-    if not switched_on.any():
-        return nothing, nothing
-    if (conflicting & switched_on & (counts == 0)).any():
-        first = int(np.argmax(conflicting & switched_on))
-        return switched_on & (index < first) & ~found.old, switched_on & (index >= first)
-    packets = CounterView(log, past.base or Counters(0, 0), found.full)
-    repeated = found.repeated if found.repeated is not None else nothing
-    switched_on &= repeated | ~packets.inside(past.spans, sure=True)  # otherwise left over from a known record
-    if found.located:
-        return nothing, switched_on & ~found.own & (index > np.argmax(found.own))
-    before = _before_restart(packets, past, ~(found.early | found.old | repeated | switched_on), log.expected)
-    after = (repeated | switched_on) & (index > np.argmax(before)) & before.any()
-    return (before, after) if after.any() else (nothing, nothing)
-
-
-def _before_restart(packets: CounterView, past: Past, live: Flags, expected: int) -> Flags:
-    """Select the row's packets before a restart: at its expected start, or if that is unknown, the largest group."""
-    if past.base is None:
-        lines, many = np.unique(packets.line[live], return_counts=True)
-        return live & np.isin(packets.line, lines[(many == many.max(initial=0)) & (many > 1)][:1])
-    selected = np.zeros(live.size, dtype=np.bool_)
-    for end in past.ends:
-        inside = (packets.ahead >= end) & (packets.ahead < end + expected)
-        selected |= live & inside & (packets.line == line_of(end, packets.full))
-    return selected
-
-
-Gap = tuple[int, int]
-Bytes = NDArray[np.uint8]
-Counts = NDArray[np.int64]
-_RESTARTED = "the card restarted"
 
 
 @dataclass(frozen=True)
@@ -155,7 +104,7 @@ class Placed:
     arrivals: Counts  # int64 [n, 2]: time (monotonic, ns), bytes received by then; no growth: the socket was empty
     conflicts: list[Gap] = field(default_factory=list)  # byte ranges with different bytes in two packets; missing
     holes: list[Gap] = field(default_factory=list)  # missing ranges below the furthest byte, in the card's order
-    slipped: bool = False  # not located only because frames may be missing (missed triggers)
+    slipped: bool = False  # not located only because whole frames are missing: triggers were missed
 
     @property
     def complete(self) -> bool:
@@ -185,6 +134,16 @@ class Preview:
     ended: bool
 
 
+class Evidence(msgspec.Struct, frozen=True):
+    """Inputs for placing a row, beside its packets; as of :func:`place_record`."""
+
+    expected: int
+    frame_bytes: int
+    not_before_ns: int = 0
+    dropped_by_card: str = ""
+    past: Past = Past()
+
+
 def place_record(
     log: PacketLog, frame_bytes: int = 1, past: Past | None = None, not_before_ns: int = 0, dropped_by_card: str = ""
 ) -> tuple[Placed, Bytes]:
@@ -195,8 +154,7 @@ def place_record(
     log
         The packets; the returned row may share its memory.
     frame_bytes
-        Bytes of one frame, 1 if the record has no frames. A record that ends a whole number of frames early has missed
-        triggers at unknown places.
+        Bytes of one frame, 1 if the record has no frames.
     past
         Knowledge from earlier records.
     not_before_ns
@@ -206,81 +164,310 @@ def place_record(
         missing without a gap in the counters, so that no byte's place is certain.
     """
     past = past or Past()
-    found = find_record(log, frame_bytes, past, not_before_ns)
-    row = _Row(log, found, past)
-    located, reason = found.located, found.reason
-    if dropped_by_card:
-        located, reason = False, f"the card dropped data before numbering it ({dropped_by_card})"
-    row.put_in_place()
-    if located and row.conflicts and not found.start_known:
-        located, reason = False, "packets with the same counters have different bytes: the card may have restarted"
-    if not located and row.counts.restarted and _RESTARTED not in reason:
-        reason = f"{_RESTARTED} within it" + (f"; {reason}" if found.certain else "")
-    holes = _merged([*_gaps(row.covered, row.extent), *row.conflicts])
+    record = _find_record(log, past, not_before_ns)
+    row = _Row(log, record)
+    why = _why_not_located(record, row, log, frame_bytes)
+    if not why.text and dropped_by_card:
+        why = _Doubt(f"the card dropped data before numbering it ({dropped_by_card})")
+    located = not why.text
+    undelivered = list(past.undelivered) if record.start == past.start else []
+    holes = _merged([*_gaps(row.covered, row.extent), *row.conflicts, *undelivered])
     missing = _merged([*holes, *([(row.extent, log.expected)] if row.extent < log.expected else [])])
     out = row.bytes(missing if located else holes)
     placed = Placed(
-        log.expected,
-        row.received,
-        missing if located else [(0, log.expected)] if log.expected else [],
-        located,
-        reason,
-        row.counts,
-        _losses(missing, row.extent, log.expected),
-        past_after(past, found, log, located, frame_bytes),
-        row.at,
-        row.arrivals(),
-        _merged(row.conflicts),
-        holes,
-        slipped=not located
-        and (found.certain or (found.fresh and not row.counts.restarted))
-        and row.extent > 0
-        and not dropped_by_card,
+        expected=log.expected,
+        received=row.received,
+        missing=missing if located else [(0, log.expected)] if log.expected else [],
+        located=located,
+        reason=why.text,
+        counts=row.counts,
+        losses=_losses(missing, row.extent, log.expected),
+        past=_past_after(past, record, _gaps(row.covered, log.expected)),
+        at=row.at,
+        arrivals=row.arrivals(),
+        conflicts=_merged(row.conflicts),
+        holes=holes,
+        slipped=why.frames_missing and not dropped_by_card,
     )
     return placed, out
 
 
-def preview(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int) -> Preview:
+def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
     """Return the progress of a row from its packets so far, without comparing or copying payload."""
-    found = find_record(log, frame_bytes, past, not_before_ns)
-    own = found.own & (found.offsets < log.expected)
-    if not own.any():
+    record = _find_record(log, past, not_before_ns)
+    if not record.own.any():
         return Preview(0, log.expected == 0, ended=False)
-    starts, ends = found.offsets[own], np.minimum((found.offsets + log.sizes)[own], log.expected)
+    starts = record.offsets[record.own]
+    ends = np.minimum(starts + log.sizes[record.own], log.expected)
     order = np.lexsort((ends, starts))
     reached = np.maximum.accumulate(ends[order])
     fresh = reached - np.maximum(np.append(0, reached[:-1]), starts[order])
     received = int(np.maximum(fresh, 0).sum())
-    ended = bool((log.sizes[own][ends == ends.max()] < found.full).all())
-    return Preview(received, found.located and received == log.expected, ended)
+    complete = record.start_is_certain and record.ends_as_planned and received == log.expected
+    return Preview(received, complete, record.ended)
+
+
+# ---- evidence -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Record:
+    """The row's record among the packets; arrays are [packet]."""
+
+    start: Counters | None  # counters of its first byte; None without any packet
+    start_is_certain: bool
+    offsets: Counts  # int64, bytes behind the start
+    steps: Counts  # int64, packets behind the start
+    own: Flags  # counters within the row, and came after the first pulse
+    beyond: Flags  # counts on from this record behind the row's last byte
+    later: Flags  # of a record behind this one
+    early: Flags  # came before the row's first pulse
+    too_early: Flags  # of these, the ones with counters of the row
+    anew: Flags  # has counters of a card that restarted within the row
+    full: int  # payload of a full packet, bytes
+    length: int = 0  # bytes up to the end of the furthest packet
+    ended: bool = False  # that packet is short, as only a record's last one is
+    ends_as_planned: bool = False  # every sign of an end at the row's last byte
+    clock_jumps: int = 0
+    doubt: str = ""  # why the start is not certain
+
+
+def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
+    """Select the row's packets by where the record starts: as predicted, or else where a whole record stands."""
+    full = find_full_payload(log)
+    jumps = int((np.diff(log.batches[:, 0]) < 0).sum())
+    early = np.zeros(log.count, dtype=np.bool_) if jumps else log.arrivals_ns < not_before_ns
+    if past.start is not None:
+        record = _record_at(log, past.start, full, early, jumps)
+        if record.own.any() or not (~early).any():
+            return record
+    # The largest group of packets that count on from each other, and where it would begin if its end is the row's.
+    live = np.flatnonzero(~early)
+    if not live.size:
+        return _record_at(log, past.start or SWITCHED_ON, full, early, jumps)
+    seen_first = Counters(int(log.byte_counts[live[0]]), int(log.sequences[live[0]]))
+    ahead = counter_differences(log.byte_counts, seen_first.byte_count, BYTE_COUNT_BITS)
+    steps = counter_differences(log.sequences, seen_first.sequence, SEQUENCE_BITS)
+    _, group, packets = np.unique((ahead - full * steps)[live], return_inverse=True, return_counts=True)
+    own = live[group == int(np.argmax(packets))]
+    lowest = own[int(np.argmin(ahead[own]))]
+    start = Counters(int(log.byte_counts[lowest]), int(log.sequences[lowest]))
+    record = _record_at(log, start, full, early, jumps)
+    if not record.ends_as_planned:
+        return _doubted(record, "the record is not whole, and its start is unknown")
+    if past.start is not None:
+        # A card whose counters a reset leaves as they are shows it by whole records that join each other.
+        counts_on = start == past.elsewhere and past.joined + 1 >= JOINS and not (~record.own & ~early).any()
+        return record if counts_on else _doubted(record, "the record does not begin where the card counts")
+    if past.lost:
+        return _doubted(record, "it is unknown where the last record ended")
+    others = ~record.own & ~early
+    behind = others & (record.offsets < 0) & (record.steps < 0)
+    if (others & ~behind).any() or 2 * int(log.sizes[behind].sum()) >= log.expected:
+        return _doubted(record, "packets of another record came with it")
+    offsets, sizes = record.offsets[record.own], log.sizes[record.own]
+    ended_before = ((sizes < full) & (offsets + sizes < record.length)).any()
+    _, first_arrival = np.unique(offsets, return_index=True)
+    if ended_before or (np.diff(first_arrival) < 0).any():
+        return _doubted(record, "its packets did not come in order, and its start is unknown")
+    return record
+
+
+def _doubted(record: _Record, doubt: str) -> _Record:
+    return replace(record, start_is_certain=False, doubt=doubt)
+
+
+def _record_at(log: PacketLog, start: Counters, full: int, early: Flags, jumps: int) -> _Record:
+    """Select the packets of a record that starts with these counters."""
+    sizes, expected = log.sizes, log.expected
+    offsets = counter_differences(log.byte_counts, start.byte_count, BYTE_COUNT_BITS)
+    steps = counter_differences(log.sequences, start.sequence, SEQUENCE_BITS)
+    on_line = (offsets == full * steps) & (offsets >= 0)
+    own = on_line & (offsets < expected) & ~early
+    length, ended = 0, False
+    if own.any():
+        stops = (offsets + sizes)[own]
+        length = int(stops.max())
+        ended = bool((sizes[own][stops == length] < full).all())
+    near = (offsets < 2 * expected + 2 * full) & (steps > 0) & (steps * full < 4 * expected + 4 * full) & ~early
+    beyond = near & on_line & (offsets >= expected)
+    later = near & ~on_line & (offsets >= max(length, full))
+    ends_in_short = expected % full > 0
+    as_planned = length == expected and ended is ends_in_short and not beyond.any()
+    anew = np.zeros_like(own)
+    if start.byte_count > 2 * expected and own.any():
+        anew = (log.byte_counts == full * (log.sequences - 1)) & (log.byte_counts < expected) & ~early & ~own
+        anew &= np.arange(log.count) > int(np.argmax(own))
+    return _Record(
+        start=start,
+        start_is_certain=True,
+        offsets=offsets,
+        steps=steps,
+        own=own,
+        beyond=beyond,
+        later=later & ~anew,
+        early=early,
+        too_early=early & on_line & (offsets < expected),
+        anew=anew,
+        full=full,
+        length=length,
+        ended=ended,
+        ends_as_planned=as_planned,
+        clock_jumps=jumps,
+    )
+
+
+def counter_differences(counters: Counts, origin: int, bits: int) -> Counts:
+    """Return `counters - origin`, int64 [n], of counters that wrap after `bits` bits; nearest to zero."""
+    spare = 64 - bits
+    wrapped = (counters.astype(np.uint64) - np.uint64(origin)) << np.uint64(spare)  # the counter's top bit is the sign
+    return wrapped.view(np.int64) >> np.int64(spare)
+
+
+def find_full_payload(log: PacketLog) -> int:
+    """Payload of a full packet in bytes: the card's default unless most packets of a longer row have another."""
+    row_fits_one_packet = log.expected < MAX_PAYLOAD_BYTES
+    default_is_seen = bool((log.sizes == MAX_PAYLOAD_BYTES).any())
+    if row_fits_one_packet or default_is_seen or log.count == 0:
+        return MAX_PAYLOAD_BYTES
+
+    # A packet that came twice counts once.
+    _, first_index = np.unique(log.byte_counts, return_index=True)
+    sizes, packets = np.unique(log.sizes[first_index], return_counts=True)
+    if packets.max() < _MIN_PACKETS_OF_A_SIZE:
+        return MAX_PAYLOAD_BYTES
+    return int(sizes[packets == packets.max()].max())
+
+
+# ---- decision -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Doubt:
+    """Why a record is not located; "" if it is. `frames_missing`: only because whole frames are missing."""
+
+    text: str = ""
+    frames_missing: bool = False
+
+
+def _why_not_located(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) -> _Doubt:
+    """Decide if the place of every byte is certain."""
+    expected = log.expected
+    if expected == 0:
+        return _Doubt()
+    if log.count == 0:
+        return _Doubt("no packet came")
+    if not record.own.any():
+        return _Doubt("every packet is of an earlier record, by its counters or by its arrival before the first pulse")
+    if record.doubt:
+        return _Doubt(record.doubt)
+    # A card that restarts within the row counts from its first counters on: again, if the row began with them.
+    counted_twice = bool(row.conflicts) or row.counts.late_by_bytes > _FAR_BEHIND * record.full
+    if row.counts.restarted or (record.start == SWITCHED_ON and counted_twice):
+        return _Doubt("the card restarted within it")
+    if record.too_early.any():
+        return _Doubt("frames came before the first pulse was sent: spurious edges on SYNC_IN")
+    if record.length > expected or record.beyond.any():
+        return _Doubt("more bytes came than the row has: the radar saw spurious triggers")
+    if record.later.sum() >= MIN_PACKETS_OF_A_RECORD:
+        return _Doubt("packets of a later record came with it: the card ended this one and began another")
+    if record.ends_as_planned:
+        return _Doubt()
+    missing = expected - record.length
+    if not record.ended:
+        return _Doubt(
+            f"the end of the record did not come ({missing} bytes): without it, data that the card dropped unnoticed or"
+            " missed SYNC_IN pulses do not show"
+        )
+    if missing % frame_bytes or frame_bytes == 1:
+        return _Doubt(f"the record ended {missing} bytes early: the card dropped data before numbering it")
+    text = f"the record ended {missing // frame_bytes} frames early: missed SYNC_IN pulses"
+    # Frames are moved by their arrival only in a record about which nothing else is unclear.
+    clean = row.counts.late == 0 and not row.conflicts and not record.later.any()
+    return _Doubt(text, frames_missing=clean)
+
+
+def _past_after(past: Past, record: _Record, undelivered: list[Gap]) -> Past:
+    """Return where the next record begins."""
+    if record.start is None or not record.own.any() or record.later.any() or record.anew.any():
+        return Past(lost=True, restarts=past.restarts)
+    length = record.length
+    # Only a short packet, or the last planned byte of a record of full packets, is a record's end.
+    end_is_known = record.ended or record.ends_as_planned
+    if not end_is_known or record.beyond.any():
+        return Past(lost=True, restarts=past.restarts)
+    next_start = record.start.after(length, -(-length // record.full))
+    if record.start_is_certain:
+        if past.restarts >= RESTARTS:
+            return Past(start=SWITCHED_ON, restarts=past.restarts, undelivered=tuple(undelivered))
+        chained = past.start is not None and past.start != SWITCHED_ON
+        return Past(start=next_start, restarts=0 if chained else past.restarts)
+    # The end of a scan's first record is one wherever that began.
+    if past == Past() and record.ended:
+        return Past(start=next_start)
+    # A whole record at another place than predicted is not trusted: it may be a second card's.
+    lost = Past(lost=True, restarts=past.restarts)
+    if not record.ends_as_planned or length < SMALL_RECORD * record.full or (~record.own & ~record.early).any():
+        return lost
+    if record.start != SWITCHED_ON:
+        joined = past.joined + 1 if record.start == past.elsewhere else 0
+        return replace(lost, elsewhere=next_start, joined=joined)
+    if past.restarts + 1 >= RESTARTS:
+        return Past(start=SWITCHED_ON, restarts=past.restarts + 1, undelivered=tuple(undelivered))
+    return replace(lost, restarts=past.restarts + 1)
+
+
+def _count_packets(
+    log: PacketLog, record: _Record, placed: Flags, duplicate: Flags, conflicting: Flags
+) -> PacketCounts:
+    """Count a row's packets. `placed`, `duplicate`, `conflicting`: bool [packet], disjoint."""
+    rest = ~(placed | duplicate | conflicting)
+    leftover = rest & (record.early | ((record.offsets < 0) & (record.steps < 0) & ~record.anew))
+    restarted = rest & record.anew & ~leftover
+    rest &= ~(leftover | restarted)
+    behind_the_row = (record.offsets >= log.expected) & (record.steps > 0) & (record.offsets < 2 * log.expected)
+    outside = rest & (record.own | record.beyond | behind_the_row)
+    return PacketCounts(
+        placed=int(placed.sum()),
+        duplicates=int(duplicate.sum()),
+        conflicting=int(conflicting.sum()),
+        leftover=int(leftover.sum()),
+        restarted=int(restarted.sum()),
+        outside=int(outside.sum()),
+        disagreeing=int((rest & ~outside).sum()),
+        malformed=log.malformed,
+        before_pulses=int((record.early & leftover).sum()),
+        clock_jumps=record.clock_jumps,
+    )
+
+
+# ---- bytes --------------------------------------------------------------------------------------------------------
 
 
 class _Row:
     """Puts the packets of a record in place."""
 
-    def __init__(self, log: PacketLog, found: Found, past: Past) -> None:
-        self._log, self._found, self._past = log, found, past
+    def __init__(self, log: PacketLog, record: _Record) -> None:
+        self._log, self._record = log, record
         self._sizes, self._starts = log.sizes, np.cumsum(log.sizes) - log.sizes
         kept = np.arange(log.count) < log.kept
-        self._own = found.own & (found.offsets < log.expected) & kept
+        self._own = record.own & kept
         self.at: Counts = np.full(log.count, -1, dtype=np.int64)
         self.covered: list[Gap] = []  # sorted, joined
         self.conflicts: list[Gap] = []
         self.received = self.extent = 0
-        self._stops = np.minimum(found.offsets + self._sizes, log.expected)
+        self._stops = np.minimum(record.offsets + self._sizes, log.expected)
         self._placed, self._duplicate, self._conflicting = np.zeros((3, log.count), dtype=np.bool_)
-        self.counts = PacketCounts()
-
-    def put_in_place(self) -> None:
-        """Select the packets to place, and compare those that overlap."""
         self._place()
-        self.counts = count_packets(
-            self._log, self._found, self._past, self._placed, self._duplicate, self._conflicting
-        )
+        self.counts = _count_packets(log, record, self._placed, self._duplicate, self._conflicting)
+        self._measure()
+
+    def _measure(self) -> None:
+        """Find what is covered, and what came late."""
         mine = np.flatnonzero(self._placed)
         if not mine.size:
             return
-        starts, stops = self._found.offsets[mine], self._stops[mine]
+        starts, stops = self._record.offsets[mine], self._stops[mine]
         order = np.argsort(starts, kind="stable")
         a, b = starts[order], np.maximum.accumulate(stops[order])
         new = np.flatnonzero(np.append(True, a[1:] > b[:-1]))
@@ -290,12 +477,12 @@ class _Row:
         behind = reached - starts
         self.counts.late = int((behind > 0).sum())
         self.counts.late_by_bytes = max(0, int(behind.max()))
-        self.counts.short = int((self._sizes[mine] < self._found.full).sum())
+        self.counts.short = int((self._sizes[mine] < self._record.full).sum())
 
     def _place(self) -> None:
         """Of packets at the same place, select the first and any with more bytes."""
         own = np.flatnonzero(self._own)
-        offsets = self._found.offsets[own]
+        offsets = self._record.offsets[own]
         order = np.argsort(offsets, kind="stable")
         sorted_offsets = offsets[order]
         new = np.append(True, np.diff(sorted_offsets) != 0)[: order.size]
@@ -312,7 +499,7 @@ class _Row:
         """Compare packets of one place, in order of arrival, with the longest so far."""
         longest = packets[0]
         for k in packets[1:]:
-            offset = int(self._found.offsets[k])
+            offset = int(self._record.offsets[k])
             both = min(int(self._stops[k]), int(self._stops[longest])) - offset
             if not np.array_equal(self._payload(k)[:both], self._payload(longest)[:both]):
                 self.conflicts.append((offset, offset + both))
@@ -385,226 +572,3 @@ def _merged(gaps: list[Gap]) -> list[Gap]:
         else:
             out.append((start, stop))
     return out
-
-
-def _scan_of(path: Path) -> Path:
-    """The scan folder of `SCAN/raw/BOARD/ROW.*`; of a file elsewhere, its own folder."""
-    return path.parents[2] if path.parent.parent.name == "raw" else path.parent
-
-
-def write_error(path: Path, done: str, e: OSError) -> DeviceError:
-    """Return the error for a file of a scan that cannot be `done`: written, opened, renamed..."""
-    full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    return DeviceError(
-        f"{path}: cannot be {done}: {e.strerror}",
-        "the disk is full, read-only or fails",
-        f"free space, then `polysight resume {_scan_of(path)}` continues after the last committed row",
-        code=ErrorCode.DISK_FULL if full else ErrorCode.FILE_UNWRITABLE,
-    )
-
-
-def damaged(path: Path) -> tuple[str, str]:
-    """Return cause and remedy for a row's file that cannot be read."""
-    return "the file is damaged or truncated", f"`polysight validate {_scan_of(path)}` names every damaged file"
-
-
-class Segment:
-    """A file of `size` bytes with reserved disk space, which :meth:`finish` writes at once; its folder is made.
-
-    A mapped file could block the receiver while the kernel writes it back, and the receive buffer holds only a quarter
-    of a second. A row that is not finished is taken again anyway.
-
-    Raises
-    ------
-    DeviceError
-        if the disk is full or cannot be written.
-    """
-
-    def __init__(self, path: Path, size: int) -> None:
-        self.path = path
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with ExitStack() as stack:
-                self._file = stack.enter_context(open_to_write(path, "w+b", 0))
-                stack.callback(path.unlink, missing_ok=True)
-                if size:
-                    # Reserve the space now: a full disk must be an error here, not after the row.
-                    os.posix_fallocate(self._file.fileno(), 0, size)
-                stack.pop_all()
-        except OSError as e:
-            raise write_error(path, f"reserved ({size} bytes)", e) from None
-
-    def finish(self, data: NDArray[np.uint8]) -> int:
-        """Write the bytes durably, close the file, and return their CRC-32. Raises DeviceError if the disk fails."""
-        left = np.ascontiguousarray(data).data
-        crc = zlib.crc32(left)
-        try:
-            while left:
-                left = left[self._file.write(left) :]
-            os.fsync(self._file.fileno())
-        except OSError as e:
-            raise write_error(self.path, "made durable", e) from None
-        finally:
-            self.close()
-        return crc
-
-    def close(self) -> None:
-        """Close the file. Safe to repeat."""
-        self._file.close()
-
-    def discard(self) -> None:
-        """Close and remove the file."""
-        self.close()
-        self.path.unlink(missing_ok=True)
-
-
-def write_index(path: Path, facts: dict[str, Any], arrivals: NDArray[np.int64]) -> int:
-    """Write a row's index durably and return its CRC-32. `arrivals` is int64 [n, 2]. Raises DeviceError."""
-    head = json.dumps({**facts, "arrivals": len(arrivals)}, sort_keys=True, separators=(",", ":"))
-    raw = head.encode("ascii") + b"\n" + arrivals.astype(PAIR).tobytes()
-    return write_durably(path, raw)
-
-
-def write_durably(path: Path, raw: bytes) -> int:
-    """Write a file durably and return its CRC-32. Raises DeviceError."""
-    try:
-        with open_to_write(path) as f:
-            f.write(raw)
-            f.flush()
-            os.fsync(f.fileno())
-    except OSError as e:
-        raise write_error(path, "written", e) from None
-    return zlib.crc32(raw)
-
-
-def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
-    """Read the facts and arrivals (int64 [n, 2]) of a row's index. Raises DataError if missing or damaged."""
-    try:
-        head, _, tail = read_bounded(path, MAX_INDEX_BYTES).partition(b"\n")
-        facts = json.loads(head)
-        pairs = np.frombuffer(tail, dtype=PAIR).reshape(-1, 2).astype(np.int64)
-    except (OSError, ValueError, RecursionError) as e:
-        what = f"{path}: not a readable row index: {e}"
-        raise DataError(what, *damaged(path), code=ErrorCode.FILE_DAMAGED) from None
-    if not isinstance(facts, dict) or facts.get("arrivals") != len(pairs):
-        raise DataError(f"{path}: the row index is incomplete", *damaged(path), code=ErrorCode.FILE_DAMAGED)
-    return facts, pairs
-
-
-PACKETS = ".pkt"  # suffix, beside the row's file
-FORMAT = 1
-RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), ("size", "<u2"), ("place", "<i8")])
-"""Run of consecutive packets of one size: counters of the first, number of packets, payload of each, and its place.
-
-`place` is an offset in the row's file; or, below zero, `-1 - offset` in this file's own payload.
-"""
-BATCH = np.dtype("<i8")  # pairs: time (CLOCK_MONOTONIC of the host, ns), packets received by then
-_MAX_RUN_BYTES = 256 << 20  # of batches and runs
-
-
-class Evidence(msgspec.Struct, frozen=True):
-    """Inputs for placing a row, beside its packets; as of :func:`polysight.capture.placement.place_record`."""
-
-    expected: int
-    frame_bytes: int
-    not_before_ns: int = 0
-    dropped_by_card: str = ""
-    past: Past = Past()
-
-
-def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed | None) -> int:
-    """Write a row's packets durably and return the file's CRC-32; without `placed`, with all of the payload.
-
-    Raises DeviceError if the disk fails.
-    """
-    kept = log.kept
-    sizes, sequences, counts = log.sizes[:kept], log.sequences[:kept], log.byte_counts[:kept]
-    at = np.full(kept, -1, dtype=np.int64) if placed is None else _in_the_row(placed, sizes)
-    here = at < 0
-    rest = np.concatenate([[0], np.cumsum(np.where(here, sizes, 0))])[:-1]
-    place = np.where(here, -1 - rest, at)
-    ahead = np.where(here[:-1], -sizes[:-1], sizes[:-1])
-    joined = (
-        (np.diff(sizes) == 0) & (np.diff(sequences) == 1) & (np.diff(counts) == sizes[:-1])
-        & (np.diff(place) == ahead) & (here[1:] == here[:-1])
-    )  # fmt: skip
-    first = np.flatnonzero(np.append(True, ~joined))[: kept and None]
-    runs = np.zeros(first.size, dtype=RUN)
-    runs["sequence"], runs["byte_count"], runs["size"] = sequences[first], counts[first], sizes[first]
-    runs["packets"], runs["place"] = np.diff(np.append(first, kept)), place[first]
-    starts = np.cumsum(log.sizes) - log.sizes
-    own = [log.payload[starts[k] : starts[k] + sizes[k]] for k in np.flatnonzero(here).tolist()]
-    head = {
-        "format": FORMAT,
-        "batches": len(log.batches),
-        "runs": len(runs),
-        "packets": log.count,
-        "kept": kept,
-        "own_bytes": int(sizes[here].sum()),
-        "malformed": log.malformed,
-        "evidence": msgspec.to_builtins(evidence),
-    }
-    line = json.dumps(head, sort_keys=True, separators=(",", ":")).encode("ascii") + b"\n"
-    raw = b"".join([line, log.batches.astype(BATCH).tobytes(), runs.tobytes(), *(part.tobytes() for part in own)])
-    return write_durably(path, raw)
-
-
-def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
-    """Read a row's packet file `path`; `row` (uint8) are the bytes of the row's file, with most of the payload.
-
-    Raises
-    ------
-    DataError
-        if the file is missing or damaged, or does not belong to the row.
-    """
-    try:
-        line, _, tail = read_bounded(path, PacketLog.max_kept_bytes(row.size) + _MAX_RUN_BYTES).partition(b"\n")
-        head: dict[str, Any] = json.loads(line)
-        evidence = msgspec.convert(head["evidence"], Evidence)
-        size = 2 * BATCH.itemsize * head["batches"]
-        batches = np.frombuffer(tail[:size], dtype=BATCH).reshape(-1, 2).astype(np.int64)
-        runs = np.frombuffer(tail[size : size + RUN.itemsize * head["runs"]], dtype=RUN)
-        own = np.frombuffer(tail[size + runs.nbytes :], dtype=np.uint8)
-        if (np.diff(batches[:, 1], prepend=0) < 0).any():
-            raise ValueError("the number of packets decreases between two batches")
-        log = _restored(evidence.expected, runs, batches, row, own)
-        whole = (head["packets"], head["own_bytes"]) == (int(batches[-1, 1]) if len(batches) else 0, own.size)
-        if not whole or log.count != head["kept"] or head["format"] != FORMAT:
-            raise ValueError("its counts are wrong")
-        log.malformed = int(head["malformed"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as e:
-        what = f"{path}: not a readable packet log: {e}"
-        raise DataError(what, *damaged(path), code=ErrorCode.FILE_DAMAGED) from None
-    return evidence, log
-
-
-def _in_the_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the offset of each packet's unchanged payload in the row's file, int64 [packet]; -1 if it is not there."""
-    at = placed.at[: sizes.size].copy()
-    at[at + sizes > placed.expected] = -1
-    for start, stop in placed.conflicts:
-        at[(at < stop) & (at + sizes > start)] = -1
-    return at
-
-
-def _restored(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row: Bytes, own: Bytes) -> PacketLog:
-    """Restore the packet log. Raises ValueError if payload is missing."""
-    many, sizes = runs["packets"].astype(np.int64), runs["size"].astype(np.int64)
-    payload_bytes = sum((many * sizes).tolist())  # each product fits 48 bits; their sum need not fit 64
-    if expected != row.size or payload_bytes > PacketLog.max_kept_bytes(expected) or (sizes == 0).any():
-        raise ValueError("it is of another row, or has more payload than a receiver keeps")
-    nth = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
-    each = np.repeat(sizes, many)
-    parts = []
-    for n, size, place in zip(many.tolist(), sizes.tolist(), runs["place"].tolist(), strict=True):
-        source, start = (row, place) if place >= 0 else (own, -1 - place)
-        parts.append(source[start : start + n * size])
-        if parts[-1].size != n * size:
-            raise ValueError("payload is missing")
-    payload = np.concatenate(parts) if parts else np.zeros(0, dtype=np.uint8)
-    sequences = np.repeat(runs["sequence"].astype(np.int64), many) + nth
-    counts = np.repeat(runs["byte_count"].astype(np.int64), many) + nth * each
-    kept = batches[batches[:, 1] <= many.sum()] if len(batches) else batches
-    if len(kept) < len(batches) and (not len(kept) or kept[-1, 1] < many.sum()):
-        kept = np.concatenate([kept, [[batches[len(kept), 0], many.sum()]]])
-    return PacketLog.restore(expected, sequences, counts, each, kept, payload)

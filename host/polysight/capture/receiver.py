@@ -111,6 +111,7 @@ class BeginRow(_Message, frozen=True):
     expected_bytes: int
     frame_bytes: int
     path: str
+    after_reset: bool = False  # the card was reset just before: its counters begin anew
 
 
 class EndRow(_Message, frozen=True):
@@ -201,6 +202,7 @@ class RowCapture(_Message, frozen=True):
     before_pulses: int = 0
     clock_jumps: int = 0
     packets_crc32: int = 0
+    start_lost: bool = False  # it is unknown where the card's next record begins: reset the card
 
     @property
     def missing_bytes(self) -> int:
@@ -303,12 +305,14 @@ class ReceiverProcess:
         """Return the descriptor that becomes readable when the process has sent a message."""
         return self._connection.fileno()
 
-    def begin_row(self, row: int, take: int, expected_bytes: int, frame_bytes: int, path: Path) -> int:
+    def begin_row(
+        self, row: int, take: int, expected_bytes: int, frame_bytes: int, path: Path, after_reset: bool = False
+    ) -> int:
         """Receive a row into the file at `path`, with its index beside it; return the number of dropped stray packets.
 
-        Raises DeviceError if the file cannot be made.
+        `after_reset`: the card was reset since its last record. Raises DeviceError if the file cannot be made.
         """
-        request = BeginRow(row, take, expected_bytes, frame_bytes, str(path))
+        request = BeginRow(row, take, expected_bytes, frame_bytes, str(path), after_reset)
         stale = self._ask(request, Began, _ANSWER_TIMEOUT_S).stale
         self._progress = Progress(row, take, 0, expected_bytes == 0, 0)
         return stale

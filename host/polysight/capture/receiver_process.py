@@ -22,22 +22,16 @@ from numpy.typing import NDArray
 from polysight.capture import receiver as messages
 from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, Status
 from polysight.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
-from polysight.capture.placement import (
-    PACKETS,
-    Evidence,
-    Preview,
-    Segment,
-    place_record,
-    preview,
-    write_index,
-    write_packets,
-)
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import Evidence, Past, Preview, place_record, preview
 from polysight.capture.receiver import take_core, take_priority
-from polysight.capture.record_search import PacketLog, Past
+from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets
 from polysight_shared.errors import DeviceError, PolysightError
 
 _MAX_BATCHES = 64  # batches fetched before requests are checked again
 _PREVIEW_SHARE = 20  # previews take at most 1/20 of the time
+_IDLE_MS = 1
+_SLEPT_NS = 200_000  # a poll() of this length has slept: nothing was there when it began
 _GATHER_MS = 1  # pause in which packets gather in the kernel's buffer: fewer, larger batches
 
 
@@ -73,7 +67,7 @@ class _Row:
     def _update(self) -> None:
         if self.log.count != self._previewed:
             self._previewed = self.log.count
-            self._preview = preview(self.log, self.request.frame_bytes, self.past, self.not_before_ns)
+            self._preview = preview(self.log, self.past, self.not_before_ns)
 
 
 class Receiver:
@@ -93,7 +87,11 @@ class Receiver:
         poll.register(self._connection.fileno(), select.POLLIN)
         requests.register(self._connection.fileno(), select.POLLIN)
         while True:
-            ready = dict(poll.poll())
+            # During a row the socket is looked at often: that a packet had not come by then is evidence, too.
+            asked_ns = time.monotonic_ns()
+            ready = dict(poll.poll(None if self._row is None else _IDLE_MS))
+            if self._row is not None and time.monotonic_ns() - asked_ns > _SLEPT_NS:
+                self._row.log.note_quiet(asked_ns)
             if self._socket is not None and self._socket.fileno() in ready and self._row is not None:
                 self._receive()
                 requests.poll(_GATHER_MS)
@@ -153,7 +151,8 @@ class Receiver:
         strays = PacketLog(0)
         while n := self._batches.receive():
             strays.add(self._batches.packets[:n], self._batches.lengths[:n], time.monotonic_ns())
-        self._past = self._past.starts_after(strays)
+        if request.after_reset:
+            self._past = self._past.after_reset()
         self._row = row = _Row(request, segment, log, self._past)
         row.stale, row.strangers = strays.count + strays.malformed, self._batches.strangers
         row.drops = kernel_drops(self._socket)
@@ -163,7 +162,7 @@ class Receiver:
         """Discard the row; the end of its record is unknown then."""
         if self._row is not None:
             self._row.segment.discard()
-        self._row, self._past = None, Past(spans=self._past.spans)
+        self._row, self._past = None, Past(lost=True, restarts=self._past.restarts)
 
     def _receive(self) -> None:
         row, batches = self._row, self._batches
@@ -215,6 +214,7 @@ class Receiver:
             card_status=request.card_status,
             holes=placed.holes,
             slipped=placed.slipped,
+            start_lost=placed.past.lost,
             **counts,
             **losses,
         )

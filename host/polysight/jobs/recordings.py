@@ -210,12 +210,9 @@ def _placement_lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
     p = again.placed
     e = again.evidence
     counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in vars(p.counts).items() if n)
-    if e.past.base is None:
+    start = "known from the record before, or from a reset"
+    if e.past.start is None:
         start = "not known from the records before"
-    elif len(e.past.ends) == 1:
-        start = "known from the record before"
-    else:
-        start = f"one of {len(e.past.ends)} places behind the record before"
     missing = ", ".join(f"{a}..{b}" for a, b in p.missing[:_SHOWN]) + (", ..." if len(p.missing) > _SHOWN else "")
     lines = [
         f"{file}: {p.received} of {p.expected} bytes in place",

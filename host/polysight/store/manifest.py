@@ -111,6 +111,7 @@ class BoardRow(Reception, frozen=True, kw_only=True, omit_defaults=True):
     crc32: str
     index_crc32: str = ""
     packets_crc32: str = ""
+    frames_untimed: int | None = None  # whose pulse follows from their count alone, not from arrival times
 
 
 class RowCommitted(Fact, frozen=True, kw_only=True, tag="row_committed"):

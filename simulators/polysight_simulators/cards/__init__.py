@@ -6,7 +6,7 @@ sockets; `card` adds sockets and a radar; `sender` sends many packets per call; 
 (`python -m polysight_simulators.cards`). Specification: docs/spec/simulated-rig.md.
 """
 
-from polysight_simulators.cards.adversary import KINDS, Adversary, Arrival, Sent
+from polysight_simulators.cards.adversary import KINDS, RADAR, Adversary, Arrival, Sent
 from polysight_simulators.cards.card import MAC, CardEndpoint, CardSender, Clock, Pace, SimulatedCard, bound_udp
 from polysight_simulators.cards.dca1000 import SOURCE_PORT, Network
 from polysight_simulators.cards.fault_draws import EventKind
@@ -15,6 +15,7 @@ from polysight_simulators.cards.sync_in import StageTrack
 __all__ = [
     "KINDS",
     "MAC",
+    "RADAR",
     "SOURCE_PORT",
     "Adversary",
     "Arrival",

@@ -11,6 +11,7 @@ import random
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from polysight_simulators.cards.dca1000 import DATA_HEADER_BYTES, Packetiser
 
@@ -33,7 +34,18 @@ KINDS = (
     "miss_frames",  # triggers are missed: the record is shorter
     "end_early",  # the card ends the record and starts another: two short packets in one stream
     "clock",  # the clock of the arrivals jumps
+    "drop_inside",  # the card drops bytes before numbering them, and its status message is lost
+    "drop_frames",  # exactly the bytes of one to three frames
+    "twin",  # a second card with the same address sends a record, too
+    "twin_alone",  # and this card's own record is lost
 )
+RADAR = (
+    "missed",  # SYNC_IN pulses
+    "spurious",  # edges nobody sent; the radar counts its frames and ignores as many pulses at the end
+    "endless",  # the radar does not count its frames
+)
+"""What a radar can do, in :meth:`Adversary.take`: only the times of its frames tell."""
+_FRAME_NS = 128_000
 _GAP_NS = 20_000  # between packets
 
 
@@ -75,6 +87,7 @@ class Adversary:
         self._chance, self._frame, self._payload = chance, frame_bytes, payload_bytes
         self._card = Packetiser(payload_bytes, sequence, byte_count)
         self._now_ns, self._number = 1_000_000_000, 0
+        self._twin = Packetiser(payload_bytes, chance.randrange(1 << 32), chance.randrange(1 << 48))
         self._late: list[Arrival] = []  # packets that arrive in a later record
         self.resets = 0
 
@@ -84,35 +97,96 @@ class Adversary:
         self._late = [a for a in self._late if not any(a is c for c in coming)]
         return coming
 
-    def record(self, frames: int, troubles: tuple[str, ...] = (), data: bytes = b"") -> Sent:
-        """Send one record with these troubles; delayed packets arrive with later records. Without `data`, draw it."""
+    def reset_by_host(self) -> None:
+        """Reset the card between two rows: its memory is empty then, and the network, too, before the next pulse."""
+        self._reset()
+        self.resets = 0
+        self.forget_late()
+
+    def take(self, pulses_ns: NDArray[np.int64], troubles: tuple[str, ...] = ()) -> Sent:
+        """Send the record of a row whose SYNC_IN pulses, int64 [pulse], start frames. The row's data is that of pulses.
+
+        Troubles may also be of `RADAR`. Each packet arrives when its last frame fills it.
+        """
+        chance = self._chance
+        draw = np.random.default_rng(chance.getrandbits(32))
+        row = draw.integers(1, 256, (pulses_ns.size, self._frame), np.uint8)
+        edges = [(int(t), row[k]) for k, t in enumerate(pulses_ns)]
+        if "missed" in troubles:
+            for _ in range(chance.randint(1, min(3, len(edges) - 1))):
+                edges.pop(chance.randrange(len(edges)))
+        if "spurious" in troubles:
+            for _ in range(chance.randint(1, 2)):
+                t = chance.randint(int(pulses_ns[0]), int(pulses_ns[-1]))
+                # One within a frame or just behind it starts none; one at a missed pulse makes that pulse's frame.
+                if np.abs(np.append(pulses_ns, [e for e, _ in edges]) - t).min() > 5 * _FRAME_NS:
+                    edges.append((t, draw.integers(1, 256, self._frame, np.uint8)))
+        edges.sort(key=lambda edge: edge[0])
+        if "endless" not in troubles:
+            edges = edges[: pulses_ns.size]
+        times = [t for t, _ in edges]
+        self._now_ns = int(pulses_ns[0]) - 50_000_000
+        sent = self.record(len(edges), troubles, b"".join(f.tobytes() for _, f in edges), times)
+        sent.whole = sent.whole and len(edges) == pulses_ns.size
+        sent.data = row.tobytes()
+        return sent
+
+    def record(
+        self, frames: int, troubles: tuple[str, ...] = (), data: bytes = b"", edges_ns: list[int] | None = None
+    ) -> Sent:
+        """Send one record with these troubles; delayed packets arrive with later records. Without `data`, draw it.
+
+        `edges_ns` are the times of its frames; without them, the packets follow each other.
+        """
         chance, self._number = self._chance, self._number + 1
         if not data:
             draw = np.random.default_rng(chance.getrandbits(32))
             data = draw.integers(1, 256, frames * self._frame, np.uint8).tobytes()
-        pulse_ns = self._now_ns + 1_000_000
+        pulse_ns = self._now_ns + 1_000_000 if edges_ns is None else edges_ns[0] - 1_000_000
         sent = Sent(self._number, data, pulse_ns, troubles=troubles)
-        packets = self._packets(sent, data)
+        packets, made = self._packets(sent, data)
         before, in_between = self.take_late(0.5), self.take_late(0.7)
-        on_time = self._network(packets, sent)
-        arriving = [Arrival(0, p, self._number) for p in on_time]
+        if "twin" in troubles or "twin_alone" in troubles:
+            sent.whole = False
+            other = np.random.default_rng(chance.getrandbits(32)).integers(1, 256, len(data), np.uint8)
+            in_between += [Arrival(0, bytes(p), -1) for p in [*self._twin.feed(other), *self._twin.flush()]]
+        on_time = [] if "twin_alone" in troubles else self._network(packets, sent)
+        arriving = [(k, Arrival(0, p, self._number)) for k, p in on_time]
+        twin = [(k, a) for k, a in enumerate(in_between) if a.record == -1]
         for late in in_between:
-            arriving.insert(chance.randint(0, min(len(arriving), 3) if chance.random() < 0.5 else len(arriving)), late)
+            if late.record != -1:
+                place = chance.randint(0, min(len(arriving), 3) if chance.random() < 0.5 else len(arriving))
+                arriving.insert(place, (arriving[place - 1][0] if place else 0, late))
+        arriving = sorted(arriving + twin, key=lambda ka: ka[0]) if twin else arriving
         early_ns = [self._now_ns + k * 1000 for k in range(len(before))]
-        times_ns = self._times(len(arriving), pulse_ns, troubles)
+        made_ns = None if edges_ns is None else [self._made_ns(byte, edges_ns) for byte in made]
+        times_ns = self._times([k for k, _ in arriving], pulse_ns, troubles, made_ns)
         sent.arrivals = [Arrival(t, a.packet, a.record) for t, a in zip(early_ns, before, strict=True)]
-        sent.arrivals += [Arrival(t, a.packet, a.record) for t, a in zip(times_ns, arriving, strict=True)]
+        sent.arrivals += [Arrival(t, a.packet, a.record) for t, (_, a) in zip(times_ns, arriving, strict=True)]
         self._now_ns = max([pulse_ns, *times_ns]) + 10_000_000
         return sent
 
-    def _packets(self, sent: Sent, data: bytes) -> list[bytes]:
-        """Return the packets of one record as the card sends them."""
+    def _packets(self, sent: Sent, data: bytes) -> tuple[list[bytes], list[int]]:
+        """Return the packets of one record as the card sends them, and the last byte of the data in each."""
+        self._bytes = np.frombuffer(data, dtype=np.uint8)
+        self._waiting = np.zeros(0, np.int64)
+        self._made: list[int] = []
+        out = self._packets_of(sent, np.arange(len(data)))
+        return out, self._made
+
+    def _packets_of(self, sent: Sent, data: NDArray[np.int64]) -> list[bytes]:
+        """Send bytes of the data, by their numbers."""
         troubles, chance, frame = sent.troubles, self._chance, self._frame
         frames = len(data) // frame
         if "miss_frames" in troubles and frames > 1:
             sent.whole = False
             for at in sorted(chance.sample(range(frames), chance.randint(1, min(3, frames - 1))), reverse=True):
-                data = data[: at * frame] + data[(at + 1) * frame :]
+                data = np.delete(data, slice(at * frame, (at + 1) * frame))
+        if "drop_inside" in troubles or "drop_frames" in troubles:
+            sent.whole = False
+            many = frame * chance.randint(1, 3) if "drop_frames" in troubles else 16 * chance.randint(1, 200)
+            cut = chance.randrange(max(1, len(data) - many))
+            data = np.delete(data, slice(cut, cut + many))
         if "reset_between" in troubles:
             self._reset()
         out: list[bytes] = []
@@ -137,15 +211,29 @@ class Adversary:
 
     def _reset(self) -> None:
         self._card, self.resets = Packetiser(self._payload), self.resets + 1
+        self._waiting = np.zeros(0, np.int64)
 
-    def _stream(self, data: bytes) -> list[bytes]:
-        return [bytes(row) for row in self._card.feed(np.frombuffer(data, dtype=np.uint8))]
+    def _stream(self, data: NDArray[np.int64]) -> list[bytes]:
+        self._waiting = np.concatenate([self._waiting, data])
+        return self._noted(self._card.feed(self._bytes[data]))
 
     def _end(self) -> list[bytes]:
-        return [bytes(row) for row in self._card.flush()]
+        return self._noted(self._card.flush())
 
-    def _network(self, packets: list[bytes], sent: Sent) -> list[bytes]:
-        """Return the packets that arrive in time, in order; keep the delayed ones."""
+    def _noted(self, rows: NDArray[np.uint8]) -> list[bytes]:
+        """Note the last byte of each packet."""
+        for row in rows:
+            size = len(row) - DATA_HEADER_BYTES
+            self._made.append(int(self._waiting[min(size, self._waiting.size) - 1]) if self._waiting.size else 0)
+            self._waiting = self._waiting[size:]
+        return [bytes(row) for row in rows]
+
+    def _made_ns(self, byte: int, edges_ns: list[int]) -> int:
+        """Time at which a byte of the data leaves the radar."""
+        return edges_ns[byte // self._frame] + _FRAME_NS * (byte % self._frame) // self._frame + 100_000
+
+    def _network(self, packets: list[bytes], sent: Sent) -> list[tuple[int, bytes]]:
+        """Return the packets that arrive in time, in order, each with its number; keep the delayed ones."""
         t, chance, n = sent.troubles, self._chance, len(packets)
         gone: set[int] = set(range(n)) if "lose_all" in t else set()
         if "lose" in t:
@@ -160,18 +248,18 @@ class Adversary:
         if "backlog" in t:
             late |= set(range(max(0, n - chance.randint(1, 4)), n))
         self._late += [Arrival(0, packets[k], sent.number) for k in sorted(late - gone)]
-        coming = [(float(k), self._damaged(packets[k], t)) for k in range(n) if k not in gone | late]
+        coming = [(float(k), k, self._damaged(packets[k], t)) for k in range(n) if k not in gone | late]
         if "duplicate" in t and coming:
             coming += [chance.choice(coming) for _ in range(chance.randint(1, 4))]
         if "two_paths" in t:
-            coming += [(k + chance.choice([0.5, 30.0]), p) for k, p in coming]
+            coming += [(at + chance.choice([0.5, 30.0]), k, p) for at, k, p in coming]
             if chance.random() < 0.5 and n:
                 self._late.append(Arrival(0, packets[-1], sent.number))
         if "reorder" in t:
-            coming = [(k + chance.uniform(-3, 3) * (chance.random() < 0.2), p) for k, p in coming]
+            coming = [(at + chance.uniform(-3, 3) * (chance.random() < 0.2), k, p) for at, k, p in coming]
         if "flows" in t:
-            coming = [(k + 5 * (int(k) % 3), p) for k, p in coming]
-        return [p for _, p in sorted(coming, key=lambda kp: kp[0])]
+            coming = [(at + 5 * (k % 3), k, p) for at, k, p in coming]
+        return [(k, p) for _, k, p in sorted(coming, key=lambda c: c[0])]
 
     def _damaged(self, packet: bytes, troubles: tuple[str, ...]) -> bytes:
         if "truncate" in troubles and self._chance.random() < 0.05:
@@ -182,9 +270,18 @@ class Adversary:
             return bytes(turned)
         return packet
 
-    def _times(self, count: int, pulse_ns: int, troubles: tuple[str, ...]) -> list[int]:
-        times = [pulse_ns + (k + 1) * _GAP_NS for k in range(count)]
-        if "clock" in troubles and count > 2:
-            at, jump = self._chance.randrange(1, count), self._chance.choice([-(10**12), 10**12, -5_000_000])
+    def _times(
+        self, numbers: list[int], pulse_ns: int, troubles: tuple[str, ...], made_ns: list[int] | None
+    ) -> list[int]:
+        """Return when the packets arrive: 20 us apart, or each when its last frame is there."""
+        times: list[int] = []
+        for n, number in enumerate(numbers):
+            t = pulse_ns + (n + 1) * _GAP_NS
+            if made_ns:
+                t = made_ns[min(number, len(made_ns) - 1)]
+                t = max(t, times[-1] + 1000) if times else t
+            times.append(t)
+        if "clock" in troubles and len(times) > 2:
+            at, jump = self._chance.randrange(1, len(times)), self._chance.choice([-(10**12), 10**12, -5_000_000])
             times = times[:at] + [t + jump for t in times[at:]]
         return times

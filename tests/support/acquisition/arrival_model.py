@@ -50,9 +50,22 @@ def receive(
 
     `lost` packets never come. The clocks' offset is drawn.
     """
+    return receive_edges(np.delete(pulses_ns, missed), pulses_ns, frame_bytes, rng, load, lost, drift)
+
+
+def receive_edges(
+    edges_ns: np.ndarray,
+    pulses_ns: np.ndarray,
+    frame_bytes: int,
+    rng: np.random.Generator,
+    load: Load,
+    lost: frozenset[int] = frozenset(),
+    drift: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """As :func:`receive`, of a radar that takes these edges, int64 [frame], for its pulses."""
     offset = int(rng.integers(10**10, 10**14))
     host = pulses_ns.reshape(-1) * (1 + drift) + offset
-    sent = np.delete(host, missed)
+    sent = edges_ns * (1 + drift) + offset
     end = len(sent) * frame_bytes
     sender = _stalls(rng, load, int(host[0]), int(host[-1]))
     receiver = _stalls(rng, load, int(host[0]), int(host[-1]))
@@ -70,6 +83,12 @@ def receive(
     at, extent, now = 0, 0, 0.0
     quiet = 0.0
     while at < len(packets):
+        # The receiver looks every millisecond while nothing comes.
+        while packets[at][0] > now + MS // 5 and pairs:
+            quiet = now
+            if packets[at][0] <= now + MS:
+                break
+            now = _awake(now + MS, receiver)
         now = _awake(max(now, packets[at][0]) + rng.exponential(20 * US), receiver)
         while True:
             looked = now

@@ -56,7 +56,9 @@ class FakeCard:
                 self._command(code, sender)
 
     def _command(self, code: int, sender: tuple[str, int]) -> None:
-        self.recording = {5: True, 6: False}.get(code, self.recording)
+        self.recording = {1: False, 5: True, 6: False}.get(code, self.recording)
+        if code == 1:  # reset
+            self.sequence, self.count, self._rest = 1, 0, b""
         self.out.sendto(struct.pack("<HHHH", 0xA55A, code, 0x0402 if code == 0x0E else 0, 0xEEAA), sender)
 
     def report_status(self, bits: int = 0x0100) -> None:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from polysight.capture.dca1000 import Counters
-from polysight.capture.placement import Placed, place_record
-from polysight.capture.record_search import PacketLog, Past
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import Past, Placed, place_record
 
 FULL = 1456  # bytes of samples in a full packet
 
@@ -79,19 +79,13 @@ def place(
     size: int, packets: list[bytes], start: Counters | Past | None = None, frame: int = 1, batch: int = 7
 ) -> tuple[Placed, np.ndarray]:
     """Place a row that starts at these counters, or after the known earlier records."""
-    past = Past(start, (0,)) if isinstance(start, Counters) else start
+    past = Past(start) if isinstance(start, Counters) else start
     return place_record(log_of(size, packets, batch), frame, past)
-
-
-def past_after(record: Record, frame: int, before: Past | None = None) -> Past:
-    """What is known after a record that came whole."""
-    return place(len(record.data), record.packets, before, frame, batch=64)[0].past
 
 
 def next_start(placed: Placed) -> Counters | None:
     """Counters with which the card's next record starts; None if that is uncertain."""
-    base, ends = placed.past.base, placed.past.ends
-    return base.after(ends[0], -(-ends[0] // FULL)) if base is not None and len(ends) == 1 else None
+    return placed.past.start
 
 
 def mask_of(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:

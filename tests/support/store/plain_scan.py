@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from polysight.capture.placement import write_index
+from polysight.capture.row_files import write_index
 from polysight.store.logs import EventWriter
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import to_text, validate

@@ -18,9 +18,10 @@ import pytest
 
 from polysight.acquisition import scan as host_run
 from polysight.acquisition.scan import ScanProgress, ScanResult, resume_scan, run_scan
-from polysight.capture.placement import PACKETS, Evidence, Segment, place_record, write_index, write_packets
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import Evidence, place_record
 from polysight.capture.receiver import RowCapture
-from polysight.capture.record_search import PacketLog
+from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets
 from polysight.store import manifest
 from polysight.store.scan_folder import MANIFEST, PART, ScanFolder
 from polysight_pi.journal import Journal, JournalFullError

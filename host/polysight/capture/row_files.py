@@ -1,0 +1,255 @@
+"""The three files of a row of one board (docs/spec/scan-folder.md).
+
+`Segment` writes the payload (`.bin`, `.part` before the commit), `write_index` the counts, gaps and arrivals (`.idx`),
+`write_packets` the packets themselves (`.pkt`), from which the row can be placed again.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import zlib
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.capture.dca1000 import MAX_PAYLOAD_BYTES, Counters
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import Evidence, Placed
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError, DeviceError
+from polysight_shared.files import open_to_write, read_bounded
+
+Bytes = NDArray[np.uint8]
+PAIR = np.dtype("<i8")
+MAX_INDEX_BYTES = 256 << 20  # sixteen million batches of packets
+
+
+def _scan_of(path: Path) -> Path:
+    """The scan folder of `SCAN/raw/BOARD/ROW.*`; of a file elsewhere, its own folder."""
+    return path.parents[2] if path.parent.parent.name == "raw" else path.parent
+
+
+def write_error(path: Path, done: str, e: OSError) -> DeviceError:
+    """Return the error for a file of a scan that cannot be `done`: written, opened, renamed..."""
+    full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return DeviceError(
+        f"{path}: cannot be {done}: {e.strerror}",
+        "the disk is full, read-only or fails",
+        f"free space, then `polysight resume {_scan_of(path)}` continues after the last committed row",
+        code=ErrorCode.DISK_FULL if full else ErrorCode.FILE_UNWRITABLE,
+    )
+
+
+def damaged(path: Path) -> tuple[str, str]:
+    """Return cause and remedy for a row's file that cannot be read."""
+    return "the file is damaged or truncated", f"`polysight validate {_scan_of(path)}` names every damaged file"
+
+
+class Segment:
+    """A file of `size` bytes with reserved disk space, which :meth:`finish` writes at once; its folder is made.
+
+    A mapped file could block the receiver while the kernel writes it back, and the receive buffer holds only a quarter
+    of a second. A row that is not finished is taken again anyway.
+
+    Raises
+    ------
+    DeviceError
+        if the disk is full or cannot be written.
+    """
+
+    def __init__(self, path: Path, size: int) -> None:
+        self.path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with ExitStack() as stack:
+                self._file = stack.enter_context(open_to_write(path, "w+b", 0))
+                stack.callback(path.unlink, missing_ok=True)
+                if size:
+                    # Reserve the space now: a full disk must be an error here, not after the row.
+                    os.posix_fallocate(self._file.fileno(), 0, size)
+                stack.pop_all()
+        except OSError as e:
+            raise write_error(path, f"reserved ({size} bytes)", e) from None
+
+    def finish(self, data: NDArray[np.uint8]) -> int:
+        """Write the bytes durably, close the file, and return their CRC-32. Raises DeviceError if the disk fails."""
+        left = np.ascontiguousarray(data).data
+        crc = zlib.crc32(left)
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+            os.fsync(self._file.fileno())
+        except OSError as e:
+            raise write_error(self.path, "made durable", e) from None
+        finally:
+            self.close()
+        return crc
+
+    def close(self) -> None:
+        """Close the file. Safe to repeat."""
+        self._file.close()
+
+    def discard(self) -> None:
+        """Close and remove the file."""
+        self.close()
+        self.path.unlink(missing_ok=True)
+
+
+def write_index(path: Path, facts: dict[str, Any], arrivals: NDArray[np.int64]) -> int:
+    """Write a row's index durably and return its CRC-32. `arrivals` is int64 [n, 2]. Raises DeviceError."""
+    head = json.dumps({**facts, "arrivals": len(arrivals)}, sort_keys=True, separators=(",", ":"))
+    raw = head.encode("ascii") + b"\n" + arrivals.astype(PAIR).tobytes()
+    return write_durably(path, raw)
+
+
+def write_durably(path: Path, raw: bytes) -> int:
+    """Write a file durably and return its CRC-32. Raises DeviceError."""
+    try:
+        with open_to_write(path) as f:
+            f.write(raw)
+            f.flush()
+            os.fsync(f.fileno())
+    except OSError as e:
+        raise write_error(path, "written", e) from None
+    return zlib.crc32(raw)
+
+
+def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
+    """Read the facts and arrivals (int64 [n, 2]) of a row's index. Raises DataError if missing or damaged."""
+    try:
+        head, _, tail = read_bounded(path, MAX_INDEX_BYTES).partition(b"\n")
+        facts = json.loads(head)
+        pairs = np.frombuffer(tail, dtype=PAIR).reshape(-1, 2).astype(np.int64)
+    except (OSError, ValueError, RecursionError) as e:
+        what = f"{path}: not a readable row index: {e}"
+        raise DataError(what, *damaged(path), code=ErrorCode.FILE_DAMAGED) from None
+    if not isinstance(facts, dict) or facts.get("arrivals") != len(pairs):
+        raise DataError(f"{path}: the row index is incomplete", *damaged(path), code=ErrorCode.FILE_DAMAGED)
+    return facts, pairs
+
+
+PACKETS = ".pkt"  # suffix, beside the row's file
+FORMAT = 2
+RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), ("size", "<u2"), ("place", "<i8")])
+"""Run of consecutive packets of one size: counters of the first, number of packets, payload of each, and its place.
+
+`place` is an offset in the row's file; or, below zero, `-1 - offset` in this file's own payload.
+"""
+BATCH = np.dtype("<i8")  # pairs: time (CLOCK_MONOTONIC of the host, ns), packets received by then
+_MAX_RUN_BYTES = 256 << 20  # of batches and runs
+
+
+def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed | None) -> int:
+    """Write a row's packets durably and return the file's CRC-32; without `placed`, with all of the payload.
+
+    Raises DeviceError if the disk fails.
+    """
+    kept = log.kept
+    sizes, sequences, counts = log.sizes[:kept], log.sequences[:kept], log.byte_counts[:kept]
+    at = np.full(kept, -1, dtype=np.int64) if placed is None else _in_the_row(placed, sizes)
+    here = at < 0
+    rest = np.concatenate([[0], np.cumsum(np.where(here, sizes, 0))])[:-1]
+    place = np.where(here, -1 - rest, at)
+    ahead = np.where(here[:-1], -sizes[:-1], sizes[:-1])
+    joined = (
+        (np.diff(sizes) == 0) & (np.diff(sequences) == 1) & (np.diff(counts) == sizes[:-1])
+        & (np.diff(place) == ahead) & (here[1:] == here[:-1])
+    )  # fmt: skip
+    first = np.flatnonzero(np.append(True, ~joined))[: kept and None]
+    runs = np.zeros(first.size, dtype=RUN)
+    runs["sequence"], runs["byte_count"], runs["size"] = sequences[first], counts[first], sizes[first]
+    runs["packets"], runs["place"] = np.diff(np.append(first, kept)), place[first]
+    starts = np.cumsum(log.sizes) - log.sizes
+    own = [log.payload[starts[k] : starts[k] + sizes[k]] for k in np.flatnonzero(here).tolist()]
+    head = {
+        "format": FORMAT,
+        "batches": len(log.batches),
+        "runs": len(runs),
+        "packets": log.count,
+        "kept": kept,
+        "own_bytes": int(sizes[here].sum()),
+        "malformed": log.malformed,
+        "evidence": msgspec.to_builtins(evidence),
+    }
+    line = json.dumps(head, sort_keys=True, separators=(",", ":")).encode("ascii") + b"\n"
+    raw = b"".join([line, log.batches.astype(BATCH).tobytes(), runs.tobytes(), *(part.tobytes() for part in own)])
+    return write_durably(path, raw)
+
+
+def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
+    """Read a row's packet file `path`; `row` (uint8) are the bytes of the row's file, with most of the payload.
+
+    Raises
+    ------
+    DataError
+        if the file is missing or damaged, or does not belong to the row.
+    """
+    try:
+        line, _, tail = read_bounded(path, PacketLog.max_kept_bytes(row.size) + _MAX_RUN_BYTES).partition(b"\n")
+        head: dict[str, Any] = json.loads(line)
+        if head["format"] == 1:
+            head["evidence"]["past"] = _past_of_format_1(head["evidence"].get("past", {}))
+        evidence = msgspec.convert(head["evidence"], Evidence)
+        size = 2 * BATCH.itemsize * head["batches"]
+        batches = np.frombuffer(tail[:size], dtype=BATCH).reshape(-1, 2).astype(np.int64)
+        runs = np.frombuffer(tail[size : size + RUN.itemsize * head["runs"]], dtype=RUN)
+        own = np.frombuffer(tail[size + runs.nbytes :], dtype=np.uint8)
+        if (np.diff(batches[:, 1], prepend=0) < 0).any():
+            raise ValueError("the number of packets decreases between two batches")
+        log = _restored(evidence.expected, runs, batches, row, own)
+        whole = (head["packets"], head["own_bytes"]) == (int(batches[-1, 1]) if len(batches) else 0, own.size)
+        if not whole or log.count != head["kept"] or head["format"] not in (1, FORMAT):
+            raise ValueError("its counts are wrong")
+        log.malformed = int(head["malformed"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as e:
+        what = f"{path}: not a readable packet log: {e}"
+        raise DataError(what, *damaged(path), code=ErrorCode.FILE_DAMAGED) from None
+    return evidence, log
+
+
+def _past_of_format_1(past: dict[str, Any]) -> dict[str, Any]:
+    """Return the start of a record from the knowledge as older releases stored it: a base and possible sizes."""
+    base, ends = past.get("base"), past.get("ends", [])
+    if base is None or len(ends) != 1:
+        return {}
+    packets = -(-ends[0] // MAX_PAYLOAD_BYTES)
+    start = Counters(base["byte_count"], base["sequence"]).after(ends[0], packets)
+    return {"start": msgspec.to_builtins(start)}
+
+
+def _in_the_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the offset of each packet's unchanged payload in the row's file, int64 [packet]; -1 if it is not there."""
+    at = placed.at[: sizes.size].copy()
+    at[at + sizes > placed.expected] = -1
+    for start, stop in placed.conflicts:
+        at[(at < stop) & (at + sizes > start)] = -1
+    return at
+
+
+def _restored(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row: Bytes, own: Bytes) -> PacketLog:
+    """Restore the packet log. Raises ValueError if payload is missing."""
+    many, sizes = runs["packets"].astype(np.int64), runs["size"].astype(np.int64)
+    payload_bytes = sum((many * sizes).tolist())  # each product fits 48 bits; their sum need not fit 64
+    if expected != row.size or payload_bytes > PacketLog.max_kept_bytes(expected) or (sizes == 0).any():
+        raise ValueError("it is of another row, or has more payload than a receiver keeps")
+    nth = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
+    each = np.repeat(sizes, many)
+    parts = []
+    for n, size, place in zip(many.tolist(), sizes.tolist(), runs["place"].tolist(), strict=True):
+        source, start = (row, place) if place >= 0 else (own, -1 - place)
+        parts.append(source[start : start + n * size])
+        if parts[-1].size != n * size:
+            raise ValueError("payload is missing")
+    payload = np.concatenate(parts) if parts else np.zeros(0, dtype=np.uint8)
+    sequences = np.repeat(runs["sequence"].astype(np.int64), many) + nth
+    counts = np.repeat(runs["byte_count"].astype(np.int64), many) + nth * each
+    kept = batches[batches[:, 1] <= many.sum()] if len(batches) else batches
+    if len(kept) < len(batches) and (not len(kept) or kept[-1, 1] < many.sum()):
+        kept = np.concatenate([kept, [[batches[len(kept), 0], many.sum()]]])
+    return PacketLog.restore(expected, sequences, counts, each, kept, payload)

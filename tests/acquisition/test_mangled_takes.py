@@ -1,0 +1,148 @@
+"""Takes of rows with every trouble of radar, wires, card and network: what is kept is right or masked.
+
+Each take goes the way of a scan's: placed by counters, its frames compared with the pulses, committed if it is whole,
+else kept as with `--keep-incomplete`. 500 takes; `--long` takes 10,000 (MANGLED_FIRST: the first seed of a piece).
+"""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from tests.support.acquisition.arrival_model import MS, PAYLOAD, pulse_times
+from tests.support.capture.records import mask_of
+
+from polysight.acquisition.pulse_times import PlacedFrames, frames_to_move, move_frames, place_frames
+from polysight.capture.packet_log import PacketLog
+from polysight.capture.placement import Past, Placed, place_record
+from polysight_simulators.cards import KINDS, RADAR, Adversary, Sent
+
+GRIDS = [  # points, pulses, bytes of a frame
+    (7, 13, 4096),  # ends in a full packet
+    (7, 12, 4096),
+    (91, 1, 4096),
+    (30, 1, 4096),
+    (24, 8, 1456),
+    (40, 4, 512),  # frames below a packet
+]
+TROUBLES = (*KINDS, *RADAR)
+LOOKS_NS = MS  # a receiver looks at its socket so often
+
+
+@dataclass
+class Kept:
+    """A row as a scan keeps it."""
+
+    placed: Placed
+    frames: PlacedFrames | None
+    out: np.ndarray
+    masked: np.ndarray
+    whole: bool
+    untimed: int
+
+
+def logged(sent: Sent, expected: int) -> PacketLog:
+    """The packets as a receiver that is always awake logs them."""
+    log = PacketLog(expected)
+    seen_ns = 0
+    for a in sent.arrivals:
+        if a.t_ns > seen_ns + LOOKS_NS // 5 and seen_ns:
+            log.note_quiet(max(seen_ns, a.t_ns - LOOKS_NS))
+        log.add(np.frombuffer(a.packet, dtype=np.uint8)[None, :], np.array([len(a.packet)]), a.t_ns)
+        seen_ns = a.t_ns + 1000
+    return log
+
+
+def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
+    """Place a take and decide what is kept of it, as acquisition does."""
+    log = logged(sent, pulses.size * frame)
+    placed, out = place_record(log, frame, past, int(pulses[0, 0]) - 5 * MS)
+    frames = None
+    if placed.located or placed.slipped:
+        events = pulses[:, -1] + 2 * MS
+        frames = place_frames(pulses, events, placed.arrivals, frame, PAYLOAD, placed.holes)
+    timed = frames is not None and not frames.reason
+    whole = placed.complete and not (timed and frames is not None and frames.contradicted)
+    untimed = frames.uncertain if timed and frames is not None else pulses.size
+    missing = placed.missing
+    if not whole and (moved := frames_to_move(placed.located, placed.slipped, bool(missing), frames)) is not None:
+        out, missing = move_frames(out, placed.holes, int(placed.arrivals[-1, 1]), moved.slots, frame)
+        untimed = 0
+    return Kept(placed, frames, out, mask_of(out.size, missing), whole, untimed)
+
+
+def takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, Sent, int]]:
+    """One to three takes of a rig, each with up to three troubles."""
+    chance = random.Random(seed)
+    points, count, frame = GRIDS[seed % len(GRIDS)]
+    card = Adversary(chance, frame, 0, 1)
+    past = Past().after_reset()
+    for number in range(chance.randint(1, 3)):
+        troubles = tuple(chance.sample(TROUBLES, chance.randint(1, 3)))
+        pulses = pulse_times(points, count) + number * 10**11
+        sent = card.take(pulses.reshape(-1), troubles)
+        kept = keep(sent, past, pulses, frame)
+        past = kept.placed.past
+        if past.lost:
+            card.reset_by_host()
+            past = past.after_reset()
+        yield troubles, kept, sent, frame
+
+
+def wrong_bytes(kept: Kept, sent: Sent) -> int:
+    truth = np.frombuffer(sent.data, dtype=np.uint8)
+    return int((kept.out[~kept.masked] != truth[~kept.masked]).sum())
+
+
+def test_no_wrong_byte_is_kept(request: pytest.FixtureRequest):
+    """A whole row may hold one in frames that the manifest says were not seen at their pulses; a kept row none."""
+    first = int(os.environ.get("MANGLED_FIRST", "0"))
+    for seed in range(first, first + (5_000 if request.config.getoption("--long") else 250)):
+        for troubles, kept, sent, frame in takes(seed):
+            wrong = wrong_bytes(kept, sent)
+            assert wrong <= (kept.untimed * frame if kept.whole else 0), (seed, troubles, wrong, kept.placed.reason)
+
+
+@pytest.mark.parametrize("grid", range(len(GRIDS)))
+def test_a_perfect_take_after_trouble_is_committed(grid):
+    points, count, frame = GRIDS[grid]
+    chance = random.Random(grid)
+    card, past = Adversary(chance, frame), Past().after_reset()
+    pulses = pulse_times(points, count)
+    refused = 0
+    for number in range(40):
+        at = pulses + number * 10**11
+        troubles = tuple(chance.sample(TROUBLES, 2)) if number % 2 == 0 else ()
+        kept = keep(card.take(at.reshape(-1), troubles), past, at, frame)
+        refused += not troubles and not kept.whole
+        past = kept.placed.past
+        if past.lost:
+            card.reset_by_host()
+            past = past.after_reset()
+    assert refused == 0
+
+
+CASES = {
+    "drop inside": ("drop_inside",),
+    "a frame dropped inside": ("drop_frames",),
+    "spurious edge, a lost packet": ("spurious", "lose"),
+    "endless radar, end lost": ("spurious", "endless", "lose_tail"),
+    "counters anew": ("reset_early",),
+    "missed and spurious edge": ("missed", "spurious"),
+    "twin alone": ("twin_alone",),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(("points", "count", "frame"), GRIDS)
+def test_rows_that_were_once_kept_with_wrong_bytes(case, points, count, frame):
+    for seed in range(3):
+        card = Adversary(random.Random(f"{case} {seed}"), frame)
+        pulses = pulse_times(points, count)
+        sent = card.take(pulses.reshape(-1), CASES[case])
+        kept = keep(sent, Past().after_reset(), pulses, frame)
+        assert wrong_bytes(kept, sent) <= (kept.untimed * frame if kept.whole else 0)

@@ -16,8 +16,9 @@ from polysight_worlds.series import (
     sphere_coefficients,
     sum_orders,
 )
-from polysight_worlds.shape_echoes import choose_solution, sum_window
+from polysight_worlds.shape_echoes import choose_solution, sum_bent
 from polysight_worlds.shapes import Shape, find_specular, follow_path
+from polysight_worlds.zones import sum_window
 
 FREQUENCY_HZ = 78e9
 K = 2 * np.pi * FREQUENCY_HZ / LIGHT_M_PER_S
@@ -128,3 +129,26 @@ def test_series_and_physical_optics_agree_where_the_radius_is_large(medium, axis
     # Of first order in 1 / (k radius): 0.6 and 0.3 per cent, times some 3.
     assert max(differences[:2]) < 0.025
     assert max(differences[2:]) < 0.015
+
+
+def test_what_physical_optics_misses_is_found_from_the_series():
+    """On solids that the terms were not made from: another radius, a skew axis, a sphere."""
+    boards = published_boards()
+    x, y = published_rig().centre_m
+    centre_m = (float(x), float(y), 0.499 + 0.1)
+    offsets = np.array([[0.0, 0.0, 0.0], [0.1, 0.05, 0.0], [-0.2, 0.1, 0.0]])
+    left = []
+    missed = []
+    for shape in (sphere("ball", METAL, centre_m, 0.1), cylinder("pipe", METAL, centre_m, 0.1, 2.0, axis=(1, 2, 0.1))):
+        ratios = []
+        for rx in (boards.h[0], boards.v[0]):
+            places = find_specular(shape, boards.tx.position[:, None] + offsets.T, rx.position[:, None] + offsets.T)
+            arguments = shape, boards.tx, rx, np.array([FREQUENCY_HZ]), offsets, places
+            exact = choose_solution(shape)(*arguments)
+            ratios.append([optics(*arguments) / exact for optics in (sum_window, sum_bent)])
+        # Only H over V counts: what both have in common is antennas and spreading.
+        without, with_bends = np.array(ratios[0]) / np.array(ratios[1])
+        missed.append(np.abs(without - 1).max())
+        left.append(np.abs(with_bends - 1).max())
+    assert min(missed) > 0.015
+    assert max(left) < 0.007

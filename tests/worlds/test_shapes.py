@@ -22,6 +22,7 @@ from polysight_worlds.optics import Antenna
 from polysight_worlds.shapes import find_specular, follow_path
 
 BOARDS = published_boards()
+ONE_RX = Boards(BOARDS.tx, BOARDS.h[2:3], BOARDS.v[2:3])
 FREQUENCIES_HZ = np.linspace(76.3e9, 79.7e9, 9)
 CENTRE_M = np.array([*published_rig().centre_m, 0.499])
 DIELECTRIC = Stack(below=4 - 0.4j)
@@ -36,7 +37,7 @@ def behind(depth_m: float) -> tuple[float, float, float]:
 SHAPES = [
     sphere("sphere", METAL, behind(0.1), 0.1),
     cylinder("cylinder", DIELECTRIC, behind(0.1), 0.1, 0.6, axis=(0.3, 1.0, 0.1)),
-    cylinder("cone", DIELECTRIC, behind(0.09), 0.09, 0.6, slope=-0.15),
+    cylinder("cone", METAL, behind(0.09), 0.09, 0.6, slope=-0.15),
     plate("saddle", METAL, behind(0.0), (0.3, 0.3), bends=(7.0, -6.0, 1.0)),
     plate("tilted", DIELECTRIC, behind(0.0), (0.9, 0.9), tilt_deg=(4.0, -2.0), is_soft=True),
 ]
@@ -70,10 +71,10 @@ def geometrical_optics(shape: Shape, tx: Antenna, rx: Antenna, offset_m: np.ndar
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.name)
 def test_a_shape_reflects_by_geometrical_optics_but_for_a_few_per_cent(shape):
-    cubes = record_shapes([shape], BOARDS, FREQUENCIES_HZ, OFFSETS_M)
-    for channel, receivers in BOARDS.receivers().items():
-        expected = np.array([geometrical_optics(shape, BOARDS.tx, receivers[2], u, 76.3e9) for u in OFFSETS_M])
-        assert np.abs(cubes[channel][2, 0] - expected).max() < 0.04 * np.abs(expected).max()
+    cubes = record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:1], OFFSETS_M)
+    for channel, receivers in ONE_RX.receivers().items():
+        expected = np.array([geometrical_optics(shape, BOARDS.tx, receivers[0], u, 76.3e9) for u in OFFSETS_M])
+        assert np.abs(cubes[channel][0, 0] - expected).max() < 0.04 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.name)
@@ -103,9 +104,8 @@ def test_curvatures_are_those_of_the_solids():
 def test_a_whole_scan_is_that_of_its_single_positions(shape):
     x = 0.002 * np.arange(-30, 30)
     offsets = np.stack([*np.meshgrid(x, x), np.zeros((60, 60))], axis=-1)
-    one_rx = Boards(BOARDS.tx, BOARDS.h[:1], BOARDS.v[:1])
-    whole = record_shapes([shape], one_rx, FREQUENCIES_HZ, offsets)
-    some = record_shapes([shape], one_rx, FREQUENCIES_HZ, offsets[::20, ::20])
+    whole = record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets)
+    some = record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets[::20, ::20])
     for channel in whole:
         difference = np.abs(whole[channel][..., ::20, ::20] - some[channel]).max()
         assert difference < 5e-3 * np.abs(some[channel]).max()
@@ -116,9 +116,8 @@ def test_a_large_flat_plate_is_the_same_in_facets_and_in_zones():
     widths_m = np.linspace(0.5, 0.56, 9)
     sharp = [plate("sharp", DIELECTRIC, behind(0.0), (w, w), tilt_deg=(4.0, -2.0)) for w in widths_m]
     few = OFFSETS_M[:2]
-    one_rx = Boards(BOARDS.tx, BOARDS.h[:1], BOARDS.v[:1])
-    first = [record_shapes([piece], one_rx, FREQUENCIES_HZ[:1], few)["h"] for piece in sharp]
-    second = record_shapes([SHAPES[4]], one_rx, FREQUENCIES_HZ[:1], few)["h"]
+    first = [record_shapes([piece], ONE_RX, FREQUENCIES_HZ[:1], few)["h"] for piece in sharp]
+    second = record_shapes([SHAPES[4]], ONE_RX, FREQUENCIES_HZ[:1], few)["h"]
     assert np.mean(first, axis=0) == pytest.approx(second, rel=0.03)
 
 

@@ -26,13 +26,14 @@ class Antenna:
     """An antenna at `position` (3 metres) that looks along `boresight`, with pattern cos^n in amplitude.
 
     `polarisation`: complex vector at boresight. In other directions it is carried along the arc from the boresight, as
-    of a Huygens source (Ludwig's third definition).
+    of a Huygens source (Ludwig's third definition); of a dipole it is the part across the direction.
     """
 
     position: NDArray
     boresight: NDArray
     polarisation: NDArray
     exponent: float = 2.0
+    is_dipole: bool = False
 
     @staticmethod
     def aimed(
@@ -60,6 +61,9 @@ class Antenna:
         """Complex field vectors [3, ...] of unit distance in unit `directions` [3, ...]."""
         cosine = _dot(self.boresight, directions)
         gain = np.maximum(np.maximum(cosine, 0) ** self.exponent, PATTERN_FLOOR)
+        if self.is_dipole:
+            along = _dot(self.polarisation, directions)
+            return gain * (_column(self.polarisation, directions) - along * directions)
         return gain * _carry(self.boresight, directions, self.polarisation)
 
 

@@ -21,12 +21,17 @@ from scipy import special
 from polysight_worlds.media import LIGHT_M_PER_S
 from polysight_worlds.optics import Antenna
 
+# A wave absorbed by exp(-2 ABSORBED) on its way through comes back as rounding: then both kinds of inner waves are the
+# same, and only the one that is found downwards is stable.
+ABSORBED = 10.0
 # Terms beyond the size parameter x: Wiscombe's criterion for double precision, 4.05 x^(1/3) + 2, and some more.
 MORE_TERMS = 12
 # Places of the integrand over the axial wave number, in units of sqrt(1 / second derivative of the phase).
 PLACES = (-np.sqrt(3), 0.0, np.sqrt(3))
 # Of the polynomials in the path by which a cylinder's coefficients are looked up.
 DEGREE = 23
+# So few positions are computed one by one.
+FEW = 40
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,7 @@ def sphere_coefficients(
 def _inner_rates(y: complex, count: int, with_inside: bool) -> NDArray:
     """Logarithmic derivatives for n = 1 .. count of y j_n(y), or of the wave that only runs inwards, y h2_n(y)."""
     rates = np.zeros(count + 1, complex)
-    if not with_inside:
+    if not with_inside and y.imag < ABSORBED:
         rates[0] = -1j
         for n in range(1, count + 1):
             rates[n] = 1 / (n / y - rates[n - 1]) - n / y
@@ -207,6 +212,10 @@ class EndlessCylinder:
         j = np.concatenate([j_below[1:], special.jv(n[-1:], x)])
         h1_below, h1 = _hankel(len(orders), x)
         j_rate, h1_rate = (eta * (below - n / x * value) for below, value in ((j_below, j), (h1_below, h1)))
+        # Orders that miss the body give nothing, with Hankel functions beyond all numbers.
+        too_high = n > np.abs(x) + 4.05 * np.abs(x) ** (1 / 3) + MORE_TERMS
+        j, j_rate = np.where(too_high, 0, j), np.where(too_high, 0, j_rate)
+        h1, h1_rate = np.where(too_high, 1, h1), np.where(too_high, 1, h1_rate)
         if self.permittivity is None:
             return -j_rate / h1_rate, -j / h1, np.zeros_like(h1)
         inside = np.conj(self.permittivity)
@@ -225,7 +234,7 @@ class EndlessCylinder:
     def _inner_rates(self, count: int, y: NDArray) -> NDArray:
         """J_n' / J_n, or H2_n' / H2_n of a wave that only runs inwards, [count, h]."""
         rates = np.zeros((count, *y.shape), complex)
-        if not self.with_inside:
+        if not self.with_inside and np.imag(y).min() < ABSORBED:
             rates[0] = -special.hankel2(1, y) / special.hankel2(0, y)
             for n in range(1, count):
                 rates[n] = 1 / ((n - 1) / y - rates[n - 1]) - n / y
@@ -246,7 +255,9 @@ def _hankel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
     values[1] = special.hankel1(0, x)
     values[0] = -special.hankel1(1, x)
     for n in range(count - 1):
-        values[n + 2] = 2 * n / x * values[n + 1] - values[n]
+        # Beyond the argument they grow without end; such orders are not used.
+        grown = np.abs(values[n + 1]) > 1e150
+        values[n + 2] = np.where(grown, 1e150, 2 * n / x * np.where(grown, 0, values[n + 1]) - values[n])
     return values[:-1], values[1:]
 
 
@@ -267,7 +278,7 @@ def _tabulate(
     return first, second, third
 
 
-def _axial_wave_number(k: float, along_m: float, path_m: NDArray, place: float) -> tuple[NDArray, NDArray]:
+def _axial_wave_number(k: float, along_m: NDArray | float, path_m: NDArray, place: float) -> tuple[NDArray, NDArray]:
     """Axial wave number at `place` beside the stationary one, and the unit of places."""
     whole = np.hypot(along_m, path_m)
     unit = np.sqrt(k * path_m**2 / whole**3)
@@ -291,7 +302,7 @@ def scatter_cylinder(
     in 1 / (k path). (On the path of steepest descent, waves that creep around the body would grow.)
     """
     k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
-    along_m = round(float((pair.rx_m[0] - pair.tx_m[0]).mean()), 9)
+    along_m = np.round(pair.rx_m[0] - pair.tx_m[0], 9)
     whole = np.hypot(along_m, path_m)
     low, high = float(np.floor(100 * path_m.min()) / 100), float(np.floor(100 * path_m.max()) / 100) + 0.01
     body = EndlessCylinder(radius_m, permittivity, with_inside)
@@ -301,10 +312,10 @@ def scatter_cylinder(
     side = -1j / (2 * PLACES[2] ** 2)
     for place, weight in zip(PLACES, (side, 1 - 2 * side, side), strict=True):
         h, unit = _axial_wave_number(k, along_m, path_m, place)
-        if len(h) <= DEGREE:
+        if len(h) <= FEW or np.ptp(along_m) > 0:
             m_m, n_n, m_n = (table.T for table in body.coefficients(k, h, orders_of(k * radius_m)))
         else:
-            m_m, n_n, m_n = (basis @ table for table in _tabulate(body, k, along_m, place, (low, high)))
+            m_m, n_n, m_n = (basis @ table for table in _tabulate(body, k, float(along_m[0]), place, (low, high)))
         slow = sum_orders(pair, (m_m, n_n, m_n), k, h, path_m)
         phase = h * along_m + np.sqrt(k**2 - h**2) * path_m - k * whole
         total += weight * unit * slow * np.exp(1j * (phase + place**2 / 2))

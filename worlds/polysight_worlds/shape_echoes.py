@@ -1,11 +1,9 @@
 """Echoes of shapes as a receiver sees them after synchronisation.
 
-Spheres and cylinders of one medium have exact series (`series`). For all other surfaces it is physical optics about the
-specular point of each stage position: the surface is sampled in units of its Fresnel zone and summed under a smooth
-window; the trapezoidal rule of a smooth integrand converges exponentially. What lies outside adds nothing but edges and
-shadow boundaries, which physical optics has wrong. What is left after the phase of the specular path is smooth, so a
-coarse lattice of stage positions and a few frequencies are enough; the path itself is exact everywhere. Flat plates
-keep their sharp edges: they are summed facet by facet at every position.
+Spheres and cylinders of one medium have exact series (`series`). All other surfaces are seen by physical optics about
+the specular point of each stage position (`zones`), with what it misses at bent ones (`bends`). What is left after the
+phase of the specular path is smooth, so a coarse lattice of stage positions and a few frequencies are enough; the path
+itself is exact everywhere. Flat plates keep their sharp edges: they are summed facet by facet at every position.
 """
 
 from __future__ import annotations
@@ -17,21 +15,14 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from polysight_worlds.media import LIGHT_M_PER_S, reflect
-from polysight_worlds.optics import CHUNK, Antenna, Response, integrate_phase, rectangle, respond
+from polysight_worlds.bends import find_bend_terms
+from polysight_worlds.media import LIGHT_M_PER_S
+from polysight_worlds.optics import CHUNK, Antenna, integrate_phase, rectangle, respond
 from polysight_worlds.rig import Boards
 from polysight_worlds.series import Pair, scatter_cylinder, scatter_sphere
 from polysight_worlds.shapes import Revolved, Shape, Sphere, find_specular, follow_path
+from polysight_worlds.zones import CosineTable, antennas_at, spread_of_ray, sum_window, window, window_units
 
-# Window exp(-x) (1 + x + .. + x^4 / 24), x = (distance / WIDTH)^2 / 2, in units of the Fresnel zone, sqrt(1 / (k second
-# derivative)). It is entire and flat to tenth order: of a quadratic phase it misses 945 / (120 (2 WIDTH^2)^5), 7e-4.
-WIDTH = 1.8
-END = 9.5
-SPACING = 0.62
-# Near a caustic the zone would grow without end.
-LEAST_BEND_PER_M = 0.8
-# Currents fade out from this cosine of incidence on: they do not end at the shadow's edge.
-GRAZING = 0.3
 # What edges diffract turns by a wave in 13 mm of the stage's way, relative to the specular path. The series has none.
 LATTICE_M = 0.005
 LATTICE_OF_SERIES_M = 0.018
@@ -79,20 +70,20 @@ def echo_of(
         return _sum_facets(shape, tx, rx, frequencies_hz, offsets, direct_m)
     solution = choose_solution(shape)
     nodes_hz, expand = _frequency_nodes(frequencies_hz)
-    lattice, coordinates = _make_lattice(offsets, LATTICE_M if solution is sum_window else LATTICE_OF_SERIES_M)
+    lattice, coordinates = _make_lattice(offsets, LATTICE_M if solution is sum_bent else LATTICE_OF_SERIES_M)
     if shows_inside(shape):
         # What crossed the body has paths of its own: no lattice of positions or frequencies holds it.
         lattice, nodes_hz, expand = None, frequencies_hz, np.eye(len(frequencies_hz))
     if lattice is None:
-        places = find_specular(shape, *_antennas(tx, rx, offsets))
+        places = find_specular(shape, *antennas_at(tx, rx, offsets))
         slow = solution(shape, tx, rx, nodes_hz, offsets, places)
     else:
         coarse = lattice.reshape(-1, 3)
-        coarse_places = find_specular(shape, *_antennas(tx, rx, coarse))
+        coarse_places = find_specular(shape, *antennas_at(tx, rx, coarse))
         coarse_slow = solution(shape, tx, rx, nodes_hz, coarse, coarse_places)
         places = tuple(_interpolate(p.reshape(lattice.shape[:2]), coordinates) for p in coarse_places)
         slow = np.stack([_interpolate(s.reshape(lattice.shape[:2]), coordinates) for s in coarse_slow])
-    path = follow_path(shape.at(*places), *_antennas(tx, rx, offsets))
+    path = follow_path(shape.at(*places), *antennas_at(tx, rx, offsets))
     if solution is solve_cylinder:
         slow = slow * _end_factors(shape, path.hessian, places[0], nodes_hz)
     return _add_carrier(slow, path.length_m - direct_m, frequencies_hz, expand)
@@ -107,12 +98,12 @@ def choose_solution(shape: Shape) -> Solution:
         return solve_sphere
     if not shape.stack.layers and isinstance(shape, Revolved) and not shape.slope and not shape.bulge:
         return solve_cylinder
-    return sum_window
+    return sum_bent
 
 
 def shows_inside(shape: Shape) -> bool:
     """True if a wave that crosses the body twice comes back with more than INSIDE_LEVEL."""
-    if choose_solution(shape) is sum_window or shape.stack.is_metal:
+    if choose_solution(shape) is sum_bent or shape.stack.is_metal:
         return False
     loss = abs(np.sqrt(shape.stack.below).imag)
     across_m = 4 * shape.scale_m()[1]
@@ -128,7 +119,7 @@ def solve_sphere(
 ) -> NDArray:
     """Mie's series, without the specular path's phase: [frequencies, offsets]."""
     patch = shape.at(*places)
-    path_m = follow_path(patch, *_antennas(tx, rx, offsets)).length_m
+    path_m = follow_path(patch, *antennas_at(tx, rx, offsets)).length_m
     pair = Pair.aimed(tx, rx, offsets, np.asarray(shape.place_m), patch.point)
     waves = []
     for frequency_hz in frequencies_hz:
@@ -142,7 +133,7 @@ def solve_cylinder(
 ) -> NDArray:
     """Series of the endless cylinder, without the specular path's phase: [frequencies, offsets]."""
     patch = shape.at(*places)
-    path_m = follow_path(patch, *_antennas(tx, rx, offsets)).length_m
+    path_m = follow_path(patch, *antennas_at(tx, rx, offsets)).length_m
     pair = Pair.aimed(tx, rx, offsets, np.asarray(shape.place_m), patch.point).turned(shape.axes)
     across_m = np.sqrt(path_m**2 - (pair.rx_m[0] - pair.tx_m[0]) ** 2)
     waves = []
@@ -157,8 +148,8 @@ def solve_cylinder(
 def _end_factors(shape: Shape, hessian: NDArray, along: NDArray, frequencies_hz: NDArray) -> NDArray:
     """What a cylinder's ends leave of the endless one's echo, [frequencies, offsets]: a Fresnel integral along it."""
     bend = hessian[0, 0] - hessian[0, 1] ** 2 / hessian[1, 1]
-    units = _window_units()
-    weights = _window(units) * np.exp(-0.5j * units**2)
+    units = window_units()
+    weights = window(units) * np.exp(-0.5j * units**2)
     weights /= weights.sum()
     factors = []
     for frequency_hz in frequencies_hz:
@@ -176,10 +167,6 @@ def _add_carrier(slow: NDArray, excess_m: NDArray, frequencies_hz: NDArray, expa
         angle = (-2 * np.pi * (turns - np.round(turns))).astype(np.float32)
         echo[index] *= np.cos(angle) + 1j * np.sin(angle)
     return echo
-
-
-def _antennas(tx: Antenna, rx: Antenna, offsets: NDArray) -> tuple[NDArray, NDArray]:
-    return tx.position[:, None] + offsets.T, rx.position[:, None] + offsets.T
 
 
 def _make_lattice(offsets: NDArray, step_m: float) -> tuple[NDArray | None, NDArray]:
@@ -212,83 +199,43 @@ def _frequency_nodes(frequencies_hz: NDArray, count: int = 5) -> tuple[NDArray, 
     return middle + half * nodes, wanted @ np.linalg.inv(basis)
 
 
-def _window_units() -> NDArray:
-    return np.arange(-np.floor(END / SPACING), np.floor(END / SPACING) + 1) * SPACING
-
-
-def _window(units: NDArray) -> NDArray:
-    """Smooth window over distances in Fresnel zones."""
-    x = (units / WIDTH) ** 2 / 2
-    return np.exp(-x) * (1 + x * (1 + x / 2 * (1 + x / 3 * (1 + x / 4))))
-
-
-def _fade_shadow(normals: NDArray, response: Response) -> NDArray:
-    """Smooth step to 0 towards grazing incidence or scattering."""
-    # The gradient is incident minus scattered direction.
-    rise = np.einsum("i...,i...->...", normals, response.gradient)
-    cosine = np.minimum(response.cos_incidence, -response.cos_incidence - rise)
-    share = np.clip(cosine / GRAZING, 0, 1)
-    return share**2 * (3 - 2 * share)
-
-
-def sum_window(
+def sum_bent(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
 ) -> NDArray:
-    """Physical optics about the specular points (a, b), without the specular path's phase: [frequencies, offsets]."""
-    units = _window_units()
-    xi, eta = (grid.ravel() for grid in np.meshgrid(units, units))
-    weights = _window(xi) * _window(eta) * SPACING**2
-    sums = np.empty((len(frequencies_hz), len(offsets)), complex)
-    at_once = max(1, CHUNK // len(weights))
-    middle_k = 2 * np.pi * float(np.mean(frequencies_hz)) / LIGHT_M_PER_S
-    tables = [CosineTable(shape, f) for f in frequencies_hz]
-    for first in range(0, len(offsets), at_once):
-        chunk = slice(first, first + at_once)
-        a0, b0 = places[0][chunk], places[1][chunk]
-        u = offsets[chunk]
-        middle = shape.at(a0, b0)
-        path = follow_path(middle, *_antennas(tx, rx, u))
-        zones, zone_area = _fresnel_zones(middle.tangents(), path.hessian, middle_k)
-        a = a0[:, None] + zones[0, 0, :, None] * xi + zones[1, 0, :, None] * eta
-        b = b0[:, None] + zones[0, 1, :, None] * xi + zones[1, 1, :, None] * eta
-        patch = shape.at(a, b)
-        moved = patch.point - u.T[:, :, None]
-        response = respond(tx, rx, moved, patch.normal)
-        area = patch.area * zone_area[:, None] * weights * shape.cover(a, b) * _fade_shadow(patch.normal, response)
-        rest_m = response.path_m - path.length_m[:, None]
-        for i, frequency_hz in enumerate(frequencies_hz):
-            k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
-            r_s, r_p = tables[i].look_up(response.cos_incidence)
-            terms = (r_s * response.s_weight + r_p * response.p_weight) * area
-            sums[i, chunk] = 1j * k / (4 * np.pi) * (terms * np.exp(-1j * k * rest_m)).sum(axis=1)
+    """Physical optics with what it misses to first order in the curvature, where the medium has no layers."""
+    sums = sum_window(shape, tx, rx, frequencies_hz, offsets, places)
+    if shape.is_bent and not shape.stack.layers:
+        sums += _add_bends(shape, tx, rx, frequencies_hz, offsets, places)
     return sums
 
 
-def _fresnel_zones(tangents: NDArray, hessian: NDArray, k: float) -> tuple[NDArray, NDArray]:
-    """Parameters' rates [2 axes, 2 parameters, n] per Fresnel zone along the path's two axes, and their area [n]."""
-    bends = np.einsum("ij...,jk...,lk...->il...", tangents, hessian, tangents)
-    eigenvalues, vectors = np.linalg.eigh(np.moveaxis(bends, -1, 0))
-    lengths = 1 / np.sqrt(k * np.maximum(np.abs(eigenvalues), LEAST_BEND_PER_M))
-    # vectors [n, component, axis]
-    rates = np.einsum("nia,ijn,na->ajn", vectors, tangents, lengths)
-    return rates, np.abs(rates[0, 0] * rates[1, 1] - rates[0, 1] * rates[1, 0])
-
-
-class CosineTable:
-    """Reflection coefficients of a shape's medium over the cosine of incidence, linear between 513 places."""
-
-    def __init__(self, shape: Shape, frequency_hz: float) -> None:
-        cosines = np.linspace(0, 1, 513)
-        cosines[0] = 1e-6
-        self._tables = [np.ascontiguousarray(table) for table in reflect(shape.stack, frequency_hz, cosines)]
-
-    def look_up(self, cos_incidence: NDArray) -> tuple[NDArray, NDArray]:
-        """(r_s, r_p) as complex128."""
-        place = np.clip(cos_incidence, 0, 1) * 512
-        left = np.minimum(place.astype(np.int32), 511)
-        share = place - left
-        s, p = (table[left] + share * (table[left + 1] - table[left]) for table in self._tables)
-        return s, p
+def _add_bends(
+    shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, places: tuple[NDArray, ...]
+) -> NDArray:
+    """What physical optics misses at the specular points, [frequencies, offsets], see `bends`."""
+    tx_m, rx_m = antennas_at(tx, rx, offsets)
+    patch = shape.at(*places)
+    spread = spread_of_ray(patch, follow_path(patch, tx_m, rx_m), tx_m, rx_m) * shape.cover(*places)
+    out, back = patch.point - tx_m, rx_m - patch.point
+    incident, scattered = out / np.linalg.norm(out, axis=0), back / np.linalg.norm(back, axis=0)
+    s_axis = np.cross(incident, patch.normal, axis=0)
+    s_axis /= np.linalg.norm(s_axis, axis=0)
+    cosine = -np.einsum("in,in->n", incident, patch.normal)
+    along = (incident + cosine * patch.normal) / np.sqrt(1 - cosine**2)
+    # The curvature of the surface in the directions along the plane of incidence and across it.
+    tangents = np.einsum("ijn,jcn->icn", patch.tangents(), np.array([patch.d_a, patch.d_b]))
+    directions = np.array([[np.einsum("cn,cn->n", t, d) for t in tangents] for d in (along, s_axis)])
+    curvature = np.einsum("xin,ijn,yjn->xyn", directions, patch.curvature(), directions)
+    weights = np.stack([np.ones_like(cosine), curvature[0, 0], curvature[1, 1], curvature[0, 1]], axis=1)
+    sent, received = tx.field(incident), rx.field(-scattered)
+    parts_in = [np.einsum("in,in->n", sent, axis) for axis in (s_axis, np.cross(s_axis, incident, axis=0))]
+    parts_out = [np.einsum("in,in->n", received, axis) for axis in (s_axis, np.cross(scattered, s_axis, axis=0))]
+    pairs = np.stack([parts_in[i] * parts_out[j] for i, j in ((0, 0), (1, 1), (0, 1), (1, 0))], axis=1)
+    terms = find_bend_terms(shape.stack)
+    return np.stack([
+        spread * np.einsum("nr,nrc,nc->n", weights, terms.at(cosine, frequency_hz), pairs)
+        for frequency_hz in frequencies_hz
+    ])  # fmt: skip
 
 
 def _sum_facets(
@@ -300,12 +247,12 @@ def _sum_facets(
     area_m2 = float(np.linalg.norm(np.cross(facets.edge_u[:, 0], facets.edge_v[:, 0])))
     normal = -shape.axes[:, 2]
     middle = np.asarray(shape.place_m)[:, None]
-    antennas = _antennas(tx, rx, offsets)
+    antennas = antennas_at(tx, rx, offsets)
     middle_path_m = np.linalg.norm(middle - antennas[0], axis=0) + np.linalg.norm(middle - antennas[1], axis=0)
     # Paths over a plate differ by less than its diagonal: so many radians to either side over half of the band.
     radians = np.pi / 2 * float(np.hypot(*shape.size_m)) * np.ptp(frequencies_hz) / LIGHT_M_PER_S
     nodes_hz, expand = _frequency_nodes(frequencies_hz, 5 + int(np.ceil(radians)))
-    tables = [CosineTable(shape, f) for f in nodes_hz]
+    tables = [CosineTable.of(shape.stack, f) for f in nodes_hz]
     slow = np.empty((len(nodes_hz), len(offsets)), complex)
     at_once = max(1, CHUNK // len(facets.centres[0]))
     for first in range(0, len(offsets), at_once):

@@ -80,8 +80,9 @@ class Shape:
     size_m: tuple[float, float]
     axes: NDArray = field(default_factory=lambda: np.eye(3), repr=False)
 
-    # Flat shapes with sharp edges are summed facet by facet, see `shape_echoes`.
+    # Flat shapes with sharp edges are summed facet by facet, see `shape_echoes`; those with soft ones are not bent.
     is_flat_plate = False
+    is_bent = True
 
     def turned(self, axis: NDArray, angle_deg: float) -> Shape:
         """Return the shape turned about its origin."""
@@ -148,9 +149,14 @@ class Graph(Shape):
     is_soft: bool = False
 
     @property
+    def is_bent(self) -> bool:  # type: ignore[override]
+        """True if it is no plane."""
+        return bool(self.bend_x or self.bend_y or self.twist)
+
+    @property
     def is_flat_plate(self) -> bool:  # type: ignore[override]
         """True for a plane with sharp edges."""
-        return not (self.bend_x or self.bend_y or self.twist or self.is_soft)
+        return not (self.is_bent or self.is_soft)
 
     def local(self, a: NDArray, b: NDArray) -> Patch:
         """Return the surface in local axes."""

@@ -1,0 +1,106 @@
+"""What physical optics misses at a bent surface, to first order in the curvature over the wave number.
+
+Physical optics takes each point's tangent plane for the surface. The true reflection differs by terms of first order
+in 1 / (k R), which are linear in the three curvatures: along the plane of incidence, across it, and the twist between
+both (which couples s and p). Three solids with exact series have each of them in turn: a cylinder across the plane of
+incidence, one along it, and one at 45 degrees. Series minus physical optics at two radii gives the terms for any
+medium, also those of a plane (radius without end) for antennas at a finite distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from polysight_worlds.media import LIGHT_M_PER_S, Stack
+from polysight_worlds.optics import Antenna
+from polysight_worlds.series import Pair, scatter_cylinder
+from polysight_worlds.shapes import cylinder, find_specular, follow_path
+from polysight_worlds.zones import spread_of_ray, sum_window
+
+ANGLES_DEG = np.linspace(30, 65, 8)
+RADII_M = (0.2, 0.4)
+FREQUENCY_HZ = 78e9
+# Each antenna's distance from the specular point, as in the published rig.
+DISTANCE_M = 0.86
+# Solids: axis, and (curvature along the plane of incidence, across it, twist) of one with radius 1.
+SOLIDS: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = (
+    ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0)),
+    ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((1.0, 1.0, 0.0), (0.5, 0.5, -0.5)),
+)
+# Polarisations sent and received: 0 is s, 1 is p.
+PAIRS = ((0, 0), (1, 1), (0, 1), (1, 0))
+
+
+@dataclass(frozen=True)
+class BendTerms:
+    """Additions to the reflection coefficients over the cosine of incidence, at `FREQUENCY_HZ`.
+
+    Each row of `table` [4 rows, 4 coefficients] is of: a plane, curvature along, across, twist (the last three times
+    metres). Coefficients: s to s, p to p, s to p, p to s.
+    """
+
+    spline: CubicSpline
+
+    def at(self, cos_incidence: NDArray, frequency_hz: float) -> NDArray:
+        """Return complex [..., 4 rows, 4 coefficients] at these cosines."""
+        angles = np.clip(np.degrees(np.arccos(cos_incidence)), ANGLES_DEG[0], ANGLES_DEG[-1])
+        values = self.spline(angles)
+        return (values[..., 0] + 1j * values[..., 1]) * (FREQUENCY_HZ / frequency_hz)
+
+
+@lru_cache(maxsize=64)
+def find_bend_terms(stack: Stack) -> BendTerms:
+    """Return the terms of a half space or metal."""
+    slopes = []
+    planes = []
+    for axis, _ in SOLIDS:
+        near, far = (_compare(stack, axis, radius_m) for radius_m in RADII_M)
+        slope = (near - far) / (1 / RADII_M[0] - 1 / RADII_M[1])
+        slopes.append(slope)
+        planes.append(far - slope / RADII_M[1])
+    curvatures = np.array([curvature for _, curvature in SOLIDS])
+    by_curvature = np.einsum("rs,sac->arc", np.linalg.inv(curvatures), np.array(slopes))
+    # The third solid bends along both directions, so its own mean of planes is the least sure.
+    table = np.concatenate([np.mean(planes[:2], axis=0)[:, None], by_curvature], axis=1)
+    # By symmetry, only a twist couples s and p, and it does nothing else.
+    table[:, :3, 2:] = 0
+    table[:, 3, :2] = 0
+    return BendTerms(CubicSpline(ANGLES_DEG, np.stack([np.real(table), np.imag(table)], axis=-1)))
+
+
+def _compare(stack: Stack, axis: tuple[float, float, float], radius_m: float) -> NDArray:
+    """Series minus physical optics over the ray's spreading, [angles, 4: s to s, p to p, s to p, p to s]."""
+    sines, cosines = np.sin(np.radians(ANGLES_DEG)), np.cos(np.radians(ANGLES_DEG))
+    shape = cylinder("solid", stack, (0.0, 0.0, radius_m), radius_m, 10.0, axis=axis)
+    s_axis = np.array([0.0, 1.0, 0.0])
+    optics = []
+    spreads = []
+    columns = []
+    for sine, cosine in zip(sines, cosines, strict=True):
+        # The plane of incidence is y = 0, the specular point the origin; p axes as of `optics.respond`.
+        tx_way, rx_way = np.array([-sine, 0.0, -cosine]), np.array([sine, 0.0, -cosine])
+        axes = (s_axis, np.cross(s_axis, -tx_way)), (s_axis, np.cross(rx_way, s_axis))
+        tx_m, rx_m = (DISTANCE_M * way[:, None] for way in (tx_way, rx_way))
+        at = find_specular(shape, tx_m, rx_m)
+        patch = shape.at(*at)
+        path = follow_path(patch, tx_m, rx_m)
+        for sent, received in PAIRS:
+            tx = Antenna(tx_m[:, 0], -tx_way, axes[0][sent], 0.0, is_dipole=True)
+            rx = Antenna(rx_m[:, 0], -rx_way, axes[1][received], 0.0, is_dipole=True)
+            arguments = (shape, tx, rx, np.array([FREQUENCY_HZ]), np.zeros((1, 3)), at)
+            optics.append(sum_window(*arguments)[0, 0])
+            spreads.append(spread_of_ray(patch, path, tx_m, rx_m)[0])
+            place = -np.asarray(shape.place_m)
+            columns.append((tx.position + place, rx.position + place, tx.polarisation, rx.polarisation))
+    pair = Pair(*(np.array(part).T for part in zip(*columns, strict=True))).turned(shape.axes)
+    path_m = np.sqrt((2 * DISTANCE_M) ** 2 - (pair.rx_m[0] - pair.tx_m[0]) ** 2)
+    medium = None if stack.is_metal else stack.below
+    series = scatter_cylinder(pair, radius_m, medium, FREQUENCY_HZ, path_m)
+    series = series * np.exp(2j * np.pi * FREQUENCY_HZ / LIGHT_M_PER_S * 2 * DISTANCE_M)
+    return ((series - np.array(optics)) / np.array(spreads)).reshape(len(ANGLES_DEG), len(PAIRS))

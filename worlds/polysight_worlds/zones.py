@@ -1,0 +1,136 @@
+"""Physical optics about specular points, and the rays through them.
+
+Around a specular point the surface is sampled in units of its Fresnel zone and summed under a smooth window; the
+trapezoidal rule of a smooth integrand converges exponentially. What lies outside adds nothing but edges and shadow
+boundaries, which physical optics has wrong.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight_worlds.media import LIGHT_M_PER_S, Stack, reflect
+from polysight_worlds.optics import CHUNK, Antenna, Response, respond
+from polysight_worlds.shapes import Patch, PathAt, Shape, follow_path
+
+# Window exp(-x) (1 + x + .. + x^4 / 24), x = (distance / WIDTH)^2 / 2, in units of the Fresnel zone, sqrt(1 / (k second
+# derivative)). It is entire and flat to tenth order: of a quadratic phase it misses 945 / (120 (2 WIDTH^2)^5), 7e-4.
+WIDTH = 1.8
+END = 9.5
+SPACING = 0.62
+# Near a caustic the zone would grow without end.
+LEAST_BEND_PER_M = 0.8
+# Currents fade out from this cosine of incidence on: they do not end at the shadow's edge.
+GRAZING = 0.3
+
+
+def antennas_at(tx: Antenna, rx: Antenna, offsets: NDArray) -> tuple[NDArray, NDArray]:
+    """Places of TX and RX [3, offsets] at stage offsets [offsets, 3]."""
+    return tx.position[:, None] + offsets.T, rx.position[:, None] + offsets.T
+
+
+def window_units() -> NDArray:
+    """Distances in Fresnel zones at which the window is sampled."""
+    return np.arange(-np.floor(END / SPACING), np.floor(END / SPACING) + 1) * SPACING
+
+
+def window(units: NDArray) -> NDArray:
+    """Smooth window over distances in Fresnel zones."""
+    x = (units / WIDTH) ** 2 / 2
+    return np.exp(-x) * (1 + x * (1 + x / 2 * (1 + x / 3 * (1 + x / 4))))
+
+
+def _fade_shadow(normals: NDArray, response: Response) -> NDArray:
+    """Smooth step to 0 towards grazing incidence or scattering."""
+    # The gradient is incident minus scattered direction.
+    rise = np.einsum("i...,i...->...", normals, response.gradient)
+    cosine = np.minimum(response.cos_incidence, -response.cos_incidence - rise)
+    share = np.clip(cosine / GRAZING, 0, 1)
+    return share**2 * (3 - 2 * share)
+
+
+def spread_of_ray(patch: Patch, path: PathAt, tx_m: NDArray, rx_m: NDArray) -> NDArray:
+    """Amplitude of a ray at specular points by geometrical optics, of 1 at 1 m; after a focus with its phase.
+
+    cos(incidence) / (r1 r2 sqrt(det path'')), with the path's second derivatives by the tangent plane's metres; the
+    root has a factor j for each negative curvature of the path.
+    """
+    out_m, back_m = np.linalg.norm(patch.point - tx_m, axis=0), np.linalg.norm(patch.point - rx_m, axis=0)
+    cosine = np.einsum("in,in->n", patch.normal, tx_m - patch.point) / out_m
+    basis = patch.tangents()
+    bends = np.linalg.eigvalsh(np.moveaxis(np.einsum("ij...,jk...,lk...->il...", basis, path.hessian, basis), -1, 0))
+    return cosine / (out_m * back_m * np.sqrt(np.abs(bends.prod(axis=1)))) * 1j ** (bends < 0).sum(axis=1)
+
+
+def sum_window(
+    shape: Shape,
+    tx: Antenna,
+    rx: Antenna,
+    frequencies_hz: NDArray,
+    offsets: NDArray,
+    places: tuple[NDArray, ...],
+) -> NDArray:
+    """Physical optics about the specular points (a, b), without the specular path's phase: [frequencies, offsets]."""
+    units = window_units()
+    xi, eta = (grid.ravel() for grid in np.meshgrid(units, units))
+    weights = window(xi) * window(eta) * SPACING**2
+    sums = np.empty((len(frequencies_hz), len(offsets)), complex)
+    at_once = max(1, CHUNK // len(weights))
+    middle_k = 2 * np.pi * float(np.mean(frequencies_hz)) / LIGHT_M_PER_S
+    tables = [CosineTable.of(shape.stack, f) for f in frequencies_hz]
+    for first in range(0, len(offsets), at_once):
+        chunk = slice(first, first + at_once)
+        a0, b0 = places[0][chunk], places[1][chunk]
+        u = offsets[chunk]
+        middle = shape.at(a0, b0)
+        path = follow_path(middle, *antennas_at(tx, rx, u))
+        zones, zone_area = _fresnel_zones(middle.tangents(), path.hessian, middle_k)
+        a = a0[:, None] + zones[0, 0, :, None] * xi + zones[1, 0, :, None] * eta
+        b = b0[:, None] + zones[0, 1, :, None] * xi + zones[1, 1, :, None] * eta
+        patch = shape.at(a, b)
+        moved = patch.point - u.T[:, :, None]
+        response = respond(tx, rx, moved, patch.normal)
+        area = patch.area * zone_area[:, None] * weights * shape.cover(a, b) * _fade_shadow(patch.normal, response)
+        rest_m = response.path_m - path.length_m[:, None]
+        for i, frequency_hz in enumerate(frequencies_hz):
+            k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
+            r_s, r_p = tables[i].look_up(response.cos_incidence)
+            terms = (r_s * response.s_weight + r_p * response.p_weight) * area
+            sums[i, chunk] = 1j * k / (4 * np.pi) * (terms * np.exp(-1j * k * rest_m)).sum(axis=1)
+    return sums
+
+
+def _fresnel_zones(tangents: NDArray, hessian: NDArray, k: float) -> tuple[NDArray, NDArray]:
+    """Parameters' rates [2 axes, 2 parameters, n] per Fresnel zone along the path's two axes, and their area [n]."""
+    bends = np.einsum("ij...,jk...,lk...->il...", tangents, hessian, tangents)
+    eigenvalues, vectors = np.linalg.eigh(np.moveaxis(bends, -1, 0))
+    lengths = 1 / np.sqrt(k * np.maximum(np.abs(eigenvalues), LEAST_BEND_PER_M))
+    # vectors [n, component, axis]
+    rates = np.einsum("nia,ijn,na->ajn", vectors, tangents, lengths)
+    return rates, np.abs(rates[0, 0] * rates[1, 1] - rates[0, 1] * rates[1, 0])
+
+
+class CosineTable:
+    """Reflection coefficients of a medium over the cosine of incidence, linear between 513 places."""
+
+    @staticmethod
+    @lru_cache(maxsize=256)
+    def of(stack: Stack, frequency_hz: float) -> CosineTable:
+        """Return the table of a medium, made once."""
+        return CosineTable(stack, frequency_hz)
+
+    def __init__(self, stack: Stack, frequency_hz: float) -> None:
+        cosines = np.linspace(0, 1, 513)
+        cosines[0] = 1e-6
+        self._tables = [np.ascontiguousarray(table) for table in reflect(stack, frequency_hz, cosines)]
+
+    def look_up(self, cos_incidence: NDArray) -> tuple[NDArray, NDArray]:
+        """(r_s, r_p) as complex128."""
+        place = np.clip(cos_incidence, 0, 1) * 512
+        left = np.minimum(place.astype(np.int32), 511)
+        share = place - left
+        s, p = (table[left] + share * (table[left + 1] - table[left]) for table in self._tables)
+        return s, p

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from polysight_pi.trigger import DEFAULT_BUFSIZ, Edge, Lines, SpiBurst
+from polysight_pi.trigger import DEFAULT_BUFSIZ, Edge, Lines, Seen, SpiBurst
 from polysight_shared.config import Instrument, Pi
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
@@ -30,6 +30,8 @@ from polysight_shared.wires import WireClient, WireEdge
 EVENT_BUFFER = 1024  # edges kept by the kernel; its default of 16 would lose edges of a program without CPU time
 SPIN_NS = 100_000  # a sleep may end this much late, so the rest of a wait polls the clock
 WARM_NS = 30_000
+SIMULATED_LOOK_BACK_S = 2.0  # of a busy machine
+LOOK_BACK_S = 0.05  # timeout for pulses that were sent and are not seen; the kernel reports them within microseconds
 TWO_CALLS_NS = 1000  # pulses up to this width are as short as two system calls make them
 SET_VALUES = 0xC010B40F  # GPIO_V2_LINE_SET_VALUES_IOCTL, with the argument (bits, mask)
 _VALUES = struct.Struct("=QQ")
@@ -142,6 +144,21 @@ def request_output(pi: Pi) -> Any:
     return _request(pi, pi.sync_out[0], direction=line.Direction.OUTPUT, output_value=line.Value.INACTIVE)
 
 
+def _request_edges(pi: Pi, number: int, debounce_us: int = 0) -> Any:
+    """Request an input whose rising edges the kernel stamps (CLOCK_MONOTONIC) and counts. Raises DeviceError."""
+    line = load_gpiod().line
+    return _request(
+        pi,
+        number,
+        EVENT_BUFFER,
+        direction=line.Direction.INPUT,
+        edge_detection=line.Edge.RISING,
+        event_clock=line.Clock.MONOTONIC,
+        bias=line.Bias[pi.trigger_bias.upper().replace("-", "_")],
+        debounce_period=timedelta(microseconds=debounce_us),
+    )
+
+
 def _lost(e: OSError) -> DeviceError:
     return DeviceError(
         f"GPIO lines are gone: {e.strerror}", "the chip vanished or its driver was unloaded", "`polysight-pi check`"
@@ -157,17 +174,7 @@ class TriggerInput:
     def __init__(self, pi: Pi) -> None:
         self.check_width = not pi.one_shot
         self._events: deque[Any] = deque()
-        line = load_gpiod().line
-        self._input = _request(
-            pi,
-            pi.trigger_in,
-            EVENT_BUFFER,
-            direction=line.Direction.INPUT,
-            edge_detection=line.Edge.RISING,
-            event_clock=line.Clock.MONOTONIC,
-            bias=line.Bias[pi.trigger_bias.upper().replace("-", "_")],
-            debounce_period=timedelta(microseconds=pi.trigger_debounce_us),
-        )
+        self._input = _request_edges(pi, pi.trigger_in, pi.trigger_debounce_us)
 
     def now_ns(self) -> int:
         """Return the time of CLOCK_MONOTONIC, nanoseconds."""
@@ -209,13 +216,29 @@ class GpiodLines(TriggerInput):
 
     def __init__(self, pi: Pi) -> None:
         self._output = request_output(pi)
+        self._return: Any = None
         self._set = partial(fcntl.ioctl, self._output.fd, SET_VALUES, _VALUES.pack(1, 1))
         self._clear = partial(fcntl.ioctl, self._output.fd, SET_VALUES, _VALUES.pack(0, 1))
         try:
             super().__init__(pi)
+            if pi.pulses_in is not None:
+                self._return = _request_edges(pi, pi.pulses_in)
         except DeviceError:
             self._output.release()
             raise
+
+    def look_back(self, sent: int) -> Seen | None:
+        """Count the rising edges of the return wire since the last call. Raises DeviceError when the line is lost."""
+        if self._return is None:
+            return None
+        pulses = 0
+        try:
+            # Once more with no time left: a pulse too many counts, too.
+            while self._return.wait_edge_events(timedelta(seconds=LOOK_BACK_S if pulses < sent else 0)):
+                pulses += len(self._return.read_edge_events())
+        except OSError as e:
+            raise _lost(e) from None
+        return Seen(pulses)
 
     def sleep_until(self, t_ns: int) -> None:
         """Return at `t_ns`, never before it.
@@ -257,6 +280,8 @@ class GpiodLines(TriggerInput):
             self._make_pulse(self._clear)
         finally:
             self._output.release()
+            if self._return is not None:
+                self._return.release()
             super().close()
 
 
@@ -294,9 +319,14 @@ class SpiDevice:
             return DEFAULT_BUFSIZ
 
     def transfer(self, data: bytes, clock_hz: int) -> tuple[int, int]:
-        """Send the bytes; return the times before and after the system call. Raises DeviceError."""
+        """Send the bytes; return the times before and after the system call. Raises DeviceError.
+
+        `received`: the bits of MISO meanwhile.
+        """
         buffer = array.array("B", data)
-        message = _TRANSFER.pack(buffer.buffer_info()[0], 0, len(data), clock_hz, 0, 8, 0, 0, 0, 0, 0)
+        self.received = array.array("B", bytes(len(data)))
+        addresses = buffer.buffer_info()[0], self.received.buffer_info()[0]
+        message = _TRANSFER.pack(*addresses, len(data), clock_hz, 0, 8, 0, 0, 0, 0, 0)
         try:
             before = time.monotonic_ns()
             fcntl.ioctl(self._fd, MESSAGE, message)
@@ -322,6 +352,8 @@ class SpiLines(TriggerInput):
     def __init__(self, pi: Pi) -> None:
         self._device = SpiDevice(pi.spi_device)
         self.bufsiz = self._device.bufsiz
+        self._has_return = pi.pulses_in is not None
+        self._seen = Seen(0)
         try:
             super().__init__(pi)
         except DeviceError:
@@ -330,7 +362,21 @@ class SpiLines(TriggerInput):
 
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:
         """Send a burst; return the times before and after. Raises DeviceError."""
-        return self._device.transfer(burst.data, burst.clock_hz)
+        times = self._device.transfer(burst.data, burst.clock_hz)
+        high = int.from_bytes(self._device.received.tobytes(), "big")
+        pulses = self._seen.pulses + (high & ~(high >> 1)).bit_count()
+        longest = 0
+        while high:
+            high &= high >> 1
+            longest += 1
+        self._seen = Seen(pulses, max(self._seen.width_max_ns, round(longest * burst.bit_ns)))
+        return times
+
+    def look_back(self, sent: int) -> Seen | None:  # noqa: ARG002 - MISO was read with the transfers
+        """Return the pulses that MISO has received since the last call; None without the wire."""
+        seen = self._seen
+        self._seen = Seen(0)
+        return seen if self._has_return else None
 
     def close(self) -> None:
         """Release the lines; MOSI is low."""
@@ -356,7 +402,14 @@ class WireLines:
         self.check_width = not pi.one_shot
         self._trigger = pi.trigger_in
         self._output = pi.sync_out[0]
-        self._client = WireClient(path, listen=(pi.trigger_in,))
+        self._return = pi.pulses_in
+        listen = (pi.trigger_in,)
+        join = None
+        if pi.pulses_in is not None:  # the simulated return wire
+            listen += (pi.pulses_in,)
+            join = (self._output, pi.pulses_in)
+        self._client = WireClient(path, listen=listen, join=join)
+        self._waiting: deque[WireEdge] = deque()  # trigger edges received while looking back
         self._now_ns = self._seqno = 0
         self._active = False
         self._unsent: list[WireEdge] = []
@@ -376,13 +429,36 @@ class WireLines:
         """
         self._flush()
         deadline = time.monotonic() + timeout_s
-        while (left_s := deadline - time.monotonic()) > 0:
+        while not self._waiting and (left_s := deadline - time.monotonic()) > 0:
             message = self._client.receive(left_s)
             if isinstance(message, WireEdge) and message.line == self._trigger and message.value:
-                self.sleep_until(message.t_ns)
-                self._seqno += 1
-                return Edge(message.t_ns, self._seqno)
-        return None
+                self._waiting.append(message)
+        if not self._waiting:
+            return None
+        edge = self._waiting.popleft()
+        self.sleep_until(edge.t_ns)
+        self._seqno += 1
+        return Edge(edge.t_ns, self._seqno)
+
+    def look_back(self, sent: int) -> Seen | None:
+        """Count the pulses that came back since the last call, and measure their widths on the wire."""
+        if self._return is None:
+            return None
+        self._flush()
+        rose_ns: list[int] = []
+        widths_ns: list[int] = [0]
+        deadline = time.monotonic() + SIMULATED_LOOK_BACK_S
+        while len(widths_ns) <= sent and (left_s := deadline - time.monotonic()) > 0:
+            message = self._client.receive(left_s)
+            if not isinstance(message, WireEdge):
+                continue
+            if message.line == self._trigger and message.value:
+                self._waiting.append(message)
+            elif message.line == self._return and message.value:
+                rose_ns.append(message.t_ns)
+            elif message.line == self._return and rose_ns:
+                widths_ns.append(message.t_ns - rose_ns[-1])
+        return Seen(len(rose_ns), max(widths_ns))
 
     def pulse(self, width_ns: int) -> tuple[int, int]:
         """Send a pulse, starting now; return its times."""

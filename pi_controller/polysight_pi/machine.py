@@ -279,7 +279,7 @@ class Machine:
         self._journal.add(
             m.Capture, row_index=row.row.index, take=row.take, point=sent.point, column=row.row.column(sent.point),
             edge_ns=sent.edge_ns, first_pulse_ns=record.first_ns, last_pulse_ns=record.last_ns, pulses=record.pulses,
-            width_max_ns=record.width_max_ns, jitter_ns=record.jitter_ns,
+            width_max_ns=record.width_max_ns, jitter_ns=record.jitter_ns, pulses_seen=self._loop.sees_pulses,
         )  # fmt: skip
         row.bursts += 1
         if row.bursts >= row.row.points:
@@ -522,6 +522,7 @@ class Machine:
         self._journal.add(
             m.RowFinished, row_index=row.row.index, take=row.take, status=row.status, points=row.points,
             **counts._asdict(), fault=row.fault, reason=row.reason, timed_by=self._loop.timed_by,
+            pulses_seen=self._loop.sees_pulses,
         )  # fmt: skip
         self.row = None
         if row.lasting:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, Protocol, runtime_checkable
 
+from polysight_shared.config import SPI_WIDTH_US
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.faults import PiFault
@@ -27,9 +28,6 @@ FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)
 LOOK_UP_S = 0.1  # timeout of waiting for an edge, after which the loop checks if it has to stop
 SILENT_STATUSES = 2  # consecutive stage statuses without an edge ...
 SILENT_POINTS = 2  # ... while at least this many points were passed: the trigger wire is off
-# SPI clock for pulses of 0.5 .. 2 us.
-MIN_HZ = 500_000
-MAX_HZ = 2_000_000
 LEAD_BITS = 8  # low bits before the first pulse, and at least as many after the last: MOSI keeps the last bit's level
 MIN_BYTES = 96  # shorter transfers have gaps: spi-bcm2835 writes them byte by byte, longer ones by DMA
 DEFAULT_BUFSIZ = 4096
@@ -86,6 +84,13 @@ class BurstRecord(NamedTuple):
     fault: int = 0  # PiFault; 0: none
 
 
+class Seen(NamedTuple):
+    """Pulses seen at the connector, by the return wire."""
+
+    pulses: int
+    width_max_ns: int = 0  # 0: not measured
+
+
 class _Lines(Protocol):
     """Trigger input and SYNC_IN output (lines.py). Methods raise DeviceError when the lines are lost."""
 
@@ -100,6 +105,9 @@ class _Lines(Protocol):
 
     # The next rising edge of the trigger line, or None after `timeout_s` of wall time.
     def wait_edge(self, timeout_s: float) -> Edge | None: ...
+
+    # The pulses seen since the last call, waiting a moment for as many as were sent; None without a return wire.
+    def look_back(self, sent: int) -> Seen | None: ...
 
     # Sets SYNC_IN low and releases the lines.
     def close(self) -> None: ...
@@ -131,18 +139,25 @@ Lines = PulseLines | BitLines
 def spi_burst(spec: BurstSpec, bufsiz: int = DEFAULT_BUFSIZ) -> SpiBurst:
     """Return the SPI transfer of a burst, for a spidev buffer of `bufsiz` bytes.
 
-    One bit lasts one pulse width, with the clock within MIN_HZ .. MAX_HZ; MIN_HZ if the burst does not fit
-    otherwise. Raises ConfigError, with the `bufsiz` to set, if it does not fit even then.
+    One bit lasts one pulse width. Raises ConfigError if the controller cannot make that width, or, with the `bufsiz` to
+    set, if the burst does not fit.
     """
-    size = 0
-    for clock_hz in (min(max(round(1e9 / spec.width_ns), MIN_HZ), MAX_HZ), MIN_HZ):
-        bits = tuple(LEAD_BITS + round(k * spec.period_ns * clock_hz / 1e9) for k in range(spec.pulses))
-        size = max(MIN_BYTES, (bits[-1] + LEAD_BITS) // 8 + 1)
-        if size <= bufsiz:
-            data = bytearray(size)
-            for bit in bits:
-                data[bit // 8] |= 0x80 >> bit % 8
-            return SpiBurst(bytes(data), clock_hz, bits)
+    low_us, high_us = SPI_WIDTH_US
+    if not low_us <= spec.width_ns / 1e3 <= high_us:
+        raise ConfigError(
+            f"a pulse of {spec.width_ns / 1e3:g} us is outside {low_us:g}..{high_us:g} us",
+            "the SPI controller makes a pulse of one bit, at 500 kHz to 2 MHz",
+            f"set burst.width_us within {low_us:g}..{high_us:g}",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
+    clock_hz = round(1e9 / spec.width_ns)
+    bits = tuple(LEAD_BITS + round(k * spec.period_ns * clock_hz / 1e9) for k in range(spec.pulses))
+    size = max(MIN_BYTES, (bits[-1] + LEAD_BITS) // 8 + 1)
+    if size <= bufsiz:
+        data = bytearray(size)
+        for bit in bits:
+            data[bit // 8] |= 0x80 >> bit % 8
+        return SpiBurst(bytes(data), clock_hz, bits)
     needed = max(4096, 1 << (size - 1).bit_length())
     raise ConfigError(
         f"a burst of {spec.pulses} pulses every {spec.period_ns / 1e3:g} us needs an SPI transfer of {size} bytes,"
@@ -322,6 +337,7 @@ class TriggerLoop:
         self._busy_until_ns = self.strays = 0
         self.counts = Counts()
         self.backend = lines.name
+        self.sees_pulses = False
         self.timed_by: Timing = "program" if lines.check_width else "one-shot"
         if isinstance(lines, BitLines):
             self.timed_by = "spi"
@@ -407,6 +423,7 @@ class TriggerLoop:
         start_ns = edge.t_ns + FIRST_PULSE_DELAY_NS
         record = send_burst(self._lines, job.spec, start_ns, self._last_rise_ns, lambda: self._is_over(job))
         self._note_sent(record)
+        record, unseen = self._look_back(record)
         self.counts = Counts(point + 1, bursts + (record.pulses > 0), pulses + record.pulses)
         self._post(BurstSent(job, point, edge.t_ns, record))
         if record.fault:
@@ -414,6 +431,21 @@ class TriggerLoop:
             if record.fault == PiFault.PULSE_TOO_LONG:
                 detail += f": may have lasted {record.width_max_ns / 1e3:.1f} us"
             self._fail(job, record.fault, detail)
+        elif unseen:
+            self._fail(job, PiFault.PULSES_UNSEEN, f"point {point}: {unseen}")
+
+    def _look_back(self, record: BurstRecord) -> tuple[BurstRecord, str]:
+        """Return the record with the pulses that were seen instead of those sent, and how they differ, or ""."""
+        seen = self._lines.look_back(record.pulses)
+        self.sees_pulses = seen is not None
+        if seen is None:
+            return record, ""
+        differ = "" if seen.pulses == record.pulses else f"{record.pulses} pulses sent, {seen.pulses} seen"
+        width_ns = seen.width_max_ns or record.width_max_ns
+        fault = record.fault
+        if seen.width_max_ns > MAX_WIDTH_NS:
+            fault = fault or int(PiFault.PULSE_TOO_LONG)
+        return record._replace(pulses=seen.pulses, width_max_ns=width_ns, fault=fault), differ
 
     def _send_without_edge(self, spec: BurstSpec) -> None:
         self._bench = None
@@ -422,8 +454,14 @@ class TriggerLoop:
             start_ns = max(start_ns, self._last_rise_ns + spec.period_ns)
         r = send_bench(self._lines, spec, start_ns, self._last_rise_ns, self._stop.is_set)
         self._note_sent(r)
+        r, unseen = self._look_back(r)
         result = Pulsed(
-            pulses=r.pulses, width_max_ns=r.width_max_ns, jitter_ns=r.jitter_ns, fault=r.fault, timed_by=self.timed_by
+            pulses=r.pulses,
+            width_max_ns=r.width_max_ns,
+            jitter_ns=r.jitter_ns,
+            fault=r.fault or (PiFault.PULSES_UNSEEN if unseen else 0),
+            timed_by=self.timed_by,
+            pulses_seen=self.sees_pulses,
         )
         self._post(result)
 

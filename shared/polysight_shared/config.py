@@ -22,6 +22,8 @@ HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
 DEBOUNCE_TICKS_US = 5_000
 CARD_TAIL_S = 2.0  # silence after which a card sends a packet that is not full (docs/spec/dca1000.md, observed)
 _MOSI = {"/dev/spidev0": 10, "/dev/spidev1": 20}  # GPIO lines of a Pi's header
+_MISO = {"/dev/spidev0": 9, "/dev/spidev1": 19}
+SPI_WIDTH_US = (0.5, 2.0)  # a bit at 2 MHz and at 500 kHz
 
 
 class Chirp(Section, frozen=True):
@@ -83,6 +85,7 @@ class Pi(Section, frozen=True):
     sync_out: tuple[GpioLine, ...] = (22,)
     wiring: Literal["fanout", "lines", "gpiomem", "spi"] = "fanout"  # "lines", "gpiomem": of old files, never opened
     one_shot: bool = False  # a hardware one-shot sets the width of the pulses instead of the GPIO line
+    pulses_in: GpioLine | None = None  # return wire of SYNC_IN, MISO with "spi"; None: pulses are sent, not seen
     command_address: str = "tcp://127.0.0.1:5601"
     event_address: str = "tcp://127.0.0.1:5602"
     journal_dir: str = "journal"
@@ -101,8 +104,31 @@ class Pi(Section, frozen=True):
             self.wiring not in ("fanout", "spi") or len(self.sync_out) == 1,
             f'wiring = "{self.wiring}" drives exactly one line in sync_out',
         )
-        if self.wiring == "spi" and (mosi := _MOSI.get(self.spi_device.rpartition(".")[0])) is not None:
+        require(
+            self.pulses_in not in (self.trigger_in, *self.sync_out), "pulses_in must be a line of its own, or left out"
+        )
+        controller = self.spi_device.rpartition(".")[0]
+        if self.wiring == "spi" and controller in _MOSI:
+            mosi, miso = _MOSI[controller], _MISO[controller]
             require(self.sync_out == (mosi,), f"MOSI of {self.spi_device} is GPIO {mosi}: sync_out = [{mosi}]")
+            require(
+                self.pulses_in in (None, miso), f"MISO of {self.spi_device} is GPIO {miso}: pulses_in = {miso}, or none"
+            )
+
+    @property
+    def pulse_source(self) -> str:
+        """Say who makes the pulses of SYNC_IN, their spacing and skew, and whether they are seen at the connector."""
+        source = "libgpiod on one line; without a one-shot: pulses above 4 us end a row (105)"
+        spacing = "spacing by the program, each event has its lateness"
+        if self.wiring == "spi":
+            source = "SPI controller (MOSI)"
+            spacing = "widths and spacing by its clock, which `polysight-pi check` measures"
+        elif self.one_shot:
+            source = "libgpiod on one line, widths by a one-shot"
+        seen = "sent, not seen: pi.pulses_in is not wired"
+        if self.pulses_in is not None:
+            seen = f"counted at the connector by GPIO {self.pulses_in}"
+        return f"{source}; {spacing}; one clock buffer, skew of the boards below 1 ns; pulses {seen}"
 
 
 class MountStep(Section, frozen=True):
@@ -288,6 +314,11 @@ class Instrument(Section, frozen=True):
             or self.stage.trigger_width_us >= self.pi.trigger_debounce_us + DEBOUNCE_TICKS_US,
             f"stage.trigger_width_us must exceed pi.trigger_debounce_us by at least {DEBOUNCE_TICKS_US} us, or every"
             " trigger is suppressed; trigger_debounce_us = 0 disables it",
+        )
+        low_us, high_us = SPI_WIDTH_US
+        require(
+            self.pi.wiring != "spi" or low_us <= self.burst.width_us <= high_us,
+            f'burst.width_us must be {low_us:g}..{high_us:g} us with wiring = "spi" (a bit of the controller)',
         )
         names = [b.name for b in self.boards]
         for name in names:  # folders of a scan are named after them

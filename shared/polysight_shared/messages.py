@@ -97,7 +97,10 @@ class RowStarted(Event, frozen=True, kw_only=True):
 
 
 class RowFinished(Event, frozen=True, kw_only=True):
-    """A row ended. `points` is the stage's count; `edges`, `bursts` and `pulses` are those of the Pi."""
+    """A row ended. `points` is the stage's count; `edges`, `bursts` and `pulses` are those of the Pi.
+
+    `pulses_seen`: as in `Capture`.
+    """
 
     row_index: Index
     take: Take
@@ -109,13 +112,14 @@ class RowFinished(Event, frozen=True, kw_only=True):
     fault: Number = 0
     reason: Text = ""
     timed_by: Timing = ""
+    pulses_seen: bool = False
 
 
 class Capture(Event, frozen=True, kw_only=True):
     """One trigger edge and its burst. Times are the Pi's monotonic clock.
 
     `width_max_ns` is an upper bound of the pulse widths, `jitter_ns` the largest deviation of a rising edge from its
-    scheduled time.
+    scheduled time. `pulses_seen`: `pulses` were counted at the connector; False: they were sent, not seen.
     """
 
     row_index: Index
@@ -128,6 +132,7 @@ class Capture(Event, frozen=True, kw_only=True):
     pulses: Natural
     width_max_ns: Natural
     jitter_ns: Natural
+    pulses_seen: bool = False
 
 
 class StageStatus(Event, frozen=True, kw_only=True):
@@ -328,13 +333,17 @@ class ReplayReply(_Message, frozen=True, kw_only=True):
 
 
 class Pulsed(_Message, frozen=True, kw_only=True):
-    """Result of `Pulse`: pulses sent, upper bound of their widths, largest delay of an edge, fault number."""
+    """Result of `Pulse`: pulses, upper bound of their widths, largest delay of an edge, fault number.
+
+    `pulses_seen`: as in `Capture`.
+    """
 
     pulses: Natural
     width_max_ns: Natural
     jitter_ns: Natural
     fault: Number = 0
     timed_by: Timing = ""
+    pulses_seen: bool = False
 
 
 AnyReply = HelloReply | Accepted | Refused | StatusReply | ReplayReply | Pulsed

@@ -7,7 +7,8 @@ radars listen. The protocol has ASCII lines:
     `M <t_ns> <x_um> <y_um> <vx_um_s>`      the stage is at (x, y) and moves at vx from now on (stage coordinates)
     `L <line> [<line> ...]`                 client to hub: subscribe to changes of these lines
     `W`                                     client to hub: subscribe to M lines
-    `K`                                     hub to client: confirms L or W
+    `J <line> <other>`                      client to hub: join two lines: changes of the first are the other's, too
+    `K`                                     hub to client: confirms L, W or J
 
 Wire time is the simulated stage's clock, which may be faster than the wall clock. Reactions to an edge are scheduled
 relative to the edge's time, so that the intervals of a simulated scan are exact on a busy machine.
@@ -67,10 +68,17 @@ def parse(line: str) -> WireMessage:
 class WireClient:
     """Client of the hub at the Unix socket `path`, subscribed to the lines `listen` and, with `motion`, to M lines.
 
-    Raises DeviceError if there is no hub within `timeout_s`.
+    `join` joins two lines. Raises DeviceError if there is no hub within `timeout_s`.
     """
 
-    def __init__(self, path: Path, listen: tuple[int, ...] = (), motion: bool = False, timeout_s: float = 10.0) -> None:
+    def __init__(
+        self,
+        path: Path,
+        listen: tuple[int, ...] = (),
+        motion: bool = False,
+        timeout_s: float = 10.0,
+        join: tuple[int, int] | None = None,
+    ) -> None:
         self._path = path
         deadline = time.monotonic() + timeout_s
         while True:
@@ -95,6 +103,8 @@ class WireClient:
             hello += ("L " + " ".join(map(str, listen)) + "\n").encode("ascii")
         if motion:
             hello += b"W\n"
+        if join is not None:
+            hello += f"J {join[0]} {join[1]}\n".encode("ascii")
         if hello:
             self._socket.sendall(hello)
             deadline = time.monotonic() + timeout_s

@@ -76,6 +76,7 @@ class WireHub:
         self._accepted = 0
         self._last_motion = b""
         self._cut: set[bytes] = set()
+        self._joined: dict[bytes, bytes] = {}
         self.relayed = 0
 
     def serve(self, stop: Event, poll_s: float = 0.1) -> None:
@@ -137,10 +138,9 @@ class WireHub:
                 if len(fields) != 4 or not fields[2]:
                     raise ProtocolError(f"not a wire line: {line!r}")
                 gpio_line = fields[2]
-                for p in others:
-                    if gpio_line in p.lines and gpio_line not in self._cut:
-                        p.pending += line + b"\n"
-                        self.relayed += 1
+                self._pass_on(gpio_line, line, others)
+                if other := self._joined.get(gpio_line):
+                    self._pass_on(other, b" ".join([b"S", fields[1], other, fields[3]]), list(self._clients.values()))
             elif tag == b"M ":
                 if not isinstance(parse(line.decode("ascii", "replace")), WireMotion):
                     raise ProtocolError(f"not a wire line: {line!r}")
@@ -158,11 +158,20 @@ class WireHub:
                 else:
                     self._cut.discard(fields[1])
                 sender.pending += b"K\n"
+            elif tag == b"J " and len(fields := line.split(b" ")) == 3:
+                self._joined[fields[1]] = fields[2]
+                sender.pending += b"K\n"
             elif line == b"W":
                 sender.motion = True
                 sender.pending += b"K\n" + self._last_motion  # a late client needs the stage's position
             else:
                 raise ProtocolError(f"not a wire line: {line!r}")
+
+    def _pass_on(self, gpio_line: bytes, line: bytes, clients: list[_Client]) -> None:
+        for client in clients:
+            if gpio_line in client.lines and gpio_line not in self._cut:
+                client.pending += line + b"\n"
+                self.relayed += 1
 
     def _write(self, client: _Client) -> None:
         try:

@@ -22,6 +22,7 @@ from polysight_pi.lines import GpiodLines, find_chip, open_lines
 from polysight_pi.trigger import BurstSpec, send_burst
 from polysight_shared.config import Instrument, Pi
 from polysight_shared.error_codes import ErrorCode
+from polysight_shared.findings import Finding
 from polysight_shared.sockets import publisher, replier
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators import gpio
@@ -56,7 +57,7 @@ def on_chip(write_config, stage, tmp_path):
 def test_a_whole_rig_is_all_ok(on_chip, rig_with):
     found = on_chip(rig_with(one_shot=True), "slow:4")  # behind a one-shot, any width is good enough
     rights = ["real time"]  # as this machine has it
-    lines = ["GPIO chip", "trigger line 26", "SYNC_IN line 22", "pulse width"]
+    lines = ["GPIO chip", "trigger line 26", "SYNC_IN line 22", "pulses", "pulse width"]
     rest = ["stage", "journal", "keys", "command address", "event address"]
     assert list(found) == ["plan", *rights, *lines, *rest]
     assert {f["verdict"] for name, f in found.items() if name not in rights} == {"ok"}
@@ -99,9 +100,14 @@ def test_line_release(rig_with, tmp_path):
         assert of(pi_4) == [level]
 
 
-def test_a_hundredth_of_the_widths_may_be_too_long():
-    assert "measured now" in str(judge_widths([3_000] * 991 + [9_000] * 9, one_shot=False))
-    assert judge_widths([3_000] * 989 + [9_000] * 11, one_shot=False).level == "error"
+def test_one_pulse_too_long_refuses_a_line_without_a_one_shot():
+    assert "measured now" in str(judge_widths([3_000] * 1000, one_shot=False))
+    finding = judge_widths([3_000] * 999 + [4_001], one_shot=False)
+    assert isinstance(finding, Finding)
+    assert finding.level == "error"
+    assert "one_shot = true" in finding.do, "the first cure"
+    assert 'wiring = "spi"' in finding.do, "the second"
+    assert "a one-shot sets the width" in str(judge_widths([3_000] * 999 + [4_001], one_shot=True))
 
 
 def test_spi_that_is_off_has_its_remedy(rig_with, tmp_path):

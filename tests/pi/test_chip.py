@@ -22,6 +22,7 @@ import pytest
 from tests.support.paths import REPO
 from tests.support.pi.program import WiresLog, require_stand_in_chip, run
 from tests.support.processes import wait_for
+from tests.support.rigs import timed_by_spi
 from tests.support.stage.processes import StageProcess
 
 from polysight_pi.system import OTHERS_PRIORITY, PRIORITY
@@ -206,8 +207,8 @@ def test_settings_reach_the_chip_and_glitches_do_not_reach_us(hub, wires, tmp_pa
 
 @pytest.fixture
 def spi_rig(instrument, tmp_path):
-    """The shipped wiring, on a stand-in chip and a stand-in controller."""
-    assert instrument.pi.wiring == "spi"
+    """The wiring without a one-shot, on a stand-in chip and a stand-in controller."""
+    instrument = timed_by_spi(instrument)
     devices = {"gpio_chip": str(tmp_path / "chip"), "spi_device": str(tmp_path / "spidev0.0")}
     return msgspec.structs.replace(instrument, pi=msgspec.structs.replace(instrument.pi, **devices))
 
@@ -255,7 +256,7 @@ def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, homed, hub,
 @pytest.mark.slow
 def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(homed, hub):
     """A run whose bursts exceed spidev's `bufsiz` is refused at once; the next one runs."""
-    _, host = homed(hub, bufsiz="512")
+    _, host = homed(hub, bufsiz="640")
     refused = host.ask(msgspec.structs.replace(host.begin(), pulses=2, period_us=20_000.0, speed_mm_s=5.0))
     assert isinstance(refused, m.Refused)
     assert (refused.number, "bufsiz=" in refused.remedy) == (PiFault.BAD_REQUEST, True)

@@ -17,7 +17,7 @@ RUN_0 = m.RunRow(scan_id="scan", row_index=0, take=1)
 
 
 def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
-    """Every pulse of the shipped rig file's SPI wire is at its place, and the events say so."""
+    """Every pulse of the shipped rig file's wire is at its place, and the events say so."""
     radar = WireClient(hub, listen=instrument.pi.sync_out)
     hello = host.ask(m.Hello())
     assert (hello.backend, hello.firmware, hello.state) == ("wires", "fake", "ready")
@@ -26,7 +26,8 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     done = host.row(1)
     burst, n = instrument.burst, instrument.grid.columns
     assert (done.status, done.points, done.edges, done.bursts) == ("done", n, n, n)
-    assert (done.pulses, done.fault, done.timed_by) == (n * burst.pulses, 0, "spi")
+    assert (done.pulses, done.fault, done.timed_by) == (n * burst.pulses, 0, "one-shot")
+    assert done.pulses_seen
     seen = host.journalled
     assert [e.seq for e in seen] == list(range(1, len(seen) + 1))
     assert [type(e) for e in seen] == [m.RunStarted, m.RowStarted] + n * [m.Capture] + [m.RowFinished]

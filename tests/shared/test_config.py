@@ -55,7 +55,7 @@ def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instr
         ("chirp", "hpf1_khz", 180.0, ErrorCode.VALUE_INVALID, ["hpf1_khz", 175.0]),
         ("burst", "period_us", 200.0, ErrorCode.VALUE_INVALID, ["period_us", 300]),
         ("burst", "width_us", 5.0, ErrorCode.VALUE_INVALID, ["width_us", 0.025, 4]),
-        ("pi", "trigger_in", 10, ErrorCode.VALUE_INVALID, ["trigger_in", "sync_out"]),
+        ("pi", "trigger_in", 22, ErrorCode.VALUE_INVALID, ["trigger_in", "sync_out"]),
         ("pi", "sync_out", [22, 23], ErrorCode.VALUE_INVALID, ["sync_out", "wiring"]),
         ("pi", "trigger_bias", "up", ErrorCode.VALUE_INVALID, ["pi.trigger_bias", "'up'"]),
         ("pi", "trigger_debounce_us", 10, ErrorCode.VALUE_INVALID, ["trigger_debounce_us", "trigger_width_us"]),

@@ -31,6 +31,7 @@ from polysight_simulators.loopback import is_free, on_subnet
 from polysight_simulators.scene import pattern_frames
 
 TIME_SCALE = 20.0
+SYNC = 22  # pi.sync_out of the shipped rig file
 CONFIGURE, PACKET = bytes.fromhex("01010102031e"), bytes.fromhex("be05350c0000")
 COMPLETED = bytes.fromhex("5aa50a000001aaee")
 
@@ -127,10 +128,10 @@ def pulse(start: Start, tmp_path: Path) -> Iterator[Callable[..., None]]:
     del start
     clients: list[WireClient] = []
 
-    def send(first: int, n: int, line: int = 10) -> None:
+    def send(first: int, n: int, line: int = SYNC) -> None:
         if not clients:
             clients.append(WireClient(tmp_path / "w.sock"))
-            clients.append(WireClient(tmp_path / "w.sock", (10, 23)))  # joined last, and so is told last
+            clients.append(WireClient(tmp_path / "w.sock", (SYNC, 23)))  # joined last, and so is told last
         edges = []
         for k in range(first, first + n):
             edges += [WireEdge(k * PERIOD_NS, line, 1), WireEdge(k * PERIOD_NS + 1000, line, 0)]

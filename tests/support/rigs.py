@@ -21,8 +21,14 @@ def published_rig() -> Instrument:
 
 
 def timed_by_the_program(rig: Instrument) -> Instrument:
-    """The same with SYNC_IN on a GPIO line, as the published rig had it: the program makes the pulses."""
-    pi = msgspec.structs.replace(rig.pi, wiring="fanout", sync_out=(22,))
+    """The same without one-shot and return wire, as the published rig had it: the program makes the pulses."""
+    pi = msgspec.structs.replace(rig.pi, one_shot=False, pulses_in=None)
+    return msgspec.structs.replace(rig, pi=pi)
+
+
+def timed_by_spi(rig: Instrument) -> Instrument:
+    """The same with SYNC_IN on MOSI, and MISO as its return wire."""
+    pi = msgspec.structs.replace(rig.pi, wiring="spi", sync_out=(10,), pulses_in=9, one_shot=False)
     return msgspec.structs.replace(rig, pi=pi)
 
 

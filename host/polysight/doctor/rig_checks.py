@@ -468,15 +468,16 @@ def check_pulses(context: CheckContext) -> Finding:
         if e.number != PiFault.BAD_REQUEST:
             raise
         return error(e.what, "the Pi's release does not know this command", "install the same release on both")
+    seen = "seen" if sent.pulses_seen else "sent, not seen,"
     observed = (
-        f"{sent.pulses} sent at rest, at most {sent.width_max_ns / 1e3:.2f} us long,"
+        f"{sent.pulses} {seen} at rest, at most {sent.width_max_ns / 1e3:.2f} us long,"
         f" at most {sent.jitter_ns / 1e3:.2f} us late"
     )
-    facts = {k: getattr(sent, k) for k in ("pulses", "width_max_ns", "jitter_ns", "fault")}
+    facts = {k: getattr(sent, k) for k in ("pulses", "pulses_seen", "width_max_ns", "jitter_ns", "fault")}
     if sent.fault:
         e = explain(sent.fault)
         return error(f"{observed}: {e.what}", e.why, e.remedy, **facts)
-    return ok(observed, **facts)
+    return ok(f"{observed} ({context.rig.pi.pulse_source})", **facts)
 
 
 def check_radar(context: CheckContext, board: Board) -> Finding:

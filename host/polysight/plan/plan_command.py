@@ -248,6 +248,7 @@ def describe(f: Forecast) -> str:
             f"{_duration(t.ramps_s)} ramps, {_duration(t.turns_s)} turns, {_duration(t.tail_s)} waiting for last"
             f" packets, {_duration(t.overhead_s)} between rows, {_duration(t.approach_s)} approach",
         ),
+        ("pulses", f.rig.pi.pulse_source),
         ("raw data", f"{_size(f.raw_bytes)} of {len(f.rig.recorded)} boards"),
         (
             "resolution",

@@ -2,6 +2,7 @@
  *
  *   GPIOSHIM_SPI=PATH      the device; made here, a link to /dev/null
  *   GPIOSHIM_MOSI=LINE     10 where nothing is said
+ *   GPIOSHIM_MISO=0        the return wire from MOSI to MISO is off; it is there where nothing is said
  *   GPIOSHIM_BUFSIZ=BYTES  of spidev's buffer, 4096 where nothing is said
  *   GPIOSHIM_CORE_HZ=A,B   the core clock as the driver believes it to be, and as it is; 250 MHz
  *
@@ -22,11 +23,14 @@
 #define MOST_HZ 125000000.0
 
 static unsigned mosi = 10, bufsiz = 4096;
+static int returned = 1;
 static double believed_hz = 250e6, core_hz = 250e6;
 
 void read_spi_settings(void) {
   const char *line = getenv("GPIOSHIM_MOSI"), *bytes = getenv("GPIOSHIM_BUFSIZ"), *clock = getenv("GPIOSHIM_CORE_HZ");
+  const char *miso = getenv("GPIOSHIM_MISO");
   if (line) mosi = atoi(line);
+  if (miso) returned = atoi(miso);
   if (bytes) bufsiz = atoi(bytes);
   if (clock) sscanf(clock, "%lf,%lf", &believed_hz, &core_hz);
 }
@@ -50,6 +54,8 @@ static int transfer(const struct spi_ioc_transfer *t, unsigned n) {
   for (unsigned i = 0; i < n; i++) {
     const uint8_t *sent = (const uint8_t *)(uintptr_t)t[i].tx_buf;
     const double bit = bit_ns(t[i].speed_hz);
+    if (t[i].rx_buf && sent && returned) memcpy((void *)(uintptr_t)t[i].rx_buf, sent, t[i].len);
+    if (t[i].rx_buf && !(sent && returned)) memset((void *)(uintptr_t)t[i].rx_buf, 0, t[i].len);
     const uint64_t begin = now_ns(CLOCK_MONOTONIC);
     for (uint64_t k = 0; k < 8ULL * t[i].len; k++)
       set_output_at(mosi, sent && sent[k / 8] >> (7 - k % 8) & 1, begin + (uint64_t)(k * bit + 0.5));

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from polysight_pi.trigger import Edge
+from polysight_pi.trigger import Edge, Seen
 from polysight_shared.config import Stage
 from polysight_shared.errors import DeviceError, PolysightError, ProtocolError
 from polysight_shared.faults import StageError
@@ -60,6 +60,7 @@ class FakeLines:
     def __init__(self, late: Callable[[int], int] = lambda _: 0, long: Callable[[int], int] = lambda _: 0) -> None:
         self.t, self.late, self.long = 0, late, long
         self.check_width = True
+        self.seen: Callable[[int], int] | None = None
         self.sleeps = 0
         self.changes: list[tuple[int, bool]] = []
         self.level = False
@@ -83,6 +84,9 @@ class FakeLines:
             raise edge
         self.t = max(self.t, edge.t_ns)
         return edge
+
+    def look_back(self, sent: int) -> Seen | None:
+        return None if self.seen is None else Seen(self.seen(sent))
 
     def pulse(self, width_ns: int) -> tuple[int, int]:
         rise = self.t

@@ -209,10 +209,12 @@ static int align_round(Work *w, Chirps *c, const Equaliser *e, const int16_t *wo
     *out.centre = against_one(w, c, words);
     int count = choose_coherent(c->coherence, c->usable, chirps, c->sorted, out.good);
     for (int k = 0; k < chirps; k++) {
-        Complex *taps = c->taps + 3 * k;
-        c->start[k] = out.frequency[k] = *out.centre + c->frequency[k];
-        find_taps(e, out.frequency[k], taps);
-        Complex sum = {taps[0].re + taps[1].re + taps[2].re, taps[0].im + taps[1].im + taps[2].im};
+        c->start[k] = *out.centre + c->frequency[k];
+        find_taps(e, c->start[k], c->taps + 3 * k);
+    }
+    VECTOR
+    for (int k = 0; k < chirps; k++) {
+        Complex *taps = c->taps + 3 * k, sum = {taps[0].re + taps[1].re + taps[2].re, taps[0].im + taps[1].im + taps[2].im};
         out.gain[k] = magnitude(sum);
         out.phase[k] = angle(times(c->product[k], sum));
         Complex turn = cis(-out.phase[k] / TURN);
@@ -227,15 +229,16 @@ static int align_round(Work *w, Chirps *c, const Equaliser *e, const int16_t *wo
     int disturbed = drop_disturbed(w, c, count);
     level /= count > 1 ? (double)count * count : 1;
     level = level > 1e-30 ? level : 1e-30;
+    VECTOR
     for (int k = 0; k < chirps; k++) {
         int others = count - out.good[k];
         double part = (double)others / (count > 1 ? count : 1), own = c->energy[k] > 1e-30 ? c->energy[k] : 1e-30;
-        double shift = part * angle(c->found_product[k]);
+        double shift = part * angle(c->found_product[k]), phase = (out.phase[k] + shift) / TURN;
         c->found[k] *= part;
         c->turns[k] = shift / TURN;
         out.amplitude[k] = others > 0 ? magnitude(c->found_product[k]) / others / level : 1;
         out.coherence[k] = out.amplitude[k] * sqrt(level / own);
-        out.phase[k] = remainder(out.phase[k] + shift, TURN);
+        out.phase[k] = TURN * (phase - floor(phase + 0.5));
         out.frequency[k] = c->frequency[k] + c->found[k];
     }
     count = choose_coherent(out.coherence, c->usable, chirps, c->sorted, out.good);

@@ -15,22 +15,36 @@
 #define BESIDE ((TAPS - FOLD) / 2)
 #define WORDS (2 * RX) /* of a sample */
 
-/* As many floats as the processor handles at once, a part of LANES. */
-typedef float Vector __attribute__((vector_size(WIDTH / 8), aligned(4), may_alias));
+/* As many floats as the processor handles at once: a part of LANES. Compilers do well with these vectors, except for the
+   conversion of words, and sums of products, which `-fassociative-math` takes apart. */
 #define STEP (WIDTH / 32)
-
-static inline Vector load(const float *at) { return *(const Vector *)at; }
-static inline void store(float *at, Vector x) { *(Vector *)at = x; }
-
-/* Words as floats. */
+typedef float Vector __attribute__((vector_size(WIDTH / 8), aligned(4), may_alias));
+typedef int32_t Whole __attribute__((vector_size(WIDTH / 8)));
+#if WIDTH == 512
+#include <immintrin.h>
 static inline Vector counts(const int16_t *words)
 {
-    typedef int16_t Short __attribute__((vector_size(WIDTH / 16)));
-    typedef int32_t Long __attribute__((vector_size(WIDTH / 8)));
-    Short x;
-    memcpy(&x, words, sizeof x);
-    return __builtin_convertvector(__builtin_convertvector(x, Long), Vector);
+    return _mm512_cvtepi32_ps(_mm512_cvtepi16_epi32(_mm256_loadu_si256((const __m256i *)words)));
 }
+static inline Vector add_product(Vector sum, Vector a, Vector b) { return _mm512_fmadd_ps(a, b, sum); }
+#elif WIDTH == 256
+#include <immintrin.h>
+static inline Vector counts(const int16_t *words)
+{
+    return _mm256_cvtepi32_ps(_mm256_cvtepi16_epi32(_mm_loadu_si128((const __m128i *)words)));
+}
+static inline Vector add_product(Vector sum, Vector a, Vector b) { return _mm256_fmadd_ps(a, b, sum); }
+#elif defined(__aarch64__)
+#include <arm_neon.h>
+static inline Vector counts(const int16_t *words) { return vcvtq_f32_s32(vmovl_s16(vld1_s16(words))); }
+static inline Vector add_product(Vector sum, Vector a, Vector b) { return vfmaq_f32(sum, a, b); }
+#else
+static inline Vector counts(const int16_t *words) { return (Vector){words[0], words[1], words[2], words[3]}; }
+static inline Vector add_product(Vector sum, Vector a, Vector b) { return sum + a * b; }
+#endif
+static inline Vector load(const float *at) { return *(const Vector *)at; }
+static inline void store(float *at, Vector x) { *(Vector *)at = x; }
+static inline Vector all(float x) { return x - (Vector){0}; }
 
 /* Sizes, tables and work arrays. */
 typedef struct {
@@ -96,13 +110,14 @@ static inline void correlate(const int16_t *words, const float *same, const floa
     for (int part = 0; part < LANES; part += STEP) {
         Vector e = {0};
         for (int n = 0; n < samples; n++) {
-            Vector a = {0}, b = {0};
+            Vector a = {0}, b = {0}, own = {0};
             for (int j = 0; j < WORDS; j++) {
                 Vector x = counts(words + LANES * (WORDS * n + j) + part);
-                a += x * same[WORDS * n + j];
-                b += x * turned[WORDS * n + j];
-                e += x * x;
+                a = add_product(a, x, all(same[WORDS * n + j]));
+                b = add_product(b, x, all(turned[WORDS * n + j]));
+                own = add_product(own, x, x);
             }
+            e += own;
             store(re + LANES * n + part, a);
             store(im + LANES * n + part, b);
         }
@@ -111,17 +126,19 @@ static inline void correlate(const int16_t *words, const float *same, const floa
 }
 
 /* Index of the strongest bin of each of sixteen spectra. */
-static inline void strongest(const float *restrict re, const float *restrict im, int size, int32_t *restrict at)
+static inline void strongest(const float *re, const float *im, int size, int32_t *at)
 {
-    float best[LANES];
-    for (int k = 0; k < LANES; k++)
-        best[k] = -1, at[k] = 0;
-    for (int i = 0; i < size; i++)
-        for (int k = 0; k < LANES; k++) {
-            float power = re[LANES * i + k] * re[LANES * i + k] + im[LANES * i + k] * im[LANES * i + k];
-            at[k] = power > best[k] ? i : at[k];
-            best[k] = power > best[k] ? power : best[k];
+    for (int part = 0; part < LANES; part += STEP) {
+        Vector best = all(-1);
+        Whole place = {0};
+        for (int i = 0; i < size; i++) {
+            Vector x = load(re + LANES * i + part), y = load(im + LANES * i + part), power = x * x + y * y;
+            Whole higher = power > best;
+            best = (Vector)(((Whole)power & higher) | ((Whole)best & ~higher));
+            place = (i & higher) | (place & ~higher);
         }
+        memcpy(at + part, &place, sizeof place);
+    }
 }
 
 static inline Complex bin_value(const float *re, const float *im, int place)
@@ -268,18 +285,17 @@ static inline void extend(float *signal, int count, int s)
 static inline void mix_and_fold(Work *w, const int16_t *words, const double *frequency, float *re, float *im)
 {
     static const double none[LANES];
-    float c[TAPS * LANES], s[TAPS * LANES];
+    float turn_c[TAPS * LANES], turn_s[TAPS * LANES], all_c[3][TAPS * LANES], all_s[3][TAPS * LANES];
     ramps(frequency, none, (FOLD - w->n) / 2.0, FOLD, w->blocks, w->phase_c, w->phase_s);
+    ramps(frequency, none, -(TAPS - 1) / 2.0, 1, TAPS, turn_c, turn_s);
+    for (int set = 0; set < 3; set++)
+        for (int i = 0; i < TAPS * LANES; i++) {
+            all_c[set][i] = turn_c[i] * w->taps[TAPS * set + i / LANES];
+            all_s[set][i] = turn_s[i] * w->taps[TAPS * set + i / LANES];
+        }
     for (int m = 0; m < w->blocks; m++) {
         const int last = m == w->blocks - 1, from = m == 0 ? BESIDE : 0, to = last ? TAPS - BESIDE : TAPS;
-        if (m < 2 || last) { /* the taps change */
-            const float *taps = w->taps + TAPS * (m == 0 ? 0 : last ? 2 : 1);
-            ramps(frequency, none, -(TAPS - 1) / 2.0, 1, TAPS, c, s);
-            for (int i = 0; i < TAPS * LANES; i++) {
-                c[i] *= taps[i / LANES];
-                s[i] *= taps[i / LANES];
-            }
-        }
+        const float *c = all_c[m == 0 ? 0 : last ? 2 : 1], *s = all_s[m == 0 ? 0 : last ? 2 : 1];
         for (int part = 0; part < LANES; part += STEP) {
             Vector x[RX] = {{0}}, y[RX] = {{0}}, u = load(w->phase_c + LANES * m + part), v = load(w->phase_s + LANES * m + part);
             for (int q = from; q < to; q++) {
@@ -287,10 +303,8 @@ static inline void mix_and_fold(Work *w, const int16_t *words, const double *fre
                 Vector f = load(c + LANES * q + part), g = load(s + LANES * q + part);
                 for (int r = 0; r < RX; r++) {
                     Vector i = counts(sample + LANES * r), j = counts(sample + LANES * (RX + r));
-                    x[r] += i * f;
-                    x[r] -= j * g;
-                    y[r] += i * g;
-                    y[r] += j * f;
+                    x[r] = add_product(add_product(x[r], i, f), j, -g);
+                    y[r] = add_product(add_product(y[r], i, g), j, f);
                 }
             }
             for (int r = 0; r < RX; r++) {
@@ -316,8 +330,8 @@ static inline void equalise(const float *re, const float *im, const Complex *tap
             for (int t = 0; t < 3; t++) {
                 Vector x = load(re + LANES * (i + RX * t) + part), y = load(im + LANES * (i + RX * t) + part);
                 Vector u = load(f[t] + part), v = load(g[t] + part);
-                a += x * u - y * v;
-                b += x * v + y * u;
+                a = add_product(add_product(a, x, u), y, -v);
+                b = add_product(add_product(b, x, v), y, u);
             }
             store(to_re + LANES * i + part, a);
             store(to_im + LANES * i + part, b);
@@ -396,22 +410,20 @@ static double against_others(Work *w, const uint8_t *good, double *found, Comple
             whole += w->all_re[i] * w->all_re[i] + w->all_im[i] * w->all_im[i];
         w->part_energy[p] = whole;
         level += whole;
-        for (int k = 0; k < chirps; k++) {
-            int lane = k % LANES, j = p * chirps + k;
-            if (lane == 0)
-                correlate_part(w->folded_re + (size_t)k * values, w->folded_im + (size_t)k * values, w->all_re, w->all_im,
-                               from, to, sums);
-            double own = sums[4][lane], part = good[k] ? own : 0;
-            even_re[j] = sums[0][lane];
-            even_im[j] = sums[1][lane];
-            odd_re[j] = sums[2][lane];
-            odd_im[j] = sums[3][lane];
-            rest_re[j] = even_re[j] + odd_re[j] - part;
-            rest_im[j] = even_im[j] + odd_im[j];
-            double others = whole - (good[k] ? 2 * (even_re[j] + odd_re[j]) - own : 0);
-            double common = rest_re[j] * rest_re[j] + rest_im[j] * rest_im[j];
-            left[j] = own - (others > 1e-30 ? common / others : own);
-            energy[k] += (float)own;
+        for (int first = 0; first < chirps; first += LANES) {
+            int count = chirps - first < LANES ? chirps - first : LANES, j = p * chirps + first;
+            size_t group = (size_t)first * values;
+            correlate_part(w->folded_re + group, w->folded_im + group, w->all_re, w->all_im, from, to, sums);
+            VECTOR
+            for (int k = 0; k < count; k++) {
+                double a = sums[0][k], b = sums[1][k], c = sums[2][k], d = sums[3][k], own = sums[4][k];
+                double inside = good[first + k] ? own : 0, re = a + c - inside, im = b + d;
+                double others = whole - (good[first + k] ? 2 * (a + c) - own : 0);
+                even_re[j + k] = a, even_im[j + k] = b, odd_re[j + k] = c, odd_im[j + k] = d;
+                rest_re[j + k] = re, rest_im[j + k] = im;
+                left[j + k] = own - (others > 1e-30 ? (re * re + im * im) / others : own);
+                energy[first + k] += sums[4][k];
+            }
         }
     }
     newton_step(rest_re, rest_im, w->part_times, w->parts, chirps, 1, found, tone);
@@ -421,6 +433,7 @@ static double against_others(Work *w, const uint8_t *good, double *found, Comple
                   odd_im + p * chirps);
     newton_step(even_re, even_im, w->part_times, w->parts, chirps, 1, apart_f, even_tone);
     newton_step(odd_re, odd_im, w->part_times, w->parts, chirps, 1, odd_f, odd_tone);
+    VECTOR
     for (int k = 0; k < chirps; k++) {
         apart_f[k] -= odd_f[k];
         apart_phase[k] = angle(times(even_tone[k], conjugate(odd_tone[k])));

@@ -47,7 +47,21 @@ static inline Complex times(Complex a, Complex b)
 
 static inline Complex conjugate(Complex a) { return (Complex){a.re, -a.im}; }
 static inline double magnitude(Complex a) { return sqrt(a.re * a.re + a.im * a.im); }
-static inline double angle(Complex a) { return atan2(a.im, a.re); }
+
+/* Angle, within 1e-10: the arc tangent's series below an eighth of a turn; without calls, which the compiler vectorises. */
+static inline double angle(Complex a)
+{
+    double x = fabs(a.re), y = fabs(a.im), high = x > y ? x : y, low = x > y ? y : x;
+    int steep = low > 0.41421356 * high; /* tan(pi / 8) */
+    double top = steep ? low - high : low, bottom = steep ? low + high : high;
+    double t = bottom > 0 ? top / bottom : 0, q = t * t, sum = 1 / 21.0;
+    for (int n = 19; n > 0; n -= 2)
+        sum = 1.0 / n - q * sum;
+    sum = t * sum + (steep ? TURN / 8 : 0);
+    sum = x > y ? sum : TURN / 4 - sum;
+    sum = a.re < 0 ? TURN / 2 - sum : sum;
+    return a.im < 0 ? -sum : sum;
+}
 
 /* Allocate zeroed memory for `count` floats on its own cache lines; free it with `release`. */
 static inline float *reserve(size_t count)

@@ -10,6 +10,7 @@ constexpr uint8_t PIN_LEFT_PUL = 3, PIN_LEFT_DIR = 8;    // vertical, left motor
 constexpr uint8_t PIN_RIGHT_PUL = 4, PIN_RIGHT_DIR = 9;  // vertical, right motor
 constexpr uint8_t PIN_X_PUL = 5, PIN_X_DIR = 10;         // horizontal
 constexpr uint8_t PIN_ENABLE = 7;                        // LOW switches the drivers on
+constexpr uint8_t PIN_BRAKE = 12;                        // HIGH while the drivers are on: releases the brake of y
 constexpr uint8_t PIN_X_SWITCH = 14, PIN_Y_SWITCH = 15, PIN_EMERGENCY = 16;  // A0, A1, A2
 
 // Switches close to ground and are normally closed: a pressed switch and a broken wire both read HIGH.
@@ -17,6 +18,7 @@ constexpr uint8_t PIN_X_SWITCH = 14, PIN_Y_SWITCH = 15, PIN_EMERGENCY = 16;  // 
 constexpr bool HAS_SWITCHES = true;
 constexpr bool HAS_EMERGENCY_STOP = true;
 
+// The Pi's [stage] inverted (SET PINS) inverts these levels without compiling.
 // Level of DIR for motion towards larger coordinates.
 constexpr bool X_POSITIVE_HIGH = true, LEFT_POSITIVE_HIGH = true, RIGHT_POSITIVE_HIGH = true;
 
@@ -43,6 +45,9 @@ constexpr uint8_t QUIET_MS = 4;
 constexpr uint16_t HOME_RATE = 4000;   // steps/s
 constexpr uint16_t CREEP_RATE = 400;   // steps/s
 constexpr uint32_t HOME_ACCEL = 40000UL;  // steps/s^2, independent of SET ACCEL: overruns the switch by 1 mm
+// Until the axis has found its switch once since the last reset, its direction may be wrong: slowly, in short legs.
+constexpr uint16_t FIRST_RATE = 2000;  // steps/s
+constexpr int32_t FIRST_LEG = 2000;    // steps
 constexpr uint16_t PULL_OFF = 400;     // steps from the switch's opening to the zero
 constexpr int32_t MAX_RELEASE = 4000;  // steps within which a pressed switch must open
 

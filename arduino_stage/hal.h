@@ -4,6 +4,17 @@
 
 enum Input : uint8_t { SWITCH_X = 1, SWITCH_Y = 2, EMERGENCY = 4 };
 
+// Value of SET PINS; shared/polysight_shared/raster.py has the same order in INVERTIBLE.
+enum Pin : uint8_t {
+  PIN_BIT_X_DIR = 1,
+  PIN_BIT_LEFT_DIR = 2,
+  PIN_BIT_RIGHT_DIR = 4,
+  PIN_BIT_ENABLE = 8,
+  PIN_BIT_PUL = 16,
+  PIN_BIT_SWITCHES = 32,
+  PIN_BIT_EMERGENCY = 64,
+};
+
 constexpr uint8_t SWITCHES = SWITCH_X | SWITCH_Y;
 
 // State of the switches: bits of Input, set = pressed.
@@ -11,6 +22,9 @@ uint8_t hal_inputs();
 
 // Call Motion::step() after this many ticks, then again after each Motion::interval() until that is 0.
 void hal_start_steps(uint16_t ticks);
+
+// Invert the levels of these pins: bits of Pin.
+void hal_pins(uint8_t inverted);
 
 // Set the direction pins.
 void hal_directions(bool x_positive, bool y_positive);

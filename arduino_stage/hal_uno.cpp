@@ -15,7 +15,10 @@ Stage stage(motion);
 namespace {
 
 uint16_t trigger_ticks;
+uint8_t inverted;         // bits of Pin
+uint8_t inverted_inputs;  // the same for pressed(): bits of Input
 uint16_t due;  // of the next step, in ticks of timer 1
+static_assert(board::PIN_X_PUL < 8 && board::PIN_LEFT_PUL < 8 && board::PIN_RIGHT_PUL < 8, "PUL pins are on port D");
 constexpr uint16_t PULSE_TICKS = board::TICK_HZ / 1000000 * board::STEP_PULSE_US;
 
 // Byte queue between an interrupt and the main program: one side puts, the other takes.
@@ -70,7 +73,7 @@ inline uint8_t pressed() {
     if (read<board::PIN_Y_SWITCH>()) inputs |= SWITCH_Y;
   }
   if (board::HAS_EMERGENCY_STOP && read<board::PIN_EMERGENCY>()) inputs |= EMERGENCY;
-  return inputs;
+  return inputs ^ inverted_inputs;
 }
 
 }  // namespace
@@ -82,7 +85,8 @@ void uno_begin() {
   hal_trigger_width(board::DEFAULT_TRIGGER_US);
   hal_enable(false);
   const uint8_t outputs[] = {board::PIN_TRIGGER,   board::PIN_LEFT_PUL, board::PIN_LEFT_DIR, board::PIN_RIGHT_PUL,
-                             board::PIN_RIGHT_DIR, board::PIN_X_PUL,    board::PIN_X_DIR,    board::PIN_ENABLE};
+                             board::PIN_RIGHT_DIR, board::PIN_X_PUL,    board::PIN_X_DIR,    board::PIN_ENABLE,
+                             board::PIN_BRAKE};
   for (uint8_t pin : outputs) pinMode(pin, OUTPUT);
   const uint8_t inputs[] = {board::PIN_X_SWITCH, board::PIN_Y_SWITCH, board::PIN_EMERGENCY};
   for (uint8_t pin : inputs) pinMode(pin, INPUT_PULLUP);
@@ -132,11 +136,10 @@ ISR(USART_UDRE_vect) {
 // between two steps at MAX_RATE. Steps that other interrupts delay are caught up.
 ISR(TIMER1_COMPA_vect) {
   const uint8_t out = motion.step(pressed());
-  if (out & STEP_X) write<board::PIN_X_PUL>(true);
-  if (out & STEP_Y) {
-    write<board::PIN_LEFT_PUL>(true);
-    write<board::PIN_RIGHT_PUL>(true);
-  }
+  uint8_t pulses = 0;
+  if (out & STEP_X) pulses |= 1 << board::PIN_X_PUL;
+  if (out & STEP_Y) pulses |= 1 << board::PIN_LEFT_PUL | 1 << board::PIN_RIGHT_PUL;
+  PIND = pulses;  // toggles the pins, whichever level they rest at
   if ((out & TRIGGER) && !read<board::PIN_TRIGGER>()) {
     write<board::PIN_TRIGGER>(true);
     OCR1B = TCNT1 + trigger_ticks;
@@ -156,9 +159,7 @@ ISR(TIMER1_COMPA_vect) {
   }
   while ((uint16_t)(TCNT1 - risen) < PULSE_TICKS) {
   }
-  write<board::PIN_X_PUL>(false);
-  write<board::PIN_LEFT_PUL>(false);
-  write<board::PIN_RIGHT_PUL>(false);
+  PIND = pulses;
 }
 
 ISR(TIMER1_COMPB_vect) {
@@ -176,12 +177,27 @@ void hal_start_steps(uint16_t ticks) {
 }
 
 void hal_directions(bool x_positive, bool y_positive) {
-  write<board::PIN_X_DIR>(x_positive == board::X_POSITIVE_HIGH);
-  write<board::PIN_LEFT_DIR>(y_positive == board::LEFT_POSITIVE_HIGH);
-  write<board::PIN_RIGHT_DIR>(y_positive == board::RIGHT_POSITIVE_HIGH);
+  write<board::PIN_X_DIR>((x_positive == board::X_POSITIVE_HIGH) != !!(inverted & PIN_BIT_X_DIR));
+  write<board::PIN_LEFT_DIR>((y_positive == board::LEFT_POSITIVE_HIGH) != !!(inverted & PIN_BIT_LEFT_DIR));
+  write<board::PIN_RIGHT_DIR>((y_positive == board::RIGHT_POSITIVE_HIGH) != !!(inverted & PIN_BIT_RIGHT_DIR));
 }
 
-void hal_enable(bool on) { write<board::PIN_ENABLE>(!on); }
+void hal_enable(bool on) {
+  write<board::PIN_ENABLE>(on == !!(inverted & PIN_BIT_ENABLE));
+  write<board::PIN_BRAKE>(on);
+}
+
+void hal_pins(uint8_t bits) {
+  InterruptLock lock;
+  inverted = bits;
+  inverted_inputs = 0;
+  if (board::HAS_SWITCHES && bits & PIN_BIT_SWITCHES) inverted_inputs |= SWITCHES;
+  if (board::HAS_EMERGENCY_STOP && bits & PIN_BIT_EMERGENCY) inverted_inputs |= EMERGENCY;
+  const bool rest = bits & PIN_BIT_PUL;
+  write<board::PIN_X_PUL>(rest);
+  write<board::PIN_LEFT_PUL>(rest);
+  write<board::PIN_RIGHT_PUL>(rest);
+}
 
 void hal_trigger_width(uint16_t us) {
   InterruptLock lock;

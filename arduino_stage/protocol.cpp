@@ -168,7 +168,7 @@ StageError Protocol::execute(const Request& request, bool& motion) {
     uint8_t count;
   };
   static const Verb VERBS[] = {{"HELLO", 0}, {"SET", 2}, {"ENABLE", 1}, {"HOME", 0},
-                               {"MOVE", 3},  {"ROW", 5}, {"CLEAR", 0}};
+                               {"MOVE", 3},  {"ROW", 5}, {"BUZZ", 1},   {"CLEAR", 0}};
   constexpr uint8_t N_VERBS = sizeof VERBS / sizeof VERBS[0];
   uint8_t i = 0;
   while (i < N_VERBS && (strlen(VERBS[i].name) != request.verb_length ||
@@ -178,7 +178,7 @@ StageError Protocol::execute(const Request& request, bool& motion) {
   if (i == N_VERBS) return ERROR_UNKNOWN_COMMAND;
   if (request.count != VERBS[i].count) return ERROR_ARGUMENT_COUNT;
   const int32_t* a = request.arguments;
-  motion = i >= 3 && i <= 5;
+  motion = i >= 3 && i <= 6;
   switch (i) {
     case 1:
       return stage_.set(a[0], a[1]);
@@ -191,6 +191,8 @@ StageError Protocol::execute(const Request& request, bool& motion) {
     case 5:
       return stage_.row(a[0], a[1], a[2], a[3], a[4]);
     case 6:
+      return stage_.buzz(a[0]);
+    case 7:
       return stage_.clear();
     default:
       return ERROR_NONE;  // HELLO

@@ -7,7 +7,9 @@ void Stage::reset() {
   activity_ = IDLE;
   alarm_ = stopping_ = ERROR_NONE;
   enabled_ = homed_ = held_ = row_command_ = homing_command_ = started_ = knew_ = false;
-  phase_ = 0;
+  phase_ = found_ = 0;
+  buzz_x_ = true;
+  searched_ = 0;
   row_ = Leg();
   row_y_ = 0;
   backlash_ = board::DEFAULT_BACKLASH;
@@ -53,6 +55,11 @@ StageError Stage::set(int32_t parameter, int32_t value) {
     case PARAMETER_BACKLASH:
       if (v > (uint32_t)board::MAX_BACKLASH) return ERROR_OUT_OF_RANGE;
       backlash_ = value;
+      return ERROR_NONE;
+    case PARAMETER_PINS:
+      if (v > 127) return ERROR_OUT_OF_RANGE;
+      hal_pins((uint8_t)v);
+      hal_enable(enabled_);
       return ERROR_NONE;
     default:
       return ERROR_OUT_OF_RANGE;
@@ -103,7 +110,36 @@ StageError Stage::home() {
   knew_ = homed_;
   homed_ = false;
   phase_ = 0;
+  searched_ = 0;
   return ERROR_NONE;
+}
+
+// 1 mm each way, slowly, also before the first homing: the direction and the driver can be seen without risk.
+StageError Stage::buzz(int32_t axis) {
+  const StageError refused = ready();
+  if (refused != ERROR_NONE) return refused;
+  if (axis != 0 && axis != 1) return ERROR_OUT_OF_RANGE;
+  begin(BUZZ);
+  motion_.set_accel(board::HOME_ACCEL);
+  buzz_x_ = axis == 0;
+  phase_ = 0;
+  return ERROR_NONE;
+}
+
+Event Stage::next_buzz_leg() {
+  if (phase_ == 3) {
+    motion_.set_accel(accel_);
+    activity_ = IDLE;
+    motion_.abandon();
+    return EVENT_DONE;
+  }
+  const int32_t distance = phase_ == 1 ? -2 * (int32_t)board::STEPS_PER_MM : board::STEPS_PER_MM;
+  Leg leg = Leg();
+  (buzz_x_ ? leg.dx : leg.dy) = distance;
+  leg.rate = board::CREEP_RATE;
+  phase_++;
+  motion_.start(leg);
+  return EVENT_NONE;
 }
 
 StageError Stage::move(int32_t x, int32_t y, int32_t rate) {
@@ -225,6 +261,10 @@ Event Stage::raise(StageError alarm, bool position_lost) {
   stop_requested_ = resume_requested_ = false;
   alarm_ = alarm;
   if (position_lost) homed_ = false;
+  if (alarm == ERROR_EMERGENCY_STOP) {  // the brake closes with the drivers
+    enabled_ = false;
+    hal_enable(false);
+  }
   return EVENT_ALARM;
 }
 
@@ -276,6 +316,8 @@ Event Stage::next_leg() {
       return EVENT_NONE;
     case HOMING:
       return next_homing_leg();
+    case BUZZ:
+      return next_buzz_leg();
     default:
       activity_ = IDLE;
       motion_.abandon();
@@ -287,7 +329,12 @@ Event Stage::next_leg() {
 Event Stage::next_homing_leg() {
   if (board::HAS_SWITCHES) {
     const uint8_t step = phase_ % 3;
-    if (started_) {
+    const uint8_t its_switch = phase_ < 3 ? SWITCH_X : SWITCH_Y;
+    const int32_t travel = phase_ < 3 ? travel_x_ : travel_y_;
+    const int32_t farthest = travel + travel / 10 + board::PULL_OFF;
+    if (started_ && step == 0 && motion_.reached()) found_ |= its_switch;
+    const bool searches_on = step == 0 && !(found_ & its_switch) && searched_ < farthest;
+    if (started_ && !searches_on) {
       const bool as_wanted = motion_.reached() == (step != 2);
       if (!as_wanted) return raise(ERROR_HOMING_FAILED, true);
       if (phase_ == 2) {
@@ -298,17 +345,24 @@ Event Stage::next_homing_leg() {
         motion_.set_y(0);
       }
       phase_++;
+      searched_ = 0;
+      started_ = false;
+      return next_homing_leg();
     }
     if (phase_ < 6) {
       const bool along_x = phase_ < 3;
-      const int32_t travel = along_x ? travel_x_ : travel_y_;
       int32_t distance;
       Leg leg = Leg();
       leg.until = along_x ? SWITCH_X : SWITCH_Y;
       switch (phase_ % 3) {
         case 0:
-          distance = -(travel + travel / 10 + board::PULL_OFF);
+          distance = -farthest;
           leg.rate = board::HOME_RATE;
+          if (searches_on) {
+            distance = -board::FIRST_LEG;
+            leg.rate = board::FIRST_RATE;
+            searched_ += board::FIRST_LEG;
+          }
           break;
         case 1:
           distance = board::MAX_RELEASE;
@@ -339,6 +393,7 @@ const char* Stage::state() const {
   if (busy() && motion_.holding() && !motion_.stepping()) return "hold";
   switch (activity_) {
     case MOVE:
+    case BUZZ:
       return "move";
     case TRAVEL:
     case ROW:

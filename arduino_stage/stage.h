@@ -14,6 +14,7 @@ enum Parameter : uint8_t {
   PARAMETER_TRAVEL_Y = 4,
   PARAMETER_TRAVEL_SPEED = 5,
   PARAMETER_BACKLASH = 6,
+  PARAMETER_PINS = 7,
 };
 
 // Bytes that act at once; shared/polysight_shared/stage_line.py has the same list.
@@ -37,6 +38,7 @@ class Stage {
   StageError home();
   StageError move(int32_t x, int32_t y, int32_t rate);
   StageError row(int32_t x0, int32_t pitch, int32_t points, int32_t y, int32_t rate);
+  StageError buzz(int32_t axis);
   StageError clear();
 
   // Process any received byte; true if it was one of Immediate. Safe in the receive interrupt.
@@ -59,11 +61,12 @@ class Stage {
   const Motion& motion() const { return motion_; }
 
  private:
-  enum Activity : uint8_t { IDLE, MOVE, TRAVEL, ROW, HOMING };
+  enum Activity : uint8_t { IDLE, MOVE, TRAVEL, ROW, HOMING, BUZZ };
   StageError ready() const;
   Event raise(StageError alarm, bool position_lost);
   Event next_leg();
   Event next_homing_leg();
+  Event next_buzz_leg();
   bool within(int32_t x, int32_t y) const;
   void begin(Activity activity);
   void go(int32_t x, int32_t y, uint16_t rate);
@@ -77,7 +80,10 @@ class Stage {
   Activity activity_;
   StageError alarm_, stopping_;  // stopping_: alarm to raise when the stage has slowed down
   bool enabled_, homed_, held_, row_command_, homing_command_, started_, knew_;  // knew_: was homed before this homing
-  uint8_t phase_;  // of homing
+  uint8_t phase_;  // of homing and of a buzz
+  uint8_t found_;  // switches that homing has reached since the reset: bits of Input
+  bool buzz_x_;
+  int32_t searched_;  // steps of the search in short legs
   Leg row_;
   int32_t row_y_, travel_x_, travel_y_, backlash_;
   uint16_t travel_rate_, heartbeat_ms_, trigger_us_;

@@ -16,6 +16,7 @@ uint8_t hal_inputs() { return machine->inputs(); }
 void hal_start_steps(uint16_t ticks) { machine->arm(ticks); }
 void hal_directions(bool x_positive, bool y_positive) { machine->set_directions(x_positive, y_positive); }
 void hal_enable(bool) {}
+void hal_pins(uint8_t) {}  // wired as the settings say
 void hal_trigger_width(uint16_t us) { machine->set_trigger_width(us); }
 void hal_write(const char* text, uint8_t length) { machine->replies_.append(text, length); }
 uint8_t hal_room() { return 255; }

@@ -104,6 +104,17 @@ def _jog(args: argparse.Namespace, instrument: Instrument) -> int:
         return _print_position(args, stage.jog(args.dx, args.dy, speed_mm_s))
 
 
+def _buzz(args: argparse.Namespace, instrument: Instrument) -> int:
+    from polysight_pi.client import refuse_beside_service
+    from polysight_pi.stage import BenchStage
+
+    refuse_beside_service(instrument)
+    if not args.json:
+        _write(f"{args.axis}: 1 mm towards larger coordinates, 2 mm back, 1 mm forward")
+    with BenchStage(instrument.stage) as stage:
+        return _print_position(args, stage.buzz(args.axis))
+
+
 def _home(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight_pi.client import home_by_service
     from polysight_pi.stage import BenchStage
@@ -213,6 +224,9 @@ COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str,
     )),
     ("pulse", _pulse, "send bursts on SYNC_IN and print their width and jitter", "--count 100", (
         WIRES, JSON, _option("--count", **COUNT, default=10, help="number of bursts (%(default)s)"),
+    )),
+    ("buzz", _buzz, "move an axis by 1 mm each way, slowly, before the first homing", "x", (
+        _option("axis", choices=("x", "y"), help="axis; y is the vertical one"), STAGE_PORT, JSON,
     )),
     ("jog", _jog, "move the stage by a distance (home it first)", "--dx 10 --dy -5", (
         STAGE_PORT, JSON, _option("--dx", **MM, help="along x, millimetres (0)"),

@@ -20,7 +20,7 @@ import msgspec
 
 from polysight_pi.journal import Journal, JournalFullError, JournalThread
 from polysight_pi.machine import Machine, RefusedError
-from polysight_pi.stage import StageDriver, StageLost, StageNews
+from polysight_pi.stage import MIN_FEED, StageDriver, StageLost, StageNews
 from polysight_pi.trigger import BurstSent, BurstSpec, LoopFault, TriggerLoop
 from polysight_shared import __version__
 from polysight_shared import messages as m
@@ -493,9 +493,10 @@ def check_run(run: m.BeginRun, stage: Stage) -> None:
     _require(plan.columns >= 1 and plan.rows >= 1, f"plan of {plan.columns} x {plan.rows} points is empty")
     _require(plan.step_x_mm > 0 and plan.step_y_mm > 0, "steps of the plan must be positive")
     fastest = max(stage.speed_mm_s, stage.travel_speed_mm_s)
+    slowest = MIN_FEED / stage.steps_per_mm
     _require(
-        0 < run.speed_mm_s <= fastest,
-        f"speed of {run.speed_mm_s} mm/s is outside 0..{fastest} mm/s of this rig's [stage]",
+        slowest <= run.speed_mm_s <= fastest,
+        f"speed of {run.speed_mm_s} mm/s is outside {slowest:g}..{fastest} mm/s of this rig's [stage]",
     )
     steps = plan.step_x_mm * stage.steps_per_mm
     _require(

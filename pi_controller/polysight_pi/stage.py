@@ -14,14 +14,14 @@ import termios
 import threading
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import serial
 
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, ProtocolError
 from polysight_shared.faults import PiFault, StageError, explain
-from polysight_shared.raster import Row, Stage
+from polysight_shared.raster import INVERTIBLE, Row, Stage
 from polysight_shared.stage_line import (
     HOMING_TIMEOUT_S,
     MAX_LINE_BYTES,
@@ -391,6 +391,15 @@ class StageDriver:
 
         Returns the sequence number of its `done`.
         """
+        self._switch_on()
+        return self._start("HOME")
+
+    def buzz(self, axis: Literal["x", "y"]) -> int:
+        """Move an axis by 1 mm each way, slowly, homed or not; return the sequence number of its `done`."""
+        self._switch_on()
+        return self._start("BUZZ", "xy".index(axis))
+
+    def _switch_on(self) -> None:
         try:
             self.clear(stop=True)
         except StageRefusedError as e:
@@ -405,11 +414,11 @@ class StageDriver:
             Parameter.TRAVEL_Y: config.travel_y_mm * config.steps_per_mm,
             Parameter.TRAVEL_SPEED: config.travel_speed_mm_s * config.steps_per_mm,
             Parameter.BACKLASH: config.backlash_mm * config.steps_per_mm,
+            Parameter.PINS: sum(1 << INVERTIBLE.index(pin) for pin in config.inverted),
         }
         for parameter, value in settings.items():
             self.link.request("SET", int(parameter), round(value))
         self.link.request("ENABLE", 1)
-        return self._start("HOME")
 
     def row(self, row: Row, speed_mm_s: float) -> int:
         """Start a row; return the sequence number of its `done`."""
@@ -504,6 +513,10 @@ class BenchStage:
     def home(self) -> Position:
         """Home the stage; return its position."""
         return self._finish(self._driver.home())
+
+    def buzz(self, axis: Literal["x", "y"]) -> Position:
+        """Move an axis by 1 mm each way; return the position, which is that of before."""
+        return self._finish(self._driver.buzz(axis))
 
     def jog(self, dx_mm: float, dy_mm: float, speed_mm_s: float) -> Position:
         """Move by (dx, dy); return the new position."""

@@ -7,7 +7,7 @@ are those of the AWR2243 (TI mmWave Radar Interface Control, frame configuration
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -27,6 +27,9 @@ _Points = Annotated[int, msgspec.Meta(ge=1, lt=100_000)]
 _Motion = Annotated[float, msgspec.Meta(ge=0.001, le=1e6)]
 _Steps = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
 _Offset = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # also refuses NaN and infinities
+INVERTIBLE = ("x_dir", "left_dir", "right_dir", "enable", "pul", "switches", "emergency_stop")
+"""Pins of the stage whose level `stage.inverted` inverts against arduino_stage/board.h."""
+_Invertible = Literal["x_dir", "left_dir", "right_dir", "enable", "pul", "switches", "emergency_stop"]
 _PLACEMENT_KEYS = ("steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2")
 
 
@@ -106,6 +109,7 @@ class Stage(Section, frozen=True):
     centre_y_mm: NonNegative = 250.0
     backlash_mm: NonNegative = 0.0
     home_after_scan: bool = False  # measures lost steps; needs limit switches
+    inverted: tuple[_Invertible, ...] = ()  # pins with the other level than in board.h, sent before the first motion
 
     def __post_init__(self) -> None:
         require(self.centre_x_mm <= self.travel_x_mm, "centre_x_mm must lie within travel_x_mm")

@@ -49,6 +49,7 @@ class Parameter(IntEnum):
     TRAVEL_X = 3  # steps, soft limit 0..TRAVEL_X
     TRAVEL_Y = 4  # steps
     TRAVEL_SPEED = 5  # steps/s, between rows
+    PINS = 7  # bits of the pins whose level is inverted, in the order of raster.INVERTIBLE
     BACKLASH = 6  # steps; rows are approached from below, with at least this run-up; 0 = off
 
 

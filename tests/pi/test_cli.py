@@ -81,6 +81,10 @@ def test_commands_without_the_service(command, instrument, write_config, hub, st
     config = write_config(at_stage_port(on_free_subnet(instrument), stage.port))
     status, out, _ = command("pulse", "--config", config, "--wires", hub, "--count", 3, "--json")
     assert (status, [r["pulses"] for r in json.loads(out)]) == (0, [4, 4, 4])
+    for axis in "xy":  # before the first homing, which `jog` needs
+        assert json.loads(command("buzz", axis, "--config", config, "--json")[1]) == {"x_mm": 0.0, "y_mm": 0.0}
+    assert [c.args for c in stage.seen if c.verb == "BUZZ"] == [(0,), (1,)]
+    assert command("jog", "--config", config, "--dx", 3)[0] != 0
     assert command("home", "--config", config)[1] == "stage at x 0.000 mm, y 0.000 mm\n"
     assert json.loads(command("jog", "--config", config, "--dx", 3, "--json")[1]) == {"x_mm": 3.0, "y_mm": 0.0}
     assert command("events", "--config", config, "--limit-s", 0.1)[0] == 5

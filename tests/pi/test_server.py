@@ -57,7 +57,7 @@ def test_stage_gets_the_row_in_steps_and_a_heartbeat(host, stage):
     half, y = 3.5 * 2 * 200, 250 * 200 - 1.5 * 2 * 200
     assert row.args == (400 * 200 - half, 400, 8, y, 4000)
     sets = {c.args[0]: c.args[1] for c in stage.seen if c.verb == "SET"}
-    assert sets == {0: 40000, 1: 1000, 2: 20, 3: 160000, 4: 100000, 5: 8000, 6: 0}
+    assert sets == {0: 40000, 1: 1000, 2: 20, 3: 160000, 4: 100000, 5: 8000, 6: 0, 7: 0}
     assert stage.bytes_seen.count(Immediate.STATUS) >= 2
     assert any(e.state == "row" for e in host.of(m.StageStatus))
 
@@ -96,7 +96,8 @@ def test_refusals_have_their_number(pi):
     assert host.refused(host.begin(period_us=299.0)) == PiFault.PERIOD_TOO_SHORT
     assert host.refused(host.begin(width_us=4.5)) == PiFault.PULSE_TOO_LONG
     for wrong in (
-        {"speed_mm_s": 1000.0}, {"pulses": 100}, {"plan": replace(plan, columns=402)},
+        {"speed_mm_s": 1000.0}, {"speed_mm_s": 5e-324}, {"speed_mm_s": 0.1},
+        {"pulses": 100}, {"plan": replace(plan, columns=402)},
         {"plan": replace(plan, step_x_mm=2.0011)},
     ):  # fmt: skip
         assert host.refused(host.begin(**wrong)) == PiFault.BAD_REQUEST

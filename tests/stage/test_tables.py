@@ -64,7 +64,17 @@ def test_limits():
     assert protocol["MAX_LINE_BYTES"] == stage_line.MAX_LINE_BYTES
     assert protocol["PROTOCOL_VERSION"] == stage_line.PROTOCOL_VERSION
     assert f'"{stage_python.FIRMWARE}"' in (SKETCH / "protocol.h").read_text(encoding="ascii")
-    for name in ("MAX_TRAVEL", "MAX_POINTS", "MAX_BACKLASH", "HOME_RATE", "CREEP_RATE", "PULL_OFF", "MAX_RELEASE"):
+    for name in (
+        "MAX_TRAVEL",
+        "MAX_POINTS",
+        "MAX_BACKLASH",
+        "HOME_RATE",
+        "FIRST_RATE",
+        "FIRST_LEG",
+        "CREEP_RATE",
+        "PULL_OFF",
+        "MAX_RELEASE",
+    ):
         assert board[name] == getattr(stage_logic, name)
     for name in ("MIN_RATE", "MAX_RATE", "TICK_HZ"):
         assert board[name] == getattr(stage_motion, name)

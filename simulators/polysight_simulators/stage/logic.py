@@ -15,6 +15,9 @@ MAX_BACKLASH = 20_000
 # steps/s and steps
 HOME_RATE = 4000
 CREEP_RATE = 400
+FIRST_RATE = 2000
+FIRST_LEG = 2000
+STEPS_PER_MM = 200
 PULL_OFF = 400
 MAX_RELEASE = 4000
 HOME_ACCEL = 40_000  # steps/s^2
@@ -27,9 +30,10 @@ _RANGES = {
     Parameter.TRAVEL_Y: (1, MAX_TRAVEL),
     Parameter.TRAVEL_SPEED: (MIN_RATE, 2**31),
     Parameter.BACKLASH: (0, MAX_BACKLASH),
+    Parameter.PINS: (0, 127),
 }
-ARGUMENTS = {"HELLO": 0, "SET": 2, "ENABLE": 1, "HOME": 0, "MOVE": 3, "ROW": 5, "CLEAR": 0}
-MOTION_VERBS = ("HOME", "MOVE", "ROW")
+ARGUMENTS = {"HELLO": 0, "SET": 2, "ENABLE": 1, "HOME": 0, "MOVE": 3, "ROW": 5, "BUZZ": 1, "CLEAR": 0}
+MOTION_VERBS = ("HOME", "MOVE", "ROW", "BUZZ")
 
 
 class Refused(Exception):  # noqa: N818 - the answer to a command, not a failure of this program
@@ -89,6 +93,7 @@ class StageLogic:
             Parameter.TRAVEL_Y: 100_000,
             Parameter.TRAVEL_SPEED: 8_000,
             Parameter.BACKLASH: 0,
+            Parameter.PINS: 0,
         }
         self.activity = "idle"  # idle, move, travel, row, home
         self.alarm: StageError | None = None
@@ -97,6 +102,8 @@ class StageLogic:
         self._enabled = self._stop = self._resume = self._homing_leg_made = False
         self._byte_seen = self._resume_begun = self._knew = self.homing_command = False
         self._quiet = True
+        self._found = self._searched = 0
+        self._buzz_x = True
         self._phase = self._heard_ms = self._byte_ms = self._looked_ms = 0
         self.lost_x = self.lost_y = 0
         self._row_leg = Leg(0, 0, MIN_RATE)
@@ -113,7 +120,7 @@ class StageLogic:
         if self.busy and self._engine.hold and not self._engine.stepping:
             return "hold"
         if self.busy:
-            return "row" if self.activity == "travel" else self.activity
+            return {"travel": "row", "buzz": "move"}.get(self.activity, self.activity)
         return "alarm" if self.alarm else "idle"
 
     def execute(self, verb: str, args: tuple[int, ...]) -> None:
@@ -126,7 +133,7 @@ class StageLogic:
         if verb in MOTION_VERBS:
             _require(self.alarm is None and not self._stop, StageError.IN_ALARM)
             _require(self._enabled, StageError.DISABLED)
-            _require(self.homed or verb == "HOME", StageError.NOT_HOMED)
+            _require(self.homed or verb in ("HOME", "BUZZ"), StageError.NOT_HOMED)
         handlers: dict[str, Callable[..., None]] = {
             "SET": self._set,
             "ENABLE": self._enable,
@@ -134,6 +141,7 @@ class StageLogic:
             "HOME": self._home,
             "MOVE": self._move,
             "ROW": self._row,
+            "BUZZ": self._buzz,
         }
         handlers[verb](*args)
 
@@ -161,7 +169,24 @@ class StageLogic:
         self._engine.set_accel(HOME_ACCEL)
         self._knew = self.homed
         self.homed = False
+        self._phase = self._searched = 0
+
+    def _buzz(self, axis: int) -> None:
+        _require(axis in (0, 1), StageError.OUT_OF_RANGE)
+        self._begin("buzz")
+        self._engine.set_accel(HOME_ACCEL)
+        self._buzz_x = axis == 0
         self._phase = 0
+
+    def _next_buzz_leg(self) -> Event:
+        if self._phase == 3:
+            self._engine.set_accel(self.parameters[Parameter.ACCEL])
+            return self._end()
+        distance = -2 * STEPS_PER_MM if self._phase == 1 else STEPS_PER_MM
+        self._phase += 1
+        leg = Leg(distance, 0, CREEP_RATE) if self._buzz_x else Leg(0, distance, CREEP_RATE)
+        self._arm(self._engine.start(leg))
+        return Event.NONE
 
     def _move(self, x: int, y: int, rate: int) -> None:
         _require(rate >= MIN_RATE, StageError.OUT_OF_RANGE)
@@ -247,6 +272,7 @@ class StageLogic:
         self._stop = self._resume = False
         self.alarm = alarm
         self.homed = self.homed and not position_lost
+        self._enabled = self._enabled and alarm != StageError.EMERGENCY_STOP
         return Event.ALARM
 
     def service(self, now_ms: int) -> Event:
@@ -290,6 +316,8 @@ class StageLogic:
             return Event.NONE
         if self.activity == "home":
             return self._next_homing_leg()
+        if self.activity == "buzz":
+            return self._next_buzz_leg()
         return self._end()
 
     def _end(self) -> Event:
@@ -298,7 +326,15 @@ class StageLogic:
         return Event.DONE
 
     def _next_homing_leg(self) -> Event:
-        if self._homing_leg_made:
+        along_x = self._phase < 3
+        step = self._phase % 3
+        its_switch = SWITCH_X if along_x else SWITCH_Y
+        travel = self.parameters[Parameter.TRAVEL_X if along_x else Parameter.TRAVEL_Y]
+        farthest = travel + travel // 10 + PULL_OFF
+        if self._homing_leg_made and step == 0 and self._engine.reached:
+            self._found |= its_switch
+        searches_on = step == 0 and not self._found & its_switch and self._searched < farthest
+        if self._homing_leg_made and not searches_on:
             if self._engine.reached != (self._phase % 3 != 2):
                 return self._raise(StageError.HOMING_FAILED, True)
             if self._phase == 2:
@@ -308,16 +344,20 @@ class StageLogic:
                 self.lost_y = -self._engine.y if self._knew else 0
                 self._engine.y = 0
             self._phase += 1
+            self._searched = 0
+            self._homing_leg_made = False
+            return self._next_homing_leg()
         if self._phase == 6:
             self._engine.set_accel(self.parameters[Parameter.ACCEL])
             self.homed = True
             return self._end()
-        along_x = self._phase < 3
-        step = self._phase % 3
         # To the switch, slowly off it until it opens, and away from it.
-        travel = self.parameters[Parameter.TRAVEL_X if along_x else Parameter.TRAVEL_Y]
-        distance = (-(travel + travel // 10 + PULL_OFF), MAX_RELEASE, PULL_OFF)[step]
+        distance = (-farthest, MAX_RELEASE, PULL_OFF)[step]
         rate = CREEP_RATE if step == 1 else HOME_RATE
+        if searches_on:
+            distance = -FIRST_LEG
+            rate = FIRST_RATE
+            self._searched += FIRST_LEG
         if along_x:
             leg = Leg(distance, 0, rate, until=SWITCH_X, until_open=step == 1)
         else:

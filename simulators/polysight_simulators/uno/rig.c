@@ -11,7 +11,7 @@
 #include <unistd.h>
 #include <simavr/avr_ioport.h>
 
-enum { TRIGGER = 2, LEFT_PUL = 3, RIGHT_PUL = 4, X_PUL = 5, DRIVERS_OFF = 7, LEFT_DIR = 8, RIGHT_DIR = 9, X_DIR = 10,
+enum { TRIGGER = 2, LEFT_PUL = 3, RIGHT_PUL = 4, X_PUL = 5, DRIVERS_OFF = 7, BRAKE = 12, LEFT_DIR = 8, RIGHT_DIR = 9, X_DIR = 10,
        X_SWITCH = 14, Y_SWITCH = 15, EMERGENCY_STOP = 16 };
 
 struct rig rig = { 2000, 1500, 0, 0, 5.0, 26, -1 };

@@ -260,7 +260,7 @@ class FakeStage:
             self._carry_out(c)
 
     def _refusal(self, c: Command) -> int:
-        if c.verb in ("HOME", "MOVE", "ROW", "SET") and self.moving:
+        if c.verb in ("HOME", "MOVE", "ROW", "BUZZ", "SET") and self.moving:
             return StageError.BUSY
         if c.verb in ("HOME", "MOVE", "ROW") and self.alarm:
             return StageError.IN_ALARM
@@ -271,7 +271,7 @@ class FakeStage:
     def _carry_out(self, c: Command) -> None:
         if c.verb == "CLEAR":
             self.alarm = 0
-        elif c.verb in ("HOME", "MOVE", "ROW"):
+        elif c.verb in ("HOME", "MOVE", "ROW", "BUZZ"):
             if self._motion:
                 self._motion.join()
             self.moving = True
@@ -303,8 +303,9 @@ class FakeStage:
     def _elsewhere(self, c: Command) -> int:
         if self._stopping.wait(self.pace_s):
             return StageError.STOPPED
-        self.homed = True
-        self.x, self.y = c.args[:2] if c.verb == "MOVE" else (0, 0)
+        if c.verb != "BUZZ":
+            self.homed = True
+            self.x, self.y = c.args[:2] if c.verb == "MOVE" else (0, 0)
         return 0
 
     def _row(self, c: Command) -> int:

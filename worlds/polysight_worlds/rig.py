@@ -82,7 +82,11 @@ def place(steps: list[dict], antenna_mm: NDArray) -> tuple[NDArray, NDArray]:
 
 def load_rig(file: Path) -> Rig:
     """The rig of an `instrument.toml`: mounts, antennas, object distance, grid. A board's four RX become their mean."""
-    content = tomllib.loads(file.read_text(encoding="utf-8"))
+    return rig_of(tomllib.loads(file.read_text(encoding="utf-8")))
+
+
+def rig_of(content: dict, leakage: tuple[complex, complex] = (0j, 0j)) -> Rig:
+    """The rig of an instrument file's content; `leakage` of p into H and of s into V, towards their mirror points."""
     boards = {board["role"]: board for board in content["boards"]}
     antennas = content["antennas"]
     sender = boards["transmit"]
@@ -92,7 +96,7 @@ def load_rig(file: Path) -> Rig:
     v = place(boards["receive_v"]["mount"], middle_mm)
     plane_m = content["geometry"]["object_distance_mm"] / 1000
     grid = content["grid"]
-    return build_rig(tx, h, v, plane_m=plane_m, columns=grid["columns"], rows=grid["rows"])
+    return build_rig(tx, h, v, plane_m=plane_m, columns=grid["columns"], rows=grid["rows"], leakage=leakage)
 
 
 def build_rig(
@@ -103,11 +107,12 @@ def build_rig(
     plane_m: float,
     columns: int = 350,
     rows: int = 200,
+    leakage: tuple[complex, complex] = (0j, 0j),
 ) -> Rig:
     """The rig of (position, boresight) of three boards, polarised as s, p and both towards their mirror points."""
 
     def aim(
-        board: tuple[NDArray, NDArray], receiver: tuple[NDArray, NDArray], s_share: float, p_share: float
+        board: tuple[NDArray, NDArray], receiver: tuple[NDArray, NDArray], s_share: complex, p_share: complex
     ) -> Antenna:
         direction = find_mirror_point(tx[0], receiver[0], plane_m) - board[0]
         direction /= np.linalg.norm(direction)
@@ -119,7 +124,7 @@ def build_rig(
         return Antenna.aimed(*board, direction, s_share * s_axis + p_share * p_axis)
 
     half = np.sqrt(0.5)
-    return Rig(aim(tx, h, half, half), aim(h, h, 1, 0), aim(v, v, 0, 1), plane_m, columns, rows)
+    return Rig(aim(tx, h, half, half), aim(h, h, 1, leakage[0]), aim(v, v, leakage[1], 1), plane_m, columns, rows)
 
 
 def published_rig() -> Rig:
@@ -153,12 +158,16 @@ def spread_receivers(rig: Rig, step_h_m: NDArray, step_v_m: NDArray, count: int 
 
 def load_boards(file: Path) -> Boards:
     """Return the boards of an `instrument.toml`."""
-    content = tomllib.loads(file.read_text(encoding="utf-8"))
-    rig = load_rig(file)
+    return boards_of(tomllib.loads(file.read_text(encoding="utf-8")))
+
+
+def boards_of(content: dict, leakage: tuple[complex, complex] = (0j, 0j)) -> Boards:
+    """Return the boards of an instrument file's content; `leakage` as of `rig_of`."""
     steps = {}
     for board in content["boards"]:
         places = [place(board["mount"], antenna_mm)[0] for antenna_mm in content["antennas"]["rx_mm"]]
-        steps[board["role"]] = (places[-1] - places[0]) / (len(places) - 1)
+        steps[board["role"]] = (places[-1] - places[0]) / max(1, len(places) - 1)
+    rig = rig_of(content, leakage)
     return spread_receivers(rig, steps["receive_h"], steps["receive_v"], len(content["antennas"]["rx_mm"]))
 
 

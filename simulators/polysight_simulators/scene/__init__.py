@@ -1,6 +1,7 @@
 """Simulate radar data: from a scene file to the frames of the radars, and to whole scans on disk.
 
-`scene_file` defines the scene file (plates, points, disturbances) and draws the true permittivities and positions.
+`scene_file` defines the scene file (plates, points, shapes, disturbances) and draws the true permittivities and
+positions. `shapes` gets the echoes of shapes from an installed package.
 `optics` has the reflection of plates and the exact but slow sum of their echo; `field` computes the same echo fast at
 every stage position. `radar` (`SimulatedRig`) adds the effects of a board and gives the frames for stage offsets;
 `cubes` gives the samples after ideal synchronisation without frames. `simulate` writes a scan, as a scan folder or in
@@ -17,6 +18,7 @@ from polysight_simulators.scene.scene_file import (
     Plate,
     Point,
     Scene,
+    Shape,
     apply_scene,
     decode_scene,
     draw_specimens,
@@ -34,6 +36,7 @@ __all__ = [
     "Plate",
     "Point",
     "Scene",
+    "Shape",
     "SignalSource",
     "SimulatedRig",
     "apply_scene",

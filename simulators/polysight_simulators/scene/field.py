@@ -53,7 +53,8 @@ from polysight_simulators.scene.optics import (
     point_scale,
     sampled,
 )
-from polysight_simulators.scene.scene_file import Facets, Plate, Scene, draw_specimens, facets, slopes
+from polysight_simulators.scene.scene_file import Facets, Scene, draw_specimens, facets, slopes
+from polysight_simulators.scene.shapes import shape_field
 
 FADE_M = 0.06  # length of the kernel's fade-out beyond the scene
 TAPS = 12  # taps of the windowed sinc
@@ -363,7 +364,7 @@ def compute(
     plane = _Plane(ant, scene, ax, ay, surfaces, amplitudes * direct_factor(board, scene))
     levels = plane.levels(rx, float(samples_hz[-1]))
     legs = [leg for level in levels for leg in level.legs]
-    nodes_hz, centre = _frequencies(scene.plates, ax, ay, legs, samples_hz)
+    nodes_hz, centre = _frequencies(scene, ax, ay, legs, samples_hz)
 
     low = min(leg[2].min() for leg in legs)
     high = max(leg[2].max() for leg in legs)
@@ -376,19 +377,27 @@ def compute(
             _add_level(total, plane, level, series[:, q], f, centre, angle, shares)
         for r, spectrum in enumerate(total):
             values[:, :, r, q] = _oversampled(_oversampled(spectrum, ay, 0), ax, 1)
-    return values, (ax.first_u, ay.first_u), (ax.step / OVERSAMPLING, ay.step / OVERSAMPLING), nodes_hz, centre
+    steps = ax.step / OVERSAMPLING, ay.step / OVERSAMPLING
+    if scene.shapes:
+        offsets = (ax.first_u + steps[0] * np.arange(ax.outputs), ay.first_u + steps[1] * np.arange(ay.outputs))
+        seen = shape_field(rig, scene, board, offsets, nodes_hz, ant.centre_m, centre)
+        # As of plates: an infinite mirror gives object_gain d / path.
+        values += np.complex64(scene.object_gain * ant.direct_m[0]) * seen[:, :, list(rx)]
+    return values, (ax.first_u, ay.first_u), steps, nodes_hz, centre
 
 
 def _frequencies(
-    plates: Sequence[Plate], ax: Axis, ay: Axis, legs: list[tuple[Real, Real, Real, Real]], samples_hz: Real
+    scene: Scene, ax: Axis, ay: Axis, legs: list[tuple[Real, Real, Real, Real]], samples_hz: Real
 ) -> tuple[Real, float]:
     """Return the nodes in the samples' band (the samples if they are fewer), and the path whose phase is removed."""
     reach = np.stack([r1 + r2 for r1, r2, _, _ in legs])[:, (ay.fade == 1)[:, None] & (ax.fade == 1)]
     inside = 0.0
-    for p in plates:  # inner echoes extend the response
+    for p in scene.plates:  # inner echoes extend the response
         depth = sum((layer.thickness_mm or 0.0) / 1e3 * abs(np.sqrt(layer.epsilon)) for layer in p.stack)
         inside = max(inside, 4 * depth)
-    spread = float(reach.max() - reach.min()) + 2 * inside
+    # Shapes extend beyond their fronts' heights; some 0.15 m on either side hold their specular points.
+    depth_m = max((abs(p.height_mm) / 1e3 + 0.15 for p in scene.shapes), default=0.0)
+    spread = float(reach.max() - reach.min()) + 2 * inside + 4 * depth_m
     centre = float(reach.max() + reach.min()) / 2
     # Time-bandwidth product plus a few: interpolation error of the Chebyshev series below 1e-6.
     nodes = int(np.ceil((samples_hz[-1] - samples_hz[0]) * spread / SPEED_OF_LIGHT_M_S)) + 8
@@ -581,7 +590,9 @@ def build_field(
     if cache_dir is None:
         return ObjectField(*compute(rig, scene, board, samples_hz, rx))
     d = scene.disturbances
-    key = to_builtins([rig, scene.plates, scene.points, scene.object_gain, d.leakage_h, d.leakage_v, d.backlash_mm])
+    key = to_builtins(
+        [rig, scene.plates, scene.points, scene.shapes, scene.object_gain, d.leakage_h, d.leakage_v, d.backlash_mm]
+    )
     drawn = scene.seed if any(p.rough_mm for p in scene.plates) else None
     text = json.dumps([_PHYSICS, key, board.name, list(samples_hz), list(rx), drawn], sort_keys=True)
     path = cache_dir / f"field-{hashlib.sha256(text.encode()).hexdigest()[:24]}.npz"

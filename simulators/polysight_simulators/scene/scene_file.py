@@ -80,6 +80,8 @@ Share = Annotated[float, msgspec.Meta(ge=0, le=0.5)]
 Degrees = Annotated[float, msgspec.Meta(ge=-10, le=10)]  # of tilt: the fast field is checked up to 2
 Tilt = tuple[Degrees, Degrees]
 Height = Annotated[float, msgspec.Meta(ge=-50, le=50)]
+SteepTilt = Annotated[float, msgspec.Meta(ge=-60, le=60)]
+Bend = Annotated[float, msgspec.Meta(ge=-100, le=100)]
 Gain = Annotated[float, msgspec.Meta(ge=-200, le=200)]
 GainSpread = Annotated[float, msgspec.Meta(ge=0, le=100)]
 Decibels = Annotated[float, msgspec.Meta(ge=-40, le=200)]
@@ -196,6 +198,49 @@ class Point(_Table, frozen=True):
     height_mm: Height = 0.0
 
 
+class Shape(_Table, frozen=True):
+    """A sphere, cylinder, cone (`slope_deg`), bottle, or plate that may be tilted and bent.
+
+    `centre_mm` and `height_mm` are those of its front: the point nearest to the radars, of a plate its middle. `axis`
+    is along a cylinder or bottle, `length_mm` of a bottle that of its body. `bends_per_m`: 1 / radius along the plate's
+    sides and its twist, positive where it bends away. With `thickness_mm` it is a thin wall in air.
+    """
+
+    kind: Literal["sphere", "cylinder", "bottle", "plate"]
+    centre_mm: tuple[Millimetres, Millimetres]
+    name: str = ""
+    height_mm: Annotated[float, msgspec.Meta(ge=-300, le=300)] = 0.0
+    radius_mm: Annotated[float, msgspec.Meta(ge=10, le=500)] | None = None
+    length_mm: Size = 400.0
+    axis: tuple[Amplitude, Amplitude, Amplitude] = (0.0, 1.0, 0.0)
+    slope_deg: Annotated[float, msgspec.Meta(ge=-30, le=30)] = 0.0
+    size_mm: tuple[Size, Size] | None = None
+    tilt_deg: tuple[SteepTilt, SteepTilt] = (0.0, 0.0)
+    turn_deg: Angle = 0.0
+    bends_per_m: tuple[Bend, Bend, Bend] = (0.0, 0.0, 0.0)
+    metal: bool = False
+    permittivity: tuple[Permittivity, Permittivity] | None = None
+    thickness_mm: Size | None = None
+
+    def __post_init__(self) -> None:
+        _require(
+            self.metal != (self.permittivity is not None), "a shape has one of permittivity = [..] or metal = true"
+        )
+        _require(
+            self.thickness_mm is None or self.permittivity is not None, "thickness_mm goes with permittivity, not metal"
+        )
+        if self.permittivity is not None:
+            _check_permittivity(self.permittivity)
+        if self.kind == "plate":
+            _require(self.size_mm is not None and self.radius_mm is None, "a plate has size_mm, and no radius_mm")
+        else:
+            _require(
+                self.radius_mm is not None and self.size_mm is None, f"a {self.kind} has radius_mm, and no size_mm"
+            )
+        length = math.hypot(*self.axis)
+        _require(length > 0 and abs(self.axis[2]) < 0.9 * length, "axis must not point at the radars")
+
+
 class Crystals(_Table, frozen=True):
     """Errors of the boards' crystals by role, ppm."""
 
@@ -294,6 +339,7 @@ class Scene(_Table, frozen=True):
     stage: dict[str, Any] = {}
     plates: tuple[Plate, ...] = ()
     points: tuple[Point, ...] = ()
+    shapes: tuple[Shape, ...] = ()
     disturbances: Disturbances = Disturbances()
 
     def __post_init__(self) -> None:

@@ -67,6 +67,10 @@ def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
         "mean_burst_travel_mm": mean_burst_travel_mm(rig.burst, rig.stage),
         "plates": plates,
         "points": points,
+        "shapes": [
+            {**msgspec.to_builtins(shape), "front_m": _in_rig(shape.centre_mm, shape.height_mm, centre)}
+            for shape in actual.shapes
+        ],
         "direct_path": scene.disturbances.direct_gain > 0,
         "scene": {**to_builtins(scene), "disturbances": msgspec.to_builtins(scene.disturbances)},
     }

@@ -1,0 +1,64 @@
+"""Echoes of curved and tilted shapes, from an installed package that offers them.
+
+The simulator's own field holds flat plates that are nearly level. Shapes come from another package, found by its entry
+point `polysight.shape_echoes`: this project's is `worlds/`, which shares no code with the simulators. It gets plain
+tables and arrays; `polysight_worlds.scene_shapes.echoes_of` says which.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight_shared.config import Board, Instrument
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ConfigError
+from polysight_shared.tables import to_builtins
+from polysight_simulators.scene.scene_file import Scene
+
+GROUP = "polysight.shape_echoes"
+
+
+def find_echoes(scene: Scene) -> Any:
+    """Return the function that computes echoes of shapes. Raises ConfigError if no package offers it."""
+    offered = list(entry_points(group=GROUP))
+    if not offered:
+        raise ConfigError(
+            f"scene {scene.name} has [[shapes]]",
+            "the simulator itself has flat plates only, and no installed package computes shapes",
+            "run: pip install ./worlds",
+            code=ErrorCode.PACKAGE_MISSING,
+        )
+    return offered[0].load()
+
+
+def shape_field(
+    rig: Instrument,
+    scene: Scene,
+    board: Board,
+    axes_m: tuple[NDArray[np.floating], NDArray[np.floating]],
+    nodes_hz: NDArray[np.floating],
+    centre_m: NDArray[np.floating],
+    path_m: float,
+) -> NDArray[np.complex64]:
+    """Return echoes of a scene's shapes on a grid of stage offsets (x, y), complex64 [y, x, rx, node].
+
+    Relative to a free path of 1 m, without the phase of `path_m`. Places of
+    shapes are relative to `centre_m`.
+    """
+    x, y = np.meshgrid(*axes_m)
+    d = scene.disturbances
+    samples = find_echoes(scene)(
+        shapes=[to_builtins(shape) for shape in scene.shapes],
+        rig=to_builtins(rig),
+        role=board.role,
+        leakage=(complex(*d.leakage_h), complex(*d.leakage_v)),
+        offsets_m=np.stack([x.ravel(), y.ravel()], axis=1),
+        frequencies_hz=nodes_hz,
+        centre_m=tuple(centre_m.tolist()),
+        path_m=path_m,
+    )
+    return np.moveaxis(samples.reshape(*samples.shape[:2], *x.shape), (0, 1), (2, 3)).astype(np.complex64)

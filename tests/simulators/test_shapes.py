@@ -1,0 +1,93 @@
+"""Shapes of scene files: through an entry point, in the simulator's own convention, up to recorded rows."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from tests.support.rigs import published_rig
+
+from polysight.pipeline import Pipeline
+from polysight.store.scan_folder import ScanFolder
+from polysight.sync.decimate import flatten, fold
+from polysight_shared.errors import ConfigError
+from polysight_simulators.scene import Scene, decode_scene, reference_cube, simulate, synced_cube
+from polysight_simulators.scene.shapes import GROUP
+
+RIG = published_rig()
+GRID = {"columns": 9, "rows": 5, "step_x_mm": 6.0, "step_y_mm": 6.0}
+BALL = {"kind": "sphere", "centre_mm": [4.0, -6.0], "radius_mm": 110.0, "metal": True}
+
+
+def scene(**content: object) -> Scene:
+    return decode_scene({"name": "shapes", "grid": GRID, **content}, "test")
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """The worlds' entry point as an installation writes it, whatever this environment was installed from."""
+    package = tmp_path / "offers_shapes-1.dist-info"
+    package.mkdir()
+    (package / "METADATA").write_text("Name: offers-shapes\nVersion: 1\n", encoding="utf-8")
+    entry = f"[{GROUP}]\naaa = polysight_worlds.scene_shapes:echoes_of\n"
+    (package / "entry_points.txt").write_text(entry, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize(
+    ("medium", "error"), [({"metal": True}, 0.05), ({"permittivity": [9.0, 1.0]}, 0.08)], ids=["metal", "dielectric"]
+)
+def test_a_level_plate_is_the_same_as_a_shape_and_as_a_plate(medium, error):
+    place = {"centre_mm": [10.0, -4.0], "size_mm": [60.0, 50.0], **medium}
+    of_shapes = reference_cube(RIG, scene(shapes=[{"kind": "plate", **place}]))
+    of_plates = reference_cube(RIG, scene(plates=[{"name": "plate", **place}]))
+    ratios = []
+    for name in of_shapes:
+        seen, expected = of_shapes[name], of_plates[name]
+        ratio = np.vdot(expected, seen) / np.vdot(expected, expected)
+        ratios.append(ratio)
+        assert np.linalg.norm(seen - ratio * expected) < 0.15 * np.linalg.norm(expected)
+    # Two models of antennas and obliquity; the phase is the same.
+    assert ratios == pytest.approx([1, 1], abs=error)
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_recorded_scan_of_a_sphere_is_processed_to_the_samples_it_was_made_of(tmp_path):
+    ball = scene(shapes=[BALL]).with_disturbances(direct_snr_db="off")
+    folder = simulate(RIG, ball, tmp_path / "scan")
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    assert truth["shapes"][0]["radius_mm"] == 110
+    pipeline = Pipeline(ScanFolder.load(folder))
+    first, last = RIG.chirp.linear_samples
+    for name, row in pipeline.synchronise_row(2).items():
+        assert row.valid.all()
+        made = synced_cube(RIG, ball, name)[:, 2, :, first:last]
+        blocks = flatten(fold(np.ascontiguousarray(made, np.complex64)))
+        common = np.vdot(blocks, row.samples) / np.vdot(blocks, blocks)
+        assert np.linalg.norm(row.samples / common - blocks) < 0.015 * np.linalg.norm(blocks)
+
+
+def test_a_scene_with_shapes_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("polysight_simulators.scene.shapes.entry_points", lambda **_: [])
+    with pytest.raises(ConfigError, match="worlds"):
+        reference_cube(RIG, scene(shapes=[BALL]))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"radius_mm": 5.0},
+        {"metal": False},
+        {"size_mm": [10.0, 10.0]},
+        {"axis": [0.0, 0.0, 1.0]},
+        {"kind": "plate"},
+        {"thickness_mm": 1.0},
+        {"kind": "teapot"},
+    ],
+    ids=str,
+)
+def test_shapes_that_cannot_be_are_refused(wrong):
+    with pytest.raises(ConfigError):
+        scene(shapes=[{**BALL, **wrong}])

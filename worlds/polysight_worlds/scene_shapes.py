@@ -1,0 +1,96 @@
+"""Echoes of the shapes of a scene file, for simulators that look for them (entry point `polysight.shape_echoes`).
+
+The only things that pass are plain tables, as a scene file and a rig file hold them, and arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight_worlds.media import METAL, Stack
+from polysight_worlds.optics import Antenna
+from polysight_worlds.rig import boards_of, find_mirror_point, rig_of
+from polysight_worlds.shape_echoes import echo_of
+from polysight_worlds.shapes import Shape, bottle, cylinder, plate, sphere
+
+
+def echoes_of(
+    shapes: Sequence[dict[str, Any]],
+    rig: dict[str, Any],
+    role: str,
+    leakage: tuple[complex, complex],
+    offsets_m: NDArray,
+    frequencies_hz: NDArray,
+    centre_m: tuple[float, float, float],
+    path_m: float,
+) -> NDArray:
+    """Samples of shapes at one board, complex64 [rx, frequency, offset].
+
+    Phases rise with the path and have that of `path_m` removed. The mirror on the object plane has the amplitude
+    1 / path in H and in V. `shapes` and `rig`: tables of the scene file and the rig file; `role`: "receive_h" or
+    "receive_v"; `leakage`: of p into H and of s into V, as waves; `offsets_m` [n, 2]. `centre_m`: the image's
+    centre on the object plane.
+    """
+    nominal = rig_of(rig)
+    boards = boards_of(rig, leakage)
+    channel = role.removeprefix("receive_")
+    level = _mirror_level(nominal.tx, getattr(nominal, channel), nominal.plane_m)
+    offsets = np.column_stack([offsets_m, np.zeros(len(offsets_m))])
+    pieces = [piece for table in shapes for piece in make_shapes(table, centre_m)]
+    samples = []
+    for rx in boards.receivers()[channel]:
+        wave = np.zeros((len(frequencies_hz), len(offsets)), np.complex64)
+        for piece in pieces:
+            wave += echo_of(piece, boards.tx, rx, np.asarray(frequencies_hz, float), offsets, path_m)
+        samples.append(wave.conj() / np.float32(level))
+    return np.stack(samples)
+
+
+def _mirror_level(tx: Antenna, rx: Antenna, plane_m: float) -> float:
+    """Product of both antennas' fields towards their mirror point, in the polarisation of the receiver."""
+    point = find_mirror_point(tx.position, rx.position, plane_m)
+    rays = [(point - antenna.position) / np.linalg.norm(point - antenna.position) for antenna in (tx, rx)]
+    fields = [antenna.field(ray[:, None])[:, 0] for antenna, ray in zip((tx, rx), rays, strict=True)]
+    # TX sends equal parts of both polarisations.
+    return float(np.linalg.norm(fields[0]) * np.linalg.norm(fields[1]) / np.sqrt(2))
+
+
+def make_shapes(table: dict[str, Any], centre_m: Sequence[float]) -> tuple[Shape, ...]:
+    """Return the shapes of one [[shapes]] table, with optional keys filled in."""
+    x, y, z = centre_m
+    front_m = x + table["centre_mm"][0] / 1000, y + table["centre_mm"][1] / 1000, z + table["height_mm"] / 1000
+    name, kind, stack = table["name"], table["kind"], _stack_of(table)
+    if kind == "plate":
+        width_mm, height_mm = table["size_mm"]
+        piece = plate(
+            name,
+            stack,
+            front_m,
+            (width_mm / 1000, height_mm / 1000),
+            tilt_deg=tuple(table["tilt_deg"]),
+            turn_deg=table["turn_deg"],
+            bends=tuple(table["bends_per_m"]),
+        )
+        return (piece,)
+    radius_m, length_m, axis = table["radius_mm"] / 1000, table["length_mm"] / 1000, tuple(table["axis"])
+    middle_m = (front_m[0], front_m[1], front_m[2] + radius_m)
+    if kind == "sphere":
+        return (sphere(name, stack, middle_m, radius_m),)
+    if kind == "bottle":
+        return bottle(name, stack, middle_m, radius_m, length_m, axis=axis)
+    slope = float(np.tan(np.radians(table["slope_deg"])))
+    return (cylinder(name, stack, middle_m, radius_m, length_m, axis=axis, slope=slope),)
+
+
+def _stack_of(table: dict[str, Any]) -> Stack:
+    if table.get("metal"):
+        return METAL
+    real, loss = table["permittivity"]
+    medium = complex(real, -loss)
+    if table.get("thickness_mm") is None:
+        return Stack(below=medium)
+    return Stack(((medium, table["thickness_mm"] / 1000),), 1.0)

@@ -32,8 +32,9 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `pulse_status` (this status bit is sent at this pulse), `stop_after_packets` (no data packets after this number),
     `end_pulses` (the record ends before this pulse), `reset_pulses` (FPGA resets before this pulse),
     `power_cycle_pulses`, `boot_s`, `stop_discards` (record stop discards an incomplete packet), `first_sequence`,
-    `first_byte_count`.
-    The radar: `missed_pulse`, `miss_pulses` (these SYNC_IN pulses start no frame). Its control server:
+    `first_byte_count`, `status_loss` (of asynchronous status messages), `twin` (a second card with the same address).
+    The radar: `missed_pulse`, `miss_pulses` (these SYNC_IN pulses start no frame), `spurious_edges` (an edge this many
+    ms behind this pulse). Its control server:
     `retrigger_fails` (these lines have no effect), `retrigger_resets` (the connection is reset at these lines). Under
     native control: `radar_fault_pulses` (the RF core faults at these pulses).
     """
@@ -67,7 +68,10 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stop_discards: bool = False
     first_sequence: Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)] = 1
     first_byte_count: Annotated[int, msgspec.Meta(ge=0, lt=1 << 48)] = 0
+    status_loss: Probability = 0.0
+    twin: bool = False
     missed_pulse: Probability = 0.0
+    spurious_edges: tuple[tuple[Natural, Seconds], ...] = ()
     miss_pulses: tuple[Natural, ...] = ()
     retrigger_fails: tuple[Natural, ...] = ()
     retrigger_resets: tuple[Natural, ...] = ()

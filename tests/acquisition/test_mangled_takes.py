@@ -29,7 +29,7 @@ GRIDS = [  # points, pulses, bytes of a frame
     (24, 8, 1456),
     (40, 4, 512),  # frames below a packet
 ]
-TROUBLES = (*KINDS, *RADAR)
+TROUBLES = (*(kind for kind in KINDS if kind != "clock"), *RADAR)  # the kernel's clock is its own
 LOOKS_NS = MS  # a receiver looks at its socket so often
 
 
@@ -69,7 +69,7 @@ def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
     whole = placed.complete and not (timed and frames is not None and frames.contradicted)
     untimed = frames.uncertain if timed and frames is not None else pulses.size
     missing = placed.missing
-    if not whole and (moved := frames_to_move(placed.located, placed.slipped, bool(missing), frames)) is not None:
+    if not whole and (moved := frames_to_move(placed, placed.counts.late, frames)) is not None:
         out, missing = move_frames(out, placed.holes, int(placed.arrivals[-1, 1]), moved.slots, frame)
         untimed = 0
     return Kept(placed, frames, out, mask_of(out.size, missing), whole, untimed)

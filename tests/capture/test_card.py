@@ -12,11 +12,13 @@ from tests.support.capture.cards import reply
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
-from polysight.capture.card import CardClient, EepromSettings, program_eeprom
+from polysight.capture.card import CardClient, EepromSettings, program_eeprom, survey_cards
 from polysight.capture.dca1000 import Code, Status
+from polysight.capture.network import card_mac
 from polysight_shared.config import Card
 from polysight_shared.error_codes import ErrorCode
 from polysight_simulators.cards import Network
+from polysight_simulators.faults import Faults
 
 
 def test_configures_as_seen_on_a_real_card(scripted):
@@ -220,3 +222,29 @@ def test_a_card_that_could_not_write_it(scripted, status, answer, code):
     with refused(code):
         program_eeprom(client, settings, settings.confirmation)
     assert [code for code, _ in card.seen].count(Code.CONFIGURE_EEPROM) == 1
+
+
+def test_a_second_card_with_the_same_address_is_refused(rig, cards):
+    """Both answer one request."""
+    cards(*(board.name for board in rig.boards), RV=Faults(twin=True))
+    for name, refused_board in (("RH", False), ("RV", True)):
+        with CardClient(rig.by_name(name), 30.0) as client:
+            if refused_board:
+                with refused(ErrorCode.VALUES_CONFLICT, "2 answers to one request"):
+                    client.require_alone()
+            else:
+                client.require_alone()
+    surveys = {s.board.name: s.silent for s in survey_cards(rig)}
+    assert surveys["RV"] == "card"
+    assert surveys["RH"] == ""
+
+
+def test_mac_addresses_of_cards_are_read_from_the_kernel(tmp_path):
+    table = tmp_path / "proc/net/arp"
+    table.parent.mkdir(parents=True)
+    line = "192.168.33.180   0x1         {}         12:34:56:78:90:12     *        eth0"
+    table.write_text("IP address HW type Flags HW address Mask Device\n" + line.format("0x2"))
+    assert card_mac("192.168.33.180", tmp_path) == "12:34:56:78:90:12"
+    assert card_mac("192.168.33.181", tmp_path) == ""
+    table.write_text("IP address HW type Flags HW address Mask Device\n" + line.format("0x0"))
+    assert card_mac("192.168.33.180", tmp_path) == ""

@@ -79,7 +79,7 @@ def test_segments(board, tmp_path):
 
 def test_events(tmp_path):
     fields = ("row_index", "take", "point", "column", "edge_ns", "first_pulse_ns", "last_pulse_ns", "pulses")
-    rest = {"scan_id": "s", "t_mono_ns": 5, "width_max_ns": 3, "jitter_ns": 7}
+    rest = {"scan_id": "s", "t_mono_ns": 5, "width_max_ns": 3, "jitter_ns": 7, "pulses_seen": True}
     sent = [{"seq": k + 1} | rest | {name: k * 10**9 + n for n, name in enumerate(fields)} for k in range(5)]
     path = tmp_path / "events.msgpack"
     writer = EventWriter(path)

@@ -136,7 +136,8 @@ def test_the_published_plan_is_possible_and_takes_two_hours(rig):
         (Changes(speed_mm_s=40.0), "speed", "40 mm/s", False),
         (Changes(period_us=500.0), "radar", "inter-frame time", False),
         (Changes(), "IF", "start_offset_hz", False),
-        (Changes(), "card", "13 pulses", False),
+        (Changes(), "card", "marks its end", False),
+        (Changes(pulses=13), "card", "no short packet", False),
     ],
 )
 def test_a_plan_with_a_fault_has_one_warning_about_it(rig, changes, topic, value, refused):

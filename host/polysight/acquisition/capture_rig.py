@@ -73,11 +73,16 @@ class CaptureRig:
             self._stack = stack.pop_all()
 
     def configure(self, names: Collection[str] = ()) -> dict[str, Version]:
-        """Stop records and configure the named cards (default: all); return FPGA versions. Raises DeviceError."""
+        """Stop records and configure the named cards (default: all); return FPGA versions.
+
+        Raises DeviceError if a card does not obey, or if one of all has a twin with the same address.
+        """
         versions = {}
         for name in names or self.cards:
             card = self.cards[name]
             card.alive()
+            if not names:
+                card.require_alone()
             card.record_stop()
             card.configure(self._instrument.card)
             versions[name] = card.version()

@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import os
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from polysight.capture import (
     PACKETS,
+    Placed,
     RowCapture,
     read_index,
     read_packets,
@@ -121,7 +122,7 @@ def place_frames(
         # A missed pulse and a spurious edge within a packet do not show: only the frame that fills it is seen.
         slots[evidence.low == _UNKNOWN] = -1
     missed = _missed(slots, pulses) if received < pulses else []
-    if received < pulses:
+    if contradicted or received < pulses:
         slots = _without_mixed(slots, pulses)
     told = contradicted or bool((slots >= 0).any())
     reason = "" if told else "the delays in this row are as long as the pauses between its bursts"
@@ -216,7 +217,8 @@ def _decide(
         own = slice(start, stop)
         index = np.arange(start, stop)
         is_last = k == len(parts) - 1
-        displaced = _longest_run(low[own] > before)
+        # Late, and when a frame of a later pulse comes; others are only late.
+        displaced = _longest_run((low[own] > before) & (high[own] >= low[own]))
         is_displaced = displaced >= _DISPLACED and late <= displaced + _RARE * received
         if (high[own] < before).any() or after < before or (after == before and is_displaced):
             contradicted = True
@@ -285,13 +287,14 @@ def _missed(slots: Times, pulses: int) -> list[int]:
 
 
 def _without_mixed(slots: Times, pulses: int) -> Times:
-    """Mask the frames beside every missed pulse.
+    """Mask the frames beside every missed pulse and every frame that is uncertain.
 
     A card that drops exactly a frame's bytes within two frames, unnoticed, leaves one frame made of both.
     """
     sure = np.flatnonzero(slots >= 0)
+    number = np.concatenate([[-1], sure, [slots.size]])
     shift = np.concatenate([[0], slots[sure] - sure, [pulses - slots.size]])
-    changes = np.flatnonzero(np.diff(shift))
+    changes = np.flatnonzero((np.diff(shift) != 0) | (np.diff(number) > 1))
     out = slots.copy()
     beside = np.concatenate([changes - 1, changes])
     out[sure[beside[(beside >= 0) & (beside < sure.size)]]] = -1
@@ -493,16 +496,21 @@ def move_frames(
     return out, missing
 
 
-def frames_to_move(located: bool, slipped: bool, has_holes: bool, frames: PlacedFrames | None) -> PlacedFrames | None:
+def frames_to_move(capture: RowCapture | Placed, late: int, frames: PlacedFrames | None) -> PlacedFrames | None:
     """Return the frames with which a row is rewritten; None if it stays as its packets' counters say.
 
-    It is if frames are not at the pulses that their number says; and of a row with holes only frames are kept that were
-    seen at their pulses: none, if the times contradict each other.
+    Rewritten is a row whose frames are not at the pulses that their number says. Of a row with holes only frames are
+    kept that were seen at their pulses. No frame is kept if the times contradict each other, or if frames are
+    displaced and packets came out of their order (`late` of them).
     """
-    if frames is None or (frames.reason and not (frames.disturbed and located and has_holes)):
+    if frames is None:
         return None
-    is_displaced = slipped or frames.contradicted
-    if is_displaced or (located and has_holes and frames.uncertain):
+    has_holes = capture.located and bool(capture.missing)
+    is_displaced = capture.slipped or frames.contradicted
+    none_is_certain = (frames.disturbed and has_holes) or (is_displaced and not frames.reason and late > 0)
+    if none_is_certain:
+        return replace(frames, slots=np.full_like(frames.slots, -1), missed=[])
+    if not frames.reason and (is_displaced or (has_holes and frames.uncertain)):
         return frames
     return None
 

@@ -224,13 +224,14 @@ def commit_row(
     `events` is the digest of the event log, which must be on the disk. `faults` are those of a row kept incomplete;
     empty for a complete row. Raises DeviceError if the disk fails.
     """
-    frames = take.row.points * scan.instrument.burst.pulses
+    planned = take.row.points * scan.instrument.burst.pulses
     boards: dict[str, BoardRow] = {}
     for name, capture in take.captures.items():
         final = scan.row_path(name, take.row.index)
-        displaced = take.displaced(name)
-        moved = frames_to_move(capture.located, capture.slipped, bool(capture.missing), take.frames.get(name))
-        untimed = take.untimed(name, scan.instrument.burst.pulses)
+        frames = take.frames.get(name)
+        moved = frames_to_move(capture, capture.late, frames)
+        untimed = take.untimed(name, scan.instrument.burst.pulses) if capture.located else 0
+        missed = frames.pulses - frames.slots.size if capture.slipped and frames is not None else None
         if moved is not None:
             capture = rewrite_row(final.with_suffix(PART), capture, moved, scan.instrument.frame_bytes)
             take.captures[name] = capture
@@ -243,14 +244,14 @@ def commit_row(
         boards[name] = BoardRow(
             file=str(final.relative_to(scan.path)),
             bytes=capture.expected,
-            frames_expected=frames,
-            frames_received=int(valid_frames(capture.missing, frames, scan.instrument.frame_bytes).sum()),
+            frames_expected=planned,
+            frames_received=int(valid_frames(capture.missing, planned, scan.instrument.frame_bytes).sum()),
             missing_bytes=capture.missing_bytes,
             crc32=f"{capture.crc32:08x}",
             index_crc32=f"{capture.index_crc32:08x}",
             packets_crc32=f"{capture.packets_crc32:08x}" if capture.packets_crc32 else "",
-            pulses_missed=None if displaced is None else displaced.pulses - displaced.slots.size,
-            frames_untimed=untimed if capture.located else 0,
+            pulses_missed=missed,
+            frames_untimed=untimed,
             **_reception(capture),
         )
     writer.append(

@@ -24,6 +24,7 @@ from polysight.capture.dca1000 import Code, Reply, Status, Version
 from polysight.capture.network import (
     Hop,
     bind_udp,
+    card_mac,
     check_receive_buffer,
     no_route,
     route_interface,
@@ -38,6 +39,7 @@ from polysight_shared.errors import ConfigError, DeviceError, ProtocolError
 from polysight_shared.findings import Finding
 
 ATTEMPTS = 3
+_TWIN_S = 0.05  # a second card answers a request as soon as the first
 EEPROM_REPORT_S = 0.5
 _PORTS = struct.Struct("<HH")  # in the EEPROM
 DEFAULT_MAC = "12:34:56:78:90:12"
@@ -82,6 +84,30 @@ class CardClient:
     def version(self) -> Version:
         """Return the card's FPGA version. Raises DeviceError."""
         return dca1000.decode_version(self._exchange(Code.VERSION, b"", ATTEMPTS).status)
+
+    def require_alone(self) -> None:
+        """Check that one card alone has this address: one answer to one request, one MAC address.
+
+        Raises DeviceError if there are two, or no answer. A second card sends whole rows that look like this one's.
+        """
+        macs = {card_mac(self.board.card_address, self._kernel_root)}
+        versions = [self.version()]
+        deadline = time.monotonic() + _TWIN_S
+        while (left := deadline - time.monotonic()) > 0:
+            reply = self._receive(left)
+            if reply is not None and reply.code == Code.VERSION:
+                versions.append(dca1000.decode_version(reply.status))
+        macs.add(card_mac(self.board.card_address, self._kernel_root))
+        macs.discard("")
+        if len(versions) > 1 or len(macs) > 1:
+            seen = f"{len(versions)} answers to one request (FPGA {', '.join(map(str, versions))})"
+            raise DeviceError(
+                f"{self._name()}: {seen}" + (f", MAC addresses {' and '.join(sorted(macs))}" if len(macs) > 1 else ""),
+                "two cards have this address, or the network doubles packets: rows of either look like the other's",
+                "give each card its own address (`polysight card`, docs/how-to/install.md), or unplug the second one;"
+                f" `arping {self.board.card_address}` shows who answers",
+                code=ErrorCode.VALUES_CONFLICT,
+            )
 
     def configure(self, card: Card, lanes: int = 4) -> None:
         """Configure raw 16-bit capture of `lanes` LVDS lanes to Ethernet, and the packet delay. Raises DeviceError."""
@@ -402,9 +428,12 @@ def _reach(survey: CardSurvey, card: CardClient) -> Iterator[Finding]:
     try:
         card.alive()
         survey.version = str(card.version())
+        card.require_alone()
     except DeviceError as e:
         error = e
-    faulty = "" if error is None else _FAULTY_HOP.get(silent_hop(address), "card")
+    faulty = ""
+    if error is not None:
+        faulty = "card" if survey.version else _FAULTY_HOP.get(silent_hop(address), "card")
     interface = "loopback" if address.startswith("127.") else route_interface(address) or "unknown interface"
     for hop, found in (("route", interface), ("link", interface), ("card", f"replies, FPGA {survey.version}")):
         if error is not None and hop == faulty:

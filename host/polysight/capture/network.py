@@ -180,6 +180,19 @@ class BatchReceiver:
         return 1
 
 
+def card_mac(address: str, root: Path = _ROOT) -> str:
+    """Return the MAC address that the kernel has for a card's address; "" if it has none."""
+    try:
+        lines = (root / "proc/net/arp").read_text(encoding="ascii").splitlines()[1:]
+    except OSError:
+        return ""
+    for line in lines:
+        fields = line.split()
+        if fields[0] == address and int(fields[2], 16) & _ARP_COMPLETE:
+            return fields[3]
+    return ""
+
+
 def usable_packets(buffer_bytes: int) -> int:
     """Return the number of full packets that a receive buffer holds."""
     return 2 * buffer_bytes // KERNEL_BYTES_A_PACKET

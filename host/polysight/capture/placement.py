@@ -31,7 +31,7 @@ SWITCHED_ON = Counters(0, 1)
 """Counters of the first packet of a card that was switched on or reset."""
 SMALL_RECORD = 16
 """Packets below which a whole record may come late; a later one is no evidence of where the card counts."""
-JOINS = 2
+JOINS = 3
 """Records that join a whole one at another place than predicted, after which the card is taken to count there."""
 RESTARTS = 2
 """Whole records in which the card counts anew, after which it is taken to do so in every record."""
@@ -258,7 +258,9 @@ def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
     if past.start is not None:
         # A card whose counters a reset leaves as they are shows it by whole records that join each other.
         counts_on = start == past.elsewhere and past.joined + 1 >= JOINS and not (~record.own & ~early).any()
-        return record if counts_on else _doubted(record, "the record does not begin where the card counts")
+        return (
+            record if counts_on else _doubted(record, "the record does not begin where the card counts: a second card?")
+        )
     if past.lost:
         return _doubted(record, "it is unknown where the last record ended")
     others = ~record.own & ~early

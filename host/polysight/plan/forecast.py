@@ -387,15 +387,25 @@ def _burst_warnings(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
 
 
 def _card_warnings(rig: Instrument) -> Iterator[Finding]:
-    if tail := tail_s(rig):
-        fits = int(1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us)
-        whole = [n for n in range(2, fits + 1) if rig.burst.chirps == 1 and whole_packets(rig, n)]
-        nearest = min(whole, key=lambda n: abs(n - rig.burst.pulses), default=0)
+    if whole_packets(rig):
         yield _note(
             "card",
-            f"a row of {rig.row_bytes} bytes does not fill whole packets of {rig.card.payload_bytes}: the card delays"
-            f" its last packet, {tail * rig.grid.rows / 60:.1f} min in total"
-            + (f"; {nearest} pulses avoid this" if nearest else ""),
+            f"a row of {rig.row_bytes} bytes fills whole packets of {rig.card.payload_bytes}: no short packet marks its"
+            f" end, and an extra frame whose packets are lost shows by its arrival time only;"
+            f" {rig.burst.pulses - 1 or 2} pulses a position have an end mark",
+        )
+    elif tail := tail_s(rig):
+        yield _note(
+            "card",
+            f"the card delays the last packet of each row, which marks its end: {tail * rig.grid.rows / 60:.1f} min in"
+            " total",
+        )
+    if rig.frame_bytes < rig.card.payload_bytes:
+        yield _note(
+            "card",
+            f"a frame of {rig.frame_bytes} bytes is smaller than a packet of {rig.card.payload_bytes}: arrival times"
+            " tell the pulse only of frames that fill a packet, and rows with missed pulses are masked; use more"
+            " samples or chirps a frame",
         )
     packet_us = max(rig.card.packet_delay_us, _WIRE_BYTES / _ETHERNET_BYTES_PER_US)
     frame_us = rig.frame_bytes / rig.card.payload_bytes * packet_us

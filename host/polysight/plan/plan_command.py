@@ -171,8 +171,8 @@ def _grids(rig: Instrument) -> Iterator[Instrument]:
 def _bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iterator[Instrument]:
     """Yield plans with as many pulses as fit, at the slowest speed that keeps the time.
 
-    They use the rig's pulse period and the radars' shortest, once with the maximum number of pulses and once with the
-    highest number that fills whole packets. A burst with several chirps a frame is not changed.
+    They use the rig's pulse period and the radars' shortest, and the highest number of pulses whose rows end in a short
+    packet, which marks the end. A burst with several chirps a frame is not changed.
     """
     if rig.burst.chirps > 1:
         for speed in _speeds(rig, minutes):
@@ -182,18 +182,16 @@ def _bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iterator[
                 return
         return
     for period in {rig.burst.period_us, min(rig.burst.period_us, shortest_period_us(rig))}:
-        for whole in (False, True):
-            for speed in _speeds(rig, minutes):
-                plan = _with_burst(rig, speed, 2, period)
-                pulses = _max_pulses(plan)
-                if whole:
-                    pulses = next((n for n in range(pulses, 1, -1) if whole_packets(plan, n)), 0)
-                if pulses < 2:
-                    break
-                plan = _with_burst(rig, speed, pulses, period)
-                if scan_time(plan, row_overhead_s).minutes <= minutes:
-                    yield plan
-                    break
+        for speed in _speeds(rig, minutes):
+            plan = _with_burst(rig, speed, 2, period)
+            most = _max_pulses(plan)
+            pulses = next((n for n in range(most, 1, -1) if not whole_packets(plan, n)), most)
+            if pulses < 2:
+                break
+            plan = _with_burst(rig, speed, pulses, period)
+            if scan_time(plan, row_overhead_s).minutes <= minutes:
+                yield plan
+                break
 
 
 def _with_burst(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float) -> Instrument:

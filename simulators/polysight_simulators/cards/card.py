@@ -31,6 +31,7 @@ from polysight_simulators.cards.dca1000 import (
     Message,
     Network,
     Output,
+    Packetiser,
     Packets,
     message,
     parse_request,
@@ -42,6 +43,7 @@ from polysight_simulators.cards.fault_draws import (
     OverflowFaults,
     PulseEvents,
     PulseFaults,
+    fault_generator,
 )
 from polysight_simulators.cards.sync_in import RECOVERY_US, Pulse, StageTrack, SyncInput
 from polysight_simulators.faults import Faults
@@ -351,6 +353,8 @@ class CardEndpoint:
         self._pace = pace
         self._network_faults = NetworkFaults(faults, seed, name, self.counts)
         self._command_faults = CommandFaults(faults, seed, name, self.counts)
+        self._status_rng = fault_generator(seed, name, "status")
+        self._twin = Packetiser(sequence=700, byte_count=1 << 40) if faults.twin else None
         self._deaf_until_s = self._link_up_s = float("-inf")
         self.bindings = 0
         self._bind(network)
@@ -438,7 +442,8 @@ class CardEndpoint:
         if isinstance(reply, Message) and self._command_faults.reply_arrives():
             self.counts["replies"] += 1
             delay_s = self._faults.reply_delay_ms * 1e-3
-            self.sender.reply(reply.payload, self._clock_s() + delay_s if delay_s else None)
+            for _ in range(2 if self._twin else 1):
+                self.sender.reply(reply.payload, self._clock_s() + delay_s if delay_s else None)
         self.emit(more)
 
     def emit(self, outputs: Sequence[Output], link_is_up: bool = True) -> None:
@@ -448,7 +453,9 @@ class CardEndpoint:
                 if not self.card.recording:
                     for rows in self._network_faults.drain():
                         self.sender.put_packets(rows)
-                if link_is_up:
+                if link_is_up and self._status_rng.random() < self._faults.status_loss:
+                    self.counts["statuses_lost"] += 1
+                elif link_is_up:
                     self.counts["statuses"] += 1
                     self.sender.put_status(output.payload)
                 else:
@@ -463,6 +470,9 @@ class CardEndpoint:
         if link_is_up:
             for rows in self._network_faults.carry(packets.rows):
                 self.sender.put_packets(rows)
+            if self._twin is not None:
+                other = packets.rows[:, DATA_HEADER_BYTES:].reshape(-1)[::-1]
+                self.sender.put_packets(self._twin.feed(np.ascontiguousarray(other)))
         else:
             self._network_faults.skip(packets.rows)
             self.counts["link_down_packets"] += n

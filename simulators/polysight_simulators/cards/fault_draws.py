@@ -184,22 +184,27 @@ class CommandFaults:
 
 
 class PulseFaults:
-    """SYNC_IN pulses that one radar misses."""
+    """SYNC_IN pulses that one radar misses, and edges that nobody sent."""
 
     def __init__(self, faults: Faults, seed: int, board_name: str) -> None:
         self._probability = faults.missed_pulse
         self._miss = frozenset(faults.miss_pulses)
+        self._spurious = dict(faults.spurious_edges)
         self._rng = fault_generator(seed, board_name, "pulses")
         self.missed = 0
 
     def seen(self, pulses: list[Pulse]) -> list[Pulse]:
-        """Return the pulses that the radar sees."""
+        """Return the edges that the radar sees."""
         draws = self._rng.random(len(pulses))
         seen = [
             p for p, draw in zip(pulses, draws, strict=True) if p.number not in self._miss and draw >= self._probability
         ]
         self.missed += len(pulses) - len(seen)
-        return seen
+        for pulse in pulses:
+            if pulse.number in self._spurious:
+                behind_ms = self._spurious[pulse.number]
+                seen.append(pulse._replace(t_ns=pulse.t_ns + round(behind_ms * 1e6)))
+        return sorted(seen, key=lambda p: p.t_ns) if self._spurious else seen
 
 
 class LvdsRun(NamedTuple):

@@ -273,6 +273,7 @@ class CalibrationFiles(Section, frozen=True):
     direct_path: str = ""
     hpf: str = ""
     metal: str = ""
+    sphere: str = ""
 
 
 class Limits(Section, frozen=True):

@@ -153,6 +153,21 @@ class MetalFile(CalibrationFile, frozen=True, kw_only=True):
     bands: list[MetalBand] = []
 
 
+class SphereFile(CalibrationFile, frozen=True, kw_only=True):
+    """`sphere`: points of a metal sphere, the reference of surfaces; gains are learnt from them with the rig in use.
+
+    `points`: by channel ("h", "v") rows of stage offset x, y, z, path (m), its slope x, y and curvature xx, xy, yy (1 /
+    m), amplitude's real and imaginary part and their standard deviation.
+    """
+
+    radius_mm: float
+    radius_found_mm: float
+    centre_mm: Vector
+    misfit_mm: float
+    gain_std: float
+    points: dict[str, list[list[float]]]
+
+
 class BoardStart(msgspec.Struct, frozen=True):
     """Start frequency of a receiver: `start_offset_hz` moves its direct path to the middle of the IF band."""
 
@@ -326,6 +341,7 @@ class Calibration:
     places: PlacesFile | None = None
     filters: FilterFile | None = None
     metal: MetalFile | None = None
+    sphere: SphereFile | None = None
     paths: dict[str, Path] | None = None
 
     def rig(self, rig: Instrument) -> Instrument:
@@ -414,7 +430,7 @@ class Calibration:
 
     def files(self) -> dict[str, CalibrationFile]:
         """Return the active calibration files by kind."""
-        files = {"direct_path": self.places, "hpf": self.filters, "metal": self.metal}
+        files = {"direct_path": self.places, "hpf": self.filters, "metal": self.metal, "sphere": self.sphere}
         return {kind: file for kind, file in files.items() if file is not None}
 
     def path(self, kind: str) -> Path:
@@ -424,7 +440,7 @@ class Calibration:
 
 def load_calibration(paths: dict[str, Path]) -> Calibration:
     """Load calibration files by kind. Raises ConfigError or DataError for an invalid file."""
-    kinds = {"direct_path": PlacesFile, "hpf": FilterFile, "metal": MetalFile}
+    kinds = {"direct_path": PlacesFile, "hpf": FilterFile, "metal": MetalFile, "sphere": SphereFile}
     found = {kind: read_calibration(path, kinds[kind], kind) for kind, path in paths.items()}
     metal = found.get("metal")
     if metal is not None and Path(metal.images).name != metal.images:
@@ -434,7 +450,13 @@ def load_calibration(paths: dict[str, Path]) -> Calibration:
             "calibrate again: `polysight calibrate metal`",
             code=ErrorCode.PATH_OUTSIDE,
         )
-    return Calibration(found.get("direct_path"), found.get("hpf"), found.get("metal"), dict(paths))
+    return Calibration(
+        places=found.get("direct_path"),
+        filters=found.get("hpf"),
+        metal=metal,
+        sphere=found.get("sphere"),
+        paths=dict(paths),
+    )
 
 
 def calibration_of_rig(rig: Instrument) -> Calibration:

@@ -31,7 +31,7 @@ FAMILIES = {
         *("plan", "doctor", "card", "inspect", "radar", "scan", "resume", "validate", "drop-raw"),
     ),
     "serve": ("serve", "preview", "scans", "note", "ask", "probe", "compare"),
-    "process": ("process", "image", "focus", "sync-report", "calibrate", "leakage"),
+    "process": ("process", "surface", "image", "focus", "sync-report", "calibrate", "leakage"),
     "materials": ("materials", "report", "permittivity", "concentration", "classify", "train", "export", "label"),
 }
 """Module of this package to the commands that it adds, in the order of the help."""

@@ -1,4 +1,4 @@
-"""The commands on recorded data: process, image, focus, sync-report, and for the rig: calibrate, leakage."""
+"""The commands on recorded data: process, surface, image, focus, sync-report, and for the rig: calibrate, leakage."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ _shift = number(float, "a shift of at most 1000 mm", lambda value: abs(value) <=
 _millimetres = number(float, "a length above 0, at most 50 mm", lambda value: 0 < value <= 50)
 
 
+_radius = number(float, "a radius of 50 to 500 mm", lambda value: 50 <= value <= 500)
 _degrees = number(float, "`one`, `pixel` or an angle of 5 to 80 degrees", lambda value: 5 <= value <= 80)
 
 
@@ -56,6 +57,12 @@ def _process(args: argparse.Namespace) -> int:
         return process(args.data[0], args.out, process_settings(args, args.data[0]))
     several = [(data, process_settings(args, data.absolute())) for data in scans]
     return process_several(several, args.out, args.jobs, args.dask, args.again)
+
+
+def _surface(args: argparse.Namespace) -> int:
+    from polysight.jobs.surface import surface
+
+    return surface(args.data, args.out, rig_file(args.config, args.data), args.reference, args.json)
 
 
 def _image(args: argparse.Namespace) -> int:
@@ -99,6 +106,20 @@ def add_commands(add: Add) -> None:
     _add_polarimetry_options(sub)
     _add_sparse(sub)
     _add_several_options(sub)
+    sub = add(
+        "surface",
+        _surface,
+        "measure shape and permittivity of curved and tilted objects",
+        "polysight surface scans/bottle --out out/bottle",
+    )
+    _add_data(sub)
+    sub.add_argument(
+        "--reference",
+        type=Path,
+        metavar="SCAN",
+        help="scan of a flat metal plate (default: the sphere of the rig file's calibration)",
+    )
+    add_json_option(sub)
     sub = add("image", _image, "make only the images from recorded data", "polysight image scans/one --out out/one")
     _add_data(sub)
     sub.add_argument(
@@ -212,6 +233,12 @@ def _metal(args: argparse.Namespace) -> int:
     return metal(args.scan, args.config, args.bands, args.out, args.json)
 
 
+def _sphere(args: argparse.Namespace) -> int:
+    from polysight.jobs.surface import sphere
+
+    return sphere(args.scan, args.radius, args.config, args.out, args.json)
+
+
 def _start_frequency(args: argparse.Namespace) -> int:
     from polysight.jobs.calibrate import start_frequency
 
@@ -252,6 +279,16 @@ def _add_calibrate(add: Add) -> None:
         metavar="K",
         help="keep K sub-bands for `polysight process --bands K` (default: none)",
     )
+    _add_outputs(sub)
+    sub = add_action(
+        actions,
+        "sphere",
+        _sphere,
+        "measure the gains of both channels over the direction with a scan of a metal sphere, for `polysight surface`",
+        "polysight calibrate sphere scans/sphere --radius 125",
+    )
+    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan of a metal sphere of 100 to 150 mm")
+    sub.add_argument("--radius", type=_radius, required=True, metavar="MM", help="radius of the sphere")
     _add_outputs(sub)
     sub = add_action(
         actions,

@@ -36,7 +36,7 @@ LEAST_PIXELS = 100  # of a plate that serves as reference
 LEAST_LEAKAGE_STD = 1e-3
 
 
-def _print_result(
+def print_result(
     path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool
 ) -> int:
     """Print the result and the keys to set; return 0."""
@@ -60,7 +60,8 @@ def with_places_of(scanned: Instrument, other: Instrument) -> Instrument:
     return msgspec.structs.replace(scanned, boards=boards, antennas=other.antennas, geometry=other.geometry)
 
 
-def _key(kind: str, path: Path) -> list[str]:
+def rig_file_keys(kind: str, path: Path) -> list[str]:
+    """Lines of the rig file that name a calibration file."""
     return ["[calibration]", f'{kind} = "{path.resolve()}"']
 
 
@@ -97,7 +98,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
         f"the target lay at ({file.target_mm[0]:+.2f}, {file.target_mm[1]:+.2f}) mm, turned by"
         f" {file.target_turn_deg:+.2f} degrees; its points explain {100 * file.explained:.1f} % of the echoes",
     ]
-    return _print_result(path, file, lines, _key("direct_path", path), as_json)
+    return print_result(path, file, lines, rig_file_keys("direct_path", path), as_json)
 
 
 def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) -> int:
@@ -125,7 +126,7 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
         + f"; IF {b.if_from_khz:.0f}..{b.if_to_khz:.0f} kHz, {b.chirps} chirps, the fit leaves {b.residual_db:.2f} dB"
         for name, b in boards.items()
     ]
-    return _print_result(path, file, lines, _key("hpf", path), as_json)
+    return print_result(path, file, lines, rig_file_keys("hpf", path), as_json)
 
 
 def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool) -> int:
@@ -149,7 +150,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
         lines.append(f"{len(file.bands)} sub-bands kept: {edges} GHz; for process --bands {len(file.bands)} alone")
     else:
         lines.append("sub-bands are not kept: calibrate with --bands K for process --bands K")
-    return _print_result(path, file, lines, _key("metal", path), as_json)
+    return print_result(path, file, lines, rig_file_keys("metal", path), as_json)
 
 
 def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
@@ -175,7 +176,7 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
             f" {b.start_offset_hz - b.start_offset_was_hz:+.0f} Hz to its start frequency",
         ]
         what_to_set += [f'[[boards]]  name = "{name}"', f"start_offset_hz = {b.start_offset_hz:.0f}"]
-    return _print_result(path, file, lines, what_to_set, as_json)
+    return print_result(path, file, lines, what_to_set, as_json)
 
 
 def leakage_of_scans(

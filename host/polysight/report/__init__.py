@@ -7,6 +7,7 @@ errors of synchronisation. The other names are for single figures of commands an
 from polysight.report.figures import draw_channel, draw_overview, focus_figure, label_figure
 from polysight.report.report import write_report
 from polysight.report.style import INK, MUTED, PALETTE, STAMP, extent_mm, figure_label, font_families, png
+from polysight.report.surface import surface_figure
 from polysight.report.sync_report import QUANTITIES, SyncReport, write_sync_report
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "font_families",
     "label_figure",
     "png",
+    "surface_figure",
     "write_report",
     "write_sync_report",
 ]

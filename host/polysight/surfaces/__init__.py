@@ -1,0 +1,54 @@
+"""Surfaces: shape and permittivity of curved and tilted objects, from the samples of one scan (docs/surfaces.md).
+
+`Samples` are what the pipeline holds of a board after synchronisation. `see_points` finds the specular points in H and
+measures the same points in V; `analyse_surface` gives points, normals, curvature and permittivity with covariance, with
+the gains that `learn_gains` takes from points of a metal sphere or plate. `write_surface` and `read_surface` are the
+files. In order: `paths` (fit of a window), `points` (geometry), `measure` (both receivers, segments), `optics`
+(polarisation, curved reflection), `permittivity`, `result`.
+"""
+
+from polysight.surfaces.measure import Seen, Shape, see_points, shape_of
+from polysight.surfaces.optics import Antenna, Optics, aimed, optics_of, reflect_curved, reflect_flat
+from polysight.surfaces.paths import Echoes, Samples, path_of_plane
+from polysight.surfaces.permittivity import Gains, Uncertainty, learn_gains, segment_permittivity, voltages_of
+from polysight.surfaces.result import (
+    POINTS,
+    SURFACE,
+    Segment,
+    Surface,
+    analyse_surface,
+    plain_segment,
+    read_surface,
+    summary_lines,
+    write_surface,
+)
+
+__all__ = [
+    "POINTS",
+    "SURFACE",
+    "Antenna",
+    "Echoes",
+    "Gains",
+    "Optics",
+    "Samples",
+    "Seen",
+    "Segment",
+    "Shape",
+    "Surface",
+    "Uncertainty",
+    "aimed",
+    "analyse_surface",
+    "learn_gains",
+    "optics_of",
+    "path_of_plane",
+    "plain_segment",
+    "read_surface",
+    "reflect_curved",
+    "reflect_flat",
+    "see_points",
+    "segment_permittivity",
+    "shape_of",
+    "summary_lines",
+    "voltages_of",
+    "write_surface",
+]

@@ -1,0 +1,167 @@
+"""From the samples of H and V to specular points with both voltages, and their grouping into segments.
+
+H gives place, normal and curvature. V sees the same point with the same normal from another stage position, some 15 mm
+away: its path is predicted, and the phase is taken against this prediction, for separate ranges of H and V are useless
+(0.3 mm is half a radian).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from polysight.surfaces.optics import Optics
+from polysight.surfaces.paths import STRIDE_M, Echoes, Samples, find_echoes, measure_echoes
+from polysight.surfaces.points import (
+    curvature_of,
+    locate,
+    normals_at,
+    offset_that_sees,
+    predict_echo,
+)
+
+Array = NDArray[np.float64]
+# Points and normals of neighbouring windows that belong to one surface differ by no more.
+MAX_GAP_M = 0.02
+MAX_PATH_MISS_M = 0.002
+MAX_TURN_RAD = 0.35
+# Windows of one surface whose path curvature is averaged.
+NEIGHBOURHOOD_M = 0.024
+MIN_POINTS = 8
+# A smaller radius is an edge or a wire: what it diffracts is no reflection.
+MIN_RADIUS_M = 0.012
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Echoes of H and V of the same points [n], and the number of the segment of each (-1: none)."""
+
+    h: Echoes
+    v: Echoes
+    segment: NDArray[np.int_]
+
+    def __getitem__(self, keep: NDArray) -> Seen:
+        return Seen(self.h[keep], self.v[keep], self.segment[keep])
+
+    def __len__(self) -> int:
+        return len(self.h)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Points [n, 3] (metres, rig frame), normals towards the antennas, cosines of incidence, curvature [n, 2, 2]."""
+
+    points: Array
+    normals: Array
+    cos: Array
+    curvature: Array
+
+    def __getitem__(self, keep: NDArray) -> Shape:
+        return Shape(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+
+def shape_of(echoes: Echoes, optics: Optics) -> Shape:
+    """Return places, normals and curvatures of H's echoes."""
+    tx_m, rx_m = optics.tx.at_m, optics.h.at_m
+    points = locate(echoes.path_m, echoes.slope, echoes.at_m, tx_m, rx_m)
+    normals, cos = normals_at(points, echoes.at_m, tx_m, rx_m)
+    curvature = curvature_of(points, normals, echoes.at_m, tx_m, rx_m, echoes.bend)
+    return Shape(points, normals, cos, curvature)
+
+
+def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, float]) -> Seen:
+    """Find the specular points of a scan in H, and measure the same points in V."""
+    echoes = find_echoes(h, gate_m)
+    echoes = echoes[_is_sound(echoes, shape_of(echoes, optics))]
+    segment = group_echoes(echoes, optics)
+    echoes, segment = echoes[segment >= 0], segment[segment >= 0]
+    echoes = smooth_bends(echoes, segment)
+    keep = _is_wide(shape_of(echoes, optics))
+    echoes, segment = echoes[keep], segment[keep]
+    shape = shape_of(echoes, optics)
+    tx_m, rx_m = optics.tx.at_m, optics.v.at_m
+    at_m = offset_that_sees(shape.points, shape.normals, echoes.at_m, tx_m, rx_m)
+    path, slope, bend = predict_echo(shape.points, shape.normals, shape.curvature, at_m, tx_m, rx_m)
+    seen_by_v, inside = measure_echoes(v, at_m, path, slope, bend)
+    return Seen(echoes[inside], seen_by_v, segment[inside])
+
+
+def _is_sound(echoes: Echoes, shape: Shape) -> NDArray[np.bool_]:
+    """True for echoes that a surface can give: in front of the antennas, curvature not that of an edge."""
+    sound = np.isfinite(shape.points).all(axis=1) & (shape.points[:, 2] > 0.2) & (shape.points[:, 2] < 1.4)
+    sound &= np.abs(echoes.slope).max(axis=1) < 0.6
+    return sound & (np.abs(echoes.amplitude) > 5 * echoes.amplitude_std)
+
+
+def _is_wide(shape: Shape) -> NDArray[np.bool_]:
+    bends = np.linalg.eigvalsh((shape.curvature + np.swapaxes(shape.curvature, 1, 2)) / 2)
+    return np.isfinite(bends).all(axis=1) & (np.abs(bends).max(axis=1) < 1 / MIN_RADIUS_M)
+
+
+def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
+    """Number of the connected surface of each echo, from the largest on; -1 for small groups.
+
+    Neighbouring windows belong together if the path of one follows from that of the other by its slope.
+    """
+    count = len(echoes)
+    if not count:
+        return np.zeros(0, int)
+    shape = shape_of(echoes, optics)
+    pairs = KDTree(echoes.at_m[:, :2]).query_pairs(2.3 * STRIDE_M, output_type="ndarray")
+    first, second = pairs.T
+    d = (echoes.at_m[second] - echoes.at_m[first])[:, :2]
+    rise = np.einsum("np,np->n", echoes.slope[first] + echoes.slope[second], d) / 2
+    miss = np.abs(echoes.path_m[second] - echoes.path_m[first] - rise)
+    gap = np.linalg.norm(shape.points[second] - shape.points[first], axis=1)
+    turn = np.linalg.norm(shape.normals[second] - shape.normals[first], axis=1)
+    tolerance = MAX_PATH_MISS_M + 4 * np.hypot(echoes.path_std_m[first], echoes.path_std_m[second])
+    joined = (miss < tolerance) & (gap < MAX_GAP_M + 2 * np.linalg.norm(d, axis=1)) & (turn < MAX_TURN_RAD)
+    ones = np.ones(int(joined.sum()))
+    graph = coo_matrix((ones, (first[joined], second[joined])), shape=(count, count))
+    _, labels = connected_components(graph, directed=False)
+    sizes = np.bincount(labels)
+    order = np.argsort(-sizes, kind="stable")
+    number = np.empty_like(order)
+    number[order] = np.arange(order.size)
+    number[sizes < MIN_POINTS] = -1
+    return number[labels]
+
+
+def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
+    """Replace path, slope and curvature of each echo by a local fit to its neighbours in the same surface.
+
+    The fit takes path and slope of all windows near by: L + g.d + d'Q d / 2 and g + Q d.
+    """
+    path, slope, bend = echoes.path_m.copy(), echoes.slope.copy(), echoes.bend.copy()
+    for number in np.unique(segment):
+        members = np.flatnonzero(segment == number)
+        at = echoes.at_m[members, :2]
+        for index, near in zip(members, KDTree(at).query_ball_point(at, NEIGHBOURHOOD_M), strict=True):
+            if len(near) < 6:
+                continue
+            other = members[near]
+            bend[index] = _fit_bend(echoes, int(index), other)
+    return replace(echoes, path_m=path, slope=slope, bend=bend)
+
+
+def _fit_bend(echoes: Echoes, index: int, other: NDArray[np.int_]) -> Array:
+    """Symmetric curvature [2, 2] from the slopes of neighbours, robustly: medians reject edges."""
+    d = (echoes.at_m[other] - echoes.at_m[index])[:, :2]
+    zero = np.zeros(len(d))
+    one = np.ones(len(d))
+    # Unknown: g_x, g_y, Q_xx, Q_xy, Q_yy.
+    along_x = np.stack([one, zero, d[:, 0], d[:, 1], zero], axis=1)
+    along_y = np.stack([zero, one, zero, d[:, 0], d[:, 1]], axis=1)
+    # The windows' own curvatures count as slopes a third of a window away.
+    own = 0.011
+    q = echoes.bend[other].mean(axis=0)
+    prior = own * np.sqrt(len(d)) * np.eye(5)[2:]
+    matrix = np.concatenate([along_x, along_y, prior])
+    right = np.concatenate([*echoes.slope[other].T, own * np.sqrt(len(d)) * np.array([q[0, 0], q[0, 1], q[1, 1]])])
+    found = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    return np.array([[found[2], found[3]], [found[3], found[4]]])

@@ -1,0 +1,122 @@
+"""Points, normals and curvatures of a surface from the paths of its echoes, and the paths from these.
+
+With u the stage offset, T and R the antennas, p the specular point, t and r the unit vectors from the antennas to p:
+|p - T - u| + |p - R - u| = L and (t + r)_xy = -g (the path is stationary, so its gradient is that of fixed p). The
+normal is n = -(t + r) / |t + r| and cos(theta) = |t + r| / 2: the angle of incidence depends on the place alone. With
+H = sum (I - k k') / distance over both legs, E the tangents and X = -E' H_xy, the second derivative of the path by the
+place on the surface is P = E' H E + 2 cos(theta) K, and eliminating the place gives Q = H_xy - X' P^-1 X, hence
+K = (X (H_xy - Q)^-1 X' - E' H E) / (2 cos(theta)). Curvature is positive for convex bodies. All arrays are [n, ...].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+NEWTON_STEPS = 12
+LONGEST_STEP_M = 0.15
+
+
+def unit_legs(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[Array, Array, Array, Array]:
+    """Unit vectors from TX and RX to points [n, 3] and the distances [n], with the stage at `at_m` [n, 3]."""
+    out = points_m - at_m - tx_m
+    back = points_m - at_m - rx_m
+    out_m = np.linalg.norm(out, axis=-1)
+    back_m = np.linalg.norm(back, axis=-1)
+    return out / out_m[:, None], back / back_m[:, None], out_m, back_m
+
+
+def bend_of_legs(t: Array, r: Array, out_m: Array, back_m: Array) -> Array:
+    """H: second derivative of the path by the point, [n, 3, 3]."""
+    eye = np.eye(3)
+    out = (eye - t[:, :, None] * t[:, None, :]) / out_m[:, None, None]
+    back = (eye - r[:, :, None] * r[:, None, :]) / back_m[:, None, None]
+    return out + back
+
+
+def locate(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
+    """Specular points [n, 3] of echoes with a path [n] and its slope [n, 2], by Newton's method."""
+    points = at_m + (tx_m + rx_m) / 2
+    points = points + np.stack([np.zeros_like(path_m), np.zeros_like(path_m), np.full_like(path_m, 0.5)], axis=-1)
+    for _ in range(NEWTON_STEPS):
+        t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
+        both = t + r
+        miss = np.concatenate([(out_m + back_m - path_m)[:, None], both[:, :2] + slope], axis=1)
+        bend = bend_of_legs(t, r, out_m, back_m)
+        matrix = np.concatenate([both[:, None], bend[:, :2]], axis=1)
+        step = np.linalg.solve(matrix + 1e-12 * np.eye(3), miss[..., None])[..., 0]
+        length = np.linalg.norm(step, axis=1, keepdims=True)
+        points = points - step * np.minimum(1, LONGEST_STEP_M / np.maximum(length, 1e-30))
+        # What lies behind the antennas comes back in front of them.
+        points[:, 2] = np.maximum(points[:, 2], 0.05)
+    return points
+
+
+def normals_at(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[Array, Array]:
+    """Normals towards the antennas [n, 3], and cosines of incidence [n]."""
+    t, r, *_ = unit_legs(points_m, at_m, tx_m, rx_m)
+    both = t + r
+    length = np.linalg.norm(both, axis=1)
+    return -both / length[:, None], length / 2
+
+
+def tangents(normals: Array) -> Array:
+    """Orthonormal tangents, columns of [n, 3, 2]: the first lies across y."""
+    first = np.cross(normals, np.array([0.0, 1.0, 0.0]))
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normals, first)], axis=-1).astype(np.float64)
+
+
+def _terms(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[Array, Array, Array, Array]:
+    """H in the stage's plane, X, E' H E and 2 cos(theta)."""
+    t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
+    bend = bend_of_legs(t, r, out_m, back_m)
+    basis = tangents(normals)
+    cross = -np.swapaxes(basis, 1, 2) @ bend[:, :, :2]
+    along = np.swapaxes(basis, 1, 2) @ bend @ basis
+    return bend[:, :2, :2], cross, along, np.linalg.norm(t + r, axis=1)
+
+
+def curvature_of(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
+    """Curvature K [n, 2, 2] in the basis of `tangents`, 1 / m, of echoes whose path has the curvature `bend`."""
+    plane, cross, along, twice = _terms(points, normals, at_m, tx_m, rx_m)
+    rest = plane - bend
+    inner = cross @ np.linalg.solve(rest + 1e-9 * np.eye(2), np.swapaxes(cross, 1, 2))
+    return (inner - along) / twice[:, None, None]
+
+
+def predict_echo(
+    points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array, rx_m: Array
+) -> tuple[Array, Array, Array]:
+    """Path [n], slope [n, 2] and curvature [n, 2, 2] of the echo of a surface seen from stage offsets [n, 3]."""
+    t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
+    plane, cross, along, twice = _terms(points, normals, at_m, tx_m, rx_m)
+    second = along + twice[:, None, None] * curvature
+    bend = plane - np.swapaxes(cross, 1, 2) @ np.linalg.solve(second, cross)
+    return out_m + back_m, -(t + r)[:, :2], bend
+
+
+def spreading(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
+    """cos(theta) / (r1 r2 sqrt |det P|): amplitude of the echo of a surface that reflects all, [n]; 1 / m.
+
+    A mirror gives 1 / path.
+    """
+    _, _, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
+    _, _, along, twice = _terms(points, normals, at_m, tx_m, rx_m)
+    second = along + twice[:, None, None] * curvature
+    root = np.sqrt(np.abs(np.linalg.det(second)))
+    return twice / (out_m * back_m * np.maximum(root, 1e-9))
+
+
+def offset_that_sees(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
+    """Stage offsets [n, 3] from which TX and RX see a point as a mirror with the given normal; starts at `at_m`."""
+    basis = np.swapaxes(tangents(normals), 1, 2)
+    at_m = at_m.copy()
+    for _ in range(NEWTON_STEPS):
+        t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
+        bend = bend_of_legs(t, r, out_m, back_m)
+        matrix = (basis @ bend)[:, :, :2]
+        step = np.linalg.solve(matrix, basis @ (t + r)[..., None])[..., 0]
+        at_m[:, :2] += np.clip(step, -LONGEST_STEP_M, LONGEST_STEP_M)
+    return at_m

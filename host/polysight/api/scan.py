@@ -37,6 +37,7 @@ from polysight.products import (
     image_dataset,
     patch_dataset,
     ranges_text,
+    surface_dataset,
     write_netcdf,
 )
 from polysight.results import Verdict
@@ -315,6 +316,32 @@ class Scan:
         trusted. `ambiguous` and `notes` tell what the data leave open. Raises as :meth:`image`, and ConfigError.
         """
         return layer_dataset(self._processed(True), self.rig.chirp, stack, bands, amplitude_percent)
+
+    def surface(self, *, reference: str | os.PathLike[str] | None = None) -> xarray.Dataset:
+        """Shape and permittivity of curved and tilted objects, as `polysight surface` finds them.
+
+        `reference` is a scan of a flat metal plate; None: the metal sphere of the calibration. Without either the shape
+        alone is given.
+
+        Returns
+        -------
+        xarray.Dataset
+            On dimension `point`: `position` and `normal` [point, axis] (metres, rig frame), `curvature` [point, 2, 2]
+            (1 / m), `incidence_deg`, `permittivity` complex128 (not a number where it is not given),
+            `permittivity_covariance` [point, 2, 2] of (real, imaginary), `segment`, `position_std`, `normal_std_deg`.
+
+        Raises
+        ------
+        DataError
+            when the rows are not there, or no surface shows a specular point.
+        """
+        from polysight.jobs.surface import make_surface
+
+        if self._source is None:
+            raise self._unknown("surface")
+        config = None if self._settings.config is None else Path(self._settings.config)
+        made = make_surface(self.folder, config, None if reference is None else Path(reference))
+        return surface_dataset(made)
 
     def plot(self, *, metal_referenced: bool = True) -> Figure:
         """Figure of |H|, |V|, |P| (dB), and of the materials' names if metal-referenced; axes in mm.

@@ -13,6 +13,7 @@ from polysight.products.exports import (
     patch_dataset,
     ranges_text,
     read_netcdf,
+    surface_dataset,
     write_netcdf,
 )
 from polysight.products.folder import (
@@ -69,6 +70,7 @@ __all__ = [
     "read_products",
     "rx_gains",
     "scan_folder_of",
+    "surface_dataset",
     "write_image",
     "write_json",
     "write_netcdf",

@@ -29,6 +29,7 @@ from polysight.polarimetry import incidence_choice, specular_incidence_rad
 from polysight.products.processed import ProcessedScan, read_products
 from polysight.results import Figure, PatchFigures, Verdict, figures_of, plain
 from polysight.store import MAX_BYTES
+from polysight.surfaces import Surface
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.files import write_atomically, write_together
@@ -246,6 +247,28 @@ def full_dataset(scan: ProcessedScan) -> xarray.Dataset:
     if scan.facts.instrument:
         dataset.attrs["instrument"] = json.dumps(scan.facts.instrument)
     return dataset
+
+
+def surface_dataset(surface: Surface) -> xarray.Dataset:
+    """Return points, normals, curvatures and permittivities of surfaces, on dimension `point`."""
+    import xarray
+
+    square = ("point", "row", "column")
+    return xarray.Dataset(
+        {
+            "position": _described(("point", "axis"), surface.points_m, "m", "specular point, rig frame"),
+            "normal": _described(("point", "axis"), surface.normals, "1", "unit normal towards the antennas"),
+            "curvature": _described(square, surface.curvature, "1/m", "curvature, positive for convex bodies"),
+            "incidence_deg": _described(("point",), surface.incidence_deg, "degree", "angle of incidence"),
+            "permittivity": _described(("point",), surface.permittivity, "1", "relative permittivity"),
+            "permittivity_covariance": _described(square, surface.covariance, "1", "covariance of (real, imaginary)"),
+            "position_std": _described(("point",), surface.position_std_m, "m", "standard deviation along the normal"),
+            "normal_std_deg": _described(("point",), surface.normal_std_deg, "degree", "standard deviation"),
+            "segment": _described(("point",), surface.segment, "1", "number of the connected surface"),
+        },
+        coords={"axis": ["x", "y", "z"]},
+        attrs={"scan_id": surface.scan_id, "simulated": int(surface.simulated)},
+    )
 
 
 def split_complex(dataset: xarray.Dataset) -> xarray.Dataset:

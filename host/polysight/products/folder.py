@@ -31,12 +31,14 @@ from polysight.products.processed import (
     raw_dropped,
 )
 from polysight.store import is_source
+from polysight.surfaces import POINTS, SURFACE
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError
 from polysight_shared.files import sync_folder, write_atomically
 
 LABELS_PICTURE = "labels.png"
-PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, REPORT, "figures")
+SURFACES = (SURFACE, POINTS, "surface.png")
+PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, REPORT, "figures", *SURFACES)
 _BY_HAND = b'"by_hand": true'
 _HERE = -100  # AT_FDCWD of renameat2(2)
 _EXCHANGE = 2

@@ -22,6 +22,7 @@ from polysight.materials import UNKNOWN
 from polysight.products import REPORT, ProcessedScan
 from polysight.report.figures import FIGURES, figures, masked_positions
 from polysight.report.style import colours_of, patch_colour, patch_label, plate_label
+from polysight.report.surface import surface_figure
 from polysight.results import (
     ErrorBudget,
     Figure,
@@ -35,6 +36,7 @@ from polysight.results import (
     percent,
     plain,
 )
+from polysight.surfaces import SURFACE, read_surface
 from polysight_shared.config import Instrument
 from polysight_shared.files import write_atomically
 from polysight_shared.geometry import incidence_deg
@@ -59,6 +61,9 @@ UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm"
 def write_report(out_dir: Path, scan: ProcessedScan) -> Path:
     """Write `report.html` and `figures/*.png` into a folder; return the path of the page."""
     pictures = figures(scan)
+    surface = read_surface(out_dir / SURFACE) if (out_dir / SURFACE).exists() else None
+    if surface is not None:
+        pictures["surface"] = surface_figure(surface)
     for name, data in pictures.items():
         write_atomically(out_dir / "figures" / f"{name}.png", data)
     page = out_dir / REPORT
@@ -85,6 +90,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         "permittivity": "Permittivity plot",
         "permittivity_map": "Map of the permittivity and its error",
         "coverage": "Masked positions",
+        "surface": "Surfaces from three sides",
     }
     centre = [f"{(float(a[0]) + float(a[-1])) * 500:.1f}" for a in (scan.x_m, scan.y_m)]
     materials = scan.materials if scan.judged else None

@@ -28,6 +28,8 @@ SLOPE_BINS = 19
 MAX_ECHOES = 3
 # Share of a window's power that a plane wave explains; noise alone gives 0.01.
 MIN_SHARE = 0.05
+# What is left after the stronger echoes: a sphere before a table that is 16 dB brighter has 0.025.
+MIN_LEFT = 0.012
 # An echo this far below the strongest of the scan is a side lobe or the echo of an edge.
 MIN_POWER = 10 ** (-3.2)
 ITERATIONS = 7
@@ -398,7 +400,7 @@ def find_echoes(board: Samples, gate_m: tuple[float, float]) -> Echoes:
     echoes = Echoes.join(parts)
     level = np.abs(echoes.amplitude)
     loud = level**2 > MIN_POWER * np.percentile(level, 99) ** 2
-    return echoes[loud & (echoes.share > MIN_SHARE)]
+    return echoes[loud]
 
 
 def _loudest(board: Samples) -> float:
@@ -426,7 +428,7 @@ def _separate(fit: _Fit, search: _Search, windows: _Windows) -> list[Echoes]:
         part = _select(replace_samples(windows, rest), active)
         first = _fit_one(fit, part, search.find(part))
         share = _power_share(fit, part, first, energy[active])
-        keep = share > MIN_SHARE
+        keep = share > (MIN_LEFT if rank else MIN_SHARE)
         if not keep.any():
             break
         active = active[keep]
@@ -435,7 +437,7 @@ def _separate(fit: _Fit, search: _Search, windows: _Windows) -> list[Echoes]:
         rest[active] -= echo
         found.append((active, first, echo))
         left = np.sum(np.abs(rest[active]) ** 2, axis=(1, 2, 3)) / energy[active]
-        more = left > MIN_SHARE
+        more = left > MIN_LEFT
         if rank and more.any():
             _refine(fit, windows, rest, found)
         active = active[more]

@@ -183,6 +183,10 @@ def _misses(v: Voltages, gains: Gains, eps: complex, wave_number: float) -> tupl
     return miss, std
 
 
+# What the first order in curvature and the antennas' changing gain over the zone leave of r_p / r_s (compared with the
+# series of spheres and cylinders of 50 to 200 mm): in proportion, and near Brewster's angle as a share of r_s.
+MODEL_RATIO_STD = 0.003
+MODEL_FLOOR_STD = 0.0008
 # Errors of a point besides noise: edges, other echoes, curvature; relative to the voltages.
 MODEL_ERROR = 0.02
 
@@ -284,6 +288,11 @@ def segment_permittivity(seen: Seen, optics: Optics, reference: Reference, uncer
     for direction in (1, 1j):
         shifted = replace(gains, coefficients=gains.coefficients + direction * log_std * _constant(gains))
         add("reference", fit_permittivity(part, shifted, k, found.eps).eps)
+        shifted = replace(gains, coefficients=gains.coefficients + direction * MODEL_RATIO_STD * _constant(gains))
+        add("model", fit_permittivity(part, shifted, k, found.eps).eps)
+        of_s = part.b[:, 0] / gains.ratio(part.arrival) * part.m[:, 1, 1] / part.m[:, 0, 0]
+        b = np.stack([part.b[:, 0], part.b[:, 1] + direction * MODEL_FLOOR_STD * of_s], axis=1)
+        add("model", fit_permittivity(replace(part, b=b), gains, k, found.eps).eps)
     return replace(found, covariance=covariance, sources=sources)
 
 

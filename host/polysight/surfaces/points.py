@@ -106,7 +106,7 @@ def spreading(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m
     _, _, along, twice = _terms(points, normals, at_m, tx_m, rx_m)
     second = along + twice[:, None, None] * curvature
     root = np.sqrt(np.abs(np.linalg.det(second)))
-    return twice / (out_m * back_m * np.maximum(root, 1e-9))
+    return twice / (2 * out_m * back_m * np.maximum(root, 1e-9))
 
 
 def offset_that_sees(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:

@@ -1,0 +1,78 @@
+"""Scenes of the worlds as the surfaces take them; simulated, no code shared with the estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from polysight.surfaces import Optics, Samples, Seen, aimed, learn_gains, see_points, voltages_of
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_worlds.rig import published_boards
+from polysight_worlds.shape_scenes import ShapeNuisances, reference_sphere, scan_offsets, scan_shapes
+from polysight_worlds.shapes import Shape
+
+GATE_M = (1.5, 1.85)
+# Fewer than a scan's, for speed: they hold paths of 0.7 m.
+FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 9)
+COLUMNS, ROWS = 80, 56
+See = Callable[..., Seen]
+
+
+def nominal_optics() -> Optics:
+    boards = published_boards()
+    middle = {name: np.mean([rx.position for rx in rxs], axis=0) for name, rxs in boards.receivers().items()}
+    tx_m = boards.tx.position
+    half = float(np.sqrt(0.5))
+    return Optics(
+        tx=aimed(tx_m, boards.tx.boresight, middle["h"], 0.499, (half, half)),
+        h=aimed(middle["h"], boards.h[0].boresight, tx_m, 0.499, (1.0, 0.0)),
+        v=aimed(middle["v"], boards.v[0].boresight, tx_m, 0.499, (0.0, 1.0)),
+        wave_number=2 * np.pi * float(FREQUENCIES_HZ.mean()) / SPEED_OF_LIGHT_M_S,
+    )
+
+
+def scan_of(
+    shapes: Sequence[Shape], columns: int = COLUMNS, rows: int = ROWS, noise: float = 1.0
+) -> tuple[Samples, Samples]:
+    offsets = scan_offsets(columns, rows)
+    cubes = scan_shapes(shapes, offsets, ShapeNuisances(noise=noise), frequencies_hz=FREQUENCIES_HZ)
+    boards = published_boards()
+    found = []
+    for name, rxs in boards.receivers().items():
+        places = np.array([rx.position for rx in rxs])
+        valid = np.ones(offsets.shape[:2], bool)
+        found.append(Samples(cubes[name], valid, offsets, FREQUENCIES_HZ, boards.tx.position, places))
+    return found[0], found[1]
+
+
+@pytest.fixture(scope="session")
+def optics() -> Optics:
+    return nominal_optics()
+
+
+@pytest.fixture(scope="session")
+def see(optics) -> See:
+    """The points that a scan of shapes shows."""
+
+    def of(shapes: Sequence[Shape], columns: int = COLUMNS, rows: int = ROWS, noise: float = 1.0) -> Seen:
+        return see_points(*scan_of(shapes, columns, rows, noise), optics, GATE_M)
+
+    return of
+
+
+@pytest.fixture(scope="session")
+def metal(see):
+    """Points of a metal sphere of 125 mm."""
+    return see([reference_sphere()], COLUMNS + 10, ROWS + 10)
+
+
+@pytest.fixture(scope="session")
+def gains(metal):
+    """Gains by the metal sphere, for any rig."""
+
+    def learn(rig: Optics):
+        return learn_gains(voltages_of(metal, rig), rig.wave_number)
+
+    return learn

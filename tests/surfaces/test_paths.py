@@ -1,0 +1,117 @@
+"""The path of an echo over a window: what was put in comes out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from polysight.surfaces import Samples
+from polysight.surfaces.paths import find_echoes
+from polysight.surfaces.points import (
+    curvature_of,
+    locate,
+    normals_at,
+    offset_that_sees,
+    predict_echo,
+    spreading,
+    unit_legs,
+)
+from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_worlds.rig import published_boards
+from polysight_worlds.shape_scenes import scan_offsets
+
+C = SPEED_OF_LIGHT_M_S
+FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 12)
+
+
+def empty_scan() -> Samples:
+    """A scan of one window and a half, without echoes."""
+    boards = published_boards()
+    offsets = scan_offsets(21, 21)
+    rx_m = np.array([rx.position for rx in boards.h])
+    cube = np.zeros((4, FREQUENCIES_HZ.size, 21, 21), complex)
+    return Samples(cube, np.ones((21, 21), bool), offsets, FREQUENCIES_HZ, boards.tx.position, rx_m)
+
+
+def with_echo(scan: Samples, point_m: np.ndarray, radius_m: float, amplitude: complex) -> Samples:
+    """Add a metal sphere's specular path, found by minimising over its surface with Newton's method."""
+    centre = point_m + np.array([0.0, 0.0, radius_m])
+    paths = np.empty((len(scan.rx_m), *scan.valid.shape))
+    for index in np.ndindex(*paths.shape):
+        tx = scan.tx_m + scan.offsets_m[index[1:]]
+        rx = scan.rx_m[index[0]] + scan.offsets_m[index[1:]]
+        normal = np.array([0.0, 0.0, -1.0])
+        for _ in range(12):
+            p = centre + radius_m * normal
+            way = (tx - p) / np.linalg.norm(tx - p) + (rx - p) / np.linalg.norm(rx - p)
+            normal = way / np.linalg.norm(way)
+        p = centre + radius_m * normal
+        paths[index] = np.linalg.norm(p - tx) + np.linalg.norm(p - rx)
+    excess = paths - scan.direct_m[:, None, None]
+    turns = scan.frequencies_hz[None, :, None, None] * excess[:, None] / C
+    return replace(scan, cube=scan.cube + amplitude * np.exp(2j * np.pi * turns))
+
+
+def with_mirror(scan: Samples, z_m: float, amplitude: complex) -> Samples:
+    """Add the echo of a level mirror, the same for all stage positions."""
+    image = scan.tx_m * [1, 1, -1] + [0, 0, 2 * z_m]
+    excess = np.linalg.norm(scan.rx_m - image, axis=1) - scan.direct_m
+    echo = amplitude * np.exp(2j * np.pi / C * np.outer(excess, scan.frequencies_hz))
+    return replace(scan, cube=scan.cube + echo[:, :, None, None])
+
+
+BEHIND = np.array([0.0, 0.0, 1.0])
+FRONT_M = np.array([-0.01, 0.104, 0.5])
+
+
+def test_a_sphere_of_rays_is_found_with_point_normal_and_radius():
+    scan = with_echo(empty_scan(), FRONT_M, 0.12, 0.5 * np.exp(0.3j))
+    echoes = find_echoes(scan, (1.4, 2.0))
+    points = locate(echoes.path_m, echoes.slope, echoes.at_m, scan.tx_m, scan.middle_m)
+    normals, _ = normals_at(points, echoes.at_m, scan.tx_m, scan.middle_m)
+    bends = curvature_of(points, normals, echoes.at_m, scan.tx_m, scan.middle_m, echoes.bend)
+    away = points - FRONT_M - 0.12 * BEHIND
+    assert np.abs(np.linalg.norm(away, axis=1) - 0.12).max() < 1e-4
+    assert np.abs(np.cross(normals, away / 0.12)).max() < np.radians(0.1)
+    assert np.allclose(np.linalg.eigvalsh(bends), 1 / 0.12, rtol=0.1)
+    assert np.abs(echoes.amplitude) == pytest.approx(0.5, rel=1e-2)
+
+
+def test_a_weak_echo_is_found_beside_a_strong_one():
+    strong = with_mirror(empty_scan(), 0.65, 1.0)
+    both = with_echo(strong, FRONT_M, 0.1, 0.16)
+    echoes = find_echoes(both, (1.4, 2.1))
+    points = locate(echoes.path_m, echoes.slope, echoes.at_m, both.tx_m, both.middle_m)
+    from_weak = np.abs(np.linalg.norm(points - (FRONT_M + 0.1 * BEHIND), axis=1) - 0.1)
+    assert (from_weak < 1e-3).sum() >= len(np.unique(echoes.at_m, axis=0))
+
+
+def test_the_path_of_a_point_gives_the_point_back():
+    scan = empty_scan()
+    rng = np.random.default_rng(1)
+    n = 200
+    points = rng.uniform([-0.1, 0.0, 0.4], [0.1, 0.2, 0.6], (n, 3))
+    at_m = np.stack([rng.uniform(-0.05, 0.05, n), rng.uniform(-0.05, 0.05, n), np.zeros(n)], axis=1)
+    normals, _ = normals_at(points, at_m, scan.tx_m, scan.middle_m)
+    bends = rng.uniform(-2, 15, (n, 2, 2))
+    bends = (bends + np.swapaxes(bends, 1, 2)) / 2
+    path, slope, bend = predict_echo(points, normals, bends, at_m, scan.tx_m, scan.middle_m)
+    assert np.allclose(locate(path, slope, at_m, scan.tx_m, scan.middle_m), points, atol=1e-8)
+    assert np.allclose(curvature_of(points, normals, at_m, scan.tx_m, scan.middle_m, bend), bends, atol=1e-4)
+    seen_from = offset_that_sees(points, normals, at_m + np.array([0.01, 0.02, 0]), scan.tx_m, scan.middle_m)
+    assert np.allclose(seen_from, at_m, atol=1e-8)
+
+
+def test_a_mirror_spreads_as_its_path():
+    scan = empty_scan()
+    at_m = np.zeros((1, 3))
+    image = scan.tx_m * [1, 1, -1] + [0, 0, 1.0]
+    share = (0.5 - scan.middle_m[2]) / (image[2] - scan.middle_m[2])
+    point = (scan.middle_m + share * (image - scan.middle_m))[None]
+    normals, _ = normals_at(point, at_m, scan.tx_m, scan.middle_m)
+    _, _, out_m, back_m = unit_legs(point, at_m, scan.tx_m, scan.middle_m)
+    found = spreading(point, normals, np.zeros((1, 2, 2)), at_m, scan.tx_m, scan.middle_m)
+    assert np.allclose(normals, [[0, 0, -1]], atol=1e-9)
+    assert found[0] == pytest.approx(1 / float(out_m[0] + back_m[0]), rel=1e-6)

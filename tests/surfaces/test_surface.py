@@ -1,0 +1,135 @@
+"""Drawn shapes: place, normal and permittivity come out within what is asked, or no figure is given."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from polysight.surfaces import (
+    SURFACE,
+    Uncertainty,
+    analyse_surface,
+    read_surface,
+    reflect_curved,
+    reflect_flat,
+    write_surface,
+)
+from polysight.surfaces.result import point_cloud
+from polysight_worlds.media import Stack
+from polysight_worlds.shape_scenes import ShapeScene
+from polysight_worlds.shapes import cylinder, sphere
+
+# A rig that stands as its file says: what is left are noise and the method's own errors.
+EXACT = Uncertainty(leakage=1e-4, axis_rad=1e-4, place_m=1e-6)
+CENTRE_M = (-0.01, 0.104, 0.5)
+
+
+def scene_of(radius_m: float, stack: Stack) -> ShapeScene:
+    x, y, z = CENTRE_M
+    return ShapeScene("sphere", (sphere("ball", stack, (x, y, z + radius_m), radius_m),), stack.below, radius_m)
+
+
+@pytest.fixture(scope="module")
+def glass_ball(see, gains, optics):
+    scene = scene_of(0.11, Stack(below=5.2 - 0.4j))
+    seen = see(scene.shapes)
+    return scene, seen, analyse_surface(seen, optics, gains, uncertainty=EXACT, scan_id="ball", simulated=True)
+
+
+def test_points_and_normals_of_a_sphere_are_found(glass_ball):
+    scene, _, surface = glass_ball
+    distance, normals = scene.surface_at(surface.points_m)
+    angle = np.degrees(np.arccos(np.clip((normals * surface.normals).sum(axis=1), -1, 1)))
+    assert np.median(np.abs(distance)) < 0.5e-3
+    assert np.median(angle) < 0.5
+
+
+def test_the_permittivity_of_a_sphere_is_found_within_its_error(glass_ball):
+    scene, _, surface = glass_ball
+    main = surface.segments[0]
+    miss = main.permittivity - scene.permittivity
+    d = np.array([miss.real, miss.imag])
+    assert abs(miss) < 0.03 * abs(scene.permittivity)
+    assert d @ np.linalg.inv(np.array(main.covariance)) @ d < 9.2  # 99 %
+
+
+def test_a_cylinder_of_50_mm_is_measured(see, gains, optics):
+    medium = 3.4 - 0.5j
+    rod = cylinder("rod", Stack(below=medium), (CENTRE_M[0], CENTRE_M[1], 0.55), 0.05, 0.4, axis=(0.5, 1.0, 0.05))
+    scene = ShapeScene("cylinder", (rod,), medium, 0.05)
+    surface = analyse_surface(see(scene.shapes), optics, gains, uncertainty=EXACT)
+    _, normals = scene.surface_at(surface.points_m)
+    angle = np.degrees(np.arccos(np.clip((normals * surface.normals).sum(axis=1), -1, 1)))
+    assert np.median(angle) < 1.0
+    assert abs(surface.segments[0].permittivity - medium) < 0.05 * abs(medium)
+
+
+def test_metal_is_metal_and_has_no_permittivity(metal, gains, optics):
+    surface = analyse_surface(metal, optics, gains, uncertainty=EXACT)
+    assert surface.segments[0].name == "metal"
+    assert surface.segments[0].permittivity is None
+    assert np.isnan(surface.permittivity).all()
+
+
+def test_below_40_mm_the_shape_alone_is_given_and_why(see, gains, optics):
+    surface = analyse_surface(
+        see(scene_of(0.03, Stack(below=4 - 0.4j)).shapes, 64, 44), optics, gains, uncertainty=EXACT
+    )
+    assert len(surface.points_m)
+    assert [s.permittivity for s in surface.segments] == [None] * len(surface.segments)
+    assert all(s.reason for s in surface.segments)
+
+
+def test_without_a_reference_the_shape_alone_is_given(glass_ball, optics):
+    _, seen, with_reference = glass_ball
+    surface = analyse_surface(seen, optics, None, uncertainty=EXACT)
+    assert np.array_equal(surface.points_m, with_reference.points_m)
+    assert all(s.permittivity is None and s.reason for s in surface.segments)
+
+
+def test_the_error_grows_with_what_is_not_known(glass_ball, gains, optics):
+    _, seen, exact = glass_ball
+    traces = [np.trace(exact.segments[0].covariance)]
+    unsure = [Uncertainty(0.02, 1e-4, 1e-6), Uncertainty(0.02, 0.02, 1e-6), Uncertainty(0.02, 0.02, 1e-3)]
+    for uncertainty in unsure:
+        judged = analyse_surface(seen, optics, gains, uncertainty=uncertainty).segments[0]
+        traces.append(np.trace(judged.covariance))
+    assert traces == sorted(traces)
+    assert traces[-1] > 2 * traces[0]
+
+
+def test_files_hold_what_was_found(glass_ball, tmp_path):
+    _, _, surface = glass_ball
+    write_surface(tmp_path, surface)
+    read = read_surface(tmp_path / SURFACE)
+    assert read.segments == surface.segments
+    assert read.scan_id == surface.scan_id
+    assert np.array_equal(read.points_m, surface.points_m)
+    assert np.array_equal(read.permittivity, surface.permittivity, equal_nan=True)
+
+
+def test_the_point_cloud_is_a_ply_of_all_points(glass_ball):
+    _, _, surface = glass_ball
+    head, _, body = point_cloud(surface).partition(b"end_header\n")
+    assert head.startswith(b"ply\nformat binary_little_endian 1.0\n")
+    assert f"element vertex {len(surface.points_m)}".encode() in head
+    properties = head.count(b"\nproperty ")
+    assert len(body) == 4 * properties * len(surface.points_m)
+    first = np.frombuffer(body[:12], "<f4")
+    assert np.allclose(first, 1e3 * surface.points_m[0], atol=1e-3)
+
+
+def test_a_surface_without_curvature_reflects_by_fresnel():
+    theta = np.radians([40.0, 55.0, 62.0])
+    flat = reflect_flat(4 - 0.3j, theta)
+    curved = reflect_curved(4 - 0.3j, theta, np.zeros(3), np.zeros(3), 1634.0)
+    assert np.allclose(flat, curved, atol=1e-9)
+
+
+def test_metal_of_curvature_turns_p_by_the_known_phase():
+    """A metal sphere: r_p / r_s turns by sin^2 / (k R cos^3), 0.02 rad at 100 mm and 55 degrees."""
+    theta = np.radians([55.0])
+    bend = np.array([10.0])
+    r_s, r_p = reflect_curved(np.inf, theta, bend, bend, 1634.0)
+    expected = np.sin(theta) ** 2 / (163.4 * np.cos(theta) ** 3)
+    assert np.angle(r_p / r_s) == pytest.approx(expected, rel=0.05)

@@ -66,7 +66,7 @@ def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeyp
 def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, asked):
     """A stage that is still `ready` has not begun: its lost steps would be those of the homing before."""
     sent = []
-    pi: Any = SimpleNamespace(
+    pi: Any = SimpleNamespace(_owner="",
         _timeout_s=1.0, _once=lambda *given: sent.append(given), _ask=lambda *given: sent.append(given),
         status=lambda: SimpleNamespace(state=state),
     )  # fmt: skip

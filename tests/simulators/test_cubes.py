@@ -58,7 +58,8 @@ def off_by(raw: np.ndarray, cube: np.ndarray) -> np.ndarray:
 
 
 def test_a_synced_cube_equals_the_synchronised_raw_scan(tmp_path: Path) -> None:
-    scene = SCENE.with_disturbances(direct_snr_db="off", leakage_h=[0.1, 0.15], leakage_v=[-0.1, 0.1])
+    leakage = {"leakage_h": [0.1, 0.15], "leakage_v": [-0.1, 0.1]}
+    scene = SCENE.with_disturbances(direct_snr_db="off", hv_drift=[0.2, 30.0], **leakage)
     assert RIG.chirp.linear_samples[0] == 0
     for board, raw in rows_by_the_host(scene, tmp_path).items():
         cube, other = (
@@ -67,6 +68,19 @@ def test_a_synced_cube_equals_the_synchronised_raw_scan(tmp_path: Path) -> None:
         own, unlike = (np.sqrt(np.mean(np.abs(off_by(raw, c)) ** 2) / np.mean(np.abs(c) ** 2)) for c in (cube, other))
         assert own < 0.01
         assert unlike > 3 * own, "the bound is too wide to detect leakage"
+
+
+def test_the_echo_of_v_drifts_by_what_the_scene_says_and_h_and_the_direct_path_do_not() -> None:
+    drifting = SCENE.with_disturbances(hv_drift=[0.2, 30.0])
+    echoes = {b: [synced_cube(RIG, s, b, noise=0.0, direct=False) for s in (drifting, SCENE)] for b in ("RH", "RV")}
+    assert np.array_equal(echoes["RH"][0], echoes["RH"][1])
+    factor = echoes["RV"][0] / echoes["RV"][1]
+    first, last = factor[0, 0, 0, 0], factor[0, -1, 0, 0]  # row 5 runs backwards
+    passed = 65 / 66  # of 66 positions, from the first to the last
+    assert abs(last) - abs(first) == pytest.approx(0.2 * passed, rel=1e-3)
+    assert np.degrees(np.angle(last / first)) == pytest.approx(30.0 * passed, rel=1e-3)
+    direct = [synced_cube(RIG, s, "RV", noise=0.0) - e for s, e in zip((drifting, SCENE), echoes["RV"], strict=True)]
+    assert np.abs(direct[0] - direct[1]).max() < 1e-5
 
 
 def test_the_noise_is_that_of_averaged_bursts(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from polysight_shared.raster import mean_burst_travel_mm, plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_simulators.scene.field import ObjectField, build_field, node_matrix
 from polysight_simulators.scene.optics import Real, antennas, direct_factor
-from polysight_simulators.scene.radar import high_pass, power_on, sample_frequencies_hz
+from polysight_simulators.scene.radar import echo_drift, high_pass, power_on, sample_frequencies_hz
 from polysight_simulators.scene.scene_file import Scene, apply_scene, stream_key
 
 
@@ -69,9 +69,8 @@ def synced_cube(
 ) -> NDArray[np.complex64]:
     """Return the samples of a scan after ideal synchronisation: referenced to the direct path, bursts averaged.
 
-    Simulated disturbances: leakage, gains and phases of the channels, H over V, noise, loss of the direct path,
-    backlash. Not simulated: timing, crystals, phases, chirp shape, filter, motion within a burst, ADC, lost packets. An
-    echo of excess path d is a exp(+j 2 pi f d / c), the direct path is constant.
+    Simulated: leakage, gains and phases of the channels, H over V and its drift, noise, loss of the direct path,
+    backlash; nothing else. An echo of excess path d is a exp(+j 2 pi f d / c), the direct path is constant.
 
     Parameters
     ----------
@@ -106,6 +105,7 @@ def synced_cube(
     direct_m = all_m[channels]
     gains = power_on(rig, scene, board, seed).gains[channels]
     cube = _read(field, rig, f, field.centre_path_m - direct_m, gains, d.backlash_mm)
+    cube *= _drift_of_positions(rig, scene, board)[:, :, None]
     if direct:
         level = direct_factor(board, scene) * d.direct_gain * all_m[0] / direct_m
         cube += (gains * level).astype(np.complex64)[:, None, None, None]
@@ -116,6 +116,19 @@ def synced_cube(
         flat *= (sigma * np.sqrt(0.5) * np.abs(gains)).astype(np.float32)[:, None, None, None]
         cube += flat
     return cube
+
+
+def _drift_of_positions(rig: Instrument, scene: Scene, board: Board) -> NDArray[np.complex64]:
+    """Return the drift of a board's echo at every position, [row, column], in the order of the scan."""
+    plan = plan_raster(rig.grid)
+    factors = np.empty((plan.rows, plan.columns), np.complex64)
+    for row in plan:
+        columns = [row.column(i) for i in range(row.points)]
+        positions = row.index * plan.columns + np.arange(row.points)
+        factors[row.index, columns] = echo_drift(
+            rig, scene.disturbances, board, positions * rig.burst.chirps_a_position
+        )
+    return factors
 
 
 def _burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int, echo_m: float) -> float:

@@ -27,9 +27,10 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import scipy
 from numpy.polynomial import chebyshev
@@ -71,7 +72,12 @@ class Axis:
     low_w: float
     high_w: float
     step: float
-    points: int
+
+    @property
+    def points(self) -> int:
+        """Number of kernel positions, a fast length of an FFT."""
+        needed = int(np.ceil((self.high_w - self.low_w + 2 * FADE_M) / self.step)) + 1
+        return int(scipy.fft.next_fast_len(needed) or 0)
 
     @property
     def w(self) -> Real:
@@ -136,8 +142,7 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
                 slope += away[i] / np.sqrt(away[0] ** 2 + away[1] ** 2 + (nearest_z - antenna[2]) ** 2)
             steepest = max(steepest, wave * float(np.abs(slope).max()))
         step = min(np.pi / (1.1 * steepest + 6 * np.pi / FADE_M), 4e-3)
-        points = int(scipy.fft.next_fast_len(int(np.ceil((span[3] - span[2] + 2 * FADE_M) / step)) + 1) or 0)
-        axes.append(Axis(span[0], span[1], span[2], span[3], step, points))
+        axes.append(Axis(span[0], span[1], span[2], span[3], step))
     if axes[0].points * axes[1].points > MAX_KERNEL_POINTS:
         width_m, height_m = (axis.high_w - axis.low_w for axis in axes)
         raise ConfigError(
@@ -356,29 +361,29 @@ def compute(
     rig: Instrument, scene: Scene, board: Board, samples_hz: Real, rx: Sequence[int]
 ) -> tuple[NDArray[np.complex64], tuple[float, float], tuple[float, float], Real, float]:
     """Return the fields of :class:`polysight_simulators.scene.field.ObjectField` for a scene of drawn specimens."""
-    ant = antennas(rig, board)
-    reflect = board_reflectivity(board, scene)
-    ax, ay = spectral_axes(rig, scene, ant, float(samples_hz[-1]))
-    amplitudes = sampled(np.array([complex(*p.amplitude) for p in scene.points])) * point_scale(ant)
-    surfaces = tuple(facets(p, i, scene.seed) for i, p in enumerate(scene.plates))
-    plane = _Plane(ant, scene, ax, ay, surfaces, amplitudes * direct_factor(board, scene))
-    levels = plane.levels(rx, float(samples_hz[-1]))
-    legs = [leg for level in levels for leg in level.legs]
-    nodes_hz, centre = _frequencies(scene, ax, ay, legs, samples_hz)
-
+    top_hz = float(samples_hz[-1])
+    planes = _planes(rig, scene, board, top_hz)
+    levels = [(plane, level) for plane in planes for level in plane.levels(rx, top_hz)]
+    nodes_hz, centre = _frequencies(scene, levels, samples_hz)
+    legs = [leg for _, level in levels for leg in level.legs]
     low = min(leg[2].min() for leg in legs)
     high = max(leg[2].max() for leg in legs)
-    series = _angle_series(scene, reflect, nodes_hz, (low, high))
-    kernels = [(level, *_factors(level, low, high, series.shape[2])) for level in levels]
-    values = np.empty((ay.outputs, ax.outputs, len(rx), len(nodes_hz)), dtype=np.complex64)
-    for q, f in enumerate(nodes_hz):
-        total = np.zeros((len(rx), ay.points, ax.points), dtype=np.complex64)
-        for level, angle, shares in kernels:
-            _add_level(total, plane, level, series[:, q], f, centre, angle, shares)
-        for r, spectrum in enumerate(total):
-            values[:, :, r, q] = _oversampled(_oversampled(spectrum, ay, 0), ax, 1)
+    reflect = board_reflectivity(board, scene)
+    series = [_angle_series(plane.scene, reflect, nodes_hz, (low, high)) for plane in planes]
+    ax, ay = planes[0].x, planes[0].y
+    values = np.zeros((ay.outputs, ax.outputs, len(rx), len(nodes_hz)), dtype=np.complex64)
+    for plane, of_plates in zip(planes, series, strict=True):
+        own = [level for other, level in levels if other is plane]
+        kernels = [(level, *_factors(level, low, high, of_plates.shape[2])) for level in own]
+        for q, f in enumerate(nodes_hz):
+            total = np.zeros((len(rx), plane.y.points, plane.x.points), dtype=np.complex64)
+            for level, angle, shares in kernels:
+                _add_level(total, plane, level, of_plates[:, q], f, centre, angle, shares)
+            for r, spectrum in enumerate(total):
+                values[:, :, r, q] += _oversampled(_oversampled(spectrum, plane.y, 0), plane.x, 1)
     steps = ax.step / OVERSAMPLING, ay.step / OVERSAMPLING
     if scene.shapes:
+        ant = planes[0].ant
         offsets = (ax.first_u + steps[0] * np.arange(ax.outputs), ay.first_u + steps[1] * np.arange(ay.outputs))
         seen = shape_field(rig, scene, board, offsets, nodes_hz, ant.centre_m, centre)
         # As of plates: an infinite mirror gives object_gain d / path.
@@ -386,19 +391,53 @@ def compute(
     return values, (ax.first_u, ay.first_u), steps, nodes_hz, centre
 
 
-def _frequencies(
-    scene: Scene, ax: Axis, ay: Axis, legs: list[tuple[Real, Real, Real, Real]], samples_hz: Real
-) -> tuple[Real, float]:
+def _planes(rig: Instrument, scene: Scene, board: Board, top_hz: float) -> list[_Plane]:
+    """Return the scene's parts: a wide background has a grid of its own, so that small plates keep small kernels.
+
+    All parts have the same step and the same range of offsets, so that their fields add up.
+    """
+    ant = antennas(rig, board)
+    surfaces = tuple(facets(p, i, scene.seed) for i, p in enumerate(scene.plates))
+    amplitudes = sampled(np.array([complex(*p.amplitude) for p in scene.points])) * point_scale(ant)
+    amplitudes = amplitudes * direct_factor(board, scene)
+    is_background = [p.background for p in scene.plates]
+    parts = [False, True] if any(is_background) and not all(is_background) else [any(is_background)]
+    planes = []
+    for background in parts:
+        members = [i for i, other in enumerate(is_background) if other == background]
+        is_first = background == parts[0]
+        part = msgspec.structs.replace(
+            scene,
+            plates=tuple(scene.plates[i] for i in members),
+            points=scene.points if is_first else (),
+            shapes=scene.shapes if is_first else (),
+        )
+        x, y = spectral_axes(rig, part, ant, top_hz)
+        own_amplitudes = amplitudes if is_first else amplitudes[:0]
+        planes.append(_Plane(ant, part, x, y, tuple(surfaces[i] for i in members), own_amplitudes))
+    step_x = min(plane.x.step for plane in planes)
+    step_y = min(plane.y.step for plane in planes)
+    return [replace(p, x=replace(p.x, step=step_x), y=replace(p.y, step=step_y)) for p in planes]
+
+
+def _frequencies(scene: Scene, levels: list[tuple[_Plane, _Level]], samples_hz: Real) -> tuple[Real, float]:
     """Return the nodes in the samples' band (the samples if they are fewer), and the path whose phase is removed."""
-    reach = np.stack([r1 + r2 for r1, r2, _, _ in legs])[:, (ay.fade == 1)[:, None] & (ax.fade == 1)]
+    ranges = []
+    for plane, level in levels:
+        inside_scene = (plane.y.fade == 1)[:, None] & (plane.x.fade == 1)
+        for r1, r2, _, _ in level.legs:
+            path = (r1 + r2)[inside_scene]
+            ranges.append((path.min(), path.max()))
+    shortest_m = float(min(low for low, _ in ranges))
+    longest_m = float(max(high for _, high in ranges))
     inside = 0.0
     for p in scene.plates:  # inner echoes extend the response
         depth = sum((layer.thickness_mm or 0.0) / 1e3 * abs(np.sqrt(layer.epsilon)) for layer in p.stack)
         inside = max(inside, 4 * depth)
     # Shapes extend beyond their fronts' heights; some 0.15 m on either side hold their specular points.
     depth_m = max((abs(p.height_mm) / 1e3 + 0.15 for p in scene.shapes), default=0.0)
-    spread = float(reach.max() - reach.min()) + 2 * inside + 4 * depth_m
-    centre = float(reach.max() + reach.min()) / 2
+    spread = longest_m - shortest_m + 2 * inside + 4 * depth_m
+    centre = (longest_m + shortest_m) / 2
     # Time-bandwidth product plus a few: interpolation error of the Chebyshev series below 1e-6.
     nodes = int(np.ceil((samples_hz[-1] - samples_hz[0]) * spread / SPEED_OF_LIGHT_M_S)) + 8
     if len(samples_hz) <= nodes:
@@ -458,7 +497,7 @@ def _oversampled(spectrum: NDArray[np.complex64], axis: Axis, along: int) -> NDA
     return line[(*lead, slice(0, axis.outputs))]
 
 
-_PHYSICS = 2  # version of the content of cached fields
+_PHYSICS = 3  # version of the content of cached fields
 
 _KAISER_BETA = 8.0
 

@@ -194,20 +194,34 @@ def sampled(factor: Any) -> Any:
 def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
     """Return the function that gives a plate's reflection in a board's samples, with cross-polar leakage.
 
-    H: r_s + leak_h r_p. V: r_p + leak_v r_s. TX is rotated by 45 degrees and sends both polarisations equally.
+    H: s + leak_h p. V: p + leak_v s. TX is rotated by 45 degrees and sends both polarisations equally. s and p are what
+    a plate returns in the polarisations of H and V (:func:`turned_reflection`).
     """
     leak_h = complex(*scene.disturbances.leakage_h)
     leak_v = complex(*scene.disturbances.leakage_v)
 
     def h(plate: Plate, frequency_hz: float, theta: Real) -> Complex:
-        s, p = plate_reflection(plate, frequency_hz, theta)
+        s, p = turned_reflection(plate, frequency_hz, theta)
         return sampled(s + leak_h * p)
 
     def v(plate: Plate, frequency_hz: float, theta: Real) -> Complex:
-        s, p = plate_reflection(plate, frequency_hz, theta)
+        s, p = turned_reflection(plate, frequency_hz, theta)
         return sampled(p + leak_v * s)
 
     return h if board.role == "receive_h" else v
+
+
+def turned_reflection(plate: Plate, frequency_hz: float, theta: Real) -> tuple[Complex, Complex]:
+    """Return what a plate sends back in the polarisations of H and V for a wave with equal s and p there.
+
+    A plate that rises by w across the plane of incidence (its height grows along y) turns this plane about x, and both
+    waves meet its s axis at d = w sin(theta). To first order the incident wave has 1 - d of s and 1 + d of p, and
+    turning back mixes the reflected ones: H receives (1 - d) r_s - d r_p and V (1 + d) r_p + d r_s. A mirror, which has
+    an image of TX with polarisation 2 (n e) n - e, gives the same.
+    """
+    r_s, r_p = plate_reflection(plate, frequency_hz, theta)
+    d = slopes(plate)[1] * np.sin(theta)
+    return (1 - d) * r_s - d * r_p, (1 + d) * r_p + d * r_s
 
 
 def direct_factor(board: Board, scene: Scene) -> complex:

@@ -119,6 +119,16 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
     return Receiver(board, chirp, gains.astype(np.complex64), phase - phase[0], error)
 
 
+def echo_drift(rig: Instrument, d: Disturbances, board: Board, pulses: NDArray[np.int64]) -> NDArray[np.complex64]:
+    """Return the factor of a board's echo by pulse [n]: linear drift of V over the scan, one in its middle."""
+    if board.role != "receive_v":
+        return np.ones(len(pulses), np.complex64)
+    share, degrees = d.hv_drift
+    scan_pulses = rig.grid.columns * rig.grid.rows * rig.burst.chirps_a_position
+    passed = pulses / scan_pulses - 0.5
+    return ((1 + share * passed) * np.exp(1j * np.radians(degrees) * passed)).astype(np.complex64)
+
+
 def per_chirp(receiver: Receiver, delay_s: Real, phase_rad: Real, hpf: bool) -> tuple[NDArray[np.complex64], Real]:
     """Return the factor of each chirp before the filter, and its IF shift (0 without filter), both [chirp, sample].
 
@@ -320,7 +330,8 @@ class SimulatedRig:
         self.outside[board.name] += int(np.sum(~inside))
         nodes = np.zeros((len(x_m), *own.direct.shape[1:2], own.expand.shape[1]), dtype=np.complex64)
         if inside.any():
-            nodes[inside] = own.field.at(x_m[inside], y_m[inside]) * own.receiver.gains[:, None]
+            gains = echo_drift(self.rig, d, board, pulses[inside])[:, None] * own.receiver.gains
+            nodes[inside] = own.field.at(x_m[inside], y_m[inside]) * gains[:, :, None]
         # One small product per chirp: BLAS runs larger ones in threads, which is slow beside other processes.
         ideal = np.matmul(nodes[:, None], own.expand)  # [chirp, 2, rx, sample]
         ideal += own.direct

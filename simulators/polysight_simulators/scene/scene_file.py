@@ -82,6 +82,8 @@ Tilt = tuple[Degrees, Degrees]
 Height = Annotated[float, msgspec.Meta(ge=-50, le=50)]
 SteepTilt = Annotated[float, msgspec.Meta(ge=-60, le=60)]
 Bend = Annotated[float, msgspec.Meta(ge=-100, le=100)]
+PlateHeight = Annotated[float, msgspec.Meta(ge=-50, le=300)]  # a table lies far behind the plates
+Drift = Annotated[float, msgspec.Meta(ge=-0.5, le=0.5)]
 Gain = Annotated[float, msgspec.Meta(ge=-200, le=200)]
 GainSpread = Annotated[float, msgspec.Meta(ge=0, le=100)]
 Decibels = Annotated[float, msgspec.Meta(ge=-40, le=200)]
@@ -133,7 +135,7 @@ class Plate(_Table, frozen=True):
 
     `height_mm` moves the plate away from the radars (+z). `tilt_deg` [ax, ay] rotates it about its centre: height grows
     along +x by tan(ax) and along +y by tan(ay). `rough_mm` is the standard deviation of the surface's height, in facets
-    of `rough_length_mm`.
+    of `rough_length_mm`. A `background` plate, such as a table, is seen by the radars but is nothing to be named.
     """
 
     name: str
@@ -145,7 +147,8 @@ class Plate(_Table, frozen=True):
     layers: tuple[Layer, ...] = ()
     strips_deg: Angle | None = None
     tilt_deg: Tilt = (0.0, 0.0)
-    height_mm: Height = 0.0
+    height_mm: PlateHeight = 0.0
+    background: bool = False
     rough_mm: Annotated[float, msgspec.Meta(ge=0, le=5)] = 0.0
     rough_length_mm: Size = 6.0
 
@@ -273,6 +276,9 @@ class Disturbances(_Table, frozen=True):
     rx_gain_spread_db: GainSpread = 1.0
     rx_phase_spread_deg: Annotated[float, msgspec.Meta(ge=0, le=360)] = 20.0
     hv_gain_db: Gain = 1.5
+    # Growth of V's echo against H's from the first to the last position: a share, and degrees. The direct path does not
+    # have it, so that referencing to that path does not take it away.
+    hv_drift: tuple[Drift, Angle] = (0.0, 0.0)
     leakage_h: Leakage = (0.05, 0.0)
     leakage_v: Leakage = (0.05, 0.0)
     burst_motion: bool = True
@@ -302,6 +308,7 @@ OFF: dict[str, Any] = {
     "rx_gain_spread_db": 0.0,
     "rx_phase_spread_deg": 0.0,
     "hv_gain_db": 0.0,
+    "hv_drift": [0.0, 0.0],
     "leakage_h": [0.0, 0.0],
     "leakage_v": [0.0, 0.0],
     "burst_motion": False,

@@ -86,6 +86,7 @@ def _plate_truth(plate: Plate, nominal: Plate, centre_m: Vector) -> dict[str, An
         "permittivity": None if plate.permittivity is None else list(plate.permittivity),
         "nominal_permittivity": None if nominal.permittivity is None else list(nominal.permittivity),
         "metal": plate.metal and plate.strips_deg is None,
+        "background": plate.background,
         "strips_deg": plate.strips_deg,
         "thickness_mm": plate.thickness_mm,
         "layers": [msgspec.to_builtins(layer) for layer in plate.layers],

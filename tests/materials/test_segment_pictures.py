@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from polysight.materials.copies import find_copies
 from polysight.materials.labels import patches_from_labels
-from polysight.materials.measure import background, check_patch, halves_apart
+from polysight.materials.measure import background, background_mean, check_patch, halves_apart
 from polysight.materials.segment import segment
 
 PIXEL_MM = 2.0
@@ -170,3 +170,17 @@ def test_the_nine_plates_of_the_published_rigs_picture_are_found_and_nothing_els
         best = max(found.patches, key=lambda p: int((p.mask & drawn).sum()))
         assert (best.mask & drawn).sum() >= 0.85 * drawn.sum(), name
         assert not best.cut
+
+
+def test_a_background_that_is_alike_over_a_plates_size_does_not_average_away():
+    """A table behind the plates adds one number to a plate; noise adds its mean over the plate's pixels."""
+    plates = {(20, 20, 44, 44): (0.0, COPPER), (90, 90, 114, 114): (-6.0, 0.3)}
+    found = segment(*draw(1, plates, background_db=-60.0), AXIS, AXIS)
+    usable = np.ones((SIDE, SIDE), bool)
+    noise = np.random.default_rng(2).standard_normal((2, SIDE, 2 * SIDE)).view(np.complex128) / np.sqrt(2)
+    table = np.full((2, SIDE, SIDE), 0.08 + 0.06j)
+    width_px = np.sqrt(np.median([p.interior.sum() for p in found.patches]))
+    assert background_mean(*table, found, usable) == pytest.approx((0.1, 0.1), rel=1e-6)
+    assert background_mean(*noise, found, usable) == pytest.approx((1 / width_px, 1 / width_px), rel=0.35)
+    everywhere = segment(np.ones((SIDE, SIDE), complex), np.ones((SIDE, SIDE), complex), AXIS, AXIS)
+    assert background_mean(*table, everywhere, usable & False) == (0.0, 0.0)

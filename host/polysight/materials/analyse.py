@@ -44,6 +44,7 @@ from polysight.materials.measure import (
     Permittivity,
     Scatter,
     background,
+    background_mean,
     check_patches,
     common_change,
     measure_patch,
@@ -186,6 +187,9 @@ def _modelled(rise: float) -> float:
     return rise if abs(rise) < MAX_RISE else 0.0
 
 
+BEHIND_PATCH = 0.6
+"""Background in a plate over that beside the plates: of tables in scenes of the independent generator. Plates and metal
+that change alike are no error of their ratio, and the brightest of the background lies at its own edges."""
 STEEP = Finding(
     "error",
     "tilted or curved beyond what is modelled",
@@ -226,7 +230,7 @@ def analyse(
     refused |= {p.label: STEEP for p in found.patches if p.label in tilts.steep}
     judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
-    seen = Seen.of((rh, rv), judged, found, reference, plane, images, tilts)
+    seen = Seen.of((rh, rv), raw, judged, found, reference, plane, images, tilts)
     prior = seen.prior(optics.prior)
     measured = [seen.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
     kinds = _kinds(classifier, float(np.mean(theta)))
@@ -260,7 +264,7 @@ def analyse(
         boxes=dict(known.names), library=() if classifier is None else classifier.names,
         brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
         errors=None if errors is None else (tuple(labels), errors), apart_mm=apart_mm,
-        drift=seen.change, halo=seen.halo.level,
+        drift=seen.change, halo=seen.halo.level, behind=seen.usual_background(measured),
     )  # fmt: skip
 
 
@@ -289,6 +293,8 @@ class Seen:
         Rise of the metal along x and across the plane of incidence, radians.
     halo
         Halo of V around the metal.
+    behind
+        Usual mean of H and of V over a place of a plate's size without a plate, relative to metal.
     """
 
     scatter: Mapping[int, Scatter]
@@ -300,11 +306,13 @@ class Seen:
     lit_evenly: bool
     metal_rise: Rise
     halo: Halo = NO_HALO
+    behind: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(
         cls,
         channels: tuple[Image, Image],
+        raw: Images,
         judged: Sequence[Patch],
         found: Segmentation,
         reference: MetalReference,
@@ -312,7 +320,10 @@ class Seen:
         images: Images,
         tilts: Tilts,
     ) -> Seen:
-        """Measure the scatter of the judged patches and of the metal; `channels` are relative to metal, smoothed."""
+        """Measure the scatter of the judged patches and of the metal, and the background.
+
+        `channels` are relative to metal and smoothed inside patches, `raw` is relative to metal.
+        """
         every = {p.label: scatter_of(p.interior, *channels, images.x_m, images.y_m) for p in judged}
         scatter = {label: s for label, s in every.items() if s is not None}
         metal = None
@@ -324,7 +335,8 @@ class Seen:
         evenly = images.illumination is not None and images.illumination.known
         change = None if metal is None else common_change(known, metal.centre_m)
         halo = NO_HALO if metal is None else find_halo(reference.mask, found.patches, images)
-        return cls(scatter, usual_scatter(known), metal, change, spread, tilts, evenly, metal_rise, halo)
+        behind = background_mean(raw.h, raw.v, found, images.usable)
+        return cls(scatter, usual_scatter(known), metal, change, spread, tilts, evenly, metal_rise, halo, behind)
 
     def prior(self, prior: RigPrior) -> RigPrior:
         """Return the prior of the rig's errors with what the plates show: the metal's error and tilt."""
@@ -345,10 +357,24 @@ class Seen:
         if scatter is not None and self.change is not None:
             change = self.change.of(list(self.scatter).index(patch.label))
         seen = measure_patch(patch, *channels, theta_rad, scatter, self.usual, change, local_std, rise)
-        around = HALO_OF_PATCH * self.halo.around.get(patch.label, 0.0)
-        if not around or not seen.brightness:
+        if not seen.brightness:
             return seen
-        return replace(seen, std=float(np.hypot(seen.std, around / seen.brightness)))
+        around = HALO_OF_PATCH * self.halo.around.get(patch.label, 0.0) / seen.brightness
+        behind = abs(seen.inverse_ratio) * self.background_in(seen)
+        return replace(seen, std=float(np.sqrt(seen.std**2 + around**2 + behind**2)))
+
+    def background_in(self, seen: PatchMeasurement) -> float:
+        """Return the standard deviation of each part of a patch's ln(V / H) by what lies behind it."""
+        if not seen.brightness or not seen.inverse_ratio:
+            return 0.0
+        behind_h, behind_v = self.behind
+        # The background has any phase: half of its power is in each part.
+        relative = np.hypot(behind_h, behind_v / abs(seen.inverse_ratio)) / np.sqrt(2)
+        return float(BEHIND_PATCH * relative / seen.brightness)
+
+    def usual_background(self, measured: Sequence[PatchMeasurement]) -> float:
+        """Return the median of :meth:`background_in` over patches; 0 without any."""
+        return float(np.median([self.background_in(m) for m in measured])) if measured else 0.0
 
 
 def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:

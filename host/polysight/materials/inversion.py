@@ -5,10 +5,11 @@ Relative to metal, a patch of true inverse ratio t = r_p / r_s = 1 / P is measur
     V / H = (1 + rho) exp(G w) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
 
 with a, b the leakage of p into H and of s into V, rho the error of the metal reference, w the rise of the plate
-relative to the metal's and G its effect on ln(V / H) (H and V are lit from other points), kappa the patch's brightness
-relative to an ideal one (thickness, roughness, illumination). A plate that rises by w across the plane of incidence
-turns the polarisations: it has a and b of its own, larger and smaller by `turn` w. (With the plate's normal in the
-plane of x and k, s turns by w, and both waves meet it at sin(theta) w; metal is not changed.) r_s and r_p follow from t
+relative to the metal's and G its effect on ln(V / H), kappa the patch's brightness relative to an ideal one (thickness,
+roughness, illumination). A plate that rises by w across the plane of incidence turns this plane about x, and both waves
+meet its s axis at d = w sin(theta): to first order H receives (1 - d) r_s - d r_p and V (1 + d) r_p + d r_s, as the
+image of the transmitter in a tilted mirror confirms. So a plate has a and b of its own, smaller and larger by d, and G
+is 4 sin(theta) across, up to the patterns of boards that see the plate from other points. r_s and r_p follow from t
 and the incidence angle by Eq. 2 and 3. Unknown are a, b, rho, G, the turn, the angle's error, the usual size of
 ln kappa, and t of every patch.
 
@@ -47,12 +48,12 @@ LIBRARY_SHARE = (0.05, 0.95)
 """Range of the share of a scene's patches that are of the library's materials; the scene tells it."""
 MOVED, MOVED_STD = 0.1, 0.025
 """Probability that the mount has moved since its leakage was measured, and the leakage's error then: 1 to 3 degrees."""
-TURN, TURN_STD = -1.0, 0.25
-"""Leakage by a plate's rise across the plane of incidence, for the published rig: between sin(theta) = 0.82 and 1.03 as
-an independent generator of its fields has it; a transmitter turned to the other side has the other sign."""
-UNEVEN_LIGHT, EVEN_LIGHT = (1.0, 4.0), (0.3, 0.7)
+TURN, TURN_STD = -0.82, 0.1
+"""Leakage by a plate's rise across the plane of incidence: -sin(theta) for the published rig, with a tenth for antennas
+whose polarisation turns off axis. A transmitter that is turned to the other side has the other sign."""
+UNEVEN_LIGHT, EVEN_LIGHT = (1.0, 1.0), (0.3, 0.5)
 """Change of ln(V / H) per radian of rise, along x and across, by the patterns of boards that see the plate from other
-points: without and with the correction of the plate's illumination."""
+points: without and with the correction of the plate's illumination. The independent generator has 0.6 along x."""
 LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
@@ -314,14 +315,18 @@ class _Scene:
     def leakage_of_patches(self, z: Real) -> tuple[Complex, Complex]:
         """Return a and b of each patch as its rise turns the polarisations, [..., patch] each."""
         a, b = self.leakage(z)
-        turned_by = (self.prior.turn + self.prior.turn_std * z[..., 11, None]) * self.rise[:, 1]
+        turned_by = self.turn(z) * self.rise[:, 1]
         return a + turned_by, b - turned_by
+
+    def turn(self, z: Real) -> Real:
+        """Return the turn of the polarisations by a rise across the plane of incidence, [..., 1], per radian."""
+        return self.prior.turn + self.prior.turn_std * z[..., 11, None]
 
     def lighting(self, z: Real) -> Complex:
         """Return the change of ln(V / H) of each patch by its rise relative to the metal's, [..., patch]."""
         along, across = self.prior.lighting_std
         rise = self.rise - np.array(self.prior.metal_rise)
-        by_across = across * (z[..., 12, None] + 0.1j * z[..., 13, None])
+        by_across = across * (z[..., 12, None] + 0.1j * z[..., 13, None]) - 4 * self.turn(z)
         return along * z[..., 14, None] * rise[:, 0] + by_across * rise[:, 1]
 
     def angle(self, z: Real) -> Real:

@@ -52,11 +52,12 @@ class TruthPlate:
 def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
     """Return the plates in the content of truth.json: name, centre_mm, size_mm, and permittivity or metal each.
 
-    Raises DataError if the content is invalid.
+    What is marked as background, such as a table, is left out: nobody asks for its name. Raises DataError if the
+    content is invalid.
     """
     try:
-        return tuple(_plate(p) for p in truth["plates"])
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as e:
+        return tuple(_plate(p) for p in truth["plates"] if not p.get("background", False))
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError, OverflowError) as e:
         raise DataError(
             f"the content of the truth file is invalid: {type(e).__name__}: {e}",
             "expected plates = [{name, centre_mm, size_mm, permittivity or metal}]",

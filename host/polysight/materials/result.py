@@ -141,6 +141,8 @@ class MaterialsResult:
         Drift of V / H over the scan at the plates, which is removed; None if it is not known.
     halo
         Amplitude of V around the metal beyond what H has there, relative to the metal.
+    behind
+        Usual error of each part of ln(V / H) by what lies behind the plates; it is in their error bars.
     """
 
     calibrated: Images
@@ -163,6 +165,7 @@ class MaterialsResult:
     apart_mm: tuple[float, float] = (0.0, 0.0)
     drift: CommonChange | None = None
     halo: float = 0.0
+    behind: float = 0.0
 
     def rows(self) -> list[PatchFigures]:
         """Return the figures of each patch, for materials.json."""

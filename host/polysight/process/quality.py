@@ -38,6 +38,7 @@ from polysight.results import (
     ScanQuality,
     Verdict,
     apart_reasons,
+    background_reasons,
     brightness_reasons,
     copies_reasons,
     direct_path_reasons,
@@ -409,6 +410,7 @@ def scene_reasons(found: MaterialsResult, plane: PlaneEstimate | None, classifie
         change = found.drift.value
         reasons += drift_reasons(float(np.abs(change.real).max()), float(np.abs(change.imag).max()))
     reasons += halo_reasons(found.halo)
+    reasons += background_reasons(found.behind)
     reasons += passivity_reasons(gaining)
     metal = found.metal
     if found.patches and metal.evidence is not None:

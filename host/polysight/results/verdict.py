@@ -134,6 +134,8 @@ DRIFT_CARE = 0.03
 """Drift of ln(V / H) between plates above which the result needs care, each part."""
 HALO_CARE = 0.005
 """Halo of V around the metal above which a receiver is overdriven."""
+BACKGROUND_CARE = 0.04
+"""Error of P by what lies behind the plates: about 3 % of a permittivity."""
 PLATE_ACROSS_DEG = 0.5
 """Tilt of a plate across the plane of incidence; turns the polarisation by 0.4 degrees: 3 to 6 % of a permittivity."""
 BRIGHTNESS_CARE = 0.2
@@ -460,6 +462,17 @@ def halo_reasons(level: float) -> list[Finding]:
         "care", f"V has a halo around the metal, {20 * np.log10(level):.0f} dB, that H does not have",
         "the receiver of V is overdriven (clipping): the metal's V is too weak, its neighbours are disturbed",
         "lower the gain of the receivers (rx_gain_db), or use a smaller piece of metal", 4.2,
+    )]  # fmt: skip
+
+
+def background_reasons(relative_std: float) -> list[Finding]:
+    """Judge what lies behind the plates: the error of each part of ln(V / H) that it makes in the usual patch."""
+    if not is_known(relative_std) or relative_std <= BACKGROUND_CARE:
+        return []
+    return [reason(
+        "care", f"what lies behind the plates disturbs P by {100 * relative_std:.0f} %, which the error bars contain",
+        "a table, a wall or a holder behind them returns waves too, and they add to those of the plates",
+        "cover it with absorber, or move it 300 mm away from the plates", 2.9,
     )]  # fmt: skip
 
 

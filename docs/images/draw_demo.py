@@ -17,6 +17,10 @@ SHOWN_DB = {"H, s-polarised": (-35, 0), "V, p-polarised": (-35, 0), "P = H / V":
 REACH_MM = 98.0
 
 
+def _loss(permittivity: dict[str, float]) -> str:
+    return f"loss {-permittivity['imag']:.1f} ± {permittivity['imag_std']:.1f}"
+
+
 def draw(products: Path, to: Path) -> None:
     """Both channels and their ratio in dB, and what each patch was named, with its relative permittivity."""
     image = np.load(products / "image.npz", allow_pickle=False)
@@ -39,17 +43,15 @@ def draw(products: Path, to: Path) -> None:
         bar.set_label("dB", fontsize=12, color=MUTED)
         ax.set_title(title, fontsize=19, color=INK, fontweight="bold", loc="left")
         ax.set_facecolor("#d9dce3")
-    for n, part in enumerate(sorted(materials["segments"], key=lambda s: s["name"] or "")):
-        axes[3].add_patch(Polygon(part["outline_mm"], facecolor=PALETTE[n] + "99", edgecolor=INK, linewidth=1.2))
+    names = sorted({part["name"] or "" for part in materials["segments"]})
+    for part in materials["segments"]:
+        colour = PALETTE[names.index(part["name"] or "")]
+        axes[3].add_patch(Polygon(part["outline_mm"], facecolor=colour + "99", edgecolor=INK, linewidth=1.2))
         x0, y0, x1, y1 = part["box_mm"]
         words = (part["name"] or "metal").split(" (")[0].replace(" ", "\n", 1)
         eps = part["permittivity"]
-        told = (
-            "reference"
-            if eps is None
-            else f"{eps['real']:.2f} {'−' if eps['imag'] < 0 else '+'} {abs(eps['imag']):.2f}j"
-        )
-        for text, size, lift in ((words, 14, 6), (told, 10.5, -13)):
+        told = "reference" if eps is None else f"{eps['real']:.1f} ± {eps['real_std']:.1f}\n{_loss(eps)}"
+        for text, size, lift in ((words, 14, 8), (told, 10.5, -13)):
             axes[3].text(
                 (x0 + x1) / 2, (y0 + y1) / 2 + lift, text, ha="center", va="center", fontsize=size, color=INK,
                 linespacing=0.95, path_effects=[withStroke(linewidth=3, foreground="white")],

@@ -467,9 +467,9 @@ def _add_simulated(add: Add) -> None:
     sub.add_argument(
         "--scene",
         type=Path,
-        default=packaged(Path("examples/nine-materials.toml")),
+        default=packaged(Path("examples/demo.toml")),
         metavar="FILE",
-        help="scene file (default: nine materials)",
+        help="scene file (default: nine plates on a table, as in a lab)",
     )
     sub.add_argument("--time-scale", type=positive, metavar="X", help="simulated seconds per second (default: 40)")
     add_config_option(sub, shipped=True)

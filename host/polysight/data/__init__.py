@@ -14,7 +14,7 @@ FOLDER = _PACKAGE if (_PACKAGE / "instrument.toml").exists() else _REPOSITORY
 def packaged(path: Path) -> Path:
     """`path` where it exists; otherwise the file or folder of that name that comes with the package, if there is one.
 
-    So `instrument.toml` and `examples/nine-materials.toml` are found from any folder, and a file of one's own comes
+    So `instrument.toml` and `examples/demo.toml` are found from any folder, and a file of one's own comes
     first.
     """
     ours = FOLDER / path

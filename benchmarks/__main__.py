@@ -21,6 +21,7 @@ NAMES = (
     "layers",
     "picture",
     "worlds",
+    "shapes",
     "pi",
 )
 

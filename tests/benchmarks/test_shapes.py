@@ -1,0 +1,50 @@
+"""The benchmark of surfaces judges what it says, on one small scan of a drawn object."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+import pytest
+from benchmarks import shapes
+from benchmarks.shapes import ObjectFigures, angles_deg, judge_object, line_of, squared_distances
+
+SMALL_GRID = (64, 44)
+
+
+@pytest.mark.slow
+def test_a_drawn_sphere_is_found_where_it_is():
+    figures = judge_object("sphere", 100, "none", SMALL_GRID)
+    assert figures.points > 10
+    assert figures.stray <= 0.05 * figures.points
+    assert figures.normal_deg is not None
+    assert figures.normal_deg < 0.5
+    assert figures.point_mm is not None
+    assert figures.point_mm < 0.5
+    assert figures.error is not None or figures.reason
+
+
+def test_distances_in_regions_and_angles_are_those_of_their_definitions():
+    away = np.array([3 + 4j, 0.1j])
+    covariances = np.array([np.eye(2), np.diag([1.0, 0.01])])
+    assert squared_distances(away, covariances) == pytest.approx([25, 1])
+    turned = np.array([[0.0, np.sin(0.01), np.cos(0.01)]])
+    assert angles_deg(turned, np.array([[0.0, 0.0, 1.0]])) == pytest.approx(np.degrees(0.01))
+
+
+def test_every_option_has_a_default_and_every_kind_a_line():
+    parser = argparse.ArgumentParser()
+    shapes.add_arguments(parser)
+    options = parser.parse_args([])
+    for kind in options.kinds.split(","):
+        seen = ObjectFigures(
+            kind=kind,
+            seed=1,
+            disturbance="none",
+            true_real=4.0,
+            true_loss=0.4,
+            radius_mm=100.0,
+            points=0,
+            stray=0,
+        )
+        assert line_of(kind, [seen], shapes.MUST_HOLD.get(kind)).startswith(kind)

@@ -22,6 +22,7 @@ import scipy
 
 from polysight.imaging import UNKNOWN_PLANE, Antennas, Illumination, Images, illumination_geometry
 from polysight.materials import (
+    NOT_PASSIVE,
     Labels,
     MaterialsResult,
     Optics,
@@ -384,9 +385,17 @@ BETTER_SIGN = 1.0
 
 
 def fits_better(one: MaterialsResult, other: MaterialsResult) -> bool:
-    """Return true if the patches of one result are clearly more plausible materials beside the metal reference."""
+    """Return true if the patches of one result are clearly more plausible materials beside the metal reference.
+
+    Fewer patches that would amplify decide, then the evidence of the metal reference.
+    """
     if one.metal.evidence is None or other.metal.evidence is None:
         return False
+    amplifying, amplifying_other = (
+        sum(p.refused is not None and p.refused.what in NOT_PASSIVE for p in result.patches) for result in (one, other)
+    )
+    if amplifying != amplifying_other:
+        return amplifying < amplifying_other
     return one.metal.evidence.score > other.metal.evidence.score + BETTER_SIGN
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -268,8 +269,12 @@ def run(args: argparse.Namespace) -> int:
     kinds, disturbances = args.kinds.split(","), args.disturbances.split(",")
     grid = args.columns, args.rows
     jobs = [(kind, seed, name, grid) for name in disturbances for seed in seeds for kind in kinds]
+    figures = []
     with ProcessPoolExecutor(args.jobs) as pool:
-        figures = list(pool.map(_judge, jobs))
+        for judged in pool.map(_judge, jobs):
+            figures.append(judged)
+            said = "no permittivity" if judged.error is None else f"permittivity within {100 * judged.error:.1f} %"
+            print(f"{judged.kind} {judged.seed}, {judged.disturbance}: {judged.points} points, {said}", file=sys.stderr)
     print(__doc__)
     print(f"{'kind':<26}{'n':>5}{'normal deg':>16}{'point mm':>16}{'eps %':>16}{'given %':>7}"
           f"{'in 95 %':>9}{'rms z':>8}{'points':>9}{'half %':>9}")  # fmt: skip

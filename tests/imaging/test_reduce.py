@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from polysight.imaging.geometry import Antennas, image_grid
 from polysight.imaging.samples import reduction, scene_gate_m
+from polysight.sync import block_sweep_of
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S as C
 
@@ -46,6 +47,24 @@ def test_the_model_predicts_an_echo_after_the_gate(rig, echo_m):
     gate = reduction(rig.chirp, GATE)
     reduced = gate.matrix @ np.exp(2j * np.pi * _sweep(rig.chirp) * echo_m / C)
     np.testing.assert_allclose(gate.model @ np.exp(2j * np.pi * gate.frequencies_hz * echo_m / C), reduced, atol=1e-4)
+
+
+@pytest.mark.parametrize("gate_m", [GATE, (0.2, 0.9)])
+def test_decimated_samples_give_what_all_samples_give(rig, gate_m):
+    """In the gate, of the direct path, in noise; and echoes from elsewhere are seen as little."""
+    gate, blocks = reduction(rig.chirp, gate_m), block_sweep_of(rig.chirp)
+    every, few = gate.maps(_sweep(rig.chirp)), gate.maps(blocks)
+
+    def off(path_m):
+        turns = 2j * np.pi * path_m / C
+        return np.abs(few @ np.exp(turns * blocks) - every @ np.exp(turns * _sweep(rig.chirp)))
+
+    paths = np.append(np.linspace(*gate_m, 30), 0.0)
+    assert max(off(d).max() for d in paths) < 3e-4
+    level = np.abs(every[:-1] @ np.exp(2j * np.pi * gate_m[0] / C * _sweep(rig.chirp))).max()
+    assert max(off(d)[:-1].max() for d in (1.5, 2.0, 2.5)) < 0.02 * level
+    noise = (np.abs(few) ** 2).sum(axis=1) / 4 / (np.abs(every) ** 2).sum(axis=1)
+    assert noise.max() < 1.1
 
 
 @pytest.mark.parametrize("window", ["hann", "boxcar"])

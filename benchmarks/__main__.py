@@ -22,6 +22,7 @@ NAMES = (
     "picture",
     "worlds",
     "shapes",
+    "foreign",
     "pi",
 )
 

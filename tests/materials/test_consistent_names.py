@@ -7,7 +7,7 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.materials import SIMULATED_LIBRARY, UNKNOWN, Classifier, Library
-from polysight.materials.classify import features_of
+from polysight.materials.result import features_of
 from polysight_shared.error_codes import ErrorCode
 
 ANGLE_DEG = 54.9

@@ -22,9 +22,10 @@ from polysight.materials import (
     read_truth,
 )
 from polysight.materials.analyse import Optics
-from polysight.materials.classify import Weights, features_of, ratio_distance
+from polysight.materials.classify import Weights, ratio_distance
 from polysight.materials.library import FORMAT, majority
 from polysight.materials.measure import median_ratio
+from polysight.materials.result import features_of
 from polysight.polarimetry import fresnel
 from polysight.results import plain
 from polysight_papers.sensys2026.item import table2

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from polysight.materials import MODELS, UNKNOWN, Classifier, Entry, Library, specimens
-from polysight.materials.classify import DISCRIMINANT, add_explanation
+from polysight.materials.classify import DISCRIMINANT
 from polysight.materials.library import Samples, SceneErrors, feature_matrix
+from polysight.materials.names import add_explanation
 from polysight.materials.specimens import (
     PUBLISHED_SPREAD,
     cost_of_none,
@@ -180,7 +181,10 @@ def test_only_what_gives_probabilities_says_that_nothing_else_comes_near(model):
     classifier = Classifier(entries(samples), model=model, angles_deg=[60.0])
     test = drawn((0.0, 0.0), 1, 4)
     named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
-    whys = [add_explanation(n, eps, None, classifier).verdict.why for n, eps in zip(named, KINDS.values(), strict=True)]
+    whys = [
+        add_explanation(n, eps, None, classifier.permittivities).verdict.why
+        for n, eps in zip(named, KINDS.values(), strict=True)
+    ]
     assert all(n.verdict.name in why for n, why in zip(named, whys, strict=True))
     assert any("no other material" in why for why in whys) == (model == "discriminant")
 
@@ -194,4 +198,4 @@ def test_a_patch_that_no_material_looks_like_is_told_with_the_nearest():
     for n, eps in zip(named, (7.5 - 0.05j, 9.4 - 18j), strict=True):
         assert n.verdict.name == UNKNOWN
         assert n.verdict.nearest in known
-        assert f"nearest: {n.verdict.nearest}" in add_explanation(n, eps, None, classifier).verdict.why
+        assert f"nearest: {n.verdict.nearest}" in add_explanation(n, eps, None, classifier.permittivities).verdict.why

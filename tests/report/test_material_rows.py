@@ -13,7 +13,8 @@ from polysight.imaging import Images
 from polysight.products import write_image, write_json
 
 PATCH = {
-    "label": 4, "name": 'PET, "0.5 mm"', "confidence": 0.75, "metal_reference": False, "metal_like": True,
+    "label": 4, "name": 'PET, "0.5 mm"', "name_source": "library",
+    "confidence": 0.75, "metal_reference": False, "metal_like": True,
     "box_mm": [10.0, -20.0, 50.0, 40.0], "outline_mm": [], "pixels": 99, "interior_pixels": 77, "incidence_deg": 54.5,
     "ratio": {"real": 0.0, "imag": 10.0}, "inverse_ratio_std": 0.004,
     "permittivity": {"real": 1 / 3 + 3.5, "imag": -0.25, "real_std": 0.0625, "imag_std": 0.125,
@@ -29,6 +30,7 @@ METAL = {
 EXPECTED = {
     "patch": [4, 5],
     "name": ['PET, "0.5 mm"', None],
+    "name_source": ["library", None],
     "confidence": [0.75, None],
     "metal_reference": [False, True],
     "metal_like": [True, False],

@@ -3,10 +3,11 @@
 `analyse` takes the images, the `Optics` and known facts of the scene (`KnownScene`, the metal reference among them); it
 returns a `MaterialsResult`. On the way: `segment.py` finds patches, `measure.py` measures
 them, `metal.py` finds and judges the metal reference, `inversion.py` solves for all permittivities and the rig's errors
-together, `kinds.py` says what a patch may be, `classify.py` names patches by a `Library`; `discriminant.py` holds the
-materials' distributions, and names scans of several angles. `sub_bands.py` and `layers.py` fit thin layers.
-`make_library` makes a library of scans, `fit_concentration` a line through solutions. `labels.py` reads boxes with
-names and true plates, `catalogue.py` the permittivities of the literature, `train.py` the published data set.
+together, `kinds.py` says what a patch may be, `names.py` names it, `classify.py` holds the library's models;
+`discriminant.py` has the materials' distributions, and names scans of several angles. `sub_bands.py` and `layers.py`
+fit thin layers. `make_library` makes a library of scans, `fit_concentration` a line through solutions. `labels.py`
+reads boxes with names and true plates, `catalogue.py` the permittivities of the literature, `train.py` the published
+data set.
 """
 
 from polysight.materials.analyse import (
@@ -32,10 +33,7 @@ from polysight.materials.classify import (
     MODELS,
     PAPER,
     SHORT,
-    UNKNOWN,
     Classifier,
-    NamedPatch,
-    PatchName,
     classifier_sentence,
 )
 from polysight.materials.copies import Copies, find_copies
@@ -77,6 +75,7 @@ from polysight.materials.library import (
     feature_matrix,
 )
 from polysight.materials.measure import NOT_PASSIVE, Permittivity, estimate_permittivity, format_permittivity
+from polysight.materials.names import LAYER, UNKNOWN, NamedPatch, PatchName
 from polysight.materials.result import (
     PATCHES,
     MatchedPatch,
@@ -125,6 +124,7 @@ __all__ = [
     "CATALOGUE",
     "CHANNELS",
     "DISCRIMINANT",
+    "LAYER",
     "LAYER_FORMS",
     "METAL",
     "METALS",

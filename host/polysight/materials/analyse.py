@@ -14,32 +14,26 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise, correct_tilt
-from polysight.materials.classify import (
-    DISCRIMINANT,
-    UNKNOWN,
-    Classifier,
-    NamedPatch,
-    add_explanation,
-    features_of,
-    name_patch,
-)
+from polysight.materials.classify import DISCRIMINANT, Classifier
 from polysight.materials.inversion import (
     EVEN_LIGHT,
     MOVED,
     UNEVEN_LIGHT,
     Inversion,
+    PatchEstimate,
     PatchMeasurement,
     RigPrior,
     at_angle,
     invert,
 )
-from polysight.materials.kinds import Kinds, literature
+from polysight.materials.kinds import Kinds, literature, weigh_kinds
 from polysight.materials.labels import TruthPlate, match_truth
 from polysight.materials.library import SceneErrors
 from polysight.materials.measure import (
     AMPLIFIES,
     BELOW_AIR,
     LEAST_STD,
+    POSSIBLE_LAYER,
     CommonChange,
     Permittivity,
     Scatter,
@@ -65,7 +59,8 @@ from polysight.materials.metal import (
     metal_in_box,
     no_metal,
 )
-from polysight.materials.result import MaterialsResult, PatchResult, Tilts
+from polysight.materials.names import UNKNOWN, NamedPatch, add_explanation, name_patch
+from polysight.materials.result import MaterialsResult, PatchResult, Tilts, features_of
 from polysight.materials.segment import Box, Patch, Segmentation, SegmentSettings, align, axis_mm, segment, whole_plane
 from polysight.materials.specimens import features, relative, softened
 from polysight.polarimetry import (
@@ -200,6 +195,13 @@ STEEP = Finding(
 HALO_OF_METAL, HALO_OF_PATCH = 4.0, 3.0
 """Error of the metal's V / H, and of V on a plate, over the halo of V around them: clipped scenes of an independent
 generator (by 10 to 50 %)."""
+THIN = Finding(
+    "error",
+    POSSIBLE_LAYER,
+    "its V / H is that of a thin plate, which reflects at both faces, rather than of any half space",
+    "fit it as a layer: `polysight process --bands 5`, then `polysight permittivity --layer NAME,?,?`",
+)
+"""Why a possible layer gets no permittivity."""
 FILLED = 0.1
 """Least |H| relative to metal at which an image without edges counts as filled with one material."""
 ACTIVE = 2.0
@@ -237,7 +239,7 @@ def analyse(
     if plane is None:
         channel = _channel_ratio(images, reference) if prior.channels_known else None
         others = dict(zip([p.label for p in judged], measured, strict=True))
-        evidence = metal_evidence(others, prior, channel, _kinds(None, float(np.mean(theta))))
+        evidence = metal_evidence(others, prior, channel, Kinds(literature(), float(np.mean(theta))))
         reference = replace(reference, evidence=evidence)
     inversion = invert(measured, prior, kinds)
     # Of the pixels only leakage is removed that is known: an undetermined estimate leans on what the patches may be.
@@ -251,7 +253,7 @@ def analyse(
         p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _angle(theta, p), estimates.get(p.label))
         for p in found.patches
     }
-    refused |= {label: why for label, e in patches.items() if (why := _no_material(e)) is not None}
+    refused |= _impossible(patches, estimates, kinds)
     errors = scene_errors(inversion, prior, measured) if judged else None
     named = _names(classifier, kinds, (sh, sv, sp), inversion, judged, theta)
     truth = match_truth(found.patches, known.plates)
@@ -380,8 +382,8 @@ class Seen:
 def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
     """Return what the patches may be: the library's materials at the library's angle, if there is one, and others."""
     if classifier is None or len(classifier.angles_deg) != 1:
-        return Kinds(literature(), theta_rad)
-    return Kinds(classifier.kinds, float(np.radians(classifier.angles_deg[0])))
+        return Kinds(literature(), theta_rad, sheets=True)
+    return Kinds(classifier.kinds, float(np.radians(classifier.angles_deg[0])), sheets=True)
 
 
 def _names(
@@ -404,10 +406,13 @@ def _names(
         angle = _angle(theta, patch) + inversion.theta_error_rad
         inverse = at_angle(corrected / p[at].astype(np.complex128), angle, kinds.theta_rad)
         if classifier.model == DISCRIMINANT:
-            name = name_patch(kinds, estimate, inverse)
+            seen = () if estimate.evidence is None else (estimate.evidence,)
+            name = name_patch((kinds,), seen, inverse[:, None])
         else:
             (name,) = classifier.scan([features_of(np.abs(h[at]), np.abs(v[at]), 1 / inverse)])
-        named[patch.label] = add_explanation(name, estimate.permittivity, estimate.covariance, classifier)
+        named[patch.label] = add_explanation(
+            name, estimate.permittivity, estimate.covariance, classifier.permittivities
+        )
     return named
 
 
@@ -422,6 +427,19 @@ def _no_material(e: Permittivity) -> Finding | None:
     if e.value.real < 1 - ACTIVE * e.real_std - 0.02:
         return Finding("error", BELOW_AIR, why, remedy)
     return None
+
+
+def _impossible(
+    patches: Mapping[int, Permittivity], estimates: Mapping[int, PatchEstimate], kinds: Kinds
+) -> dict[int, Finding]:
+    """Return why patches are no half spaces: an impossible permittivity, or rather a thin plate."""
+    thin = {label: THIN for label, e in estimates.items() if _is_thin(e, kinds)}
+    return thin | {label: why for label, e in patches.items() if (why := _no_material(e)) is not None}
+
+
+def _is_thin(estimate: PatchEstimate, kinds: Kinds) -> bool:
+    """True if a patch is rather a thin plate than a half space."""
+    return estimate.evidence is not None and weigh_kinds((kinds,), (estimate.evidence,)).sheet > 0.5
 
 
 def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:

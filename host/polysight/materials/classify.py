@@ -1,7 +1,7 @@
 """Name the pixels and patches of a scan by a reference library; the paper's classifier.
 
 `MODELS` lists the models: the paper's KNN and the discriminant of error sources. `Classifier` uses the library's model,
-or the requested one. `add_explanation` gives the reason of a name.
+or the requested one.
 
 `PaperKnn` is the paper's weighted k-nearest-neighbour classifier on |H|, |V| and complex P (section 6.3). The distance
 of two pixels is lambda_H |d|H|| + lambda_V |d|V|| + lambda_P d_P, summed over the incidence angles. The paper uses |dP|
@@ -20,7 +20,7 @@ nearest neighbour exists for every patch; unknown patches are recognised by the 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from typing import Any, Literal, get_args
@@ -29,8 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.materials.discriminant import ErrorDiscriminant
-from polysight.materials.inversion import PatchEstimate
-from polysight.materials.kinds import Kind, Kinds, literature, pair
+from polysight.materials.kinds import Kind, literature
 from polysight.materials.library import (
     Library,
     Model,
@@ -39,11 +38,10 @@ from polysight.materials.library import (
     Samples,
     SceneErrors,
     by_angle,
-    feature_matrix,
     majority,
     usable,
 )
-from polysight.materials.measure import format_permittivity
+from polysight.materials.names import INCLUSIONS, LIKELY, UNKNOWN, NamedPatch, PatchName
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -310,66 +308,12 @@ EARLIER = (
     "quadratic discriminant",
 )
 """Names of models in earlier releases and their libraries: the discriminant replaces them."""
-UNKNOWN = "unknown"
-INCLUSIONS = 0.05
-"""Share of a patch's pixels that may be of another material; a pixel's prior is its patch's name otherwise."""
-LIKELY = 0.005
-"""Materials of less probability are not listed."""
-REGION_99 = 9.21
-"""Chi-square of two degrees of freedom that 1 % exceed."""
 
 
 MODELS: dict[str, Callable[[str], Model]] = {
     PAPER: PaperKnn,
     DISCRIMINANT: ErrorDiscriminant,
 }
-
-
-@dataclass(frozen=True)
-class PatchName:
-    """Name of one patch, with its confidence and reason.
-
-    Attributes
-    ----------
-    name
-        Material, or "unknown".
-    confidence
-        Probability of that name; for the KNN the share of its pixels.
-    votes
-        Share of the pixels with each name, largest first.
-    distance
-        Distance to the material, in units of its threshold: above 1 is unknown.
-    pixels
-        Usable pixels.
-    probabilities
-        Of each likely material and of "unknown", largest first; empty for models without probabilities.
-    why
-        Reason of the name in one sentence (:func:`add_explanation`); empty if permittivities are not known.
-    nearest
-        The likeliest material, also of an unknown patch; None without usable pixels.
-    """
-
-    name: str
-    confidence: float
-    votes: dict[str, float]
-    distance: float
-    pixels: int
-    probabilities: dict[str, float] = field(default_factory=dict)
-    why: str = ""
-    nearest: str | None = None
-
-
-@dataclass(frozen=True)
-class NamedPatch:
-    """Names of a patch's pixels [n], their distances over the threshold [n], and the patch's verdict.
-
-    `confidence` [n]: probability of each pixel's likeliest material, 0 for unusable pixels; None: the model gives none.
-    """
-
-    names: npt.NDArray[np.str_]
-    distance: Real
-    verdict: PatchName
-    confidence: Real | None = None
 
 
 class Classifier:
@@ -502,84 +446,6 @@ class Classifier:
         return NamedPatch(every, relative, replace(name, votes=votes, pixels=int(good.sum())))
 
 
-def name_patch(kinds: Kinds, estimate: PatchEstimate, inverse_ratios: npt.NDArray[np.complex128]) -> NamedPatch:
-    """Name a patch and its pixels from the joint inversion.
-
-    The patch's name is the kind of the largest probability; a material of the library whose value lies outside the
-    patch's own 99 % region (errors and specimens together) is never the name. A pixel is, but for `INCLUSIONS`, of its
-    patch's material.
-
-    Parameters
-    ----------
-    kinds
-        What patches may be.
-    estimate
-        The patch, with the probabilities of these kinds.
-    inverse_ratios
-        complex [n]: V / H of the pixels at the kinds' angle, NaN where not usable.
-    """
-    good = np.isfinite(inverse_ratios)
-    if estimate.kinds is None or not good.any():
-        return NamedPatch(
-            np.full(good.size, UNKNOWN), np.full(good.size, np.inf), PatchName(UNKNOWN, 0.0, {}, np.inf, 0)
-        )
-    middle = complex(np.median(inverse_ratios[good].real), np.median(inverse_ratios[good].imag))
-    inverse = np.linalg.inv(kinds.covariance + estimate.inverse_ratio_covariance)
-    off = pair(middle - kinds.t)
-    distance = np.sqrt(np.einsum("ki,kij,kj->k", off, inverse, off) / REGION_99)
-    probability = np.where(distance <= 1, estimate.kinds[:-1], 0.0)
-    ours = kinds.ours
-    names = np.array(kinds.names)
-    nearest = int(np.argmin(np.where(ours, distance, np.inf)))
-    none = 1 - float(probability[ours].sum())
-    best = int(np.argmax(np.where(ours, probability, -1.0)))
-    likely = {str(names[k]): round(float(probability[k]), 4) for k in np.flatnonzero(ours & (probability >= LIKELY))}
-    likely[UNKNOWN] = round(none, 4)
-    name, confidence, of = str(names[best]), float(probability[best]), best
-    if confidence <= none:
-        name, confidence, of = UNKNOWN, none, nearest
-    verdict = PatchName(
-        name,
-        confidence,
-        {},
-        float(distance[of]),
-        int(good.sum()),
-        dict(sorted(likely.items(), key=lambda item: -item[1])),
-        nearest=str(names[nearest]),
-    )
-    pixel_names, far, sure = _name_pixels(kinds, estimate, inverse_ratios, np.where(ours, probability, 0.0))
-    count = dict(zip(*np.unique(pixel_names, return_counts=True), strict=True))
-    votes = {str(n): int(c) / pixel_names.size for n, c in sorted(count.items(), key=lambda i: (-i[1], i[0]))}
-    return NamedPatch(pixel_names, far, replace(verdict, votes=votes), sure)
-
-
-def _name_pixels(
-    kinds: Kinds, estimate: PatchEstimate, t: npt.NDArray[np.complex128], of_patch: Real
-) -> tuple[npt.NDArray, Real, Real]:
-    """Return name, distance over the threshold, and probability of the name of each pixel, [n] each."""
-    good = np.isfinite(t)
-    ours = kinds.ours
-    pixel = np.cov(pair(t[good]).T) if good.sum() > 2 else np.zeros((2, 2))
-    both = kinds.covariance[ours] + estimate.inverse_ratio_covariance + pixel
-    inverse = np.linalg.inv(both)
-    off = pair(np.where(good, t, 0)[:, None] - kinds.t[ours])
-    distance2 = np.einsum("nki,kij,nkj->nk", off, inverse, off)
-    prior = (1 - INCLUSIONS) * of_patch[ours] + INCLUSIONS / ours.sum()
-    likelihood = prior * np.sqrt(np.linalg.det(inverse)) * np.exp(-0.5 * np.minimum(distance2, 1400))
-    best = likelihood.argmax(axis=1)
-    row = np.arange(t.size)
-    far = np.where(good, np.sqrt(distance2[row, best] / REGION_99), np.inf)
-    share = likelihood[row, best] / np.maximum(likelihood.sum(axis=1), 1e-300)
-    names = np.where(far <= 1, np.array(kinds.names)[ours][best], UNKNOWN)
-    return names, far, np.where(good, share * min(1.0, float(of_patch.sum()) + INCLUSIONS), 0.0)
-
-
-def features_of(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
-    """Return features [n, 4] of pixels; not finite for unusable pixels."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return feature_matrix(np.ravel(h), np.ravel(v), np.ravel(p))
-
-
 def _model_name(given: str) -> str:
     name = DISCRIMINANT if given in EARLIER else SHORT.get(given, given)
     if name not in MODELS:
@@ -588,43 +454,6 @@ def _model_name(given: str) -> str:
             f"one of {', '.join(SHORT)}", code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     return name
-
-
-def add_explanation(
-    named: NamedPatch, permittivity: complex | None, covariance: npt.NDArray[np.float64] | None, classifier: Classifier
-) -> NamedPatch:
-    """Return the patch with the reason of its name, one sentence for a reader who knows materials.
-
-    `permittivity` is eps' - j eps'' of the patch, `covariance` [2, 2] that of its real and imaginary part; None if it
-    has none. The classifier gives the library's permittivities.
-    """
-    name = named.verdict
-    known, found = classifier.permittivities, _estimate(permittivity, covariance)
-    nearest = name.name if name.name != UNKNOWN else name.nearest
-    like = "" if nearest is None else _with_permittivity(nearest, known.get(nearest))
-    if name.name == UNKNOWN:
-        near = f"; nearest: {like}" if like else ""
-        why = f"not in the library: {found}{near}" if found else f"not in the library{near}"
-    else:
-        others = [f"{n} {100 * p:.0f} %" for n, p in name.probabilities.items() if n not in (name.name, UNKNOWN)][:2]
-        match = f"{found} matches the library's {like}" if found else f"it looks like the library's {like}"
-        alone = "; no other material is likely" if name.probabilities else ""  # the KNN has no probabilities
-        why = match + (f"; it could also be {' or '.join(others)}" if others else alone)
-    return replace(named, verdict=replace(name, why=why))
-
-
-def _estimate(permittivity: complex | None, covariance: npt.NDArray[np.float64] | None) -> str:
-    if permittivity is None:
-        return ""
-    text = f"permittivity {format_permittivity(permittivity)}"
-    if covariance is None or not np.isfinite(covariance).all():
-        return text
-    real, loss = np.sqrt(np.diag(covariance))
-    return f"{text} (+- {real:.2f}, {loss:.2f})"
-
-
-def _with_permittivity(name: str, permittivity: complex | None) -> str:
-    return name if permittivity is None else f"{name} ({format_permittivity(permittivity)})"
 
 
 def classifier_sentence(classifier: Classifier) -> str:

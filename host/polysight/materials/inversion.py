@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.materials.kinds import DensityMap, Kinds, pair, turned
+from polysight.materials.kinds import DensityMap, Kinds, RatioEvidence, pair, turned
 from polysight.materials.specimens import METAL_WITHOUT_BRIGHTNESS, METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import permittivity_from_ratio
 
@@ -163,8 +163,8 @@ class PatchEstimate:
         float64 [2, 2] of its real and its imaginary part; None if metal-like.
     shares
         Source to its share of the covariance's trace; the sum is 1.
-    kinds
-        float64 [kind + 1]: probability of each of the kinds, and last of any other material; None without kinds.
+    evidence
+        What its name rests on; None without kinds.
     """
 
     inverse_ratio: complex
@@ -172,7 +172,7 @@ class PatchEstimate:
     permittivity: complex | None
     covariance: Real | None
     shares: Mapping[str, float]
-    kinds: Real | None = None
+    evidence: RatioEvidence | None = None
 
     @property
     def dominated_by(self) -> str | None:
@@ -475,10 +475,10 @@ def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> Patch
     t = model.ratios(z)[:, i]
     middle = complex(t.mean())
     of_ratio = np.cov(pair(t).T) + model.own[i]
-    kinds = None if model.kinds is None else _probabilities(model, model.kinds, z, i)
+    evidence = None if model.kinds is None else _evidence(model, model.kinds, z, i)
     distance = min(abs(middle - 1), abs(1 / middle - 1) if middle else np.inf)
     if not distance >= max(METAL_WITHOUT_PERMITTIVITY, LEAST_DISTANCE * np.sqrt(np.trace(of_ratio) / 2)):
-        return PatchEstimate(middle, of_ratio, None, None, {}, kinds)
+        return PatchEstimate(middle, of_ratio, None, None, {}, evidence)
     theta = float(model.angle(z)[:, i].mean())
     value = complex(permittivity_from_ratio(middle, theta))
     noise = rng.multivariate_normal(np.zeros(2), model.own[i], (_DRAWS, len(z)), method="cholesky")
@@ -489,7 +489,7 @@ def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> Patch
     kept = np.einsum("...i,ij,...j->...", off, np.linalg.inv(of_ratio), off) < 11.8
     parts = pair(drawn[kept] - value)
     covariance = np.asarray(parts.T @ parts / len(parts), np.float64)
-    return PatchEstimate(middle, of_ratio, value, covariance, _shares(model, z, i, value), kinds)
+    return PatchEstimate(middle, of_ratio, value, covariance, _shares(model, z, i, value), evidence)
 
 
 def _shares(model: _Scene, z: Real, i: int, value: complex) -> dict[str, float]:
@@ -506,16 +506,11 @@ def _shares(model: _Scene, z: Real, i: int, value: complex) -> dict[str, float]:
     return {source: out[source] / total for source in SOURCES} if np.isfinite(total) and total > 0 else {}
 
 
-def _probabilities(model: _Scene, kinds: Kinds, z: Real, i: int) -> Real:
-    """Return the probability of each kind, and last of any other material, [kind + 1]."""
-    each, other = kinds.densities(model.ratios_of_kinds(z, kinds)[:, i], model.own[i])
-    ours = model.library_share(z)
-    each = each * np.where(kinds.ours, ours[:, None], 1 - ours[:, None])
-    weights = np.append(each.mean(axis=0), ((1 - ours) * other).mean())
-    total = float(weights.sum())
-    if not total > 0:
-        return np.append(np.zeros(len(each[0])), 1.0)
-    return weights / total
+def _evidence(model: _Scene, kinds: Kinds, z: Real, i: int) -> RatioEvidence:
+    """Return what the scene says of a patch's ratio at the angle of the kinds."""
+    t = model.ratios_of_kinds(z, kinds)[:, i]
+    covariance = np.cov(pair(t).T) + model.own[i]
+    return RatioEvidence(kinds.theta_rad, complex(t.mean()), covariance, float(model.library_share(z).mean()))
 
 
 def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -17,21 +18,31 @@ import scipy
 
 from polysight.materials.catalogue import load_catalogue, same_material
 from polysight.materials.specimens import LOSS_RANGE, PUBLISHED_SPREAD, REAL_RANGE, SOFT_LOSS
-from polysight.polarimetry import permittivity_from_ratio, ratio_from_permittivity
+from polysight.polarimetry import multilayer, permittivity_from_ratio, ratio_from_permittivity
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 Source = Literal["library", "literature"]
 
 LITERATURE_SHARE = 0.7
-"""Share of the literature in the patches that are none of the library's materials; the others are any half space."""
+"""Share of the literature in thick plates that are none of the library's materials; others are any half space."""
 METAL_SHARE = 0.1
 """Share of metal in these patches."""
+SHEET_SHARE = 0.15
+"""Share of thin plates, which reflect at both faces, in the patches that are none of the library's materials."""
+SHEET_REAL, SHEET_LOSS_TANGENT, SHEET_MM = (1.5, 8.0), (1e-3, 0.2), (0.2, 6.0)
+"""Permittivities and thicknesses of thin plates; all uniform on logarithmic scales."""
+HOLDER_REAL = (1.0, 2.5)
+"""Permittivity behind a thin plate: air, foam, wood. Half of the plates have air."""
+SHEET_HZ = 78e9
+SHEET_KERNEL = 0.02
+"""Smoothing of the distribution of thin plates, in t."""
 LEAST_LOSS_SPREAD = 0.02
 """Standard deviation of eps'' between specimens of low-loss materials."""
 METAL_SPREAD = 0.01
 """Standard deviation of metal's t: sheets are not perfectly flat."""
 _STEP = 1e-4
+_SHEETS, _HALF_SPACES = 6000, 4000
 
 
 @dataclass(frozen=True)
@@ -42,6 +53,28 @@ class Kind:
     permittivity: complex | None
     spread: tuple[float, float] = PUBLISHED_SPREAD
     source: Source = "library"
+    family: str = ""
+    """Class of a material of the literature: "polymer", "wood"."""
+
+
+@dataclass(frozen=True)
+class RatioEvidence:
+    """What one scan says of a patch, for its name.
+
+    Attributes
+    ----------
+    theta_rad
+        Angle of incidence that the ratio is for.
+    inverse_ratio, covariance
+        t, corrected for all estimated errors; float64 [2, 2] of its real and imaginary part.
+    library_share
+        Expected share of the library's materials in this scan.
+    """
+
+    theta_rad: float
+    inverse_ratio: complex
+    covariance: Real
+    library_share: float
 
 
 def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
@@ -71,42 +104,39 @@ class Kinds:
         The library's and the literature's.
     ours
         bool [kind]: those of the library.
-    t, covariance, share
-        complex [kind], float64 [kind, 2, 2], float64 [kind]: each kind's mean of t, the covariance by its specimens,
-        and its share in the library, or in what is none of the library's.
+    t, effects, covariance, share
+        complex [kind], float64 [kind, 2, 2] twice, float64 [kind]: each kind's mean of t, the effect of the specimens'
+        two deviations on real and imaginary part, the covariance by them, and its share in the library, or in what is
+        none of the library's.
     other
         Share of any other half space in what is none of the library's.
+    sheet_share, sheets
+        Share of thin plates in what is none of the library's (0: plates are thick), and complex [draw]: their t.
     """
 
-    def __init__(self, kinds: Sequence[Kind], theta_rad: float) -> None:
-        self.kinds = (*kinds, Kind("metal", None, source="literature"))
+    def __init__(self, kinds: Sequence[Kind], theta_rad: float, sheets: bool = False) -> None:
+        self.kinds = (*kinds, Kind("metal", None, source="literature", family="metal"))
         self.theta_rad = theta_rad
         self.ours = np.array([kind.source == "library" for kind in self.kinds])
         self.t = np.array([_mean(kind, theta_rad) for kind in self.kinds], np.complex128)
-        self.covariance = np.stack([_covariance(kind, theta_rad) for kind in self.kinds])
-        self.share, self.other = _shares(self.kinds)
+        self.effects = np.stack([_effects(kind, theta_rad) for kind in self.kinds])
+        self.covariance = self.effects @ self.effects.mT + 1e-10 * np.eye(2)
+        self.sheet_share = SHEET_SHARE if sheets else 0.0
+        self.share, self.other = _shares(self.kinds, self.sheet_share)
+        self.sheets = draw_sheets(theta_rad)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Name of each kind."""
         return tuple(kind.name for kind in self.kinds)
 
-    def densities(self, t: Complex, covariance: Real) -> tuple[Real, Real]:
-        """Return share times density of measured ratios t [...] under each kind [..., kind], and as any other [...].
-
-        `covariance` float64 [2, 2] is that of their errors.
-        """
-        off = pair(t[..., None] - self.t)
-        inverse = np.linalg.inv(self.covariance + covariance)
-        distance2 = np.einsum("...ki,kij,...kj->...k", off, inverse, off)
-        scale = self.share * np.sqrt(np.linalg.det(inverse)) / (2 * np.pi)
-        return scale * np.exp(-0.5 * distance2), self.other * self._any_half_space(t, covariance)
-
     def density_map(self, low: complex, high: complex, covariance: Real, cells: int = 96) -> DensityMap:
         """Return the densities of the library's kinds and of all others on a rectangle of t, for quick looking up."""
         real = np.linspace(low.real, high.real, cells)
         imag = np.linspace(low.imag, high.imag, cells)
-        others = self.other * self._any_half_space(real[None, :] + 1j * imag[:, None], covariance)
+        others = self.other * self.any_half_space(real[None, :] + 1j * imag[:, None], covariance)
+        if self.sheet_share:
+            others += self.sheet_share * _histogram(self.sheets, real, imag, covariance)
         density = np.stack([np.zeros_like(others), others])
         both = self.covariance + covariance
         reach = 4.5 * np.sqrt(both[:, (0, 1), (0, 1)])
@@ -122,7 +152,7 @@ class Kinds:
             density[0 if self.ours[k] else 1][window] += scale[k] * np.exp(-0.5 * distance2)
         return DensityMap(low, high, np.log(density + 1e-12))
 
-    def _any_half_space(self, t: Complex, covariance: Real) -> Real:
+    def any_half_space(self, t: Complex, covariance: Real) -> Real:
         """Return the density of t of any half space: ln eps' uniform, eps'' uniform on a scale that ends in a line.
 
         Errors of the measurement soften the border of the passive half spaces: the density there is that of the
@@ -171,7 +201,7 @@ class DensityMap:
 def literature(library: Collection[str] = ()) -> list[Kind]:
     """Return the materials of the catalogue, but for those that a library of these names has measured itself."""
     return [
-        Kind(material.name, material.permittivity, material.spread, "literature")
+        Kind(material.name, material.permittivity, material.spread, "literature", material.kind)
         for material in load_catalogue()
         if not any(same_material(material.name, name) for name in library)
     ]
@@ -183,19 +213,18 @@ def _mean(kind: Kind, theta_rad: float) -> complex:
     return complex(inverse_ratio(kind.permittivity, theta_rad))
 
 
-def _covariance(kind: Kind, theta_rad: float) -> Real:
-    """Return the covariance of t by the differences of specimens, [2, 2]."""
+def _effects(kind: Kind, theta_rad: float) -> Real:
+    """Return the effect on t of one standard deviation of ln eps' and of eps'' between specimens, [part, deviation]."""
     if kind.permittivity is None:
-        return METAL_SPREAD**2 * np.eye(2)
+        return METAL_SPREAD * np.eye(2)
     eps = kind.permittivity
     stretched = np.array([eps + _STEP * eps.real, eps - 1j * _STEP])
     slopes = pair((inverse_ratio(stretched, theta_rad) - inverse_ratio(eps, theta_rad)) / _STEP)
     loss_std = np.hypot(kind.spread[1] * abs(eps.imag), LEAST_LOSS_SPREAD)
-    scaled = slopes * np.array([[kind.spread[0]], [loss_std]])
-    return np.asarray(scaled.T @ scaled + 1e-10 * np.eye(2), np.float64)
+    return np.asarray((slopes * np.array([[kind.spread[0]], [loss_std]])).T, np.float64)
 
 
-def _shares(kinds: Sequence[Kind]) -> tuple[Real, float]:
+def _shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
     """Return the share of each kind in the library or in the rest, and that of any other half space in the rest."""
     ours = np.array([kind.source == "library" for kind in kinds])
     metal = np.array([kind.permittivity is None for kind in kinds]) & ~ours
@@ -205,4 +234,105 @@ def _shares(kinds: Sequence[Kind]) -> tuple[Real, float]:
     for mask, share in ((ours, 1.0), (metal, METAL_SHARE), (literature, share_literature)):
         if mask.any():
             out[mask] = share / mask.sum()
-    return out, 1 - METAL_SHARE - share_literature
+    out[~ours] *= 1 - sheets
+    return out, (1 - METAL_SHARE - share_literature) * (1 - sheets)
+
+
+@cache
+def draw_sheets(theta_rad: float, frequency_hz: float = SHEET_HZ) -> Complex:
+    """Return t of thin plates before air or a holder, complex128 [draw]; the same plates at every angle."""
+    eps, holder, thickness_m = _drawn_sheets()
+    r_s, r_p = multilayer([eps, holder], [thickness_m, np.inf], frequency_hz, theta_rad)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = r_p / r_s
+    return np.where(np.isfinite(t), t, 1e3).astype(np.complex128)
+
+
+@cache
+def _drawn_sheets() -> tuple[Complex, Complex, Real]:
+    """Return permittivity, permittivity behind, and thickness in metres of thin plates, [draw] each."""
+    unit = np.random.default_rng(0).random((_SHEETS, 5))
+    real, tangent, size_mm = (
+        low * (high / low) ** part
+        for (low, high), part in zip((SHEET_REAL, SHEET_LOSS_TANGENT, SHEET_MM), unit.T[:3], strict=True)
+    )
+    behind = np.where(unit[:, 3] < 0.5, 1.0, HOLDER_REAL[0] + (HOLDER_REAL[1] - HOLDER_REAL[0]) * unit[:, 4])
+    return real * (1 - 1j * tangent), behind.astype(np.complex128), size_mm / 1e3
+
+
+def _histogram(draws: Complex, real: Real, imag: Real, covariance: Real) -> Real:
+    """Return the density of draws on a grid [imaginary, real], smoothed by the errors."""
+    step = np.array([imag[1] - imag[0], real[1] - real[0]])
+    edges = [np.append(axis - d / 2, axis[-1] + d / 2) for axis, d in zip((imag, real), step, strict=True)]
+    count = np.histogram2d(draws.imag, draws.real, edges)[0] / (draws.size * step.prod())
+    width = np.sqrt(np.diag(covariance)[::-1] + SHEET_KERNEL**2) / step
+    return scipy.ndimage.gaussian_filter(count, width, mode="nearest")
+
+
+@dataclass(frozen=True)
+class Odds:
+    """Probabilities of what a patch may be: float64 [kind], of a thin plate, of any other half space; they sum to 1.
+
+    `distance` [kind] is that of the measurement over the 99 % region of each kind; beyond 1 the probability is 0.
+    """
+
+    kinds: Real
+    sheet: float
+    other: float
+    distance: Real
+
+
+def weigh_kinds(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> Odds:
+    """Return the probabilities of what a patch may be, from one scan or from several under different angles.
+
+    The specimen is the same in all scans, the errors are each scan's own. `kinds` are the same at each scan's angle.
+    """
+    first = kinds[0]
+    size = 2 * len(seen)
+    errors = scipy.linalg.block_diag(*(one.covariance for one in seen))
+    t = np.array([one.inverse_ratio for one in seen])
+    effects = np.concatenate([at.effects for at in kinds], axis=1)
+    inverse = np.linalg.inv(effects @ effects.mT + 1e-10 * np.eye(size) + errors)
+    off = pair(t - np.stack([at.t for at in kinds], axis=1)).reshape(-1, size)
+    distance2 = np.einsum("ki,kij,kj->k", off, inverse, off)
+    each = first.share * np.sqrt(np.linalg.det(inverse / (2 * np.pi))) * np.exp(-0.5 * distance2)
+    ours = float(np.mean([one.library_share for one in seen])) if first.ours.any() else 0.0
+    each = each * np.where(first.ours, ours, 1 - ours)
+    drawn = np.stack([at.sheets for at in kinds], axis=1)
+    sheet = (1 - ours) * first.sheet_share * float(np.mean(_normal(drawn, t, errors + SHEET_KERNEL**2 * np.eye(size))))
+    other = (1 - ours) * first.other * _other_density(kinds, seen)
+    distance = np.sqrt(distance2 / scipy.special.chdtri(size, 0.01))
+    total = float(each.sum()) + sheet + other
+    if not total > 0:
+        return Odds(np.zeros(len(each)), 0.0, 1.0, distance)
+    inside = np.where(distance <= 1, each, 0.0) / total
+    sheet = sheet / total
+    return Odds(inside, sheet, 1 - sheet - float(inside.sum()), distance)
+
+
+def _normal(draws: Complex, mean: Complex, covariance: Real) -> Real:
+    """Return the normal density of draws [draw, scan] about `mean` [scan], with `covariance` [2 scan, 2 scan]."""
+    inverse = np.linalg.inv(covariance)
+    off = pair(draws - mean).reshape(len(draws), -1)
+    scale = np.sqrt(np.linalg.det(inverse / (2 * np.pi)))
+    return scale * np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, inverse, off))
+
+
+def _other_density(kinds: Sequence[Kinds], seen: Sequence[RatioEvidence]) -> float:
+    """Return the density of the measured ratios as any half space.
+
+    With several angles by half spaces that are drawn from the measurement that is known best.
+    """
+    best = min(range(len(seen)), key=lambda i: float(np.linalg.det(seen[i].covariance)))
+    mean, covariance = seen[best].inverse_ratio, seen[best].covariance
+    if len(seen) == 1:
+        return float(kinds[best].any_half_space(np.array(mean), covariance))
+    noise = np.random.default_rng(0).multivariate_normal(np.zeros(2), covariance, _HALF_SPACES, method="cholesky")
+    t = mean + noise[:, 0] + 1j * noise[:, 1]
+    density = kinds[best].any_half_space(t, 1e-8 * np.eye(2))
+    eps = permittivity_from_ratio(t, kinds[best].theta_rad)
+    for i, one in enumerate(seen):
+        if i != best:
+            there = inverse_ratio(eps, one.theta_rad)
+            density = density * _normal(there[:, None], np.array([one.inverse_ratio]), one.covariance)
+    return float(np.mean(density))

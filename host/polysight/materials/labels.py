@@ -322,7 +322,7 @@ def patches_from_labels(
 
 
 LONGEST_NAME = 80
-RESERVED = ("unknown", "none of these")
+RESERVED = ("unknown", "none of these", "possible layer")
 """Words that the classifier uses."""
 _TOLERANCE_MM = 0.01  # files hold three decimals
 _HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]")  # invisible characters
@@ -345,6 +345,8 @@ def clean_name(text: str, kind: str = "name") -> str:
         wrong = "it has control characters, which figures and tables cannot show"
     elif kind == "name" and name.casefold() in RESERVED:
         wrong = "the classifier uses this word for unknown materials"
+    elif kind == "name" and name.casefold().endswith("(literature)"):
+        wrong = "names of the literature end like this, which the library has not measured"
     elif kind == "name" and name.isdecimal():
         wrong = "a plain number is the number of a patch"
     if wrong:

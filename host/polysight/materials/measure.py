@@ -70,8 +70,9 @@ _AROUND_PX = 6  # margin around patches that does not count as background
 
 AMPLIFIES = "it would amplify beyond its error bar"
 BELOW_AIR = "its permittivity would be below that of air"
-NOT_PASSIVE = (AMPLIFIES, BELOW_AIR)
-"""Reasons for refusing plates whose permittivity is impossible for a passive material."""
+POSSIBLE_LAYER = "possible layer"
+NOT_PASSIVE = (AMPLIFIES, BELOW_AIR, POSSIBLE_LAYER)
+"""Reasons for refusing plates that are no half spaces; they may be fitted as layers."""
 
 
 def background(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[float, float]:

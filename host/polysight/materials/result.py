@@ -21,12 +21,12 @@ import scipy
 from msgspec import UNSET
 
 from polysight.imaging import Image, Images, Rise
-from polysight.materials.classify import NamedPatch, PatchName, features_of
 from polysight.materials.inversion import Inversion, RigPrior, ratio_error
 from polysight.materials.labels import Labels, TruthPlate
-from polysight.materials.library import Real, SceneErrors
+from polysight.materials.library import Real, SceneErrors, feature_matrix
 from polysight.materials.measure import CommonChange, Permittivity, background, ratio_sigma
 from polysight.materials.metal import MetalReference
+from polysight.materials.names import NamedPatch, PatchName
 from polysight.materials.segment import Box, Patch, Segmentation, axis_mm
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, PermittivityFigures, TruthFigures
 from polysight.store import open_npz
@@ -202,9 +202,11 @@ class MaterialsResult:
         return PatchFigures(
             label=label,
             name=name.name if name else None,
+            name_source=None if name is None else name.source,
             confidence=name.confidence if name else None,
             votes=name.votes if name else {},
             probabilities=name.probabilities if name else {},
+            literature=name.literature if name else {},
             why=name.why if name else "",
             distance=name.distance if name and math.isfinite(name.distance) else None,
             metal_reference=label == self.metal.label,
@@ -303,11 +305,17 @@ class MatchedPatch:
     features: Real
 
 
+def features_of(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
+    """Return features [n, 4] of pixels; not finite for unusable pixels."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return feature_matrix(np.ravel(h), np.ravel(v), np.ravel(p))
+
+
 def labels_of(found: MaterialsResult, description: str = "") -> Labels:
     """Return boxes around the interiors of a result's patches, in pixels, with unique names as drawn or classified."""
     out: dict[str, Box] = {}
     for r in found.patches:
-        named = r.verdict.name if r.verdict is not None else None
+        named = r.verdict.name if r.verdict is not None and r.verdict.source == "library" else None
         name = found.boxes.get(r.patch.label) or ("metal" if r.patch.label == found.metal.label else named or "patch")
         inside = r.patch.interior if r.patch.interior.any() else r.patch.mask
         rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))

@@ -255,8 +255,14 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
+    name
+        Material of the library, "like ... (literature)", "possible layer" or "unknown".
+    name_source
+        "library" or "literature"; None without a name, or where it is no material's.
     votes, probabilities
-        Share of the pixels, and probability, of materials and `unknown`; likeliest first.
+        Share of the pixels, and probability, of names and `unknown`; likeliest first.
+    literature
+        Probability of each likely material of the literature.
     why
         Reason for the name in one sentence.
     outline_mm, pixels
@@ -275,6 +281,7 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
 
     label: Annotated[int, Column("patch", "number of the patch in label", variable="")]
     name: Annotated[Text, Column("name", "material; empty where it was not named", "")] = None
+    name_source: Annotated[Text, Column("name_source", "where the name is from: library or literature", "")] = None
     confidence: Annotated[Number, Column("confidence", "confidence in the name, 0 to 1")] = None
 
     @property
@@ -289,6 +296,7 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
 
     votes: dict[str, float] = {}
     probabilities: dict[str, float] = {}
+    literature: dict[str, float] = {}
     why: str = ""
     distance: Number = None
     metal_reference: Annotated[bool, Column("metal_reference", "True where the patch is the metal reference")] = False
@@ -468,7 +476,8 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     def withheld(self) -> Self:
         """Return only place and size: without name, measured values and truth."""
         return msgspec.structs.replace(
-            self, name=None, confidence=None, votes={}, probabilities={}, why="", distance=None, metal_like=False,
+            self, name=None, name_source=None, confidence=None, votes={}, probabilities={}, literature={}, why="",
+            distance=None, metal_like=False,
             permittivity=None, ratio=None, inverse_ratio_std=None, amplitude_h=None, truth=None, bands=UNSET,
         )  # fmt: skip
 

@@ -38,7 +38,7 @@ export class Labels {
     this.boxes = [];
     for (const p of this.patches) {
       const [x0, y0, x1, y1] = p.box_mm, mx = margin(x0, x1), my = margin(y0, y1);
-      const named = p.name && p.name !== "unknown" ? p.name : "";
+      const named = p.name_source === "library" ? p.name : "";
       const box = [x0 + mx, y0 + my, x1 - mx, y1 - my].map((v) => Math.round(v * 10) / 10);
       this.boxes.push({ name: p.metal_reference ? "metal" : named, box, metal: Boolean(p.metal_reference), specimen: "" });
     }

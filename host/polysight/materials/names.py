@@ -1,0 +1,273 @@
+"""Names of patches and of their pixels, by what one scan or several say of a patch's ratio.
+
+A name is a material of the library, materials of the literature together ("like PTFE or paraffin wax (literature)"), a
+possible layer, or unknown. The probabilities of a patch's names sum to one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from polysight.materials.catalogue import load_catalogue
+from polysight.materials.kinds import Kinds, Odds, RatioEvidence, pair, weigh_kinds
+from polysight.materials.measure import format_permittivity
+
+Real = npt.NDArray[np.float64]
+
+UNKNOWN = "unknown"
+INCLUSIONS = 0.05
+"""Share of a patch's pixels that may be of another material; a pixel's prior is its patch's name otherwise."""
+LIKELY = 0.005
+"""Materials of less probability are not listed."""
+LAYER = "possible layer"
+"""Name of a patch that is rather a thin plate than a half space."""
+MOST_NAMES = 3
+"""Largest number of names in a statement about the literature."""
+MOST_OF_IT = 0.8
+"""Share of the literature's probability that such a statement holds at least."""
+
+
+@dataclass(frozen=True)
+class PatchName:
+    """Name of one patch, with its confidence and reason.
+
+    Attributes
+    ----------
+    name
+        Material, "like ... (literature)", "possible layer", or "unknown".
+    confidence
+        Probability of that name; for the KNN the share of its pixels.
+    votes
+        Share of the pixels with each name, largest first.
+    distance
+        Distance to the material, in units of its threshold: above 1 is unknown.
+    pixels
+        Usable pixels.
+    probabilities
+        Of each likely name and of "unknown", largest first; their sum is 1. Empty for models without probabilities.
+    why
+        Reason of the name in one sentence (:func:`add_explanation`); empty if permittivities are not known.
+    nearest
+        The library's nearest material, also of an unknown patch; None without usable pixels.
+    literature
+        Probability of each likely material of the literature, largest first.
+    from_literature
+        True if the name is of the literature.
+    """
+
+    name: str
+    confidence: float
+    votes: dict[str, float]
+    distance: float
+    pixels: int
+    probabilities: dict[str, float] = field(default_factory=dict)
+    why: str = ""
+    nearest: str | None = None
+    literature: dict[str, float] = field(default_factory=dict)
+    from_literature: bool = False
+
+    @property
+    def source(self) -> Literal["library", "literature"] | None:
+        """Where the name is from; None if it is no material's."""
+        if self.name in (UNKNOWN, LAYER):
+            return None
+        return "literature" if self.from_literature else "library"
+
+
+@dataclass(frozen=True)
+class NamedPatch:
+    """Names of a patch's pixels [n], their distances over the threshold [n], and the patch's verdict.
+
+    `confidence` [n]: probability of each pixel's likeliest material, 0 for unusable pixels; None: the model gives none.
+    """
+
+    names: npt.NDArray[np.str_]
+    distance: Real
+    verdict: PatchName
+    confidence: Real | None = None
+
+
+def name_of_literature(kinds: Kinds, odds: Odds) -> tuple[str, npt.NDArray[np.bool_]]:
+    """Return what the literature's materials are called together, and which of them the name means, bool [kind].
+
+    Few materials that hold most of the literature's probability are named; otherwise their families, a family of one
+    likely material by that material. The name is empty if more than `MOST_NAMES` would be needed.
+    """
+    foreign = np.where(kinds.ours, 0.0, odds.kinds)
+    names = np.array(kinds.names)
+    families = np.array([kind.family or kind.name for kind in kinds.kinds])
+    for groups in (names, families):
+        labels, member = np.unique(groups, return_inverse=True)
+        share = np.bincount(member, foreign)
+        order = np.argsort(-share, kind="stable")[:MOST_NAMES]
+        needed = 1 + int(np.searchsorted(np.cumsum(share[order]), MOST_OF_IT * foreign.sum()))
+        if needed > MOST_NAMES or not foreign.any():
+            continue
+        meant = np.isin(member, order[:needed]) & ~kinds.ours
+        said = []
+        for group in order[:needed]:
+            alone = np.where(member == group, foreign, 0.0)
+            likeliest = int(alone.argmax())
+            by_itself = alone[likeliest] >= MOST_OF_IT * share[group]
+            said.append(str(names[likeliest]) if by_itself else str(labels[group]))
+        return f"like {_either(said)} (literature)", meant
+    return "", np.zeros(len(names), np.bool_)
+
+
+def _either(names: Sequence[str]) -> str:
+    *first, last = names
+    return f"{', '.join(first)} or {last}" if first else last
+
+
+def name_patch(
+    kinds: Sequence[Kinds], seen: Sequence[RatioEvidence], inverse_ratios: npt.NDArray[np.complex128]
+) -> NamedPatch:
+    """Name a patch and its pixels by what one scan, or several under different angles, say of its ratio.
+
+    The patch's name is what has the largest probability: a material of the library, those of the literature together, a
+    thin plate, or none of these. A material whose value lies outside of the patch's own 99 % region (errors and
+    specimens together) is never the name. A pixel is, but for `INCLUSIONS`, of its patch's material.
+
+    Parameters
+    ----------
+    kinds
+        What patches may be, at each scan's angle.
+    seen
+        What the scans say of the patch, in their order.
+    inverse_ratios
+        complex [n, scan]: V / H of the pixels at the kinds' angles, NaN where not usable.
+    """
+    good = np.isfinite(inverse_ratios).all(axis=1)
+    if not good.any():
+        return nothing_named(good.size)
+    odds, first = weigh_kinds(kinds, seen), kinds[0]
+    names = np.array(first.names)
+    foreign, meant = name_of_literature(first, odds)
+    share = {str(names[k]): float(odds.kinds[k]) for k in np.flatnonzero(first.ours)}
+    nearest = min(share, key=lambda name: odds.distance[first.names.index(name)], default=None)
+    if foreign:
+        share[foreign] = float(odds.kinds[meant].sum())
+    if first.sheet_share:
+        share[LAYER] = odds.sheet
+    likely = {name: round(p, 4) for name, p in share.items() if p >= LIKELY}
+    likely[UNKNOWN] = round(1 - sum(likely.values()), 4)
+    likely = dict(sorted(likely.items(), key=lambda item: -item[1]))
+    name = next(iter(likely))
+    distances = {str(n): float(d) for n, d in zip(names, odds.distance, strict=True)}
+    distance = distances.get(name, float(odds.distance[meant].min()) if name == foreign else np.inf)
+    if name in (UNKNOWN, LAYER) and nearest is not None:
+        distance = distances[nearest]
+    literature = {str(names[k]): round(float(odds.kinds[k]), 4) for k in np.flatnonzero(~first.ours)}
+    verdict = PatchName(
+        name,
+        likely[name],
+        {},
+        distance,
+        int(good.sum()),
+        likely,
+        nearest=nearest,
+        literature={n: p for n, p in sorted(literature.items(), key=lambda item: -item[1]) if p >= LIKELY},
+        from_literature=name == foreign,
+    )
+    called = np.where(first.ours, names, np.where(meant, foreign, UNKNOWN))
+    pixel_names, far, sure = _name_pixels(kinds, seen, inverse_ratios, odds.kinds, called)
+    count = dict(zip(*np.unique(pixel_names, return_counts=True), strict=True))
+    votes = {str(n): int(c) / pixel_names.size for n, c in sorted(count.items(), key=lambda i: (-i[1], i[0]))}
+    return NamedPatch(pixel_names, far, replace(verdict, votes=votes), sure)
+
+
+def nothing_named(pixels: int) -> NamedPatch:
+    """Return a patch without any usable pixel."""
+    verdict = PatchName(UNKNOWN, 0.0, {}, np.inf, 0)
+    return NamedPatch(np.full(pixels, UNKNOWN), np.full(pixels, np.inf), verdict)
+
+
+def _name_pixels(
+    kinds: Sequence[Kinds],
+    seen: Sequence[RatioEvidence],
+    t: npt.NDArray[np.complex128],
+    of_patch: Real,
+    called: npt.NDArray[np.str_],
+) -> tuple[npt.NDArray, Real, Real]:
+    """Return name, distance over the threshold, and probability of the name of each pixel, [n] each."""
+    good = np.isfinite(t).all(axis=1)
+    first = kinds[0]
+    named = called != UNKNOWN
+    size = 2 * len(seen)
+    values = pair(t[good]).reshape(-1, size)
+    pixel = np.cov(values.T) if len(values) > 2 else np.zeros((size, size))
+    effects = np.concatenate([at.effects[named] for at in kinds], axis=1)
+    errors = scipy.linalg.block_diag(*(one.covariance for one in seen)) + pixel + 1e-10 * np.eye(size)
+    inverse = np.linalg.inv(effects @ effects.mT + errors)
+    middles = np.stack([at.t[named] for at in kinds], axis=1)
+    usable: npt.NDArray[np.complex128] = np.where(good.reshape(-1, 1), t, 0)
+    off = pair(usable[:, None, :] - middles).reshape(t.shape[0], -1, size)
+    distance2 = np.einsum("nki,kij,nkj->nk", off, inverse, off)
+    ours = np.take(first.ours, np.flatnonzero(named))
+    prior = (1 - INCLUSIONS) * of_patch[named] + INCLUSIONS * ours / max(ours.sum(), 1)
+    likelihood = prior * np.sqrt(np.linalg.det(inverse)) * np.exp(-0.5 * np.minimum(distance2, 1400))
+    labels, member = np.unique(called[named], return_inverse=True)
+    of_label = likelihood @ np.equal.outer(member, np.arange(labels.size))
+    label = of_label.argmax(axis=1)
+    row = np.arange(t.shape[0])
+    nearest = np.where(np.equal.outer(label, member), distance2, np.inf).min(axis=1)
+    far = np.where(good, np.sqrt(nearest / scipy.special.chdtri(size, 0.01)), np.inf)
+    share = of_label[row, label] / np.maximum(of_label.sum(axis=1), 1e-300)
+    names = np.where(far <= 1, labels[label], UNKNOWN)
+    return names, far, np.where(good, share * min(1.0, float(of_patch[named].sum()) + INCLUSIONS), 0.0)
+
+
+def add_explanation(
+    named: NamedPatch,
+    permittivity: complex | None,
+    covariance: npt.NDArray[np.float64] | None,
+    known: Mapping[str, complex],
+) -> NamedPatch:
+    """Return the patch with the reason of its name, one sentence for a reader who knows materials.
+
+    `permittivity` is eps' - j eps'' of the patch, `covariance` [2, 2] that of its real and imaginary part; None if it
+    has none. `known` are the library's permittivities.
+    """
+    name = named.verdict
+    found = _estimate(permittivity, covariance)
+    nearest = name.name if name.name in known else name.nearest
+    like = "" if nearest is None else _with_permittivity(nearest, known.get(nearest))
+    near = f"; nearest: {like}" if like else ""
+    if name.name == UNKNOWN:
+        why = f"not in the library: {found}{near}" if found else f"not in the library{near}"
+    elif name.name == LAYER:
+        why = f"{found} as a half space, but rather a thin plate{near}" if found else f"rather a thin plate{near}"
+    elif name.from_literature:
+        why = f"{found} is like {_values_of(name.literature)} of the literature; not measured by this library{near}"
+    else:
+        others = [f"{n} {100 * p:.0f} %" for n, p in name.probabilities.items() if n not in (name.name, UNKNOWN)][:2]
+        match = f"{found} matches the library's {like}" if found else f"it looks like the library's {like}"
+        alone = "; no other material is likely" if name.probabilities else ""  # the KNN has no probabilities
+        why = match + (f"; it could also be {' or '.join(others)}" if others else alone)
+    return replace(named, verdict=replace(name, why=why))
+
+
+def _estimate(permittivity: complex | None, covariance: npt.NDArray[np.float64] | None) -> str:
+    if permittivity is None:
+        return ""
+    text = f"permittivity {format_permittivity(permittivity)}"
+    if covariance is None or not np.isfinite(covariance).all():
+        return text
+    real, loss = np.sqrt(np.diag(covariance))
+    return f"{text} (+- {real:.2f}, {loss:.2f})"
+
+
+def _values_of(literature: Mapping[str, float]) -> str:
+    """The likeliest materials of the literature with their permittivities."""
+    values = {material.name: material.permittivity for material in load_catalogue()}
+    return ", ".join(_with_permittivity(name, values.get(name)) for name in list(literature)[:MOST_NAMES])
+
+
+def _with_permittivity(name: str, permittivity: complex | None) -> str:
+    return name if permittivity is None else f"{name} ({format_permittivity(permittivity)})"

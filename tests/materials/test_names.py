@@ -1,0 +1,75 @@
+"""Names of the library, of the literature, possible layers: their probabilities and what they are called."""
+
+import numpy as np
+import pytest
+from benchmarks.foreign import judge_scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from polysight.materials import LAYER, UNKNOWN, clean_name
+from polysight.materials.kinds import Kind, Kinds, RatioEvidence, draw_sheets, inverse_ratio, literature
+from polysight.materials.names import name_patch
+from polysight_shared.errors import DataError
+
+ANGLES = tuple(np.radians([55.0, 65.0]))
+LIBRARY = {"acrylic": 4.0 - 0.4j, "rubber": 5.06 - 1.11j, "wood": 2.61 - 0.01j, "glass": 7.26 - 0.85j}
+KINDS = (*(Kind(name, eps) for name, eps in LIBRARY.items()), *literature(tuple(LIBRARY)))
+AT_ANGLES = tuple(Kinds(KINDS, angle, sheets=True) for angle in ANGLES)
+
+
+def name_of(*ratios: complex, std: float = 0.004, share: float = 0.5):
+    kinds = AT_ANGLES[: len(ratios)]
+    covariance = std**2 * np.eye(2)
+    seen = [RatioEvidence(at.theta_rad, t, covariance, share) for at, t in zip(kinds, ratios, strict=True)]
+    pixels = np.tile(np.array(ratios, np.complex128), (20, 1))
+    return name_patch(kinds, seen, pixels)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(1.05, 12.0), st.floats(0.0, 8.0), st.floats(0.002, 0.05), st.integers(1, 2))
+def test_probabilities_sum_to_one_and_the_name_has_the_largest(real, loss, std, scans):
+    verdict = name_of(*inverse_ratio(complex(real, -loss), np.array(ANGLES[:scans])), std=std).verdict
+    assert sum(verdict.probabilities.values()) == pytest.approx(1, abs=1e-9)
+    assert verdict.confidence == verdict.probabilities[verdict.name] == max(verdict.probabilities.values())
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(1.05, 12.0), st.floats(0.0, 8.0))
+def test_a_name_of_the_literature_is_never_one_of_the_library(real, loss):
+    verdict = name_of(complex(inverse_ratio(complex(real, -loss), ANGLES[0]))).verdict
+    if verdict.source == "library":
+        assert verdict.name in LIBRARY
+    else:
+        assert verdict.name not in LIBRARY
+        assert verdict.name in (UNKNOWN, LAYER) or verdict.source == "literature"
+    with pytest.raises(DataError):
+        clean_name(verdict.name if verdict.source != "library" else UNKNOWN)
+
+
+def test_what_only_the_literature_explains_is_said_as_like_it():
+    verdict = name_of(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2).verdict
+    assert verdict.source == "literature"
+    assert "sapphire" in verdict.literature
+
+
+def test_a_second_angle_makes_a_true_name_surer():
+    t = inverse_ratio(LIBRARY["acrylic"], np.array(ANGLES))
+    alone = name_of(t[0], std=0.03).verdict.probabilities["acrylic"]
+    both = name_of(*t, std=0.03).verdict
+    assert both.name == "acrylic"
+    assert both.confidence > alone
+
+
+def test_what_is_no_half_space_but_a_thin_plate_is_a_possible_layer():
+    t = draw_sheets(ANGLES[0])
+    far = t[np.argsort(np.abs(t))[int(0.97 * t.size)]]
+    names = [name_of(complex(far)).verdict.name, name_of(-0.25 + 0.2j).verdict.name]
+    assert LAYER in names
+    assert not set(names) & set(LIBRARY)
+
+
+@pytest.mark.slow
+def test_materials_that_the_library_lacks_get_no_sure_name_of_it():
+    pieces = judge_scene("plates", 0)
+    assert len(pieces) == 8
+    assert not [p for p in pieces if p.source == "library" and p.confidence >= 0.9]

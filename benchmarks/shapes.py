@@ -236,7 +236,7 @@ def line_of(title: str, figures: Sequence[ObjectFigures], limits: tuple[float | 
     cells = [f"{title:<26}{len(figures):>5}"]
     for values, limit in zip(columns, limits or (None, None, None), strict=True):
         known = [v for v in values if v is not None]
-        value = f"{np.percentile(known, 68):.2f}" if known else "-"
+        value = f"{np.percentile(known, 68, method='inverted_cdf'):.2f}" if known else "-"
         cells.append(f"{value:>8} {'' if limit is None else f'<= {limit:g}':<7}")
     given = [f for f in figures if f.error is not None]
     cells.append(f"{100 * len(given) / len(figures):>7.0f}")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from polysight.data import packaged
 from polysight.surfaces import (
     SURFACE,
     Uncertainty,
@@ -12,9 +15,11 @@ from polysight.surfaces import (
     read_surface,
     reflect_curved,
     reflect_flat,
+    visible_normals,
     write_surface,
 )
 from polysight.surfaces.result import point_cloud
+from polysight_shared.config import load_instrument
 from polysight_worlds.media import Stack
 from polysight_worlds.shape_scenes import ShapeScene
 from polysight_worlds.shapes import cylinder, sphere
@@ -133,3 +138,11 @@ def test_metal_of_curvature_turns_p_by_the_known_phase():
     r_s, r_p = reflect_curved(np.inf, theta, bend, bend, 1634.0)
     expected = np.sin(theta) ** 2 / (163.4 * np.cos(theta) ** 3)
     assert np.angle(r_p / r_s) == pytest.approx(expected, rel=0.05)
+
+
+def test_the_published_grid_shows_normals_of_15_and_22_degrees():
+    """As the grid's reach and the distance say: 0.349 m and 0.199 m at half a metre, 55 degrees of incidence."""
+    seen = visible_normals(load_instrument(packaged(Path("instrument.toml"))))
+    assert seen.x_deg == pytest.approx(15, abs=1)
+    assert seen.y_deg == pytest.approx(22, abs=1)
+    assert min(seen.alias_deg) > 50

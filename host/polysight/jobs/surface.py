@@ -190,8 +190,12 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
     shape = shape_of(metal.h, optics)
-    centre, radius_m, rest_m = fit_sphere(shape.points)
-    if abs(1e3 * radius_m - radius_mm) > 0.15 * radius_mm:
+    bends = np.linalg.eigvalsh((shape.curvature + np.swapaxes(shape.curvature, 1, 2)) / 2)
+    radius_m = 1 / float(np.median(bends))
+    centre = np.median(shape.points - radius_mm / 1e3 * shape.normals, axis=0)
+    rest_m = np.linalg.norm(shape.points - centre, axis=1) - radius_mm / 1e3
+    rest_m = float(np.median(np.abs(rest_m - np.median(rest_m))))
+    if not 0.7 < 1e3 * radius_m / radius_mm < 1.4:
         raise DataError(
             f"{scan}: the surface has a radius of {1e3 * radius_m:.0f} mm, not {radius_mm:g}",
             "it is another object, or the boards stand elsewhere than the rig file says",
@@ -218,14 +222,3 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
         f"H / V is known to {100 * gains.std:.2f} %",
     ]
     return print_result(path, file, lines, rig_file_keys("sphere", path), as_json)
-
-
-def fit_sphere(points_m: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Centre [3], radius and rms misfit of the sphere through points [n, 3], metres; linear least squares."""
-    middle = points_m.mean(axis=0)
-    rows = points_m - middle
-    matrix = np.concatenate([2 * rows, np.ones((len(rows), 1))], axis=1)
-    found = np.linalg.lstsq(matrix, (rows**2).sum(axis=1), rcond=None)[0]
-    radius = float(np.sqrt(found[3] + found[:3] @ found[:3]))
-    rest = np.linalg.norm(rows - found[:3], axis=1) - radius
-    return middle + found[:3], radius, float(np.sqrt(np.mean(rest**2)))

@@ -38,6 +38,7 @@ from polysight.plan.forecast import (
 )
 from polysight.radar import INTER_FRAME_US, TRIGGER_MARGIN_US, chirp_us
 from polysight.store import EVENTS, RawSource, ScanFolder, read_events
+from polysight.surfaces import VisibleNormals, visible_normals
 from polysight.sync import BoardSetup, synchronise_row
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
@@ -260,6 +261,7 @@ def describe(f: Forecast) -> str:
         ),
         ("field", f"without aliases over {_pair(f.field.alias_free_mm, 0)} mm"),
         ("", f"flat plates need {_pair(f.field.mirror_zone_mm, 0)} mm of aperture beyond them on every side"),
+        ("normals", _normals(visible_normals(f.rig))),
         (
             "motion",
             f"{f.burst.travel_mm:.2f} mm during a burst, {f.burst.travel_wavelengths:.2f} wavelengths;"
@@ -280,6 +282,13 @@ def describe(f: Forecast) -> str:
     return "\n".join(out) + "\n"
 
 
+def _normals(seen: VisibleNormals) -> str:
+    """Text of the tilts at which curved and tilted surfaces are seen."""
+    text = f"surfaces tilted by up to {seen.x_deg:.0f} degrees in x, {seen.y_deg:.0f} in y are seen"
+    alias = [a for a, tilt in zip(seen.alias_deg, (seen.x_deg, seen.y_deg), strict=True) if a < tilt]
+    return f"{text}; beyond {min(alias):.0f} degrees their phases alias: take a smaller step" if alias else text
+
+
 def _table(plans: list[Forecast]) -> str:
     lines = ["    time      mm/s  chirps  period us  steps mm     grid       image dB  motion  alias-free mm   raw"]
     for i, f in enumerate(plans, 1):
@@ -295,6 +304,7 @@ def _table(plans: list[Forecast]) -> str:
 def forecast_values(f: Forecast) -> dict[str, Any]:
     """Return a forecast as plain values for JSON; infinite ones as None."""
     g, b, s, t, r = f.rig.grid, f.rig.burst, f.rig.stage, f.time, f.response
+    seen = visible_normals(f.rig)
 
     def finite(values: tuple[float, float]) -> list[float | None]:
         return [float(v) if math.isfinite(v) else None for v in values]
@@ -325,6 +335,8 @@ def forecast_values(f: Forecast) -> dict[str, Any]:
         "point_paper_mm": finite(r.paper_mm),
         "alias_free_mm": finite(f.field.alias_free_mm),
         "mirror_zone_mm": finite(f.field.mirror_zone_mm),
+        "visible_normals_deg": [seen.x_deg, seen.y_deg],
+        "alias_tilt_deg": finite(seen.alias_deg),
         "burst_ms": f.burst.duration_ms,
         "between_positions_ms": f.burst.between_ms,
         "burst_travel_mm": f.burst.travel_mm,

@@ -8,7 +8,16 @@ files. In order: `paths` (fit of a window), `points` (geometry), `measure` (both
 """
 
 from polysight.surfaces.measure import Seen, Shape, see_points, shape_of
-from polysight.surfaces.optics import Antenna, Optics, aimed, optics_of, reflect_curved, reflect_flat
+from polysight.surfaces.optics import (
+    Antenna,
+    Optics,
+    VisibleNormals,
+    aimed,
+    optics_of,
+    reflect_curved,
+    reflect_flat,
+    visible_normals,
+)
 from polysight.surfaces.paths import Echoes, Samples, path_of_plane
 from polysight.surfaces.permittivity import Gains, Uncertainty, learn_gains, segment_permittivity, voltages_of
 from polysight.surfaces.result import (
@@ -36,6 +45,7 @@ __all__ = [
     "Shape",
     "Surface",
     "Uncertainty",
+    "VisibleNormals",
     "aimed",
     "analyse_surface",
     "learn_gains",
@@ -49,6 +59,7 @@ __all__ = [
     "segment_permittivity",
     "shape_of",
     "summary_lines",
+    "visible_normals",
     "voltages_of",
     "write_surface",
 ]

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.polarimetry import fresnel
-from polysight.surfaces.points import tangents, unit_legs
+from polysight.surfaces.points import normals_at, tangents, unit_legs
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import place, rx_positions_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -114,6 +114,42 @@ def aimed(at_m: Array, boresight: Array, partner_m: Array, plane_m: float, parts
     other = p_share * s_axis + s_share * p_axis
     vectors = [_carry(direction, boresight[None], v)[0] for v in (wanted, other)]
     return Antenna(at_m, boresight, vectors[0], vectors[1])
+
+
+@dataclass(frozen=True)
+class VisibleNormals:
+    """Normals that a grid shows at the middle of the image: tilts in x and y, and those at which phases alias; degrees.
+
+    `alias_deg` is infinite where no tilt aliases.
+    """
+
+    x_deg: float
+    y_deg: float
+    alias_deg: tuple[float, float]
+
+
+def visible_normals(rig: Instrument) -> VisibleNormals:
+    """Return the normals that a rig's grid shows: those that mirror TX into H from its ends.
+
+    The slope of a tilted plane's path is 2 cos(theta) sin(tilt); phases alias where it exceeds lambda / (2 step).
+    """
+    optics = optics_of(rig)
+    share = (rig.geometry.object_distance_mm / 1e3 - optics.tx.at_m[2]) / (
+        2 * rig.geometry.object_distance_mm / 1e3 - optics.tx.at_m[2] - optics.h.at_m[2]
+    )
+    middle = optics.tx.at_m + share * (optics.h.at_m - optics.tx.at_m)
+    middle[2] = rig.geometry.object_distance_mm / 1e3
+    half_x = (rig.grid.columns - 1) / 2 * rig.grid.step_x_mm / 1e3
+    half_y = (rig.grid.rows - 1) / 2 * rig.grid.step_y_mm / 1e3
+    at_m = np.array([[half_x, 0.0, 0.0], [0.0, half_y, 0.0], [0.0, 0.0, 0.0]])
+    normals, cos = normals_at(np.tile(middle, (3, 1)), at_m, optics.tx.at_m, optics.h.at_m)
+    tilts = np.degrees(np.arctan2(np.abs(normals[:, :2]), -normals[:, 2:]))
+    wave_m = 2 * np.pi / optics.wave_number
+    limits = []
+    for step_mm in (rig.grid.step_x_mm, rig.grid.step_y_mm):
+        sine = wave_m / (2 * step_mm / 1e3) / (2 * float(cos[2]))
+        limits.append(float(np.degrees(np.arcsin(sine))) if sine < 1 else float("inf"))
+    return VisibleNormals(float(tilts[0, 0]), float(tilts[1, 1]), (limits[0], limits[1]))
 
 
 def polarisation_row(points: Array, normals: Array, at_m: Array, tx: Antenna, rx: Antenna) -> Complex:

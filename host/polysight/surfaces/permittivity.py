@@ -33,6 +33,8 @@ DEGREE = 2
 # Change of ln(H / V) per radian of direction that a flat plate cannot exclude: two boards 20 degrees apart with the
 # pattern cos^2 differ by 0.7.
 UNKNOWN_SLOPE = 0.7
+# Windows of 34 mm every 8 mm: so many share their noise and the ripple of edges.
+OVERLAP = 18
 # A point whose ratio lies so many standard deviations from the segment's does not belong to it.
 OUTLIER = 4.0
 
@@ -130,8 +132,7 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
         rest = np.abs(log - basis @ coefficients)
         spread = 1.48 * float(np.median(rest))
         weight = weight / (1 + (rest / (2 * spread + 1e-9)) ** 2)
-    # Neighbouring windows overlap: about ten share their noise.
-    std = float(spread / np.sqrt(max(1.0, len(log) / 10)))
+    std = float(spread / np.sqrt(max(1.0, len(log) / OVERLAP)))
     return Gains(coefficients, middle, degree, std, (low, high))
 
 
@@ -185,7 +186,7 @@ def _misses(v: Voltages, gains: Gains, eps: complex, wave_number: float) -> tupl
 
 # What the first order in curvature and the antennas' changing gain over the zone leave of r_p / r_s (compared with the
 # series of spheres and cylinders of 50 to 200 mm): in proportion, and near Brewster's angle as a share of r_s.
-MODEL_RATIO_STD = 0.003
+MODEL_RATIO_STD = 0.004
 MODEL_FLOOR_STD = 0.0008
 # Errors of a point besides noise: edges, other echoes, curvature; relative to the voltages.
 MODEL_ERROR = 0.02
@@ -221,9 +222,9 @@ def fit_permittivity(v: Voltages, gains: Gains, wave_number: float, start: compl
         value = np.array([np.clip(value[0], 1.2, 40), np.clip(value[1], -20, 0.5)])
         if np.abs(move).max() < 1e-6:
             break
-    # Scatter of the misses, not the assumed noise, gives the error; some ten overlapping windows share theirs.
+    # Scatter of the misses, not the assumed noise, gives the error.
     terms = np.einsum("np,n,n->np", jacobian.conj(), miss, weights).real
-    meat = terms.T @ terms * 10
+    meat = terms.T @ terms * OVERLAP
     inverse = np.linalg.inv(information)
     covariance = inverse @ meat @ inverse
     scatter = float(np.sqrt(np.average((np.abs(miss) / np.maximum(noise, 1e-30)) ** 2, weights=weights) / 2))

@@ -185,9 +185,10 @@ def _misses(v: Voltages, gains: Gains, eps: complex, wave_number: float) -> tupl
 
 
 # What the first order in curvature and the antennas' changing gain over the zone leave of r_p / r_s (compared with the
-# series of spheres and cylinders of 50 to 200 mm): in proportion, and near Brewster's angle as a share of r_s.
-MODEL_RATIO_STD = 0.004
-MODEL_FLOOR_STD = 0.0008
+# series of spheres and cylinders: 0.003), and what drawn scenes show besides (1 to 2 % of a permittivity, mostly too
+# high): in proportion, and near Brewster's angle as a share of r_s.
+MODEL_RATIO_STD = 0.008
+MODEL_FLOOR_STD = 0.002
 # Errors of a point besides noise: edges, other echoes, curvature; relative to the voltages.
 MODEL_ERROR = 0.02
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -44,17 +45,31 @@ from polysight.polarimetry import fresnel
 from polysight.process.quality import scene_reasons
 from polysight.results import verdict_of
 from polysight_shared.config import load_instrument
-from polysight_worlds import NUISANCES, TABLE_2, ImagePair, Plate, draw_nuisances, draw_world, published_rig, simulate
+from polysight_worlds import (
+    NUISANCES,
+    TABLE_2,
+    ImagePair,
+    Plate,
+    Stack,
+    World,
+    draw_nuisances,
+    draw_world,
+    published_rig,
+    simulate,
+)
 
 UNMEASURED = ("leakage", "all")
 """Nuisances of rigs whose leakage was never measured."""
-THETA_STD_RAD = 4e-3
-"""Error of the incidence angle that the analysis counts with: 2 mm in the places of boards and plane."""
+THETA_STD_RAD = 1.5e-3
+"""Error of the incidence angle that the analysis counts with: 2 mm in the places of the boards (1.2e-3 by the published
+rig's geometry), 1 mm in that of the plane (0.9e-3)."""
 MARGIN_MM = 6.0
 LEAST_PIXELS = 8
 """Least width and height of a plate's part within the picture."""
 CHI2_95 = 5.991
 FIRST_REASONS = 2
+LIQUIDS = {"water": 8.7 - 14.0j, "oil": 2.3 - 0.02j, "alcohol": 3.2 - 1.2j}
+"""Liquids in glass dishes, rounded: water at 20 degrees and 78 GHz, and typical values for the others."""
 CAUSES = {
     "h_turn": "turned|moved",
     "v_turn": "turned|moved",
@@ -69,13 +84,13 @@ CAUSES = {
     "interference": "interference",
     "clipping": "clip",
     "roughness": "rough",
-    "waviness": "rough|uneven",
-    "bow": "bent|uneven",
+    "waviness": "wavy",
+    "bow": "bent",
     "brightness": "brighter|darker",
     "leakage": "leakage",
     "border": "border",
     "aperture": "aperture",
-    "dark": "masked",
+    "dark": "masked|without data",
 }
 """Nuisance to the words (regular expression) by which a reason names it as found or as a likely cause."""
 
@@ -266,6 +281,67 @@ def figures_of(nuisance: str, patch: PatchResult, plate: Plate) -> PatchFigures:
     return PatchFigures(nuisance, plate.name, distance2, half_width, error, name, confidence, refused)
 
 
+METAL_KINDS = ("copper declared", "dielectric declared", "no metal")
+
+
+@dataclass(frozen=True)
+class MetalFigures:
+    """One scene with sheets and dishes: its kind, the verdict's level, if the declared metal was withdrawn, names."""
+
+    kind: str
+    seed: int
+    level: str
+    withdrawn: bool
+    names: tuple[str, ...]
+
+
+def draw_metal_world(rng: np.random.Generator, with_metal: bool) -> World:
+    """Draw plates, thin sheets in air and dishes of liquids, with copper or without."""
+    rig = published_rig()
+    materials: dict[str, complex | Stack] = dict(TABLE_2)
+    for name, liquid in LIQUIDS.items():
+        materials[name] = Stack(((6.9 - 0.5j, rng.uniform(1e-3, 3e-3)),), liquid)
+    for number in range(4):
+        sheet = rng.uniform(2, 5) * (1 - 1j * rng.uniform(0.001, 0.05))
+        materials[f"sheet {number}"] = Stack(((sheet, rng.uniform(0.5e-3, 3e-3)),), 1.0)
+    pieces = int(rng.integers(3, 10))
+    return draw_world(
+        rng, tuple(rig.centre_m), materials=materials, half_spaces=True, with_metal=with_metal, pieces=pieces
+    )
+
+
+def judge_metal(kind: str, seed: int, searched: bool) -> MetalFigures:
+    """Judge one scene of `METAL_KINDS`."""
+    rng = np.random.default_rng([seed, METAL_KINDS.index(kind)])
+    world = draw_metal_world(rng, with_metal=kind != "no metal")
+    pair = simulate(world, draw_nuisances(rng, "none"), published_rig())
+    declared = {"copper declared": "copper", "no metal": None}.get(kind)
+    if kind == "dielectric declared":
+        declared = next(plate.name for plate in world.plates if not plate.stack.layers and not plate.stack.is_metal)
+    classifier = table_2_classifier(float(np.radians(pair.incidence_deg)))
+    found, _ = analyse_world(pair, declared, classifier=classifier, searched=searched)
+    verdict = verdict_of(scene_reasons(found, None, classifier))
+    shown = found if verdict.usable else found.without_result()
+    names = [patch.verdict.name for patch in shown.patches if patch.verdict is not None]
+    withdrawn = found.metal.evidence is not None and found.metal.evidence.against
+    return MetalFigures(kind, seed, verdict.level, withdrawn, tuple(name for name in names if name != UNKNOWN))
+
+
+def _judge_metal(job: tuple[str, int, bool]) -> MetalFigures:
+    return judge_metal(*job)
+
+
+def print_metal(scenes: Sequence[MetalFigures]) -> None:
+    """Print how often a declared metal is withdrawn, and what scenes without metal are given."""
+    for kind in METAL_KINDS:
+        own = [scene for scene in scenes if scene.kind == kind]
+        if own:
+            counts = Counter(scene.level for scene in own)
+            levels = ", ".join(f"{level} {counts[level]}" for level in ("good", "care", "none"))
+            print(f"{kind}: {len(own)} scenes, withdrawn {sum(scene.withdrawn for scene in own)}, verdicts {levels},"
+                  f" scenes with names {sum(bool(scene.names) for scene in own)}")  # fmt: skip
+
+
 def _judge(job: tuple[str, int, bool]) -> SceneFigures:
     return judge_world(*job)
 
@@ -326,6 +402,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", type=int, default=1, help="scenes for each nuisance")
     parser.add_argument("--first", type=int, default=100, help="seed of the first scene")
     parser.add_argument("--nuisances", default=",".join(("none", *NUISANCES, "all")), help="separated by commas")
+    parser.add_argument("--metal", type=int, default=0, help="judge so many scenes of each kind of metal instead")
     parser.add_argument("--searched", action="store_true", help="search for patches instead of giving boxes")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--json", type=Path, default=None, help="write the figures of each scene there")
@@ -333,6 +410,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Judge worlds of each nuisance; print the tables."""
+    if args.metal:
+        seeds = range(args.first, args.first + args.metal)
+        of_metal = [(kind, seed, args.searched) for kind in METAL_KINDS for seed in seeds]
+        with ProcessPoolExecutor(args.jobs) as pool:
+            print_metal(list(pool.map(_judge_metal, of_metal)))
+        return 0
     seeds = range(args.first, args.first + args.scenes)
     jobs = [(name, seed, args.searched) for name in args.nuisances.split(",") for seed in seeds]
     with ProcessPoolExecutor(args.jobs) as pool:

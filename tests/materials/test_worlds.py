@@ -28,9 +28,11 @@ def half_space(permittivity: complex) -> Stack:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("nuisance", "least"), [("none", 0.85), ("tilt", 0.8), ("leakage", 0.8), ("height", 0.8)])
+@pytest.mark.parametrize(("nuisance", "least"), [("none", 0.85), ("tilt", 0.8), ("leakage", 0.8), ("misplaced", 0.8)])
 def test_regions_hold_the_truth_and_sure_names_are_right(nuisance, least):
-    patches = [p for seed in (20, 21) for p in judge_world(nuisance, seed).patches]
+    scenes = [judge_world(nuisance, seed) for seed in (20, 21)]
+    patches = [p for scene in scenes for p in scene.patches]
+    assert all(scene.level == ("care" if nuisance in ("tilt", "misplaced") else "good") for scene in scenes)
     distances = np.array([p.distance2 for p in patches if p.distance2 is not None])
     assert distances.size >= 0.8 * len(patches)
     assert np.mean(distances < CHI2_95) >= least

@@ -10,9 +10,13 @@ from polysight.results.verdict import (
     Coverage,
     NoResult,
     Verdict,
+    apart_reasons,
     brightness_reasons,
     direct_path_reasons,
     disturbance_reasons,
+    drift_reasons,
+    fit_reasons,
+    halo_reasons,
     incidence_reasons,
     leakage_reasons,
     level_reasons,
@@ -193,8 +197,13 @@ def test_every_reason_says_what_why_and_what_to_do():
         *incidence_reasons(57.0, 54.9),
         *tilt_reasons({1: 1.0, 4: -2.0}),
         *brightness_reasons({1: 0.4, 4: -0.4}),
+        *apart_reasons((3.0, -1.0)),
+        *drift_reasons(0.1, 0.05),
+        *halo_reasons(0.02),
+        *fit_reasons((0.1, 0.05), 0.0),
+        *fit_reasons((0.1, 0.05), 0.1),
     ]
-    assert len(reasons) >= 16
+    assert len(reasons) >= 21
     for r in reasons:
         assert all((r.what, r.why, r.do))
         assert not any(text.endswith(".") for text in (r.what, r.do))
@@ -234,6 +243,11 @@ def plane(offset_mm=0.0, tilt_deg=(0.0, 0.0)):
         (lambda across: tilt_reasons({1: across}), 0.5, 0.501, ("good", "care")),
         (lambda ln: brightness_reasons({1: ln}), 0.2, 0.201, ("good", "care")),
         (lambda ln: brightness_reasons({1: ln}), -0.2, -0.201, ("good", "care")),
+        (lambda mm: apart_reasons((0.0, mm)), 1.0, 1.01, ("good", "care")),
+        (lambda drift: drift_reasons(0.0, drift), 0.035, 0.0351, ("good", "care")),
+        (halo_reasons, 0.005, 0.0051, ("good", "care")),
+        (lambda ripple: fit_reasons((ripple, 0.0), 0.0), 0.03, 0.0301, ("good", "care")),
+        (lambda relief: fit_reasons((0.0, 0.0), relief), 0.035, 0.0351, ("good", "care")),
         (lambda error: leakage_reasons(False, False, error), 0.0199, 0.02, ("good", "care")),
         (lambda angle: incidence_reasons(angle, 55.0), 55.299, 55.301, ("good", "care")),
         (lambda angle: incidence_reasons(angle, 55.0), 54.701, 54.699, ("good", "care")),

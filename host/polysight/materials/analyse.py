@@ -32,6 +32,7 @@ from polysight.materials.library import SceneErrors
 from polysight.materials.measure import (
     AMPLIFIES,
     BELOW_AIR,
+    BORDER_STD,
     LEAST_STD,
     POSSIBLE_LAYER,
     CommonChange,
@@ -61,7 +62,17 @@ from polysight.materials.metal import (
 )
 from polysight.materials.names import UNKNOWN, NamedPatch, add_explanation, name_patch
 from polysight.materials.result import MaterialsResult, PatchResult, Tilts, features_of
-from polysight.materials.segment import Box, Patch, Segmentation, SegmentSettings, align, axis_mm, segment, whole_plane
+from polysight.materials.segment import (
+    Box,
+    Patch,
+    Segmentation,
+    SegmentSettings,
+    align,
+    axis_mm,
+    segment,
+    touches_border,
+    whole_plane,
+)
 from polysight.materials.specimens import features, relative, softened
 from polysight.polarimetry import (
     IncidenceChoice,
@@ -202,6 +213,9 @@ THIN = Finding(
     "fit it as a layer: `polysight process --bands 5`, then `polysight permittivity --layer NAME,?,?`",
 )
 """Why a possible layer gets no permittivity."""
+ANGLE_BY_APART = 1.0
+"""Error of the incidence angle, radians per metre between the images of H and V: boards 2 to 5 mm out of place turn it
+by 2 mrad and move the images 2 mm apart (rms; geometry of the published rig)."""
 FILLED = 0.1
 """Least |H| relative to metal at which an image without edges counts as filled with one material."""
 ACTIVE = 2.0
@@ -214,7 +228,6 @@ def analyse(
     """Find the patches of the images, estimate their permittivities, and name them if there is a classifier.
 
     A scene without patches or without metal is no error; see `metal` and `refused` of the result.
-
     Raises DataError if the image has no valid pixel, or the given metal box or patch number does not exist.
     """
     known = known or KnownScene()
@@ -233,12 +246,13 @@ def analyse(
     judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
     seen = Seen.of((rh, rv), raw, judged, found, reference, plane, images, tilts)
-    prior = seen.prior(optics.prior)
+    prior = seen.prior(optics.prior, float(np.hypot(*apart_mm)))
     measured = [seen.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
     kinds = _kinds(classifier, float(np.mean(theta)))
+    labels = [p.label for p in judged]
     if plane is None:
         channel = _channel_ratio(images, reference) if prior.channels_known else None
-        others = dict(zip([p.label for p in judged], measured, strict=True))
+        others = dict(zip(labels, measured, strict=True))
         evidence = metal_evidence(others, prior, channel, Kinds(literature(), float(np.mean(theta))))
         reference = replace(reference, evidence=evidence)
     inversion = invert(measured, prior, kinds)
@@ -246,7 +260,6 @@ def analyse(
     calibrated = remove_leakage(raw, inversion.leakage if inversion.leakage_determined else prior.leakage)
     sh, sv = (smooth_inside(c, found, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
-    labels = [p.label for p in judged]
     estimates = dict(zip(labels, inversion.patches, strict=True))
     off = dict(zip(labels, inversion.brightness_off.tolist(), strict=True))
     patches = {
@@ -257,16 +270,15 @@ def analyse(
     errors = scene_errors(inversion, prior, measured) if judged else None
     named = _names(classifier, kinds, (sh, sv, sp), inversion, judged, theta)
     truth = match_truth(found.patches, known.plates)
-    results = tuple(
-        PatchResult(p, patches[p.label], named.get(p.label), truth.get(p.label), refused.get(p.label))
-        for p in found.patches
-    )
+    at = [(p, p.label) for p in found.patches]
+    results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in at)
     return MaterialsResult(
         calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, tilts=tilts,
         boxes=dict(known.names), library=() if classifier is None else classifier.names,
         brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
         errors=None if errors is None else (tuple(labels), errors), apart_mm=apart_mm,
         drift=seen.change, halo=seen.halo.level, behind=seen.usual_background(measured),
+        ripple=seen.usual, relief_rad=seen.relief_rad,
     )  # fmt: skip
 
 
@@ -335,15 +347,25 @@ class Seen:
         spread = None if plane is None else plane.spread
         metal_rise = (0.0, 0.0) if reference.label is None else tilts.in_plane(reference.label)
         evenly = images.illumination is not None and images.illumination.known
-        change = None if metal is None else common_change(known, metal.centre_m)
+        at_border = [*(touches_border(p.mask) for p in judged if p.label in scatter), False]
+        change = None if metal is None else common_change(known, metal.centre_m, at_border)
         halo = NO_HALO if metal is None else find_halo(reference.mask, found.patches, images)
         behind = background_mean(raw.h, raw.v, found, images.usable)
         return cls(scatter, usual_scatter(known), metal, change, spread, tilts, evenly, metal_rise, halo, behind)
 
-    def prior(self, prior: RigPrior) -> RigPrior:
-        """Return the prior of the rig's errors with what the plates show: the metal's error and tilt."""
+    @property
+    def relief_rad(self) -> float:
+        """Usual standard deviation of the phase of H about a plane inside the plates; 0 without plates."""
+        return float(np.median([s.relief_rad for s in self.scatter.values()])) if self.scatter else 0.0
+
+    def prior(self, prior: RigPrior, apart_mm: float) -> RigPrior:
+        """Return the prior of the rig's errors with what the plates show: the metal's error and tilt.
+
+        `apart_mm` is the distance of the images of H and V before they were laid on each other.
+        """
         light = EVEN_LIGHT if self.lit_evenly else UNEVEN_LIGHT
-        prior = replace(prior, metal_rise=self.metal_rise, lighting_std=light)
+        theta_std_rad = float(np.hypot(prior.theta_std_rad, ANGLE_BY_APART * apart_mm / 1e3))
+        prior = replace(prior, metal_rise=self.metal_rise, lighting_std=light, theta_std_rad=theta_std_rad)
         if self.metal_spread is not None:
             return replace(prior, reference_std=LEAST_STD)
         amplitude, phase = relative_errors(self.metal, self.usual)
@@ -353,6 +375,8 @@ class Seen:
     def measure(self, patch: Patch, channels: tuple[Image, Image], theta_rad: float) -> PatchMeasurement:
         """Measure one patch relative to metal."""
         local_std = self.metal_spread or 0.0
+        if touches_border(patch.mask) and self.metal is not None:
+            local_std = BORDER_STD
         scatter = self.scatter.get(patch.label)
         rise = self.tilts.in_plane(patch.label)
         change = None

@@ -54,6 +54,8 @@ whose polarisation turns off axis. A transmitter that is turned to the other sid
 UNEVEN_LIGHT, EVEN_LIGHT = (1.0, 1.0), (0.3, 0.5)
 """Change of ln(V / H) per radian of rise, along x and across, by the patterns of boards that see the plate from other
 points: without and with the correction of the plate's illumination. The independent generator has 0.6 along x."""
+CHI2_95 = 5.991
+"""Squared distance in standard deviations that holds 95 % of a normal distribution of two dimensions."""
 LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
@@ -489,6 +491,9 @@ def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> Patch
     kept = np.einsum("...i,ij,...j->...", off, np.linalg.inv(of_ratio), off) < 11.8
     parts = pair(drawn[kept] - value)
     covariance = np.asarray(parts.T @ parts / len(parts), np.float64)
+    # A tail (the mount may have moved) widens a covariance more than the region that holds 95 %.
+    distance2 = np.einsum("...i,ij,...j->...", parts, np.linalg.inv(covariance), parts)
+    covariance *= float(np.quantile(distance2, 0.95)) / CHI2_95
     return PatchEstimate(middle, of_ratio, value, covariance, _shares(model, z, i, value), evidence)
 
 

@@ -6,6 +6,7 @@ of the pixels. `check_patches` refuses patches that are no flat plates.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -41,14 +42,20 @@ TILT_STD = 0.004
 
 A tilted plate is illuminated from other points, different for H and V; one degree of tilt spreads the phase by 0.3 rad.
 """
-DRIFTS = (0.002, 0.02, 0.06)
-"""Prior standard deviations of the drift of ln(V / H) over a scan, each part: of a stable rig, of a usual one, and of
-one that drifts by 15 % and 9 degrees."""
+DRIFTS = {0.002: 0.7, 0.02: 0.1, 0.06: 0.2}
+"""Standard deviations of the drift of ln(V / H) over a scan, each part, with their prior probabilities: of a stable
+rig, of a usual one, and of one that drifts by 15 % and 9 degrees."""
 DRIFT_M = 0.07
 """Length over which a drift changes, along the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
 COMMON_SLOPES = (0.1, 1.0)
 """Prior standard deviations of the slope of ln(V / H) that all plates have by themselves, per metre: H and V that see
 the same place, and images some millimetres apart (their edges differ)."""
+OWN_SLOPES = (0.05, 1.0, 3.0)
+"""The same of the slope that each plate has of its own: flat plates, uneven or disturbed ones."""
+BORDER_STD = 0.05
+"""Error of ln(V / H) of a plate at the border of the image, each part: the end of the aperture lights it."""
+BORDER_SLOPE_STD = 100.0
+"""Standard deviation of the slope of a plate at the border of the image: it says nothing."""
 RIPPLE_M = 0.02
 """Error of a plate's ln(V / H) by ripple of the scene, over the scatter of the plates' slopes: half a plate's width."""
 Real = npt.NDArray[np.float64]
@@ -198,6 +205,8 @@ class Scatter:
         Its change per metre along x and y, complex [2], and the standard deviation of either part's, [2] each complex.
     centre_m
         Centre of the pixels, x and y.
+    relief_rad
+        Standard deviation of the phase of H about a plane: the plate's surface is rough, wavy or bent.
     """
 
     amplitude: float
@@ -206,6 +215,7 @@ class Scatter:
     slope: npt.NDArray[np.complex128]
     slope_std: npt.NDArray[np.complex128]
     centre_m: tuple[float, float]
+    relief_rad: float = 0.0
 
 
 def scatter_of(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Scatter | None:
@@ -228,9 +238,20 @@ def scatter_of(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Scatter 
     # Robust against bright strips at edges: deviations beyond three standard deviations are cut.
     cut = np.clip(off.real, -3 * amplitude, 3 * amplitude) + 1j * np.clip(off.imag, -3 * phase, 3 * phase)
     slope_of = np.linalg.solve(information, centred.T @ cut)
+    rest = np.asarray(off - centred @ slope_of, np.complex128)
+    about = complex(*(1.4826 * float(np.median(np.abs(part - np.median(part)))) for part in (rest.real, rest.imag)))
     unit = np.sqrt(np.diag(np.linalg.inv(information)) * rows.size / blocks)
     x, y = places.mean(axis=0).tolist()
-    return Scatter(amplitude, phase, blocks, slope_of, unit * complex(amplitude, phase), (x, y))
+    return Scatter(amplitude, phase, blocks, slope_of, unit * about, (x, y), _relief(h[at], centred))
+
+
+def _relief(h: Image, centred: Real) -> float:
+    """Return the standard deviation of the phase of pixels [n] about a plane over their places [n, 2], radians."""
+    mean = complex(h.astype(np.complex128).sum())
+    phase = np.angle(h * np.conj(mean)).astype(np.float64)
+    design = np.column_stack([np.ones(len(centred)), centred])
+    fit = np.linalg.lstsq(design, phase, rcond=None)[0]
+    return float(np.std(phase - design @ fit))
 
 
 def usual_scatter(all_plates: Sequence[Scatter]) -> tuple[float, float]:
@@ -258,6 +279,14 @@ class CommonChange:
     std: npt.NDArray[np.complex128]
     ripple: complex
 
+    def largest(self) -> tuple[float, float]:
+        """Return the largest root mean square of the drift at a plate, of its real and of its imaginary part."""
+        if not self.value.size:
+            return 0.0, 0.0
+        parts = (np.hypot(part(self.value), part(self.std)) for part in (np.real, np.imag))
+        amplitude, phase = (float(part.max()) for part in parts)
+        return amplitude, phase
+
     def of(self, plate: int) -> tuple[complex, tuple[float, float]]:
         """Return ln(V / H) of a plate relative to the origin, and the standard deviations of both of its parts."""
         std = complex(self.std[plate])
@@ -266,14 +295,17 @@ class CommonChange:
         return complex(self.value[plate]), (amplitude, phase)
 
 
-def common_change(plates: Sequence[Scatter], origin_m: tuple[float, float]) -> CommonChange:
+def common_change(
+    plates: Sequence[Scatter], origin_m: tuple[float, float], at_border: Sequence[bool] = ()
+) -> CommonChange:
     """Return what the slopes of all plates of a scene tell of a drift of ln(V / H) over the scan.
 
     Rows are scanned one after the other, so that a drift is a function of y; the stage moves the whole rig, so that
     nothing else changes ln(V / H) over a plane (Gaussian process with its derivative; Rasmussen and Williams, Gaussian
     Processes for Machine Learning, 2006, 9.4). A slope that all plates have alike may be theirs: edges of images that
-    are not in the same place.
+    are not in the same place. Plates `at_border` of the image say nothing of it.
     """
+    border = np.array(at_border, bool) if at_border else np.zeros(len(plates), bool)
     y_m = np.array([s.centre_m[1] for s in plates], np.float64)
     value = np.zeros(y_m.size, np.complex128)
     std = np.zeros(y_m.size, np.complex128)
@@ -281,21 +313,21 @@ def common_change(plates: Sequence[Scatter], origin_m: tuple[float, float]) -> C
     for axis in (0, 1):
         for k, (part, unit) in enumerate(((np.real, 1), (np.imag, 1j))):
             slopes = np.array([part(s.slope[axis]) for s in plates], np.float64)
-            noise = np.maximum([part(s.slope_std[axis]) for s in plates], 1e-3)
+            noise = np.maximum([part(s.slope_std[axis]) for s in plates], 1e-3) + BORDER_SLOPE_STD * border
             left = slopes - np.median(slopes)
             if axis == 1:
                 change, deviation, drift_slopes = _averaged_drift(y_m, origin_m[1], slopes, noise)
                 value += unit * change
                 std += unit * deviation
                 left = slopes - drift_slopes
-            ripple2[k] += max(0.0, float(np.sum(left**2 - noise**2)) / max(slopes.size - 2, 1)) / 2
+            ripple2[k] += max(0.0, float(np.sum((left**2 - noise**2)[~border])) / max(int(np.sum(~border)) - 2, 1)) / 2
     return CommonChange(value, std, complex(*np.sqrt(ripple2)))
 
 
 def _averaged_drift(y_m: Real, origin_m: float, slopes: Real, noise: Real) -> tuple[Real, Real, Real]:
     """Return mean and standard deviation of a drift [plate] relative to the origin, and its expected slopes [plate].
 
-    They are averaged over `DRIFTS` and `COMMON_SLOPES` with the evidence of each.
+    They are averaged over `DRIFTS`, `COMMON_SLOPES` and `OWN_SLOPES` with the evidence of each.
     """
     apart = y_m[:, None] - y_m
     near = np.exp(-0.5 * (apart / DRIFT_M) ** 2)
@@ -306,15 +338,17 @@ def _averaged_drift(y_m: Real, origin_m: float, slopes: Real, noise: Real) -> tu
     with_slopes = (apart * near + (from_origin * near_origin)[None, :]) / DRIFT_M**2
     of_itself = 2 - 2 * near_origin
     means, variances, fitted, evidences = [], [], [], []
-    for drift in DRIFTS:
-        for common in COMMON_SLOPES:
-            explained = drift**2 * of_slopes + common**2
-            total = explained + np.diag(noise**2)
-            gain = drift**2 * with_slopes @ np.linalg.inv(total)
-            means.append(gain @ slopes)
-            variances.append(drift**2 * of_itself - np.sum(gain * drift**2 * with_slopes, axis=1))
-            fitted.append(explained @ np.linalg.solve(total, slopes))
-            evidences.append(-0.5 * float(slopes @ np.linalg.solve(total, slopes)) - 0.5 * np.linalg.slogdet(total)[1])
+    for drift, common, own in itertools.product(DRIFTS, COMMON_SLOPES, OWN_SLOPES):
+        explained = drift**2 * of_slopes + common**2
+        total = explained + np.diag(noise**2 + own**2)
+        inverse = np.linalg.inv(total)
+        gain = drift**2 * with_slopes @ inverse
+        means.append(gain @ slopes)
+        variances.append(drift**2 * of_itself - np.sum(gain * drift**2 * with_slopes, axis=1))
+        fitted.append(explained @ inverse @ slopes)
+        evidences.append(
+            np.log(DRIFTS[drift]) - 0.5 * float(slopes @ inverse @ slopes) - 0.5 * np.linalg.slogdet(total)[1]
+        )
     weight = np.exp(np.array(evidences) - max(evidences))
     weight /= weight.sum()
     mean = weight @ np.array(means)

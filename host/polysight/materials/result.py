@@ -143,6 +143,10 @@ class MaterialsResult:
         Amplitude of V around the metal beyond what H has there, relative to the metal.
     behind
         Usual error of each part of ln(V / H) by what lies behind the plates; it is in their error bars.
+    ripple
+        Usual scatter of ln|V / H| and of its phase inside the plates, where a flat plate has none.
+    relief_rad
+        Usual standard deviation of the phase of H about a plane inside the plates.
     """
 
     calibrated: Images
@@ -166,6 +170,8 @@ class MaterialsResult:
     drift: CommonChange | None = None
     halo: float = 0.0
     behind: float = 0.0
+    ripple: tuple[float, float] = (0.0, 0.0)
+    relief_rad: float = 0.0
 
     def rows(self) -> list[PatchFigures]:
         """Return the figures of each patch, for materials.json."""

@@ -235,6 +235,11 @@ def segment(
     return Segmentation(labels, tuple(patches), left_out)
 
 
+def touches_border(mask: Mask) -> bool:
+    """Return true if a mask reaches the first or the last row or column of the image."""
+    return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
+
+
 def _is_cut(mask: Mask, smallest_px: float) -> bool:
     """Return true if more than the smallest patch's width lies at the border of the image.
 

@@ -44,6 +44,7 @@ from polysight.results import (
     direct_path_reasons,
     disturbance_reasons,
     drift_reasons,
+    fit_reasons,
     halo_reasons,
     incidence_reasons,
     leakage_reasons,
@@ -406,11 +407,11 @@ def scene_reasons(found: MaterialsResult, plane: PlaneEstimate | None, classifie
     if copies is not None:
         reasons += copies_reasons(copies.labels, copies.shift_mm, copies.level_db)
     reasons += apart_reasons(found.apart_mm)
-    if found.drift is not None and found.drift.value.size:
-        change = found.drift.value
-        reasons += drift_reasons(float(np.abs(change.real).max()), float(np.abs(change.imag).max()))
+    if found.drift is not None:
+        reasons += drift_reasons(*found.drift.largest())
     reasons += halo_reasons(found.halo)
     reasons += background_reasons(found.behind)
+    reasons += fit_reasons(found.ripple, found.relief_rad)
     reasons += passivity_reasons(gaining)
     metal = found.metal
     if found.patches and metal.evidence is not None:

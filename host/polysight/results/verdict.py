@@ -130,12 +130,16 @@ PLANE_GATE_MM = 13.0
 """Distance at which the plates lie at the edge of the range gate."""
 APART_MM = 1.0
 """Distance of the images of H and V above which boards are out of place; undisturbed scenes have up to 0.6 mm."""
-DRIFT_CARE = 0.03
+DRIFT_CARE = 0.035
 """Drift of ln(V / H) between plates above which the result needs care, each part."""
 HALO_CARE = 0.005
 """Halo of V around the metal above which a receiver is overdriven."""
 BACKGROUND_CARE = 0.04
 """Error of P by what lies behind the plates: about 3 % of a permittivity."""
+RIPPLE_CARE = 0.03
+"""Scatter of V / H inside plates above which the result needs care; undisturbed scenes have up to 0.012."""
+RELIEF_CARE_RAD = 0.035
+"""Scatter of the phase of H inside plates above which they are uneven; flat ones have up to 0.005, tilted ones 0.03."""
 PLATE_ACROSS_DEG = 0.5
 """Tilt of a plate across the plane of incidence; turns the polarisation by 0.4 degrees: 3 to 6 % of a permittivity."""
 BRIGHTNESS_CARE = 0.2
@@ -444,7 +448,7 @@ def apart_reasons(apart_mm: tuple[float, float]) -> list[Finding]:
 
 
 def drift_reasons(amplitude: float, phase_rad: float) -> list[Finding]:
-    """Judge the drift of V / H over the scan: largest differences between plates and metal."""
+    """Judge the drift of V / H over the scan: its largest root mean square at a plate, relative to the metal."""
     if not (is_known(amplitude) and is_known(phase_rad)) or max(amplitude, phase_rad) <= DRIFT_CARE:
         return []
     return [reason(
@@ -473,6 +477,27 @@ def background_reasons(relative_std: float) -> list[Finding]:
         "care", f"what lies behind the plates disturbs P by {100 * relative_std:.0f} %, which the error bars contain",
         "a table, a wall or a holder behind them returns waves too, and they add to those of the plates",
         "cover it with absorber, or move it 300 mm away from the plates", 2.9,
+    )]  # fmt: skip
+
+
+def fit_reasons(ripple: tuple[float, float], relief_rad: float) -> list[Finding]:
+    """Judge how well flat plates fit: usual scatter of ln|V / H| and of its phase inside them, and their relief.
+
+    A flat plate has one V / H, and a phase of H that is a plane.
+    """
+    if is_known(relief_rad) and relief_rad > RELIEF_CARE_RAD:
+        return [reason(
+            "care", f"plates are rough, wavy or bent: the phase of H scatters by {np.degrees(relief_rad):.0f} degrees",
+            "an uneven surface is seen from other places by H and V; errors are larger, counted by the scatter",
+            "lay flat plates, or press them onto a plane", 2.1,
+        )]  # fmt: skip
+    if not all(map(is_known, ripple)) or max(ripple) <= RIPPLE_CARE:
+        return []
+    return [reason(
+        "care",
+        f"V / H ripples by {100 * ripple[0]:.0f} % and {np.degrees(ripple[1]):.0f} degrees inside the plates",
+        "a second path beside the direct path, positions without data, interference, or a small aperture do that",
+        "take reflectors away from the line between transmitter and receivers; scan all positions", 2.4,
     )]  # fmt: skip
 
 

@@ -1,0 +1,99 @@
+"""What a scene says of its own errors: images that lie apart, a drift, a halo of an overdriven receiver."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from polysight.imaging import Images
+from polysight.materials.measure import Scatter, common_change
+from polysight.materials.metal import find_halo
+from polysight.materials.segment import align, segment
+
+PIXEL_M = 2e-3
+SIDE = 120
+AXIS = (np.arange(SIDE) - (SIDE - 1) / 2) * PIXEL_M
+PLACES_M = [(x, y) for y in (-0.064, 0.0, 0.064) for x in (-0.064, 0.0, 0.064)]
+ORIGIN_M = PLACES_M[4]
+
+
+def plates(ratio=0.25, seed=0):
+    """H and V of copper and three dielectrics of one ratio, 46 mm wide, with noise 40 dB below."""
+    rng = np.random.default_rng(seed)
+    h, v = np.zeros((2, SIDE, SIDE), complex)
+    for number, (x0, y0) in enumerate([(20, 20), (70, 20), (20, 70), (70, 70)]):
+        h[y0 : y0 + 23, x0 : x0 + 23] = 1.0
+        v[y0 : y0 + 23, x0 : x0 + 23] = 1.0 if number == 0 else ratio
+    noise = 0.003 * (rng.standard_normal((2, SIDE, SIDE)) + 1j * rng.standard_normal((2, SIDE, SIDE)))
+    return [ndimage.gaussian_filter(channel.real, 1.0) + one for channel, one in zip((h, v), noise, strict=True)]
+
+
+def images(h, v):
+    return Images(h, v, AXIS, AXIS, np.ones(h.shape, bool))
+
+
+@pytest.mark.parametrize("shift_px", [(0.0, 1.5), (-2.0, 1.0), (1.2, 0.0)])
+def test_images_of_h_and_v_that_lie_apart_are_laid_on_each_other(shift_px):
+    h, v = plates()
+    moved = ndimage.shift(v, shift_px, order=3)
+    aligned, apart_mm = align(images(h, moved))
+    assert apart_mm == pytest.approx((2 * shift_px[1], 2 * shift_px[0]), abs=0.4)
+    inside = np.s_[10:110, 10:110]
+    assert np.abs(aligned.v - v)[inside].mean() < 0.5 * np.abs(moved - v)[inside].mean()
+
+
+def test_images_that_lie_on_each_other_are_left_alone():
+    pair = images(*plates())
+    aligned, apart_mm = align(pair)
+    assert apart_mm == (0.0, 0.0)
+    assert np.array_equal(aligned.v, pair.v)
+
+
+def test_noise_has_no_place():
+    rng = np.random.default_rng(1)
+    h, v = rng.standard_normal((2, SIDE, SIDE)) + 1j * rng.standard_normal((2, SIDE, SIDE))
+    assert align(images(h, v))[1] == (0.0, 0.0)
+
+
+def scattered(slope_of):
+    """Nine plates with the slopes (x, y) that a function of their place gives, known to 0.1 per metre."""
+    std = np.full(2, 0.1 + 0.1j)
+    return [Scatter(0.01, 0.01, 8.0, np.array(slope_of(*place)), std, place) for place in PLACES_M]
+
+
+def test_slopes_that_all_plates_have_alike_are_theirs():
+    found = common_change(scattered(lambda _x, _y: (0.7 + 0.5j, 0.4j)), ORIGIN_M)
+    assert np.abs(found.value).max() < 0.01
+
+
+def test_a_drift_over_the_rows_is_followed_within_its_error():
+    """ln(V / H) = 0.06 cos(20 y): both parts, slopes along y."""
+    found = common_change(scattered(lambda _x, y: (0j, -(1 + 1j) * 0.06 * 20 * np.sin(20 * y))), ORIGIN_M)
+    true = (1 + 1j) * 0.06 * (np.cos(20 * np.array(PLACES_M)[:, 1]) - 1)
+    off = found.value - true
+    assert (np.abs(off.real) <= 2 * found.std.real + 1e-6).all()
+    assert np.abs(off).max() < 0.6 * np.abs(true).max()
+    assert max(found.largest()) > 0.03
+
+
+def test_slopes_along_a_row_are_no_drift():
+    found = common_change(scattered(lambda x, _y: (20 * x, 0j)), ORIGIN_M)
+    assert np.abs(found.value).max() < 0.005
+
+
+def test_plates_at_the_border_say_nothing_of_a_drift():
+    steep = scattered(lambda _x, y: (0j, 8.0 if y > 0.05 else 0j))
+    found = common_change(steep, ORIGIN_M, [place[1] > 0.05 for place in PLACES_M])
+    assert np.abs(found.value[:6]).max() < 0.01
+
+
+def test_an_overdriven_receiver_shows_as_a_halo_of_v_alone():
+    h, v = plates()
+    pair = images(h, v)
+    patches = segment(h, v, AXIS, AXIS).patches
+    metal = next(p for p in patches if np.median(np.abs(v[p.interior])) > 0.8)
+    assert find_halo(metal.interior, patches, pair).level == 0
+    glow = 0.3 * ndimage.gaussian_filter(metal.mask.astype(float), 8.0)
+    found = find_halo(metal.interior, patches, images(h, v + glow))
+    assert found.level > 0.005
+    assert max(found.around, key=lambda label: found.around[label]) == metal.label
+    assert find_halo(metal.interior, patches, images(h + glow, v + glow)).level == 0

@@ -265,3 +265,30 @@ def test_every_frame_of_a_perfect_row_is_seen_at_its_pulse(count, frame):
 def test_a_missed_and_a_spurious_edge_in_bursts_of_one_pulse_are_seen():
     seen = [check_troubled(seed, 30, 1, FRAME, ("missed", "spurious")) for seed in range(40)]
     assert all(r.contradicted or r.uncertain > 1 or r.slots.size < 30 for r in seen)
+
+
+@pytest.mark.parametrize("at", range(8, 84, 5))
+def test_frames_below_a_packet_beside_a_spurious_edge_are_masked(at):
+    """Most bursts are then a pulse early, so that the times of the others seem late."""
+    frame, pulses = 1440, pulse_times(13, 7)
+    edges = np.insert(pulses.reshape(-1), at, pulses.reshape(-1)[at] - 700 * US)[: pulses.size]
+    truth = np.insert(np.arange(pulses.size), at, -2)[: pulses.size]
+    arrivals, answer = receive_edges(edges, pulses, frame, np.random.default_rng(at), QUIET)
+    result = place_frames(pulses, answer, arrivals, frame, PAYLOAD)
+    sure = result.slots >= 0
+    assert result.contradicted
+    np.testing.assert_array_equal(result.slots[sure], truth[sure])
+
+
+@pytest.mark.parametrize("bursts", [3, 8, 30])
+@pytest.mark.parametrize("share", [0.5, 0.7, 1.0])
+def test_the_first_pulse_missed_in_many_bursts_shifts_nothing(bursts, share):
+    """Then the bursts' first frames come a period late, all alike: only whole bursts tell when frames come."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        pulses = pulse_times(bursts)
+        many = max(1, round(share * bursts))
+        missed = sorted((PULSES * rng.choice(bursts, many, replace=False)).tolist())
+        arrivals, answer = receive(pulses, missed, FRAME, rng, QUIET)
+        result = place_frames(pulses, answer, arrivals, FRAME, PAYLOAD)
+        check(result, np.delete(np.arange(pulses.size), missed), set(missed))

@@ -119,8 +119,9 @@ def place_frames(
         return PlacedFrames(none, [], pulses, str(e), disturbed=isinstance(e, _DisturbedError))
     slots, contradicted = _decide(evidence, counted, pulses_ns.shape[1], pulses)
     if frame_bytes < payload_bytes:
-        # A missed pulse and a spurious edge within a packet do not show: only the frame that fills it is seen.
-        slots[evidence.low == _UNKNOWN] = -1
+        # A missed pulse and a spurious edge within a packet do not show: only the frame that fills it is seen. Which
+        # bursts are punctual beside a spurious edge does not show either: frames are counted from the row's first.
+        slots[(evidence.low == _UNKNOWN) | contradicted] = -1
     missed = _missed(slots, pulses) if received < pulses else []
     if contradicted or received < pulses:
         slots = _without_mixed(slots, pulses)
@@ -163,7 +164,9 @@ def _observe(
     # The short last packet waits for the end of the record.
     full = stop % payload_bytes == 0
     pauses = _pauses(pulses_ns, received_ns)
-    earliest, expected = _expected_arrivals(pulses_ns, pauses, came[full], frame[full], frame_bytes >= payload_bytes)
+    earliest, expected = _expected_arrivals(
+        pulses_ns, pauses, came[full], frame[full], frame_bytes >= payload_bytes, received < pulses.size
+    )
 
     first_batch = np.searchsorted(stop, np.arange(received) * frame_bytes, "right")
     sent_by_then = np.searchsorted(earliest, came + min(_EARLY * period_ns, _EARLY_NS), "right") - 1
@@ -347,13 +350,14 @@ def _pauses(pulses_ns: Times, received_ns: Times) -> Times:
 
 
 def _expected_arrivals(
-    pulses_ns: Times, pauses: Times, came: Times, frame: Times, is_first: bool
+    pulses_ns: Times, pauses: Times, came: Times, frame: Times, is_first: bool, only_whole: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the earliest and the expected arrival of each pulse's frame: host's clock, float64 [pulse] each.
 
     Estimated from the packets of each burst: the shortest time from pulse to data, and its drift along the row. A burst
     with a missed pulse or a spurious edge differs from the others and is left out. `is_first`: a burst's first packet
-    is of its first frame; otherwise (frames below a packet) frames are counted from the row's first.
+    is of its first frame; otherwise (frames below a packet) frames are counted from the row's first. `only_whole`: of a
+    row with missed pulses only bursts with all of their frames count, as a radar may miss the first pulse of many.
     """
     count = pulses_ns.shape[1]
     sent, delay = [], []
@@ -362,7 +366,7 @@ def _expected_arrivals(
         own = slice(int(edges[b]), int(edges[b + 1]))
         pulse = frame[own] - (frame[own][:1] if is_first else b * count)
         of_burst = (pulse >= 0) & (pulse < count)
-        if of_burst.any():
+        if of_burst.any() and (pulse.max() == count - 1 or not only_whole):
             sent.append(pulses_ns[b, 0])
             delay.append((came[own][of_burst] - pulses_ns[b][pulse[of_burst]]).min())
     if len(sent) < _AGREEING:

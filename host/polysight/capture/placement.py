@@ -147,7 +147,7 @@ class Evidence(msgspec.Struct, frozen=True):
 def place_record(
     log: PacketLog, frame_bytes: int = 1, past: Past | None = None, not_before_ns: int = 0, dropped_by_card: str = ""
 ) -> tuple[Placed, Bytes]:
-    """Place one row's packets; return the result and the row: uint8 [expected], zero where masked.
+    """Place one row's packets; return the result and the row: uint8 [expected], zero at the holes.
 
     Parameters
     ----------

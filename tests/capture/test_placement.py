@@ -25,7 +25,8 @@ from tests.support.capture.records import (
 
 from polysight.capture.dca1000 import Counters
 from polysight.capture.packet_log import PacketLog
-from polysight.capture.placement import Losses, Past, place_record
+from polysight.capture.placement import Evidence, Losses, Past, place_record
+from polysight.capture.row_files import read_packets, write_packets
 
 SLOW = [HealthCheck.too_slow]  # a busy machine is no fault
 COUNT, SEQUENCE = 1 << 48, 1 << 32
@@ -409,6 +410,25 @@ def test_overlapping_payload_is_compared():
     assert placed.missing == [(7 * FULL, 8 * FULL)]
     assert (placed.counts.conflicting, placed.counts.duplicates) == (1, 1)
     assert is_original_or_masked(record, placed, out)
+
+
+@pytest.mark.parametrize("trouble", ["conflict", "short", "conflict and short"])
+def test_placing_leaves_the_logged_payload_as_it_came(trouble, tmp_path):
+    """The row's packet file is written from it afterwards, and gives the same result again."""
+    record = Record.make(20 * FULL + 100, 0, 1)
+    other = encode_packet(8, 7 * FULL, bytes(255 - b for b in record.packets[7][10:]))
+    end = FULL if "short" in trouble else 0
+    size = len(record.data) + end
+    elsewhere = encode_packet(99, 5 * size, bytes([9] * 99))
+    packets = [*record.packets, *([other] if "conflict" in trouble else []), elsewhere]
+    log, past = log_of(size, packets), Past().after_reset()
+    came = log.payload[: log.payload_bytes].copy()
+    placed, out = place_record(log, FRAME, past)
+    assert (log.payload[: came.size] == came).all()
+    write_packets(tmp_path / "0000.pkt", log, Evidence(size, FRAME, past=past), placed)
+    again, same = place_record(read_packets(tmp_path / "0000.pkt", out)[1], FRAME, past)
+    assert (again.counts, again.missing) == (placed.counts, placed.missing)
+    assert (same == out).all()
 
 
 def test_packets_before_the_first_pulse_are_left_over_or_spurious_frames():

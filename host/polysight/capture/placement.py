@@ -102,7 +102,6 @@ class Placed:
     past: Past  # knowledge for the next record
     at: Counts  # int64 [packet]: offset of its payload in the row, -1 outside the row
     arrivals: Counts  # int64 [n, 2]: time (monotonic, ns), bytes received by then; no growth: the socket was empty
-    conflicts: list[Gap] = field(default_factory=list)  # byte ranges with different bytes in two packets; missing
     holes: list[Gap] = field(default_factory=list)  # missing ranges below the furthest byte, in the card's order
     slipped: bool = False  # not located only because whole frames are missing: triggers were missed
 
@@ -185,7 +184,6 @@ def place_record(
         past=_past_after(past, record, _gaps(row.covered, log.expected)),
         at=row.at,
         arrivals=row.arrivals(),
-        conflicts=_merged(row.conflicts),
         holes=holes,
         slipped=why.frames_missing and not dropped_by_card,
     )
@@ -527,10 +525,14 @@ class _Row:
         return np.ascontiguousarray(pairs[pairs[:, 1] > 0])
 
     def bytes(self, holes: list[Gap]) -> Bytes:
-        """Return the row: the log's own memory if the packets came in order, otherwise a copy. Zero at the holes."""
+        """Return the row: the log's own memory if it came whole and in order, otherwise a copy. Zero at the holes.
+
+        The log's payload stays as it came: it is stored as the evidence.
+        """
         log, mine = self._log, np.flatnonzero(self._placed)
         out = log.payload[: log.expected]
-        if (self.at[mine] != self._starts[mine]).any() or log.payload.size < log.expected:
+        whole = not holes and self.extent == log.expected
+        if not whole or (self.at[mine] != self._starts[mine]).any():
             out = np.zeros(log.expected, dtype=np.uint8)
             self._copy(mine, out)
         out[self.extent :] = 0

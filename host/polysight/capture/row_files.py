@@ -227,7 +227,7 @@ def _in_the_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the offset of each packet's unchanged payload in the row's file, int64 [packet]; -1 if it is not there."""
     at = placed.at[: sizes.size].copy()
     at[at + sizes > placed.expected] = -1
-    for start, stop in placed.conflicts:
+    for start, stop in placed.holes:
         at[(at < stop) & (at + sizes > start)] = -1
     return at
 

@@ -103,3 +103,16 @@ def test_correction_factors_stay_finite_at_the_edge_of_the_illumination():
     assert np.isfinite(factors).all()
     assert factors.min() > 0.5
     assert factors.max() < 2
+
+
+@pytest.mark.parametrize("radius_m", [0.1, 0.3, np.inf])
+def test_the_curvature_of_a_patch_is_estimated_from_its_phase(radius_m):
+    flat = np.ones((2, 24, 24), np.complex64)
+    lit = Illumination(flat, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))
+    x_m = (np.arange(24) - 11.5) * 2e-3
+    height_m = 0.01 * x_m + x_m**2 / (2 * radius_m)
+    noise = np.random.default_rng(1).standard_normal((24, 48)).view(np.complex128)
+    image = np.tile(np.exp(-1j * 1900.0 * height_m), (24, 1)) + 0.05 * noise
+    along_x, along_y = lit.bend(image, image, np.ones((24, 24), bool))
+    assert along_x == pytest.approx(1 / radius_m, abs=0.2)
+    assert along_y == pytest.approx(0.0, abs=0.2)

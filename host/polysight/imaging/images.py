@@ -60,6 +60,8 @@ MIN_RISE = 2e-3
 """Smallest tilt that is corrected (0.11 degrees); smaller ones may come from sidelobes of neighbours."""
 _FEEBLE = 0.12
 """Level of V relative to H below which its phase is not used: permittivities below 2.8 at 55 degrees."""
+_LEAST_LINES = 6
+"""Columns or rows of pixels in a patch from which a curvature is estimated."""
 _COHERENT = 0.5
 """Smallest coherence of the phase steps between pixels (1: all equal)."""
 _MAX_CHANGE = 2.0
@@ -130,6 +132,30 @@ class Illumination:
             slope = float(np.angle(step)) / self.pixel_m[along] / float(self.steepness_rad_m.mean())
             out.append(slope if abs(step) > _COHERENT else 0.0)
         return out[0], out[1]
+
+    def bend(self, h: Image, v: Image, mask: Mask) -> tuple[float, float]:
+        """Estimate a patch's curvature along x and y from its phase, 1 / m, positive where it bends away; 0 if unknown.
+
+        The phase from pixel to pixel, summed over lines of the other axis, grows evenly on a surface of one curvature.
+        """
+        channel = h if np.nansum(np.abs(h[mask])) >= np.nansum(np.abs(v[mask])) else v
+        bends = []
+        for axis in (1, 0):
+            pitch_m = self.pixel_m[1 - axis]
+            ahead, here = (slice(1, None), slice(None, -1))
+            first, second = ((slice(None), part) if axis == 1 else (part, slice(None)) for part in (here, ahead))
+            inside = mask[first] & mask[second]
+            steps = np.sum(np.where(inside, channel[second] * np.conj(channel[first]), 0), axis=1 - axis)
+            seen = inside.sum(axis=1 - axis) > 2
+            if seen.sum() < _LEAST_LINES:
+                bends.append(0.0)
+                continue
+            place_m = np.flatnonzero(seen) * pitch_m
+            weight = np.sqrt(np.abs(steps[seen]))
+            growth = float(np.polyfit(place_m, np.unwrap(np.angle(steps[seen])), 1, w=weight)[0])
+            # The samples are conjugated: the phase falls where the surface is farther.
+            bends.append(-growth / pitch_m / float(self.steepness_rad_m.mean()))
+        return bends[0], bends[1]
 
     @property
     def known(self) -> bool:

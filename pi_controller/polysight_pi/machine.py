@@ -26,6 +26,7 @@ from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 
 STATUS_EVENT_S = 0.24
 RESTS = 3  # consecutive statuses at rest after which the reply to the end of a motion counts as lost
+ASKED_AGAIN = 3  # times that such a reply is asked for; a stage whose banner was lost never gives it
 MOVING = ("homing", "running", "held", "stopping")
 POSITION_LOST = (
     StageError.NOT_HOMED, StageError.IN_ALARM, StageError.LIMIT_SWITCH, StageError.EMERGENCY_STOP, StageError.DISABLED,
@@ -74,7 +75,7 @@ RULES = (
     Rule("Abort", "idle homed ready stopping ending fault", "same"),
     Rule("Pulse", "idle homed fault", "same"),
     # Replies of the stage; ignored in all other states.
-    Rule("homed", "homing", "homed ready", "note_homed"),
+    Rule("homed", "homing", "homed ready fault", "note_homed"),
     Rule("passed", "running held", "done ending", "note_passed"),
     Rule("passed", "stopping", "ending", "note_stopped"),
     Rule("stopped", "running held stopping done", "ending", "note_stopped"),
@@ -335,8 +336,11 @@ class Machine:
             self._rests += 1
         else:
             self._rests = 0
-        if self._rests >= RESTS:
+        if self._rests > RESTS * ASKED_AGAIN:
             self._rests = 0
+            reason = "it rests, and does not say how its motion ended: it was reset"
+            self.happen("stage lost", PiFault.STAGE_LOST, reason)
+        elif self._rests and self._rests % RESTS == 0:
             try:
                 self.stage.link.repeat()  # the stage repeats the end of its motion
             except StageLostError as e:
@@ -377,6 +381,10 @@ class Machine:
 
     def _note_homed(self, reply: Reply) -> str:
         self.stage.at_rest()
+        place = (_number(reply, "x"), _number(reply, "y"))
+        if place != (0, 0):
+            self._report_fault(PiFault.POSITION, f"homing ended at {place}, not at (0, 0) (x, y in steps)")
+            return "fault"
         limit = MAX_MM * self.stage.config.steps_per_mm
         lost_x, lost_y = (max(-limit, min(_number(reply, key), limit)) for key in ("lostx", "losty"))
         self.lost_mm = (lost_x / self.stage.config.steps_per_mm, lost_y / self.stage.config.steps_per_mm)

@@ -96,7 +96,7 @@ class StatusWatch:
         return True
 
     def heard(self) -> None:
-        """Note that the stage has sent something."""
+        """Note that the stage has answered a status request."""
         self._unanswered_since_s = None
 
     def silent_s(self, now_s: float) -> float:
@@ -310,8 +310,9 @@ class StageLink:
         except ProtocolError:
             self.bad_lines += 1  # if it was an answer, its line is retried
             return
-        # Only what a stage says is a sign of life; a serial line can chatter without end.
-        self._watch.heard()
+        # Only the answer to the request is a sign of life; a serial line can chatter without end, and repeat itself.
+        if reply.kind == "status":
+            self._watch.heard()
         if reply.kind in ("ok", "error"):
             self._answers.put(reply)
         elif reply.kind == "banner" and not self._greeted:
@@ -417,7 +418,13 @@ class StageDriver:
             Parameter.PINS: sum(1 << INVERTIBLE.index(pin) for pin in config.inverted),
         }
         for parameter, value in settings.items():
-            self.link.request("SET", int(parameter), round(value))
+            try:
+                self.link.request("SET", int(parameter), round(value))
+            except StageRefusedError as e:
+                if parameter == Parameter.PINS:
+                    e.why = "the sketch is older than this program and does not know stage.inverted"
+                    e.remedy = "flash the sketch of this release"
+                raise
         self.link.request("ENABLE", 1)
 
     def row(self, row: Row, speed_mm_s: float) -> int:

@@ -129,6 +129,33 @@ def test_a_fresh_machine_has_no_fault_and_nothing_to_wait_for():
     assert (machine.homed, machine.in_run, machine.row, machine.lost_mm) == (False, False, None, (0.0, 0.0))
 
 
+@pytest.mark.parametrize("motion", ["homing", "row before its first point"])
+def test_a_reset_whose_banner_was_lost_is_noticed_in_time(motion):
+    bench = Bench().homed()
+    if motion == "homing":
+        bench.machine.command("Home")
+        bench.run_posted()
+        bench.stage_says(Reply("ok", bench.stage.number))
+    else:
+        bench.start()
+    for _ in range(2 * STATUS_PER_HEARTBEAT * 2):  # of two seconds
+        bench.status(0, state="idle")
+    assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.STAGE_LOST)
+    assert not bench.machine.homed
+
+
+@pytest.mark.parametrize("place", [(500, 0), (0, -1)])
+def test_a_homing_that_does_not_end_at_zero_is_a_fault(place):
+    bench = Bench().homed()
+    bench.machine.command("Home")
+    bench.run_posted()
+    bench.stage_says(Reply("ok", bench.stage.number))
+    x, y = map(str, place)
+    bench.stage_says(Reply("done", bench.stage.number, fields={"x": x, "y": y}))
+    assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.POSITION)
+    assert not bench.machine.homed
+
+
 def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
     bench = Bench().homed()
     bench.start()

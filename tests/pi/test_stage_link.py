@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import subprocess
 from contextlib import closing
@@ -19,7 +20,7 @@ from polysight_pi.cli import main
 from polysight_pi.stage import BenchStage, StageLink, StageLost, StageLostError, StageRefusedError
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.faults import StageError, explain
-from polysight_shared.stage_line import Command, Immediate, Reply
+from polysight_shared.stage_line import Command, Immediate, Parameter, Reply
 from polysight_simulators.builds import sketch_compiler
 
 
@@ -103,6 +104,32 @@ def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage, connect):
     assert "silent" in lost.reason
     with pytest.raises(StageLostError):
         link.request("SET", 1, 500)
+
+
+def test_only_a_status_answers_a_status_request(dry_stage, connect):
+    link, news = connect(heartbeat_s=0.2)
+    dry_stage.deaf = True
+    link.ask_status_every(0.02)
+    lost = None
+    for _ in range(10_000):
+        os.write(dry_stage.master, Reply("ok", 0).encode())
+        if isinstance(lost := news.get(timeout=HANG_S), StageLost):
+            break
+    assert isinstance(lost, StageLost)
+
+
+def test_an_old_sketch_is_named_as_such(dry_stage, instrument, monkeypatch):
+    request = StageLink.request
+
+    def old(link, verb, *args):
+        if verb == "SET" and args[0] == Parameter.PINS:
+            raise StageRefusedError(verb, StageError.OUT_OF_RANGE)
+        return request(link, verb, *args)
+
+    monkeypatch.setattr(StageLink, "request", old)
+    with pytest.raises(StageRefusedError) as e, BenchStage(at_stage_port(instrument, dry_stage.port).stage) as bench:
+        bench.home()
+    assert e.value.remedy == "flash the sketch of this release"
 
 
 def test_a_pulled_cable_is_a_lost_stage(dry_stage, connect):

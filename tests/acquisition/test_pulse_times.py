@@ -292,3 +292,13 @@ def test_the_first_pulse_missed_in_many_bursts_shifts_nothing(bursts, share):
         arrivals, answer = receive(pulses, missed, FRAME, rng, QUIET)
         result = place_frames(pulses, answer, arrivals, FRAME, PAYLOAD)
         check(result, np.delete(np.arange(pulses.size), missed), set(missed))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_frames_below_a_packet_that_are_all_a_pulse_off_are_seen(seed):
+    """The first pulse was missed, and an edge behind the last one was taken for a pulse: their times agree."""
+    pulses = pulse_times(40, 4)
+    edges = np.append(pulses.reshape(-1)[1:], pulses[-1, -1] + 200 * MS)
+    arrivals, answer = receive_edges(edges, pulses, 512, np.random.default_rng(seed), QUIET)
+    result = place_frames(pulses, answer, arrivals, 512, PAYLOAD)
+    assert result.contradicted or result.uncertain == pulses.size

@@ -209,11 +209,14 @@ def _decide(
     low, high, _ = evidence
     received = low.size
     slots = np.full(received, -1, dtype=np.int64)
-    certain, frames, _ = counted
+    certain, frames, most = counted
     edges = [(int(frames[b]), b * count - int(frames[b])) for b in certain]
     # Every pulse has a frame or was missed, whatever happened before: that gives the shift at the end.
     edges.append((received, pulses - received))
-    contradicted = any(shift != 0 for _, shift in edges)
+    planned = np.minimum(np.arange(most.size) * count, received)
+    # Also bounds of a count tell: of frames below a packet few counts are certain, and all may be a pulse off.
+    off = received == pulses and bool(((frames > planned) | (most < planned)).any())
+    contradicted = off or any(shift != 0 for _, shift in edges)
     parts = list(itertools.pairwise(edges))
     late = sum(int((low[i:j] > before).sum()) for (i, before), (j, after) in parts if before == after)
     for k, ((start, before), (stop, after)) in enumerate(parts):

@@ -10,10 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
 
 from polysight.surfaces.optics import Optics
 from polysight.surfaces.paths import STRIDE_M, Echoes, Samples, find_echoes, measure_echoes
@@ -112,7 +110,7 @@ def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
     if not count:
         return np.zeros(0, int)
     shape = shape_of(echoes, optics)
-    pairs = KDTree(echoes.at_m[:, :2]).query_pairs(2.3 * STRIDE_M, output_type="ndarray")
+    pairs = scipy.spatial.KDTree(echoes.at_m[:, :2]).query_pairs(2.3 * STRIDE_M, output_type="ndarray")
     first, second = pairs.T
     d = (echoes.at_m[second] - echoes.at_m[first])[:, :2]
     rise = np.einsum("np,np->n", echoes.slope[first] + echoes.slope[second], d) / 2
@@ -122,8 +120,8 @@ def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
     tolerance = MAX_PATH_MISS_M + 4 * np.hypot(echoes.path_std_m[first], echoes.path_std_m[second])
     joined = (miss < tolerance) & (gap < MAX_GAP_M + 2 * np.linalg.norm(d, axis=1)) & (turn < MAX_TURN_RAD)
     ones = np.ones(int(joined.sum()))
-    graph = coo_matrix((ones, (first[joined], second[joined])), shape=(count, count))
-    _, labels = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_matrix((ones, (first[joined], second[joined])), shape=(count, count))
+    _, labels = scipy.sparse.csgraph.connected_components(graph, directed=False)
     sizes = np.bincount(labels)
     order = np.argsort(-sizes, kind="stable")
     number = np.empty_like(order)
@@ -141,7 +139,7 @@ def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
     for number in np.unique(segment):
         members = np.flatnonzero(segment == number)
         at = echoes.at_m[members, :2]
-        for index, near in zip(members, KDTree(at).query_ball_point(at, NEIGHBOURHOOD_M), strict=True):
+        for index, near in zip(members, scipy.spatial.KDTree(at).query_ball_point(at, NEIGHBOURHOOD_M), strict=True):
             if len(near) < 6:
                 continue
             other = members[near]

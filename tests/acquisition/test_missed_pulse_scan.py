@@ -89,7 +89,7 @@ def test_row_with_a_spurious_edge_is_not_complete(paced, payload, tmp_path):
         np.testing.assert_array_equal(data.payload[~data.mask], want[~data.mask])
         bursts = data.mask.reshape(POINTS * PULSES, -1)
         assert bursts[18:24].all(), "its own"
-        if not bursts[:18].any() and data.mask.mean() < 0.5:
+        if not bursts[:16].any() and data.mask.mean() < 0.5:  # frames beside it are not sure either
             break
     else:
         pytest.fail("not noticed, or not placed, in 20 scans")

@@ -11,6 +11,7 @@ from polysight.results.verdict import (
     NoResult,
     Verdict,
     apart_reasons,
+    background_reasons,
     brightness_reasons,
     direct_path_reasons,
     disturbance_reasons,
@@ -200,6 +201,7 @@ def test_every_reason_says_what_why_and_what_to_do():
         *apart_reasons((3.0, -1.0)),
         *drift_reasons(0.1, 0.05),
         *halo_reasons(0.02),
+        *background_reasons(0.1),
         *fit_reasons((0.1, 0.05), 0.0),
         *fit_reasons((0.1, 0.05), 0.1),
     ]
@@ -246,6 +248,7 @@ def plane(offset_mm=0.0, tilt_deg=(0.0, 0.0)):
         (lambda mm: apart_reasons((0.0, mm)), 1.0, 1.01, ("good", "care")),
         (lambda drift: drift_reasons(0.0, drift), 0.035, 0.0351, ("good", "care")),
         (halo_reasons, 0.005, 0.0051, ("good", "care")),
+        (background_reasons, 0.04, 0.0401, ("good", "care")),
         (lambda ripple: fit_reasons((ripple, 0.0), 0.0), 0.03, 0.0301, ("good", "care")),
         (lambda relief: fit_reasons((0.0, 0.0), relief), 0.035, 0.0351, ("good", "care")),
         (lambda error: leakage_reasons(False, False, error), 0.0199, 0.02, ("good", "care")),

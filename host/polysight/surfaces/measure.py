@@ -131,11 +131,11 @@ def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
 
 
 def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
-    """Replace path, slope and curvature of each echo by a local fit to its neighbours in the same surface.
+    """Replace the curvature of each echo's path by a fit to its neighbours in the same surface.
 
-    The fit takes path and slope of all windows near by: L + g.d + d'Q d / 2 and g + Q d.
+    The fit takes the slopes of all windows near by, g + Q d at the distance d, for the unknown g and Q.
     """
-    path, slope, bend = echoes.path_m.copy(), echoes.slope.copy(), echoes.bend.copy()
+    bend = echoes.bend.copy()
     for number in np.unique(segment):
         members = np.flatnonzero(segment == number)
         at = echoes.at_m[members, :2]
@@ -144,7 +144,7 @@ def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
                 continue
             other = members[near]
             bend[index] = _fit_bend(echoes, int(index), other)
-    return replace(echoes, path_m=path, slope=slope, bend=bend)
+    return replace(echoes, bend=bend)
 
 
 def _fit_bend(echoes: Echoes, index: int, other: NDArray[np.int_]) -> Array:

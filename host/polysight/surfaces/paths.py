@@ -409,9 +409,17 @@ def _loudest(board: Samples) -> float:
 
 
 def _none() -> Echoes:
-    arrays = {"at_m": (0, 3), "slope": (0, 2), "bend": (0, 2, 2), "slope_std": (0, 2)}
-    empty = {f.name: np.zeros(arrays.get(f.name, (0,))) for f in fields(Echoes)}
-    return Echoes(**{**empty, "amplitude": np.zeros(0, complex)})  # type: ignore[arg-type]
+    return Echoes(
+        at_m=np.zeros((0, 3)),
+        path_m=np.zeros(0),
+        slope=np.zeros((0, 2)),
+        bend=np.zeros((0, 2, 2)),
+        amplitude=np.zeros(0, np.complex128),
+        amplitude_std=np.zeros(0),
+        path_std_m=np.zeros(0),
+        slope_std=np.zeros((0, 2)),
+        share=np.zeros(0),
+    )
 
 
 def _select(windows: _Windows, keep: NDArray) -> _Windows:

@@ -21,7 +21,7 @@ $(VENV)/installed: pyproject.toml $(PROJECTS:%=%/pyproject.toml) $(KERNELS)
 	@./tests/install-python.sh $(PYTHON) $(VENV)
 	@touch $@
 
-demo: $(VENV)/installed  ## the whole rig, simulated: scan nine materials, end with a report (OUT=out)
+demo: $(VENV)/installed  ## the whole rig, simulated: scan nine plates on a table, end with a report (OUT=out)
 	$(BIN)/polysight demo --out $(OUT)/demo
 
 test: $(VENV)/installed  ## install what is missing, then run every test

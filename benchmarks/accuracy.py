@@ -129,10 +129,10 @@ def at_bins(rig: Instrument, board: Board, bins: float) -> Instrument:
         return msgspec.structs.replace(rig, geometry=geometry)
 
     def bins_at(z_mm: float) -> float:
-        there = moved(z_mm)
-        tx = np.array(tx_position_m(there))
-        rx = np.array(rx_positions_m(there, board)[0])
-        point = np.array(specular_midpoint_m(there, board))
+        moved_rig = moved(z_mm)
+        tx = np.array(tx_position_m(moved_rig))
+        rx = np.array(rx_positions_m(moved_rig, board)[0])
+        point = np.array(specular_midpoint_m(moved_rig, board))
         excess = np.linalg.norm(point - tx) + np.linalg.norm(rx - point) - np.linalg.norm(rx - tx)
         return float(excess * rig.chirp.hz_per_sample * samples / SPEED_OF_LIGHT_M_S)
 

@@ -41,15 +41,29 @@ from polysight_simulators.scene.scene_file import Scene, apply_scene
 from polysight_simulators.scene.simulated_scan import simulate, truth
 
 MATERIALS: dict[str, tuple[float, float]] = {
-    "wood": (2.61, 0.01), "PTFE": (2.05, 0.005), "PET": (3.78, 0.7), "acrylic": (4.0, 0.4), "cardboard": (4.54, 0.56),
-    "glass fibre": (4.69, 0.7), "rubber": (5.06, 1.11), "silicone": (3.52, 0.82), "ceramic": (4.75, 2.43),
-    "liquid behind glass": (3.66, 0.43), "glass": (6.3, 0.2), "marble": (7.5, 0.25),
-}  # fmt: skip
+    "wood": (2.61, 0.01),
+    "PTFE": (2.05, 0.005),
+    "PET": (3.78, 0.7),
+    "acrylic": (4.0, 0.4),
+    "cardboard": (4.54, 0.56),
+    "glass fibre": (4.69, 0.7),
+    "rubber": (5.06, 1.11),
+    "silicone": (3.52, 0.82),
+    "ceramic": (4.75, 2.43),
+    "liquid behind glass": (3.66, 0.43),
+    "glass": (6.3, 0.2),
+    "marble": (7.5, 0.25),
+}
 KNOWN: dict[str, tuple[float, float]] = {
-    "rubber": (5.06, 1.11), "cardboard (rough)": (4.54, 0.56), "silicone rubber": (3.52, 0.82),
-    "PET (0.5 mm)": (3.78, 0.7), "ceramic": (4.75, 2.43), "acrylic (3 mm)": (4.0, 0.4), "glass fiber": (4.69, 0.7),
+    "rubber": (5.06, 1.11),
+    "cardboard (rough)": (4.54, 0.56),
+    "silicone rubber": (3.52, 0.82),
+    "PET (0.5 mm)": (3.78, 0.7),
+    "ceramic": (4.75, 2.43),
+    "acrylic (3 mm)": (4.0, 0.4),
+    "glass fiber": (4.69, 0.7),
     "wood (thin, smooth)": (2.61, 0.01),
-}  # fmt: skip
+}
 """Materials of the simulated library: named scenes hold these, all specimens alike."""
 CLASSES = {"low loss": 0.05, "medium": 0.18, "lossy": np.inf}
 """Material classes by their loss tangent's upper end."""
@@ -114,14 +128,19 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
     leak = [complex(0.1 * rng.random() * np.exp(2j * np.pi * rng.random())) for _ in range(2)]
     materials = KNOWN if kind == "named" else MATERIALS
     names = rng.choice(list(materials), len(PLACES), replace=False).tolist()
-    metal = None if kind == "no metal" or (kind in WHOLE and rng.random() < 0.25) else int(rng.integers(len(PLACES)))
+    if kind == "no metal" or (kind in WHOLE and rng.random() < 0.25):
+        metal = None
+    else:
+        metal = int(rng.integers(len(PLACES)))
     tilted = rng.random() < 0.5
     plates = []
     for i, (x, y) in enumerate(PLACES):
         place = {"centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [46.0, 46.0]}
         relief = {"height_mm": rng.uniform(-0.5, 0.5), "tilt_deg": (rng.uniform(-1, 1, 2) * tilted).tolist()}
-        material = {"name": "metal", "metal": True} if i == metal else {
-            "name": names[i], "permittivity": list(materials[names[i]]), "rough_mm": rng.uniform(0, 0.2)}  # fmt: skip
+        if i == metal:
+            material = {"name": "metal", "metal": True}
+        else:
+            material = {"name": names[i], "permittivity": list(materials[names[i]]), "rough_mm": rng.uniform(0, 0.2)}
         plates.append({**place, **relief, **material})
     if kind == "no metal":
         plates = plates[: int(rng.integers(1, len(PLACES) + 1))]
@@ -131,29 +150,35 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
         plates[sheet] |= {"thickness_mm": rng.uniform(0.5, 5)}
     return decode_scene(
         {
-            "name": f"drawn {kind} {seed}", "seed": 1000 + seed, "grid": GRID, "object_distance_mm": 499.0,
+            "name": f"drawn {kind} {seed}",
+            "seed": 1000 + seed,
+            "grid": GRID,
+            "object_distance_mm": 499.0,
             "image": {"columns": 116, "rows": 90},
-            "specimen_spread": [0.0, 0.0] if kind == "named" else [0.03, 0.3], "plane_shift_mm": rng.uniform(-10, 10),
+            "specimen_spread": [0.0, 0.0] if kind == "named" else [0.03, 0.3],
+            "plane_shift_mm": rng.uniform(-10, 10),
             "plane_tilt_deg": (rng.uniform(-1, 1, 2) * (not tilted)).tolist(),
             "plates": [] if kind in ("empty", "noise") else plates,
             "disturbances": {
-                "leakage_h": [leak[0].real, leak[0].imag], "leakage_v": [leak[1].real, leak[1].imag],
+                "leakage_h": [leak[0].real, leak[0].imag],
+                "leakage_v": [leak[1].real, leak[1].imag],
                 "direct_loss_db": "absent" if kind in ("no direct path", "noise") else rng.uniform(-6, 12),
-            } | ({} if measured is None else {"leakage_measured": measured}),
+            }
+            | ({} if measured is None else {"leakage_measured": measured}),
         },
         "drawn",
-    )  # fmt: skip
+    )
 
 
 def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     """A metal plate over the plane, on the rig file's plane, with the scene's rig: the same leakage and gains."""
     plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
-    whole = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
-    alone = msgspec.structs.replace(scene, plates=whole, plane_shift_mm=0.0, plane_tilt_deg=(0.0, 0.0))
+    plates = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
+    alone = msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0, plane_tilt_deg=(0.0, 0.0))
     pipeline = _imaged(Cubes(rig, alone))
     images = pipeline.form_images()
-    found = plane_reference(images.level(images.valid))
-    return replace(found, made_with=pipeline.calibration.imaged_with(pipeline.rig))
+    reference = plane_reference(images.level(images.valid))
+    return replace(reference, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 
 def _imaged(source: Any, model: str | None = "none", inputs: Inputs = NO_INPUTS) -> Pipeline:
@@ -186,27 +211,33 @@ def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigur
     """Judged patches of one scene: the sample from which coverage is counted."""
     scene, rig, findings, _ = judged(seed, kind, raw)
     plates = truth_plates(truth(rig, scene, scene.seed))
-    found = findings.found
-    true = match_truth([r.patch for r in found.patches], plates)
+    result = findings.found
+    true = match_truth([r.patch for r in result.patches], plates)
     out = []
-    for r in found.patches:
+    for r in result.patches:
         e = r.permittivity
         plate = true.get(r.patch.label)
         if plate is None or plate.permittivity is None or e.value is None or e.covariance is None or r.refused:
             continue
-        away = np.array([(e.value - plate.permittivity).real, (e.value - plate.permittivity).imag])
+        difference = np.array([(e.value - plate.permittivity).real, (e.value - plate.permittivity).imag])
         size = abs(plate.permittivity)
         tangent = -plate.permittivity.imag / plate.permittivity.real
         values = np.linalg.eigvalsh(e.covariance)
         out.append(
             PatchFigures(
-                seed, plate.name, next(k for k, top in CLASSES.items() if tangent <= top),
-                float(away @ np.linalg.solve(e.covariance, away)), float(np.hypot(*away)) / size,
-                float(np.sqrt(values.mean())) / size, float(np.sqrt(values[0])) / size,
-                found.prior.leakage_measured, any(p.metal for p in scene.plates), findings.verdict.level,
+                seed,
+                plate.name,
+                next(k for k, top in CLASSES.items() if tangent <= top),
+                float(difference @ np.linalg.solve(e.covariance, difference)),
+                float(np.hypot(*difference)) / size,
+                float(np.sqrt(values.mean())) / size,
+                float(np.sqrt(values[0])) / size,
+                result.prior.leakage_measured,
+                any(p.metal for p in scene.plates),
+                findings.verdict.level,
                 plate.thickness_mm is not None,
             )
-        )  # fmt: skip
+        )
     return out
 
 
@@ -215,10 +246,13 @@ def _table(rows: list[PatchFigures], title: str) -> dict[str, float]:
     if d.size == 0:
         return {}
     entry = {
-        "patches": float(d.size), "in_68": float(np.mean(d < CHI2_68)), "in_95": float(np.mean(d < CHI2_95)),
-        "rms_z": float(np.sqrt(np.mean(d) / 2)), "median_error": float(np.median([r.relative_error for r in rows])),
+        "patches": float(d.size),
+        "in_68": float(np.mean(d < CHI2_68)),
+        "in_95": float(np.mean(d < CHI2_95)),
+        "rms_z": float(np.sqrt(np.mean(d) / 2)),
+        "median_error": float(np.median([r.relative_error for r in rows])),
         "median_std": float(np.median([r.relative_std for r in rows])),
-    }  # fmt: skip
+    }
     print(
         f"{title:36s} {d.size:5d} patches   68 %: {100 * entry['in_68']:5.1f}   95 %: {100 * entry['in_95']:5.1f}"
         f"   rms z {entry['rms_z']:.2f}   median error {100 * entry['median_error']:.1f} %,"
@@ -236,9 +270,9 @@ def _names(seed: int) -> list[tuple[float, bool]]:
     """Probability beside each name of one scene, and whether the name is right."""
     scene, rig, findings, _ = judged(seed, "named")
     plates = truth_plates(truth(rig, scene, scene.seed))
-    found = findings.found
-    true = match_truth([r.patch for r in found.patches], plates)
-    named = [(r.verdict, true[r.patch.label]) for r in found.patches if r.patch.label in true]
+    result = findings.found
+    true = match_truth([r.patch for r in result.patches], plates)
+    named = [(r.verdict, true[r.patch.label]) for r in result.patches if r.patch.label in true]
     return [(v.confidence, v.name == plate.name) for v, plate in named if v is not None and v.name != UNKNOWN]
 
 
@@ -250,8 +284,10 @@ def _reliability(pairs: list[tuple[float, bool]]) -> list[dict[str, float]]:
         if inside:
             said, right = (float(np.mean(x)) for x in zip(*inside, strict=True))
             out.append({"names": len(inside), "probability": said, "right": right})
-            print(f"  probability {100 * low:3.0f}..{min(100 * high, 100):3.0f} %: {len(inside):4d} names, said"
-                  f" {100 * said:.0f} %, right {100 * right:.0f} %")  # fmt: skip
+            print(
+                f"  probability {100 * low:3.0f}..{min(100 * high, 100):3.0f} %: {len(inside):4d} names, said"
+                f" {100 * said:.0f} %, right {100 * right:.0f} %"
+            )
     return out
 
 
@@ -281,14 +317,17 @@ def run(args: argparse.Namespace) -> int:
     jobs = [(i, "full", False) for i in seeds] + [(args.first + i, "full", True) for i in range(args.raw)]
     print("simulated scenes; regions of the permittivity (real and imaginary part together)")
     with ProcessPoolExecutor(args.jobs) as pool:
-        found = list(pool.map(_one, jobs))
-        thin = [r for one in pool.map(figures, [*range(args.first, args.first + args.sheets)], ["sheet"] * args.sheets)
-                for r in one]  # fmt: skip
+        results = list(pool.map(_one, jobs))
+        thin = [
+            r
+            for result in pool.map(figures, [*range(args.first, args.first + args.sheets)], ["sheet"] * args.sheets)
+            for r in result
+        ]
         kinds = [(args.first + i, KINDS[1 + i % 4]) for i in range(args.without)]
         without = list(pool.map(_without, kinds))
-        named = [pair for one in pool.map(_names, range(args.first, args.first + args.named)) for pair in one]
-    rows = [r for one in found[: args.scenes] for r in one]
-    raw = [r for one in found[args.scenes :] for r in one]
+        named = [pair for result in pool.map(_names, range(args.first, args.first + args.named)) for pair in result]
+    rows = [r for result in results[: args.scenes] for r in result]
+    raw = [r for result in results[args.scenes :] for r in result]
     out: dict[str, Any] = {"all": _table(rows, "all, from samples")}
     out["raw"] = _table(raw, "all, from raw data")
     for name in CLASSES:
@@ -303,13 +342,12 @@ def run(args: argparse.Namespace) -> int:
     out["sheet"] = _table([r for r in thin if r.sheet], "  the sheet itself, as a half space")
     print(f"  sheets: {args.sheets}; without a permittivity {args.sheets - sum(r.sheet for r in thin)}")
     same = {(r.scene, r.material): r for r in rows}
-    apart = [
+    outliers = [
         abs(r.relative_error - same[r.scene, r.material].relative_error) for r in raw if (r.scene, r.material) in same
     ]
-    if apart:
-        print(
-            f"raw beside samples: errors of the same patches differ by {100 * float(np.median(apart)):.2f} % (median)"
-        )
+    if outliers:
+        median_percent = 100 * float(np.median(outliers))
+        print(f"raw beside samples: errors of the same patches differ by {median_percent:.2f} % (median)")
     said = [w for w in without if w[3] or w[2] != "none"]
     print(f"scenes with nothing to name: {len(without)}; given a name or permittivity: {len(said)}")
     for w in said:

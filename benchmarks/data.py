@@ -61,8 +61,8 @@ def recorded_rows(rig: Instrument, scene: Scene, count: int = DISTINCT) -> dict[
     rows: dict[str, list[NDArray[np.int16]]] = {b.name: [] for b in rig.receivers}
     for row in itertools.islice(plan, first, first + count):
         x, y = row_offsets_mm(radar, row)
-        for name, found in rows.items():
-            found.append(radar.chirps(name, x, y, row.index * len(x)))
+        for name, board_rows in rows.items():
+            board_rows.append(radar.chirps(name, x, y, row.index * len(x)))
     return rows
 
 
@@ -72,7 +72,7 @@ def write_scan(folder: Path, rig: Instrument, rows: dict[str, list[NDArray[np.in
     layout = OwnLayout(folder, rig, plan, "benchmark", "2000-01-01T00:00:00+00:00")
     layout.start()
     for row in itertools.islice(plan, count):
-        payloads = {name: found[row.index % len(found)] for name, found in rows.items()}
+        payloads = {name: board_rows[row.index % len(board_rows)] for name, board_rows in rows.items()}
         layout.write_row(row, payloads, {name: [] for name in payloads})
     layout.end()
 
@@ -137,8 +137,8 @@ def point_row(
     """
     offsets = row_offsets_m(rig, row)
     shift = np.pad(offsets if chosen is None else offsets[chosen], ((0, 0), (0, 1)))
-    away = points_m[None] - shift[:, None]
-    path = antennas.excess_m(away[..., 0], away[..., 1], away[..., 2])
+    offset_m = points_m[None] - shift[:, None]
+    path = antennas.excess_m(offset_m[..., 0], offset_m[..., 1], offset_m[..., 2])
     return np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * path[..., None] * frequencies_hz).sum(axis=2)
 
 

@@ -87,16 +87,18 @@ class Case:
 
 def draw_scene(seed: int) -> Scene:
     """Six stacks on the places of a coverage scene."""
-    own = np.random.default_rng([20261123, seed // A_RIG])
+    rig_rng = np.random.default_rng([20261123, seed // A_RIG])
     rng = np.random.default_rng([20261124, seed])
-    leak = [complex(0.1 * own.random() * np.exp(2j * np.pi * own.random())) for _ in range(2)]
+    leak = [complex(0.1 * rig_rng.random() * np.exp(2j * np.pi * rig_rng.random())) for _ in range(2)]
     plates: list[dict[str, Any]] = []
     kinds = iter(rng.permutation([*KINDS[:2] * 2, KINDS[2], KINDS[seed % 2]]).tolist())
     for i, (x, y) in enumerate(PLACES):
         place = {
-            "centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [SIDE_MM, SIDE_MM],
-            "height_mm": rng.uniform(-0.3, 0.3), "rough_mm": rng.uniform(0, 0.1),
-        }  # fmt: skip
+            "centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)],
+            "size_mm": [SIDE_MM, SIDE_MM],
+            "height_mm": rng.uniform(-0.3, 0.3),
+            "rough_mm": rng.uniform(0, 0.1),
+        }
         kind = next(kinds)
         real = rng.uniform(2, 7)
         sheet = {"permittivity": [real, real * rng.uniform(0, 0.1)], "thickness_mm": rng.uniform(0.5, 5)}
@@ -109,15 +111,22 @@ def draw_scene(seed: int) -> Scene:
         plates.append({**place, "name": f"{kind} {i}", "layers": layers})
     return decode_scene(
         {
-            "name": f"layers {seed}", "seed": 2000 + seed, "grid": GRID, "object_distance_mm": 499.0,
-            "image": {"columns": 116, "rows": 90}, "plane_shift_mm": rng.uniform(-5, 5), "plates": plates,
+            "name": f"layers {seed}",
+            "seed": 2000 + seed,
+            "grid": GRID,
+            "object_distance_mm": 499.0,
+            "image": {"columns": 116, "rows": 90},
+            "plane_shift_mm": rng.uniform(-5, 5),
+            "plates": plates,
             "disturbances": {
-                "leakage_h": [leak[0].real, leak[0].imag], "leakage_v": [leak[1].real, leak[1].imag],
-                "leakage_measured": 0.003, "direct_loss_db": own.uniform(-6, 12),
+                "leakage_h": [leak[0].real, leak[0].imag],
+                "leakage_v": [leak[1].real, leak[1].imag],
+                "leakage_measured": 0.003,
+                "direct_loss_db": rig_rng.uniform(-6, 12),
             },
         },
         "drawn",
-    )  # fmt: skip
+    )
 
 
 def _imaged(rig: Instrument, scene: Scene) -> Pipeline:
@@ -131,8 +140,8 @@ def _imaged(rig: Instrument, scene: Scene) -> Pipeline:
 def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     """A metal plate over the plane, scanned by the same rig, on the rig file's plane, in the same sub-bands."""
     plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
-    whole = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
-    pipeline = _imaged(rig, msgspec.structs.replace(scene, plates=whole, plane_shift_mm=0.0))
+    plates = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
+    pipeline = _imaged(rig, msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0))
     parts = tuple(plane_of(pipeline, part) for part in pipeline.sub_bands.finish(pipeline.source.mirrored))
     return replace(plane_of(pipeline, pipeline.form_images()), bands=parts)
 
@@ -142,10 +151,10 @@ def rows_of(seed: int, rig: Instrument, scene: Scene, metal: PlaneReference) -> 
     pipeline = _imaged(rig, scene)
     pipeline.inputs = Inputs(reference=metal)
     findings = pipeline.examine(pipeline.form_images())
-    found = findings.found
-    plates = match_truth([r.patch for r in found.patches], truth_plates(truth(apply_scene(rig, scene), scene, seed)))
-    rows = {plates[row.label].name: row for row in found.rows() if row.label in plates}
-    return rows, found.prior.theta_std_rad
+    result = findings.found
+    plates = match_truth([r.patch for r in result.patches], truth_plates(truth(apply_scene(rig, scene), scene, seed)))
+    rows = {plates[row.label].name: row for row in result.rows() if row.label in plates}
+    return rows, result.prior.theta_std_rad
 
 
 def asked(plate: Plate, within: float | None = None) -> list[Layer]:
@@ -167,14 +176,25 @@ def judged(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -> C
     size_mm = layer.thickness_mm or 0.0
     if fit is None or fit.covariance is None:
         return Case(seed, kind, setting, true, size_mm)
-    away = np.array([fit.permittivity.real - true[0], -fit.permittivity.imag - true[1]])
+    difference = np.array([fit.permittivity.real - true[0], -fit.permittivity.imag - true[1]])
     found_mm = 1e3 * (fit.thickness_m or 0.0)
     return Case(
-        seed, kind, setting, true, size_mm, (fit.permittivity.real, -fit.permittivity.imag), found_mm,
-        float(np.hypot(*away) / np.hypot(*true)), abs(found_mm / size_mm - 1) if size_mm else 0.0,
-        float(away @ np.linalg.solve(fit.covariance[:2, :2], away)), fit.relative_std, fit.ambiguous, len(fit.rivals),
-        fit.chi2 / fit.freedom, any("does not explain" in w for w in fit.warnings()),
-    )  # fmt: skip
+        seed,
+        kind,
+        setting,
+        true,
+        size_mm,
+        (fit.permittivity.real, -fit.permittivity.imag),
+        found_mm,
+        float(np.hypot(*difference) / np.hypot(*true)),
+        abs(found_mm / size_mm - 1) if size_mm else 0.0,
+        float(difference @ np.linalg.solve(fit.covariance[:2, :2], difference)),
+        fit.relative_std,
+        fit.ambiguous,
+        len(fit.rivals),
+        fit.chi2 / fit.freedom,
+        any("does not explain" in w for w in fit.warnings()),
+    )
 
 
 def cases(seeds: Sequence[int]) -> list[Case]:
@@ -189,7 +209,10 @@ def cases(seeds: Sequence[int]) -> list[Case]:
             row = rows.get(plate.name)
             for trusted, within in SETTINGS:
                 stack = asked(plate, within)
-                fit = None if row is None else fit_row(row, rig.chirp, stack, BANDS, trusted, theta_std_rad)
+                if row is None:
+                    fit = None
+                else:
+                    fit = fit_row(row, rig.chirp, stack, BANDS, trusted, theta_std_rad)
                 out.append(judged(seed, plate, fit, (trusted, within)))
     return out
 
@@ -203,8 +226,10 @@ def table(rows: list[Case], title: str) -> dict[str, float]:
         return {}
     d = np.array([r.distance2 for r in sure])
     entry = {
-        "cases": float(len(rows)), "not fitted": float(len(rows) - len(fits)),
-        "right": float(np.mean([r.right for r in fits])), "ambiguous": float(np.mean([r.flagged for r in fits])),
+        "cases": float(len(rows)),
+        "not fitted": float(len(rows) - len(fits)),
+        "right": float(np.mean([r.right for r in fits])),
+        "ambiguous": float(np.mean([r.flagged for r in fits])),
         "rivals": float(np.mean([r.rivals > 0 for r in fits])),
         "wrong, not flagged": float(sum(not r.right for r in sure)),
         "in_68, no rivals": float(np.mean(everywhere < CHI2_68)) if everywhere.size else float("nan"),
@@ -214,7 +239,7 @@ def table(rows: list[Case], title: str) -> dict[str, float]:
         "median_std": float(np.median([r.relative_std for r in fits])),
         "median_error": float(np.median([max(r.error, r.thickness_error) for r in fits])),
         "unexplained": float(np.mean([r.unexplained for r in fits])),
-    }  # fmt: skip
+    }
     percent = {key: 100 * entry[key] for key in entry}
     print(
         f"{title:22s} {len(rows):4d} cases, {len(rows) - len(fits)} not fitted   within 5 %: {percent['right']:5.1f} %"
@@ -240,13 +265,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the table; 1 when more than 5 % of the fits not flagged are beyond 5 %."""
     scenes = range(args.first, args.first + -(-args.cases // len(PLACES)))
-    rigs = [list(one) for _, one in itertools.groupby(scenes, lambda seed: seed // A_RIG)]
+    rigs = [list(group) for _, group in itertools.groupby(scenes, lambda seed: seed // A_RIG)]
     print(f"simulated sheets and liquids, {BANDS} sub-bands")
     with ProcessPoolExecutor(args.jobs) as pool:
-        rows = [case for one in pool.map(cases, rigs) for case in one]
+        rows = [case for group in pool.map(cases, rigs) for case in group]
     out: dict[str, dict[str, float]] = {}
     for setting in SETTINGS:
-        near = f"{1e3 * RANGE_M[0]:g} to {1e3 * RANGE_M[1]:g} mm" if setting[1] is None else f"+-{100 * setting[1]:g} %"
+        if setting[1] is None:
+            near = f"{1e3 * RANGE_M[0]:g} to {1e3 * RANGE_M[1]:g} mm"
+        else:
+            near = f"+-{100 * setting[1]:g} %"
         print(f"|H| trusted to {100 * setting[0]:g} %, thickness looked for in {near}")
         same = [r for r in rows if r.setting == setting]
         for kind in (*KINDS, "all"):

@@ -72,12 +72,12 @@ class Seconds:
 
 def alternate(jobs: dict[str, Callable[[], Any]], repeats: int) -> dict[str, Seconds]:
     """Run the jobs in turn, `repeats` rounds after one that warms caches and is not counted."""
-    found = {name: Seconds() for name in jobs}
+    seconds = {name: Seconds() for name in jobs}
     for turn in range(repeats + 1):
         for name, job in jobs.items():
-            with (found[name] if turn else Seconds()).timed():
+            with (seconds[name] if turn else Seconds()).timed():
                 job()
-    return found
+    return seconds
 
 
 class AnonymousMemory:
@@ -203,12 +203,18 @@ class Line:
         return "holds" if self._reaches(self.at_least) else "DOES NOT HOLD"
 
     def _reaches(self, limit: float) -> bool:
-        return self.value >= limit if self.higher_is_better else self.value <= limit
+        if self.higher_is_better:
+            return self.value >= limit
+        return self.value <= limit
 
     def cells(self) -> list[str]:
 
         def number(x: float | None) -> str:
-            return "" if x is None else f"{x:.0f}x" if self.higher_is_better else f"{x:.3g}"
+            if x is None:
+                return ""
+            if self.higher_is_better:
+                return f"{x:.0f}x"
+            return f"{x:.3g}"
 
         value = f"{self.value:.1f}x" if self.higher_is_better else f"{self.value:.3g}"
         return [self.quantity, self.ours, self.theirs, value, number(self.at_least), number(self.aim), self.verdict]
@@ -221,9 +227,10 @@ def show(title: str, lines: list[Line], quick: bool = False) -> None:
     """Print a table, its notes below; after a quick trial without verdicts, which would mean nothing."""
     rows = [HEAD, *(line.cells()[: -1 if quick else None] for line in lines)]
     width = [max(len(row[i]) for row in rows if i < len(row)) for i in range(len(HEAD))]
-    here = machine()
+    this_machine = machine()
     print(f"\n{title}{'; a quick trial, not a measurement' if quick else ''}")
-    print(f"{here['cpu']}, {here['cores']} cores, load {here['load_average'][0]}; seconds are CPU seconds")
+    load = this_machine["load_average"][0]
+    print(f"{this_machine['cpu']}, {this_machine['cores']} cores, load {load}; seconds are CPU seconds")
     for row in rows:
         print("  ".join(cell.ljust(width[i]) if i < 3 else cell.rjust(width[i]) for i, cell in enumerate(row)))
     for line in lines:

@@ -46,8 +46,8 @@ def run(args: argparse.Namespace) -> int:
     with temporary(args.folder) as folder, ExitStack() as stack:
         figures = _measure(_rig(folder, min(points, ROW_POINTS)), points, folder, stack)
     print(f"\nthe Pi half, simulated: {points} positions, 10 a second, 16 pulses each; this machine, not a Pi")
-    here = machine()
-    print(f"{here['cpu']}, {here['cores']} cores, load {here['load_average'][0]}")
+    this_machine = machine()
+    print(f"{this_machine['cpu']}, {this_machine['cores']} cores, load {this_machine['load_average'][0]}")
     for name, value in figures.items():
         print(f"  {name:48s} {value}")
     write(args.json, "pi", [], figures=figures)
@@ -89,24 +89,24 @@ def _measure(rig: Instrument, points: int, folder: Path, stack: ExitStack) -> di
     event_address = process.stdout.readline().split()[1] if process.stdout else ""
     wires = WireClient(hub, listen=rig.pi.sync_out)
     stack.callback(wires.close)
-    where = msgspec.structs.replace(rig.pi, command_address=command_address, event_address=event_address)
+    addresses = msgspec.structs.replace(rig.pi, command_address=command_address, event_address=event_address)
     context: zmq.Context[Any] = zmq.Context()
     stack.callback(context.destroy, linger=0)
-    client = stack.enter_context(PiClient(context, msgspec.structs.replace(rig, pi=where)))
-    seen = _Rows(client, rig, wires, process.pid)
-    while len(seen.bursts) < points:
-        seen.take_row()
+    client = stack.enter_context(PiClient(context, msgspec.structs.replace(rig, pi=addresses)))
+    rows = _Rows(client, rig, wires, process.pid)
+    while len(rows.bursts) < points:
+        rows.take_row()
     status = Path(f"/proc/{process.pid}/status").read_text().split()
-    captures = [c for c, _ in seen.bursts]
+    captures = [c for c, _ in rows.bursts]
     late_us = sorted((c.first_pulse_ns - c.edge_ns) / 1e3 for c in captures)
-    rises = [[e.t_ns for e in burst[::2]] for _, burst in seen.bursts]
+    rises = [[e.t_ns for e in burst[::2]] for _, burst in rows.bursts]
     error_us = sorted(abs((b - a) / 1e3 - rig.burst.period_us) for burst in rises for a, b in pairwise(burst))
-    high_us = sorted((b.t_ns - a.t_ns) / 1e3 for _, e in seen.bursts for a, b in zip(e[::2], e[1::2], strict=True))
+    high_us = sorted((b.t_ns - a.t_ns) / 1e3 for _, e in rows.bursts for a, b in zip(e[::2], e[1::2], strict=True))
     width_us = sorted(c.width_max_ns / 1e3 for c in captures)
     return {
-        "rows, and how many a busy machine ended early": [seen.rows, len(seen.faults)],
-        "faults of those": sorted(set(seen.faults)),
-        "CPU, share of a core": round(seen.cpu_s / seen.wall_s, 3),
+        "rows, and how many a busy machine ended early": [rows.rows, len(rows.faults)],
+        "faults of those": sorted(set(rows.faults)),
+        "CPU, share of a core": round(rows.cpu_s / rows.wall_s, 3),
         "memory at most, MB": round(int(status[status.index("VmHWM:") + 1]) / 1e3, 1),
         "edge to first pulse, us: p50, p99.9, worst": _quantiles(late_us),
         "period off by, us: p50, p99.9, worst": _quantiles(error_us),
@@ -183,5 +183,5 @@ def _cpu_s(pid: int) -> float:
 
 
 def _quantiles(values: list[float]) -> list[float]:
-    at = [0.5, 0.999, 1.0]
-    return [round(values[min(len(values) - 1, int(q * len(values)))], 2) for q in at]
+    shares = [0.5, 0.999, 1.0]
+    return [round(values[min(len(values) - 1, int(q * len(values)))], 2) for q in shares]

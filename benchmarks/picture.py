@@ -55,7 +55,8 @@ class Form:
 def forms_of(source: Path, boxes: dict[str, list[int]], scratch: Path) -> list[Form]:
     """Write the picture in its four forms."""
     with np.load(source) as arrays:
-        h, v = arrays["h"], arrays["v"]
+        h = arrays["h"]
+        v = arrays["v"]
     out = []
     for with_boxes in (True, False):
         kind = "with boxes" if with_boxes else "without boxes"
@@ -85,8 +86,8 @@ def process(form: Form, boxes: dict[str, list[int]], library: Path | None) -> tu
     patch_of = {}
     for name, (x0, y0, x1, y1) in boxes.items():
         inside = labels[y0:y1, x0:x1]
-        found = np.bincount(inside[inside > 0], minlength=1)
-        patch_of[name] = int(found.argmax()) if found.sum() > 0.5 * inside.size else 0
+        pixel_counts = np.bincount(inside[inside > 0], minlength=1)
+        patch_of[name] = int(pixel_counts.argmax()) if pixel_counts.sum() > 0.5 * inside.size else 0
     return scan, patch_of
 
 
@@ -98,7 +99,8 @@ def line(box: str, patch: PatchFigures | None) -> tuple[str, bool, bool, bool, b
     if patch.refused is not None:
         return f"  {box:16} {real:5.2f} {loss:5.2f}   refused: {patch.refused.what}", False, False, False, False
     e = patch.permittivity
-    inside, estimate = False, "no permittivity"
+    inside = False
+    estimate = "no permittivity"
     if e is not None and e.spread is not None:
         inside = abs(e.real - real) <= TWO_SIDED_95 * e.spread.real_std
         estimate = f"{e.real:5.2f} +- {e.spread.real_std:4.2f}  {e.loss:5.2f} +- {e.spread.loss_std:4.2f}"
@@ -133,18 +135,24 @@ def run(args: argparse.Namespace) -> int:
             lines = [line(box, by_number.get(patch_of[box])) for box in TABLE_2]
             metal = by_number.get(patch_of[METAL_BOX])
             extra = len(by_number) - len({n for n in patch_of.values() if n})
-            held, right, wrong, estimated = (sum(row[k] for row in lines) for k in (1, 2, 3, 4))
+            held_count, right, wrong, estimated = (sum(row[k] for row in lines) for k in (1, 2, 3, 4))
             level = scan.verdict.text if scan.verdict else ""
             reference = "copper" if metal is not None and metal.metal_reference else "NOT copper"
             figures[form.name] = {
-                "patches": len(by_number), "not_plates": extra, "reference": reference, "verdict": level,
-                "regions_hold_table_2": held, "estimated": estimated, "names_right": right, "sure_and_wrong": wrong,
-            }  # fmt: skip
+                "patches": len(by_number),
+                "not_plates": extra,
+                "reference": reference,
+                "verdict": level,
+                "regions_hold_table_2": held_count,
+                "estimated": estimated,
+                "names_right": right,
+                "sure_and_wrong": wrong,
+            }
             print(f"{form.name}: " + ", ".join(f"{k.replace('_', ' ')} {v}" for k, v in figures[form.name].items()))
             print("  plate            Table 2       permittivity +- std, loss +- std         name")
             print("\n".join(row[0] for row in lines))
-            for why in (scan.verdict.reasons if scan.verdict else ())[: args.reasons]:
-                print(f"  - {why.what}")
+            for reason in (scan.verdict.reasons if scan.verdict else ())[: args.reasons]:
+                print(f"  - {reason.what}")
     if args.json:
         args.json.write_text(json.dumps(figures, indent=1))
     return 0

@@ -80,12 +80,12 @@ def thinned(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
     """The images from every n-th row, by matched filter or by reconstruction; the builder is left as it was."""
     valid = {name: board.valid.copy() for name, board in builder.boards.items()}
     weights = {name: board.weights for name, board in builder.boards.items()}
-    whole = builder.finish()
+    all_images = builder.finish()
     raw = []
     for name, board in builder.boards.items():
-        kept = np.zeros_like(valid[name])
-        kept[::every] = True
-        board.keep(kept)
+        kept_rows = np.zeros_like(valid[name])
+        kept_rows[::every] = True
+        board.keep(kept_rows)
         if rebuilt:
             raw.append(predicted(board, reconstruct(board, ITERATIONS).image, weights[name]))
     images = builder.finish()
@@ -94,18 +94,18 @@ def thinned(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
     if not rebuilt:
         return images
     flat = [
-        np.divide(r, w, out=np.zeros_like(r), where=whole.valid).conj()
-        for r, w in zip(raw, whole.illumination.footprints, strict=True)
+        np.divide(r, w, out=np.zeros_like(r), where=all_images.valid).conj()
+        for r, w in zip(raw, all_images.illumination.footprints, strict=True)
     ]
-    return replace(whole, h=flat[0], v=flat[1], h_raw=raw[0], v_raw=raw[1])
+    return replace(all_images, h=flat[0], v=flat[1], h_raw=raw[0], v_raw=raw[1])
 
 
 def image_error(images: Images, ideal: Images) -> float:
     """Of both channels' whole images, relative, after the complex factor that fits best."""
     errors = []
-    for made, wanted in ((images.h_raw, ideal.h_raw), (images.v_raw, ideal.v_raw)):
-        factor = np.vdot(made, wanted) / np.vdot(made, made)
-        errors.append(float(np.linalg.norm(factor * made - wanted) / np.linalg.norm(wanted)))
+    for image, ideal_image in ((images.h_raw, ideal.h_raw), (images.v_raw, ideal.v_raw)):
+        factor = np.vdot(image, ideal_image) / np.vdot(image, image)
+        errors.append(float(np.linalg.norm(factor * image - ideal_image) / np.linalg.norm(ideal_image)))
     return float(np.mean(errors))
 
 
@@ -126,8 +126,8 @@ def measure(
 ) -> None:
     """Print figures of one scan; `every` n-th row was scanned."""
     scanned = Changes(step_y_mm=every * rig.grid.step_y_mm).apply(rig)  # its minutes are those of the rows scanned
-    found = named(rig, images, plates)
-    pairs = [(r, r.truth) for r in found.patches if r.truth is not None]
+    result = named(rig, images, plates)
+    pairs = [(r, r.truth) for r in result.patches if r.truth is not None]
     right = sum(r.verdict is not None and r.verdict.name == t.name for r, t in pairs)
     errors = [
         abs(r.permittivity.value.real / t.permittivity.real - 1)
@@ -137,10 +137,10 @@ def measure(
     b = rig.burst
     g = scanned.grid
     plan = f"{rig.stage.speed_mm_s:g} mm/s, {b.pulses} x {b.period_us / 1e3:g} ms, {g.step_x_mm:g} x {g.step_y_mm:g} mm"
-    off = 100 * float(np.median(errors)) if errors else float("nan")
+    median_error = 100 * float(np.median(errors)) if errors else float("nan")
     print(
         f"| {name} | {plan} | {scan_time(scanned).minutes:.1f} | {100 * image_error(images, ideal):.1f} % |"
-        f" {right} of {len(plates)} | {100 * (pixel_accuracy(found) or 0.0):.1f} % | {off:.1f} % |",
+        f" {right} of {len(plates)} | {100 * (pixel_accuracy(result) or 0.0):.1f} % | {median_error:.1f} % |",
         flush=True,
     )
 
@@ -159,10 +159,10 @@ def fast(rig: Instrument, scene: Scene) -> Iterator[Made]:
     builder, uncompensated = as_scanned(rig, scene)
     yield "fast", rig, builder.finish(), 1
     yield "fast, motion not compensated", rig, uncompensated.finish(), 1
-    for every in (2, 3, 4):
-        yield f"fast, 1 row in {every}", rig, thinned(builder, every, rebuilt=False), every
-        if every > 2:
-            yield f"fast, 1 row in {every}, reconstructed", rig, thinned(builder, every, rebuilt=True), every
+    for step in (2, 3, 4):
+        yield f"fast, 1 row in {step}", rig, thinned(builder, step, rebuilt=False), step
+        if step > 2:
+            yield f"fast, 1 row in {step}, reconstructed", rig, thinned(builder, step, rebuilt=True), step
 
 
 def short(rig: Instrument, scene: Scene) -> Iterator[Made]:
@@ -207,8 +207,8 @@ def main() -> int:
     print(HEAD, flush=True)
     measure("ideal", rig, ideal, ideal, plates)
     for make in (s for s in SCANS if s.__name__ in args.scans):
-        for name, scanned, images, every in make(rig, scene):
-            measure(name, scanned, images, ideal, plates, every)
+        for name, scanned, images, step in make(rig, scene):
+            measure(name, scanned, images, ideal, plates, step)
     return 0
 
 

@@ -121,7 +121,10 @@ class Synchroniser:
         """
         linear = mean[:, self._a : self._b]
         beam = self._beam @ linear if self._tuned else None
-        spectrum = self._beam @ self._wide(linear) if beam is None else np.asarray(scipy.fft.fft(beam, RANGE_BINS))
+        if beam is None:
+            spectrum = self._beam @ self._wide(linear)
+        else:
+            spectrum = np.asarray(scipy.fft.fft(beam, RANGE_BINS))
         power = np.abs(spectrum)
         peaks, _ = scipy.signal.find_peaks(power, height=power.max() / 2, distance=2)
         best = int(peaks[0] if len(peaks) else power.argmax())
@@ -186,7 +189,7 @@ def form_image(
     start_hz = chirp.first_sample_hz + chirp.hz_per_sample * a
     full = rows + y.size - 1, columns + x.size - 1
     shape = tuple(int(scipy.fft.next_fast_len(n) or n) for n in full) if tuned else full
-    seen = slice(rows - 1, rows - 1 + ny), slice(columns - 1, columns - 1 + nx)
+    window = slice(rows - 1, rows - 1 + ny), slice(columns - 1, columns - 1 + nx)
     image = np.zeros((ny, nx), np.complex64)
     total = np.zeros(shape, np.complex64)
     for rx in range(n_rx):
@@ -195,13 +198,16 @@ def form_image(
         turns = (-2 * np.pi * start_hz / SPEED_OF_LIGHT_M_S * excess[rx]).astype(np.float32)
         wave = np.exp(1j * turns) if tuned else None
         for n in range(int(bins.min()), int(bins.max()) + 1):
-            kernel = np.where(bins == n, wave, 0) if wave is not None else np.exp(1j * turns) * (bins == n)
+            if wave is not None:
+                kernel = np.where(bins == n, wave, 0)
+            else:
+                kernel = np.exp(1j * turns) * (bins == n)
             kernel = np.asarray(scipy.fft.fft2(kernel, shape))
             total += kernel * np.asarray(scipy.fft.fft2(spectrum[:, :, n % points], shape))
         if not tuned:
-            image += np.asarray(scipy.fft.ifft2(total))[seen]
+            image += np.asarray(scipy.fft.ifft2(total))[window]
             total[:] = 0
-    return np.asarray(scipy.fft.ifft2(total))[seen] if tuned else image
+    return np.asarray(scipy.fft.ifft2(total))[window] if tuned else image
 
 
 def _lattice(axis_m: NDArray[np.float64], positions: int) -> NDArray[np.float64]:

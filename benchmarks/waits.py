@@ -50,9 +50,9 @@ def rows_then_products(scan: Path, out: Path) -> dict[str, float]:
 def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
     """All rows read back and both images made: of the rig file's plane, and of another, each in a new pipeline."""
     same = Seconds()
-    other = Seconds()
+    other_seconds = Seconds()
     for _ in range(repeats + 1):
-        for took, depth_mm in ((same, 0.0), (other, 5.0)):
+        for took, depth_mm in ((same, 0.0), (other_seconds, 5.0)):
             source = ScanFolder.load(scan)
             pipeline = Pipeline(source, Settings(depth_mm=depth_mm), samples="read")
             rows = list(source.rows())
@@ -62,9 +62,9 @@ def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
                 for row in rows:
                     pipeline.add_row(row)
                 pipeline.form_images()
-    for took in (same, other):  # the first round makes kernels
+    for took in (same, other_seconds):  # the first round makes kernels
         del took.cpu[0], took.wall[0]
-    return same, other
+    return same, other_seconds
 
 
 def listed(scan: Path, made: Path, root: Path, count: int) -> tuple[Seconds, Seconds]:
@@ -85,14 +85,14 @@ def listed(scan: Path, made: Path, root: Path, count: int) -> tuple[Seconds, Sec
 
 def command(words: list[str]) -> tuple[float, float]:
     """CPU and wall seconds of a command in a process of its own. Raises RuntimeError when it fails."""
-    before = os.times()
+    start = os.times()
     began = time.perf_counter()
     done = subprocess.run([sys.executable, "-m", "polysight", *words], cwd=ROOT, capture_output=True, check=False)
     wall = time.perf_counter() - began
-    after = os.times()
+    end = os.times()
     if done.returncode:
         raise RuntimeError(f"polysight {' '.join(words)}: {done.stderr.decode()}")
-    return after.children_user + after.children_system - before.children_user - before.children_system, wall
+    return end.children_user + end.children_system - start.children_user - start.children_system, wall
 
 
 def run(args: argparse.Namespace) -> int:
@@ -102,17 +102,17 @@ def run(args: argparse.Namespace) -> int:
         count = rows_that_fit(rig, 20 if args.quick else rig.grid.rows, folder)
         write_scan(folder / "scan", rig, recorded_rows(rig, scene, min(4, count)), count)
         behind = [rows_then_products(folder / "scan", folder / f"out{n}") for n in range(repeats)]
-        same, other = from_samples(folder / "scan", repeats)
-        made = small_products(folder)
-        first, again = listed(folder / "scan", made, folder / "many", 20 if args.quick else 200)
-        typed = {name: [command(name.format(made=made).split()) for _ in range(repeats)] for name in COMMANDS}
+        same, other_seconds = from_samples(folder / "scan", repeats)
+        products = small_products(folder)
+        first, again = listed(folder / "scan", products, folder / "many", 20 if args.quick else 200)
+        typed = {name: [command(name.format(made=products).split()) for _ in range(repeats)] for name in COMMANDS}
     boards = len(rig.receivers)
     lines = []
     for stage, limit in (("image", 0.1), ("report", 4.0)):
         waited = [found[stage] for found in behind]
         note = ", ".join(f"{seconds:.2f}" for seconds in waited)
         lines.append(_least(f"last committed row to {stage}, wall s", statistics.median(waited), limit, limit, note))
-    for name, took in (("its own plane", same), ("another plane", other)):
+    for name, took in (("its own plane", same), ("another plane", other_seconds)):
         lines.append(_least(f"image from kept samples, {name}, a board, CPU s", took.median / boards, 0.15, 0.1))
     for name, took in (("first look", first), ("later", again)):
         note = f"{took.median_wall:.2f} s wall"
@@ -129,18 +129,21 @@ def run(args: argparse.Namespace) -> int:
 def small_products(folder: Path) -> Path:
     """Products of a small scan, to ask commands about."""
     scan = folder / "small"
-    made = folder / "made"
+    products = folder / "made"
     rig = ["--config", str(ROOT / "instrument.toml")]
-    small = (SCENE.parent / "own-scene.toml") if (SCENE.parent / "own-scene.toml").exists() else SCENE
+    if (SCENE.parent / "own-scene.toml").exists():
+        small = SCENE.parent / "own-scene.toml"
+    else:
+        small = SCENE
     subprocess.run(
         [sys.executable, "-m", "polysight_simulators", "simulate", str(small), *rig, "--out", str(scan)],
         cwd=ROOT,
         check=True,
         capture_output=True,
     )
-    command(["process", str(scan), "--out", str(made)])
+    command(["process", str(scan), "--out", str(products)])
     shutil.rmtree(scan)
-    return made
+    return products
 
 
 def _least(name: str, value: float, at_least: float, aim: float, note: str = "") -> Line:

@@ -45,10 +45,10 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
     else:
         rig, _ = published(**source["grid"])
         scan = RepeatedRows(rig, {name: [Path(f) for f in files] for name, files in source["files"].items()})
-    whole = Seconds()
+    total = Seconds()
     once = Seconds()
     last = Seconds()
-    with whole.timed():
+    with total.timed():
         with once.timed():
             pipeline = Pipeline(scan, live=live)
             rows = list(scan.rows())
@@ -63,8 +63,8 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
             pipeline.form_images(from_sums=live)
     return {
         "rows": len(rows),
-        "cpu_s": whole.cpu[0],
-        "wall_s": whole.wall[0],
+        "cpu_s": total.cpu[0],
+        "wall_s": total.wall[0],
         "once_cpu_s": sum(once.cpu),
         "last_row_wall_s": last.wall,
         "last_row_cpu_s": last.cpu,
@@ -138,7 +138,7 @@ def run(args: argparse.Namespace) -> int:
         files = {name: scan / "raw" / name / "0000.bin" for name in rows}
         del rows
         plain, tuned = (Published(rig, files, t) for t in (False, True))
-        batch, live = (Chain(folder, how, {"scan": str(scan)}) for how in ("batch", "live"))
+        batch, live = (Chain(folder, mode, {"scan": str(scan)}) for mode in ("batch", "live"))
         ours = []
         theirs = []
         theirs_tuned = []
@@ -150,7 +150,10 @@ def run(args: argparse.Namespace) -> int:
         memory = max(batch.end(), live.end())
     scale = rig.grid.rows / count
     size = rig.grid.columns * rig.burst.pulses * rig.frame_bytes * len(rig.receivers) * count
-    part = f"{count} of {rig.grid.rows} rows ({size / 1e9:.1f} GB)" if scale > 1 else f"all {size / 1e9:.1f} GB"
+    if scale > 1:
+        part = f"{count} of {rig.grid.rows} rows ({size / 1e9:.1f} GB)"
+    else:
+        part = f"all {size / 1e9:.1f} GB"
     seconds = statistics.median((r["cpu_s"] - r["once_cpu_s"]) * scale + r["once_cpu_s"] for r in ours)
     lines = [
         _time_line(seconds, statistics.median(theirs), statistics.median(theirs_tuned), part),

@@ -48,8 +48,8 @@ def _simulate(args: argparse.Namespace) -> None:
     """Run `simulate`. Raises PolysightError."""
     if args.layout == "own" and (args.columns or args.absent):
         option = "--columns" if args.columns else "--absent"
-        why = "only the published data has such scans"
-        raise ConfigError(f"{option} with --layout own", why, "add --layout authors")
+        cause = "only the published data has such scans"
+        raise ConfigError(f"{option} with --layout own", cause, "add --layout authors")
     rig = load_instrument(args.config)
     scene = load_scene(args.scene)
     if args.specimens:

@@ -92,7 +92,9 @@ def _folder() -> Path:
 
 def sketch_compiler() -> str | None:
     """Return the C++ compiler's path; None if it or the sketch's sources are missing."""
-    return shutil.which("g++") if (SKETCH_DIR / "pc" / "main.cpp").is_file() else None
+    if (SKETCH_DIR / "pc" / "main.cpp").is_file():
+        return shutil.which("g++")
+    return None
 
 
 def build_sketch(gxx: str, flags: tuple[str, ...] = _FLAGS) -> Path:

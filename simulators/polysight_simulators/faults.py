@@ -139,10 +139,10 @@ def read_faults(
                 f"--fault {setting!r}: {e}", "not of the form KEY=VALUE", "write for example loss=0.01 or RH.mute=true"
             ) from None
     common = {k: v for k, v in table.items() if not isinstance(v, dict)}
-    own = {k: v for k, v in table.items() if isinstance(v, dict)}
-    if unknown := sorted(set(own) - set(boards)):
+    board_tables = {k: v for k, v in table.items() if isinstance(v, dict)}
+    if unknown := sorted(set(board_tables) - set(boards)):
         raise ConfigError(f"faults for unknown boards {unknown}", f"the boards are {list(boards)}", "correct the name")
-    faults = {name: decode({**common, **own.get(name, {})}, Faults, f"faults of {name}") for name in boards}
+    faults = {name: decode({**common, **board_tables.get(name, {})}, Faults, f"faults of {name}") for name in boards}
     for name, f in faults.items():
         for needed, keys in OF_CONTROL.items():
             if control not in (None, needed) and (idle := [key for key in keys if getattr(f, key)]):

@@ -49,12 +49,12 @@ def is_free(rig: Instrument) -> bool:
     radars = (*rig.radar.servers.values(), *(b.usb_serial for b in rig.radar.native.values()))
     addresses = (rig.pi.command_address, rig.pi.event_address, *radars)
     tcp = [address.removeprefix("tcp://").split(":") for address in addresses]
-    with ExitStack() as held:
+    with ExitStack() as stack:
         try:
             for address, port in udp:
-                held.enter_context(bound_udp(address, port))
+                stack.enter_context(bound_udp(address, port))
             for address, port in tcp:
-                s = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
+                s = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
                 s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # addresses of a rig that just ended are free
                 s.bind((address, int(port)))
         except (OSError, DeviceError):

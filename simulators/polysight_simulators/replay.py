@@ -197,8 +197,8 @@ def _run(args: argparse.Namespace, stop: Event) -> None:
         Recording(path)  # raises DataError before the start
     faults = read_faults(args.faults, args.fault, (name,))[name]
     if useless := [key for key in (*_OF_PULSES, *_OF_RADARS) if getattr(faults, key)]:
-        why = "a replay has no SYNC_IN pulses, radars or frames"
-        raise ConfigError(f"faults {useless}", why, "leave them out")
+        cause = "a replay has no SYNC_IN pulses, radars or frames"
+        raise ConfigError(f"faults {useless}", cause, "leave them out")
     network = Network(args.host_address, args.card_address, MAC, args.command_port, args.data_port)
     pace = Pace(not (args.no_wait or args.real_pacing), args.real_pacing)
     endpoint = CardEndpoint(name, network, faults, args.seed, args.time_scale, time.monotonic, pace, lanes=None)

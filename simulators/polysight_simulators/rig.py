@@ -175,8 +175,8 @@ class RigProcesses:
         started = [self._module("stage", "uno" if options.uno else "stage", *common, "--link", rig.stage.port)]
         for group in card_groups(rig):
             name = f"cards-{group.partition(',')[0]}"
-            own = ["--boards", group, "--report", str(self._folder / f"{name}.json")]
-            started.append(self._module(name, "cards", *common, *own, *_card_options(scene, options)))
+            card_options = ["--boards", group, "--report", str(self._folder / f"{name}.json")]
+            started.append(self._module(name, "cards", *common, *card_options, *_card_options(scene, options)))
         self._wait(started)
         if options.with_pi:
             self._wait([self._launch("pi", [_pi_program(), "run", "--config", config, "--wires", wires])])
@@ -256,7 +256,10 @@ def _pi_program() -> str:
 
 def _write_files(rig: Instrument, scene: Scene | None, folder: Path, options: RigOptions) -> None:
     table = to_builtins(rig)
-    table["name"] = rig.name if rig.name.endswith("(simulated)") else f"{rig.name} (simulated)"
+    if rig.name.endswith("(simulated)"):
+        table["name"] = rig.name
+    else:
+        table["name"] = f"{rig.name} (simulated)"
     (folder / "instrument.toml").write_bytes(tomli_w.dumps(table).encode())
     if rig.radar.firmware == str(folder / IMAGE_FILE):
         (folder / IMAGE_FILE).write_bytes(make_image())

@@ -130,7 +130,7 @@ class WireHub:
             self._disconnect(client, str(e))
 
     def _relay(self, sender: _Client, lines: list[bytes]) -> None:
-        others = [p for p in self._clients.values() if p is not sender]
+        other_clients = [p for p in self._clients.values() if p is not sender]
         for line in lines:
             tag = line[:2]
             if tag == b"S ":
@@ -138,14 +138,14 @@ class WireHub:
                 if len(fields) != 4 or not fields[2]:
                     raise ProtocolError(f"not a wire line: {line!r}")
                 gpio_line = fields[2]
-                self._pass_on(gpio_line, line, others)
-                if other := self._joined.get(gpio_line):
-                    self._pass_on(other, b" ".join([b"S", fields[1], other, fields[3]]), list(self._clients.values()))
+                self._pass_on(gpio_line, line, other_clients)
+                if joined := self._joined.get(gpio_line):
+                    self._pass_on(joined, b" ".join([b"S", fields[1], joined, fields[3]]), list(self._clients.values()))
             elif tag == b"M ":
                 if not isinstance(parse(line.decode("ascii", "replace")), WireMotion):
                     raise ProtocolError(f"not a wire line: {line!r}")
                 self._last_motion = line + b"\n"
-                for p in others:
+                for p in other_clients:
                     if p.motion:
                         p.pending += self._last_motion
                         self.relayed += 1

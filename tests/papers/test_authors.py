@@ -42,13 +42,18 @@ def material(number):
 
 
 def angles(number):
-    return (60, 55) if number <= 23 else (55,) if number <= 32 else (60,)
+    if number <= 23:
+        return (60, 55)
+    if number <= 32:
+        return (55,)
+    return (60,)
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     """materials/ with three sets, labels/ with two scans, and a stranger among the names."""
-    folder, seed = tmp_path_factory.mktemp("authors") / "dataset", 0
+    folder = tmp_path_factory.mktemp("authors") / "dataset"
+    seed = 0
     for k in range(3):
         for number in CHOSEN:
             for angle in angles(number):
@@ -82,7 +87,8 @@ def test_table_2_is_recovered_from_both_kinds_of_files(out):
         assert row["metal_like"] == (number == 1)
         if number == 1:
             continue
-        true, seen = ROWS[number].permittivity, complex(*row["without_leakage"].values())
+        true = ROWS[number].permittivity
+        seen = complex(*row["without_leakage"].values())
         assert abs(seen - true) < 0.08 * abs(true)
         assert abs(complex(*row["as_is"].values()) - true) > abs(seen - true)  # the files hold leakage
 
@@ -215,7 +221,10 @@ def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, ca
     assert set(library.fit["angles"]) == {"55", "60"}
     for e in library.entries:
         eps = next(m for m in ROWS.values() if m.name == e.name).permittivity
-        true = 1 if e.name == "Metal" else complex(ratio_from_permittivity(eps, np.radians(e.incidence_deg)))
+        if e.name == "Metal":
+            true = 1
+        else:
+            true = complex(ratio_from_permittivity(eps, np.radians(e.incidence_deg)))
         assert np.median(e.p.real) + 1j * np.median(e.p.imag) == pytest.approx(true, rel=0.08)
         np.testing.assert_allclose(abs(e.p), e.h / e.v, rtol=1e-5)
     shown = capsys.readouterr()

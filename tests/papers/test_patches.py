@@ -76,7 +76,8 @@ def test_v_and_p_add_to_what_h_tells():
 
 
 def test_no_classifier_passes_the_bound_and_the_better_one_comes_near():
-    group, errors = groups()["powders"], Errors(0.03, 0.06)
+    group = groups()["powders"]
+    errors = Errors(0.03, 0.06)
     found = [score(draw(group.materials, 60.0, errors, seed).samples(), DISCRIMINANT) for seed in range(12)]
     alone = pixel_bound(group.materials, (60.0,), errors, True, 1)
     known = pixel_bound(group.materials, (60.0,), errors, False, 1)

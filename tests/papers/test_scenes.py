@@ -25,7 +25,8 @@ def test_random_places_never_overlap_and_stay_on_the_plane(seed):
 
 
 def test_the_rig_side_by_side_sees_the_plane_front_on(tmp_path):
-    steep, near = published_rig(), load_instrument(front_on(RIG_FILE, tmp_path))
+    steep = published_rig()
+    near = load_instrument(front_on(RIG_FILE, tmp_path))
     assert np.degrees(specular_incidence_rad(steep)) == pytest.approx(55, abs=0.2)
     assert np.degrees(specular_incidence_rad(near)) < 2
     assert near.chirp == steep.chirp

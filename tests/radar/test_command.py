@@ -182,7 +182,8 @@ def test_an_event_at_any_time_after_power_up_replays(
 ):
     """A trace counts looks, each of which takes its time over USB: the line rises in a replay where it was seen to."""
     del opened
-    look, boot = words.interrupt, board.cores.boot
+    look = words.interrupt
+    boot = board.cores.boot
 
     def slow_look():
         clock.sleep(look_s)
@@ -193,7 +194,8 @@ def test_an_event_at_any_time_after_power_up_replays(
         board.cores.event(0x5002, FAULT_DATA, BOOT_S + after_s)
 
     board.cores.fault_at = "never"
-    words.interrupt, board.cores.boot = slow_look, booting
+    words.interrupt = slow_look
+    board.cores.boot = booting
     trace = str(tmp_path / "day.jsonl")
     assert run(rig_file(), "check", "RH", "--trace", trace) == 0
     result = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
@@ -287,7 +289,8 @@ def test_an_existing_trace_is_not_overwritten(rig_file, opened, capsys, tmp_path
 def test_an_interrupted_flash_write_reports_the_parts_written(rig_file, words, board, capsys, tmp_path):
     image = tmp_path / "image.bin"
     image.write_bytes(make_image())
-    write, seen = words.write, []
+    write = words.write
+    seen = []
 
     def stop_at_part_7(sent):
         seen.extend(w for w in sent[:1] if w == 0x1234)

@@ -26,7 +26,9 @@ class FlippingWords(BoardWords):
 
     def __init__(self, board: Simulated, clock: VirtualClock, at: int, bit: int) -> None:
         super().__init__(board, clock)
-        self.at, self.bit, self.count = at, bit, 0
+        self.at = at
+        self.bit = bit
+        self.count = 0
 
     def _flip(self, word: int) -> int:
         self.count += 1
@@ -71,10 +73,8 @@ def test_commands_are_executed_once_in_order_although_messages_are_lost(faults_o
 @example(7, 3)
 def test_a_flipped_bit_never_changes_a_setting(at: int, bit: int):
     clock = VirtualClock()
-    clean_board, board = (
-        Simulated(lambda: clock.time, flash=make_image()),
-        Simulated(lambda: clock.time, flash=make_image()),
-    )
+    clean_board = Simulated(lambda: clock.time, flash=make_image())
+    board = Simulated(lambda: clock.time, flash=make_image())
     clean = RadarBoard("LS", BoardWords(clean_board, clock), clock, program(RIG, RIG.by_name("LS")))
     clean.arm(FRAMES)
     radar = RadarBoard("LS", FlippingWords(board, clock, at, bit), clock, program(RIG, RIG.by_name("LS")))

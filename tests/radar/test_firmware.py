@@ -303,7 +303,9 @@ def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, 
 
     def answer(number, data):
         result = effect(number, data)
-        return result[:10] + bytes(reported) if number == 0x40E0 and any(result[10:]) else result
+        if number == 0x40E0 and any(result[10:]):
+            return result[:10] + bytes(reported)
+        return result
 
     monkeypatch.setattr(new.cores, "_effect", answer)
     radar = made(new, clock, IMAGE)

@@ -266,7 +266,8 @@ def test_a_full_disk_ends_a_trace_but_no_row(rig, usb, clock, tmp_path, monkeypa
 
 def test_a_fatal_event_during_arming_is_retried(radars, usb, monkeypatch):
     """The board faults once at its start."""
-    arm, failed = boards.RadarBoard.arm, []
+    arm = boards.RadarBoard.arm
+    failed = []
 
     def once(board, frames) -> None:
         if board.name == "RV" and not failed:

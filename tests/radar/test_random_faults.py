@@ -34,7 +34,9 @@ class FaultyWords(BoardWords):
 
     def __init__(self, board: Simulated, clock: VirtualClock, at: int, act: Callable[[FaultyWords], None]) -> None:
         super().__init__(board, clock)
-        self.at, self.act, self.count = at, act, 0
+        self.at = at
+        self.act = act
+        self.count = 0
         self.flip: Callable[[int], int] = lambda word: word
         self.stuck: bool | None = None
         self.begun: float | None = None
@@ -193,8 +195,11 @@ class Outcome:
 
     def heal(self) -> None:
         """Repair the faults between host and board: plugged in, powered, undisturbed lines."""
-        self.words.flip, self.words.stuck, self.words.dead = (lambda word: word), None, None
-        self.board.plugged, self.board.cores.destroyed = True, False
+        self.words.flip = lambda word: word
+        self.words.stuck = None
+        self.words.dead = None
+        self.board.plugged = True
+        self.board.cores.destroyed = False
         self.board.inject()
         if not self.board.powered:
             self.board.power(True)
@@ -253,7 +258,8 @@ def accepted_rightly(found: Outcome, clean: Simulated) -> bool:
 @pytest.mark.timeout(3600)
 def test_random_faults(clean, request):
     cases = 10_000 if request.config.getoption("--long") else 300
-    failed, unnamed = 0, []
+    failed = 0
+    unnamed = []
     kinds: Counter[str] = Counter()
     for number in range(cases):
         case, at = draw(random.Random(number))

@@ -41,7 +41,8 @@ AWR1243_RF_UP = bytes.fromhex("badccdab16800e000c0000000000cf7f6c90")
 AWR1243_ERROR = bytes.fromhex("badccdab16000e000c0000000100ceffcbcd")
 # AWR2243, main core fault while its firmware was loaded; the start then succeeds. E2E 1267477. The forum's text lost a
 # digit among the zeros: their number is that of the length, and the CRC is right with it.
-_FAULT_BEGIN, _FAULT_END = "badccdab36a032000c00000001008a5f0250240005000000800000fe", "ffffffffffff0000f4b5"
+_FAULT_BEGIN = "badccdab36a032000c00000001008a5f0250240005000000800000fe"
+_FAULT_END = "ffffffffffff0000f4b5"
 AWR2243_FAULT = bytes.fromhex(_FAULT_BEGIN) + bytes(54 - 28 - 10) + bytes.fromhex(_FAULT_END)
 
 RECEIVED = {
@@ -58,18 +59,22 @@ class Sent:
     """A device that says given messages: one after each command, or all at once."""
 
     def __init__(self, *messages: bytes) -> None:
-        self.messages, self.out, self.waiting = list(messages), b"", False
+        self.messages = list(messages)
+        self.out = b""
+        self.waiting = False
         self.written: list[bytes] = []
 
     def write(self, words: Sequence[int]) -> None:
         raw = b"".join(w.to_bytes(2, "little") for w in words)
         self.written.append(raw)
         if raw[:4] == bytes.fromhex("78566587"):
-            self.out, self.waiting = self.messages.pop(0), False
+            self.out = self.messages.pop(0)
+            self.waiting = False
         self.waiting = bool(self.messages) and (self.waiting or raw[:4] != bytes.fromhex("78566587"))
 
     def read(self, count: int) -> list[int]:
-        part, self.out = self.out[: 2 * count].ljust(2 * count, b"\xff"), self.out[2 * count :]
+        part = self.out[: 2 * count].ljust(2 * count, b"\xff")
+        self.out = self.out[2 * count :]
         if not self.out and self.messages:
             self.waiting = True
         return [int.from_bytes(part[n : n + 2], "little") for n in range(0, len(part), 2)]

@@ -150,7 +150,8 @@ def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged):
     words.close()
     for at in range(1, whole + 1):
         bus.plug(plugged)
-        plugged.transfers, plugged.pull_at = 0, at
+        plugged.transfers = 0
+        plugged.pull_at = at
         with refused(ErrorCode.NO_ANSWER, "FT1234"):
             open_usb("FT1234")
         assert UsbTools.Devices == {}

@@ -12,13 +12,12 @@ from polysight_simulators.cards import Pace, SimulatedCard, StageTrack, bound_ud
 from polysight_simulators.faults import read_faults
 from polysight_simulators.scene import PatternSource, pattern_frames
 
-FRAME, PERIOD_NS = 4096, 1_500_000
-ALIVE, CONFIGURE, EEPROM, START = (
-    (0x09, b""),
-    (0x03, bytes.fromhex("01010102031e")),
-    0x04,
-    (0x05, b""),
-)
+FRAME = 4096
+PERIOD_NS = 1_500_000
+ALIVE = (0x09, b"")
+CONFIGURE = (0x03, bytes.fromhex("01010102031e"))
+EEPROM = 0x04
+START = (0x05, b"")
 
 
 class Bench:
@@ -72,7 +71,8 @@ class Bench:
         while n:
             some = min(n, 1 + self.pulse % 7)
             self.card.pulses([(self.pulse + i) * PERIOD_NS for i in range(some)], self.track)
-            self.pulse, n = self.pulse + some, n - some
+            self.pulse = self.pulse + some
+            n = n - some
 
     def record(self, pulses: int) -> None:
         """Start a record, send pulses and wait for its end."""

@@ -17,7 +17,8 @@ from polysight.store.open import open_source
 from polysight_simulators.scene import decode_scene, simulate
 
 RIG = published_rig()
-PULSES, FRAME = 16, 4096
+PULSES = 16
+FRAME = 4096
 
 
 def scan_in(folder: Path, columns: int = 5, **more: object) -> Path:
@@ -32,7 +33,8 @@ def scan_in(folder: Path, columns: int = 5, **more: object) -> Path:
 def positions_by_pauses(log: Path) -> list[int]:
     """Position of each frame as the authors' rule has it. Raises IndexError where the log has no last pause."""
     table = np.loadtxt(log, delimiter=",", ndmin=2)
-    sizes, times = table[:, 1].astype(int), table[:, 2]
+    sizes = table[:, 1].astype(int)
+    times = table[:, 2]
     frames: list[int] = []
     packet = held = position = gathered = 0
     while packet < len(sizes):

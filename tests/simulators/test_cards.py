@@ -32,7 +32,8 @@ from polysight_simulators.scene import pattern_frames
 
 TIME_SCALE = 20.0
 SYNC = 22  # pi.sync_out of the shipped rig file
-CONFIGURE, PACKET = bytes.fromhex("01010102031e"), bytes.fromhex("be05350c0000")
+CONFIGURE = bytes.fromhex("01010102031e")
+PACKET = bytes.fromhex("be05350c0000")
 COMPLETED = bytes.fromhex("5aa50a000001aaee")
 
 
@@ -231,7 +232,8 @@ def test_the_eeproms_addresses_are_taken_over_the_network_after_a_power_cycle(
 ) -> None:
     bench = Bench(rig, sockets)
     subnet = bench.board.card_address.rpartition(".")[0]
-    old, new = bench.board.card_address, f"{subnet}.199"
+    old = bench.board.card_address
+    new = f"{subnet}.199"
     swapped = [bytes(map(int, a.split(".")))[::-1] for a in (bench.board.host_address, new)]
     ports = struct.pack("<HH", bench.board.command_port, bench.board.data_port)
     body = b"".join(swapped) + bytes.fromhex("129078563412") + ports
@@ -249,7 +251,9 @@ def test_the_eeproms_addresses_are_taken_over_the_network_after_a_power_cycle(
 
 
 def test_single_packets_leave_no_faster_than_their_delay_and_one_by_one(rig: Instrument, sockets: ExitStack) -> None:
-    board, now, sent = rig.boards[0], [0.0], list[float]()
+    board = rig.boards[0]
+    now = [0.0]
+    sent = list[float]()
     receiver = sockets.enter_context(bound_udp(board.host_address, board.data_port))
     sender = CardSender(
         (board.card_address, 1024), (board.host_address, 1), (board.host_address, board.data_port), Pace(False, True)
@@ -279,7 +283,8 @@ def test_single_packets_leave_no_faster_than_their_delay_and_one_by_one(rig: Ins
 def test_packets_in_calls_of_many_keep_the_delay_as_a_mean_also_after_a_pause(
     rig: Instrument, sockets: ExitStack
 ) -> None:
-    board, now = rig.boards[0], [0.0]
+    board = rig.boards[0]
+    now = [0.0]
     sender = CardSender((board.card_address, 1024), (board.host_address, 1), (board.host_address, 9), Pace(False))
     sockets.callback(sender.close)
     for pause in (0.0, 1.0, 0.003):

@@ -136,7 +136,8 @@ def test_the_link_is_down_for_a_time(rig: Instrument, sockets: ExitStack) -> Non
     bench.now += 0.015
     assert bench.request(*ALIVE) == [reply(9)]
     bench.end()
-    packets, counts = bench.packets(), bench.counts
+    packets = bench.packets()
+    counts = bench.counts
     whole = bench.pattern(0, 30)
     for p in packets:
         at = int.from_bytes(p[4:10], "little")

@@ -33,7 +33,8 @@ def launch(tmp_path):
 
 def children(program: Program) -> dict[str, int]:
     """Process ids below the rig, by module."""
-    found, pid = {}, program.process.pid
+    found = {}
+    pid = program.process.pid
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         words = Path(f"/proc/{child}/cmdline").read_bytes().decode().split("\0")
         found[next((w for w in words if w.startswith("polysight_simulators.")), words[0])] = int(child)

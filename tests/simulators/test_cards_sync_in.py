@@ -71,7 +71,8 @@ def test_motion_lines_are_kept_long_enough_and_not_forever() -> None:
 
 
 def test_without_burst_motion_all_pulses_of_a_burst_are_at_its_middle() -> None:
-    moving, frozen = StageTrack(RIG), StageTrack(RIG, burst_motion=False)
+    moving = StageTrack(RIG)
+    frozen = StageTrack(RIG, burst_motion=False)
     trigger = 1_000_000_000
     times = [trigger + 200_000 + k * 1_500_000 for k in range(16)]  # as the Pi sends them
     for track in (moving, frozen):
@@ -90,7 +91,8 @@ def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, 
     radar = SimulatedRig(RIG, decode_scene({"name": "t"}, "t").with_disturbances(**disturbed))
     d = radar.scene.disturbances
     for index in (10, 11):
-        row, track = plan_raster(RIG.grid).row(index), StageTrack(RIG, d.burst_motion, d.backlash_mm)
+        row = plan_raster(RIG.grid).row(index)
+        track = StageTrack(RIG, d.burst_motion, d.backlash_mm)
         bursts = [at_point(track, index, row.column(i), 10**9 + i * 10**8) for i in range(row.points)]
         sent = [pulse for burst in bursts for pulse in burst]
         at = track.offsets_mm([pulse.t_ns for pulse in sent])
@@ -102,7 +104,8 @@ def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, 
 
 def at_point(track: StageTrack, row: int, column: int, t_ns: int) -> list[Pulse]:
     """The stage raises its trigger at a point of the plan; the pulses of its burst, with numbers of no meaning."""
-    plan, centre = plan_raster(RIG.grid), (RIG.stage.centre_x_mm, RIG.stage.centre_y_mm)
+    plan = plan_raster(RIG.grid)
+    centre = (RIG.stage.centre_x_mm, RIG.stage.centre_y_mm)
     x = (column - (plan.columns - 1) / 2) * plan.step_x_mm + centre[0]
     y = plan.row(row).y_mm + centre[1]
     track.add(WireMotion(t_ns, round(1000 * x), round(1000 * y), plan.row(row).direction * 20_000))

@@ -75,7 +75,9 @@ def test_the_echo_of_v_drifts_by_what_the_scene_says_and_h_and_the_direct_path_d
     echoes = {b: [synced_cube(RIG, s, b, noise=0.0, direct=False) for s in (drifting, SCENE)] for b in ("RH", "RV")}
     assert np.array_equal(echoes["RH"][0], echoes["RH"][1])
     factor = echoes["RV"][0] / echoes["RV"][1]
-    first, last = factor[0, 0, 0, 0], factor[0, -1, 0, 0]  # row 5 runs backwards
+    # row 5 runs backwards
+    first = factor[0, 0, 0, 0]
+    last = factor[0, -1, 0, 0]
     passed = 65 / 66  # of 66 positions, from the first to the last
     assert abs(last) - abs(first) == pytest.approx(0.2 * passed, rel=1e-3)
     assert np.degrees(np.angle(last / first)) == pytest.approx(30.0 * passed, rel=1e-3)

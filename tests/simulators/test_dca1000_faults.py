@@ -30,7 +30,10 @@ def rows(n: int) -> np.ndarray:
 
 
 def arrivals(faults: Faults, sizes: list[int], seed: int = 1, board: str = "RH") -> list[bytes]:
-    network, data, at, out = NetworkFaults(faults, seed, board), rows(sum(sizes)), 0, []
+    network = NetworkFaults(faults, seed, board)
+    data = rows(sum(sizes))
+    at = 0
+    out = []
     for size in sizes:
         out += [r.tobytes() for part in network.carry(data[at : at + size]) for r in part]
         at += size

@@ -29,8 +29,12 @@ class AnyUse(RuleBasedStateMachine):
     )
     def switch_on(self, sequence: int, count: int, lanes: bool) -> None:
         self.card = Card(HOME, sequence, count, lanes=4 if lanes else None)
-        self.sequence, self.count, self.now = sequence, count, 0.0
-        self.recording, self.suits, self.lanes = False, True, lanes
+        self.sequence = sequence
+        self.count = count
+        self.now = 0.0
+        self.recording = False
+        self.suits = True
+        self.lanes = lanes
         self.payload = 1456
         self.given = self.received = b""
         self.last_data: float | None = None
@@ -46,7 +50,8 @@ class AnyUse(RuleBasedStateMachine):
             assert (sequence, low | high << 32) == (self.sequence, self.count)
             size = len(packet) - 10
             assert 0 < size <= self.payload
-            self.sequence, self.count = (sequence + 1) % 2**32, (self.count + size) % 2**48
+            self.sequence = (sequence + 1) % 2**32
+            self.count = (self.count + size) % 2**48
             self.received += packet[10:]
             self.sizes.append(size)
         statuses = [o.payload for o in outputs if isinstance(o, Message) and o.payload[2:4] == b"\x0a\x00"]
@@ -62,7 +67,8 @@ class AnyUse(RuleBasedStateMachine):
             assert not self.recording or all(s == self.payload for s in self.sizes)
 
     def begin(self) -> None:
-        self.recording, self.last_data = True, None
+        self.recording = True
+        self.last_data = None
         self.given = self.received = b""
         self.sizes = []
 
@@ -129,7 +135,11 @@ class AnyUse(RuleBasedStateMachine):
             self.card.power_cycle()
         else:
             assert self.card.command(request(0x01), self.now) == [message(0x01, 0)]
-        self.recording, self.suits, self.payload, self.sequence, self.count = False, True, 1456, 1, 0
+        self.recording = False
+        self.suits = True
+        self.payload = 1456
+        self.sequence = 1
+        self.count = 0
 
     @property
     def started(self) -> float:

@@ -49,7 +49,8 @@ def read(field: ObjectField, offsets_m: np.ndarray, f: np.ndarray, rx: int, samp
 
 def test_interpolation_between_frequencies_is_exact() -> None:
     rig, scene = setup(plates=PLATES[:1])
-    board, samples = rig.receivers[0], sample_frequencies_hz(rig)
+    board = rig.receivers[0]
+    samples = sample_frequencies_hz(rig)
     field = build_field(rig, scene, board, samples)
     offset = np.array([[0.021, -0.033]])
     assert len(field.nodes_hz) < 16
@@ -93,7 +94,8 @@ def test_a_metal_plate_in_the_middle_is_within_a_factor_of_1_5_of_the_direct_pat
 def test_echoes_add_up() -> None:
     rig, both = setup(plates=PLATES)
     parts = [setup(plates=[p])[1] for p in PLATES]
-    offsets, f = np.array([[0.01, 0.02]]), np.array([77e9, 80e9])
+    offsets = np.array([[0.01, 0.02]])
+    f = np.array([77e9, 80e9])
     for board in rig.receivers:
         total = field_exact(rig, both, board, offsets, f)
         assert np.allclose(total, sum(field_exact(rig, s, board, offsets, f) for s in parts), atol=1e-12)
@@ -101,14 +103,16 @@ def test_echoes_add_up() -> None:
 
 def test_leakage_mixes_the_two_polarisations() -> None:
     rig, scene = setup(plates=PLATES[1:2])
-    offsets, f = np.array([[0.05, 0.05]]), np.array([78e9])
+    offsets = np.array([[0.05, 0.05]])
+    f = np.array([78e9])
     h, v = rig.receivers
 
     def at(board: Any, **d: Any) -> complex:
         return complex(field_exact(rig, scene.with_disturbances(ideal=True, **d), board, offsets, f)[0, 0])
 
     # From no leakage to full leakage H gains all of p: linear in between.
-    s_only, s_and_p = at(h), at(h, leakage_h=[1.0, 0.0])
+    s_only = at(h)
+    s_and_p = at(h, leakage_h=[1.0, 0.0])
     assert np.isclose(at(h, leakage_h=[0.05, 0.02]), s_only + np.conj(0.05 + 0.02j) * (s_and_p - s_only))
     assert np.isclose(at(h, leakage_v=[0.1, 0.0]), s_only)
     assert not np.isclose(at(v, leakage_v=[0.1, 0.0]), at(v))
@@ -134,7 +138,8 @@ def test_an_empty_scene_has_no_echo_and_offsets_outside_are_refused() -> None:
 
 def test_a_cached_field_is_the_same_field(tmp_path: Path) -> None:
     rig, scene = setup(plates=PLATES[:1])
-    board, samples = rig.receivers[0], sample_frequencies_hz(rig)
+    board = rig.receivers[0]
+    samples = sample_frequencies_hz(rig)
     first = build_field(rig, scene, board, samples, tmp_path)
     second = build_field(rig, scene, board, samples, tmp_path)
     assert len(list(tmp_path.iterdir())) == 1
@@ -172,7 +177,9 @@ def test_scene_plates_choose_their_model() -> None:
 def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None:
     """Samples of a path tau have the phase +2 pi f tau, also inside the sheet."""
     rig = published_rig()
-    theta, thick_m, eps = np.radians(55.0), 0.1, 4.0
+    theta = np.radians(55.0)
+    thick_m = 0.1
+    eps = 4.0
     sheet = Plate("sheet", (0.0, 0.0), (45.0, 45.0), permittivity=(eps, 0.02), thickness_mm=1e3 * thick_m)
     f = np.linspace(76.3e9, 79.75e9, 400)
     path_m = np.linspace(-1.0, 1.0, 2001)

@@ -40,8 +40,10 @@ ZERO = np.zeros(1)
 
 @pytest.mark.parametrize("board", ["RH", "RV"])
 def test_a_point_target_alone_has_phase_2_pi_f_tau(board: str) -> None:
-    with_point, without = radar(tables={"points": [POINT]}), radar()
-    x, y = np.array([0.0, 33.3, -41.7]), np.array([0.0, 20.0, -24.9])
+    with_point = radar(tables={"points": [POINT]})
+    without = radar()
+    x = np.array([0.0, 33.3, -41.7])
+    y = np.array([0.0, 20.0, -24.9])
     echo = with_point.signals(board, x, y) - without.signals(board, x, y)
     ant = antennas(with_point.rig, with_point.rig.by_name(board))
     target = ant.centre_m + np.array([*POINT["position_mm"], 0.0]) / 1e3
@@ -67,7 +69,8 @@ def test_the_direct_path_alone_is_a_pure_tone(board: str) -> None:
 
 def test_the_reference_cube_is_the_ideal_signal_less_the_direct_path() -> None:
     tables = {"plates": [PLATE], "points": [POINT]}
-    rig, empty = radar(tables=tables), radar()
+    rig = radar(tables=tables)
+    empty = radar()
     cube = reference_cube(RIG, rig.scene, remove_direct=False)["RV"]
     travel = rig.burst_mm(-1)[0]
     x = np.array([rig.rig.grid.step_x_mm * (8 - 4) + travel])  # odd rows start at the largest x
@@ -92,7 +95,8 @@ def test_an_undisturbed_chirp_repeats() -> None:
 
 
 def test_pulses_do_not_depend_on_the_batch() -> None:
-    x, y = np.linspace(-30, 30, 70), np.full(70, 5.0)
+    x = np.linspace(-30, 30, 70)
+    y = np.full(70, 5.0)
     whole = default_radar().chirps("RH", x, y)
     other = default_radar()
     parts = [other.chirps("RH", x[a:b], y[a:b]) for a, b in ((0, 1), (1, 17), (17, 70))]
@@ -102,7 +106,8 @@ def test_pulses_do_not_depend_on_the_batch() -> None:
 
 
 def test_the_same_seed_repeats_and_another_seed_or_take_does_not() -> None:
-    x, y = np.zeros(4), np.zeros(4)
+    x = np.zeros(4)
+    y = np.zeros(4)
     first = default_radar(seed=5).chirps("RV", x, y, 0)
     assert np.array_equal(first, default_radar(seed=5).chirps("RV", x, y, 0))
     for other in (default_radar(seed=6).chirps("RV", x, y, 0), default_radar(seed=5).chirps("RV", x, y, 4)):
@@ -122,10 +127,12 @@ def test_random_numbers_of_pulses_are_uniform_and_independent_of_batches() -> No
 
 
 def test_timing_shifts_the_if_by_slope_times_delay_and_turns_the_phase() -> None:
-    on, off = radar(sync_uncertainty_ns=5.0), radar()
+    on = radar(sync_uncertainty_ns=5.0)
+    off = radar()
     n = 40
     ratio = on.signals("RH", np.zeros(n), np.zeros(n)) / off.signals("RH", np.zeros(n), np.zeros(n))
-    h, tx = on.rig.by_name("RH"), on.rig.transmitter
+    h = on.rig.by_name("RH")
+    tx = on.rig.transmitter
     pulses = np.arange(n)
     d = on.scene.disturbances
     delay = sync_delay_s(d, 1, h, pulses) - sync_delay_s(d, 1, tx, pulses)
@@ -137,21 +144,24 @@ def test_timing_shifts_the_if_by_slope_times_delay_and_turns_the_phase() -> None
 
 
 def test_a_common_latency_cancels() -> None:
-    a, b = radar(sync_latency_ns=160.0).signals("RH", ZERO, ZERO), radar().signals("RH", ZERO, ZERO)
+    a = radar(sync_latency_ns=160.0).signals("RH", ZERO, ZERO)
+    b = radar().signals("RH", ZERO, ZERO)
     assert np.abs(a - b).max() < 1e-5
 
 
 def test_h_and_v_have_independent_timing_relative_to_the_transmitter() -> None:
     rig = radar(sync_uncertainty_ns=5.0)
     n = 2000
-    d, pulses = rig.scene.disturbances, np.arange(n)
+    d = rig.scene.disturbances
+    pulses = np.arange(n)
     tx, h, v = (sync_delay_s(d, 1, rig.rig.by_name(b), pulses) for b in ("LS", "RH", "RV"))
     correlation = np.corrcoef(h - tx, v - tx)[0, 1]
     assert abs(correlation - 0.5) < 0.06  # the transmitter's share is common
 
 
 def test_one_ppm_of_crystal_is_76_khz_and_a_slope_error() -> None:
-    on, off = radar(crystal_ppm={"receive_h": 1.0}), radar()
+    on = radar(crystal_ppm={"receive_h": 1.0})
+    off = radar()
     turn = np.angle(on.signals("RH", ZERO, ZERO)[0, 0] / off.signals("RH", ZERO, ZERO)[0, 0])
     t = np.arange(256) / on.rig.chirp.sample_rate_hz
     c2, c1, _ = np.polyfit(t, np.unwrap(turn) / 2 / np.pi, 2)
@@ -194,7 +204,8 @@ def test_phase_is_uniform_from_chirp_to_chirp() -> None:
 @pytest.mark.parametrize("board", ["RH", "RV"])
 def test_the_chirp_bends_only_after_the_linear_samples(board: str) -> None:
     for seed in range(3):
-        on, off = radar(seed, bend_hz=300e3, ripple_hz=3e3), radar(seed)
+        on = radar(seed, bend_hz=300e3, ripple_hz=3e3)
+        off = radar(seed)
         turn = np.unwrap(np.angle(on.signals(board, ZERO, ZERO)[0, 0] / off.signals(board, ZERO, ZERO)[0, 0]))
         k = np.arange(192)
         rest = turn[:192] - np.polyval(np.polyfit(k, turn[:192], 1), k)
@@ -235,7 +246,8 @@ def test_each_path_goes_through_the_filter_at_its_own_if() -> None:
 
 
 def test_gains_are_within_their_spread_fixed_for_a_power_cycle_and_new_in_the_next() -> None:
-    on, off = radar(3, rx_gain_spread_db=1.0, rx_phase_spread_deg=20.0), radar(3)
+    on = radar(3, rx_gain_spread_db=1.0, rx_phase_spread_deg=20.0)
+    off = radar(3)
     gain = on.signals("RV", np.zeros(2), np.zeros(2)) / off.signals("RV", np.zeros(2), np.zeros(2))
     assert np.allclose(gain, gain[:1, :, :1], atol=1e-5)
     per_rx = gain[0, :, 0]
@@ -256,8 +268,10 @@ def test_h_and_v_differ_by_the_set_gain() -> None:
 def test_leakage_reaches_direct_path_and_object() -> None:
     tables = {"plates": [{**PLATE, "metal": False, "permittivity": [4.0, 0.4]}]}
     leak = [0.06, -0.03]
-    on, off = radar(tables=tables, leakage_v=leak), radar(tables=tables)
-    empty_on, empty_off = radar(leakage_v=leak), radar()
+    on = radar(tables=tables, leakage_v=leak)
+    off = radar(tables=tables)
+    empty_on = radar(leakage_v=leak)
+    empty_off = radar()
     ratio = empty_on.signals("RV", ZERO, ZERO) / empty_off.signals("RV", ZERO, ZERO)
     assert np.allclose(ratio, np.conj(1.06 - 0.03j), atol=1e-5)
     f = sample_frequencies_hz(on.rig)[[100]]
@@ -270,7 +284,8 @@ def test_leakage_reaches_direct_path_and_object() -> None:
 
 
 def test_noise_has_the_set_ratio_on_every_channel_and_averages_down() -> None:
-    on, off = radar(direct_snr_db=5.5, rx_gain_spread_db=1.0), radar(rx_gain_spread_db=1.0)
+    on = radar(direct_snr_db=5.5, rx_gain_spread_db=1.0)
+    off = radar(rx_gain_spread_db=1.0)
     n = 160
     clean = off.signals("RH", ZERO, ZERO)
     noise = on.signals("RH", np.zeros(n), np.zeros(n)) - clean
@@ -298,7 +313,8 @@ def test_frames_contain_i_of_the_four_rx_then_q() -> None:
 
 
 def test_clipping_is_bounded_and_counted() -> None:
-    loud, quiet = radar(adc_full_scale=0.5), radar(adc_full_scale=2.0)
+    loud = radar(adc_full_scale=0.5)
+    quiet = radar(adc_full_scale=2.0)
     frames = loud.chirps("RH", ZERO, ZERO)
     wanted = quiet.signals("RH", ZERO, ZERO).view(np.float32)
     assert frames.max() == 32767
@@ -325,7 +341,8 @@ def test_the_transmitting_board_sends_its_leakage_and_noise() -> None:
 
 
 def test_a_burst_moves_with_the_stage_or_stays_at_its_mean() -> None:
-    moving, still = radar(burst_motion=True), radar()
+    moving = radar(burst_motion=True)
+    still = radar()
     assert np.allclose(moving.burst_mm(1), 20.0 * (0.2e-3 + np.arange(16) * 1.5e-3))
     assert np.allclose(still.burst_mm(-1), -0.229)
     for direction in (1, -1):
@@ -333,7 +350,8 @@ def test_a_burst_moves_with_the_stage_or_stays_at_its_mean() -> None:
 
 
 def test_chirps_outside_the_aperture_contain_only_the_direct_path_and_are_counted() -> None:
-    rig, empty = radar(tables={"plates": [PLATE]}), radar()
+    rig = radar(tables={"plates": [PLATE]})
+    empty = radar()
     far = np.array([0.0, -400.0])
     signal = rig.signals("RH", far, np.zeros(2))
     direct = empty.signals("RH", far[:1], np.zeros(1))

@@ -40,7 +40,8 @@ def setup(**tables: Any) -> tuple[Instrument, Scene]:
 def fields(n: int = 12, role: str = "receive_h", rx: int = 1, **tables: Any) -> tuple[np.ndarray, np.ndarray]:
     """The fast and the exact field at random offsets and three frequencies."""
     rig, scene = setup(**tables)
-    board, samples = rig.by_role(role), sample_frequencies_hz(rig)
+    board = rig.by_role(role)
+    samples = sample_frequencies_hz(rig)
     field = build_field(rig, scene, board, samples)
     offsets = np.random.default_rng(0).uniform(-1, 1, (n, 2)) * [0.1, 0.07]
     at = [0, 128, 255]
@@ -88,7 +89,8 @@ def test_zero_relief_is_bit_exact() -> None:
 
 def test_height_turns_the_phase_by_2_k_cos_theta() -> None:
     rig, _ = setup()
-    board, f = rig.receivers[0], np.array([78.5e9])
+    board = rig.receivers[0]
+    f = np.array([78.5e9])
     cos = np.cos(np.radians(incidence_deg(rig, board)))
     flat, high = (
         field_exact(rig, setup(plates=[{**PLATE, "height_mm": h}])[1], board, np.zeros((1, 2)), f)[0, 0]
@@ -101,7 +103,9 @@ def test_a_shifted_plane_equals_another_object_distance_but_does_not_change_the_
     rig, shifted = setup(plates=[PLATE], plane_shift_mm=1.5)
     assert rig.geometry.object_distance_mm == 499.0
     there, distant = setup(plates=[PLATE], object_distance_mm=500.5)
-    board, offsets, f = rig.receivers[0], np.array([[0.01, -0.02], [0.04, 0.03]]), np.array([77e9, 80e9])
+    board = rig.receivers[0]
+    offsets = np.array([[0.01, -0.02], [0.04, 0.03]])
+    f = np.array([77e9, 80e9])
     got = field_exact(rig, shifted, board, offsets, f)
     # The image centre does not depend on the distance: both boards' antennas lie at z = 0.
     assert np.abs(got - field_exact(there, distant, board, offsets, f)).max() < 1e-3 * np.abs(got).max()
@@ -109,7 +113,8 @@ def test_a_shifted_plane_equals_another_object_distance_but_does_not_change_the_
 
 def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitude() -> None:
     rig, _ = setup()
-    board, samples = rig.receivers[0], np.array([78.5e9])
+    board = rig.receivers[0]
+    samples = np.array([78.5e9])
     cos = np.cos(np.radians(incidence_deg(rig, board)))
     offsets = np.zeros(1)
 
@@ -141,9 +146,12 @@ def middle_of_image(plate: dict[str, Any]) -> np.ndarray:
     grid = {"columns": 49, "rows": 61, "step_x_mm": 8.0, "step_y_mm": 4.0}
     rig, scene = setup(plates=[{**plate, "size_mm": [30.0, 30.0]}], grid=grid)
     scene = scene.with_disturbances(ideal=True)
-    board, f = rig.receivers[0], sample_frequencies_hz(rig)[[0, 40, 80, 120, 160]]
+    board = rig.receivers[0]
+    f = sample_frequencies_hz(rig)[[0, 40, 80, 120, 160]]
     cube = synced_cube(rig, scene, board.name, f, rx=[0], direct=False)[0]
-    ant, plan, travel = antennas(rig, board), plan_raster(rig.grid), mean_burst_travel_mm(rig.burst, rig.stage)
+    ant = antennas(rig, board)
+    plan = plan_raster(rig.grid)
+    travel = mean_burst_travel_mm(rig.burst, rig.stage)
     axis = np.arange(-24.0, 25.0, 2.0)
     px, py = np.meshgrid(axis + plate["centre_mm"][0], axis + plate["centre_mm"][1])
     image = np.zeros(px.shape, complex)

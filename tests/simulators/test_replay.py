@@ -29,8 +29,10 @@ from polysight_simulators.loopback import on_free_subnet
 from polysight_simulators.replay import Player, Recording, scan_rows
 
 OK = {code: bytes.fromhex(f"5aa5{code:02x}000000aaee") for code in range(1, 15)}
-START, STOP = "5aa505000000aaee", "5aa506000000aaee"
-ALIVE, VERSION = "5aa509000000aaee", "5aa50e000000aaee"
+START = "5aa505000000aaee"
+STOP = "5aa506000000aaee"
+ALIVE = "5aa509000000aaee"
+VERSION = "5aa50e000000aaee"
 # Requests before record start; all of them work with real cards.
 CLIENTS = {
     "configuration body in both commands, packets of 1472": [

@@ -31,7 +31,8 @@ from polysight_simulators.scene.scene_file import Disturbances, Layer, Plate, Po
 Path_ = tuple[str | int, ...]
 CPU_LIMIT_S = 20
 MEMORY_LIMIT_BYTES = 2 << 30
-INF, NAN = math.inf, math.nan
+INF = math.inf
+NAN = math.nan
 VALUES: list[Any] = [
     NAN, INF, -INF,
     -1, 0, 2, 5, 0.5, -0.001, 1e-300, 1e5, 1e9, 1e300, 10**18, -(10**19), True, "", "x", "off", "absent",
@@ -111,7 +112,9 @@ def limits() -> Iterator[None]:
 
 def check(scene: dict[str, Any], tmp_path: Path, name: str = "scan") -> bool:
     """Simulate; return True for a scan. Otherwise there is one message and no folder."""
-    file, out, err = tmp_path / f"{name}.toml", tmp_path / name, io.StringIO()
+    file = tmp_path / f"{name}.toml"
+    out = tmp_path / name
+    err = io.StringIO()
     file.write_text(tomli_w.dumps(scene))
     command = ["simulate", str(file), "--config", str(REPO / "instrument.toml"), "--out", str(out), "--json"]
     quiet = contextlib.redirect_stdout(io.StringIO())
@@ -139,7 +142,10 @@ def test_a_scene_with_these_keys_alone_is_a_scan(tmp_path: Path) -> None:
 @pytest.mark.timeout(3600)  # with --long
 def test_two_keys_of_a_scene_give_a_scan_or_a_message(tmp_path: Path, pytestconfig: pytest.Config) -> None:
     every_pair = list(itertools.combinations(keys(), 2))
-    drawn = every_pair if pytestconfig.getoption("--long") else random.Random(1).sample(every_pair, 40)
+    if pytestconfig.getoption("--long"):
+        drawn = every_pair
+    else:
+        drawn = random.Random(1).sample(every_pair, 40)
     rng = random.Random(2)
     scans = 0
     of_key: dict[Path_, list[Any]] = {}
@@ -200,7 +206,8 @@ def test_a_scan_ends_when_its_truth_is_written(tmp_path: Path, monkeypatch: pyte
     def refuse(*_args: Any, **_kwargs: Any) -> int:
         raise OSError(28, "No space left on device")
 
-    file, out = tmp_path / "scene.toml", tmp_path / "scan"
+    file = tmp_path / "scene.toml"
+    out = tmp_path / "scan"
     file.write_text(tomli_w.dumps(SCENE))
     monkeypatch.setattr(Path, "write_text", refuse)
     assert main(["simulate", str(file), "--config", str(REPO / "instrument.toml"), "--out", str(out)]) == 5

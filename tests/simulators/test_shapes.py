@@ -45,7 +45,8 @@ def test_a_level_plate_is_the_same_as_a_shape_and_as_a_plate(medium, error):
     of_plates = reference_cube(RIG, scene(plates=[{"name": "plate", **place}]))
     ratios = []
     for name in of_shapes:
-        seen, expected = of_shapes[name], of_plates[name]
+        seen = of_shapes[name]
+        expected = of_plates[name]
         ratio = np.vdot(expected, seen) / np.vdot(expected, expected)
         ratios.append(ratio)
         assert np.linalg.norm(seen - ratio * expected) < 0.15 * np.linalg.norm(expected)

@@ -100,7 +100,8 @@ def test_truth_json_contains_the_drawn_values(tmp_path: Path) -> None:
     )
     folder = simulate(RIG, real, tmp_path / "scan")
     content = json.loads((folder / "truth.json").read_text())
-    plate, drawn = content["plates"][0], draw_specimens(real).plates[0]
+    plate = content["plates"][0]
+    drawn = draw_specimens(real).plates[0]
     assert plate["permittivity"] == list(drawn.permittivity or ())
     assert plate["nominal_permittivity"] == [4.0, 0.4] != plate["permittivity"]
     assert (plate["tilt_deg"], plate["height_mm"]) == ([0.4, 0.0], 1.0)

@@ -37,16 +37,21 @@ def test_a_tilted_dielectric_changes_as_in_vector_physical_optics(permittivity):
     """V / H of a plate at +-1 degree over that of a level one, beside the independent generator of fields."""
     x_m, y_m = map(float, published_rig().centre_m)
     stack = METAL if permittivity is None else Stack(below=permittivity)
-    material = {"metal": True} if permittivity is None else {"permittivity": (permittivity.real, -permittivity.imag)}
-    seen, expected = [], []
+    if permittivity is None:
+        material = {"metal": True}
+    else:
+        material = {"permittivity": (permittivity.real, -permittivity.imag)}
+    seen = []
+    expected = []
     for rise_deg in (0.0, 1.0, -1.0):
         world = World((PlateOfWorlds("a", (x_m, y_m), (0.05, 0.05), stack, tilt_y_deg=rise_deg),))
         images = simulate(world, pixels=30)
         middle = slice(8, 22)
         seen.append(images.v[middle, middle].sum() / images.h[middle, middle].sum())
-        material = (
-            {"metal": True} if permittivity is None else {"permittivity": (permittivity.real, -permittivity.imag)}
-        )
+        if permittivity is None:
+            material = {"metal": True}
+        else:
+            material = {"permittivity": (permittivity.real, -permittivity.imag)}
         h, v = turned_reflection(plate(rise_deg, **material), 78e9, np.array(THETA))
         expected.append(complex(v) / complex(h))
     change, predicted = (np.array(ratios[1:]) / ratios[0] - 1 for ratios in (seen, expected))

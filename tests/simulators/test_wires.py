@@ -68,7 +68,9 @@ def take(client: WireClient, n: int) -> list[WireMessage]:
 
 def test_edges_arrive_in_the_order_of_each_sender(serve: Serve, join: Join) -> None:
     path = serve()
-    listener, stage, pi = join(path, (22, 26), motion=True), join(path), join(path)
+    listener = join(path, (22, 26), motion=True)
+    stage = join(path)
+    pi = join(path)
     n = 5000
     triggers = [WireEdge(1000 * k, 26, k % 2) for k in range(n)]
     pulses = [WireEdge(1000 * k + 7, 22, k % 2) for k in range(n)]
@@ -104,7 +106,8 @@ def test_a_client_gets_its_subscriptions_and_never_its_own_lines(serve: Serve, j
 
 def test_a_late_client_gets_the_stage_s_position(serve: Serve, join: Join) -> None:
     path = serve()
-    stage, early = join(path), join(path, motion=True)
+    stage = join(path)
+    early = join(path, motion=True)
     stage.send(WireMotion(1, 10, 20, 0), WireMotion(2, 30, 40, 50))
     assert len(take(early, 2)) == 2
     late = join(path, motion=True)
@@ -114,7 +117,9 @@ def test_a_late_client_gets_the_stage_s_position(serve: Serve, join: Join) -> No
 
 def test_a_client_that_does_not_read_delays_nobody_and_loses_nothing(serve: Serve, join: Join) -> None:
     path = serve()
-    slow, fast, stage = join(path, (26,)), join(path, (26,)), join(path)
+    slow = join(path, (26,))
+    fast = join(path, (26,))
+    stage = join(path)
     edges = [WireEdge(k, 26, k % 2) for k in range(50_000)]
     stage.send(*edges)
     assert take(fast, len(edges)) == edges
@@ -123,7 +128,9 @@ def test_a_client_that_does_not_read_delays_nobody_and_loses_nothing(serve: Serv
 
 def test_beyond_the_limit_only_the_slow_client_is_disconnected(serve: Serve, join: Join, reports: list[str]) -> None:
     path = serve(max_pending_bytes=10_000)
-    slow, fast, stage = join(path, (26,)), join(path, (26,)), join(path)
+    slow = join(path, (26,))
+    fast = join(path, (26,))
+    stage = join(path)
     edges = [WireEdge(k, 26, k % 2) for k in range(50_000)]
     for i in range(0, len(edges), 100):
         stage.send(*edges[i : i + 100])

@@ -139,7 +139,7 @@ class BringUp:
         Raises DeviceError or ConfigError if a part is refused, or the board does not start from its flash afterwards.
         """
         self._reset()
-        before = self._same_rom(image)
+        patch_before = self._same_rom(image)
         send_image(self._link, self._board.name, image, TO_FLASH, progress)
         self._ignored.clear()
         self._reset()
@@ -150,13 +150,13 @@ class BringUp:
                 "download it again; until then radar.firmware starts the board from RAM",
                 code=ErrorCode.RADAR_NO_FIRMWARE,
             )
-        after = self._main_patch()
-        self._verify(after, before, image)
+        patch_after = self._main_patch()
+        self._verify(patch_after, patch_before, image)
         self._refuse_damaged()
         if self._board.die_id:  # only readable after the RF power-up
             self._rf_up()
             self._read_die()
-        return f"main core's patch {after} from flash (before: {before})"
+        return f"main core's patch {patch_after} from flash (before: {patch_before})"
 
     def _reset(self) -> str:
         self._board.words.reset(held=True)
@@ -252,17 +252,19 @@ class BringUp:
 
         Its place in the file is not documented by TI, so the latter is no error.
         """
-        what = f"{self._board.name}: reports patch {patch} after the download, {image.name} contains {image.patches[0]}"
+        mismatch = (
+            f"{self._board.name}: reports patch {patch} after the download, {image.name} contains {image.patches[0]}"
+        )
         if patch == image.patches[0]:
             return
         if patch in (before, _NO_PATCH):
             raise DeviceError(
-                what,
+                mismatch,
                 "it did not start from the download",
                 "power-cycle the board, then `polysight radar check`",
                 code=ErrorCode.MISMATCH,
             )
-        self._link.warnings.append(what)
+        self._link.warnings.append(mismatch)
 
     def _verify_rf(self, patch: str, image: Image) -> None:
         """Warn if the RF core's patch, which is known only when that core runs, is not the file's."""

@@ -337,7 +337,9 @@ def chirp_us(rig: Instrument) -> float:
 
 def tx_mask(rig: Instrument, board: Board) -> int:
     """Return the bit mask of a board's transmitters: one on the transmitting board, none on the others."""
-    return 1 << board.tx_antenna if board.name == rig.transmitter.name else 0
+    if board.name == rig.transmitter.name:
+        return 1 << board.tx_antenna
+    return 0
 
 
 def program(rig: Instrument, board: Board) -> Program:
@@ -466,8 +468,10 @@ def _finite(rig: Instrument) -> Iterator[Constraint]:
             value = getattr(part, key)
             if isinstance(value, int | float) and not -_LARGEST <= value <= _LARGEST:
                 name = f"{table}.{key}"
-                shown = value if isinstance(value, float) else inf
-                yield Constraint(name, "a number", shown, "", f"give a number in {name}", low=-_LARGEST, high=_LARGEST)
+                finite_value = value if isinstance(value, float) else inf
+                yield Constraint(
+                    name, "a number", finite_value, "", f"give a number in {name}", low=-_LARGEST, high=_LARGEST
+                )
 
 
 def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
@@ -481,9 +485,11 @@ def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
     # ICD 91
     yield Constraint("chirps", "chirps of a frame", burst.chirps, "", "set burst.chirps to 1..255", low=1, high=255)
     if burst.chirps > 1:
-        apart = f"set radar.idle_us to {burst.chirp_us - chirp + rig.radar.idle_us:g}, or burst.chirp_us"
+        spacing_remedy = f"set radar.idle_us to {burst.chirp_us - chirp + rig.radar.idle_us:g}, or burst.chirp_us"
         excess = chirp - burst.chirp_us
-        yield Constraint("chirp spacing", "idle + ramp - chirp_us", excess, "us", apart, low=-0.006, high=0.006)
+        yield Constraint(
+            "chirp spacing", "idle + ramp - chirp_us", excess, "us", spacing_remedy, low=-0.006, high=0.006
+        )
     # ICD 91
     rest = period - burst.chirps * chirp
     yield Constraint("inter-frame time", "frame period - chirps", rest, "us", longer, low=INTER_FRAME_US)
@@ -507,8 +513,8 @@ def _chirp(rig: Instrument) -> Iterator[Constraint]:
     limit = MAX_RATE_HZ[c.if_mode]
     yield Constraint("sample rate", "rate", c.sample_rate_hz, "Hz", "set chirp.sample_rate_hz", low=2e6, high=limit)
     remainder = abs(c.sample_rate_hz / 1e3 - round(c.sample_rate_hz / 1e3)) * 1e3
-    whole = "give whole kHz in sample_rate_hz"
-    yield Constraint("sample rate step", "distance to whole kHz", remainder, "Hz", whole, high=1e-3)
+    whole_khz = "give whole kHz in sample_rate_hz"
+    yield Constraint("sample rate step", "distance to whole kHz", remainder, "Hz", whole_khz, high=1e-3)
     slope = slope_code(c.slope_hz_per_s)
     yield Constraint("slope", "code of the slope", slope, "", "lower chirp.slope_hz_per_s", low=1, high=MAX_SLOPE_CODE)
     yield Constraint("ADC start", "ADC start", c.adc_start_us, "us", "lower chirp.adc_start_us", low=0, high=40.95)

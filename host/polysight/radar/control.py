@@ -113,7 +113,9 @@ def open_board(place: str, slow: bool = False) -> WordLink:
 
     `slow`: send words one by one at 1 MHz. Raises ConfigError, DeviceError.
     """
-    return open_tcp(place, slow) if place.startswith(SCHEME) else open_usb(place, slow)
+    if place.startswith(SCHEME):
+        return open_tcp(place, slow)
+    return open_usb(place, slow)
 
 
 def radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmware: Image | None) -> RadarBoard:
@@ -389,11 +391,10 @@ class LineServers(RadarControl):
         states = {}
         for board, address in self._servers.items():
             self._is_closed(board)
-            states[board] = (
-                BoardState(RadarState.FAULT, f"its control server at {address} reset the connection")
-                if board in self._reset
-                else BoardState(RadarState.UNKNOWN, f"re-armed through {address}, which never replies")
-            )
+            if board in self._reset:
+                states[board] = BoardState(RadarState.FAULT, f"its control server at {address} reset the connection")
+            else:
+                states[board] = BoardState(RadarState.UNKNOWN, f"re-armed through {address}, which never replies")
         return states
 
     def close(self) -> None:
@@ -447,15 +448,15 @@ class LineServers(RadarControl):
     def _unreachable(self, board: str, e: OSError) -> DeviceError:
         if isinstance(e, ConnectionRefusedError):
             reason = ": connection refused"
-            why = "that machine is running, but no server listens"
+            cause = "that machine is running, but no server listens"
         elif isinstance(e, TimeoutError):
             reason = f" within {self._timeout_s:g} s"
-            why = "that machine is off, or a firewall drops the connection"
+            cause = "that machine is off, or a firewall drops the connection"
         else:
             reason = f": {e.strerror or e}"
-            why = "the address is wrong, or there is no route to it"
-        what = f"{board}: cannot reach its control server at {self._servers[board]}{reason}"
-        return DeviceError(what, why, _START_SERVER, code=ErrorCode.NO_ANSWER)
+            cause = "the address is wrong, or there is no route to it"
+        message = f"{board}: cannot reach its control server at {self._servers[board]}{reason}"
+        return DeviceError(message, cause, _START_SERVER, code=ErrorCode.NO_ANSWER)
 
 
 def _unacknowledged(connection: socket.socket) -> int:

@@ -95,21 +95,28 @@ def check_image(data: bytes, name: str) -> Image:
     expected = int.from_bytes(data[-4:], "little")
     if actual != expected:
         raise _file_error(name, f"CRC-32 {actual:08x} instead of {expected:08x}", "damaged during the copy")
-    begins = [at for at in range(_HEADER_BYTES, len(data) - _PATCH_AT - 8, 4) if data[at : at + 4] == _PART]
+    begins = [
+        offset for offset in range(_HEADER_BYTES, len(data) - _PATCH_AT - 8, 4) if data[offset : offset + 4] == _PART
+    ]
     if _END not in data[:_HEADER_BYTES] or not begins or begins[0] != _HEADER_BYTES:
         raise _file_error(name, "no program part after its header", "an image of another kind")
     if len(begins) != len(_CORES):
         raise _file_error(name, f"{len(begins)} program parts, an AWR2243 has two cores", "an image of another kind")
-    roms = [tuple(data[at + _ROM_AT : at + _ROM_AT + 4]) for at in begins]
-    if others := [rom[0] for rom in roms if rom[0] != GENERATION]:
+    roms = [tuple(data[offset + _ROM_AT : offset + _ROM_AT + 4]) for offset in begins]
+    foreign_generations = [rom[0] for rom in roms if rom[0] != GENERATION]
+    if foreign_generations:
+        generation = foreign_generations[0]
         raise _file_error(
             name,
-            f"for devices of generation {others[0]} ({_family(others[0])}); an AWR2243 has generation {GENERATION}",
+            f"for devices of generation {generation} ({_family(generation)}); an AWR2243 has generation {GENERATION}",
             "an image for another device",
         )
-    patches = tuple(describe_patch(*data[at + _PATCH_AT : at + _PATCH_AT + 4]) for at in begins)
-    if others := [p for p in patches if not p.startswith(f"{GENERATION}.")]:
-        raise _file_error(name, f"its patches are {', '.join(others)}, those of an AWR2243 2.x", "an image for xWR6243")
+    patches = tuple(describe_patch(*data[offset + _PATCH_AT : offset + _PATCH_AT + 4]) for offset in begins)
+    foreign_patches = [p for p in patches if not p.startswith(f"{GENERATION}.")]
+    if foreign_patches:
+        raise _file_error(
+            name, f"its patches are {', '.join(foreign_patches)}, those of an AWR2243 2.x", "an image for xWR6243"
+        )
     return Image(name, data, roms[0], patches)
 
 

@@ -169,9 +169,9 @@ class Link:
         Raises NotReportedError after the timeout, DeviceError if the link is lost.
         """
         deadline = self._clock.now() + timeout_s
-        lost: Finding | None = None
+        lost_message: Finding | None = None
         while True:
-            lost = self._read_messages() or lost
+            lost_message = self._read_messages() or lost_message
             events = list(self._events)
             self._events.clear()
             for event in events:
@@ -183,8 +183,8 @@ class Link:
                 names = ", ".join(f"0x{i:04X}" for i in ids)
                 raise NotReportedError(
                     f"{self._name}: the radar did not report {names} within {timeout_s:g} s"
-                    + (f"; a message was lost meanwhile: {lost.what}" if lost else ""),
-                    lost.why if lost else f"it was reset, or: {_SILENT}",
+                    + (f"; a message was lost meanwhile: {lost_message.what}" if lost_message else ""),
+                    lost_message.why if lost_message else f"it was reset, or: {_SILENT}",
                     _REMEDY,
                     code=ErrorCode.NO_ANSWER,
                 )

@@ -111,8 +111,8 @@ class Message:
             return None
         for block in self.blocks:
             if block.id == ERROR_BLOCK and len(block.data) >= 4:
-                number, where = _BLOCK.unpack(block.data[:4])
-                return number, where
+                number, block_number = _BLOCK.unpack(block.data[:4])
+                return number, block_number
         return (None, None) if self.message_id == ERROR_MESSAGE else None
 
 
@@ -190,7 +190,10 @@ def encode(message: Message) -> bytes:
     flags = message.sequence << 12 | _CRC32 | (_RETRY if message.retry else 0)
     head = struct.pack("<5H", opcode, length, flags, message.remaining_chunks, len(message.blocks))
     head += checksum(head).to_bytes(2, "little")
-    sync = HOST_SYNC if message.direction in (Direction.HOST_TO_RF, Direction.HOST_TO_MAIN) else DEVICE_SYNC
+    if message.direction in (Direction.HOST_TO_RF, Direction.HOST_TO_MAIN):
+        sync = HOST_SYNC
+    else:
+        sync = DEVICE_SYNC
     return sync + head + body + zlib.crc32(head + body).to_bytes(4, "little")
 
 
@@ -464,8 +467,8 @@ def _cpu(codes: tuple[str, ...]) -> Callable[[bytes], _Read]:
         kind, code, line = struct.unpack_from("<BBH", data)
         if kind == 0xFF:
             return "no fault", False, {}
-        more = f", {_word(codes, code)}, firmware line {line}" if kind == 3 and codes else ""
-        return _word(_CPU_FAULTS, kind) + more, True, {"type": kind, "code": code, "line": line}
+        detail = f", {_word(codes, code)}, firmware line {line}" if kind == 3 and codes else ""
+        return _word(_CPU_FAULTS, kind) + detail, True, {"type": kind, "code": code, "line": line}
 
     return read
 

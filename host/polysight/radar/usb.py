@@ -58,7 +58,9 @@ _NO_THREE_PHASE = 0x8D
 _THREE_PHASE = 0x8C
 _DIVISOR = 0x86
 _NO_LOOPBACK = 0x85
-SPI_DIVISOR, SLOW_DIVISOR = 2, 29  # 60 MHz / (2 x (2 + 1)) = 10 MHz; 1 MHz
+# 60 MHz / (2 x (2 + 1)) = 10 MHz; 1 MHz
+SPI_DIVISOR = 2
+SLOW_DIVISOR = 29
 # One pin command holds its pins for 0.2 us (FTDI AN_114), two clocks at 10 MHz; ICD 3.2.4 wants two at least.
 _SELECT_COMMANDS = 2
 _IDLE_COMMANDS = 3
@@ -249,8 +251,8 @@ class FtdiPort:
             self._ftdi.set_bitmode(direction, ftdi.BitMode.BITBANG if bit_bang else ftdi.BitMode.MPSSE)
         except self._library.errors as e:
             self.close()
-            what = f"{place}, channel {'ABCD'[interface - 1]}: cannot be opened: {e}"
-            raise _usb_error(what, e, "it was unplugged, or libusb is missing") from None
+            message = f"{place}, channel {'ABCD'[interface - 1]}: cannot be opened: {e}"
+            raise _usb_error(message, e, "it was unplugged, or libusb is missing") from None
 
     def write(self, data: bytes) -> None:
         """Send bytes. Raises DeviceError."""
@@ -346,9 +348,9 @@ class _Library(NamedTuple):
             raise _usb_error(f"{place}: {e}", e, "libusb is missing, or the chip was unplugged") from None
         on_the_bus = f"chips at {', '.join(sorted(paths))}" if paths else "no chip on the bus"
         if not matching:
-            what = "at this path" if by_path else "with this serial number"
+            kind_of_place = "at this path" if by_path else "with this serial number"
             raise DeviceError(
-                f"radar USB {place}: cannot be opened: no chip 0451:fd03 {what}; {on_the_bus}",
+                f"radar USB {place}: cannot be opened: no chip 0451:fd03 {kind_of_place}; {on_the_bus}",
                 "unplugged, another serial number or path, or no permission (a udev rule for 0451:fd03)",
                 _CHECK,
                 code=ErrorCode.NO_ANSWER,
@@ -365,7 +367,9 @@ class _Library(NamedTuple):
     def _serial(self, chip: Any) -> str | None:
         """Return a chip's serial number; None if it has none or cannot be read."""
         try:
-            return self.tools.get_string(chip, chip.iSerialNumber) if chip.iSerialNumber else None
+            if chip.iSerialNumber:
+                return self.tools.get_string(chip, chip.iSerialNumber)
+            return None
         except self.errors:
             return None
 

@@ -50,10 +50,10 @@ def task_samples(task: str, seed: int, quick: bool) -> Samples:
     name, _, two = task.partition(", ")
     group = groups()[name]
     errors = calibrated_errors(name, _draws(quick))
-    one = draw(group.materials, group.angle_deg, errors, seed).samples()
+    samples = draw(group.materials, group.angle_deg, errors, seed).samples()
     if not two:
-        return one
-    return one.joined(draw(group.materials, SECOND_ANGLE_DEG, errors, seed).samples())
+        return samples
+    return samples.joined(draw(group.materials, SECOND_ANGLE_DEG, errors, seed).samples())
 
 
 @cache
@@ -74,7 +74,9 @@ def noise_text(tasks: Iterable[str], quick: bool) -> str:
 
 def _angles(task: str) -> tuple[float, ...]:
     name, _, two = task.partition(", ")
-    return (groups()[name].angle_deg, SECOND_ANGLE_DEG) if two else (groups()[name].angle_deg,)
+    if two:
+        return (groups()[name].angle_deg, SECOND_ANGLE_DEG)
+    return (groups()[name].angle_deg,)
 
 
 def chance(quick: bool) -> Table:
@@ -83,7 +85,7 @@ def chance(quick: bool) -> Table:
     for task in TASKS:
         name = task.partition(", ")[0]
         seeds = OTHER_DRAWS[: 2 if quick else None]
-        found = [score(task_samples(task, seed, quick), DISCRIMINANT) for seed in seeds]
+        scores = [score(task_samples(task, seed, quick), DISCRIMINANT) for seed in seeds]
         errors = calibrated_errors(name, _draws(quick))
         limits = [
             pixel_bound(groups()[name].materials, _angles(task), errors, reference, pixels)
@@ -91,9 +93,9 @@ def chance(quick: bool) -> Table:
         ]
         cells = []
         for share, limit in zip(("pixels", "in_scan", "by_patch"), limits, strict=True):
-            values = np.array([getattr(s, share) for s in found])
+            values = np.array([getattr(s, share) for s in scores])
             cells += [f"{100 * values.mean():.2f} ± {100 * values.std():.2f} %", percent(limit)]
-        rows.append((f"{len(found[0].names)} {task}", *cells))
+        rows.append((f"{len(scores[0].names)} {task}", *cells))
     kinds = ("pixel alone", "pixel, scan known", "by patch, scan known")
     head = ("Task", *(f"{k}{w}" for k in kinds for w in (", found", ", bound")))
     caption = (
@@ -111,10 +113,14 @@ def unknowns(quick: bool) -> Table:
         drawn = task_samples(task, RESULT, quick)
         missed = score_unseen_materials(drawn, DISCRIMINANT)
         never = [n for n, share in missed.items() if share < 0.5]
-        rows.append((
-            f"{len(missed)} {task}", percent(judged(task, DISCRIMINANT, "H+V+P", False, quick).unknown),
-            percent(float(np.mean(list(missed.values())))), ", ".join(never) or "–",
-        ))  # fmt: skip
+        rows.append(
+            (
+                f"{len(missed)} {task}",
+                percent(judged(task, DISCRIMINANT, "H+V+P", False, quick).unknown),
+                percent(float(np.mean(list(missed.values())))),
+                ", ".join(never) or "–",
+            )
+        )
     head = ("Task", "known, called unknown", "never learnt, called unknown", "taken for another more often than not")
     return Table(f"Patches called unknown; {REJECTED:.0%} of the known ones are meant to be", head, tuple(rows))
 
@@ -146,11 +152,17 @@ class TaskScores:
         name, _, two = self.task.partition(", ")
         printed = published()["classification"][name]
         return (
-            f"{len(self.knn.names)} {self.task}", percent(None if two else printed["h_percent"] / 100),
-            percent(self.h_pixel.pixels), percent(_published_percent(self.task) / 100), percent(self.knn_pixel.pixels),
-            percent(self.knn.pixels), percent(self.discriminant_pixel.pixels),
-            percent(self.discriminant.pixels), percent(self.discriminant.in_scan), percent(self.discriminant.by_patch),
-        )  # fmt: skip
+            f"{len(self.knn.names)} {self.task}",
+            percent(None if two else printed["h_percent"] / 100),
+            percent(self.h_pixel.pixels),
+            percent(_published_percent(self.task) / 100),
+            percent(self.knn_pixel.pixels),
+            percent(self.knn.pixels),
+            percent(self.discriminant_pixel.pixels),
+            percent(self.discriminant.pixels),
+            percent(self.discriminant.in_scan),
+            percent(self.discriminant.by_patch),
+        )
 
     def plain(self, quick: bool) -> dict[str, Any]:
         """Return the content of the JSON file."""
@@ -188,10 +200,17 @@ def fig18(run: Run) -> Item:
     """Accuracy of the paper's KNN and of the discriminant under both splits, with confusion matrices."""
     scores = [TaskScores.of(task, run.quick) for task in TASKS]
     head = (
-        "Task", "H, published", "H, simulated", "H+V+P, published", "KNN, by pixel (optimistic)", "KNN, scans left out",
-        "discriminant, by pixel (optimistic)", "discriminant, scans left out: pixel alone",
-        "… pixel, scan known", "… by patch",
-    )  # fmt: skip
+        "Task",
+        "H, published",
+        "H, simulated",
+        "H+V+P, published",
+        "KNN, by pixel (optimistic)",
+        "KNN, scans left out",
+        "discriminant, by pixel (optimistic)",
+        "discriminant, scans left out: pixel alone",
+        "… pixel, scan known",
+        "… by patch",
+    )
     return Item(
         "fig18",
         "Fig. 18: classification of solids, liquids and powders",
@@ -281,11 +300,11 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
     if many:
         axes[3].set_axis_off()
         axes[3].text(0.02, 0.98, _confused(panels[1:]), va="top", fontsize=9, color=INK, linespacing=1.5)
-    shown = None
-    for ax, (found, table, title) in zip(axes[: len(panels)], panels, strict=True):
-        order = [found.names.index(m.name) for m in materials]
+    image = None
+    for ax, (scored, table, title) in zip(axes[: len(panels)], panels, strict=True):
+        order = [scored.names.index(m.name) for m in materials]
         shares = table[np.ix_(order, order)]
-        shown = ax.imshow(100 * shares, cmap="cividis", vmin=0, vmax=100, interpolation="nearest")
+        image = ax.imshow(100 * shares, cmap="cividis", vmin=0, vmax=100, interpolation="nearest")
         first = ax in (axes[0], axes[2] if many else axes[0])
         lines = [fill(line, 60 if many else 36) for line in title.splitlines()]
         dress(ax, "\n".join(lines), "named", "true" if first else "")
@@ -297,8 +316,8 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
             colour = INK if shares[i, j] > 0.6 else "w"
             text = f"{100 * shares[i, j]:.0f}"
             ax.text(j, i, text, ha="center", va="center", fontsize=size - 1.5, color=colour)
-    if shown is not None:
-        bar = fig.colorbar(shown, ax=list(axes), fraction=0.02, pad=0.01)
+    if image is not None:
+        bar = fig.colorbar(image, ax=list(axes), fraction=0.02, pad=0.01)
         bar.set_label("% of pixels", fontsize=8)
         bar.ax.tick_params(labelsize=7)
     return fig
@@ -307,14 +326,14 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
 def _confused(panels: Sequence[Panel], shown: int = 5) -> str:
     """The largest confusions of each panel."""
     lines = []
-    for found, table, title in panels:
-        apart = table * (1 - np.eye(len(table)))
+    for scored, table, title in panels:
+        confusions = table * (1 - np.eye(len(table)))
         lines.append(f"Most confused, {title.splitlines()[0].rpartition(':')[0]}:")
-        for at in np.argsort(apart, axis=None)[::-1][:shown]:
-            i, j = np.unravel_index(at, apart.shape)
-            if apart[i, j] > 0:
-                lines.append(f"   {found.names[i]} named {found.names[j]}: {100 * apart[i, j]:.0f} %")
-        lines += [""] if apart.any() else ["   none", ""]
+        for cell in np.argsort(confusions, axis=None)[::-1][:shown]:
+            i, j = np.unravel_index(cell, confusions.shape)
+            if confusions[i, j] > 0:
+                lines.append(f"   {scored.names[i]} named {scored.names[j]}: {100 * confusions[i, j]:.0f} %")
+        lines += [""] if confusions.any() else ["   none", ""]
     return "\n".join(lines)
 
 
@@ -353,9 +372,9 @@ def pixel_bound(
         for c, s in enumerate(std):
             noise = s * np.sqrt(variance) * rng.standard_normal((TRIALS, 1))
             if c % 3 == 2:  # a direction: its angle to each material's
-                apart = np.angle(mean[k, c] * np.exp(1j * noise) / mean[None, :, c])
+                difference = np.angle(mean[k, c] * np.exp(1j * noise) / mean[None, :, c])
             else:
-                apart = np.real(mean[k, c]) + noise - np.real(mean[None, :, c])
-            cost += (apart / s) ** 2
+                difference = np.real(mean[k, c]) + noise - np.real(mean[None, :, c])
+            cost += (difference / s) ** 2
         right.append((cost.argmin(axis=1) == k).mean())
     return float(np.mean(right))

@@ -121,22 +121,22 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
         )
     base = load_instrument(config)
     notices = []
-    found = {}
+    libraries = {}
     if pickles := sorted((folder / "materials").glob("*.pkl")):
-        found[MATERIALS] = _readable(read_material, pickles, notices)
+        libraries[MATERIALS] = _readable(read_material, pickles, notices)
     scans = _readable(read_labelled_scan, label_folders(folder / "labels"), notices)
     if scans:
-        how = image_orientation(scans)
-        notices.append(f"boxes of labels/ are read with {how}: so they explain the images' brightness best")
-        turned = [s.oriented(how) for s in scans]
+        orientation = image_orientation(scans)
+        notices.append(f"boxes of labels/ are read with {orientation}: so they explain the images' brightness best")
+        turned = [s.oriented(orientation) for s in scans]
         angles = {s.scan: _angle(folder, s, base, notices) for s in scans}
-        found[LABELS] = _entries(turned, angles, notices)
+        libraries[LABELS] = _entries(turned, angles, notices)
         if images is not None:
             ours = [s for scan in turned if (s := _imaged_here(scan, images, notices)) is not None]
-            found[IMAGES] = _entries(ours, angles, notices)
+            libraries[IMAGES] = _entries(ours, angles, notices)
     elif images is not None:
         notices.append("images made here are left out: labels/ holds no boxes to look at them with")
-    meaning, sources = _named({k: e for k, e in found.items() if e}, read_names(names) if names else {}, notices)
+    meaning, sources = _named({k: e for k, e in libraries.items() if e}, read_names(names) if names else {}, notices)
     if not sources:
         raise DataError(
             f"{folder}: neither materials/*.pkl nor labels/<scan> with a known material is in it",
@@ -193,17 +193,17 @@ def _imaged_here(scan: LabelledScan, images: Path, notices: list[str]) -> Labell
     except (OSError, ValueError, KeyError, zipfile.BadZipFile, DataError) as e:
         notices.append(f"{scan.scan}: no image made here: {e}")
         return None
-    seen = valid & np.isfinite(h) & np.isfinite(v)
-    h, v = (np.where(seen, x, 0) for x in (h, v))
+    imaged_mask = valid & np.isfinite(h) & np.isfinite(v)
+    h, v = (np.where(imaged_mask, x, 0) for x in (h, v))
     theirs = np.abs(scan.h)
     ways = [(k, flip) for k in range(4) for flip in (False, True)]
 
     def turn(image: np.ndarray, way: tuple[int, bool]) -> np.ndarray:
         return np.rot90(image[::-1] if way[1] else image, way[0])
 
-    alike = {w: _correlation(np.abs(turn(h, w)), theirs) for w in ways if turn(h, w).shape == theirs.shape}
-    best = max(alike, key=lambda w: alike[w], default=None)
-    if best is None or not alike[best] >= _ALIKE:
+    correlations = {w: _correlation(np.abs(turn(h, w)), theirs) for w in ways if turn(h, w).shape == theirs.shape}
+    best = max(correlations, key=lambda w: correlations[w], default=None)
+    if best is None or not correlations[best] >= _ALIKE:
         notices.append(f"{scan.scan}: the image made here does not show what sar_h.npy shows; left out")
         return None
     return replace(scan, h=turn(h, best), v=turn(v, best))
@@ -261,7 +261,10 @@ def words(name: str) -> frozenset[str]:
 def _share_of_common_words(theirs: frozenset[str], row: Published) -> float:
     """Return the share of common words and numbers; the container of a row is optional."""
     ours = words(row.name)
-    optional = ours & _CONTAINERS if " with " in row.name or "(with" in row.name else frozenset()
+    if " with " in row.name or "(with" in row.name:
+        optional = ours & _CONTAINERS
+    else:
+        optional = frozenset()
     union = (ours | theirs) - (optional - theirs)
     return len(ours & theirs) / len(union) if union else 0.0
 
@@ -285,27 +288,27 @@ def read_names(path: Path) -> dict[str, int]:
     """Read a file of names: JSON, {name: row of Table 2}. Raises DataError."""
     try:
         content = read_json(path)
-        given = {str(name): int(number) for name, number in content.items()}
+        numbers = {str(name): int(number) for name, number in content.items()}
     except (OSError, ValueError, AttributeError, TypeError) as e:
         raise DataError(
             f"{path}: not a list of names: {e}",
             'expected JSON, {"their name": row of Table 2}',
             code=ErrorCode.FILE_UNREADABLE,
         ) from None
-    wrong = [n for n in given.values() if not 1 <= n <= len(table2())]
+    wrong = [n for n in numbers.values() if not 1 <= n <= len(table2())]
     if wrong:
         raise DataError(
             f"{path}: Table 2 has no row {wrong[0]}", f"its rows are 1 to {len(table2())}", code=ErrorCode.VALUE_INVALID
         )
-    return given
+    return numbers
 
 
 def rows_of(
     names: Iterable[tuple[str, float | None]], given: Mapping[str, int] | None = None
 ) -> dict[tuple[str, float | None], int]:
     """Return the rows of names with their thicknesses; names without a row are skipped."""
-    found = {(n, t): (given or {}).get(n) or row_of(n, t) for n, t in set(names)}
-    return {key: number for key, number in found.items() if number is not None}
+    rows = {(n, t): (given or {}).get(n) or row_of(n, t) for n, t in set(names)}
+    return {key: number for key, number in rows.items() if number is not None}
 
 
 def train_authors(folder: Path, config: Path, out: Path) -> int:
@@ -323,10 +326,10 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
     fits: dict[str, Any] = {}
     fitted: list[Entry] = []
     for angle in library.angles_deg:
-        own = library.at(angle)
+        own_library = library.at(angle)
         try:
-            fits |= fit_library(own).fit["angles"]
-            fitted += own.entries
+            fits |= fit_library(own_library).fit["angles"]
+            fitted += own_library.entries
         except DataError as e:
             sys.stderr.write(f"note: {angle:g} degrees left out: {e.what}\n")
     if not fitted:
@@ -344,23 +347,23 @@ def authors_library(data: AuthorsData) -> Library:
     """Return the patches of all sources except our own images, without leakage and without duplicates."""
     a = complex(*data.base.polarimetry.leakage_h)
     b = complex(*data.base.polarimetry.leakage_v)
-    kept: dict[tuple[str, str, int], list[Entry]] = {}
+    merged: dict[tuple[str, str, int], list[Entry]] = {}
     for source, library in data.sources.items():
         if source == IMAGES:
             continue
-        found: dict[tuple[str, str, int], list[Entry]] = {}
+        entries_of_source: dict[tuple[str, str, int], list[Entry]] = {}
         for e in library.entries:
-            found.setdefault((e.name, e.scan, round(e.incidence_deg)), []).append(_without_leakage(e, a, b))
-        kept = {**kept, **found}
-    entries = tuple(e for group in kept.values() for e in group)
+            entries_of_source.setdefault((e.name, e.scan, round(e.incidence_deg)), []).append(_without_leakage(e, a, b))
+        merged = {**merged, **entries_of_source}
+    entries = tuple(e for group in merged.values() for e in group)
     return Library(entries, {}, f"{'simulated files' if data.simulated else 'files'} of {data.folder.name}")
 
 
 def _without_leakage(entry: Entry, leak_hv: complex, leak_vh: complex) -> Entry:
     """Return an entry with at most `PIXELS` pixels, with the cross-polar leakage removed."""
-    at = np.unique(np.linspace(0, entry.p.size - 1, min(PIXELS, entry.p.size)).round().astype(int))
-    v = entry.v[at].astype(np.complex128)  # a common phase of H and V has no effect
-    h, v = correct_leakage(entry.p[at] * v, v, leak_hv, leak_vh)
+    picked = np.unique(np.linspace(0, entry.p.size - 1, min(PIXELS, entry.p.size)).round().astype(int))
+    v = entry.v[picked].astype(np.complex128)  # a common phase of H and V has no effect
+    h, v = correct_leakage(entry.p[picked] * v, v, leak_hv, leak_vh)
     return replace(
         entry,
         h=np.abs(h).astype(np.float32),

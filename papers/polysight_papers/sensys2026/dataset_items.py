@@ -90,9 +90,9 @@ def paired(first: Library, second: Library) -> tuple[Library, Library]:
 
     No scan is in two pairs, so that a pair can be left out as a whole. Scans without a partner are left out.
     """
-    held = [{s: {e.name for e in lib.entries if e.scan == s} for s in lib.scans} for lib in (first, second)]
+    names_by_scan = [{s: {e.name for e in lib.entries if e.scan == s} for s in lib.scans} for lib in (first, second)]
     pairs = sorted(
-        ((len(a & b), s, t) for s, a in held[0].items() for t, b in held[1].items() if a & b),
+        ((len(a & b), s, t) for s, a in names_by_scan[0].items() for t, b in names_by_scan[1].items() if a & b),
         key=lambda p: (-p[0], p[1], p[2]),
     )
     names: tuple[dict[str, str], dict[str, str]] = ({}, {})
@@ -112,8 +112,10 @@ def repeated(samples: Samples) -> Samples | None:
     The classifiers fit their weights with scans kept apart: two must remain when one is left out.
     """
     scans = {n: np.unique(samples.groups[samples.names == n]).size for n in np.unique(samples.names)}
-    kept = samples.take(np.isin(samples.names, [n for n, count in scans.items() if count > 1]))
-    return kept if np.unique(kept.names).size > 1 and np.unique(kept.groups).size > 2 else None
+    repeated_samples = samples.take(np.isin(samples.names, [n for n, count in scans.items() if count > 1]))
+    if np.unique(repeated_samples.names).size > 1 and np.unique(repeated_samples.groups).size > 2:
+        return repeated_samples
+    return None
 
 
 def _split_one_scan(samples: Samples) -> Samples:
@@ -143,15 +145,17 @@ class Judgements:
 
     def found(self, tasks: tuple[str, ...]) -> list[tuple[str, str, Samples]]:
         """Return source, task and pixels of all that can be judged. Raises DataError if there is nothing."""
-        found = [(s, t, x) for s in self.data.sources for t in tasks if (x := self.samples(s, t)) is not None]
-        if not found:
+        tasks_with_samples = [
+            (s, t, x) for s in self.data.sources for t in tasks if (x := self.samples(s, t)) is not None
+        ]
+        if not tasks_with_samples:
             raise DataError(
                 "nothing to classify: no source holds two materials of one group under its angle",
                 "solids and powders are judged at 60 degrees, liquids at 55, as in the paper",
                 "see what the names were taken for, and --names",
                 code=ErrorCode.NO_DATA,
             )
-        return found
+        return tasks_with_samples
 
     def judged(self, source: str, task: str, model: str, channels: str = "H+V+P") -> tuple[Score, Score | None]:
         """Return the scores of a model by pixel, and with whole scans left out if possible."""
@@ -182,16 +186,24 @@ def authors_fig18(judge: Judgements) -> Item:
         scores = [s for m in (PAPER, DISCRIMINANT) for s in judge.judged(source, task, m)]
         h_only = judge.judged(source, task, PAPER, "H")
         names = np.unique(samples.names)
-        held = 0 if several is None else np.unique(several.names).size
-        rows.append((
-            f"{names.size} {task}", source, str(np.unique(samples.groups).size),
-            "–" if two else percent(printed[name]["h_percent"] / 100), *(_share(s) for s in h_only), percent(paper),
-            *(_share(s) for s in scores), "–" if scores[3] is None else percent(scores[3].patches), str(held),
-        ))  # fmt: skip
+        material_count = 0 if several is None else np.unique(several.names).size
+        rows.append(
+            (
+                f"{names.size} {task}",
+                source,
+                str(np.unique(samples.groups).size),
+                "–" if two else percent(printed[name]["h_percent"] / 100),
+                *(_share(s) for s in h_only),
+                percent(paper),
+                *(_share(s) for s in scores),
+                "–" if scores[3] is None else percent(scores[3].patches),
+                str(material_count),
+            )
+        )
         content[f"{task}, {source}"] = {
             "published_percent": 100 * paper,
             "scores": [None if s is None else asdict(s) for s in (*scores, *h_only)],
-            "judged_with_scans_left_out": held,
+            "judged_with_scans_left_out": material_count,
         }
         split = LEFT_OUT if several is not None else OPTIMISTIC
         h, best = (h_only[0], scores[2]) if several is None else (h_only[1], scores[3])
@@ -208,10 +220,20 @@ def authors_fig18(judge: Judgements) -> Item:
             fig, f"{task[0].upper()}{task[1:]}, {source}, {split}. Rows are the truth, adding to 100 %."
         )
     head = (
-        "Task", "source", "scans", "H, published", f"H, KNN {OPTIMISTIC}", f"H, KNN {LEFT_OUT}", "H+V+P, published",
-        f"KNN, {OPTIMISTIC}", f"KNN, {LEFT_OUT}", f"discriminant, {OPTIMISTIC}", f"discriminant, {LEFT_OUT}",
-        "discriminant, patches, scans left out", "materials in two scans or more",
-    )  # fmt: skip
+        "Task",
+        "source",
+        "scans",
+        "H, published",
+        f"H, KNN {OPTIMISTIC}",
+        f"H, KNN {LEFT_OUT}",
+        "H+V+P, published",
+        f"KNN, {OPTIMISTIC}",
+        f"KNN, {LEFT_OUT}",
+        f"discriminant, {OPTIMISTIC}",
+        f"discriminant, {LEFT_OUT}",
+        "discriminant, patches, scans left out",
+        "materials in two scans or more",
+    )
     return Item(
         "fig18",
         "Fig. 18: classification of solids, liquids and powders",
@@ -235,34 +257,49 @@ def authors_fig20(judge: Judgements) -> Item:
     tasks = ("solids", "liquids", "powders")
     rows = []
     content = {}
-    found = judge.found(tasks)
-    sources = list(dict.fromkeys(s for s, _, _ in found))
+    judged_tasks = judge.found(tasks)
+    sources = list(dict.fromkeys(s for s, _, _ in judged_tasks))
     fig = new_figure(8.4, 4.2)
     ax = fig.subplots()
     bars = [("published", [printed[c] for c in CHANNELS])]
     for source in sources:
-        mine = [(t, x) for s, t, x in found if s == source]
+        own_tasks = [(t, x) for s, t, x in judged_tasks if s == source]
         means: dict[str, tuple[float, float | None]] = {}
         for channel in CHANNELS:
-            pairs = [judge.judged(source, t, PAPER, channel) for t, _ in mine]
-            weight = [np.unique(x.names).size for _, x in mine]
+            pairs = [judge.judged(source, t, PAPER, channel) for t, _ in own_tasks]
+            weight = [np.unique(x.names).size for _, x in own_tasks]
             mixed = float(np.average([p[0].pixels for p in pairs], weights=weight))
-            left = [(p[1], len(p[1].names)) for p in pairs if p[1] is not None]
-            held = float(np.average([s.pixels for s, _ in left], weights=[n for _, n in left])) if left else None
-            means[channel] = (mixed, held)
-            rows.append((channel, source, f"{printed[channel]:.2f} %", percent(mixed), percent(held),
-                         ", ".join(f"{t} {_share(p[1])}" for (t, _), p in zip(mine, pairs, strict=True))))  # fmt: skip
+            scores_without_scan = [(p[1], len(p[1].names)) for p in pairs if p[1] is not None]
+            if scores_without_scan:
+                held_out_accuracy = float(
+                    np.average([s.pixels for s, _ in scores_without_scan], weights=[n for _, n in scores_without_scan])
+                )
+            else:
+                held_out_accuracy = None
+            means[channel] = (mixed, held_out_accuracy)
+            rows.append(
+                (
+                    channel,
+                    source,
+                    f"{printed[channel]:.2f} %",
+                    percent(mixed),
+                    percent(held_out_accuracy),
+                    ", ".join(f"{t} {_share(p[1])}" for (t, _), p in zip(own_tasks, pairs, strict=True)),
+                )
+            )
             content[f"{channel}, {source}"] = {
-                "published_percent": printed[channel], "by_pixel": mixed, "scans_left_out": held,
-            }  # fmt: skip
+                "published_percent": printed[channel],
+                "by_pixel": mixed,
+                "scans_left_out": held_out_accuracy,
+            }
         bars.append((f"{source}, {OPTIMISTIC}", [100 * means[c][0] for c in CHANNELS]))
         if all(means[c][1] is not None for c in CHANNELS):
             bars.append((f"{source}, {LEFT_OUT}", [100 * (means[c][1] or 0.0) for c in CHANNELS]))
     width = 0.84 / len(bars)
     for k, (label, heights) in enumerate(bars):
-        at = np.arange(len(CHANNELS)) + width * (k - (len(bars) - 1) / 2)
+        positions = np.arange(len(CHANNELS)) + width * (k - (len(bars) - 1) / 2)
         drawn = ax.bar(
-            at, heights, 0.92 * width, label=label, color=PALETTE[k], hatch="//" if OPTIMISTIC in label else ""
+            positions, heights, 0.92 * width, label=label, color=PALETTE[k], hatch="//" if OPTIMISTIC in label else ""
         )
         ax.bar_label(drawn, fmt="%.0f", fontsize=7)
     dress(ax, "Accuracy by channel, weighted KNN of the paper", "", "pixels named right (%)")
@@ -289,43 +326,67 @@ def authors_fig21(data: AuthorsData) -> Item:
     tables = []
     content = {}
     plots = []
-    why = []
+    reasons = []
     for source, library in data.sources.items():
-        known = concentrations(library.names, {WATER_IN_GLASS: 0.0})
-        angles = [e.incidence_deg for e in library.entries if e.name in known]
+        concentration_of_name = concentrations(library.names, {WATER_IN_GLASS: 0.0})
+        angles = [e.incidence_deg for e in library.entries if e.name in concentration_of_name]
         if not angles:
             continue
         best = max(set(angles), key=lambda a: len({e.name for e in library.entries if abs(e.incidence_deg - a) < 1}))
-        near = Library(tuple(e for e in library.entries if e.name in known and abs(e.incidence_deg - best) < 1))
+        near = Library(
+            tuple(e for e in library.entries if e.name in concentration_of_name and abs(e.incidence_deg - best) < 1)
+        )
         try:
             result = fit_concentration(near, {WATER_IN_GLASS: 0.0})
         except DataError as e:
-            why.append(f"{source}: {e.what}")
+            reasons.append(f"{source}: {e.what}")
             continue
         x = np.array([float(np.median(polarisation_angle_rad(e.p))) for e in near.entries])
-        y = np.array([known[e.name] for e in near.entries])
-        seen = float(np.median(np.abs(result.line.percent(x) - y)))
+        y = np.array([concentration_of_name[e.name] for e in near.entries])
+        median_error = float(np.median(np.abs(result.line.percent(x) - y)))
         rows = []
-        for name in sorted(near.names, key=lambda n: known[n]):
-            of = [r for r in result.left_out if r.name == name]
-            error = np.median([abs(r.percent - r.true_percent) for r in of])
-            rows.append((name, f"{known[name]:.1f} %", f"{np.mean([r.percent for r in of]):.2f} %", str(len(of)),
-                         f"{error:.2f} %"))  # fmt: skip
-        rows.append(("median error, each concentration left out", f"published {printed:g} %",
-                     f"{result.median_error:.3f} %", str(len(result.left_out)), ""))  # fmt: skip
-        rows.append(("median error, line has seen them (optimistic)", "", f"{seen:.3f} %", "", ""))
-        tables.append(Table(f"Concentration estimated from the others, {source}, {best:.0f} degrees",
-                            ("Solution", "true", "found", "patches", "median error"), tuple(rows)))  # fmt: skip
+        for name in sorted(near.names, key=lambda n: concentration_of_name[n]):
+            errors_of_name = [r for r in result.left_out if r.name == name]
+            error = np.median([abs(r.percent - r.true_percent) for r in errors_of_name])
+            rows.append(
+                (
+                    name,
+                    f"{concentration_of_name[name]:.1f} %",
+                    f"{np.mean([r.percent for r in errors_of_name]):.2f} %",
+                    str(len(errors_of_name)),
+                    f"{error:.2f} %",
+                )
+            )
+        rows.append(
+            (
+                "median error, each concentration left out",
+                f"published {printed:g} %",
+                f"{result.median_error:.3f} %",
+                str(len(result.left_out)),
+                "",
+            )
+        )
+        rows.append(("median error, line has seen them (optimistic)", "", f"{median_error:.3f} %", "", ""))
+        tables.append(
+            Table(
+                f"Concentration estimated from the others, {source}, {best:.0f} degrees",
+                ("Solution", "true", "found", "patches", "median error"),
+                tuple(rows),
+            )
+        )
         content[source] = {
-            "published_median_error_percent": printed, "median_error_percent": result.median_error,
-            "median_error_seen_percent": seen, "angle_deg": best, "line": asdict(result.line),
+            "published_median_error_percent": printed,
+            "median_error_percent": result.median_error,
+            "median_error_seen_percent": median_error,
+            "angle_deg": best,
+            "line": asdict(result.line),
             "left_out": [asdict(r) for r in result.left_out],
-        }  # fmt: skip
+        }
         plots.append((source, x, y, result))
     if not plots:
         raise DataError(
             "no sugar solutions to draw a line through",
-            "; ".join(why) or "none of the names means water or cane sugar",
+            "; ".join(reasons) or "none of the names means water or cane sugar",
             "see what the names were taken for, and --names",
             code=ErrorCode.NO_DATA,
         )
@@ -345,21 +406,26 @@ def authors_fig21(data: AuthorsData) -> Item:
 
 def _sugar_figure(plots: list[tuple[str, Any, Any, Any]], printed: float) -> Any:
     fig = new_figure(11.0, 4.3)
-    left, right = fig.subplots(1, 2)
+    left_axes, right = fig.subplots(1, 2)
     for k, (source, x, y, result) in enumerate(plots):
         colour = (PALETTE[0], PALETTE[6], PALETTE[3])[k % 3]
         angle = np.degrees(x)
-        at = np.linspace(angle.min() - 0.1, angle.max() + 0.1, 50)
-        left.plot(angle, y, "osD"[k % 3], ms=4, color=colour, label=source)
-        left.plot(at, result.line.percent(np.radians(at)), color=colour, lw=1.2)
+        line_angles = np.linspace(angle.min() - 0.1, angle.max() + 0.1, 50)
+        left_axes.plot(angle, y, "osD"[k % 3], ms=4, color=colour, label=source)
+        left_axes.plot(line_angles, result.line.percent(np.radians(line_angles)), color=colour, lw=1.2)
         error = np.sort([abs(r.percent - r.true_percent) for r in result.left_out])
         share = np.arange(error.size + 1) / error.size
         label = f"{source}: median {result.median_error:.3f} %"
         right.step(np.concatenate([[0], error]), share, where="post", color=colour, label=label)
     right.axvline(printed, color=INK, ls="--", lw=1.2, label=f"published median {printed:g} %")
-    dress(left, "Concentration by polarisation angle", "polarisation angle arctan |P| (degrees)", "sugar (% by weight)")
+    dress(
+        left_axes,
+        "Concentration by polarisation angle",
+        "polarisation angle arctan |P| (degrees)",
+        "sugar (% by weight)",
+    )
     dress(right, "Error, each concentration left out", "error (% by weight)", "share of patches")
-    left.legend(fontsize=8, frameon=False)
+    left_axes.legend(fontsize=8, frameon=False)
     right.legend(fontsize=8, frameon=False)
     return fig
 
@@ -370,9 +436,21 @@ def _share(s: Score | None) -> str:
 
 Complex = npt.NDArray[np.complexfloating]
 HEAD = (
-    "No.", "Material", "angle", "scans", "pixels", "published ε′", "published ε″", "Eq. 3 ε′", "Eq. 3 ε″",
-    "without leakage ε′", "without leakage ε″", "±", "authors' recipe ε′", "authors' recipe ε″",
-)  # fmt: skip
+    "No.",
+    "Material",
+    "angle",
+    "scans",
+    "pixels",
+    "published ε′",
+    "published ε″",
+    "Eq. 3 ε′",
+    "Eq. 3 ε″",
+    "without leakage ε′",
+    "without leakage ε″",
+    "±",
+    "authors' recipe ε′",
+    "authors' recipe ε″",
+)
 """Head of the comparison with Table 2."""
 
 MAKERS: dict[str, Callable[[Judgements], Item]] = {
@@ -447,13 +525,13 @@ def _check_keys(keys: Sequence[str]) -> None:
 
 def origin_of(data: AuthorsData) -> Origin:
     """Return the notes on the data for the page."""
-    held = "; ".join(
+    contents = "; ".join(
         f"{source}: {len(lib.entries)} boxes of {len(lib.names)} materials in {len(lib.scans)} scans"
         for source, lib in data.sources.items()
     )
     titles = {m.number: m.name for m in table2()}
     taken = ", ".join(f"“{n}” = {k}" for n, k in data.meaning.items() if not n.startswith(titles[k]))
-    notes = [f"Read from {data.folder.name}: {held}.", *(f"{n[0].upper()}{n[1:]}." for n in data.notices)]
+    notes = [f"Read from {data.folder.name}: {contents}.", *(f"{n[0].upper()}{n[1:]}." for n in data.notices)]
     if taken:
         notes.insert(1, f"Names that were taken for a row of Table 2 by their words: {taken}.")
     if data.simulated:
@@ -507,8 +585,8 @@ def authors_recipe(p: Complex, angle_deg: float) -> complex:
     """Return the permittivity by the authors' recipe: leakage, factor, the middle pixels by |P|, mean of Eq. 3."""
     used = without_leakage(p, AXIAL_RATIO) * METAL_FACTOR
     low, high = np.percentile(np.abs(used), PERCENTILES)
-    kept = used[(np.abs(used) >= low) & (np.abs(used) <= high)]
-    eps = permittivity_from_ratio(kept, np.radians(angle_deg))
+    in_range = used[(np.abs(used) >= low) & (np.abs(used) <= high)]
+    eps = permittivity_from_ratio(in_range, np.radians(angle_deg))
     return complex(np.mean(eps[np.isfinite(eps)]))
 
 
@@ -517,10 +595,10 @@ def _pixels_of_material(data: AuthorsData, source: str, m: Published) -> tuple[C
     paper = next(g.angle_deg for g in groups().values() if m in g.materials)
     entries = list(data.at(source, range(m.number, m.number + 1), paper).entries)
     if not entries:
-        others = sorted(e.incidence_deg for e in data.sources[source].entries if e.name == m.name)
-        if not others:
+        other_angles = sorted(e.incidence_deg for e in data.sources[source].entries if e.name == m.name)
+        if not other_angles:
             return None
-        entries = list(data.at(source, range(m.number, m.number + 1), others[0]).entries)
+        entries = list(data.at(source, range(m.number, m.number + 1), other_angles[0]).entries)
     p = np.concatenate([e.p for e in entries]).astype(np.complex128)
     angle = float(np.mean([e.incidence_deg for e in entries]))
     return p[np.isfinite(p) & (p != 0)], angle, len({e.scan for e in entries})
@@ -571,59 +649,84 @@ def authors_table2(data: AuthorsData) -> Item:
         ),
         tuple(Table(f"Permittivity from {source}", HEAD, tuple(map(_row, e))) for source, e in estimates.items()),
         {"permittivity": Picture(_figure(estimates), "From the files against published; the dotted line is equality.")},
-        {"materials": [_plain(source, e) for source, found in estimates.items() for e in found]},
+        {
+            "materials": [
+                _plain(source, e) for source, estimates_of_source in estimates.items() for e in estimates_of_source
+            ]
+        },
     )
 
 
 def _estimates(data: AuthorsData, source: str, leakage: float) -> list[Estimate]:
     """Estimate all materials of Table 2 in a source; `leakage` is still in its ratios."""
-    found = []
+    source_estimates = []
     for m in table2():
-        seen = _pixels_of_material(data, source, m)
-        if seen is None or not seen[0].size:
+        pixels = _pixels_of_material(data, source, m)
+        if pixels is None or not pixels[0].size:
             continue
-        p, angle, scans = seen
-        one = np.ones(p.size, np.complex128)
+        p, angle, scans = pixels
+        ones = np.ones(p.size, np.complex128)
         theta = np.radians(angle)
-        as_is, clean = (estimate_permittivity(x, one, theta) for x in (p, without_leakage(p, leakage)))
-        found.append(Estimate(m, angle, scans, p.size, as_is, clean, authors_recipe(p, angle)))
-    return found
+        as_is, clean = (estimate_permittivity(x, ones, theta) for x in (p, without_leakage(p, leakage)))
+        source_estimates.append(Estimate(m, angle, scans, p.size, as_is, clean, authors_recipe(p, angle)))
+    return source_estimates
 
 
 def _row(e: Estimate) -> tuple[str, ...]:
     m = e.material
     std = e.clean.real_std
     return (
-        str(m.number), m.name, f"{e.angle_deg:.0f}°", str(e.scans), str(e.pixels), f"{m.permittivity.real:.4g}",
-        "–" if m.number == 23 else f"{-m.permittivity.imag:.4g}", *_cells(e.as_is.value), *_cells(e.clean.value),
-        "" if std is None or e.metal_like else f"± {std:.2f}", *_cells(None if e.metal_like else e.recipe),
-    )  # fmt: skip
+        str(m.number),
+        m.name,
+        f"{e.angle_deg:.0f}°",
+        str(e.scans),
+        str(e.pixels),
+        f"{m.permittivity.real:.4g}",
+        "–" if m.number == 23 else f"{-m.permittivity.imag:.4g}",
+        *_cells(e.as_is.value),
+        *_cells(e.clean.value),
+        "" if std is None or e.metal_like else f"± {std:.2f}",
+        *_cells(None if e.metal_like else e.recipe),
+    )
 
 
 def _cells(value: complex | None) -> tuple[str, str]:
-    return ("metal-like", "") if value is None else (f"{value.real:.2f}", f"{-value.imag:.2f}")
+    if value is None:
+        return ("metal-like", "")
+    return (f"{value.real:.2f}", f"{-value.imag:.2f}")
 
 
 def _plain(source: str, e: Estimate) -> dict[str, Any]:
     """Return the content of the JSON file."""
     return {
-        "source": source, "number": e.material.number, "name": e.material.name, "angle_deg": e.angle_deg,
-        "scans": e.scans, "pixels": e.pixels, "published": e.material.permittivity, "as_is": e.as_is.value,
-        "without_leakage": e.clean.value, "std": e.clean.real_std, "authors_recipe": e.recipe,
-        "metal_like": e.metal_like, "ratio": e.clean.ratio,
-    }  # fmt: skip
+        "source": source,
+        "number": e.material.number,
+        "name": e.material.name,
+        "angle_deg": e.angle_deg,
+        "scans": e.scans,
+        "pixels": e.pixels,
+        "published": e.material.permittivity,
+        "as_is": e.as_is.value,
+        "without_leakage": e.clean.value,
+        "std": e.clean.real_std,
+        "authors_recipe": e.recipe,
+        "metal_like": e.metal_like,
+        "ratio": e.clean.ratio,
+    }
 
 
 def _figure(estimates: Mapping[str, Sequence[Estimate]]) -> Figure:
     """Draw real part and loss of each source, without leakage, against the published values."""
     fig = new_figure(10.5, 4.6)
     axes = fig.subplots(1, 2)
-    for colour, (source, found) in zip((PALETTE[0], PALETTE[6], PALETTE[3]), estimates.items(), strict=False):
+    for colour, (source, source_estimates) in zip(
+        (PALETTE[0], PALETTE[6], PALETTE[3]), estimates.items(), strict=False
+    ):
         bars: dict[str, Any] = {"fmt": "o", "ms": 4, "color": colour, "lw": 1, "label": source}
-        shown = [e for e in found if not e.metal_like]
-        true = [e.material.permittivity for e in shown]
-        values = [e.clean.value or 0j for e in shown]
-        std = [e.clean.real_std or 0.0 for e in shown]
+        drawn = [e for e in source_estimates if not e.metal_like]
+        true = [e.material.permittivity for e in drawn]
+        values = [e.clean.value or 0j for e in drawn]
+        std = [e.clean.real_std or 0.0 for e in drawn]
         axes[0].errorbar([t.real for t in true], [v.real for v in values], yerr=std, **bars)
         axes[1].errorbar([-t.imag for t in true], [-v.imag for v in values], yerr=std, **bars)
     for ax, part in zip(axes, ("real part ε′", "loss ε″"), strict=True):

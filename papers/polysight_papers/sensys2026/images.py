@@ -85,8 +85,8 @@ def imaged(source: RawSource, plates: tuple[TruthPlate, ...]) -> Imaged:
         pipeline.add_row(row)
     images = pipeline.form_images()
     metal = next(p for p in plates if p.metal)
-    known, _ = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
-    result = pipeline.find_materials(images, KnownScene(known, metal.box_mm, plates=plates))
+    labelled_patches, _ = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
+    result = pipeline.find_materials(images, KnownScene(labelled_patches, metal.box_mm, plates=plates))
     return Imaged(result, images.x_m, images.y_m)
 
 
@@ -127,8 +127,8 @@ def view_scan(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = 4
     """Scan of plates with the permittivities of these rows of Table 2, and a copper plate in the middle."""
     around = [p for p in PLACES_MM if p != (0.0, 0.0)]
     step = len(around) // len(rows)
-    at = [around[i * step] for i in range(len(rows))]
-    return _scan(name, rows, at, run.config, 1300, object_distance_mm=distance_mm)
+    picked_rows = [around[i * step] for i in range(len(rows))]
+    return _scan(name, rows, picked_rows, run.config, 1300, object_distance_mm=distance_mm)
 
 
 def _scan(
@@ -138,17 +138,17 @@ def _scan(
     plates = [plate("copper", None, 0.0, 0.0)]
     plates += [plate(table2()[n - 1].name, table2()[n - 1].permittivity, *xy) for n, xy in zip(rows, at, strict=True)]
     with scanned(name, plates, config, seed=seed, **more) as (source, truth):
-        found = imaged(source, truth)
+        imaged_scan = imaged(source, truth)
     scan = ProcessedScan.computed(
         Path(),
-        images=found.result.calibrated,
+        images=imaged_scan.result.calibrated,
         quality=ScanQuality(),
         facts=ScanFacts(scan_id=name, simulated=True),
-        materials=ScanMaterials(segments=found.result.rows()),
-        found=found.result,
+        materials=ScanMaterials(segments=imaged_scan.result.rows()),
+        found=imaged_scan.result,
         plates=truth,
     )
-    return ScanView(found.result, scan)
+    return ScanView(imaged_scan.result, scan)
 
 
 def _label_plates(ax: Any, scan: ProcessedScan, size: float = 7.5) -> None:
@@ -156,11 +156,17 @@ def _label_plates(ax: Any, scan: ProcessedScan, size: float = 7.5) -> None:
         x0, y0, x1, y1 = plate.box_mm
         name = plate.name.split(" (")[0]
         ax.text(
-            (x0 + x1) / 2, (y0 + y1) / 2, name.replace(" ", "\n"), ha="center", va="center", fontsize=size,
-            color="white", path_effects=[withStroke(linewidth=2.0, foreground=INK)],
-        )  # fmt: skip
-    left, right, bottom, top = extent_mm(scan)
-    ax.set_xlim(max(left, -110), min(right, 110))
+            (x0 + x1) / 2,
+            (y0 + y1) / 2,
+            name.replace(" ", "\n"),
+            ha="center",
+            va="center",
+            fontsize=size,
+            color="white",
+            path_effects=[withStroke(linewidth=2.0, foreground=INK)],
+        )
+    x_min, right, bottom, top = extent_mm(scan)
+    ax.set_xlim(max(x_min, -110), min(right, 110))
     ax.set_ylim(max(bottom, -110), min(top, 110))
 
 
@@ -175,15 +181,15 @@ def _reflects(scan: ProcessedScan) -> npt.NDArray[np.float64]:
 def draw_row(fig: Any, axes: Any, view: ScanView, keys: tuple[str, ...], name: str) -> None:
     """Draw images of a scan side by side, with colour bars and the plates' names."""
     for ax, key in zip(axes, keys, strict=True):
-        shown, unit = draw_channel(ax, view.scan, key)
+        image, unit = draw_channel(ax, view.scan, key)
         if key.endswith("_p"):
-            shown.set_alpha(_reflects(view.scan))
+            image.set_alpha(_reflects(view.scan))
         kind, _, channel = key.partition("_")
         dress(ax, f"{name}: {kind} {channel.upper()}", "x (mm)", "y (mm)" if ax is axes[0] else "")
         ax.set_aspect("equal")
         ax.grid(visible=False)
         ax.set_facecolor("#3a404a")
-        bar = fig.colorbar(shown, ax=ax, fraction=0.046, pad=0.02)
+        bar = fig.colorbar(image, ax=ax, fraction=0.046, pad=0.02)
         bar.set_label(unit, fontsize=8)
         bar.ax.tick_params(labelsize=7.5)
         if bar.solids is not None:
@@ -267,10 +273,10 @@ def _spread_deg(values: npt.NDArray[np.complexfloating]) -> float:
 def fig14(run: Run) -> Item:
     """Phase of H, V and P inside water, oil and metal."""
     view = view_scan("liquids", SETS["liquids"], run)
-    shown = ("Water (with glass)", "Corn Oil (with glass)", "copper")
+    drawn_materials = ("Water (with glass)", "Corn Oil (with glass)", "copper")
     fig = new_figure(11.5, 3.4)
     channels = {"H": view.result.calibrated.h, "V": view.result.calibrated.v, "P": view.result.calibrated.p}
-    patches = {p.truth.name: p for p in view.result.patches if p.truth is not None and p.truth.name in shown}
+    patches = {p.truth.name: p for p in view.result.patches if p.truth is not None and p.truth.name in drawn_materials}
     rows = []
     data = {}
     inside = np.any([p.patch.interior for p in patches.values()], axis=0)
@@ -279,9 +285,14 @@ def fig14(run: Run) -> Item:
         angle = np.angle(values / metal, deg=True)
         phase = np.ma.masked_array(angle, ~inside)
         picture = ax.imshow(
-            phase, extent=extent_mm(view.scan), origin="lower", cmap="PuOr", vmin=-PHASE_DEG, vmax=PHASE_DEG,
+            phase,
+            extent=extent_mm(view.scan),
+            origin="lower",
+            cmap="PuOr",
+            vmin=-PHASE_DEG,
+            vmax=PHASE_DEG,
             interpolation="nearest",
-        )  # fmt: skip
+        )
         dress(ax, f"phase of {channel}", "x (mm)", "y (mm)")
         ax.grid(visible=False)
         ax.set_facecolor("#b9c0ca")

@@ -60,9 +60,14 @@ def groups() -> dict[str, Group]:
     The paper counts eight liquids; its table has nine, all of which are used here.
     """
     rows = table2()
-    return {g.name: g for g in (
-        Group("solids", rows[:23], 60.0), Group("liquids", rows[23:32], 55.0), Group("powders", rows[32:], 60.0),
-    )}  # fmt: skip
+    return {
+        g.name: g
+        for g in (
+            Group("solids", rows[:23], 60.0),
+            Group("liquids", rows[23:32], 55.0),
+            Group("powders", rows[32:], 60.0),
+        )
+    }
 
 
 @dataclass(frozen=True)
@@ -139,17 +144,17 @@ def draw(
 ) -> Pixels:
     """Draw pixels of every material in every scan; the same seed gives the same errors up to their size."""
     rng = np.random.default_rng([seed, round(angle_deg * 100)])
-    own = np.sqrt(1 - errors.shared)
+    own_share = np.sqrt(1 - errors.shared)
     common = np.sqrt(errors.shared)
 
     def channel(r: Complex) -> Complex:
-        one = (scans, len(materials), 1)
+        shape = (scans, len(materials), 1)
         parts = []
         for std in (errors.amplitude, errors.phase_rad):
-            patch = common * rng.standard_normal(one) + own * rng.standard_normal((*one[:2], pixels))
+            patch = common * rng.standard_normal(shape) + own_share * rng.standard_normal((*shape[:2], pixels))
             parts.append((std * patch, std * common * rng.standard_normal((scans, 1, 1))))
         (a, a_ref), (b, b_ref) = parts
-        return np.broadcast_to(r, one[:2])[..., None] * (1 + a) / (1 + a_ref) * np.exp(1j * (b - b_ref))
+        return np.broadcast_to(r, shape[:2])[..., None] * (1 + a) / (1 + a_ref) * np.exp(1j * (b - b_ref))
 
     own_rng = np.random.default_rng([seed, 1])  # the same specimens under every angle
     eps = specimens(materials, errors.spread, own_rng.standard_normal((2, scans, len(materials))))
@@ -177,8 +182,8 @@ def calibrated_errors(group_name: str, draws: int = 3, shared: float = 0.5) -> E
     def excess(log_amplitude: float) -> float:
         return h_accuracy(group, replace(start, amplitude=float(np.exp(log_amplitude))), seeds) - target
 
-    at = scipy.optimize.root_scalar(excess, bracket=(np.log(1e-4), np.log(0.3)), method="bisect", xtol=0.01)
-    return replace(start, amplitude=float(np.exp(at.root)))
+    solution = scipy.optimize.root_scalar(excess, bracket=(np.log(1e-4), np.log(0.3)), method="bisect", xtol=0.01)
+    return replace(start, amplitude=float(np.exp(solution.root)))
 
 
 SPREADS = ((0.0, 0.0), (0.01, 0.05), (0.02, 0.1), (0.05, 0.2))
@@ -205,10 +210,12 @@ class Found(NamedTuple):
 
 def both_angles(group: str, angles_deg: tuple[float, ...], errors: Errors, seed: int, scans: int) -> Samples:
     """Pixels of a group under one angle, or under two of the same specimens."""
-    one, *more = (draw(groups()[group].materials, a, errors, seed, scans).samples() for a in angles_deg)
-    for other in more:
-        one = one.joined(other)
-    return one
+    joined_samples, *further_samples = (
+        draw(groups()[group].materials, a, errors, seed, scans).samples() for a in angles_deg
+    )
+    for next_samples in further_samples:
+        joined_samples = joined_samples.joined(next_samples)
+    return joined_samples
 
 
 @cache
@@ -228,9 +235,9 @@ def by_patch(model: Model, test: Samples) -> tuple[npt.NDArray[np.bool_], npt.ND
     """Name all patches, scan by scan; return for each: named, right (by the nearest material), confidence, [patch]."""
     rows = []
     for scan in np.unique(test.groups):
-        mine = test.take(test.groups == scan)
-        found = model.by_scan(mine.x, mine.patches)
-        truth = mine.names[[np.flatnonzero(mine.patches == p)[0] for p in found.patches]]
+        scan_samples = test.take(test.groups == scan)
+        found = model.by_scan(scan_samples.x, scan_samples.patches)
+        truth = scan_samples.names[[np.flatnonzero(scan_samples.patches == p)[0] for p in found.patches]]
         rows.append((found.distance <= 1, found.names == truth, found.confidence))
     named, right, sure = (np.concatenate(column) for column in zip(*rows, strict=True))
     return named, right, sure
@@ -256,10 +263,10 @@ def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool
     trials = 40 if quick else 250
     for k in range(len(materials)):
         eps = specimens(materials, errors.spread, rng.standard_normal((2, trials, len(materials))))[:, k]
-        seen = _features(eps, angles_deg) + std * rng.standard_normal((trials, std.size))
-        off = seen[:, None, None] - mean[None]
-        off[..., 2::3] = (off[..., 2::3] + np.pi) % (2 * np.pi) - np.pi
-        q = np.sum((off / std) ** 2, axis=-1)
+        measured = _features(eps, angles_deg) + std * rng.standard_normal((trials, std.size))
+        difference = measured[:, None, None] - mean[None]
+        difference[..., 2::3] = (difference[..., 2::3] + np.pi) % (2 * np.pi) - np.pi
+        q = np.sum((difference / std) ** 2, axis=-1)
         likelihood = np.einsum("tnm,n->tm", np.exp(-(q - q.min(axis=(1, 2), keepdims=True)) / 2), weights)
         right.append((likelihood.argmax(axis=1) == k).mean())
     return float(np.mean(right))
@@ -282,14 +289,14 @@ def strangers_named(taught: Samples, test: Samples, quick: bool) -> tuple[int, i
     outside = []
     scans = np.unique(test.groups)[: 2 if quick else 6]
     for name in np.unique(test.names):
-        others = taught.take(taught.names != name)
-        model = MODELS[DISCRIMINANT]("H+V+P").fit(others)
+        taught_others = taught.take(taught.names != name)
+        model = MODELS[DISCRIMINANT]("H+V+P").fit(taught_others)
         for scan in scans:
-            mine = test.take(test.groups == scan)
-            found = model.by_scan(mine.x, mine.patches)
-            strange = np.unique(mine.patches[mine.names == name])
+            scan_samples = test.take(test.groups == scan)
+            found = model.by_scan(scan_samples.x, scan_samples.patches)
+            strange = np.unique(scan_samples.patches[scan_samples.names == name])
             named += (found.distance[np.searchsorted(found.patches, strange)] <= 1).tolist()
-            outside += _outside(mine.take(np.isin(mine.patches, strange)), others).tolist()
+            outside += _outside(scan_samples.take(np.isin(scan_samples.patches, strange)), taught_others).tolist()
     far = np.array(outside)
     return int(np.sum(named)), len(named), int(np.array(named)[far].sum()), int(far.sum())
 
@@ -299,14 +306,14 @@ def _outside(seen: Samples, known: Samples) -> npt.NDArray[np.bool_]:
 
     Of ln|H|, ln|V| and arg P of patches, normal with mean and covariance from so many patches (Hotelling's law).
     """
-    at, _ = _patch_features(seen)
+    features, _ = _patch_features(seen)
     means, names = _patch_features(known)
-    out = np.ones(len(at), np.bool_)
+    out = np.ones(len(features), np.bool_)
     for name in np.unique(names):
-        own = means[names == name]
-        n, d = own.shape
-        off = at - own.mean(axis=0)
-        q = np.einsum("pd,de,pe->p", off, np.linalg.inv(np.cov(own.T)), off)
+        own_means = means[names == name]
+        n, d = own_means.shape
+        difference = features - own_means.mean(axis=0)
+        q = np.einsum("pd,de,pe->p", difference, np.linalg.inv(np.cov(own_means.T)), difference)
         out &= q > (n + 1) * (n - 1) * d / (n * (n - d)) * scipy.stats.f.ppf(0.95, d, n - d)
     return out
 
@@ -327,12 +334,19 @@ def spread_table(quick: bool) -> Table:
     for group, angles in tasks[3:] if quick else tasks:
         for spread in SPREADS[:: 3 if quick else 1]:
             f = with_spread(group, angles, spread, quick)
-            seen = f"{len(groups()[group].materials)} {group}{', two angles' if len(angles) > 1 else ''}"
+            row_title = f"{len(groups()[group].materials)} {group}{', two angles' if len(angles) > 1 else ''}"
             label = f"{100 * spread[0]:g} / {100 * spread[1]:g} %"
-            rows.append((
-                seen, label, percent(f.right), percent(f.bound), f"{f.calibration:.3f}",
-                "{} of {}".format(*f.strangers[:2]), "{} of {}".format(*f.strangers[2:]),
-            ))  # fmt: skip
+            rows.append(
+                (
+                    row_title,
+                    label,
+                    percent(f.right),
+                    percent(f.bound),
+                    f"{f.calibration:.3f}",
+                    "{} of {}".format(*f.strangers[:2]),
+                    "{} of {}".format(*f.strangers[2:]),
+                )
+            )
     head = (
         "Task",
         "spread of real part / loss",

@@ -77,8 +77,8 @@ def fig3(run: Run) -> Item:
         axes[1].plot(angle, np.abs(r_p) ** 2, **style)
         axes[2].plot(angle, 20 * np.log10(np.abs(p)), **style)
         brewster = float(np.degrees(brewster_angle_rad(m.permittivity)))
-        at = [abs(complex(ratio_from_permittivity(m.permittivity, np.radians(a)))) for a in (0, 55, 60)]
-        rows.append((m.name, "–" if m.number == 1 else f"{brewster:.1f}°", *(f"{x:.2f}" for x in at)))
+        magnitudes = [abs(complex(ratio_from_permittivity(m.permittivity, np.radians(a)))) for a in (0, 55, 60)]
+        rows.append((m.name, "–" if m.number == 1 else f"{brewster:.1f}°", *(f"{x:.2f}" for x in magnitudes)))
         curves[m.name] = {"R_s": np.abs(r_s) ** 2, "R_p": np.abs(r_p) ** 2, "abs_P": np.abs(p)}
     for ax, title, unit in zip(
         axes,
@@ -122,16 +122,16 @@ def fig16(run: Run) -> Item:
     fig = new_figure(11.5, 4.6)
     axes = fig.subplots(1, 3, sharex=True)
     levels: dict[str, dict[str, np.ndarray]] = {}
-    for ax, (angle, what) in zip(axes, ((0.0, "|H|"), (55.0, "|P|"), (60.0, "|P|")), strict=True):
-        seen = draw(materials, angle, errors, seed=16)
-        values = np.abs(seen.h) if what == "|H|" else np.abs(seen.h / seen.v)
+    for ax, (angle, quantity) in zip(axes, ((0.0, "|H|"), (55.0, "|P|"), (60.0, "|P|")), strict=True):
+        measured = draw(materials, angle, errors, seed=16)
+        values = np.abs(measured.h) if quantity == "|H|" else np.abs(measured.h / measured.v)
         level = 20 * np.log10(values)
         levels[f"{angle:.0f}"] = {m.name: level[:, j].ravel() for j, m in enumerate(materials)}
         for j in range(len(materials)):
             x = j + np.random.default_rng(j).uniform(-0.28, 0.28, level[:, j].size)
             ax.plot(x, level[:, j].ravel(), MARKERS[j], ms=2.6, color=PALETTE[j], alpha=0.6)
             ax.plot([j - 0.35, j + 0.35], 2 * [float(np.median(level[:, j]))], color=INK, lw=1.4)
-        dress(ax, f"incidence {angle:.0f}°: {what}", "", f"{what} relative to metal (dB)")
+        dress(ax, f"incidence {angle:.0f}°: {quantity}", "", f"{quantity} relative to metal (dB)")
         ax.set_xticks(range(len(materials)), [m.name for m in materials], rotation=35, ha="right", fontsize=8)
     rows = [
         (f"{a} / {b}", *(f"{_d_prime(level[a], level[b]):.1f}" for level in levels.values()))
@@ -166,10 +166,10 @@ def table2_item(run: Run) -> Item:
     axes = fig.subplots(1, 2)
     for colour, (name, group) in zip((PALETTE[0], PALETTE[6], PALETTE[3]), groups().items(), strict=True):
         errors = calibrated_errors(name, 1 if run.quick else 3)
-        seen = draw(group.materials, group.angle_deg, errors, seed=2)
-        found: list[tuple[complex, complex, float]] = []
+        measured = draw(group.materials, group.angle_deg, errors, seed=2)
+        estimated: list[tuple[complex, complex, float]] = []
         for j, m in enumerate(group.materials):
-            e = estimate_permittivity(seen.h[:, j].ravel(), seen.v[:, j].ravel(), np.radians(group.angle_deg))
+            e = estimate_permittivity(measured.h[:, j].ravel(), measured.v[:, j].ravel(), np.radians(group.angle_deg))
             true = m.permittivity
             row = {"number": m.number, "name": m.name, "angle_deg": group.angle_deg}
             printed = (f"{true.real:.2f}", "–" if m.number == 23 else f"{-true.imag:.2f}")
@@ -177,19 +177,32 @@ def table2_item(run: Run) -> Item:
                 rows.append((str(m.number), m.name, "metal", "metal", "metal-like", "", "", ""))
                 data.append(row | {"recovered": None, "metal_like": True})
                 continue
-            apart = abs(e.value - true) / abs(true)
-            rows.append((
-                str(m.number), m.name, *printed, f"{e.value.real:.2f}", f"{-e.value.imag:.2f}", f"± {e.real_std:.2f}",
-                f"{100 * apart:.1f} %",
-            ))  # fmt: skip
-            data.append(row | {"published": true, "recovered": e.value, "std": e.real_std, "relative_error": apart})
-            found.append((true, e.value, e.real_std))
+            relative_error = abs(e.value - true) / abs(true)
+            rows.append(
+                (
+                    str(m.number),
+                    m.name,
+                    *printed,
+                    f"{e.value.real:.2f}",
+                    f"{-e.value.imag:.2f}",
+                    f"± {e.real_std:.2f}",
+                    f"{100 * relative_error:.1f} %",
+                )
+            )
+            data.append(
+                row | {"published": true, "recovered": e.value, "std": e.real_std, "relative_error": relative_error}
+            )
+            estimated.append((true, e.value, e.real_std))
         bars: dict[str, Any] = {
-            "yerr": [f[2] for f in found], "fmt": "o", "ms": 4, "color": colour, "lw": 1,
+            "yerr": [f[2] for f in estimated],
+            "fmt": "o",
+            "ms": 4,
+            "color": colour,
+            "lw": 1,
             "label": f"{name}, {group.angle_deg:.0f}°",
-        }  # fmt: skip
-        axes[0].errorbar([f[0].real for f in found], [f[1].real for f in found], **bars)
-        axes[1].errorbar([-f[0].imag for f in found], [-f[1].imag for f in found], **bars)
+        }
+        axes[0].errorbar([f[0].real for f in estimated], [f[1].real for f in estimated], **bars)
+        axes[1].errorbar([-f[0].imag for f in estimated], [-f[1].imag for f in estimated], **bars)
     for ax, part in zip(axes, ("real part ε′", "loss ε″"), strict=True):
         dress(ax, part, f"published {part}", f"recovered {part}")
         ax.axline((1, 1), slope=1, color=INK, lw=0.8, ls=":")
@@ -220,14 +233,14 @@ def table2_item(run: Run) -> Item:
 def places(seed: int, count: int = 3) -> list[tuple[float, float]]:
     """Draw random centres of plates, mm, at least `APART_MM` from each other in x or in y."""
     rng = np.random.default_rng(seed)
-    found: list[tuple[float, float]] = []
-    while len(found) < count:
+    centres: list[tuple[float, float]] = []
+    while len(centres) < count:
         x, y = (round(float(c), 1) for c in rng.uniform(-REACH_MM, REACH_MM, 2))
-        if all(max(abs(x - a), abs(y - b)) >= APART_MM for a, b in found):
-            found.append((x, y))
+        if all(max(abs(x - a), abs(y - b)) >= APART_MM for a, b in centres):
+            centres.append((x, y))
         elif rng.random() < 0.05:
-            found.clear()  # two plates may leave no room for a third
-    return found
+            centres.clear()  # two plates may leave no room for a third
+    return centres
 
 
 def fig17(run: Run) -> Item:
@@ -241,12 +254,12 @@ def fig17(run: Run) -> Item:
         plates = [plate("copper", None, *at[0])]
         plates += [plate(name, eps, *xy) for (name, eps), xy in zip(true.items(), at[1:], strict=True)]
         with scanned(f"placement {i + 1}", plates, run.config, seed=1700 + i) as (source, truth):
-            seen = imaged(source, truth).result
-        for patch in seen.patches:
+            result = imaged(source, truth).result
+        for patch in result.patches:
             if patch.truth is not None and patch.truth.name in pixels:
-                inside = patch.patch.interior & np.isfinite(seen.p)
-                theta = np.broadcast_to(seen.theta_rad, seen.p.shape)[inside]
-                pixels[patch.truth.name].append(permittivity_from_ratio(seen.p[inside], theta))
+                inside = patch.patch.interior & np.isfinite(result.p)
+                theta = np.broadcast_to(result.theta_rad, result.p.shape)[inside]
+                pixels[patch.truth.name].append(permittivity_from_ratio(result.p[inside], theta))
         centres.append(dict(zip(("copper", *true), at, strict=True)))
     return _item(true, pixels, centres)
 
@@ -317,8 +330,8 @@ def fig21(run: Run) -> Item:
     printed = published()["sugar_median_error_percent"]
     value = concentrations(library.names, {WATER_IN_GLASS: 0.0})
     fig = new_figure(11.5, 4.2)
-    left, centre, right = fig.subplots(1, 3)
-    _draw_line(left, library, value, result)
+    left_axes, centre, right = fig.subplots(1, 3)
+    _draw_line(left_axes, library, value, result)
     _draw_permittivity(centre, library, value, {value[m.name]: m.permittivity.real for m in materials})
     _draw_errors(right, result, printed)
     return Item(
@@ -358,10 +371,10 @@ def _draw_line(ax: Axes, library: Library, value: Mapping[str, float], result: C
     """Draw the calibration line with its interval, and the patches."""
     x = np.array([np.degrees(np.median(polarisation_angle_rad(e.p))) for e in library.entries])
     ax.plot(x, [value[e.name] for e in library.entries], "o", ms=4, color=PALETTE[0], label="patches")
-    at = np.linspace(x.min() - 0.1, x.max() + 0.1, 100)
-    low, high = result.line.interval(np.radians(at))
-    ax.plot(at, result.line.percent(np.radians(at)), color=INK, lw=1.4, label="line")
-    ax.fill_between(at, low, high, color=PALETTE[1], alpha=0.35, lw=0, label="90 % of new patches")
+    line_angles = np.linspace(x.min() - 0.1, x.max() + 0.1, 100)
+    low, high = result.line.interval(np.radians(line_angles))
+    ax.plot(line_angles, result.line.percent(np.radians(line_angles)), color=INK, lw=1.4, label="line")
+    ax.fill_between(line_angles, low, high, color=PALETTE[1], alpha=0.35, lw=0, label="90 % of new patches")
     dress(ax, "Concentration by polarisation angle", "polarisation angle arctan |P| (degrees)", "sugar (% by weight)")
     ax.legend(fontsize=8, frameon=False)
 
@@ -395,10 +408,15 @@ def _concentration_rows(value: Mapping[str, float], result: ConcentrationResult)
     """Return a table line for each solution, by concentration."""
     rows = []
     for name in sorted(value, key=lambda n: value[n]):
-        of = [r for r in result.left_out if r.name == name]
-        spread = np.median([abs(r.percent - r.true_percent) for r in of])
-        rows.append((
-            name, f"{value[name]:.1f} %", f"{np.mean([r.percent for r in of]):.2f} %",
-            f"{np.mean([r.low for r in of]):.2f} … {np.mean([r.high for r in of]):.2f} %", f"{spread:.2f} %",
-        ))  # fmt: skip
+        errors_of_name = [r for r in result.left_out if r.name == name]
+        spread = np.median([abs(r.percent - r.true_percent) for r in errors_of_name])
+        rows.append(
+            (
+                name,
+                f"{value[name]:.1f} %",
+                f"{np.mean([r.percent for r in errors_of_name]):.2f} %",
+                f"{np.mean([r.low for r in errors_of_name]):.2f} … {np.mean([r.high for r in errors_of_name]):.2f} %",
+                f"{spread:.2f} %",
+            )
+        )
     return tuple(rows)

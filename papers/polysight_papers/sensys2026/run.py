@@ -78,10 +78,13 @@ def reproduce(out: Path, keys: Sequence[str] = (), run: Run | None = None) -> in
     run = run or Run()
     for key in keys:
         if key not in MAKERS:
-            why = f"{TITLES[key]}: not reproduced yet" if key in TITLES else "the paper has no such item"
+            if key in TITLES:
+                reason = f"{TITLES[key]}: not reproduced yet"
+            else:
+                reason = "the paper has no such item"
             raise ConfigError(
                 f"item {key!r} cannot be made",
-                why,
+                reason,
                 f"give some of: {' '.join(MAKERS)}",
                 code=ErrorCode.KEY_UNKNOWN,
             )
@@ -209,13 +212,13 @@ def write_page(
         undefined=StrictUndefined,
         trim_blocks=True,
     )
-    held = {i.key for i in items}
+    made_keys = {i.key for i in items}
     page = environment.get_template("reproduce.html").render(
         items=sorted(items, key=lambda i: list(TITLES).index(i.key)),
         images={name: base64.b64encode(data).decode("ascii") for name, data in pictures.items()},
-        left_out=[(k, t) for k, t in TITLES.items() if k in makers and k not in held and k not in failed],
+        left_out=[(k, t) for k, t in TITLES.items() if k in makers and k not in made_keys and k not in failed],
         missing=[(k, t) for k, t in TITLES.items() if k not in makers],
-        failed=[(k, TITLES[k], why) for k, why in failed.items()],
+        failed=[(k, TITLES[k], reason) for k, reason in failed.items()],
         quick=quick,
         origin=origin,
     )

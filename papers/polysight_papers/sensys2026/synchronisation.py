@@ -75,10 +75,10 @@ def sync_scan(run: Run) -> SyncScan:
         board = rig.receivers[0].name
         setups = {b.name: BoardSetup.of(rig, b) for b in rig.receivers}
         reports = {n: SyncReport(chirp.sample_rate_hz, chirp.linear_samples, 4) for n in setups}
-        before = ImageBuilder(rig)
-        after = ImageBuilder(rig)
+        builder_before = ImageBuilder(rig)
+        builder_after = ImageBuilder(rig)
         middle = source.plan.rows // 2
-        shown = {}
+        example = {}
         carrier = None
         for row in source.rows():
             for name, setup in setups.items():
@@ -90,15 +90,15 @@ def sync_scan(run: Run) -> SyncScan:
                 if carrier is None:
                     carrier = float(np.median(synced.direct_hz)) / chirp.sample_rate_hz
                 mixed = raw[:, :: rig.burst.pulses] * np.exp(-2j * np.pi * carrier * np.arange(chirp.samples))
-                one = replace(synced, samples=mixed.astype(np.complex64))
-                before.add_row(name, row, one)
-                after.add_row(name, row, synced)
+                unsynchronised = replace(synced, samples=mixed.astype(np.complex64))
+                builder_before.add_row(name, row, unsynchronised)
+                builder_after.add_row(name, row, synced)
                 if name == board and row == middle:
-                    shown = {"before": one.samples[0], "after": synced.samples[0]}
-        pairs = [np.abs(b.boards[board].image()[0]).astype(np.float32) for b in (before, after)]
-        grid = after.grid
+                    example = {"before": unsynchronised.samples[0], "after": synced.samples[0]}
+        pairs = [np.abs(b.boards[board].image()[0]).astype(np.float32) for b in (builder_before, builder_after)]
+        grid = builder_after.grid
     a, b = chirp.linear_samples
-    profiles = [np.abs(np.fft.fft(shown[k][:, a:b] * np.hanning(b - a), 1024)).astype(np.float32) for k in shown]
+    profiles = [np.abs(np.fft.fft(example[k][:, a:b] * np.hanning(b - a), 1024)).astype(np.float32) for k in example]
     range_m = np.arange(1024) / 1024 * SPEED_OF_LIGHT_M_S / chirp.hz_per_sample
     near = range_m < 2.5
     x, y = ((v[[0, -1]] - v[[0, -1]].mean()) * 1e3 for v in (grid.x_m, grid.y_m))
@@ -188,11 +188,11 @@ def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: flo
     """Standard deviation of a quantity after each stage, with the bounds and the published value, if there is one."""
     for i, (board, content) in enumerate(summary.items()):
         stages = content["stages"]
-        at = np.array([list(STAGES).index(s) for s in stages]) + 0.12 * (2 * i - 1)
+        positions = np.array([list(STAGES).index(s) for s in stages]) + 0.12 * (2 * i - 1)
         values = [s[f"{quantity}_std"] for s in stages.values()]
-        ax.plot(at, values, "os"[i], ms=7, color=PALETTE[(0, 6)[i]], label=f"{board}, simulated")
+        ax.plot(positions, values, "os"[i], ms=7, color=PALETTE[(0, 6)[i]], label=f"{board}, simulated")
         key = f"{quantity}_bound"
-        bound = [(x, s[key]) for x, s in zip(at, stages.values(), strict=True) if key in s]
+        bound = [(x, s[key]) for x, s in zip(positions, stages.values(), strict=True) if key in s]
         ax.plot(*zip(*bound, strict=True), "_", ms=16, mew=1.6, color=INK, label=None if i else "Cramér-Rao bound")
     ax.set_yscale("log")
     if limit is not None:
@@ -212,8 +212,8 @@ def _stage_rows(summary: Mapping[str, Any], limits: Mapping[str, float]) -> tupl
     for board, content in summary.items():
         for name, s in content["stages"].items():
             printed = [f"{limits[q]:g}" if name == "referenced" and q in limits else "" for q in QUANTITIES]
-            own = [f"{s[f'{q}_std']:.4g}" for q in QUANTITIES]
-            cells = [x for pair in zip(own, printed, strict=True) for x in pair]
+            own_figures = [f"{s[f'{q}_std']:.4g}" for q in QUANTITIES]
+            cells = [x for pair in zip(own_figures, printed, strict=True) for x in pair]
             rows.append((f"{board}, {name}: {STAGES[name]}", *cells[:-1]))
     return tuple(rows)
 
@@ -227,9 +227,9 @@ def tones(chirps: npt.NDArray[np.complex64], chirp: Chirp) -> tuple[npt.NDArray,
     window = np.hanning(b - a)
     spectrum = np.fft.fft(chirps[..., a:b] * window, _PADDED, axis=-1)
     power = (np.abs(spectrum) ** 2).sum(axis=0)
-    at = power.argmax(axis=-1)
-    amplitude = np.sqrt(power[np.arange(len(at)), at]) / window.sum()
-    return at / _PADDED * chirp.sample_rate_hz, amplitude
+    peak_bin = power.argmax(axis=-1)
+    amplitude = np.sqrt(power[np.arange(len(peak_bin)), peak_bin]) / window.sum()
+    return peak_bin / _PADDED * chirp.sample_rate_hz, amplitude
 
 
 def skirt_db(
@@ -248,7 +248,7 @@ def skirt_db(
 def _sweep(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
     """IF (Hz) and amplitude of the direct path over all start frequencies, and the chirps of the usual one."""
     swept = []
-    shown = np.zeros((1, 1, chirp.samples), np.complex64)
+    example = np.zeros((1, 1, chirp.samples), np.complex64)
     for offset in OFFSETS_HZ:
         disturbances = {"if_offset_hz": offset}
         with scanned("direct path", (), run.config, 900, grid=GRID, disturbances=disturbances) as (source, _):
@@ -256,10 +256,10 @@ def _sweep(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
             chirps, valid = decode_row(data.payload, data.missing, data.frames_expected, chirp.samples)
         swept.append(tones(chirps[:, valid], chirp))
         if offset == USUAL_HZ:
-            shown = chirps[:, valid]
+            example = chirps[:, valid]
     if_hz, amplitude = (np.concatenate(part) for part in zip(*swept, strict=True))
-    heard = (if_hz > 0.05 * chirp.sample_rate_hz) & (if_hz < 0.9 * chirp.sample_rate_hz)
-    return if_hz[heard], amplitude[heard], shown
+    in_band = (if_hz > 0.05 * chirp.sample_rate_hz) & (if_hz < 0.9 * chirp.sample_rate_hz)
+    return if_hz[in_band], amplitude[in_band], example
 
 
 def _draw_spectrogram(ax: Axes, one: Complex, chirp: Chirp) -> None:
@@ -283,10 +283,10 @@ def _draw_skirts(ax: Axes, chirps: Complex, chirp: Chirp) -> dict[str, float]:
     smear = {}
     parts = {"whole chirp": ((0, chirp.samples), PALETTE[6]), "used part": (chirp.linear_samples, INK)}
     for part, ((first, last), colour) in parts.items():
-        apart, level = skirt_db(chirps[..., first:last], chirp.sample_rate_hz)
-        near = (np.abs(apart) > SKIRT_HZ[0]) & (np.abs(apart) < SKIRT_HZ[1])
+        distance_bins, level = skirt_db(chirps[..., first:last], chirp.sample_rate_hz)
+        near = (np.abs(distance_bins) > SKIRT_HZ[0]) & (np.abs(distance_bins) < SKIRT_HZ[1])
         smear[part] = float(10 * np.log10(np.mean(10 ** (level[near] / 10))))
-        ax.plot(apart / 1e6, level, color=colour, lw=1.2, label=part)
+        ax.plot(distance_bins / 1e6, level, color=colour, lw=1.2, label=part)
     dress(ax, "Spectrum about the tone", "IF from the tone (MHz)", "dB, 0 = peak")
     ax.set_xlim(-0.6, 0.6)
     ax.legend(fontsize=8, frameon=False, loc="upper right")
@@ -295,12 +295,12 @@ def _draw_skirts(ax: Axes, chirps: Complex, chirp: Chirp) -> dict[str, float]:
 
 def _draw_filter(ax: Axes, if_hz: npt.NDArray, amplitude: npt.NDArray, fitted: HighPass, programmed: HighPass) -> None:
     """Draw amplitude against IF without the fitted filter's gain, and both filters."""
-    at = np.linspace(if_hz.min(), if_hz.max(), 300)
+    grid_hz = np.linspace(if_hz.min(), if_hz.max(), 300)
     ax.plot(if_hz / 1e6, 20 * np.log10(amplitude), ".", ms=3, color=PALETTE[1], label="sweep, simulated")
     for model, colour, style, name in ((fitted, INK, "-", "fitted"), (programmed, PALETTE[6], "--", "programmed")):
         corners = ", ".join(f"{c / 1e3:.0f}" for c in model.corners_hz)
-        response = 20 * np.log10(np.abs(model.response(at)))
-        ax.plot(at / 1e6, response, color=colour, ls=style, lw=1.5, label=f"{name}: {corners} kHz")
+        response = 20 * np.log10(np.abs(model.response(grid_hz)))
+        ax.plot(grid_hz / 1e6, response, color=colour, ls=style, lw=1.5, label=f"{name}: {corners} kHz")
     dress(ax, "High-pass filter", "IF (MHz)", "gain (dB)")
     ax.legend(fontsize=8, frameon=False, loc="lower right")
 
@@ -308,19 +308,19 @@ def _draw_filter(ax: Axes, if_hz: npt.NDArray, amplitude: npt.NDArray, fitted: H
 def fig9(run: Run) -> Item:
     """The direct path alone, received at ten start frequencies of the receiver."""
     chirp = load_instrument(run.config).chirp
-    if_hz, amplitude, shown = _sweep(run, chirp)
+    if_hz, amplitude, example = _sweep(run, chirp)
     fitted = fit_high_pass(if_hz, amplitude)
     programmed = high_pass(chirp)
     amplitude = amplitude / np.exp(np.mean(np.log(amplitude / np.abs(fitted.response(if_hz)))))
 
     fig = new_figure(11.5, 4.2)
-    left, centre, right = fig.subplots(1, 3)
-    _draw_spectrogram(left, shown[0, 0], chirp)
-    smear = _draw_skirts(centre, shown, chirp)
+    left_axes, centre, right = fig.subplots(1, 3)
+    _draw_spectrogram(left_axes, example[0, 0], chirp)
+    smear = _draw_skirts(centre, example, chirp)
     _draw_filter(right, if_hz, amplitude, fitted, programmed)
 
-    at = np.linspace(if_hz.min(), if_hz.max(), 300)
-    response = np.abs(fitted.response(at)) / np.abs(programmed.response(at))
+    grid_hz = np.linspace(if_hz.min(), if_hz.max(), 300)
+    response = np.abs(fitted.response(grid_hz)) / np.abs(programmed.response(grid_hz))
     worst = float(np.abs(20 * np.log10(response / np.exp(np.mean(np.log(response))))).max())
     rows = tuple(
         (f"corner {i + 1}", *(f"{m.corners_hz[i] / 1e3:.0f} kHz" for m in (programmed, fitted))) for i in (0, 1)

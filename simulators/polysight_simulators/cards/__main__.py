@@ -100,7 +100,12 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
         scene = without_offset(scene)
     base = {} if scene is None else {"loss": scene.disturbances.packet_loss}
     faults = read_faults(args.faults, args.fault, known, base, rig.radar.control)
-    seed = args.seed if args.seed is not None else 0 if scene is None else scene.seed
+    if args.seed is not None:
+        seed = args.seed
+    elif scene is None:
+        seed = 0
+    else:
+        seed = scene.seed
     source = _source(args, rig, scene, names)
     power_cycle = Event()
     signal.signal(signal.SIGUSR1, lambda _signal, _frame: power_cycle.set())

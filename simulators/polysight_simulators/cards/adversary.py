@@ -84,9 +84,12 @@ class Adversary:
         sequence: int = 1,
         payload_bytes: int = 1456,
     ) -> None:
-        self._chance, self._frame, self._payload = chance, frame_bytes, payload_bytes
+        self._chance = chance
+        self._frame = frame_bytes
+        self._payload = payload_bytes
         self._card = Packetiser(payload_bytes, sequence, byte_count)
-        self._now_ns, self._number = 1_000_000_000, 0
+        self._now_ns = 1_000_000_000
+        self._number = 0
         self._twin = Packetiser(payload_bytes, chance.randrange(1 << 32), chance.randrange(1 << 48))
         self._late: list[Arrival] = []  # packets that arrive in a later record
         self.resets = 0
@@ -138,14 +141,16 @@ class Adversary:
 
         `edges_ns` are the times of its frames; without them, the packets follow each other.
         """
-        chance, self._number = self._chance, self._number + 1
+        chance = self._chance
+        self._number = self._number + 1
         if not data:
             draw = np.random.default_rng(chance.getrandbits(32))
             data = draw.integers(1, 256, frames * self._frame, np.uint8).tobytes()
         pulse_ns = self._now_ns + 1_000_000 if edges_ns is None else edges_ns[0] - 1_000_000
         sent = Sent(self._number, data, pulse_ns, troubles=troubles)
         packets, made = self._packets(sent, data)
-        before, in_between = self.take_late(0.5), self.take_late(0.7)
+        before = self.take_late(0.5)
+        in_between = self.take_late(0.7)
         if "twin" in troubles or "twin_alone" in troubles:
             sent.whole = False
             other = np.random.default_rng(chance.getrandbits(32)).integers(1, 256, len(data), np.uint8)
@@ -176,7 +181,9 @@ class Adversary:
 
     def _packets_of(self, sent: Sent, data: NDArray[np.int64]) -> list[bytes]:
         """Send bytes of the data, by their numbers."""
-        troubles, chance, frame = sent.troubles, self._chance, self._frame
+        troubles = sent.troubles
+        chance = self._chance
+        frame = self._frame
         frames = len(data) // frame
         if "miss_frames" in troubles and frames > 1:
             sent.whole = False
@@ -184,7 +191,10 @@ class Adversary:
                 data = np.delete(data, slice(at * frame, (at + 1) * frame))
         if "drop_inside" in troubles or "drop_frames" in troubles:
             sent.whole = False
-            many = frame * chance.randint(1, 3) if "drop_frames" in troubles else 16 * chance.randint(1, 200)
+            if "drop_frames" in troubles:
+                many = frame * chance.randint(1, 3)
+            else:
+                many = 16 * chance.randint(1, 200)
             cut = chance.randrange(max(1, len(data) - many))
             data = np.delete(data, slice(cut, cut + many))
         if "reset_between" in troubles:
@@ -192,7 +202,8 @@ class Adversary:
         out: list[bytes] = []
         if "end_early" in troubles and frames > 2:
             sent.whole = False
-            cut, lost = chance.randint(1, frames - 2) * frame, chance.randint(0, 1) * frame
+            cut = chance.randint(1, frames - 2) * frame
+            lost = chance.randint(0, 1) * frame
             out += self._stream(data[:cut]) + self._end()
             data = data[cut + lost :]
         if "reset" in troubles or "reset_early" in troubles:
@@ -210,7 +221,8 @@ class Adversary:
         self._late.clear()
 
     def _reset(self) -> None:
-        self._card, self.resets = Packetiser(self._payload), self.resets + 1
+        self._card = Packetiser(self._payload)
+        self.resets = self.resets + 1
         self._waiting = np.zeros(0, np.int64)
 
     def _stream(self, data: NDArray[np.int64]) -> list[bytes]:
@@ -234,7 +246,9 @@ class Adversary:
 
     def _network(self, packets: list[bytes], sent: Sent) -> list[tuple[int, bytes]]:
         """Return the packets that arrive in time, in order, each with its number; keep the delayed ones."""
-        t, chance, n = sent.troubles, self._chance, len(packets)
+        t = sent.troubles
+        chance = self._chance
+        n = len(packets)
         gone: set[int] = set(range(n)) if "lose_all" in t else set()
         if "lose" in t:
             gone |= {k for k in range(n) if chance.random() < chance.choice([0.02, 0.2])}
@@ -265,7 +279,8 @@ class Adversary:
         if "truncate" in troubles and self._chance.random() < 0.05:
             return packet[: self._chance.randint(DATA_HEADER_BYTES, len(packet))]
         if "turn_header_bit" in troubles and self._chance.random() < 0.05:
-            bit, turned = self._chance.randrange(8 * DATA_HEADER_BYTES), bytearray(packet)
+            bit = self._chance.randrange(8 * DATA_HEADER_BYTES)
+            turned = bytearray(packet)
             turned[bit // 8] ^= 1 << bit % 8
             return bytes(turned)
         return packet
@@ -282,6 +297,7 @@ class Adversary:
                 t = max(t, times[-1] + 1000) if times else t
             times.append(t)
         if "clock" in troubles and len(times) > 2:
-            at, jump = self._chance.randrange(1, len(times)), self._chance.choice([-(10**12), 10**12, -5_000_000])
+            at = self._chance.randrange(1, len(times))
+            jump = self._chance.choice([-(10**12), 10**12, -5_000_000])
             times = times[:at] + [t + jump for t in times[at:]]
         return times

@@ -122,7 +122,8 @@ class CardSender:
         data_to: tuple[str, int],
         pace: Pace = Pace(),  # noqa: B008 - immutable
     ) -> None:
-        self._command_to, self._data_to = command_to, data_to
+        self._command_to = command_to
+        self._data_to = data_to
         self._socket = bound_udp(*source)
         self._segmented = _can_segment(self._socket)
         self._receiver = ReceiveQueue(*data_to)
@@ -205,7 +206,10 @@ class CardSender:
                 continue
             if not self._may_send(now):
                 return _POLL_S
-            n = 1 if self._pace.single else min(len(item), _CALL_SEGMENTS, max(1, _CALL_BYTES // item.shape[1]))
+            if self._pace.single:
+                n = 1
+            else:
+                n = min(len(item), _CALL_SEGMENTS, max(1, _CALL_BYTES // item.shape[1]))
             self._send(item[:n])
             self._queued_bytes -= n * item.shape[1]
             catch_up_s = 0.0 if self._pace.single or self._was_idle else _CATCH_UP_S
@@ -434,7 +438,10 @@ class CardEndpoint:
             return
         code = request[0]
         refused = self._command_faults.refused(code)
-        reply, *more = [message(code, 1)] if refused else self.card.command(datagram, self.wire_s())
+        if refused:
+            reply, *more = [message(code, 1)]
+        else:
+            reply, *more = self.card.command(datagram, self.wire_s())
         if code == Code.CONFIGURE_FPGA:
             self._deaf_until_s = self._clock_s() + self._faults.deaf_ms * 1e-3
         if bits := self._command_faults.status_after(code):
@@ -464,7 +471,8 @@ class CardEndpoint:
                 self._emit_packets(output, link_is_up)
 
     def _emit_packets(self, packets: Packets, link_is_up: bool) -> None:
-        n, payload_bytes = len(packets.rows), packets.payload_bytes
+        n = len(packets.rows)
+        payload_bytes = packets.payload_bytes
         self.counts["packets_made"] += n
         self.counts["bytes_made"] += payload_bytes
         if link_is_up:
@@ -545,9 +553,10 @@ class SimulatedCard:
         dead_s = (later_us + rig.chirp.ramp_end_us + RECOVERY_US) * 1e-6
         native = rig.radar.control == "native"
         die = 1 + [b.name for b in rig.boards].index(board.name)
-        self.radar = (
-            RadarBoard(clock_s, dead_s=dead_s, fault_pulses=faults.radar_fault_pulses, die=die) if native else None
-        )
+        if native:
+            self.radar = RadarBoard(clock_s, dead_s=dead_s, fault_pulses=faults.radar_fault_pulses, die=die)
+        else:
+            self.radar = None
         self._sync = SyncInput(rig, self.radar)
         self._events = PulseEvents(faults)
         self._pulse_faults = PulseFaults(faults, seed, board.name)

@@ -24,7 +24,8 @@ TAIL_S = 2.0  # from the last LVDS data to the short last packet (seen)
 FPGA_VERSION = 2 | 8 << 7  # 2.8: bytes 02 04 (seen)
 DELAY_TICK_S = 8e-9
 TIMER_S = 30
-_MIN_PACKET, _MAX_PACKET = 48, 1470
+_MIN_PACKET = 48
+_MAX_PACKET = 1470
 _CHOICES = (2, 2, 2, 2, 3)  # of each byte of command 0x03 but the last, counted from 1
 _LANES = {1: 4, 2: 2}
 
@@ -77,7 +78,9 @@ class Network(NamedTuple):
         """Parse the 18 bytes of command 0x04. Raises ProtocolError if there are not 18."""
         if len(body) != 18:
             raise ProtocolError(f"EEPROM body of {len(body)} bytes, expected 18")
-        host, card, mac = body[3::-1], body[7:3:-1], body[13:7:-1]
+        host = body[3::-1]
+        card = body[7:3:-1]
+        mac = body[13:7:-1]
         command_port, data_port = struct.unpack("<HH", body[14:])
         return Network(".".join(map(str, host)), ".".join(map(str, card)), mac, command_port, data_port)
 
@@ -150,12 +153,14 @@ class Packetiser:
 
     def flush(self) -> Bytes2D:
         """Return the short last packet, [1, 10 + rest]; [0, 10] if nothing is left."""
-        rest, self._rest = self._rest, np.empty(0, np.uint8)
+        rest = self._rest
+        self._rest = np.empty(0, np.uint8)
         return self._pack(rest.reshape(1 if len(rest) else 0, len(rest)))
 
     def discard(self) -> int:
         """Discard bytes that are not sent yet; return their number."""
-        lost, self._rest = len(self._rest), np.empty(0, np.uint8)
+        lost = len(self._rest)
+        self._rest = np.empty(0, np.uint8)
         return lost
 
     def _pack(self, payload: Bytes2D) -> Bytes2D:
@@ -251,7 +256,9 @@ class Card:
         code, body, well_formed = request
         if code == Code.RECORD_START:
             if not self._recording:
-                self._recording, self._last_data_s, self._started_s = True, None, now_s
+                self._recording = True
+                self._last_data_s = None
+                self._started_s = now_s
                 self.records += 1
             return [message(code, 0)]
         if code == Code.RECORD_STOP:

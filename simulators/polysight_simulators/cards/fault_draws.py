@@ -50,7 +50,10 @@ class NetworkFaults:
         suffers = [int(i) for i in np.flatnonzero(self._suffers(draws))]
         at = 0
         while at < len(rows):
-            next_one = suffers[bisect_left(suffers, at)] if suffers and suffers[-1] >= at else len(rows)
+            if suffers and suffers[-1] >= at:
+                next_one = suffers[bisect_left(suffers, at)]
+            else:
+                next_one = len(rows)
             if self._held or next_one == at:
                 arrived += self._one(rows[at : at + 1], draws[at], self._index)
                 arrived += self._release(self._index)
@@ -103,7 +106,8 @@ class NetworkFaults:
         rows = rows.copy()
         draws = self._corrupt_rng.random((len(rows), 3))
         for i in np.flatnonzero((draws[:, 0] < f.corrupt) | (draws[:, 1] < f.corrupt_header)):
-            row, draw = rows[i], draws[i]
+            row = rows[i]
+            draw = draws[i]
             if draw[0] < f.corrupt:
                 payload_bits = 8 * (len(row) - DATA_HEADER_BYTES)
                 _turn_bit(row, 8 * DATA_HEADER_BYTES + int(draw[2] * payload_bits))
@@ -234,14 +238,18 @@ class OverflowFaults:
         for probability, status, rng in self._kinds:
             for i in np.flatnonzero(rng.random(len(frames)) < probability):
                 lost.setdefault(int(i), status)
-        runs, first = [], 0
+        runs = []
+        first = 0
         for i in sorted(lost):
-            whole, frame = frames[first:i].reshape(-1), frames[i].reshape(-1)
+            whole = frames[first:i].reshape(-1)
+            frame = frames[i].reshape(-1)
             kept = len(frame) // 2
             run = np.concatenate([whole, frame[:kept]])
             runs.append(LvdsRun(run, lost[i], (len(frame) - kept) * frame.itemsize))
             first = i + 1
-        return [*runs, LvdsRun(frames[first:], None, 0)] if first < len(frames) else runs
+        if first < len(frames):
+            return [*runs, LvdsRun(frames[first:], None, 0)]
+        return runs
 
 
 class EventKind(Enum):
@@ -268,7 +276,8 @@ class PulseEvents:
         """Split the pulses before each one with an event."""
         if not pulses or not self._at:
             return [pulses] if pulses else []
-        first, end = pulses[0].number, pulses[0].number + len(pulses)
+        first = pulses[0].number
+        end = pulses[0].number + len(pulses)
         cuts = sorted({0, len(pulses), *(n - first for n in self._at if first <= n < end)})
         return [pulses[a:b] for a, b in pairwise(cuts)]
 

@@ -34,7 +34,8 @@ class CardServer:
         chips: Sequence[RadarSocket] = (),
     ) -> None:
         self._cards = cards
-        self._control, self._chips = control, chips
+        self._control = control
+        self._chips = chips
         self._power_cycle = power_cycle or Event()
         self._wires = wires
         self._trigger = rig.pi.trigger_in
@@ -134,7 +135,9 @@ class CardServer:
             wait = endpoint.flush()
         if wait is not None:
             return min(wait, IDLE_S)
-        return IDLE_S if card.card.deadline_s is None else min(IDLE_S, max(0.001, 0.1 * TAIL_S / self._time_scale))
+        if card.card.deadline_s is None:
+            return IDLE_S
+        return min(IDLE_S, max(0.001, 0.1 * TAIL_S / self._time_scale))
 
     def _listen(self, wanted: bool) -> None:
         """Start or stop reading the wires; unread edges stay in the socket and the hub."""

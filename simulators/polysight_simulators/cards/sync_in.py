@@ -94,7 +94,8 @@ class StageTrack:
     def __init__(self, rig: Instrument, burst_motion: bool = True, backlash_mm: float = 0.0) -> None:
         self._backlash_mm = backlash_mm
         self._middle_ns = None if burst_motion else round(burst_middle_s(rig.burst) * 1e9)
-        self._plan, self._burst = plan_raster(rig.grid), rig.burst
+        self._plan = plan_raster(rig.grid)
+        self._burst = rig.burst
         self._triggers: list[int] = []
         self._centre_mm = (rig.stage.centre_x_mm, rig.stage.centre_y_mm)
         self._lines: list[WireMotion] = []
@@ -126,7 +127,8 @@ class StageTrack:
         A retaken row thus keeps its numbers. A pulse that belongs to no point keeps its number.
         """
         found: list[Pulse] = []
-        edge_ns, first = -1, None
+        edge_ns = -1
+        first = None
         for pulse in pulses:
             at = bisect_right(self._triggers, pulse.t_ns)
             if at and self._triggers[at - 1] != edge_ns:
@@ -155,7 +157,9 @@ class StageTrack:
 
     def _reported_mm(self, t_ns: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
         """Return the reported offsets, and bool [n], True while the stage moves towards -x."""
-        x, y, backwards = np.zeros(len(t_ns)), np.zeros(len(t_ns)), np.zeros(len(t_ns), np.bool_)
+        x = np.zeros(len(t_ns))
+        y = np.zeros(len(t_ns))
+        backwards = np.zeros(len(t_ns), np.bool_)
         if not self._lines:
             return x, y, backwards
         for i, pulse_ns in enumerate(t_ns):

@@ -56,14 +56,14 @@ def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> li
         elif "in" in record:
             sent = [board.read_word() for _ in _words(record["in"])]
             if sent != _words(record["in"]):
-                here = b"".join(w.to_bytes(2, "little") for w in sent).hex()
-                differences.append(f"line {number}: the traced board sent {record['in']}, the simulated one {here}")
+                sent_hex = b"".join(w.to_bytes(2, "little") for w in sent).hex()
+                differences.append(f"line {number}: the traced board sent {record['in']}, the simulated one {sent_hex}")
     return differences
 
 
 def _words(text: str) -> list[int]:
     raw = bytes.fromhex(text)
-    return [int.from_bytes(raw[at : at + 2], "little") for at in range(0, len(raw), 2)]
+    return [int.from_bytes(raw[offset : offset + 2], "little") for offset in range(0, len(raw), 2)]
 
 
 def main() -> int:

@@ -198,14 +198,14 @@ class RadarBoard:
         if not self.ready_for_triggers:
             return False
         cores = self.cores
-        at = self.now() if pulse_s is None else pulse_s
+        time_s = self.now() if pulse_s is None else pulse_s
         period = cores.period_s()
-        too_soon = abs(at - self._pulse_s) < (period if self._dead_s is None else self._dead_s) - 1e-9
+        too_soon = abs(time_s - self._pulse_s) < (period if self._dead_s is None else self._dead_s) - 1e-9
         if too_soon or self._pulses_seen - 1 in self._fault_pulses:
             cores.armed = False
             self._event(RF_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), 0.0)
             return False
-        self._pulse_s, cores.frame_ends = at, self.now() + period
+        self._pulse_s, cores.frame_ends = time_s, self.now() + period
         cores.frames_left -= 1
         if cores.frames_left == 0:
             cores.armed = False
@@ -258,9 +258,9 @@ class RadarBoard:
             )
 
     def _deliver(self) -> None:
-        for at, raw in sorted(self._later, key=lambda p: p[0]):
-            if at <= self.now():
-                self._later.remove((at, raw))
+        for due_s, raw in sorted(self._later, key=lambda p: p[0]):
+            if due_s <= self.now():
+                self._later.remove((due_s, raw))
                 self._waiting.append(raw)
         if self._waiting and not self._out:
             self._offered = True
@@ -297,7 +297,10 @@ class RadarBoard:
         for _ in range(count):
             block, size = struct.unpack_from("<HH", body)
             refused = fault in (Fault.REFUSE, Fault.REFUSE_BARE)
-            error, data, extra = (6, b"", 0.0) if refused else self.cores.execute(block, body[4:size], remaining)
+            if refused:
+                error, data, extra = (6, b"", 0.0)
+            else:
+                error, data, extra = self.cores.execute(block, body[4:size], remaining)
             if error:
                 break
             delay += extra

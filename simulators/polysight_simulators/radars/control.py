@@ -83,9 +83,9 @@ class UsbChip:
     def give(self, name: str, size: int) -> bytes:
         """Return up to `size` bytes of a channel for the host. Raises DeviceError if unplugged."""
         self._check()
-        found = bytes(self._answers[name][:size])
+        answer = bytes(self._answers[name][:size])
         del self._answers[name][:size]
-        return found
+        return answer
 
     def _check(self) -> None:
         if not self._board.plugged:
@@ -261,11 +261,11 @@ class RadarSocket(_Server):
 
     def _execute(self, client: socket.socket, data: bytes) -> bytes:
         while len(data) >= _HEAD.size:
-            channel, what, size = _HEAD.unpack_from(data)
+            channel, operation, size = _HEAD.unpack_from(data)
             port = channel.decode("ascii")
-            if what == b"R":
-                found = self.chip.give(port, size)
-                client.sendall(struct.pack("<H", len(found)) + found)
+            if operation == b"R":
+                answer = self.chip.give(port, size)
+                client.sendall(struct.pack("<H", len(answer)) + answer)
                 data = data[_HEAD.size :]
                 continue
             if len(data) < _HEAD.size + size:

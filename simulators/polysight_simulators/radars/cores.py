@@ -67,8 +67,8 @@ def make_image(size: int = 7940, *, rom: bytes = _ROM) -> bytes:
     image[:0x80] = struct.pack("<4s5I", b"MSTR", 2, 0x37, 0, 0, size - 4).ljust(0x5C, b"\0") + b"MEND".ljust(
         0x24, b"\0"
     )
-    for at, patch in ((_MAIN_AT, _MAIN_PATCH), (_RF_AT, _RF_PATCH)):
-        image[at : at + 0x60] = b"RPRC".ljust(0x38, b"\0") + rom.ljust(0x10, b"\0") + patch.ljust(0x18, b"\0")
+    for offset, patch in ((_MAIN_AT, _MAIN_PATCH), (_RF_AT, _RF_PATCH)):
+        image[offset : offset + 0x60] = b"RPRC".ljust(0x38, b"\0") + rom.ljust(0x10, b"\0") + patch.ljust(0x18, b"\0")
     return bytes(image) + zlib.crc32(image).to_bytes(4, "little")
 
 
@@ -84,8 +84,8 @@ def boot_errors(image: bytes) -> int:
 
 def patch_of(image: bytes, main: bool) -> bytes:
     """Return the last six bytes of a version answer (ICD tables 5.66, 5.157): major, minor, date, build and debug."""
-    at = (_MAIN_AT if main else _RF_AT) + 0x48
-    major, minor, build, debug, *date = image[at : at + 7]
+    offset = (_MAIN_AT if main else _RF_AT) + 0x48
+    major, minor, build, debug, *date = image[offset : offset + 7]
     return bytes((major, minor, *date, build << 4 | debug))
 
 
@@ -159,8 +159,8 @@ class Cores:
         self._file: tuple[int, int] | None = None  # file type, missing bytes
         self._restored: dict[int, bytes] = {}
         self._part = b""
-        for kept in (self.settings, self.profiles, self.chirps):
-            kept.clear()
+        for table in (self.settings, self.profiles, self.chirps):
+            table.clear()
 
     def boot(self) -> None:
         """Boot in functional mode: ROM, then the flash's image if it is complete (ICD 5.21.1)."""
@@ -228,7 +228,9 @@ class Cores:
         return b""
 
     def _patched(self) -> bytes:
-        return self.ram if self.ram and not boot_errors(self.ram) else self._booted
+        if self.ram and not boot_errors(self.ram):
+            return self.ram
+        return self._booted
 
     def _patch(self, main: bool) -> bytes:
         image = self._patched()
@@ -255,12 +257,12 @@ class Cores:
 
     def _read_back(self, number: int, data: bytes) -> tuple[int, bytes]:
         """Read back a setting in the form in which it was sent (ICD 5.6.1..5.6.6)."""
-        kept = {
+        stored = {
             0x0120: lambda: self.profiles.get(struct.unpack_from("<H", data)[0]),
             0x0121: lambda: self.chirps.get(struct.unpack_from("<H", data)[0]),
             0x0122: lambda: self.settings.get(FRAME),
         }[number]()
-        return (5, b"") if kept is None else (0, kept)
+        return (5, b"") if stored is None else (0, stored)
 
     def _calibration(self, number: int, data: bytes) -> tuple[int, bytes]:
         """Save or restore 672 bytes of calibration in three parts (ICD 5.2.11, 5.3.2)."""
@@ -270,11 +272,11 @@ class Cores:
         if number == SAVE:
             if not self.calibrated:
                 return 6, b""
-            whole = (
+            calibration_data = (
                 struct.pack("<2I8xh", self.passes, self.passes, 41)
                 + bytes((self.die * 31 + n) & 0xFF for n in range(654))
             )[:672]
-            return 0, struct.pack("<2H", CHUNKS, part) + whole[CHUNK_BYTES * part : CHUNK_BYTES * (part + 1)]
+            return 0, struct.pack("<2H", CHUNKS, part) + calibration_data[CHUNK_BYTES * part : CHUNK_BYTES * (part + 1)]
         self._restored[part] = data[4:]
         if len(self._restored) == CHUNKS:
             status, copy = struct.unpack_from("<2I", self._restored[0])

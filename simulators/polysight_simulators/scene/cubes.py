@@ -51,8 +51,8 @@ def reference_cube(rig: Instrument, scene: Scene, remove_direct: bool = True) ->
     for board in rig.receivers:
         field = build_field(rig, ideal, board, f)
         direct_m = antennas(rig, board).direct_m
-        away = field.centre_path_m - (direct_m if remove_direct else 0.0 * direct_m)
-        cubes[board.name] = _read(field, rig, f, away, np.ones(len(away), np.complex64), 0.0)
+        path_m = field.centre_path_m - (direct_m if remove_direct else 0.0 * direct_m)
+        cubes[board.name] = _read(field, rig, f, path_m, np.ones(len(path_m), np.complex64), 0.0)
     return cubes
 
 
@@ -98,7 +98,10 @@ def synced_cube(
     seed = scene.seed if seed is None else seed
     board = rig.by_name(board_name)
     d = scene.disturbances
-    f = sample_frequencies_hz(rig) if frequencies_hz is None else np.asarray(frequencies_hz, np.float64)
+    if frequencies_hz is None:
+        f = sample_frequencies_hz(rig)
+    else:
+        f = np.asarray(frequencies_hz, np.float64)
     channels = list(range(len(rig.antennas.rx_mm))) if rx is None else list(rx)
     field = build_field(rig, scene, board, f, cache_dir, channels)
     all_m = antennas(rig, board).direct_m
@@ -109,7 +112,10 @@ def synced_cube(
     if direct:
         level = direct_factor(board, scene) * d.direct_gain * all_m[0] / direct_m
         cube += (gains * level).astype(np.complex64)[:, None, None, None]
-    sigma = _burst_noise(rig, scene, board, seed, field.centre_path_m) if noise is None else noise
+    if noise is None:
+        sigma = _burst_noise(rig, scene, board, seed, field.centre_path_m)
+    else:
+        sigma = noise
     if sigma > 0:
         rng = np.random.default_rng(stream_key(seed, "synced noise", board.name))
         flat = rng.standard_normal((*cube.shape[:-1], 2 * len(f)), dtype=np.float32).view(np.complex64)

@@ -76,8 +76,8 @@ class Axis:
     @property
     def points(self) -> int:
         """Number of kernel positions, a fast length of an FFT."""
-        needed = int(np.ceil((self.high_w - self.low_w + 2 * FADE_M) / self.step)) + 1
-        return int(scipy.fft.next_fast_len(needed) or 0)
+        point_count = int(np.ceil((self.high_w - self.low_w + 2 * FADE_M) / self.step)) + 1
+        return int(scipy.fft.next_fast_len(point_count) or 0)
 
     @property
     def w(self) -> Real:
@@ -138,8 +138,10 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
         for rx in ant.rx_m:
             slope = np.zeros_like(corners[0])
             for antenna in (ant.tx_m, rx):
-                away = np.stack([corners[0] - antenna[0], corners[1] - antenna[1]])
-                slope += away[i] / np.sqrt(away[0] ** 2 + away[1] ** 2 + (nearest_z - antenna[2]) ** 2)
+                distances_m = np.stack([corners[0] - antenna[0], corners[1] - antenna[1]])
+                slope += distances_m[i] / np.sqrt(
+                    distances_m[0] ** 2 + distances_m[1] ** 2 + (nearest_z - antenna[2]) ** 2
+                )
             steepest = max(steepest, wave * float(np.abs(slope).max()))
         step = min(np.pi / (1.1 * steepest + 6 * np.pi / FADE_M), 4e-3)
         axes.append(Axis(span[0], span[1], span[2], span[3], step))
@@ -271,12 +273,12 @@ class _Plane:
                 groups[-1].append(float(height))
             else:
                 groups.append([float(height)])
-        found = []
+        all_levels = []
         for group in groups:
             inside = [i for i, height in enumerate(heights) if group[0] <= height <= group[-1]]
             members = [i for i in inside if i < len(plates)], [i - len(plates) for i in inside if i >= len(plates)]
-            found.append(self._level((group[0] + group[-1]) / 2, members, rx, top_hz))
-        return found
+            all_levels.append(self._level((group[0] + group[-1]) / 2, members, rx, top_hz))
+        return all_levels
 
     def _level(
         self, height_mm: float, members: tuple[list[int], list[int]], rx: Sequence[int], top_hz: float
@@ -286,8 +288,8 @@ class _Plane:
         wx, wy = np.meshgrid(self.x.w, self.y.w)
         legs = [self.ant.legs(wx, wy, r, z) for r in rx]
         lifts = [
-            np.array([(table[i].height_mm - height_mm) / 1e3 for i in own])
-            for table, own in zip((self.scene.plates, self.scene.points), members, strict=True)
+            np.array([(table[i].height_mm - height_mm) / 1e3 for i in chosen])
+            for table, chosen in zip((self.scene.plates, self.scene.points), members, strict=True)
         ]
         relief = float(np.abs(lifts[1]).max(initial=0.0))
         for i, lift in zip(members[0], lifts[0], strict=True):
@@ -302,8 +304,8 @@ class _Plane:
         while reach**n / (2.0 ** (n - 1) * math.factorial(n)) > _RELIEF_TOLERANCE:
             n += 1
         r1, r2, _, _ = self.ant.legs(centre[0], centre[1], 0, z)
-        away = z - self.ant.tx_m[2], z - self.ant.rx_m[0, 2]
-        bend = float(sum((r**2 - h**2) / r**3 for r, h in zip((r1, r2), away, strict=True)))
+        heights_m = z - self.ant.tx_m[2], z - self.ant.rx_m[0, 2]
+        bend = float(sum((r**2 - h**2) / r**3 for r, h in zip((r1, r2), heights_m, strict=True)))
         nodes = (low + high) / 2 + half * cheb_nodes(n)
         return _Level(members[0], members[1], lifts[0], lifts[1], legs, bend, nodes, (low + high) / 2, half)
 
@@ -323,9 +325,11 @@ class _Plane:
         y = _spectra(self.y, ant.centre_m[1] + table[smooth, 1], table[smooth, 3], turn[smooth, 1])
         maps = [_outer(y, weights[smooth, j], x) for j in range(series.shape[1])]
         for n in np.flatnonzero(~smooth):
-            own = self._rough_map(self.surfaces[level.plates[n]], table[n, :2], turn[n], wave * level.steepness[m])
-            for j, one in enumerate(maps):
-                one += np.complex64(weights[n, j]) * own
+            plate_map = self._rough_map(
+                self.surfaces[level.plates[n]], table[n, :2], turn[n], wave * level.steepness[m]
+            )
+            for j, target_map in enumerate(maps):
+                target_map += np.complex64(weights[n, j]) * plate_map
         return maps
 
     def _rough_map(self, parts: Facets, centre_m: Real, turn: Real, per_metre: float) -> NDArray[np.complex64]:
@@ -370,11 +374,12 @@ def compute(
     high = max(leg[2].max() for leg in legs)
     reflect = board_reflectivity(board, scene)
     series = [_angle_series(plane.scene, reflect, nodes_hz, (low, high)) for plane in planes]
-    ax, ay = planes[0].x, planes[0].y
+    ax = planes[0].x
+    ay = planes[0].y
     values = np.zeros((ay.outputs, ax.outputs, len(rx), len(nodes_hz)), dtype=np.complex64)
     for plane, of_plates in zip(planes, series, strict=True):
-        own = [level for other, level in levels if other is plane]
-        kernels = [(level, *_factors(level, low, high, of_plates.shape[2])) for level in own]
+        levels_of_plane = [level for level_plane, level in levels if level_plane is plane]
+        kernels = [(level, *_factors(level, low, high, of_plates.shape[2])) for level in levels_of_plane]
         for q, f in enumerate(nodes_hz):
             total = np.zeros((len(rx), plane.y.points, plane.x.points), dtype=np.complex64)
             for level, angle, shares in kernels:
@@ -385,9 +390,9 @@ def compute(
     if scene.shapes:
         ant = planes[0].ant
         offsets = (ax.first_u + steps[0] * np.arange(ax.outputs), ay.first_u + steps[1] * np.arange(ay.outputs))
-        seen = shape_field(rig, scene, board, offsets, nodes_hz, ant.centre_m, centre)
+        shape_echo = shape_field(rig, scene, board, offsets, nodes_hz, ant.centre_m, centre)
         # As of plates: an infinite mirror gives object_gain d / path.
-        values += np.complex64(scene.object_gain * ant.direct_m[0]) * seen[:, :, list(rx)]
+        values += np.complex64(scene.object_gain * ant.direct_m[0]) * shape_echo[:, :, list(rx)]
     return values, (ax.first_u, ay.first_u), steps, nodes_hz, centre
 
 
@@ -401,10 +406,13 @@ def _planes(rig: Instrument, scene: Scene, board: Board, top_hz: float) -> list[
     amplitudes = sampled(np.array([complex(*p.amplitude) for p in scene.points])) * point_scale(ant)
     amplitudes = amplitudes * direct_factor(board, scene)
     is_background = [p.background for p in scene.plates]
-    parts = [False, True] if any(is_background) and not all(is_background) else [any(is_background)]
+    if any(is_background) and not all(is_background):
+        parts = [False, True]
+    else:
+        parts = [any(is_background)]
     planes = []
     for background in parts:
-        members = [i for i, other in enumerate(is_background) if other == background]
+        members = [i for i, plate_is_background in enumerate(is_background) if plate_is_background == background]
         is_first = background == parts[0]
         part = msgspec.structs.replace(
             scene,
@@ -471,9 +479,9 @@ def _add_level(
     for m in range(len(level.steepness)):
         maps = plane.plate_maps(level, series, f, m)
         point_map = plane.point_map(level, f, m)
-        for r, whole in enumerate(bases):
+        for r, spectrum in enumerate(bases):
             part = shares[r]
-            base = whole if part is None else whole * part[m]
+            base = spectrum if part is None else spectrum * part[m]
             for j, plate_map in enumerate(maps):
                 kernel = (base * level.legs[r][3] * angle[r, :, :, j]).astype(np.complex64)
                 total[r] += plate_map * np.asarray(scipy.fft.ifft2(kernel, norm="forward"))
@@ -573,10 +581,10 @@ class ObjectField:
             )
         position = (u - self.start_m[axis]) / self.step_m[axis]
         index = np.floor(position).astype(np.intp)[:, None] + np.arange(1 - TAPS // 2, 1 + TAPS // 2)
-        away = position[:, None] - index
-        inner = np.sqrt(np.maximum(0.0, 1 - (2 * away / TAPS) ** 2))
+        distance = position[:, None] - index
+        inner = np.sqrt(np.maximum(0.0, 1 - (2 * distance / TAPS) ** 2))
         window = scipy.special.i0(_KAISER_BETA * inner) / scipy.special.i0(_KAISER_BETA)
-        return index, (np.sinc(away) * window).astype(np.float32)
+        return index, (np.sinc(distance) * window).astype(np.float32)
 
 
 def node_matrix(field: ObjectField, frequencies_hz: Real) -> tuple[Real, Real]:

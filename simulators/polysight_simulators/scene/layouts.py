@@ -301,18 +301,18 @@ class AuthorsLayout:
             skipped = self._skipped.get((name, row.index), frozenset())
             points = [i for i in range(row.points) if i not in skipped]
             sent = payload.reshape(row.points, -1, *payload.shape[1:])[points]
-            lost = [(a, min(b, sent.nbytes)) for a, b in gaps[name] if a < sent.nbytes]
+            lost_ranges = [(a, min(b, sent.nbytes)) for a, b in gaps[name] if a < sent.nbytes]
             folder = self.folder / name
             folder.mkdir(exist_ok=True)
-            raw = blank(sent, lost)
+            raw = blank(sent, lost_ranges)
             if not self._zero_filling:
-                ends = [0, *(e for gap in lost for e in gap), len(raw)]
-                kept = [raw[a:b] for a, b in zip(ends[::2], ends[1::2], strict=True)]
+                ends = [0, *(e for gap in lost_ranges for e in gap), len(raw)]
+                pieces = [raw[a:b] for a, b in zip(ends[::2], ends[1::2], strict=True)]
             else:
-                kept = [raw]
+                pieces = [raw]
             with named(folder / f"{stem}.bin"):
-                (folder / f"{stem}.bin").write_bytes(b"".join(kept))
-            (folder / f"{stem}_log.csv").write_text(self._log(len(raw), lost, points, step_s), encoding="ascii")
+                (folder / f"{stem}.bin").write_bytes(b"".join(pieces))
+            (folder / f"{stem}_log.csv").write_text(self._log(len(raw), lost_ranges, points, step_s), encoding="ascii")
         self._now_s += row.points * step_s + LATE_S + 2.0
 
     def end(self) -> None:
@@ -327,10 +327,10 @@ class AuthorsLayout:
         frame = self._rig.frame_bytes
         pulses = self._rig.burst.pulses
         period_s = self._rig.burst.period_us * 1e-6
-        gone = {start // full for a, b in lost for start in range(a - a % full, b, full)}
+        lost_packets = {start // full for a, b in lost for start in range(a - a % full, b, full)}
         lines = []
         for k, start in enumerate(range(0, size, full)):
-            if k in gone:
+            if k in lost_packets:
                 continue
             stop = min(start + full, size)
             position, chirp = divmod((stop - 1) // frame, pulses)
@@ -456,7 +456,12 @@ def write_cube(
         direct_m = antennas(rig, board).direct_m
         if keep_direct:
             cube += (direct_factor(board, scene) * direct_m[0] / direct_m).astype(np.complex64)[:, None, None, None]
-        away = direct_m if from_transmitter else direct_m - direct_m[0] if common_reference else 0 * direct_m
-        cube *= np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(away, f)).astype(np.complex64)[:, None, None]
+        if from_transmitter:
+            removed_m = direct_m
+        elif common_reference:
+            removed_m = direct_m - direct_m[0]
+        else:
+            removed_m = 0 * direct_m
+        cube *= np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(removed_m, f)).astype(np.complex64)[:, None, None]
         np.save(folder / f"{board_name}_synced.npy", cube.conj() if conjugate else cube)
     return folder

@@ -256,15 +256,15 @@ class SimulatedRig:
         n, rx, samples = signal.shape
         out = np.empty((n, samples, 2 * rx), dtype=np.int16)
         scale = np.float32(_FULL_SCALE / d.adc_full_scale)
-        for at in range(0, n, _BATCH):
-            part = signal[at : at + _BATCH]
+        for start in range(0, n, _BATCH):
+            part = signal[start : start + _BATCH]
             parts = part.view(np.float32).reshape(*part.shape, 2).transpose(0, 2, 3, 1)
             counts = np.rint(parts * scale)
             extreme = np.abs(counts).max(initial=0.0)
             if extreme > _FULL_SCALE:
                 self.clipped[board_name] += int(np.sum(np.abs(counts) > _FULL_SCALE))
                 np.clip(counts, -_FULL_SCALE - 1, _FULL_SCALE, out=counts)
-            out[at : at + _BATCH] = counts.reshape(len(part), samples, 2 * rx)
+            out[start : start + _BATCH] = counts.reshape(len(part), samples, 2 * rx)
         return out
 
     def signals(
@@ -280,8 +280,8 @@ class SimulatedRig:
         first = self._next_pulse[board_name] if first_pulse is None else first_pulse
         self._next_pulse[board_name] = first + len(x_mm)
         out = np.empty((len(x_mm), len(self.rig.antennas.rx_mm), self.rig.chirp.samples), dtype=np.complex64)
-        for at in range(0, len(x_mm), _BATCH):
-            batch = slice(at, min(at + _BATCH, len(x_mm)))
+        for start in range(0, len(x_mm), _BATCH):
+            batch = slice(start, min(start + _BATCH, len(x_mm)))
             pulses = np.arange(first + batch.start, first + batch.stop, dtype=np.int64)
             self._noise(board, pulses, out[batch])
             if board.role == "transmit":
@@ -299,11 +299,11 @@ class SimulatedRig:
         burst = self.rig.burst
         stage = self.rig.stage
         d = self.scene.disturbances
-        lost = d.backlash_mm if direction < 0 else 0.0
+        backlash_mm = d.backlash_mm if direction < 0 else 0.0
         if not d.burst_motion:
-            return np.full(burst.chirps_a_position, direction * mean_burst_travel_mm(burst, stage) + lost)
+            return np.full(burst.chirps_a_position, direction * mean_burst_travel_mm(burst, stage) + backlash_mm)
         after_s = FIRST_PULSE_DELAY_S + np.array(burst.chirp_times_s)
-        return direction * stage.speed_mm_s * after_s + lost
+        return direction * stage.speed_mm_s * after_s + backlash_mm
 
     def _receiving(self, name: str) -> _ReceivingBoard:
         if name not in self._boards:
@@ -320,25 +320,28 @@ class SimulatedRig:
         out: NDArray[np.complex64],
     ) -> None:
         d = self.scene.disturbances
-        own = self._receiving(board.name)
+        receiver = self._receiving(board.name)
         chirp = self.rig.chirp
         frames = pulses // self.rig.burst.chirps  # all chirps of a frame start with one pulse
         delay = sync_delay_s(d, self.seed, board, frames) - sync_delay_s(d, self.seed, self.rig.transmitter, frames)
-        turns = pulse_uniform(stream_key(self.seed, "phase", board.name), pulses) if d.random_phase else 0.0 * delay
-        factor, shift = per_chirp(own.receiver, delay, 2 * np.pi * turns, d.hpf)
-        inside = own.field.covers(x_m, y_m)
+        if d.random_phase:
+            turns = pulse_uniform(stream_key(self.seed, "phase", board.name), pulses)
+        else:
+            turns = 0.0 * delay
+        factor, shift = per_chirp(receiver.receiver, delay, 2 * np.pi * turns, d.hpf)
+        inside = receiver.field.covers(x_m, y_m)
         self.outside[board.name] += int(np.sum(~inside))
-        nodes = np.zeros((len(x_m), *own.direct.shape[1:2], own.expand.shape[1]), dtype=np.complex64)
+        nodes = np.zeros((len(x_m), *receiver.direct.shape[1:2], receiver.expand.shape[1]), dtype=np.complex64)
         if inside.any():
-            gains = echo_drift(self.rig, d, board, pulses[inside])[:, None] * own.receiver.gains
-            nodes[inside] = own.field.at(x_m[inside], y_m[inside]) * gains[:, :, None]
+            gains = echo_drift(self.rig, d, board, pulses[inside])[:, None] * receiver.receiver.gains
+            nodes[inside] = receiver.field.at(x_m[inside], y_m[inside]) * gains[:, :, None]
         # One small product per chirp: BLAS runs larger ones in threads, which is slow beside other processes.
-        ideal = np.matmul(nodes[:, None], own.expand)  # [chirp, 2, rx, sample]
-        ideal += own.direct
+        ideal = np.matmul(nodes[:, None], receiver.expand)  # [chirp, 2, rx, sample]
+        ideal += receiver.direct
         if not d.hpf:
             out += factor[:, None] * ideal[:, 0]
             return
-        h, slope = high_pass(own.middle_hz + shift, chirp)
+        h, slope = high_pass(receiver.middle_hz + shift, chirp)
         ideal[:, 0] *= (factor * h).astype(np.complex64)[:, None]
         ideal[:, 1] *= (factor * slope).astype(np.complex64)[:, None]
         out += ideal[:, 0]

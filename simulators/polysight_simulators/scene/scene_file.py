@@ -293,7 +293,9 @@ class Disturbances(_Table, frozen=True):
     @property
     def direct_gain(self) -> float:
         """Amplitude of the direct path relative to a free path; 0 without direct path."""
-        return 0.0 if isinstance(self.direct_loss_db, str) else 10 ** (-self.direct_loss_db / 20)
+        if isinstance(self.direct_loss_db, str):
+            return 0.0
+        return 10 ** (-self.direct_loss_db / 20)
 
 
 OFF: dict[str, Any] = {
@@ -367,8 +369,8 @@ def _apply_switches(table: Any, source: str) -> Any:
     """Replace `ideal = true` and "off"/"on" (or false/true) in a [disturbances] table by plain values."""
     if not isinstance(table, dict):
         return table
-    given = dict(table)
-    ideal = given.pop("ideal", False)
+    values = dict(table)
+    ideal = values.pop("ideal", False)
     if not isinstance(ideal, bool):
         raise ConfigError(
             f"{source}: disturbances.ideal = {ideal!r}",
@@ -377,7 +379,7 @@ def _apply_switches(table: Any, source: str) -> Any:
             code=ErrorCode.TYPE_WRONG,
         )
     result: dict[str, Any] = dict(OFF) if ideal else {}
-    for key, value in given.items():
+    for key, value in values.items():
         if value == "off" or value is False:
             if key not in OFF and key in Disturbances.__struct_fields__:
                 raise ConfigError(
@@ -450,10 +452,12 @@ def _known_leakage(scene: Scene) -> dict[str, Any]:
     if d.leakage_measured is not None:
         rng = np.random.default_rng(stream_key(scene.seed, "leakage"))
         error = rng.standard_normal((2, 2)) * d.leakage_measured
-        found = (np.array([d.leakage_h, d.leakage_v]) + error).tolist()
-        return {**dict(zip(parts, found, strict=True)), "leakage_std": d.leakage_measured}
+        measured = (np.array([d.leakage_h, d.leakage_v]) + error).tolist()
+        return {**dict(zip(parts, measured, strict=True)), "leakage_std": d.leakage_measured}
     none = {key: [0.0, 0.0] for key in parts if not any(getattr(d, key))}
-    return {**none, "leakage_std": 0.0} if len(none) == len(parts) else none
+    if len(none) == len(parts):
+        return {**none, "leakage_std": 0.0}
+    return none
 
 
 _AIR = (1.0, 0.0)
@@ -529,11 +533,11 @@ def _move_with_plane(plate: Plate, scene: Scene) -> Plate:
     """Return the plate with shift and tilt of the plane added."""
     tilt = plate.tilt_deg
     if any(scene.plane_tilt_deg):
-        both = [
+        corners = [
             math.tan(math.radians(a)) + math.tan(math.radians(b))
             for a, b in zip(tilt, scene.plane_tilt_deg, strict=True)
         ]
-        tilt = (math.degrees(math.atan(both[0])), math.degrees(math.atan(both[1])))
+        tilt = (math.degrees(math.atan(corners[0])), math.degrees(math.atan(corners[1])))
     height_mm = plate.height_mm + _plane_height_mm(scene, plate.centre_mm)
     return msgspec.structs.replace(plate, tilt_deg=tilt, height_mm=height_mm)
 
@@ -550,7 +554,9 @@ def _draw_permittivities(plate: Plate, index: int, scene: Scene) -> Plate:
 
 def _vary_layer(layer: Layer, scene: Scene, rng: np.random.Generator) -> Layer:
     varied = _vary(layer.permittivity, scene.specimen_spread, rng)
-    return layer if layer.permittivity == _AIR else msgspec.structs.replace(layer, permittivity=varied)
+    if layer.permittivity == _AIR:
+        return layer
+    return msgspec.structs.replace(layer, permittivity=varied)
 
 
 def _vary(nominal: Pair, spread: Pair, rng: np.random.Generator) -> Pair:

@@ -178,8 +178,8 @@ def simulate(
     facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id}
     if layout == "own":
         stamp = datetime.fromtimestamp(started_s, UTC).isoformat(timespec="seconds")
-        own = OwnLayout(out, rig, plan, scan_id, stamp)
-        return _write_scan(own, radar, plan, rig.recorded, by_columns, progress, facts)
+        own_layout = OwnLayout(out, rig, plan, scan_id, stamp)
+        return _write_scan(own_layout, radar, plan, rig.recorded, by_columns, progress, facts)
     authors = AuthorsLayout(out, rig, scan_id, started_s, zero_filling, by_columns, skipped)
     _write_scan(authors, radar, plan, rig.boards, by_columns, progress, facts)
     # The authors' files contain neither geometry nor filter nor leakage.

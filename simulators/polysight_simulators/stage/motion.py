@@ -59,7 +59,9 @@ class StepEngine:
 
     def ramp_steps(self, rate: int) -> int:
         """Return the steps from rest to `rate`: v^2 / 2a, rounded up."""
-        return 0 if rate <= self._slowest else -(-rate * rate // (2 * self.accel))
+        if rate <= self._slowest:
+            return 0
+        return -(-rate * rate // (2 * self.accel))
 
     @property
     def finished(self) -> bool:

@@ -17,7 +17,7 @@ from polysight_shared import __version__
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.errors import PolysightError, os_error
 from polysight_shared.faults import explain
-from polysight_shared.program import close_standard_output, open_standard_streams
+from polysight_shared.program import close_standard_output, expand_home, open_standard_streams
 from polysight_shared.raster import WIDTH_TEXT
 
 # Commands import their modules when they are called, so `--help` needs no other package.
@@ -285,7 +285,7 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Entry point. Returns 0 on success; an error is one message on stderr, without a trace."""
     open_standard_streams()
-    args = _parser().parse_args(argv)
+    args = _parser().parse_args(expand_home(sys.argv[1:] if argv is None else argv))
     try:
         return args.action(args) if args.action is _keys else args.action(args, _rig(args))
     except PolysightError as e:

@@ -69,11 +69,13 @@ class DataError(PolysightError):
 def no_such(path: Path) -> DataError:
     """Return the error for a missing file or folder."""
     try:
-        near = did_you_mean(path.name, [p.name for p in path.parent.iterdir()])
+        names_beside = [p.name for p in path.parent.iterdir()]
+        cause = "the path is wrong"
     except OSError:
-        near = f"{path.parent} does not exist either"
-    remedy = near or "give the path of an existing file or folder"
-    return DataError(f"{path}: does not exist", "the path is wrong", remedy, code=ErrorCode.FILE_MISSING)
+        names_beside = []
+        cause = f"the path is wrong: {path.parent} does not exist either"
+    remedy = did_you_mean(path.name, names_beside) or "give the path of an existing file or folder"
+    return DataError(f"{path}: does not exist", cause, remedy, code=ErrorCode.FILE_MISSING)
 
 
 class ProtocolError(PolysightError):

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 
 # Until an interrupted command looks again whether a module is still loading.
 _RETRY_S = 0.02
+
+
+def expand_home(words: Sequence[str]) -> list[str]:
+    """Put the home folder in the place of `~/` at the start of a word or of an option's value.
+
+    A shell leaves it as it is in quotes, and in `--out=~/scans`.
+    """
+    option_or_nothing = r"^((?:-[\w-]*|[\w.]+)=)?"
+    return [re.sub(option_or_nothing + "~/", lambda m: f"{m[1] or ''}{Path.home()}/", word) for word in words]
 
 
 def open_standard_streams() -> None:

@@ -42,7 +42,9 @@ def read_toml(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         remedy = "give the path of a TOML file"
         raise ConfigError(f"{path}: no such file", "the path is wrong", remedy, code=ErrorCode.FILE_MISSING) from None
-    except (OSError, UnicodeDecodeError, DataError) as e:
+    except DataError as e:
+        raise ConfigError(e.what, e.why, e.remedy, code=ErrorCode.FILE_UNREADABLE) from None
+    except (OSError, UnicodeDecodeError) as e:
         what = f"{path}: cannot be read: {e}"
         why = "it is not a readable text file"
         raise ConfigError(what, why, "check the path", code=ErrorCode.FILE_UNREADABLE) from None

@@ -43,6 +43,7 @@ class WireMotion(NamedTuple):
 
 
 WireMessage = WireEdge | WireMotion
+_RIG_ENDED = "the simulated rig ended", "start it again"
 
 
 def encode(message: WireMessage) -> bytes:
@@ -121,7 +122,7 @@ class WireClient:
         try:
             self._socket.sendall(b"".join(map(encode, messages)))
         except OSError as e:
-            raise DeviceError(f"simulated wires at {self._path} broke: {e}", "the simulated rig ended") from None
+            raise DeviceError(f"simulated wires at {self._path} broke: {e}", *_RIG_ENDED) from None
 
     def receive(self, timeout_s: float | None) -> WireMessage | None:
         """Return the next message, or None after `timeout_s`. Raises DeviceError if the hub is gone."""
@@ -136,12 +137,12 @@ class WireClient:
             except (TimeoutError, BlockingIOError):
                 return None
             except OSError as e:
-                raise DeviceError(f"simulated wires at {self._path} broke: {e}", "the simulated rig ended") from None
+                raise DeviceError(f"simulated wires at {self._path} broke: {e}", *_RIG_ENDED) from None
             finally:
                 if self._socket.fileno() >= 0:
                     self._socket.settimeout(None)
             if not data:
-                raise DeviceError(f"simulated wires at {self._path} were closed", "the simulated rig ended")
+                raise DeviceError(f"simulated wires at {self._path} were closed", *_RIG_ENDED)
             lines = (self._buffer + data).split(b"\n")
             self._buffer = lines.pop()
             self._pending = [line.decode("ascii", "replace") for line in reversed(lines)]

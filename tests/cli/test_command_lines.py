@@ -15,7 +15,9 @@ from polysight.cli.main import build_parser, main
 from polysight.cli.options import joined
 from polysight.materials.library import SIMULATED_LIBRARY
 from polysight.products import write_json
+from polysight_pi.cli import main as polysight_pi
 from polysight_shared.error_codes import ErrorCode
+from polysight_shared.program import expand_home
 
 E = {"real": 4.5, "imag": -0.4, "real_std": 0.07, "imag_std": 0.08}
 SEGMENTS = [
@@ -108,6 +110,23 @@ def test_a_shift_of_the_plane_is_a_length_in_the_lab(text):
 def test_a_place_left_of_the_middle_needs_no_equals_sign(words, value):
     given = joined(["process", "scan", *words, "--out", "o"])
     assert build_parser().parse_args(given).metal == value
+
+
+@pytest.mark.parametrize("words", [["{}"], ["--out={}"], ["--out", "{}"], ["--strips", "90={}"]])
+def test_a_tilde_that_the_shell_left_is_the_home_folder(words, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/somebody")
+    given = [word.format("~/scans/one") for word in words]
+    assert expand_home(given) == [word.format("/home/somebody/scans/one") for word in words]
+    kept = ["~", "~other/x", "a ~/b", "--text", "see a=b ~/c"]
+    assert expand_home(kept) == kept
+
+
+def test_both_programs_take_a_tilde(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for program in (["validate", "~/nowhere"], ["pi", "check", "--config", "~/nowhere"]):
+        status = polysight_pi(program[1:]) if program[0] == "pi" else main(program)
+        assert status > 0
+        assert str(tmp_path / "nowhere") in capsys.readouterr().err
 
 
 def test_other_words_are_left_as_they_are():

@@ -46,6 +46,30 @@ def test_no_function_is_over_60_lines():
     assert long == {}
 
 
+PROGRAM_FOLDERS = ("host", "shared", "pi_controller", "papers")
+ERRORS_FOR_PEOPLE = ("ConfigError", "DataError", "DeviceError", "ScanError")
+
+
+def errors_without_three_parts(file: Path) -> list[int]:
+    """Lines of errors that are raised without a cause or an advice."""
+    lines = []
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name):
+            continue
+        keywords = {keyword.arg for keyword in node.keywords}
+        parts = len(node.args) + len(keywords & {"why", "remedy"})
+        is_unpacked = any(isinstance(argument, ast.Starred) for argument in node.args)
+        if node.func.id in ERRORS_FOR_PEOPLE and parts < 3 and not is_unpacked:
+            lines.append(node.lineno)
+    return lines
+
+
+def test_every_error_says_what_why_and_what_to_do():
+    files = [file for file in tracked(".py") if file.relative_to(ROOT).parts[0] in PROGRAM_FOLDERS]
+    incomplete = {str(file.relative_to(ROOT)): errors_without_three_parts(file) for file in files}
+    assert {name: lines for name, lines in incomplete.items() if lines} == {}
+
+
 def test_the_root_of_host_is_the_flow_and_rooms():
     assert {p.name for p in HOST.glob("*.py")} == {"__init__.py", "__main__.py", "pipeline.py", "settings.py"}
     assert len((HOST / "pipeline.py").read_text(encoding="utf-8").splitlines()) <= 115

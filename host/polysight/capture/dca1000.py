@@ -225,7 +225,9 @@ def decode_two_lane(
     """
     if samples % 2:
         what = f"a 2-lane chirp has an even number of samples, not {samples}"
-        raise DataError(what, "wrong number of samples given", code=ErrorCode.VALUE_INVALID)
+        raise DataError(
+            what, "a wrong number of samples was given", "correct the samples of a chirp", code=ErrorCode.VALUE_INVALID
+        )
     words = _words(payload, chirps * samples * rx * 2).reshape(chirps, rx, samples // 2, 2, 2)
     return _complex(words.transpose(3, 1, 0, 2, 4).reshape(2, rx, chirps, samples), swap_iq)
 

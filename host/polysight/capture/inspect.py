@@ -145,8 +145,9 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
     sizes = np.array([len(p) for p in packets]) - dca1000.PACKET_HEADER_BYTES
     size = int((ahead + sizes).max() - ahead.min())
     if size > 1 << 34:
-        what = f"byte counts span {size} bytes: more than one record, or corrupted packets"
-        raise DataError(what, code=ErrorCode.FILE_DAMAGED)
+        what = f"byte counts span {size} bytes"
+        why = "the file holds more than one record, or corrupted packets"
+        raise DataError(what, why, "cut the capture to one record", code=ErrorCode.FILE_DAMAGED)
     log = PacketLog(size)
     for packet in packets:
         log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), 0)
@@ -298,7 +299,12 @@ def read_pcap(path: Path) -> Iterator[Datagram]:
         raise DataError(what, why, remedy, code=ErrorCode.FILE_FOREIGN) from None
     if reader.datalink() != dpkt.pcap.DLT_EN10MB:
         what = f"{path}: link type {reader.datalink()}, expected {dpkt.pcap.DLT_EN10MB} (Ethernet)"
-        raise DataError(what, "recorded on `-i any`?", code=ErrorCode.FILE_FOREIGN)
+        raise DataError(
+            what,
+            "recorded on `-i any`?",
+            "record on one Ethernet interface: tcpdump -i eth0",
+            code=ErrorCode.FILE_FOREIGN,
+        )
     count = 0
     try:
         for t_s, frame in reader:

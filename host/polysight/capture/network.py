@@ -164,7 +164,8 @@ class BatchReceiver:
             number = ctypes.get_errno()
             if number in (errno.EAGAIN, errno.EINTR):
                 return 0
-            raise DeviceError(f"receiving from the capture card failed: {os.strerror(number)}")
+            what = f"receiving from the capture card failed: {os.strerror(number)}"
+            raise DeviceError(what, "the network interface went down", "`polysight doctor` names the hop")
         self.lengths[:n] = self._received[:n]
         self._name_lengths[:n] = 16
         return n

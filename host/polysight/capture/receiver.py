@@ -243,7 +243,7 @@ def send(connection: Connection, message: Request | Answer) -> None:
         connection.send_bytes(_encoder.encode(message))
     except OSError as e:
         what, why = f"the receiver's pipe broke: {e}", "the other process ended"
-        raise DeviceError(what, why, code=ErrorCode.NO_ANSWER) from None
+        raise DeviceError(what, why, "start the scan again", code=ErrorCode.NO_ANSWER) from None
 
 
 def next_request(connection: Connection) -> Request:

@@ -32,6 +32,7 @@ _MAX_BATCHES = 64  # batches fetched before requests are checked again
 _PREVIEW_SHARE = 20  # previews take at most 1/20 of the time
 _IDLE_MS = 1
 _SLEPT_NS = 200_000  # a poll() of this length has slept: nothing was there when it began
+_RESTART = "start the scan again"
 _GATHER_MS = 1  # pause in which packets gather in the kernel's buffer: fewer, larger batches
 
 
@@ -138,7 +139,7 @@ class Receiver:
 
     def _begin(self, request: messages.BeginRow) -> messages.Answer:
         if self._socket is None or self._batches is None:
-            raise DeviceError("the receiver has no socket yet")
+            raise DeviceError("the receiver has no socket yet", "a row began before the cards were opened", _RESTART)
         if self._row is not None:
             self._discard()
         segment = Segment(Path(request.path), request.expected_bytes)
@@ -147,7 +148,7 @@ class Receiver:
         except MemoryError:
             segment.discard()
             what = f"{request.path}: no memory for a row of {request.expected_bytes} bytes"
-            raise DeviceError(what, "the row is larger than memory") from None
+            raise DeviceError(what, "the row is larger than memory", "scan shorter rows, or fewer pulses") from None
         strays = PacketLog(0)
         while n := self._batches.receive():
             strays.add(self._batches.packets[:n], self._batches.lengths[:n], time.monotonic_ns())
@@ -181,7 +182,7 @@ class Receiver:
     def _end(self, request: messages.EndRow) -> messages.Answer:
         row = self._row
         if row is None or self._socket is None or self._batches is None:
-            raise DeviceError("no row is being received")
+            raise DeviceError("no row is being received", "a row ended that had not begun", _RESTART)
         self._receive()
         self._row = None
         begun, log, path = row.request, row.log, Path(row.request.path)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from polysight_shared import __version__
 from polysight_shared.program import (
     close_standard_output,
+    expand_home,
     flush_standard_output,
     interrupts_between_imports,
     open_standard_streams,
@@ -62,15 +63,15 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
         sub.most_used = most_used
         return sub
 
-    wanted = [family for family, names in FAMILIES.items() if command in names]
-    for family in wanted or FAMILIES:
+    families = [family for family, names in FAMILIES.items() if command in names]
+    for family in families or FAMILIES:
         import_module(f"polysight.cli.{family}").add_commands(add)
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    words = list(sys.argv[1:] if argv is None else argv)
+    words = expand_home(sys.argv[1:] if argv is None else argv)
     name = " ".join(["polysight", *words[:1]])
     open_standard_streams()
     try:

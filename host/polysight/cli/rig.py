@@ -442,7 +442,10 @@ def _reproduce(args: argparse.Namespace) -> int:
 
         return reproduce_authors(args.authors, args.out, args.config, args.items, args.images, args.names)
     if args.images is not None or args.names is not None:
-        raise ConfigError("--images and --names say how to read the published files", "no --authors was given")
+        raise ConfigError(
+            "--images and --names say how to read the published files", "no --authors was given",
+            "give --authors DIR, or leave them out", code=ErrorCode.VALUES_CONFLICT,
+        )  # fmt: skip
     from polysight_papers.sensys2026.item import Run
     from polysight_papers.sensys2026.run import reproduce
 

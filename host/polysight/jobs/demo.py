@@ -117,7 +117,7 @@ def simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) ->
 def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
     """Return the rig file named by the rig's `ready` line."""
     if rig.stdout is None or rig.stderr is None:
-        raise DeviceError("the simulated rig has no output to read")
+        raise DeviceError("the simulated rig has no output to read", "it was started without pipes", "start it again")
     deadline = time.monotonic() + _START_LIMIT_S
     with selectors.DefaultSelector() as selector:
         selector.register(rig.stdout, selectors.EVENT_READ)

@@ -129,7 +129,11 @@ def permittivity(
         raise products.verdict.error("the images are kept")
     patches = [patch for patch in products.segments if segment is None or patch.label == segment]
     if not patches:
-        raise DataError(f"{products.folder}: no segment {segment}", f"its number is not in {MATERIALS}")
+        raise DataError(
+            f"{products.folder}: no segment {segment}",
+            f"its number is not in {MATERIALS}",
+            f"`polysight materials {products.folder}` lists them",
+        )
     chirp = _chirp(products, config) if stack else None
     out: list[dict[str, Any]] = []
     lines: list[str] = []

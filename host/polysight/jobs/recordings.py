@@ -30,7 +30,7 @@ from polysight.store import (
 )
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, PolysightError
+from polysight_shared.errors import DataError, PolysightError, os_error
 
 _SHOWN = 8  # missing ranges that are printed
 BOTTOM_DB = -20.0  # of the plot of a range profile
@@ -174,7 +174,7 @@ def plot_profile(report: Report, path: Path) -> None:
     try:
         figure.savefig(path, format="png", dpi=120)
     except OSError as e:
-        raise DataError(f"{path}: cannot be written: {e.strerror}", "no such folder, or no permission") from None
+        raise os_error(e) from None
 
 
 # --- placement of packets ---

@@ -242,7 +242,7 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
                 folder = Path(temporary) / f"{file.stem}-{again}"
                 command = ["simulate", str(file), "--config", str(config), "--out", str(folder)]
                 if run_simulator([*command, "--specimens", str(again)]):
-                    raise ScanError(f"{file}: simulation failed, see above")
+                    raise ScanError(f"{file}: simulation failed", "the lines above say why", "correct the scene file")
                 scans.append(training_scan(folder, config))
                 shutil.rmtree(folder)
     note = (

@@ -79,12 +79,14 @@ class Weights:
             w = Weights(float(raw["h"]), float(raw["v"]), float(raw["p"]), raw["measure"], int(raw["neighbours"]))
         except (KeyError, TypeError, ValueError) as e:
             raise DataError(
-                f"the library's weights cannot be read: {e}", "made by another version", code=ErrorCode.VALUE_INVALID
-            ) from None
+                f"the library's weights cannot be read: {e}", "another release made it", "train it again",
+                code=ErrorCode.VALUE_INVALID,
+            ) from None  # fmt: skip
         if w.measure not in MEASURES or min(w.h, w.v, w.p) < 0 or w.neighbours < 1:
             raise DataError(
-                f"the library's weights are invalid: {raw}", "made by another version", code=ErrorCode.VALUE_INVALID
-            )
+                f"the library's weights are invalid: {raw}", "another release made it", "train it again",
+                code=ErrorCode.VALUE_INVALID,
+            )  # fmt: skip
         return w
 
 

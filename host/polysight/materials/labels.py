@@ -61,6 +61,7 @@ def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
         raise DataError(
             f"the content of the truth file is invalid: {type(e).__name__}: {e}",
             "expected plates = [{name, centre_mm, size_mm, permittivity or metal}]",
+            "remove the file: a report does without it",
             code=ErrorCode.VALUE_INVALID,
         ) from None
 
@@ -312,7 +313,7 @@ def patches_from_labels(
         if not mask.any():
             raise DataError(
                 f"label {name}: box {box} has no pixel", f"the image has {x.size} x {y.size} pixels",
-                code=ErrorCode.NO_DATA,
+                "correct the box in the label file", code=ErrorCode.NO_DATA,
             )  # fmt: skip
         n = len(patches) + 1
         patches.append(make_patch(n, mask, x_m, y_m, margin_mm))

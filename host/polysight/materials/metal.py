@@ -246,6 +246,7 @@ def metal_by_label(label: int, segmentation: Segmentation) -> MetalReference:
     raise DataError(
         f"there is no patch {label} to take as metal",
         f"{len(segmentation.patches)} patches were found",
+        "give the number of one of them",
         code=ErrorCode.NO_DATA,
     )
 

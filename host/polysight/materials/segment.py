@@ -202,15 +202,17 @@ def segment(
     cfg = settings or SegmentSettings()
     if h.shape != v.shape or h.shape != (np.size(y_m), np.size(x_m)):
         raise DataError(
-            f"images {h.shape}, {v.shape} do not fit axes of {np.size(y_m)} x {np.size(x_m)}", code=ErrorCode.MISMATCH
-        )
+            f"images {h.shape}, {v.shape} do not fit axes of {np.size(y_m)} x {np.size(x_m)}",
+            "they are not of one scan", "give arrays of one scan", code=ErrorCode.MISMATCH,
+        )  # fmt: skip
     usable = np.isfinite(h) & np.isfinite(v)
     if valid is not None:
         usable &= valid
     if not usable.any():
         raise DataError(
-            "the image has no valid pixel", "nothing was recorded, or all of it was masked", code=ErrorCode.NO_DATA
-        )
+            "the image has no valid pixel", "nothing was recorded, or all of it was masked", "look at quality.json",
+            code=ErrorCode.NO_DATA,
+        )  # fmt: skip
     pixel_mm = abs(float(axis_mm(x_m)[1] - axis_mm(x_m)[0]))
     level = np.maximum(level_db(h, v, usable, cfg.smooth_px, cfg.smallest_mm / pixel_mm / 2), cfg.floor_db)
     even = _without_speckle(level, usable, cfg, pixel_mm)

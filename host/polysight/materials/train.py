@@ -107,6 +107,8 @@ class LabelledScan:
         if not mask.any():
             raise DataError(
                 f"{self.scan}: the box of {name}, {self.boxes[name]}, holds no pixel of the {self.h.shape} image",
+                "the label file is of another scan",
+                "correct the box, or leave the scan out",
                 code=ErrorCode.NO_DATA,
             )
         return mask
@@ -151,13 +153,14 @@ def read_labelled_scan(folder: Path) -> LabelledScan:
             ) from None  # fmt: skip
         if image.ndim != 2 or not np.iscomplexobj(image):
             raise DataError(
-                f"{path}: {image.dtype} {image.shape}", "expected a complex image [150, 150]", code=ErrorCode.TYPE_WRONG
-            )
+                f"{path}: {image.dtype} {image.shape}", "expected a complex image [150, 150]",
+                "give a folder labels/<scan> of the published data", code=ErrorCode.TYPE_WRONG,
+            )  # fmt: skip
         images.append(image.astype(np.complex64))
     if images[0].shape != images[1].shape:
         raise DataError(
             f"{folder}: images of {images[0].shape} and {images[1].shape}", "they are not of one scan",
-            code=ErrorCode.MISMATCH,
+            "copy the folder again", code=ErrorCode.MISMATCH,
         )  # fmt: skip
     return LabelledScan(folder.name, description, images[0], images[1], boxes, "simulated" in description.lower())
 
@@ -262,7 +265,7 @@ def read_pickle(path: Path) -> Any:
     except OSError as e:
         raise DataError(
             f"{path}: cannot be read: {e.strerror}", "the path is wrong, or you may not read it",
-            code=ErrorCode.FILE_UNREADABLE,
+            "check the path and its permissions", code=ErrorCode.FILE_UNREADABLE,
         ) from None  # fmt: skip
     except pickle.UnpicklingError as e:
         raise DataError(
@@ -274,7 +277,7 @@ def read_pickle(path: Path) -> Any:
     except Exception as e:  # noqa: BLE001 - a damaged pickle raises anything
         raise DataError(
             f"{path}: not a pickle: {type(e).__name__}: {e}", "it is truncated or another file",
-            code=ErrorCode.FILE_DAMAGED,
+            "download it again, or leave it out", code=ErrorCode.FILE_DAMAGED,
         ) from None  # fmt: skip
 
 
@@ -297,18 +300,19 @@ def read_material(path: Path) -> Entry:
         raise DataError(
             f"{path}: not a material file: {type(e).__name__}: {e}",
             "expected a dict with name, collection_name, incident_angle, ref_name, values [P, H, V], ref_values",
+            "leave the file out",
             code=ErrorCode.FILE_FOREIGN,
         ) from None
     if not p.size == h.size == v.size > 0 or not ref_p.size == ref_h.size == ref_v.size > 0:
         raise DataError(
             f"{path}: P, H and V have {p.size}, {h.size}, {v.size} pixels", "they belong to one box",
-            code=ErrorCode.MISMATCH,
+            "leave the file out", code=ErrorCode.MISMATCH,
         )  # fmt: skip
     level_h, level_v, level_p = np.sqrt(np.mean(abs(ref_h) ** 2)), np.sqrt(np.mean(abs(ref_v) ** 2)), np.mean(ref_p)
     if not (np.isfinite([level_h, level_v, abs(level_p)]).all() and min(level_h, level_v, abs(level_p)) > 0):
         raise DataError(
             f"{path}: the reference {reference} has no signal", "ref_values are zero or not finite",
-            code=ErrorCode.VALUE_INVALID,
+            "leave the file out", code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     return Entry(
         name=name,

@@ -84,8 +84,9 @@ def metal_gains(h: Image, v: Image, metal_mask: Mask) -> tuple[complex, complex]
     """
     if metal_mask.shape != h.shape or h.shape != v.shape:
         raise DataError(
-            f"metal region {metal_mask.shape} and images {h.shape}, {v.shape} differ in shape", code=ErrorCode.MISMATCH
-        )
+            f"metal region {metal_mask.shape} and images {h.shape}, {v.shape} differ in shape",
+            "they are not of one scan", "give arrays of one scan", code=ErrorCode.MISMATCH,
+        )  # fmt: skip
     mh, mv = h[metal_mask].astype(np.complex128), v[metal_mask].astype(np.complex128)
     good = np.isfinite(mh) & np.isfinite(mv)
     mh, mv = mh[good], mv[good]

@@ -357,6 +357,7 @@ def read_netcdf(path: Path) -> xarray.Dataset:
         raise DataError(
             f"{path}: not a NetCDF file: {e}",
             "the path is wrong, or the file is damaged",
+            "give a file that `polysight export --netcdf` wrote",
             code=ErrorCode.FILE_UNREADABLE,
         ) from None
     if "simulated" in dataset.attrs and dataset.attrs["simulated"] != "unknown":
@@ -386,6 +387,7 @@ def _check_hdf5(path: Path) -> None:
         raise DataError(
             f"{path}: {external[0]} lies in another file",
             "it was not written by this program",
+            "give a file that `polysight export --netcdf` wrote",
             code=ErrorCode.PATH_OUTSIDE,
         )
     if sum(sizes) > MAX_BYTES:

@@ -95,7 +95,10 @@ def write_image(path: Path, images: Images) -> None:
     try:
         _check_image(arrays)
     except (KeyError, ValueError) as e:
-        raise DataError(f"{path}: no image: {e}", code=ErrorCode.MISMATCH) from None
+        raise DataError(
+            f"{path}: no image: {e}", "arrays are missing or differ in shape", "process the scan again",
+            code=ErrorCode.MISMATCH,
+        ) from None  # fmt: skip
     buffer = io.BytesIO()
     stored: dict[str, Any] = {name: np.asarray(array, _ARRAYS[name]) for name, array in arrays.items()}
     np.savez_compressed(buffer, **stored)
@@ -116,6 +119,7 @@ def read_image(path: Path) -> Images:
         raise DataError(
             f"{path}: not an image product: {e}",
             "it was not written by polysight process or image",
+            "process the scan again",
             code=ErrorCode.FILE_DAMAGED,
         ) from None
 

@@ -246,7 +246,9 @@ def make_app(site: Site) -> Starlette:
 
     async def send_file(request: Request) -> Response:
         answer = files.get(request.path_params["name"])
-        return answer if answer is not None else await _tell_no_page(request, DataError("no such file"))
+        if answer is not None:
+            return answer
+        return await _tell_no_page(request, DataError("no such file", "the address is wrong", "go to the first page"))
 
     routes = [Route(path, show_page) for path in PAGES]
     routes.append(Route("/{name}", send_file))

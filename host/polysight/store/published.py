@@ -287,7 +287,8 @@ def read_log(path: Path) -> PacketLog | None:
     try:
         table = np.loadtxt(lines, delimiter=",", usecols=(0, 1, 2), ndmin=2)
     except ValueError as e:
-        raise DataError(f"{path}: not a packet log: {e}", "a damaged file", code=ErrorCode.FILE_DAMAGED) from None
+        what = f"{path}: not a packet log: {e}"
+        raise DataError(what, "a damaged file", "download it again", code=ErrorCode.FILE_DAMAGED) from None
     sequence, first = np.unique(table[:, 0].astype(np.int64), return_index=True)
     size, at_s = table[first, 1].astype(np.int64), table[first, 2]
     if size[-1] < size.max():
@@ -540,7 +541,7 @@ class PublishedScan(_Published):
         stream = self._stream(board_name, row)
         if stream is None:
             what = f"{self.path}: no row {row} of board {board_name}"
-            raise DataError(what, "the download is not complete", code=ErrorCode.NO_DATA)
+            raise DataError(what, "the download is not complete", "download it again", code=ErrorCode.NO_DATA)
         shape, frames = self._shape, self._shape.positions * self._shape.pulses
         lost = stream.packets_lost
         if stream.data.size >= shape.bytes:  # nothing slipped
@@ -639,12 +640,14 @@ class PublishedCubes(_Published):
                 cube = np.load(file, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError) as e:
             what = f"{file}: not a cube: {e}"
-            raise DataError(what, "the download is not complete", code=ErrorCode.FILE_DAMAGED) from None
+            raise DataError(
+                what, "the download is not complete", "download it again", code=ErrorCode.FILE_DAMAGED
+            ) from None
         rig, s = self._instrument, self._settings
         shape = (len(rig.antennas.rx_mm), s.total_y, s.total_x, rig.chirp.samples)
         if cube.shape != shape:
             what = f"{file}: shape {cube.shape}, {shape} in its settings"
-            raise DataError(what, "not the settings of this scan", code=ErrorCode.MISMATCH)
+            raise DataError(what, "not the settings of this scan", "download both again", code=ErrorCode.MISMATCH)
         ascending = cube[:, :, row] if self.mirrored else cube[:, row]  # from the smallest x (y) on
         return CubeRow(np.array(ascending[:, :: self._plan.row(row).direction], np.complex64))
 

@@ -293,13 +293,15 @@ def read_names(path: Path) -> dict[str, int]:
         raise DataError(
             f"{path}: not a list of names: {e}",
             'expected JSON, {"their name": row of Table 2}',
+            "correct the file",
             code=ErrorCode.FILE_UNREADABLE,
         ) from None
     wrong = [n for n in numbers.values() if not 1 <= n <= len(table2())]
     if wrong:
         raise DataError(
-            f"{path}: Table 2 has no row {wrong[0]}", f"its rows are 1 to {len(table2())}", code=ErrorCode.VALUE_INVALID
-        )
+            f"{path}: Table 2 has no row {wrong[0]}", f"its rows are 1 to {len(table2())}", "correct the number",
+            code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
     return numbers
 
 

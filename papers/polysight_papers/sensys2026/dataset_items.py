@@ -162,7 +162,9 @@ class Judgements:
         key = source, task, model, channels
         samples = self.samples(source, task)
         if samples is None:
-            raise DataError(f"{source} has no {task}", code=ErrorCode.NO_DATA)
+            raise DataError(
+                f"{source} has no {task}", "the data set is not complete", "download it again", code=ErrorCode.NO_DATA
+            )
         if key not in self._scores:
             several = repeated(samples)
             mixed = score(_split_one_scan(samples), model, channels, by_pixel=True)
@@ -633,7 +635,10 @@ def authors_table2(data: AuthorsData) -> Item:
     leakage = float(np.mean([data.base.polarimetry.leakage_h[0], data.base.polarimetry.leakage_v[0]]))
     estimates = {source: _estimates(data, source, 0.0 if source == IMAGES else leakage) for source in data.sources}
     if not any(estimates.values()):
-        raise DataError("no material of Table 2 is in the data", "see the notices on its names", code=ErrorCode.NO_DATA)
+        raise DataError(
+            "no material of Table 2 is in the data", "its names are others, see the notices on them",
+            "say which rows they are: --names FILE", code=ErrorCode.NO_DATA,
+        )  # fmt: skip
     return Item(
         "table2",
         "Table 2: permittivity of 36 materials",

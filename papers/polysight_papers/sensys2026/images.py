@@ -65,7 +65,10 @@ def scanned(
         folder = Path(temporary) / "scan"
         file.write_text(tomli_w.dumps(content), encoding="utf-8")
         if run_simulator(["simulate", str(file), "--config", str(config), "--out", str(folder)]):
-            raise ScanError(f"the scene {name!r} could not be simulated", "see above", code=ErrorCode.VALUE_INVALID)
+            raise ScanError(
+                f"the scene {name!r} could not be simulated", "the lines above say why", "correct the rig file",
+                code=ErrorCode.VALUE_INVALID,
+            )  # fmt: skip
         yield ScanFolder.load(folder), read_truth(folder / TRUTH)
 
 

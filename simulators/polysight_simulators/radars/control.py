@@ -198,6 +198,7 @@ class _Server:
             raise DeviceError(
                 f"{what}: cannot listen at {address}: {e.strerror}",
                 "another program uses this address",
+                "end it, or change the address",
                 code=ErrorCode.BUSY,
             ) from None
         self._listener.setblocking(False)

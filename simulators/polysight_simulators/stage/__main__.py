@@ -67,7 +67,9 @@ class SerialPort:
             fresh.symlink_to(name)
             fresh.replace(link)
         except OSError as e:
-            raise DeviceError(f"simulated stage port {link}: {e}", "the folder is missing or not writable") from None
+            raise DeviceError(
+                f"simulated stage port {link}: {e}", "the folder is missing or not writable", "give another path"
+            ) from None
 
     @property
     def is_open(self) -> bool:

@@ -20,6 +20,12 @@ Vector = tuple[float, float, float]
 HPF_FIRST_KHZ = (175.0, 235.0, 350.0, 700.0)
 HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
 DEBOUNCE_TICKS_US = 5_000
+# 2000 x 2000: imaging holds some 200 bytes a pixel, and an image of 9999 x 9999 took all memory of a PC.
+MAX_PIXELS = 4_000_000
+# The wavelength is 4 mm; the spectral imager's memory grows as one over the size.
+MIN_PIXEL_MM = 0.05
+MAX_PIXEL_MM = 100.0
+PixelSize = Annotated[float, msgspec.Meta(ge=MIN_PIXEL_MM, le=MAX_PIXEL_MM)]
 CARD_TAIL_S = 2.0  # silence after which a card sends a packet that is not full (docs/spec/dca1000.md, observed)
 _MOSI = {"/dev/spidev0": 10, "/dev/spidev1": 20}  # GPIO lines of a Pi's header
 _MISO = {"/dev/spidev0": 9, "/dev/spidev1": 19}
@@ -248,8 +254,14 @@ class Image(Section, frozen=True):
 
     columns: Count = 150
     rows: Count = 150
-    pixel_mm: Positive = 2.0
+    pixel_mm: PixelSize = 2.0
     apodisation: Literal["none", "kaiser", "taylor"] = "kaiser"
+
+    def __post_init__(self) -> None:
+        require(
+            self.columns * self.rows <= MAX_PIXELS,
+            f"{self.columns} x {self.rows} pixels are more than {MAX_PIXELS}",
+        )
 
 
 class Polarimetry(Section, frozen=True):

@@ -70,6 +70,7 @@ def refusal(*words: str) -> str:
     [
         (["calibrate", "direct-path", "s", "--prior"], "a length above 0, at most 50 mm"),
         (["doctor", "--bursts"], "a whole number from 1 to 16"),
+        (["focus", "s", "--out", "o", "--depth"], "a length of 0.5 to 100 mm"),
         (["card", "--listen"], "a number of seconds from 0 to 3600"),
         (["permittivity", "o", "--amplitude"], "a percentage from 0 to 100"),
         (["concentration", "l", "--confidence"], "a share from 0.5 to below 1"),

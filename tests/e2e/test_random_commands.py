@@ -84,6 +84,17 @@ def draw_words(parser: argparse.ArgumentParser, draw: random.Random) -> Iterator
                 yield draw_value(action, draw)
 
 
+def each_number(name: str, parser: argparse.ArgumentParser) -> Iterator[list[str]]:
+    """Command lines of a command: each option that has a value with each number."""
+    options = [action for action in parser._actions if action.option_strings and action.nargs != 0]
+    places = ["scan" for action in parser._actions if not action.option_strings]
+    for option in options:
+        required = [other for other in options if other.required and other is not option]
+        others = [word for other in required for word in (other.option_strings[-1], "out/x")]
+        for number in NUMBERS:
+            yield [name, *places, *others, f"{option.option_strings[-1]}={number}"]
+
+
 def check_end(words: list[str]) -> None:
     """Run a command in this process: it ends with 0, or with another status and a message."""
     out = io.StringIO()
@@ -110,3 +121,13 @@ def test_random_command_lines_end_with_a_message(folder, monkeypatch, request):
             name = draw.choice(list(parsers))
             monkeypatch.setattr(sys, "stdin", io.StringIO(""))
             check_end([name, *(word for word in draw_words(parsers[name], draw) if word != "--yes")])
+
+
+def test_each_option_takes_each_number_or_refuses_it(folder, monkeypatch, request):
+    lines = [words for name, parser in commands().items() for words in each_number(name, parser)]
+    if not request.config.getoption("--long"):
+        lines = random.Random(2).sample(lines, CASES)
+    with chdir(folder):
+        for words in lines:
+            monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+            check_end(words)

@@ -48,7 +48,17 @@ def test_a_plan_that_is_impossible_fails(options, status):
     assert main(["plan", *RIG, *options]) == status
 
 
-@pytest.mark.parametrize("option", [("--snr-db", "nan"), ("--row-overhead-s", "-1"), ("--scene-mm", "170,inf")])
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--snr-db", "nan"),
+        ("--snr-db", "1e308"),
+        ("--row-overhead-s", "-1"),
+        ("--row-overhead-s", "1e300"),
+        ("--scene-mm", "170,inf"),
+        ("--scene-mm", "1e300,170"),
+    ],
+)
 def test_a_value_that_is_no_quantity_is_a_usage_error(option):
     with pytest.raises(SystemExit) as e:
         main(["plan", *RIG, *option])

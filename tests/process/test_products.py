@@ -96,7 +96,9 @@ def test_another_plane_and_grid_from_the_command_line(scan: Path, tmp_path: Path
     assert products.facts.instrument["geometry"]["object_distance_mm"] == distance + 4
 
 
-@pytest.mark.parametrize("grid", ["60", "60x30", "0x30@2", "60x30@0", "60x30@two", "60x30@2@3"])
+@pytest.mark.parametrize(
+    "grid", ["60", "60x30", "0x30@2", "60x30@0", "60x30@two", "60x30@2@3", "9999x9999@1", "60x30@9999", "60x30@0.001"]
+)
 def test_an_invalid_grid_is_refused(grid: str) -> None:
     with pytest.raises(SystemExit):
         main(["image", "scan", "--out", "out", "--grid", grid])

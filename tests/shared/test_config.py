@@ -55,6 +55,9 @@ def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instr
         ("chirp", "hpf1_khz", 180.0, ErrorCode.VALUE_INVALID, ["hpf1_khz", 175.0]),
         ("burst", "period_us", 200.0, ErrorCode.VALUE_INVALID, ["period_us", 300]),
         ("burst", "width_us", 5.0, ErrorCode.VALUE_INVALID, ["width_us", 0.025, 4]),
+        ("image", "pixel_mm", 1e-4, ErrorCode.VALUE_INVALID, ["image.pixel_mm"]),
+        ("image", "pixel_mm", 1e4, ErrorCode.VALUE_INVALID, ["image.pixel_mm"]),
+        ("image", "columns", 30_000, ErrorCode.VALUE_INVALID, ["30000 x 150 pixels"]),
         ("pi", "trigger_in", 22, ErrorCode.VALUE_INVALID, ["trigger_in", "sync_out"]),
         ("pi", "sync_out", [22, 23], ErrorCode.VALUE_INVALID, ["sync_out", "wiring"]),
         ("pi", "trigger_bias", "up", ErrorCode.VALUE_INVALID, ["pi.trigger_bias", "'up'"]),
@@ -119,4 +122,4 @@ def test_an_unknown_key_is_refused_with_a_suggestion(line, wrong, suggestion, tm
 def test_a_missing_path_is_refused_with_a_similar_one(tmp_path):
     (tmp_path / "scan-7").mkdir()
     assert "'scan-7'" in str(no_such(tmp_path / "scan-77"))
-    assert str(tmp_path / "away") in no_such(tmp_path / "away" / "scan-7").remedy
+    assert str(tmp_path / "away") in no_such(tmp_path / "away" / "scan-7").why

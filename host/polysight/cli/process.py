@@ -17,12 +17,13 @@ from polysight.cli.options import (
     count,
     material_settings,
     number,
-    positive,
     rig_file,
 )
 from polysight.settings import Settings, path_text
+from polysight_shared.config import MAX_PIXEL_MM, MAX_PIXELS, MIN_PIXEL_MM
 
 _shift = number(float, "a shift of at most 1000 mm", lambda value: abs(value) <= 1000)
+_search_range = number(float, "a length of 0.5 to 100 mm", lambda value: 0.5 <= value <= 100)
 _millimetres = number(float, "a length above 0, at most 50 mm", lambda value: 0 < value <= 50)
 
 
@@ -141,7 +142,7 @@ def add_commands(add: Add) -> None:
     )
     _add_data(sub)
     sub.add_argument(
-        "--depth", type=positive, default=8.0, metavar="MM", help="search range to either side (default: 8 mm)"
+        "--depth", type=_search_range, default=8.0, metavar="MM", help="search range to either side (default: 8 mm)"
     )
     sub = add(
         "sync-report",
@@ -190,9 +191,15 @@ def _add_several_options(sub: argparse.ArgumentParser) -> None:
 def grid(text: str) -> tuple[int, int, float]:
     """`COLUMNSxROWS@MM`: pixels and their distance."""
     words = re.fullmatch(r"(\d{1,4})x(\d{1,4})@(\d+(?:\.\d+)?)", text)
-    columns, rows, pixel_mm = (int(words[1]), int(words[2]), float(words[3])) if words else (0, 0, 0.0)
-    if min(columns, rows) < 2 or pixel_mm <= 0:
+    if words is None:
         raise argparse.ArgumentTypeError(f"{text!r}: a grid is COLUMNSxROWS@MM, for example 300x300@1")
+    columns = int(words[1])
+    rows = int(words[2])
+    pixel_mm = float(words[3])
+    if min(columns, rows) < 2 or columns * rows > MAX_PIXELS or not MIN_PIXEL_MM <= pixel_mm <= MAX_PIXEL_MM:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: a grid has 2 x 2 to {MAX_PIXELS} pixels, {MIN_PIXEL_MM:g} to {MAX_PIXEL_MM:g} mm apart"
+        )
     return columns, rows, pixel_mm
 
 

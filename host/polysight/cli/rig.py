@@ -6,7 +6,6 @@ Simulated: demo, simulate, reproduce. Real: plan, doctor, card, inspect, radar, 
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from pathlib import Path
 
@@ -32,6 +31,8 @@ _bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <=
 # Nearer than a few wavelengths (4 mm) no antenna sees a plane wave.
 _distance = number(float, "a distance from 20 to 10000 mm", lambda value: 20 <= value <= 10_000)
 _seconds = number(float, "a number of seconds from 0 to 3600", lambda value: 0 <= value <= 3600)
+_decibels = number(float, "a ratio of -100 to 100 dB", lambda value: abs(value) <= 100)
+_scene_side = number(float, "a length above 0, at most 10000 mm", lambda value: 0 < value <= 10_000)
 
 
 def add_commands(add: Add) -> None:
@@ -74,9 +75,10 @@ def _plan(args: argparse.Namespace) -> int:
 
 def _size(text: str) -> tuple[float, float]:
     try:
-        width, height = (positive(part) for part in text.split(","))
+        width, height = (_scene_side(part) for part in text.split(","))
     except (ValueError, argparse.ArgumentTypeError):
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form WIDTH,HEIGHT in mm, e.g. 170,170") from None
+        form = "WIDTH,HEIGHT in mm, at most 10000, e.g. 170,170"
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form {form}") from None
     return width, height
 
 
@@ -95,13 +97,13 @@ def _add_plan(add: Add) -> None:
     sub.add_argument("--scene-mm", type=_size, metavar="W,H", help="size of the scene (default: the image's)")
     sub.add_argument(
         "--snr-db",
-        type=number(float, "a finite number", math.isfinite),
+        type=_decibels,
         metavar="DB",
         help="direct path over noise per channel, sample and chirp (default: 5.5)",
     )
     sub.add_argument(
         "--row-overhead-s",
-        type=number(float, "a number, 0 or more", lambda s: 0 <= s < math.inf),
+        type=_seconds,
         metavar="S",
         help="standstill between rows (default: 0.3, simulated)",
     )

@@ -68,7 +68,13 @@ def _plan(args: argparse.Namespace) -> int:
 
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
     options = PlanOptions(
-        args.minutes, args.count, args.like, args.snr_db, args.row_overhead_s, args.scene_mm, args.json
+        minutes=args.minutes,
+        count=args.count,
+        like=args.like,
+        snr_db=args.snr_db,
+        row_overhead_s=args.row_overhead_s,
+        scene_mm=args.scene_mm,
+        as_json=args.json,
     )
     return run_plan(args.config, Changes(**{name: getattr(args, name) for name in names}), options)
 

@@ -50,8 +50,6 @@ ROW_OVERHEAD_S = 0.3
 Simulated: 0.14 and 0.29 s between rows of 350 points x 13 and 16 chirps on the simulated rig at real time, on a busy
 machine. Not measured on hardware; `polysight plan --like SCAN` measures it in a scan.
 """
-
-
 Real = NDArray[np.float64]
 
 MAX_STEPS_PER_S = 20_000  # of the stage's firmware (docs/spec/stage-line.md, timing)
@@ -117,10 +115,19 @@ def row_motion_s(grid: Grid, stage: Stage) -> float:
     return straight_move_s(length, stage.speed_mm_s, stage.accel_mm_s2)
 
 
+def measuring_s(rig: Instrument) -> float:
+    """Return the duration from a row's first point to its last, at constant speed."""
+    return (rig.grid.columns - 1) * rig.grid.step_x_mm / rig.stage.speed_mm_s
+
+
 def turn_s(grid: Grid, stage: Stage) -> float:
     """Return the duration from a row's end to the next one's beginning; only y moves, and takes up its backlash."""
-    step, lost = grid.step_y_mm, stage.backlash_mm
-    legs = (step,) if lost <= step else (lost - step, lost)
+    step = grid.step_y_mm
+    if stage.backlash_mm <= step:
+        legs = (step,)
+    else:
+        # Back beyond the row's place, then to it.
+        legs = (stage.backlash_mm - step, stage.backlash_mm)
     return sum(straight_move_s(leg, stage.travel_speed_mm_s, stage.accel_mm_s2) for leg in legs)
 
 
@@ -133,8 +140,7 @@ def tail_s(rig: Instrument) -> float:
     """Return the wait for the cards' last packet at the end of each row, after the stage has stopped, seconds."""
     if whole_packets(rig):
         return 0.0
-    grid, stage = rig.grid, rig.stage
-    run_out = (row_motion_s(grid, stage) - (grid.columns - 1) * grid.step_x_mm / stage.speed_mm_s) / 2
+    run_out = (row_motion_s(rig.grid, rig.stage) - measuring_s(rig)) / 2
     return max(0.0, burst_duration_s(rig.burst) + CARD_TAIL_S - run_out)
 
 
@@ -143,9 +149,10 @@ def scan_time(rig: Instrument, row_overhead_s: float = ROW_OVERHEAD_S) -> ScanTi
 
     `row_overhead_s` is the standstill for each row apart from motion and the wait for the last packet, seconds.
     """
-    grid, stage = rig.grid, rig.stage
+    grid = rig.grid
+    stage = rig.stage
     row = row_motion_s(grid, stage)
-    measuring = (grid.columns - 1) * grid.step_x_mm / stage.speed_mm_s
+    measuring = measuring_s(rig)
     x = stage.centre_x_mm - (grid.columns - 1) / 2 * grid.step_x_mm - stage.run_up_mm(grid.step_x_mm)
     y = stage.centre_y_mm - (grid.rows - 1) / 2 * grid.step_y_mm
     return ScanTime(
@@ -249,23 +256,25 @@ def forecast(
     noise = noise or Noise()
     aperture, taper = aperture_of(rig)
     return Forecast(
-        rig,
-        scan_time(rig, row_overhead_s),
-        rig.scan_bytes,
-        predict_burst(rig),
-        point_response(aperture, taper),
-        field_limits(rig),
-        predict_noise(rig, noise),
-        noise.source,
-        find_warnings(rig, noise, scene_mm),
+        rig=rig,
+        time=scan_time(rig, row_overhead_s),
+        raw_bytes=rig.scan_bytes,
+        burst=predict_burst(rig),
+        response=point_response(aperture, taper),
+        field=field_limits(rig),
+        noise=predict_noise(rig, noise),
+        noise_source=noise.source,
+        warnings=find_warnings(rig, noise, scene_mm),
     )
 
 
 def aperture_of(rig: Instrument) -> tuple[Aperture, Real]:
     """Return the aperture of the H receiver and its taper [row, column]."""
-    plan, grid = plan_raster(rig.grid), image_grid(rig)
+    grid = image_grid(rig)
     antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
-    frequencies = reduction(rig.chirp, scene_gate_m(antennas, plan, grid), _FAST_TIME_WINDOW).frequencies_hz
+    frequencies = reduction(
+        rig.chirp, scene_gate_m(antennas, plan_raster(rig.grid), grid), _FAST_TIME_WINDOW
+    ).frequencies_hz
     return Aperture(antennas[0], scan_offsets_m(rig), frequencies, grid), np.outer(*_tapers(rig))
 
 
@@ -276,13 +285,14 @@ def _tapers(rig: Instrument) -> tuple[Real, Real]:
 
 def predict_burst(rig: Instrument) -> BurstForecast:
     """Predict duration and travel of a burst, and the loss by motion."""
-    grid, stage, burst = rig.grid, rig.stage, rig.burst
-    travel_mm = stage.speed_mm_s * burst_duration_s(burst)
+    grid = rig.grid
+    stage = rig.stage
+    travel_mm = stage.speed_mm_s * burst_duration_s(rig.burst)
     middle_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * sum(rig.chirp.linear_samples) / 2
     half_m = (grid.columns - 1) / 2 * grid.step_x_mm / 1e3
     change_rad = travel_mm / 1e3 * abs(PhaseSlope(rig, 0).at(half_m, middle_hz))
     return BurstForecast(
-        duration_ms=burst.pulses * burst.period_us * 1e-3,
+        duration_ms=rig.burst.pulses * rig.burst.period_us * 1e-3,
         between_ms=1e3 * grid.step_x_mm / stage.speed_mm_s,
         travel_mm=travel_mm,
         travel_wavelengths=travel_mm / 1e3 * middle_hz / SPEED_OF_LIGHT_M_S,
@@ -296,15 +306,16 @@ def predict_noise(rig: Instrument, noise: Noise) -> NoiseForecast:
     A weighted sum of n equal signals in independent noise gains `(sum w)^2 / sum w^2`: over pulses, RX, fast time and
     positions.
     """
-    a, b = rig.chirp.linear_samples
+    first, end = rig.chirp.linear_samples
+    samples = end - first
     rx = len(rig.antennas.rx_mm)
     position = 10 ** (noise.direct_snr_db / 10) * rig.burst.chirps_a_position
     gain = rx
-    for window in (window_weights(_FAST_TIME_WINDOW, b - a), *_tapers(rig)):
+    for window in (window_weights(_FAST_TIME_WINDOW, samples), *_tapers(rig)):
         gain *= window.sum() ** 2 / (window**2).sum()
     return NoiseForecast(
         position_db=float(10 * np.log10(position)),
-        direct_phase_rad=float(1 / np.sqrt(2 * (b - a) * rx * position)),
+        direct_phase_rad=float(1 / np.sqrt(2 * samples * rx * position)),
         image_db=float(10 * np.log10(position * gain)),
     )
 
@@ -319,7 +330,7 @@ def find_warnings(rig: Instrument, noise: Noise, scene_mm: tuple[float, float] |
     """
     image_mm = (rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm)
     scene_mm = scene_mm or image_mm
-    found = [
+    warnings = [
         *_stage_warnings(rig),
         *_burst_warnings(rig, predict_burst(rig)),
         *_card_warnings(rig),
@@ -329,10 +340,10 @@ def find_warnings(rig: Instrument, noise: Noise, scene_mm: tuple[float, float] |
     phase = predict_noise(rig, noise).direct_phase_rad
     if phase > _PUBLISHED_PHASE_RAD:
         text = f"standard deviation of the direct path's phase {phase:.3f} rad (published rig after all stages:"
-        found.append(_note("noise", f"{text} {_PUBLISHED_PHASE_RAD}): use more pulses a position"))
+        warnings.append(_note("noise", f"{text} {_PUBLISHED_PHASE_RAD}): use more pulses a position"))
     if text := why_unnamed(DEFAULT, rig):
-        found.append(_note("library", text.replace("was named", "will be named", 1)))
-    return tuple(sorted(found, key=lambda w: w.level != "error"))
+        warnings.append(_note("library", text.replace("was named", "will be named", 1)))
+    return tuple(sorted(warnings, key=lambda w: w.level != "error"))
 
 
 def _note(topic: str, text: str) -> Finding:
@@ -344,9 +355,11 @@ def _refusal(topic: str, text: str) -> Finding:
 
 
 def _stage_warnings(rig: Instrument) -> Iterator[Finding]:
-    stage, grid = rig.stage, rig.grid
-    rate, limit = stage.speed_mm_s * stage.steps_per_mm, MAX_STEPS_PER_S / stage.steps_per_mm
+    stage = rig.stage
+    grid = rig.grid
+    rate = stage.speed_mm_s * stage.steps_per_mm
     if rate > MAX_STEPS_PER_S:
+        limit = MAX_STEPS_PER_S / stage.steps_per_mm
         text = f"{stage.speed_mm_s:g} mm/s are {rate:g} steps/s; the maximum of the stage is {limit:g} mm/s"
         yield _refusal("speed", text)
     for axis, step in (("x", grid.step_x_mm), ("y", grid.step_y_mm)):
@@ -369,7 +382,8 @@ def _burst_warnings(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
         check_burst_fits(rig.grid, rig.burst, rig.stage)
     except ConfigError as e:
         remedy = f"at most {1e3 * rig.grid.step_x_mm / burst.duration_ms:.3g} mm/s"
-        remedy += f", or at most {max_pulses} pulses" if max_pulses else ""
+        if max_pulses:
+            remedy += f", or at most {max_pulses} pulses"
         yield _refusal("burst", f"too fast for the burst: {e.what}; {remedy}")
     if burst.edge_loss_db > _MAX_BURST_LOSS_DB:
         yield _note(
@@ -420,8 +434,9 @@ def _radar_warnings(rig: Instrument) -> Iterator[Finding]:
     for c in constraints(rig, rig.grid.columns * rig.burst.pulses):
         about_if = c.name.startswith("IF")
         if not c.holds and (offsets_known or not about_if):
-            found = _refusal if native else _note
-            yield found("IF" if about_if else "radar", f"{c}: {c.remedy}")
+            level = "error" if native else "note"
+            topic = "IF" if about_if else "radar"
+            yield Finding(level, f"{c}: {c.remedy}", where=topic)
     if not offsets_known:
         yield _note(
             "IF",
@@ -432,10 +447,14 @@ def _radar_warnings(rig: Instrument) -> Iterator[Finding]:
 
 
 def _field_warnings(rig: Instrument, scene_mm: tuple[float, float], image_mm: tuple[float, float]) -> Iterator[Finding]:
-    grid, field = rig.grid, field_limits(rig)
+    grid = rig.grid
+    field = field_limits(rig)
     axes = (("x", grid.step_x_mm, grid.columns), ("y", grid.step_y_mm, grid.rows))
     for i, (axis, step, count) in enumerate(axes):
-        scene, free, zone, size = scene_mm[i], field.alias_free_mm[i], field.mirror_zone_mm[i], (count - 1) * step
+        scene = scene_mm[i]
+        free = field.alias_free_mm[i]
+        zone = field.mirror_zone_mm[i]
+        size = (count - 1) * step
         need = (scene + image_mm[i]) / 2
         if free < need:
             yield _note(

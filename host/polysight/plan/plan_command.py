@@ -28,6 +28,7 @@ from polysight.plan.forecast import (
     Noise,
     find_warnings,
     forecast,
+    measuring_s,
     predict_burst,
     predict_noise,
     row_motion_s,
@@ -85,7 +86,7 @@ class Changes:
         grid = table["grid"]
         for axis, count, size in (("x", "columns", self.width_mm), ("y", "rows", self.height_mm)):
             step = f"step_{axis}_mm"
-            extent = (grid[count] - 1) * grid[step] if size is None else size
+            extent = size or (grid[count] - 1) * grid[step]
             grid[step] = getattr(self, step) or grid[step]
             grid[count] = getattr(self, count) or 1 + round(extent / grid[step])
         if min(grid["columns"], grid["rows"]) < 2:
@@ -110,7 +111,8 @@ class Changes:
 
 def rig_lines(plan: Instrument, original: Instrument) -> str:
     """Return the lines of the rig file that differ between `plan` and `original`; "" if none differs."""
-    new, old = to_builtins(plan), to_builtins(original)
+    new = to_builtins(plan)
+    old = to_builtins(original)
     parts = []
     for section, keys in new.items():
         if not isinstance(keys, dict):
@@ -222,8 +224,9 @@ def _speeds(rig: Instrument, minutes: float) -> Iterator[float]:
 def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
-    minutes = seconds / 60
-    return f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.2f} h"
+    if seconds < 6000:
+        return f"{seconds / 60:.1f} min"
+    return f"{seconds / 3600:.2f} h"
 
 
 def _size(count: float) -> str:
@@ -236,8 +239,13 @@ def _pair(values: tuple[float, float], digits: int = 1) -> str:
 
 def describe(f: Forecast) -> str:
     """Return the text of one forecast."""
-    g, b, s, t, r = f.rig.grid, f.rig.burst, f.rig.stage, f.time, f.response
-    w, h = (g.columns - 1) * g.step_x_mm, (g.rows - 1) * g.step_y_mm
+    g = f.rig.grid
+    b = f.rig.burst
+    s = f.rig.stage
+    t = f.time
+    r = f.response
+    w = (g.columns - 1) * g.step_x_mm
+    h = (g.rows - 1) * g.step_y_mm
     lines = [
         ("scan", f"{g.columns} x {g.rows} positions, steps {g.step_x_mm:g} x {g.step_y_mm:g} mm, {w:g} x {h:g} mm"),
         ("", f"{s.speed_mm_s:g} mm/s, {b.chirps_a_position} chirps a position, {b.chirp_us or b.period_us:g} us apart"),
@@ -285,14 +293,18 @@ def describe(f: Forecast) -> str:
 def _normals(seen: VisibleNormals) -> str:
     """Text of the tilts at which curved and tilted surfaces are seen."""
     text = f"surfaces tilted by up to {seen.x_deg:.0f} degrees in x, {seen.y_deg:.0f} in y are seen"
-    alias = [a for a, tilt in zip(seen.alias_deg, (seen.x_deg, seen.y_deg), strict=True) if a < tilt]
-    return f"{text}; beyond {min(alias):.0f} degrees their phases alias: take a smaller step" if alias else text
+    limits = zip(seen.alias_deg, (seen.x_deg, seen.y_deg), strict=True)
+    aliases_deg = [alias for alias, tilt in limits if alias < tilt]
+    if aliases_deg:
+        text += f"; beyond {min(aliases_deg):.0f} degrees their phases alias: take a smaller step"
+    return text
 
 
 def _table(plans: list[Forecast]) -> str:
     lines = ["    time      mm/s  chirps  period us  steps mm     grid       image dB  motion  alias-free mm   raw"]
     for i, f in enumerate(plans, 1):
-        g, b = f.rig.grid, f.rig.burst
+        g = f.rig.grid
+        b = f.rig.burst
         lines.append(
             f"{i:2d}  {_duration(f.time.total_s):9s} {f.rig.stage.speed_mm_s:4g}  {b.pulses:6d}  {b.period_us:9g}"
             f"  {f'{g.step_x_mm:g} x {g.step_y_mm:g}':11s}  {f'{g.columns} x {g.rows}':9s}  {f.noise.image_db:8.1f}"
@@ -301,14 +313,18 @@ def _table(plans: list[Forecast]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _finite_or_none(values: tuple[float, float]) -> list[float | None]:
+    return [float(v) if math.isfinite(v) else None for v in values]
+
+
 def forecast_values(f: Forecast) -> dict[str, Any]:
     """Return a forecast as plain values for JSON; infinite ones as None."""
-    g, b, s, t, r = f.rig.grid, f.rig.burst, f.rig.stage, f.time, f.response
-    seen = visible_normals(f.rig)
-
-    def finite(values: tuple[float, float]) -> list[float | None]:
-        return [float(v) if math.isfinite(v) else None for v in values]
-
+    g = f.rig.grid
+    b = f.rig.burst
+    s = f.rig.stage
+    t = f.time
+    r = f.response
+    normals = visible_normals(f.rig)
     return {
         "possible": f.possible,
         "speed_mm_s": s.speed_mm_s,
@@ -330,13 +346,13 @@ def forecast_values(f: Forecast) -> dict[str, Any]:
             "standstill": t.overhead_s,
         },
         "raw_bytes": f.raw_bytes,
-        "point_width_mm": finite(r.width_mm),
-        "point_limit_mm": finite(r.limit_mm),
-        "point_paper_mm": finite(r.paper_mm),
-        "alias_free_mm": finite(f.field.alias_free_mm),
-        "mirror_zone_mm": finite(f.field.mirror_zone_mm),
-        "visible_normals_deg": [seen.x_deg, seen.y_deg],
-        "alias_tilt_deg": finite(seen.alias_deg),
+        "point_width_mm": _finite_or_none(r.width_mm),
+        "point_limit_mm": _finite_or_none(r.limit_mm),
+        "point_paper_mm": _finite_or_none(r.paper_mm),
+        "alias_free_mm": _finite_or_none(f.field.alias_free_mm),
+        "mirror_zone_mm": _finite_or_none(f.field.mirror_zone_mm),
+        "visible_normals_deg": [normals.x_deg, normals.y_deg],
+        "alias_tilt_deg": _finite_or_none(normals.alias_deg),
         "burst_ms": f.burst.duration_ms,
         "between_positions_ms": f.burst.between_ms,
         "burst_travel_mm": f.burst.travel_mm,
@@ -359,17 +375,17 @@ def measure_noise(source: RawSource) -> Noise:
 
     rig = source.instrument
     rows = list(source.rows())
-    chosen = [rows[i] for i in sorted({*np.linspace(0, len(rows) - 1, _NOISE_ROWS).astype(int)})] if rows else []
-    found = []
+    spread = np.linspace(0, len(rows) - 1, min(_NOISE_ROWS, len(rows))).astype(int)
+    ratios = []
     for board in rig.receivers:
         setup = BoardSetup.of(rig, board)
         report = SyncReport(rig.chirp.sample_rate_hz, rig.chirp.linear_samples, len(rig.antennas.rx_mm))
-        for row in chosen:
+        for row in (rows[i] for i in spread):
             data = source.read_row(board.name, row)
             words, valid = row_words(data.payload, data.missing, data.frames_expected, rig.chirp.samples)
             report.add(synchronise_row(words, valid, setup))
-        found.append(report.snr)
-    if not np.isfinite(found).all():
+        ratios.append(report.snr)
+    if not np.isfinite(ratios).all():
         raise DataError(
             f"scan {source.scan_id}: its noise cannot be measured",
             "it has no rows, or bursts of a single chirp",
@@ -377,7 +393,7 @@ def measure_noise(source: RawSource) -> Noise:
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
     kind = "simulated scan" if source.simulated else "scan"
-    return Noise(float(10 * np.log10(min(found))), f"measured on {kind} {source.scan_id}")
+    return Noise(float(10 * np.log10(min(ratios))), f"measured on {kind} {source.scan_id}")
 
 
 def measure_row_overhead(folder: Path) -> float | None:
@@ -389,19 +405,22 @@ def measure_row_overhead(folder: Path) -> float | None:
     scan = ScanFolder.load(folder)
     if scan.started.pi is None:
         return None
-    rig, ends = scan.instrument, {}
+    rig = scan.instrument
+    # Times of the first and last trigger of each take of a row.
+    ends: dict[tuple[int, int], tuple[int, int]] = {}
     for event in read_events(folder / EVENTS).events:
         if isinstance(event, Capture):
             first, _ = ends.setdefault((event.row_index, event.take), (event.edge_ns, event.edge_ns))
             ends[event.row_index, event.take] = (first, event.edge_ns)
-    measuring = (rig.grid.columns - 1) * rig.grid.step_x_mm / rig.stage.speed_mm_s
-    known = row_motion_s(rig.grid, rig.stage) - measuring + turn_s(rig.grid, rig.stage) + tail_s(rig)
+    motion = row_motion_s(rig.grid, rig.stage) - measuring_s(rig) + turn_s(rig.grid, rig.stage) + tail_s(rig)
     gaps = [
         (later[0] - earlier[1]) / 1e9
         for (row, earlier), (next_row, later) in pairwise((row, t) for (row, _), t in ends.items())
         if next_row == row + 1
     ]
-    return max(0.0, float(np.median(gaps)) - known) if gaps else None
+    if not gaps:
+        return None
+    return max(0.0, float(np.median(gaps)) - motion)
 
 
 @dataclass(frozen=True)
@@ -428,35 +447,41 @@ def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
     if options.minutes is None:
         f = forecast(rig, noise, overhead, options.scene_mm)
         sys.stdout.write(json.dumps(forecast_values(f), indent=1) + "\n" if options.as_json else describe(f))
-        return 0 if f.possible else 1
+        return int(not f.possible)
     plans = propose(rig, options.minutes, options.count, noise, overhead, options.scene_mm)
     if options.as_json:
         content = {"minutes": options.minutes, "plans": [forecast_values(p) for p in plans]}
         sys.stdout.write(json.dumps(content, indent=1) + "\n")
     elif plans:
         lines = rig_lines(plans[0].rig, original)
+        differences = (
+            f"Its lines in the rig file, all that differ:\n\n{lines}" if lines else "It is the rig file's plan.\n"
+        )
         sys.stdout.write(
             f"Best plans within {options.minutes:g} minutes for this aperture, least noise in the image first"
             f" (dB: point over noise; motion: wavelengths during a burst)\n\n{_table(plans)}\n"
-            f"The first plan in full:\n\n{describe(plans[0])}\n"
-            + (f"Its lines in the rig file, all that differ:\n\n{lines}" if lines else "It is the rig file's plan.\n")
+            f"The first plan in full:\n\n{describe(plans[0])}\n{differences}"
         )
     else:
         sys.stderr.write(
-            f"polysight plan: no plan within {options.minutes:g} minutes without aliases for this aperture, stage and"
-            " scene: give more time, a smaller --width-mm or --height-mm, a smaller --scene-mm, or a higher"
+            f"polysight plan: no plan within {options.minutes:g} minutes without aliases\n"
+            "  why: aperture, stage and scene need more\n"
+            "  do: give more time, a smaller --width-mm or --height-mm, a smaller --scene-mm, or a higher"
             " --accel-mm-s2\n"
         )
-    return 0 if plans else 1
+    return int(not plans)
 
 
 def _assumptions(options: PlanOptions) -> tuple[Noise, float]:
     """Noise and standstill: as given, else of the scan of --like, else the simulated rig's."""
-    noise, overhead = Noise(source=_SIMULATED), None
+    noise = Noise(source=_SIMULATED)
+    overhead_s = ROW_OVERHEAD_S
     if options.like is not None:
-        noise, overhead = measure_noise(ScanFolder.load(options.like)), measure_row_overhead(options.like)
+        noise = measure_noise(ScanFolder.load(options.like))
+        measured_s = measure_row_overhead(options.like)
+        overhead_s = ROW_OVERHEAD_S if measured_s is None else measured_s
     if options.snr_db is not None:
         noise = Noise(options.snr_db, "given")
     if options.row_overhead_s is not None:
-        overhead = options.row_overhead_s
-    return noise, ROW_OVERHEAD_S if overhead is None else overhead
+        overhead_s = options.row_overhead_s
+    return noise, overhead_s

@@ -1,135 +1,244 @@
-"""Judges the times of a row's trigger edges: a lost and a spurious edge keep the count, but not the intervals.
+"""Judges the trigger edges of a row: a lost and a spurious edge keep the count, but not the times.
 
-At constant speed each interval is the step divided by the speed. A hold slows the stage down with the acceleration of
-[stage], lets it wait, and speeds it up again, so its intervals are known but for the place of the stop and the wait.
+Three reports of the stage are compared with the edges:
+
+* the row's motion: at constant speed each interval is step / speed; a hold slows the stage down to the place that its
+  status names, and from there speeds it up again, so those intervals are known as well, but for the wait;
+* the points in each status: as many edges came before it was asked for or later, and as many until it was written;
+* the end: behind the last point the stage runs on and slows down, so its `done` comes that much later.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from bisect import bisect_right
 from itertools import pairwise
+from typing import NamedTuple
 
 from polysight_shared.raster import Row, Stage
 
+# Lowest speed of the sketch, steps/s (board.h, MIN_RATE).
+MIN_FEED = 31
+# Of its timer.
+TICK_HZ = 2_000_000
 # Of the interval at constant speed. The resonator of an UNO is within 0.5 % of its frequency.
 TOLERANCE = 0.01
-# Of the search for the place of a stop and the lowest speed: a grid, then a finer one around its best point.
-LEVELS = 7
-PLACES = 64
-SPEEDS = 16
+# Of the same interval: an edge may be stamped that much after a status that counts its point was written: a
+# simulated trigger wire is later than a simulated serial line.
+STATUS_TOLERANCE = 0.2
+
+
+class RowMotion(NamedTuple):
+    """A row in motor steps, as the stage is told it, and the motion that follows (docs/spec/stage-line.md, "A row")."""
+
+    x_start: int
+    step: int
+    points: int
+    y: int
+    feed: int
+    accel: int
+    backlash: int
+
+    @staticmethod
+    def plan(row: Row, stage: Stage, speed_mm_s: float) -> RowMotion:
+        """Return the motion of a row of the plan."""
+        k = stage.steps_per_mm
+        return RowMotion(
+            x_start=round((stage.centre_x_mm + row.x_start_mm) * k),
+            step=round(row.step_mm * k),
+            points=row.points,
+            y=round((stage.centre_y_mm + row.y_mm) * k),
+            feed=round(speed_mm_s * k),
+            accel=round(stage.accel_mm_s2 * k),
+            backlash=round(stage.backlash_mm * k),
+        )
+
+    @property
+    def line(self) -> tuple[int, int, int, int, int]:
+        """Arguments of ROW."""
+        return self.x_start, self.step, self.points, self.y, self.feed
+
+    @property
+    def ramp(self) -> int:
+        """Steps from rest to full speed."""
+        if self.feed <= slowest_feed(self.accel):
+            return 0
+        return -(-(self.feed**2) // (2 * self.accel))
+
+    @property
+    def run_up(self) -> int:
+        """Steps from rest to the first point, and from the last one to rest."""
+        return self.ramp + max(abs(self.step), self.backlash)
+
+    @property
+    def length(self) -> int:
+        """Steps from rest to rest."""
+        return (self.points - 1) * abs(self.step) + 2 * self.run_up
+
+    @property
+    def end(self) -> tuple[int, int]:
+        """X and y where the stage rests after the row."""
+        direction = 1 if self.step > 0 else -1
+        return self.x_start + (self.points - 1) * self.step + direction * self.run_up, self.y
+
+    def distance(self, x: int) -> int:
+        """Return the steps from the beginning of the motion to this x."""
+        direction = 1 if self.step > 0 else -1
+        return direction * (x - self.x_start) + self.run_up
+
+    def time_points(self, stops: list[int]) -> tuple[list[float], float]:
+        """Return the time of each point and that of the row's end, seconds, if the stage rests at these distances.
+
+        It does not wait there: the times between a point before and one behind a stop are lower limits.
+        """
+        times: list[float] = []
+        begin_s = 0.0
+        point = 0
+        for begin, end in pairwise([0, *stops, self.length]):
+            leg = _Leg.plan(end - begin, self)
+            while point < self.points and (place := self.run_up + point * abs(self.step)) <= end:
+                times.append(begin_s + leg.time_s(place - begin))
+                point += 1
+            begin_s += leg.time_s(end - begin)
+        return times, begin_s
+
+
+class _Leg(NamedTuple):
+    """A motion from rest to rest, in the arithmetic of the sketch (motion_step.h)."""
+
+    distance: int
+    up_s: list[float]  # time of each step while the stage speeds up
+    cruise_s: float  # of each step at constant speed
+    down_s: list[float]  # time from full speed to each step while it slows down
+
+    @staticmethod
+    def plan(distance: int, motion: RowMotion) -> _Leg:
+        ramp = min(motion.ramp, distance // 2)
+        slowest = slowest_feed(motion.accel)
+        speed = slowest
+        step_s = 0.0
+        up_s = [0.0]
+        for _ in range(ramp):
+            speed = min(speed + motion.accel * step_s, motion.feed)
+            step_s = _step_s(speed)
+            up_s.append(up_s[-1] + step_s)
+        cruise_s = step_s
+        if ramp == motion.ramp:
+            speed = motion.feed
+            cruise_s = 1 / motion.feed
+        step_s = cruise_s
+        down_s = [0.0]
+        for _ in range(ramp):
+            speed = max(speed - motion.accel * step_s, slowest)
+            step_s = _step_s(speed)
+            down_s.append(down_s[-1] + step_s)
+        return _Leg(distance, up_s, cruise_s, down_s)
+
+    def time_s(self, steps: int) -> float:
+        """Return the time from rest to this step."""
+        ramp = len(self.up_s) - 1
+        if steps <= ramp:
+            return self.up_s[steps]
+        cruised = min(steps, self.distance - ramp) - ramp
+        return self.up_s[ramp] + cruised * self.cruise_s + self.down_s[steps - ramp - cruised]
+
+
+def _step_s(speed: float) -> float:
+    """Return the time of a step on a ramp, whole ticks of the timer."""
+    return TICK_HZ // int(speed) / TICK_HZ
+
+
+def slowest_feed(accel: int) -> int:
+    """Return the speed with which the stage starts and stops, steps/s."""
+    return max(math.isqrt(accel // 2), MIN_FEED)
 
 
 class EdgeTimes:
-    """The edges of one row. `holds`: number of holds commanded so far."""
+    """The edges of one row. Times of edges and statuses are on one clock, nanoseconds."""
 
-    def __init__(self, row: Row, stage: Stage, speed_mm_s: float) -> None:
-        self._step_mm = abs(row.step_mm)
-        self._speed_mm_s = round(speed_mm_s * stage.steps_per_mm) / stage.steps_per_mm
-        self._accel_mm_s2 = stage.accel_mm_s2
-        self._nominal_s = self._step_mm / self._speed_mm_s
+    def __init__(self, motion: RowMotion) -> None:
+        self._motion = motion
+        self._interval_s = abs(motion.step) / motion.feed
         self._edges_ns: list[int] = []
-        self._counts = (0, 0)  # edges at the status before the last one, and at the last one
-        self.holds = 0
+        self._statuses: list[tuple[int, int]] = []  # points, and the latest time at which they were written
+        self._stops: list[int] = []  # distances at which the stage rested, in a hold
+        self._early_stops: list[int] = []  # those before the first point: of the row, or of the travel to it
+        self._is_held = False
 
-    def note(self, edge_ns: int) -> str:
+    def note_hold(self) -> None:
+        """A hold is commanded: intervals may be longer from now on, until they are judged at the end."""
+        self._is_held = True
+
+    def note_stop(self, x: int, points: int) -> None:
+        """The stage rests at `x` in a hold, after this many points."""
+        distance = self._motion.distance(x)
+        stops = self._stops if points else self._early_stops
+        if 0 < distance < self._motion.length and distance not in stops:
+            stops.append(distance)
+
+    def note_edge(self, edge_ns: int) -> str:
         """Add an edge; return what is wrong with it, or ""."""
         self._edges_ns.append(edge_ns)
         if len(self._edges_ns) < 2:
             return ""
         interval_s = (edge_ns - self._edges_ns[-2]) * 1e-9
-        ratio = interval_s / self._nominal_s
-        if ratio < 1 - TOLERANCE:
-            kind = "a spurious or early edge"
-        elif ratio <= 1 + TOLERANCE or self.holds:
+        if self._is_held and interval_s > self._interval_s:
             return ""
-        elif abs(ratio - round(ratio)) <= TOLERANCE * ratio:
-            kind = f"{round(ratio) - 1} edges lost"
-        else:
-            kind = "a late edge, or lost ones beside a spurious one"
-        return f"{kind} at point {len(self._edges_ns) - 1}: {self._compare(interval_s)}"
+        return self._compare(len(self._edges_ns) - 1, interval_s, self._interval_s)
 
-    def note_status(self, points: int) -> str:
-        """Compare the stage's points with the edges of two statuses ago; return what is wrong, or ""."""
-        before, last = self._counts
-        self._counts = (last, len(self._edges_ns))
-        return f"a spurious edge: {before} edges came and later {points} points were passed" if before > points else ""
+    def note_status(self, points: int, asked_ns: int, written_ns: int) -> str:
+        """Compare the points that the stage has passed with the edges; return what is wrong, or ""."""
+        self._statuses.append((points, written_ns))
+        edges = bisect_right(self._edges_ns, asked_ns)
+        return f"a spurious edge: {edges} edges came before {points} points were passed" if edges > points else ""
 
-    def judge_holds(self) -> str:
-        """Judge the intervals of a whole row that was held; return what is wrong, or ""."""
-        intervals_s = [(b - a) * 1e-9 for a, b in pairwise(self._edges_ns)]
-        longest_s = self._nominal_s * (1 + TOLERANCE)
-        stretched = [i for i, interval_s in enumerate(intervals_s) if interval_s > longest_s]
-        stops = self._group(stretched)
-        if len(stops) > self.holds:
-            return f"late or lost edges at points {[first + 1 for first, _ in stops]}, {self.holds} holds"
-        for first, last in stops:
-            # One more interval on either side: the slowing down may begin or end in it.
-            begin = max(0, first - 1)
-            if not self._is_hold(intervals_s[begin : last + 2]):
-                return f"late or lost edges at points {first + 1} to {last + 1}, not those of a hold"
+    def judge(self, was_held: bool, done_ns: int) -> str:
+        """Judge a row whose counts are right, with its `done` written by `done_ns`; return what is wrong, or ""."""
+        for points, written_ns in self._statuses:
+            latest_ns = written_ns + round(STATUS_TOLERANCE * self._interval_s * 1e9)
+            edges = bisect_right(self._edges_ns, latest_ns)
+            if edges < points:
+                return f"a lost or late edge: {points} points were passed when {edges} edges had come"
+        if not was_held:
+            return self._judge_motion([], done_ns)
+        stops = sorted(self._stops)
+        # A hold during the travel to the row has no effect on it.
+        wrong = self._judge_motion(stops, done_ns)
+        if wrong and self._early_stops:
+            wrong = self._judge_motion(sorted(self._early_stops) + stops, done_ns)
+        return wrong
+
+    def _judge_motion(self, stops: list[int], done_ns: int) -> str:
+        points_s, end_s = self._motion.time_points(stops)
+        for point in range(1, self._motion.points):
+            interval_s = (self._edges_ns[point] - self._edges_ns[point - 1]) * 1e-9
+            place = self._motion.run_up + point * abs(self._motion.step)
+            waited = any(place - abs(self._motion.step) <= stop < place for stop in stops)
+            expected_s = points_s[point] - points_s[point - 1]
+            if waited and interval_s > expected_s:
+                continue
+            if wrong := self._compare(point, interval_s, expected_s):
+                return wrong
+        run_out_s = (done_ns - self._edges_ns[-1]) * 1e-9
+        expected_s = end_s - points_s[-1]
+        if run_out_s < (1 - TOLERANCE) * expected_s:
+            return (
+                f"a spurious or late edge: the row ended {run_out_s * 1e3:.1f} ms after the last edge, "
+                f"from the last point it takes {expected_s * 1e3:.1f} ms"
+            )
         return ""
 
-    def _group(self, stretched: Sequence[int]) -> list[tuple[int, int]]:
-        """Return the first and last interval of each stop: intervals that one stop can touch belong together."""
-        reach = math.ceil(self._speed_mm_s**2 / self._accel_mm_s2 / self._step_mm) + 1
-        stops: list[tuple[int, int]] = []
-        for i in stretched:
-            if stops and i - stops[-1][0] <= reach:
-                stops[-1] = (stops[-1][0], i)
-            else:
-                stops.append((i, i))
-        return stops
-
-    def _is_hold(self, intervals_s: Sequence[float]) -> bool:
-        """True if a hold somewhere among these intervals, or beside them, explains each of them.
-
-        Searches the place of the slowest moment and its speed (0 unless the motion was resumed before the stop).
-        """
-        margin_mm = self._speed_mm_s**2 / (2 * self._accel_mm_s2)
-        length_mm = len(intervals_s) * self._step_mm
-        for slowest_mm_s in (0.0, self._speed_mm_s / 2):
-            middle_mm = length_mm / 2
-            width_mm = length_mm + 2 * margin_mm
-            width_mm_s = 2 * slowest_mm_s
-            for _ in range(LEVELS):
-                speeds = [0.0]
-                if width_mm_s:
-                    speeds = [slowest_mm_s + width_mm_s * (k / SPEEDS - 0.5) for k in range(SPEEDS + 1)]
-                    speeds = [min(max(speed, 0.0), 0.999 * self._speed_mm_s) for speed in speeds]
-                places = [middle_mm + width_mm * (k / PLACES - 0.5) for k in range(PLACES + 1)]
-                error, middle_mm, slowest_mm_s = min(
-                    (self._misfit(intervals_s, place, speed), place, speed) for place in places for speed in speeds
-                )
-                if error <= TOLERANCE:
-                    return True
-                width_mm /= PLACES / 16
-                width_mm_s /= SPEEDS / 6
-        return False
-
-    def _misfit(self, intervals_s: Sequence[float], stop_mm: float, slowest_mm_s: float) -> float:
-        """Return the largest deviation, relative to the interval at constant speed."""
-        worst = 0.0
-        for i, interval_s in enumerate(intervals_s):
-            before_mm = stop_mm - i * self._step_mm
-            after_mm = before_mm - self._step_mm
-            expected_s = abs(self._time_s(abs(before_mm), slowest_mm_s) - self._time_s(abs(after_mm), slowest_mm_s))
-            holds_stop = before_mm >= 0 >= after_mm
-            if holds_stop:
-                expected_s = self._time_s(before_mm, slowest_mm_s) + self._time_s(-after_mm, slowest_mm_s)
-            error_s = interval_s - expected_s
-            if holds_stop and slowest_mm_s == 0:
-                error_s = min(error_s, 0.0)  # it waits there
-            worst = max(worst, abs(error_s) / max(self._nominal_s, expected_s))
-        return worst
-
-    def _time_s(self, distance_mm: float, slowest_mm_s: float) -> float:
-        """Return the time from the slowest moment to this distance from it."""
-        accel = self._accel_mm_s2
-        ramp_mm = (self._speed_mm_s**2 - slowest_mm_s**2) / (2 * accel)
-        on_ramp_mm = min(distance_mm, ramp_mm)
-        on_ramp_s = (math.sqrt(slowest_mm_s**2 + 2 * accel * on_ramp_mm) - slowest_mm_s) / accel
-        return on_ramp_s + (distance_mm - on_ramp_mm) / self._speed_mm_s
-
-    def _compare(self, interval_s: float) -> str:
-        return f"{interval_s * 1e3:.2f} ms after the one before, {self._nominal_s * 1e3:.2f} ms at this speed"
+    def _compare(self, point: int, interval_s: float, expected_s: float) -> str:
+        """Say what is wrong with the edge of a point, or ""."""
+        tolerance_s = TOLERANCE * max(self._interval_s, expected_s)
+        late_s = interval_s - expected_s
+        lost = round(late_s / self._interval_s)
+        if abs(late_s) <= tolerance_s:
+            return ""
+        if late_s < 0:
+            kind = "a spurious or early edge"
+        elif lost and abs(late_s - lost * self._interval_s) <= (lost + 1) * tolerance_s:
+            kind = f"{lost} edges lost"
+        else:
+            kind = "a late edge, or lost ones beside a spurious one"
+        return f"{kind} at point {point}: {interval_s * 1e3:.2f} ms after the one before, not {expected_s * 1e3:.2f} ms"

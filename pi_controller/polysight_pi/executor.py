@@ -18,9 +18,10 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from polysight_pi.edges import MIN_FEED
 from polysight_pi.journal import Journal, JournalFullError, JournalThread
 from polysight_pi.machine import Machine, RefusedError
-from polysight_pi.stage import MIN_FEED, StageDriver, StageLost, StageNews
+from polysight_pi.stage import StageDriver, StageLost, StageNews
 from polysight_pi.trigger import BurstSent, BurstSpec, LoopFault, TriggerLoop
 from polysight_shared import __version__
 from polysight_shared import messages as m
@@ -96,7 +97,7 @@ class Executor:
         self._machine = Machine(stage, loop, self.journal, self._inbox.put)
         self._run: m.BeginRun | None = None
         self._last_row: tuple[int, int] | None = None
-        self._takes: dict[int, int] = {}  # the newest one of each row of this run
+        self._takes: dict[int, int] = {}  # the newest one of each row of this scan
         self._waits_for_journal = False  # a run begins or ends
         self._deferred: list[Request] = []  # commands behind it
         self._after_row: Request | None = None
@@ -187,7 +188,7 @@ class Executor:
         self._machine.check_deadlines()
         late = self._find_late()
         if late:
-            self._machine.stop_for(late)
+            self._machine.stop_motion(PiFault.PROGRAM_LATE, late)
         self._refresh()
         self._send_replies()
         self._turned_s = time.monotonic()
@@ -274,8 +275,10 @@ class Executor:
         if self._waits_for_journal and isinstance(command, (*JOURNALLED, m.Pulse)):
             self._deferred.append(request)
             return None
-        # A run whose host is gone keeps nobody from homing.
-        owned = isinstance(command, OWNED) or (isinstance(command, m.Home) and self._machine.host_lives)
+        owned = isinstance(command, OWNED)
+        if run and isinstance(command, m.Home):
+            # A run whose host is gone keeps nobody from homing; a host of an older release sends no owner.
+            owned = run.owns_home and self._machine.host_lives
         if run and owned and getattr(command, "owner", "") not in (run.owner, self.take_over_key):
             raise RefusedError(PiFault.NOT_OWNER, f"run {run.scan_id} is another program's")
         match command:
@@ -355,21 +358,25 @@ class Executor:
         return self._machine.row is not None
 
     def _begin(self, request: Request, run: m.BeginRun) -> None:
+        takes: dict[int, int] = {}
+
         def write(journal: Journal) -> None:
             resumed, lost = journal.open(run.scan_id, run.plan, run.last_seq)
             journal.add(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
             journal.commit()
+            takes.update(journal.takes)
 
         def begun() -> m.Accepted:
             self._forget_run()
             self._run = run
+            self._takes = takes
             return self._accept("BeginRun", run.heartbeat_ms)
 
         self._write_synced(request, write, begun)
 
     def _forget_run(self) -> None:
         self._run = self._last_row = None
-        self._takes.clear()
+        self._takes = {}
         self._machine.happen("EndRun")
 
     def _end_run(self, request: Request, command: m.EndRun) -> m.Accepted | None:
@@ -432,7 +439,13 @@ class Executor:
         _require(index < run.plan.rows, f"row {index} is not in the plan of {run.plan.rows}")
         # A late copy of an old command must not move the stage.
         newest = self._takes.get(index, 0)
-        _require(command.take > newest, f"take {command.take} of row {index} is not newer than take {newest}")
+        if command.take <= newest:
+            raise RefusedError(
+                PiFault.BAD_REQUEST,
+                f"take {command.take} of row {index} is not newer than take {newest}",
+                "a late copy of an old command, or a program that does not know the scan's events",
+                "ask for the scan's events (Replay), and count on from them",
+            )
         accepted = self._accept("RunRow", run.plan.row(index), command.take, read_burst(run), run.speed_mm_s)
         self._takes[index] = command.take
         return accepted

@@ -175,6 +175,11 @@ class TriggerInput:
         self.check_width = not pi.one_shot
         self._events: deque[Any] = deque()
         self._input = _request_edges(pi, pi.trigger_in, pi.trigger_debounce_us)
+        gpiod = load_gpiod()
+        with gpiod.Chip(find_chip(pi.gpio_chip)) as chip:
+            clock = chip.get_line_info(pi.trigger_in).event_clock
+        # A chip with a timestamp engine of its own has another clock.
+        self.is_real_time = clock == gpiod.line.Clock.MONOTONIC
 
     def now_ns(self) -> int:
         """Return the time of CLOCK_MONOTONIC, nanoseconds."""
@@ -397,6 +402,7 @@ class WireLines:
     """
 
     name: str = WIRES
+    is_real_time = False
 
     def __init__(self, path: Path, pi: Pi) -> None:
         self.check_width = not pi.one_shot

@@ -13,16 +13,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
-from polysight_pi.edges import EdgeTimes
+from polysight_pi.edges import EdgeTimes, RowMotion
 from polysight_pi.journal import JournalThread
-from polysight_pi.stage import MAX_MM, StageDriver, StageLostError, StageRefusedError, row_end_in_steps
+from polysight_pi.stage import MAX_MM, StageDriver, StageLostError, StageRefusedError
 from polysight_pi.trigger import BurstSent, BurstSpec, Counts, Job, LoopFault, TriggerLoop, TriggerWatch
 from polysight_shared import messages as m
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import PolysightError, ProtocolError
 from polysight_shared.faults import PiFault, StageError, explain
 from polysight_shared.raster import Row, Stage
-from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
+from polysight_shared.stage_line import END_OF_TIME_NS, HOMING_TIMEOUT_S, Immediate, Reply
 
 STATUS_EVENT_S = 0.24
 RESTS = 3  # consecutive statuses at rest after which the reply to the end of a motion counts as lost
@@ -116,21 +116,24 @@ class RunningRow:
     take: int
     job: Job
     sequence: int  # of the stage's ROW and its `done`
-    end_steps: tuple[int, int]  # x and y where the stage has to end
+    motion: RowMotion
     edges: EdgeTimes
+    is_underway: bool = False  # True once the stage's `ok` was read: earlier statuses belong to the motion before
     status: m.RowStatus | None = None
     fault: int = 0
     reason: str = ""
     lasting: bool = False  # the next state is fault
     points: int = 0  # passed, counted by the stage
     bursts: int = 0  # reported to the host
+    was_held: bool = False  # within the row; the stage says so
+    done_ns: int = END_OF_TIME_NS  # latest time at which its `done` was written
 
     def judge(self, counts: Counts) -> None:
         """Set the result of a row that was not stopped: `done` if all counts agree, else `fault`."""
         points = self.row.points
         pulses = points * self.job.spec.pulses
         if self.points == points and counts == Counts(points, points, pulses):
-            wrong = self.edges.judge_holds()
+            wrong = self.edges.judge(self.was_held, self.done_ns)
             self.status = "fault" if wrong else "done"
             self.fault = int(PiFault.EDGE_TIME) if wrong else 0
             self.reason = wrong or self.reason
@@ -172,6 +175,9 @@ class Machine:
         self._deadline_s = math.inf
         self._homing = -1  # sequence of HOME
         self._homing_underway = False  # True once the stage has accepted it
+        self._homing_is_watched = False  # its host sends heartbeats
+        self._rests_in_hold = False
+        self._resumes_at_rest = False
         self._lines_dead = self._terminating = False
         self._rests = 0
         self._watch = TriggerWatch()
@@ -243,7 +249,9 @@ class Machine:
 
     @property
     def _host_lost_s(self) -> float:
-        return self._host_alive_s + self._host_timeout_s if self.state in ("running", "held") else math.inf
+        if self.state in ("running", "held") or (self.state == "homing" and self._homing_is_watched):
+            return self._host_alive_s + self._host_timeout_s
+        return math.inf
 
     def seconds_left(self) -> float:
         """Return the time until the next deadline; infinity if there is none."""
@@ -255,14 +263,14 @@ class Machine:
             self.happen("timeout")
         if self._clock() >= self._host_lost_s:
             reason = f"no heartbeat of the host for {self._host_timeout_s * 1e3:.0f} ms"
-            self.happen("row fault", PiFault.HOST_LOST, reason)
+            self.stop_motion(PiFault.HOST_LOST, reason)
 
-    def stop_for(self, late: str) -> None:
-        """Stop the motion because a part of the program does not answer; `late` names it."""
+    def stop_motion(self, number: int, reason: str) -> None:
+        """Stop a row or homing, if there is one, with this fault."""
         if self.state in ("running", "held"):
-            self.happen("row fault", PiFault.PROGRAM_LATE, late)
+            self.happen("row fault", number, reason)
         elif self.state == "homing":
-            self.happen("lasting fault", PiFault.PROGRAM_LATE, late)
+            self.happen("lasting fault", number, reason)
 
     # --- events of trigger loop and stage ---------------------------------------------------------------------------
 
@@ -272,7 +280,7 @@ class Machine:
         record = sent.record
         if row is None or sent.job is not row.job:
             return
-        wrong = row.edges.note(sent.edge_ns)
+        wrong = row.edges.note_edge(sent.edge_ns)
         if wrong:
             self.happen("row fault", PiFault.EDGE_TIME, wrong)
         if not record.pulses:
@@ -302,6 +310,8 @@ class Machine:
             self._on_status(reply)
         elif reply.kind == "ok":
             self._homing_underway |= homing and answers_home
+            if self.row is not None and reply.sequence == self.row.sequence:
+                self.row.is_underway = True
         elif homing and not self._homing_underway:
             pass  # sent before HOME was accepted
         elif reply.kind == "banner":
@@ -323,14 +333,8 @@ class Machine:
         self.stage.note_position(reply)
         self._publish_status(reply)
         row = self.row
-        edges = self._loop.counts.edges
-        if row is not None and self.state in MOVING:
-            row.points = max(0, _number(reply, "points"))
-            if wrong := row.edges.note_status(row.points):
-                self.happen("row fault", PiFault.EDGE_TIME, wrong)
-            if self.state != "stopping" and self._watch.is_silent(row.points, edges):
-                reason = f"the stage has passed {row.points} points, {edges} edges were received: wire off?"
-                self.happen("lasting fault", PiFault.TRIGGER_LINE_LOST, reason)
+        if row is not None and row.is_underway and self.state in MOVING:
+            self._note_row_status(row, reply)
         waits_for_end = self.state in MOVING and (row is not None or self._homing_underway)
         if waits_for_end and reply.fields.get("state") in ("idle", "alarm"):
             self._rests += 1
@@ -345,6 +349,23 @@ class Machine:
                 self.stage.link.repeat()  # the stage repeats the end of its motion
             except StageLostError as e:
                 self.happen("stage lost", e.number, str(e))
+
+    def _note_row_status(self, row: RunningRow, reply: Reply) -> None:
+        row.points = max(0, _number(reply, "points"))
+        if wrong := row.edges.note_status(row.points, reply.asked_ns, reply.written_ns):
+            self.happen("row fault", PiFault.EDGE_TIME, wrong)
+        edges = self._loop.counts.edges
+        if self.state != "stopping" and self._watch.is_silent(row.points, edges):
+            reason = f"the stage has passed {row.points} points, {edges} edges were received: wire off?"
+            self.happen("lasting fault", PiFault.TRIGGER_LINE_LOST, reason)
+        if self.state in ("running", "held") and reply.fields.get("state") == "hold":
+            row.edges.note_stop(_number(reply, "x"), row.points)
+            self._rests_in_hold = True
+            if self._resumes_at_rest:
+                try:
+                    self._send_resume()
+                except StageLostError as e:
+                    self.happen("stage lost", e.number, str(e))
 
     def _publish_status(self, reply: Reply) -> None:
         now_s = self._clock()
@@ -364,6 +385,7 @@ class Machine:
             remedy = "find out why, then start polysight-pi again"
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self.reason, remedy=remedy)
         self.homed = self._homing_underway = False
+        self._homing_is_watched = self.host_lives
         self._journal.retry()
         self._forget_fault()
         self._post(self._home_now)
@@ -400,8 +422,9 @@ class Machine:
 
     def _start_row(self, row: Row, take: int, spec: BurstSpec, speed_mm_s: float) -> None:
         job = self._loop.arm(row.points, spec)
+        motion = RowMotion.plan(row, self.stage.config, speed_mm_s)
         try:
-            sequence = self.stage.row(row, speed_mm_s)
+            sequence = self.stage.row(motion)
         except (StageRefusedError, StageLostError) as e:
             self._loop.disarm()
             if isinstance(e, StageLostError):
@@ -409,9 +432,7 @@ class Machine:
             elif e.number in POSITION_LOST:
                 self.happen("not homed")
             raise
-        end_steps = row_end_in_steps(row, self.stage.config, speed_mm_s)
-        edges = EdgeTimes(row, self.stage.config, speed_mm_s)
-        self.row = RunningRow(row, take, job, sequence, end_steps, edges)
+        self.row = RunningRow(row, take, job, sequence, motion, EdgeTimes(motion))
         self.row_timeout_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
         self._rests = 0
         self._watch = TriggerWatch()
@@ -419,10 +440,19 @@ class Machine:
         self._journal.add(m.RowStarted, row=row, take=take)
 
     def _hold(self) -> None:
-        self._current.edges.holds += 1
+        self._current.edges.note_hold()
+        self._rests_in_hold = False
+        self._resumes_at_rest = False
         self.stage.link.send_byte(Immediate.HOLD)
 
     def _resume(self) -> None:
+        # Not before the stage rests: its place then tells the times of the edges around it.
+        self._resumes_at_rest = True
+        if self._rests_in_hold:
+            self._send_resume()
+
+    def _send_resume(self) -> None:
+        self._resumes_at_rest = False
         self.stage.link.send_byte(Immediate.RESUME)
 
     # --- actions: how a row ends ------------------------------------------------------------------------------------
@@ -493,14 +523,14 @@ class Machine:
         row = self._current
         self.stage.at_rest()
         row.points = max(0, _number(reply, "points", row.row.points))
+        row.done_ns = reply.written_ns
         if _number(reply, "held"):
+            row.was_held = True
             row.reason = "held during the row: some positions were passed below full speed"
-        else:
-            row.edges.holds = 0  # held before the first point
-        end_steps = (_number(reply, "x", -1), _number(reply, "y", -1))
-        if end_steps != row.end_steps and row.status is None:
+        end = (_number(reply, "x", -1), _number(reply, "y", -1))
+        if end != row.motion.end and row.status is None:
             self.homed = False
-            self._fail_row(PiFault.POSITION, f"the row ended at {end_steps}, not at {row.end_steps} (x, y in steps)")
+            self._fail_row(PiFault.POSITION, f"the row ended at {end}, not at {row.motion.end} (x, y in steps)")
         return "ending" if row.bursts >= row.row.points else None
 
     def _note_stopped(self, reply: Reply | None = None) -> None:

@@ -251,7 +251,12 @@ class Service:
             opened.callback(self._loop.stop)
             self.server = Server(pi.command_address, pi.event_address, Path(pi.key_dir), pi.heartbeat_ms)
             opened.callback(self.server.close)
-            stage = StageDriver(instrument.stage, self._post, lambda: self.executor.unresponsive_s)
+            stage = StageDriver(
+                instrument.stage,
+                self._post,
+                caller_late_s=lambda: self.executor.unresponsive_s,
+                bound_now_ns=self._loop.bound_now_ns,
+            )
             opened.callback(stage.close)
             feed = partial(system.notify_systemd, "WATCHDOG=1")
             self.executor = Executor(stage, self._loop, self._journal, feed, self._find_late)

@@ -7,22 +7,25 @@ the heartbeat without which a moving stage stops. Protocol: docs/spec/stage-line
 
 from __future__ import annotations
 
-import math
 import os
 import queue
 import termios
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import msgspec
 import serial
 
+from polysight_pi.edges import RowMotion
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, ProtocolError
 from polysight_shared.faults import PiFault, StageError, explain
-from polysight_shared.raster import INVERTIBLE, Row, Stage
+from polysight_shared.raster import INVERTIBLE, Stage
 from polysight_shared.stage_line import (
+    END_OF_TIME_NS,
     HOMING_TIMEOUT_S,
     MAX_LINE_BYTES,
     MAX_SEQUENCE,
@@ -32,7 +35,9 @@ from polysight_shared.stage_line import (
     Parameter,
     Reply,
 )
+from polysight_shared.units import NS_PER_S
 
+BITS_PER_BYTE = 10  # on the line: with start and stop bit
 BANNER_TIMEOUT_S = 3.0  # the first opening of the port resets an UNO, whose boot loader takes up to 2 s
 ANSWER_TIMEOUT_S = 0.5  # the longest line and its answer take 14 ms at 115200 baud; the rest is for a busy machine
 TRIES = 4
@@ -45,7 +50,6 @@ IDLE_STATUS_S = 1.0
 STOP_TIMEOUT_S = 3.0  # from STOP to standstill
 CLEAR_RETRY_S = 0.05
 CALLER_LATE_S = 3.0  # longer than a line and its retries take
-MIN_FEED = 31  # steps/s; the stage starts and stops at sqrt(acceleration / 2), but not below this
 MAX_MM = 1e6  # limit of a position in the messages
 MOTION_TIMEOUT_S = HOMING_TIMEOUT_S  # no motion takes longer than homing
 
@@ -128,6 +132,8 @@ class StageLink:
     caller_late_s
         How long the thread that commands the stage has not completed a turn. A stage in motion is stopped if that, and
         the time since its last command, exceed `CALLER_LATE_S`: the heartbeat must not speak for a thread that hangs.
+    bound_now_ns
+        Earliest and latest time that it can be now on the clock of the trigger edges, for the times of each reply.
     """
 
     def __init__(
@@ -138,10 +144,14 @@ class StageLink:
         heartbeat_s: float = 2.0,
         banner_timeout_s: float = BANNER_TIMEOUT_S,
         caller_late_s: Callable[[], float] = lambda: 0.0,
+        bound_now_ns: Callable[[], tuple[int, int]] = lambda: (0, END_OF_TIME_NS),
     ) -> None:
         self.port = port
         self._news = news
         self._caller_late_s = caller_late_s
+        self._bound_now_ns = bound_now_ns
+        # Of requests without an answer yet. More than two are never open: a stage that is silent for so long is lost.
+        self._asked_ns: deque[int] = deque(maxlen=2)
         self._commanded_s = time.monotonic()
         self._watch = StatusWatch(heartbeat_s, time.monotonic())
         try:
@@ -299,6 +309,7 @@ class StageLink:
     def _ask_status(self, now: float) -> None:
         hung_s = min(self._caller_late_s(), now - self._commanded_s)
         if hung_s < CALLER_LATE_S or self._watch.interval_s >= IDLE_STATUS_S:
+            self._asked_ns.append(self._bound_now_ns()[0])
             self._write(bytes([Immediate.STATUS]))
         else:
             self._write(Immediate.STOP.sent)
@@ -311,8 +322,14 @@ class StageLink:
             self.bad_lines += 1  # if it was an answer, its line is retried
             return
         # Only the answer to the request is a sign of life; a serial line can chatter without end, and repeat itself.
+        asked_ns = 0
         if reply.kind == "status":
             self._watch.heard()
+            if self._asked_ns:
+                asked_ns = self._asked_ns.popleft()
+        # Its last byte came now; the stage wrote the line before its first one.
+        written_ns = self._bound_now_ns()[1] - len(line) * BITS_PER_BYTE * NS_PER_S // self._serial.baudrate
+        reply = msgspec.structs.replace(reply, asked_ns=asked_ns, written_ns=written_ns)
         if reply.kind in ("ok", "error"):
             self._answers.put(reply)
         elif reply.kind == "banner" and not self._greeted:
@@ -323,13 +340,11 @@ class StageLink:
 
 
 class StageDriver:
-    """The stage of the [stage] table, used by one thread; `news` and `caller_late_s` as in :class:`StageLink`."""
+    """The stage of the [stage] table, used by one thread; `news` and `of_link` are arguments of :class:`StageLink`."""
 
-    def __init__(
-        self, config: Stage, news: Callable[[StageNews], None], caller_late_s: Callable[[], float] = lambda: 0.0
-    ) -> None:
+    def __init__(self, config: Stage, news: Callable[[StageNews], None], **of_link: Any) -> None:
         self.config = config
-        self._caller_late_s = caller_late_s
+        self._of_link = of_link
         self.port = config.port
         self._news = news
         self._open: StageLink | None = None
@@ -349,7 +364,7 @@ class StageDriver:
             self.config.baud,
             self._news,
             self.config.heartbeat_ms / 1e3,
-            caller_late_s=self._caller_late_s,
+            **self._of_link,
         )
         if link.steps_per_mm not in ("", f"{self.config.steps_per_mm:g}"):
             self.close()
@@ -427,9 +442,9 @@ class StageDriver:
                 raise
         self.link.request("ENABLE", 1)
 
-    def row(self, row: Row, speed_mm_s: float) -> int:
+    def row(self, motion: RowMotion) -> int:
         """Start a row; return the sequence number of its `done`."""
-        return self._start("ROW", *row_in_steps(row, self.config, speed_mm_s))
+        return self._start("ROW", *motion.line)
 
     def move(self, x_mm: float, y_mm: float, speed_mm_s: float) -> int:
         """Start a move to a position; return the sequence number of its `done`."""
@@ -467,25 +482,6 @@ class StageDriver:
             self.at_rest()
             raise
         return -1 if answer.sequence is None else answer.sequence
-
-
-def row_in_steps(row: Row, stage: Stage, speed_mm_s: float) -> tuple[int, int, int, int, int]:
-    """Return the arguments of ROW: first point, signed step, points, y (all in steps), speed in steps/s."""
-    k = stage.steps_per_mm
-    x_start = round((stage.centre_x_mm + row.x_start_mm) * k)
-    y = round((stage.centre_y_mm + row.y_mm) * k)
-    return x_start, round(row.step_mm * k), row.points, y, round(speed_mm_s * k)
-
-
-def row_end_in_steps(row: Row, stage: Stage, speed_mm_s: float) -> tuple[int, int]:
-    """Return x and y in steps where the stage rests after a row (docs/spec/stage-line.md, "A row")."""
-    x_start, step, points, y, feed = row_in_steps(row, stage, speed_mm_s)
-    accel = round(stage.accel_mm_s2 * stage.steps_per_mm)
-    ramp = 0
-    if feed > max(math.isqrt(accel // 2), MIN_FEED):
-        ramp = -(-(feed**2) // (2 * accel))
-    run_up = ramp + max(abs(step), round(stage.backlash_mm * stage.steps_per_mm))
-    return x_start + (points - 1) * step + row.direction * run_up, y
 
 
 class Position(NamedTuple):

@@ -20,6 +20,7 @@ from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.faults import PiFault
 from polysight_shared.messages import Pulsed, Timing
 from polysight_shared.raster import FIRST_PULSE_DELAY_S, MAX_WIDTH_NS, MIN_PERIOD_NS, Burst
+from polysight_shared.stage_line import END_OF_TIME_NS
 from polysight_shared.units import us_to_ns
 
 # From edge to first pulse. A fixed delay, longer than the usual wake-up time, keeps the pulses of all positions at the
@@ -96,6 +97,7 @@ class _Lines(Protocol):
 
     name: str
     check_width: bool  # True without a hardware one-shot: a pulse that may have been too long is a fault
+    is_real_time: bool  # True if their clock is CLOCK_MONOTONIC
 
     # Time on the clock of edges and pulses.
     def now_ns(self) -> int: ...
@@ -346,6 +348,13 @@ class TriggerLoop:
     def start(self) -> None:
         """Start the thread."""
         self._thread.start()
+
+    def bound_now_ns(self) -> tuple[int, int]:
+        """Return the earliest and the latest time that it can be now on the clock of the edges. From any thread."""
+        if not self._lines.is_real_time:
+            return 0, END_OF_TIME_NS
+        now_ns = self._lines.now_ns()
+        return now_ns, now_ns
 
     def arm(self, points: int, spec: BurstSpec) -> Job:
         """Answer the edges of this row from now on."""

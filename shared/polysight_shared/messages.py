@@ -182,7 +182,7 @@ class BeginRun(Command, frozen=True, kw_only=True):
 
     `last_seq` is the run's last event that the host has; the Pi continues the sequence after it, even if its journal
     was lost. `heartbeat_ms`: period of the host's `Alive` messages; 0: none. `owner`: a secret chosen by the host,
-    required in all commands of this run.
+    required in all commands of this run. `owns_home`: in `Home`, too; False from hosts that send none there.
     """
 
     scan_id: ScanId
@@ -194,6 +194,7 @@ class BeginRun(Command, frozen=True, kw_only=True):
     last_seq: Seq = 0
     heartbeat_ms: Annotated[int, msgspec.Meta(ge=0, le=MAX_HEARTBEAT_MS)] = 0
     owner: Owner = ""
+    owns_home: bool = False
 
 
 class EndRun(Command, frozen=True, kw_only=True):

@@ -16,6 +16,7 @@ from polysight_shared.errors import ProtocolError
 PROTOCOL_VERSION = 2
 MAX_LINE_BYTES = 96
 MAX_SEQUENCE = 65535
+END_OF_TIME_NS = 2**63 - 1
 HOMING_TIMEOUT_S = 300.0  # of the Pi; programs that wait for the Pi need a longer one
 _VALUE = re.compile(r"-?[0-9]{1,10}")
 _COMMAND = re.compile(r"N([0-9]{1,5}) ([A-Z]+)((?: -?[0-9]{1,10})*)")
@@ -128,12 +129,16 @@ class Reply(msgspec.Struct, frozen=True):
     * `done`: motion command `sequence` ended; a row has fields points, pulses, x, y
     * `alarm`: latched fault `number`
     * `status`: answer to the STATUS byte; fields state, x, y, points, pulses, alarm, limits
+
+    The receiver notes that it was written after `asked_ns` and before `written_ns`.
     """
 
     kind: str
     sequence: int | None = None
     number: int = 0
     fields: dict[str, str] = {}
+    asked_ns: int = 0
+    written_ns: int = END_OF_TIME_NS
 
     def encode(self) -> bytes:
         """Return the sealed line."""

@@ -12,11 +12,10 @@ import msgspec
 import pytest
 import tomli_w
 from tests.support.pi.fakes import FakeStage
-from tests.support.pi.host_side import HostSide
+from tests.support.pi.host_side import HostSide, Running
 from tests.support.pi.program import Process
 from tests.support.rigs import at_stage_port, published_rig, timed_by_the_program
 
-from polysight_pi.service import Service
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
 from polysight_shared.tables import to_builtins
@@ -110,23 +109,6 @@ def start(
             return program, host
 
         yield start
-
-
-class Running:
-    """A service in a thread, and the host's end of its sockets."""
-
-    def __init__(self, instrument: Instrument, wires: Path) -> None:
-        self.service = Service(instrument, wires)
-        self.thread = threading.Thread(target=self.service.serve)
-        self.thread.start()
-        server = self.service.server
-        self.host = HostSide(server.command_address, server.event_address, instrument)
-
-    def close(self) -> None:
-        self.host.close()
-        self.service.stop()
-        self.thread.join()
-        self.service.close()
 
 
 @pytest.fixture

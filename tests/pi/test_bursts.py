@@ -288,6 +288,7 @@ class Controller:
 
     name = "fake"
     check_width = True
+    is_real_time = True
 
     def __init__(self, rate: float = 1.0, late_ns: int = 30_000, bufsiz: int = 4096) -> None:
         self.t, self.rate, self.late_ns, self.bufsiz = 0, rate, late_ns, bufsiz

@@ -2,125 +2,33 @@
 
 from __future__ import annotations
 
-import random
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, get_args
+from typing import get_args
 
 import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.paths import REPO
-from tests.support.pi.fakes import FakeDriver, FakeLines
+from tests.support.pi.machine_bench import Bench
 from tests.support.rigs import published_rig
 
 from polysight.plan.forecast import row_motion_s
 from polysight_pi.executor import check_run, read_burst
-from polysight_pi.machine import RULES, TIMEOUTS_S, WIRE_STATE, Machine, RefusedError, State
-from polysight_pi.stage import STATUS_PER_HEARTBEAT, StatusWatch, row_end_in_steps
-from polysight_pi.trigger import LOOK_UP_S, BurstSent, BurstSpec, Edge, LoopFault, TriggerLoop, TriggerWatch
+from polysight_pi.machine import RULES, TIMEOUTS_S, WIRE_STATE, RefusedError, State
+from polysight_pi.stage import STATUS_PER_HEARTBEAT, StatusWatch
+from polysight_pi.trigger import LOOK_UP_S, LoopFault, TriggerWatch
 from polysight_shared import messages as m
 from polysight_shared.config import Burst
 from polysight_shared.faults import PiFault, StageError
-from polysight_shared.raster import MIN_PERIOD_US, WIDTH_US, Row, plan_raster
+from polysight_shared.raster import MIN_PERIOD_US, WIDTH_US, plan_raster
 from polysight_shared.stage_line import Immediate, Reply
 
-SPEC = BurstSpec(2, 1_500_000, 1000)
-ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
-INTERVAL_NS = 100_000_000  # 2 mm at 20 mm/s
 SAFE_WITHIN_S = 0.5
 ROW_STATES = ("running", "held", "stopping", "done", "ending")
 SPEC_PAGE = (REPO / "docs/spec/wire.md").read_text(encoding="utf-8").split("## State machine\n")[1].split("\n## ")[0]
-
-
-class FakeJournal:
-    def __init__(self) -> None:
-        self.events: list[Any] = []
-
-    def add(self, kind: type, **fields: Any) -> None:
-        self.events.append(kind(scan_id="", seq=0, t_mono_ns=0, **fields))
-
-    def retry(self) -> None: ...
-
-
-class Bench:
-    """A machine with its stage, trigger loop and journal."""
-
-    def __init__(self) -> None:
-        self.t = 100.0
-        self.lines, self.stage, self.journal = FakeLines(), FakeDriver(), FakeJournal()
-        self.posted: list[Any] = []
-        self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)  # not started: edges are given to it
-        parts: Any = (self.stage, self.loop, self.journal, self.posted.append, lambda: self.t)
-        self.machine = Machine(*parts)
-        self.seqno = self.edge_ns = 0
-        self.row = ROW
-
-    def run_posted(self) -> None:
-        while self.posted:
-            item = self.posted.pop(0)
-            if isinstance(item, BurstSent):
-                self.machine.on_burst(item)
-            elif isinstance(item, LoopFault):
-                self.machine.on_loop_fault(item)
-            else:
-                item()
-
-    def later(self, seconds: float) -> None:
-        """Time goes on, in the executor's turns: until something is due, or the time is over."""
-        end = self.t + seconds
-        while self.t < end:
-            left = self.machine.seconds_left()
-            self.t = min(end, self.t + (seconds if left is None else max(left, 1e-6)))
-            self.machine.check_deadlines()
-            self.run_posted()
-
-    def homed(self) -> Bench:
-        self.machine.command("BeginRun", 0)
-        self.machine.command("Home")
-        self.run_posted()
-        self.stage_says(Reply("ok", self.stage.number))
-        self.stage_says(Reply("done", self.stage.number))
-        assert self.machine.state == "ready"
-        return self
-
-    def start(self, row: Row = ROW) -> None:
-        self.row = row
-        self.machine.command("RunRow", row, 1, SPEC, 20.0)
-        self.row_number = self.stage.number
-
-    def stage_says(self, reply: Reply) -> None:
-        self.machine.on_stage(reply)
-        self.run_posted()
-
-    def status(self, points: int, state: str = "row") -> None:
-        self.stage_says(Reply("status", fields={"state": state, "points": str(points), "x": "0", "y": "0"}))
-
-    def row_done(self, dx: int = 0, dy: int = 0, held: int = 0) -> None:
-        """The stage ends the row, this many steps away from where it should."""
-        x, y = row_end_in_steps(self.row, self.stage.config, 20.0)
-        fields = {"points": str(self.row.points), "x": str(x + dx), "y": str(y + dy), "held": str(held)}
-        self.stage_says(Reply("done", self.stage.number, fields=fields))
-
-    def edge(self) -> None:
-        self.edge_at(self.edge_ns + INTERVAL_NS)
-
-    def edge_at(self, t_ns: int) -> None:
-        self.seqno += 1
-        self.edge_ns = t_ns
-        self.lines.t = max(self.lines.t, t_ns)
-        with self.loop._lock:
-            self.loop._take(Edge(t_ns, self.seqno))
-        self.run_posted()
-
-    @property
-    def armed(self) -> bool:
-        return self.loop._job is not None
-
-    def of(self, kind: type) -> list[Any]:
-        return [e for e in self.journal.events if isinstance(e, kind)]
 
 
 def test_a_fresh_machine_has_no_fault_and_nothing_to_wait_for():
@@ -182,61 +90,6 @@ def test_a_row_that_ends_elsewhere_is_no_row(dx, dy):
     assert bench.machine.state == "idle", "its position is not known"
 
 
-LONG_ROW = Row(index=0, y_mm=0.0, x_start_mm=-20.0, step_mm=2.0, points=20)
-
-
-def draw_edge_fault(rng: random.Random, edges_ns: list[int]) -> tuple[str, list[int]]:
-    """Edges with a fault, and its kind."""
-    kind = rng.choice(["lost", "spurious", "lost and spurious", "shifted"])
-    edges = list(edges_ns)
-    if "lost" in kind:
-        del edges[rng.randrange(len(edges))]
-    if "spurious" in kind:
-        begin_ns, end_ns = edges_ns[0] - 2 * INTERVAL_NS, edges_ns[-1] + INTERVAL_NS
-        edges.append(rng.randint(begin_ns, end_ns))
-    if kind == "shifted":
-        edges[rng.randrange(len(edges))] += round(rng.choice([-1, 1]) * rng.uniform(0.02, 0.9) * INTERVAL_NS)
-    return kind, sorted(edges)
-
-
-def run_row(edges_ns: list[int]) -> Any:
-    """A row with these edges and with the statuses of a sound stage; gives its end and the machine's bench."""
-    bench = Bench().homed()
-    bench.start(LONG_ROW)
-    passed_ns = [10**10 + i * INTERVAL_NS for i in range(LONG_ROW.points)]
-    happens = [(t, "edge") for t in edges_ns]
-    happens += [(t + 1, "status") for t in range(passed_ns[0] - 5 * INTERVAL_NS, passed_ns[-1], 125_000_000)]
-    for t_ns, what in sorted(happens):
-        if bench.machine.state != "running":
-            break
-        if what == "edge":
-            bench.edge_at(t_ns)
-        else:
-            bench.status(sum(t <= t_ns for t in passed_ns))
-    if bench.machine.state == "running":
-        bench.row_done()
-        bench.later(2.0)
-    else:
-        bench.stage_says(Reply("alarm", number=StageError.STOPPED))
-    return bench.of(m.RowFinished)[-1]
-
-
-def test_drawn_edge_faults_are_found(request):
-    """Lost, spurious, both, or shifted by 2 % of the interval or more: never `done`, and named."""
-    rows = 1000 if request.config.getoption("--long") else 100
-    rng = random.Random(36)
-    sound_ns = [10**10 + i * INTERVAL_NS for i in range(LONG_ROW.points)]
-    assert run_row(sound_ns).status == "done"
-    for _ in range(rows):
-        within = [t + round(rng.uniform(-0.004, 0.004) * INTERVAL_NS) for t in sound_ns]
-        assert run_row(within).status == "done"
-        kind, edges_ns = draw_edge_fault(rng, sound_ns)
-        finished = run_row(edges_ns)
-        assert finished.status == "fault", (kind, edges_ns)
-        assert finished.fault in (PiFault.EDGE_TIME, PiFault.EDGE_DURING_BURST, PiFault.POINTS_MISMATCH), finished
-        assert finished.reason
-
-
 @pytest.mark.parametrize("held", [False, True])
 @given(beats=st.integers(0, 30), heartbeat_ms=st.integers(10, 100))
 def test_a_host_that_falls_silent_ends_the_row_in_time(held, beats, heartbeat_ms):
@@ -258,6 +111,37 @@ def test_a_host_that_falls_silent_ends_the_row_in_time(held, beats, heartbeat_ms
     finished = bench.of(m.RowFinished)[-1]
     assert (finished.status, finished.fault) == ("fault", PiFault.HOST_LOST)
     assert (bench.machine.state, bench.machine.fault) == ("ready", PiFault.HOST_LOST)
+
+
+def test_a_host_that_falls_silent_ends_its_homing():
+    bench = Bench().homed()
+    bench.machine.command("BeginRun", 100)
+    bench.machine.command("Home")
+    bench.run_posted()
+    bench.stage_says(Reply("ok", bench.stage.number))
+    bench.later(SAFE_WITHIN_S)
+    assert bench.stage.sent == [Immediate.STOP]
+    assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.HOST_LOST)
+    bench.stage_says(Reply("alarm", number=StageError.STOPPED))
+    bench.machine.command("Home")
+    bench.run_posted()
+    bench.stage_says(Reply("ok", bench.stage.number))
+    bench.later(200.0)
+    assert bench.machine.state == "homing", "a person at the Pi homes without a host"
+
+
+def test_a_held_row_goes_on_once_it_rests():
+    """Then its place is known, and with it the times of the edges around it."""
+    bench = Bench().homed()
+    bench.start()
+    bench.machine.command("Hold")
+    bench.machine.command("Resume")
+    bench.status(0)
+    assert bench.stage.sent == [Immediate.HOLD]
+    bench.status(0, state="hold", x=70_000)
+    assert bench.stage.sent == [Immediate.HOLD, Immediate.RESUME]
+    bench.status(0, state="hold", x=70_000)
+    assert bench.stage.sent == [Immediate.HOLD, Immediate.RESUME], "once"
 
 
 def test_a_host_without_a_heartbeat_is_not_watched():

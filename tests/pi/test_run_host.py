@@ -6,6 +6,7 @@ import select
 import socket
 import stat
 import threading
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.support.pi.fakes import FakeDriver, FakeLines
+from tests.support.pi.host_side import Running
 from tests.support.processes import HANG_S, wait_for
+from tests.support.rigs import at_stage_port
 
 from polysight_pi import executor as executors
 from polysight_pi import system
@@ -218,6 +221,28 @@ def test_an_old_row_does_not_move_the_stage_again(host, stage):
     host.accepted(m.RunRow(scan_id="scan", row_index=1, take=4))  # repeated: it was the last one
     assert stage.rows_run == 4
     assert sum(isinstance(e, m.RowStarted) for e in host.replay()) == 4
+    host.accepted(host.begin())
+    assert host.refused(m.RunRow(scan_id="scan", row_index=1, take=4)) == PiFault.BAD_REQUEST, "the scan is the same"
+    assert host.row(1, 5).status == "done"
+
+
+def test_takes_increase_across_a_restart_of_the_pi(instrument, stage, hub):
+    """The journal has them."""
+    rig = at_stage_port(instrument, stage.port)
+    for first_take in (1, 2):
+        with closing(Running(rig, hub)) as running:
+            running.host.accepted(running.host.begin())
+            running.host.home()
+            if first_take > 1:
+                old = m.RunRow(scan_id="scan", row_index=0, take=first_take - 1)
+                assert running.host.refused(old) == PiFault.BAD_REQUEST
+            assert running.host.row(0, first_take).status == "done"
+
+
+def test_a_host_of_an_older_release_homes_in_its_own_run(pi):
+    """It sends no owner in `Home`."""
+    pi.host.accepted(pi.host.begin(owner="mine", heartbeat_ms=10_000, owns_home=False))
+    pi.host.home()
 
 
 def test_a_person_at_the_pi_takes_over(pi, owner_in_row, instrument):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from polysight.plan import Changes, row_motion_s, scan_time, straight_move_s
 from polysight.plan.forecast import tail_s, turn_s, whole_packets
-from polysight_pi.stage import row_in_steps
+from polysight_pi.edges import RowMotion
 from polysight_shared.config import CARD_TAIL_S, Instrument
 from polysight_shared.raster import plan_raster
 from polysight_shared.stage_line import Command, Parameter
@@ -57,7 +57,7 @@ def scanned(rig: Instrument) -> tuple[float, list[int]]:
     """Motion of a whole scan from the home corner, seconds, and the times of its triggers, ns."""
     stage = Stage(rig)
     total = sum(
-        stage.seconds("ROW", *row_in_steps(row, rig.stage, rig.stage.speed_mm_s)) for row in plan_raster(rig.grid)
+        stage.seconds("ROW", *RowMotion.plan(row, rig.stage, rig.stage.speed_mm_s).line) for row in plan_raster(rig.grid)
     )
     edges = [w.t_ns for w in stage.board.wires if isinstance(w, WireEdge) and w.value]
     return total, edges

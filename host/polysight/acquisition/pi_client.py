@@ -163,7 +163,7 @@ class PiClient:
 
         Raises RefusedError, DeviceError.
         """
-        run = msgspec.structs.replace(run, owner=self._owner)
+        run = msgspec.structs.replace(run, owner=self._owner, owns_home=True)
         deadline = time.monotonic() + _SILENT_BEATS * run.heartbeat_ms / 1e3
         while True:
             try:

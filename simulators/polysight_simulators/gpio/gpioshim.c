@@ -8,7 +8,8 @@
  *   GPIOSHIM_FAULTS=denied,no-edges,busy:LINE,slow:US                 faults from the start
  *   GPIOSHIM_SPI=PATH      a spidev device beside it: spidev.c
  *   GPIOSHIM_CLOCK=wires   edges carry their wire time, which the thread that reads them uses: a sleep returns at once and
- *                          takes exactly its duration. So a burst is exact even on a busy machine
+ *                          takes exactly its duration. So a burst is exact even on a busy machine. The chip reports a
+ *                          hardware timestamp engine: its clock is not the program's
  *   SIGUSR1                                                           the chip vanishes, as when a driver is unloaded
  *
  * As the kernel does: a request's event buffer drops its oldest event when it is full, and line_seqno tells; edges are
@@ -114,6 +115,7 @@ static int describe_line(struct gpio_v2_line_info *i) {
   memset(i, 0, sizeof *i);
   i->offset = n;
   i->flags = lines[n].flags ? lines[n].flags : GPIO_V2_LINE_FLAG_INPUT;
+  if (wire_clock) i->flags |= GPIO_V2_LINE_FLAG_EVENT_CLOCK_HTE; /* a clock of the chip's own */
   snprintf(i->name, sizeof i->name, "GPIO%u", n);
   snprintf(i->consumer, sizeof i->consumer, "%s", lines[n].consumer);
   if (lines[n].debounce_ns) {

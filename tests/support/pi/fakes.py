@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from polysight_pi.trigger import Edge, Seen
-from polysight_shared.config import Stage
 from polysight_shared.errors import DeviceError, PolysightError, ProtocolError
 from polysight_shared.faults import StageError
+from polysight_shared.raster import Stage
 from polysight_shared.stage_line import Command, Immediate, Reply
 from polysight_shared.wires import WireClient, WireEdge
 
@@ -56,6 +56,7 @@ class FakeLines:
     """`late(n)`: how late the n-th sleep ends; `long(n)`: how long the n-th change of the output takes; nanoseconds."""
 
     name = "fake"
+    is_real_time = True
 
     def __init__(self, late: Callable[[int], int] = lambda _: 0, long: Callable[[int], int] = lambda _: 0) -> None:
         self.t, self.late, self.long = 0, late, long
@@ -326,6 +327,8 @@ class FakeStage:
             self.points += 1
             if i not in self.skip:
                 self._edge(self.t_ns)
+        if self._stopping.wait(2 * self.pace_s):  # it runs on and slows down
+            return StageError.STOPPED
         self.x, self.y = self.row_end or _rest_after(c)
         if self.endless and self._stopping.wait():
             return StageError.STOPPED

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import zmq
 
+from polysight_pi.service import Service
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
 from polysight_shared.raster import plan_raster
@@ -64,6 +66,7 @@ class HostSide:
             "period_us": i.burst.period_us,
             "width_us": i.burst.width_us,
             "speed_mm_s": i.stage.speed_mm_s,
+            "owns_home": True,
         }
         return m.BeginRun(**{**fields, **changes})
 
@@ -113,3 +116,20 @@ class HostSide:
 
     def close(self) -> None:
         self.context.destroy(linger=0)
+
+
+class Running:
+    """A service in a thread, and the host's end of its sockets."""
+
+    def __init__(self, instrument: Instrument, wires: Path) -> None:
+        self.service = Service(instrument, wires)
+        self.thread = threading.Thread(target=self.service.serve)
+        self.thread.start()
+        server = self.service.server
+        self.host = HostSide(server.command_address, server.event_address, instrument)
+
+    def close(self) -> None:
+        self.host.close()
+        self.service.stop()
+        self.thread.join()
+        self.service.close()

@@ -1,0 +1,105 @@
+"""The state machine with a stage, a trigger loop and a journal that tests control, on a clock that they turn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from polysight_pi.edges import RowMotion
+from polysight_pi.machine import Machine
+from polysight_pi.trigger import BurstSent, BurstSpec, Edge, LoopFault, TriggerLoop
+from polysight_shared.raster import Row
+from polysight_shared.stage_line import Reply
+from tests.support.pi.fakes import FakeDriver, FakeLines
+
+SPEC = BurstSpec(2, 1_500_000, 1000)
+ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
+INTERVAL_NS = 100_000_000  # 2 mm at 20 mm/s
+
+
+class FakeJournal:
+    def __init__(self) -> None:
+        self.events: list[Any] = []
+
+    def add(self, kind: type, **fields: Any) -> None:
+        self.events.append(kind(scan_id="", seq=0, t_mono_ns=0, **fields))
+
+    def retry(self) -> None: ...
+
+
+class Bench:
+    """A machine with its stage, trigger loop and journal."""
+
+    def __init__(self) -> None:
+        self.t = 100.0
+        self.lines, self.stage, self.journal = FakeLines(), FakeDriver(), FakeJournal()
+        self.posted: list[Any] = []
+        self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)  # not started: edges are given to it
+        parts: Any = (self.stage, self.loop, self.journal, self.posted.append, lambda: self.t)
+        self.machine = Machine(*parts)
+        self.seqno = self.edge_ns = 0
+        self.row = ROW
+
+    def run_posted(self) -> None:
+        while self.posted:
+            item = self.posted.pop(0)
+            if isinstance(item, BurstSent):
+                self.machine.on_burst(item)
+            elif isinstance(item, LoopFault):
+                self.machine.on_loop_fault(item)
+            else:
+                item()
+
+    def later(self, seconds: float) -> None:
+        """Time goes on, in the executor's turns: until something is due, or the time is over."""
+        end = self.t + seconds
+        while self.t < end:
+            left = self.machine.seconds_left()
+            self.t = min(end, self.t + (seconds if left is None else max(left, 1e-6)))
+            self.machine.check_deadlines()
+            self.run_posted()
+
+    def homed(self) -> Bench:
+        self.machine.command("BeginRun", 0)
+        self.machine.command("Home")
+        self.run_posted()
+        self.stage_says(Reply("ok", self.stage.number))
+        self.stage_says(Reply("done", self.stage.number))
+        assert self.machine.state == "ready"
+        return self
+
+    def start(self, row: Row = ROW, speed_mm_s: float = 20.0) -> None:
+        self.row = row
+        self.machine.command("RunRow", row, 1, SPEC, speed_mm_s)
+        self.stage_says(Reply("ok", self.stage.number))
+
+    def stage_says(self, reply: Reply) -> None:
+        self.machine.on_stage(reply)
+        self.run_posted()
+
+    def status(self, points: int, state: str = "row", x: int = 0, **times_ns: int) -> None:
+        fields = {"state": state, "points": str(points), "x": str(x), "y": "0"}
+        self.stage_says(Reply("status", fields=fields, **times_ns))
+
+    def row_done(self, dx: int = 0, dy: int = 0, held: int = 0, **times_ns: int) -> None:
+        """The stage ends the row, this many steps away from where it should."""
+        x, y = RowMotion.plan(self.row, self.stage.config, 20.0).end
+        fields = {"points": str(self.row.points), "x": str(x + dx), "y": str(y + dy), "held": str(held)}
+        self.stage_says(Reply("done", self.stage.number, fields=fields, **times_ns))
+
+    def edge(self) -> None:
+        self.edge_at(self.edge_ns + INTERVAL_NS)
+
+    def edge_at(self, t_ns: int) -> None:
+        self.seqno += 1
+        self.edge_ns = t_ns
+        self.lines.t = max(self.lines.t, t_ns)
+        with self.loop._lock:
+            self.loop._take(Edge(t_ns, self.seqno))
+        self.run_posted()
+
+    @property
+    def armed(self) -> bool:
+        return self.loop._job is not None
+
+    def of(self, kind: type) -> list[Any]:
+        return [e for e in self.journal.events if isinstance(e, kind)]

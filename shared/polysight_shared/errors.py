@@ -68,6 +68,9 @@ class DataError(PolysightError):
 
 def no_such(path: Path) -> DataError:
     """Return the error for a missing file or folder."""
+    if path.is_file():
+        what = f"{path}: is a file"
+        return DataError(what, "a folder is needed here", "give a folder", code=ErrorCode.FILE_FOREIGN)
     try:
         names_beside = [p.name for p in path.parent.iterdir()]
         cause = "the path is wrong"

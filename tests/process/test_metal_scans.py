@@ -88,6 +88,8 @@ def test_leakage_of_both_boards_is_recovered_from_metal_at_two_orientations(scan
     out = capsys.readouterr().out
     assert "simulated" in out
     assert "axial ratio" in out  # one orientation: equal leakage of both boards is assumed
+    assert main(["leakage", str(plate), "--strips", f"0={plate}"]) == 3
+    assert "whole plate" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

@@ -123,3 +123,5 @@ def test_a_missing_path_is_refused_with_a_similar_one(tmp_path):
     (tmp_path / "scan-7").mkdir()
     assert "'scan-7'" in str(no_such(tmp_path / "scan-77"))
     assert str(tmp_path / "away") in no_such(tmp_path / "away" / "scan-7").why
+    (tmp_path / "file").touch()
+    assert "is a file" in no_such(tmp_path / "file").what

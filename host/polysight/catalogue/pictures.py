@@ -123,7 +123,7 @@ class Pixels(ProcessedScan):
         left, right, low, high = self.extent_mm
         if not (left <= x_mm <= right and low <= y_mm <= high):
             raise DataError(
-                f"x = {x_mm:.1f} mm, y = {y_mm:.1f} mm lies outside the image",
+                f"x = {x_mm:.6g} mm, y = {y_mm:.6g} mm lies outside the image",
                 f"it reaches from x {left:.1f} to {right:.1f} mm, and from y {low:.1f} to {high:.1f} mm",
                 "give a place in it, in mm from its centre", code=ErrorCode.VALUE_INVALID,
             )  # fmt: skip

@@ -24,16 +24,19 @@ from polysight.calibration import (
     write_calibration,
 )
 from polysight.imaging import Image, Mask
-from polysight.jobs.output import print_json, say, steps
+from polysight.jobs.output import print_json, print_lines, say, steps
 from polysight.jobs.process import imaged, load_reference, plane_of
 from polysight.polarimetry import Leakage, leakage_from_images, specular_incidence_rad
 from polysight.settings import Settings, path_text
 from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 from polysight_shared.tables import to_builtins
 
 LEAST_PIXELS = 100  # of a plate that serves as reference
 LEAST_LEAKAGE_STD = 1e-3
+# Real mounts leak up to 0.1; a plate in the place of strips gives 1.
+MAX_LEAKAGE = 0.5
 
 
 def print_result(
@@ -70,9 +73,9 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     from polysight.calibration import Prior, calibration_of_scan, fit_places, load_echoes, places_file, read_target
 
     points = read_target(target)
-    given = None if config is None else load_instrument(config)
-    source = open_raw(scan, given)
-    rig = source.instrument if given is None else with_places_of(source.instrument, given)
+    rig_file = None if config is None else load_instrument(config)
+    source = open_raw(scan, rig_file)
+    rig = source.instrument if rig_file is None else with_places_of(source.instrument, rig_file)
     calibration = calibration_of_scan(source)
     filters = {b.name: calibration.high_pass(b.name) for b in rig.receivers}
     say("places of boards and plane")
@@ -114,8 +117,8 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
         )
     names = [b.name for b in sources[0].instrument.receivers]
     boards = {name: fit_filter(sources, name) for name in steps(names, [f"filters of {name}" for name in names])}
-    found = [source_scan(source, folder) for source, folder in zip(sources, scans, strict=True)]
-    file = FilterFile(**header("hpf", found), boards=boards)
+    source_scans = [source_scan(source, folder) for source, folder in zip(sources, scans, strict=True)]
+    file = FilterFile(**header("hpf", source_scans), boards=boards)
     path = write_calibration(file, out)
     lines = [
         f"{name}: corners "
@@ -168,7 +171,8 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
     for name, b in boards.items():
         line = f"{name}: direct path at {b.direct_if_hz / 1e3:.1f} +- {b.direct_if_standard_error_hz / 1e3:.1f} kHz"
         line += f" ({b.expected_if_hz / 1e3:.0f} kHz by the rig file)"
-        line += f", an alias of {b.direct_if_hz / 1e3 + b.alias * rate_khz:.0f} kHz" if b.alias else ""
+        if b.alias:
+            line += f", an alias of {b.direct_if_hz / 1e3 + b.alias * rate_khz:.0f} kHz"
         lines += [
             line,
             f"{name}: start_offset_hz {b.start_offset_was_hz:.0f} -> {b.start_offset_hz:.0f} puts it at"
@@ -213,11 +217,11 @@ def leakage_of_scans(
     names = [pipeline.source.scan_id]
     simulated = pipeline.source.simulated
     for degrees, folder in strips:
-        other, seen = imaged(folder, settings)
+        other, strip_images = imaged(folder, settings)
         whole.check_rig(other.calibration.imaged_with(other.rig), str(plate))
-        whole.check_axes(seen.x_m, seen.y_m)
-        mask = mask & seen.valid
-        turned.append((float(np.radians(degrees)), seen.h, seen.v))
+        whole.check_axes(strip_images.x_m, strip_images.y_m)
+        mask = mask & strip_images.valid
+        turned.append((float(np.radians(degrees)), strip_images.h, strip_images.v))
         names.append(other.source.scan_id)
         simulated = simulated or other.source.simulated
     if int(mask.sum()) < LEAST_PIXELS:
@@ -226,10 +230,18 @@ def leakage_of_scans(
             "plate and strips must cover the same part of the plane",
             "scan them in the same place, larger than the grid on every side",
         )
-    found = leakage_from_images((whole.h, whole.v), turned, mask, theta)
+    leakage = leakage_from_images((whole.h, whole.v), turned, mask, theta)
+    largest = max(abs(leakage.h), abs(leakage.v))
+    if largest > MAX_LEAKAGE:
+        raise DataError(
+            f"a leakage of {largest:.2f}: that of a rig is below {MAX_LEAKAGE}",
+            "the strips' scan shows a whole plate, or strips at another angle",
+            "correct the angle, DEG of --strips DEG=SCAN, or scan the strips again",
+            code=ErrorCode.VALUE_INVALID,
+        )
     std = _leakage_std((whole.h, whole.v), turned, mask, theta)
     facts = {"scans": names, "simulated": simulated, "pixels": int(mask.sum()), "leakage_std": std}
-    return found, {**facts, "incidence_deg": float(np.degrees(theta))}
+    return leakage, {**facts, "incidence_deg": float(np.degrees(theta))}
 
 
 def _leakage_std(
@@ -246,10 +258,10 @@ def _leakage_std(
     for up in (rows > middle[0], rows <= middle[0]):
         for right in (columns > middle[1], columns <= middle[1]):
             try:
-                found = leakage_from_images(plate, strips, mask & up & right, theta_rad)
+                quarter = leakage_from_images(plate, strips, mask & up & right, theta_rad)
             except DataError:
                 continue
-            parts.append([found.h.real, found.h.imag, found.v.real, found.v.imag])
+            parts.append([quarter.h.real, quarter.h.imag, quarter.v.real, quarter.v.imag])
     if len(parts) < 2:
         return LEAST_LEAKAGE_STD
     return max(LEAST_LEAKAGE_STD, float(np.sqrt(np.mean(np.var(parts, axis=0, ddof=1)))) / 2)
@@ -257,21 +269,37 @@ def _leakage_std(
 
 def leakage(plate: Path, strips: Sequence[tuple[float, Path]], config: Path | None, as_json: bool) -> int:
     """`polysight leakage`: print the keys for the rig file's [polarimetry]; return the exit status."""
-    found, facts = leakage_of_scans(plate, strips, config)
-    rows = {key: [round(z.real, 5), round(z.imag, 5)] for key, z in (("leakage_h", found.h), ("leakage_v", found.v))}
-    imbalance = {"db": 20 * float(np.log10(abs(found.imbalance))), "deg": float(np.degrees(np.angle(found.imbalance)))}
+    measured, facts = leakage_of_scans(plate, strips, config)
+    leakage_h = [round(measured.h.real, 5), round(measured.h.imag, 5)]
+    leakage_v = [round(measured.v.real, 5), round(measured.v.imag, 5)]
+    imbalance_db = 20 * float(np.log10(abs(measured.imbalance)))
+    imbalance_deg = float(np.degrees(np.angle(measured.imbalance)))
     if as_json:
-        out = {**facts, **rows, "imbalance_db": imbalance["db"], "imbalance_deg": imbalance["deg"]}
-        print_json({**out, "residual_rad": found.residual, "alike": len(strips) == 1})
+        content = {
+            **facts,
+            "leakage_h": leakage_h,
+            "leakage_v": leakage_v,
+            "imbalance_db": imbalance_db,
+            "imbalance_deg": imbalance_deg,
+            "residual_rad": measured.residual,
+            "alike": len(strips) == 1,
+        }
+        print_json(content)
         return 0
-    source = "# simulated scans\n" if facts["simulated"] else ""
-    alike = "# one orientation: both boards are taken to leak alike (the axial ratio)\n" if len(strips) == 1 else ""
-    rest = f", the standards agree within {found.residual:.4f} rad" if len(strips) > 2 else ""
-    sys.stdout.write(
-        f"{source}{alike}[polarimetry]\n"
-        f"leakage_h = {rows['leakage_h']}\nleakage_v = {rows['leakage_v']}\n"
-        f"leakage_std = {facts['leakage_std']:.4f}\n"
-        f"# H over V in the images: {imbalance['db']:+.2f} dB, {imbalance['deg']:+.1f} degrees;"
-        f" from {facts['pixels']} pixels{rest}\n"
-    )
+    lines = []
+    if facts["simulated"]:
+        lines.append("# simulated scans")
+    if len(strips) == 1:
+        lines.append("# one orientation: both boards are taken to leak alike (the axial ratio)")
+    lines += [
+        "[polarimetry]",
+        f"leakage_h = {leakage_h}",
+        f"leakage_v = {leakage_v}",
+        f"leakage_std = {facts['leakage_std']:.4f}",
+    ]
+    gain = f"# H over V in the images: {imbalance_db:+.2f} dB, {imbalance_deg:+.1f} degrees"
+    gain += f"; from {facts['pixels']} pixels"
+    if len(strips) > 2:
+        gain += f", the standards agree within {measured.residual:.4f} rad"
+    print_lines([*lines, gain])
     return 0

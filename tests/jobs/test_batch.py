@@ -15,7 +15,16 @@ from tests.support.store.plain_scan import write_scan
 
 from polysight.cli.main import main
 from polysight.jobs import batch as many
-from polysight.jobs.batch import Outcome, at_once, find_scans, finished, make_jobs, memory_bytes, process_many, table
+from polysight.jobs.batch import (
+    Outcome,
+    find_scans,
+    fit_scans,
+    is_finished,
+    make_jobs,
+    memory_bytes,
+    process_many,
+    table,
+)
 from polysight.process import cores
 from polysight.products.processed import FINISHED
 from polysight.settings import Settings
@@ -123,24 +132,24 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
         options = {"library": library, "config": config, **changes}
         return job_of(folder, tmp_path / "out", **options)
 
-    assert not finished(job())
+    assert not is_finished(job())
     process_many([job()], tmp_path / "out", 1)
-    assert finished(job())
+    assert is_finished(job())
     for change in ({"metal_box_mm": (0.0, 0.0, 1.0, 1.0)}, {"library": None}, {"config": None}):
-        assert not finished(job(**change)), change
+        assert not is_finished(job(**change)), change
     (folder / "RH").mkdir()
     for path in (library, rig, folder / "RH" / "0_0.bin"):
         before = path.read_bytes() if path.exists() else b""
         path.write_bytes(b"2")
-        assert not finished(job()), path
+        assert not is_finished(job()), path
         path.write_bytes(before)
     (folder / "RH" / "0_0.bin").unlink()
-    assert finished(job())
+    assert is_finished(job())
     (tmp_path / "out" / "a" / "image.npz").unlink()
-    assert not finished(job())
+    assert not is_finished(job())
     process_many([job()], tmp_path / "out", 1, again=True)
     (tmp_path / "out" / "a" / FINISHED).write_text("[1]")
-    assert not finished(job())
+    assert not is_finished(job())
 
 
 @pytest.mark.usefixtures("worker")
@@ -150,14 +159,14 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
     kept = folder / "samples" / "RH.npy"
     process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
 
-    def is_finished():
-        return finished(jobs(tmp_path / "in", "scan")[0])
+    def done():
+        return is_finished(jobs(tmp_path / "in", "scan")[0])
 
     no_data = ("operator.json", "program/process.log", "export/image.nc", "labels.json", "control/request.json")
     for name in (*no_data, "products/report.html", "samples/RH.npy", "raw/RH/0004.part"):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text("new")
-        assert is_finished(), name
+        assert done(), name
     for name in ("manifest.jsonl", "raw/RH/0000.bin", "raw/RV/0001.idx", "truth.json"):
         file = folder / name
         file.parent.mkdir(exist_ok=True)
@@ -165,18 +174,18 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
         times = file.stat().st_mtime_ns if file.exists() else 0
         with file.open("a") as appended:
             appended.write("\n")
-        assert not is_finished(), name
+        assert not done(), name
         if before is None:
             file.unlink()
         else:
             file.write_bytes(before)
             os.utime(file, ns=(times, times))
-        assert is_finished(), name
+        assert done(), name
     drop(ScanFolder.load(folder), raw_digests(folder), tmp_path / "out" / "scan")
     process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
-    assert is_finished()
+    assert done()
     kept.write_text("other samples")
-    assert not is_finished()  # they are all that is left
+    assert not done()  # they are all that is left
 
 
 def raw_digests(folder):
@@ -192,7 +201,7 @@ def test_ended_early_its_programs_end_too(tmp_path):
     first = next(results)  # slow2, which is not slow
     assert (first.name, first.status) == ("slow2", "done")
     results.close()  # else this takes the 600 s that it sleeps, more than a test may
-    assert not finished(todo[0])
+    assert not is_finished(todo[0])
 
 
 def test_names_folders_and_what_is_a_scan(tmp_path):
@@ -210,9 +219,9 @@ def test_names_folders_and_what_is_a_scan(tmp_path):
 
 def test_scans_at_a_time_follow_cores_and_memory():
     need = memory_bytes(70_000)
-    assert at_once(70_000, cores=8, free_bytes=100 * need) == 8
-    assert at_once(70_000, cores=8, free_bytes=3 * need) == 2
-    assert at_once(70_000, cores=8, free_bytes=0) == 1
+    assert fit_scans(70_000, cores=8, free_bytes=100 * need) == 8
+    assert fit_scans(70_000, cores=8, free_bytes=3 * need) == 2
+    assert fit_scans(70_000, cores=8, free_bytes=0) == 1
     assert many.free_memory_bytes() > 0
     assert cores() >= 1
 
@@ -261,7 +270,7 @@ def test_a_dask_cluster_does_the_same(tmp_path):
     ) as cluster:
         outcomes = process_many(todo, tmp_path / "out", 1, dask=cluster.scheduler_address)
     assert [o.status for o in outcomes] == ["done", "failed", "done"]
-    assert all(finished(j) == (j.name != "bad") for j in todo)
+    assert all(is_finished(j) == (j.name != "bad") for j in todo)
     with refused(ErrorCode.NO_ANSWER):
         list(many.run_on_dask(todo, "tcp://127.0.0.1:9", timeout="1s"))
 

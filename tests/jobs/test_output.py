@@ -6,7 +6,7 @@ import pytest
 
 from polysight.cli.main import main
 from polysight.jobs import output
-from polysight.jobs.output import counted, steps
+from polysight.jobs.output import count_steps, steps
 
 
 def test_every_step_is_named_before_it_begins(capsys):
@@ -20,7 +20,7 @@ def test_every_step_is_named_before_it_begins(capsys):
 def test_without_a_terminal_rows_are_counted_in_lines(capsys, monkeypatch):
     now = iter(range(0, 1000, 2))
     monkeypatch.setattr(output, "monotonic", lambda: next(now))
-    rows = counted(range(40), 40, "rows")
+    rows = count_steps(range(40), 40, "rows")
     assert next(rows) == 0
     assert capsys.readouterr().err == "40 rows ...\n"  # before the first is done
     assert list(rows) == list(range(1, 40))

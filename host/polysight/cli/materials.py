@@ -26,7 +26,9 @@ def _materials(args: argparse.Namespace) -> int:
             "polysight materials out/one, or polysight materials --catalogue",
             code=ErrorCode.VALUES_CONFLICT,
         )
-    return catalogue(args.json) if args.catalogue else materials(args.data, args.json)
+    if args.catalogue:
+        return catalogue(args.json)
+    return materials(args.data, args.json)
 
 
 def _report(args: argparse.Namespace) -> int:

@@ -44,7 +44,8 @@ class CommandParser(argparse.ArgumentParser):
         grouped = [a for group in groups for a in group._group_actions]
         named = [a for a in self._actions if a.option_strings and a not in grouped]
         named.sort(key=lambda a: (not a.required, not set(self.most_used) & set(a.option_strings), a.dest == "help"))
-        first = _FIRST if len(named) > _FIRST + 1 else len(named)  # no section for --help alone
+        # No section for --help alone.
+        first = _FIRST if len(named) > _FIRST + 1 else len(named)
         formatter = self._get_formatter()
         formatter.add_text(self.description)
         formatter.add_text(self.epilog)
@@ -111,10 +112,10 @@ def material_settings(args: argparse.Namespace) -> Settings:
         when an option would have no effect.
     """
     options = {"--library": args.library, "--metal": args.metal, "--labels": args.labels, "--model": args.model}
-    given = [name for name, value in options.items() if value is not None]
-    if given and getattr(args, "no_process", False):
+    options_used = [name for name, value in options.items() if value is not None]
+    if options_used and getattr(args, "no_process", False):
         raise ConfigError(
-            f"{' and '.join(given)} with --no-process would do nothing",
+            f"{' and '.join(options_used)} with --no-process would do nothing",
             "it says how the scan is processed, and it will only be recorded",
             "give it to `polysight process` later, or leave --no-process out",
             code=ErrorCode.VALUES_CONFLICT,
@@ -164,16 +165,22 @@ def joined(words: Sequence[str]) -> list[str]:
 
 def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
     """Add `--model`; with `none` also the choice to name nothing."""
-    names = ["knn", "discriminant", *(["none"] if none else [])]
-    text = "classifier (default: discriminant; knn is the paper's"
-    sub.add_argument("--model", choices=names, help=text + ("; none: name nothing)" if none else ")"))
+    names = ["knn", "discriminant"]
+    text = "default: discriminant; knn is the paper's"
+    if none:
+        names.append("none")
+        text += "; none: name nothing"
+    sub.add_argument("--model", choices=names, help=f"classifier ({text})")
 
 
 def add_config_option(sub: argparse.ArgumentParser, shipped: bool = False) -> None:
     """Add `--config`; with `shipped` the packaged rig file is used where the current folder has none."""
-    where = "instrument.toml here, or the packaged one" if shipped else "instrument.toml"
-    default = packaged(RIG) if shipped else RIG
-    sub.add_argument("--config", type=Path, default=default, metavar="FILE", help=f"rig file (default: {where})")
+    default = RIG
+    text = "instrument.toml"
+    if shipped:
+        default = packaged(RIG)
+        text = "instrument.toml here, or the packaged one"
+    sub.add_argument("--config", type=Path, default=default, metavar="FILE", help=f"rig file (default: {text})")
 
 
 def add_material_options(sub: argparse.ArgumentParser) -> None:

@@ -33,7 +33,9 @@ _degrees = number(float, "`one`, `pixel` or an angle of 5 to 80 degrees", lambda
 
 def _incidence(text: str) -> str | float:
     """`one`, `pixel`, or degrees."""
-    return text if text in ("one", "pixel") else _degrees(text)
+    if text in ("one", "pixel"):
+        return text
+    return _degrees(text)
 
 
 def process_settings(args: argparse.Namespace, data: Path) -> Settings:

@@ -29,7 +29,9 @@ def _serve(args: argparse.Namespace) -> int:
     sys.stderr.write("polysight serve: starting\n")  # what it shows takes seconds to load
     from polysight.serve import serve
 
-    config = args.config if args.config is not None else RIG if RIG.exists() else None
+    config = args.config
+    if config is None and RIG.exists():
+        config = RIG
     if config is not None and not config.is_file():
         raise ConfigError(f"{config}: no such file", "--config names it", "give a rig file, or leave it out")
     return serve(args.scans, _place(args), config, not args.read_only)

@@ -161,7 +161,7 @@ def run_doctor(
         text = "".join(map(_lines, findings)) + summary
         write_bundle(bundle, options, context.loaded_rig, findings, text, system.root)
         sys.stderr.write(f"{bundle}: written, without raw data and keys. Read it before you send it\n")
-    return 1 if failed else 0
+    return int(bool(failed))
 
 
 def _lines(finding: Finding) -> str:
@@ -176,4 +176,6 @@ def _summary(findings: list[Finding], failed: list[str]) -> str:
         f"{verdicts.count('ok')} ok, {verdicts.count('warning')} warnings, {len(failed)} errors,"
         f" {verdicts.count('not checked')} not checked"
     )
-    return f"{counts}: begin with {failed[0]}" if failed else counts
+    if not failed:
+        return counts
+    return f"{counts}: begin with {failed[0]}"

@@ -91,7 +91,8 @@ def read_interface(name: str, root: Path = Path("/")) -> NetworkInterface:
             value = int((folder / file).read_text(encoding="ascii"))
         except (OSError, ValueError):
             return None
-        return value if value >= 0 else None
+        # The kernel writes -1 for an interface that is down.
+        return None if value < 0 else value
 
     ring, ring_max = _receive_ring(name) if root == Path("/") else (None, None)
     lost = sum(number(f"statistics/{counter}") or 0 for counter in _DROP_COUNTERS)

@@ -199,7 +199,9 @@ def check_time(context: CheckContext) -> Finding:
     rig = context.rig
     seconds = scan_time(context.rig).total_s
     hours, minutes = divmod(round(seconds / 60), 60)
-    duration = f"{hours} h {minutes:02d} min" if hours else f"{seconds / 60:.1f} min"
+    duration = f"{seconds / 60:.1f} min"
+    if hours:
+        duration = f"{hours} h {minutes:02d} min"
     return ok(
         f"a scan of {rig.grid.rows} rows takes about {duration}: {seconds / rig.grid.rows:.1f} s a row,"
         f" {rig.scan_bytes / 1e9:.2f} GB",
@@ -410,7 +412,8 @@ def _judge_interface(interface: NetworkInterface) -> Finding:
     name = interface.name
     ring = interface.ring
     observed = f"{name}: MTU {interface.mtu or 'unknown'}, {interface.speed_mbit or 'unknown'} Mbit/s"
-    observed += f", ring {ring} of {interface.ring_max}" if ring is not None else ""
+    if ring is not None:
+        observed += f", ring {ring} of {interface.ring_max}"
     if interface.mtu is not None and interface.mtu < _MIN_MTU:
         return warning(observed, f"a card sends frames of {_MIN_MTU} bytes", f"`ip link set {name} mtu {_MIN_MTU}`")
     if interface.speed_mbit is not None and interface.speed_mbit < _MIN_SPEED_MBIT:
@@ -659,7 +662,8 @@ def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
         "use one line and a clock buffer (docs/how-to/wiring.md); compare SYNC_IN at the boards with an oscilloscope"
     )
     if abs(skew) > _SKEW_WARNING_S:
-        return (error if abs(skew) > _SKEW_ERROR_S else warning)(observed, why, remedy, **facts)
+        finding = error if abs(skew) > _SKEW_ERROR_S else warning
+        return finding(observed, why, remedy, **facts)
     if jitter > _MAX_JITTER_S:
         return warning(
             f"{observed}; {jitter * 1e9:.1f} ns from chirp to chirp",

@@ -25,6 +25,7 @@ from typing import Any, Literal
 import msgspec
 
 from polysight.calibration import calibration_of_scan
+from polysight.jobs.output import exit_status
 from polysight.jobs.process import process
 from polysight.process import cores, is_given_images
 from polysight.products import FINISHED, ProcessedScan, write_json
@@ -52,7 +53,10 @@ PROGRAM = (sys.executable, "-m", "polysight.jobs.batch")
 """Module that processes the job on its standard input."""
 ALIVE = "POLYSIGHT_PARENT_ALIVE"
 """Environment of the program: number of a pipe that ends with the program that started it."""
-_FREE = 0.8  # of the free memory is used
+# Leave a fifth of the free memory to the system.
+SHARE_OF_FREE_MEMORY = 0.8
+# Unit of `ru_maxrss`, getrusage(2).
+_MAXRSS_BYTES = 1 if sys.platform == "darwin" else 1024
 _POLL_S = 0.2
 
 
@@ -86,14 +90,21 @@ class Outcome:
     memory_gb: float = 0.0
     message: str = ""
 
+    @property
+    def has_products(self) -> bool:
+        """True if the scan is processed now, or was before."""
+        return self.status in ("done", "skipped")
+
 
 def find_scans(paths: Sequence[Path]) -> list[Path]:
     """Return the scans at paths: scan folders themselves, and the scans in other folders."""
     out: list[Path] = []
     for path in paths:
-        single = _is_data(path) or not path.is_dir()
-        inside = [] if single else sorted(p for p in path.iterdir() if _is_data(p))
-        out += inside or [path]
+        if path.is_dir() and not _is_data(path):
+            scans_inside = sorted(p for p in path.iterdir() if _is_data(p))
+        else:
+            scans_inside = []
+        out += scans_inside or [path]
     return out
 
 
@@ -137,8 +148,10 @@ def made_with(data: Path, settings: Settings) -> dict[str, Any]:
     config = settings.path("config")
     options = settings.choices()
     for name, path in settings.files().items():
-        is_file = path.is_file()
-        options[name] = hashlib.sha256(path.read_bytes()).hexdigest() if is_file else _digest_scan(path, config)
+        if path.is_file():
+            options[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        else:
+            options[name] = _digest_scan(path, config)
     return {
         "versions": versions(),
         "products": PRODUCTS_VERSION,
@@ -162,8 +175,10 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
     `config` is the rig file of scans without one. Kept samples count where raw data was dropped: elsewhere they are
     made again from it. Notes, labels, exports, programs and products in the folder are no data.
     """
+    if is_given_images(folder) and folder.is_file():
+        return [folder]
     if is_given_images(folder):
-        return [folder] if folder.is_file() else sorted([*folder.glob("*.npy"), *folder.glob("*.json")])
+        return sorted([*folder.glob("*.npy"), *folder.glob("*.json")])
     patterns = _OWN_FILES if (folder / MANIFEST).exists() else _PUBLISHED_FILES
     files: list[Path] = []
     with suppress(PolysightError):  # the scan's own program will say what is wrong with it
@@ -176,7 +191,7 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
     return sorted({file for file in files if file.is_file()})
 
 
-def finished(job: Job) -> bool:
+def is_finished(job: Job) -> bool:
     """True if the products exist and have exactly these dependencies."""
     try:
         mark = read_json(job.out / FINISHED)
@@ -192,7 +207,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     That program ends when this one does, however this one ends. A scan that carries its mark is done: a Dask worker
     may have been killed between the mark and its answer.
     """
-    if finished(job):
+    if is_finished(job):
         return _done(job)
     began = time.monotonic()
     log = job.out.with_name(job.name + ".log")
@@ -210,7 +225,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
         os.close(alive)
         os.close(promise)
     seconds = time.monotonic() - began
-    if child.returncode == 0 or finished(job):  # it may be killed after the mark
+    if child.returncode == 0 or is_finished(job):  # it may be killed after the mark
         return _done(job, seconds)
     if stop is not None and stop.is_set():
         return Outcome(job.name, "stopped", seconds)
@@ -239,11 +254,13 @@ def _done(job: Job, seconds: float = 0.0) -> Outcome:
 def _failure(log: Path, status: int, on_dask: bool) -> str:
     """The last message in a program's log, or the signal that killed it."""
     if status < 0:
-        fewer = "start fewer workers on one machine" if on_dask else "give --jobs 1"
-        return f"killed by signal {-status}; signal 9 is usually the system running out of memory: {fewer}"
+        what_to_do = "start fewer workers on one machine" if on_dask else "give --jobs 1"
+        return f"killed by signal {-status}; signal 9 is usually the system running out of memory: {what_to_do}"
     lines = [x.strip() for x in log.read_text(encoding="utf-8", errors="replace").splitlines() if x.strip()]
     messages = [x for x in lines if not x.startswith(("why:", "do:"))]
-    return messages[-1] if messages else f"exit status {status}"
+    if not messages:
+        return f"exit status {status}"
+    return messages[-1]
 
 
 def run_here(jobs: Sequence[Job], at_once: int) -> Iterator[Outcome]:
@@ -291,7 +308,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
         for future in as_completed(list(named)):
             if future.status == "finished":
                 yield future.result()
-            elif finished(jobs_by_name[named[future]]):  # its worker was lost behind the mark
+            elif is_finished(jobs_by_name[named[future]]):  # its worker was lost behind the mark
                 yield _done(jobs_by_name[named[future]])
             else:
                 yield Outcome(named[future], "failed", message=f"its workers were lost: {future.exception()}")
@@ -302,9 +319,9 @@ def memory_bytes(positions: int) -> int:
     return 400_000_000 + 6_000 * positions
 
 
-def at_once(positions: int, cores: int, free_bytes: int) -> int:
+def fit_scans(positions: int, cores: int, free_bytes: int) -> int:
     """Number of scans that fit cores and free memory; at least one."""
-    return max(1, min(cores, int(_FREE * free_bytes / memory_bytes(positions))))
+    return max(1, min(cores, int(SHARE_OF_FREE_MEMORY * free_bytes / memory_bytes(positions))))
 
 
 def free_memory_bytes() -> int:
@@ -328,19 +345,26 @@ def process_many(
     ConfigError
         when there is no Dask, or no cluster, where it is asked for.
     """
-    passed_over = [] if again else [j for j in jobs if finished(j)]
-    todo = [j for j in jobs if j not in passed_over]
-    outcomes = {j.name: Outcome(j.name, "skipped") for j in passed_over}
+    skipped = [j for j in jobs if not again and is_finished(j)]
+    todo = [j for j in jobs if j not in skipped]
+    outcomes = {j.name: Outcome(j.name, "skipped") for j in skipped}
     where = f"on the cluster at {dask}" if dask else f"{jobs_at_once} at a time"
-    sys.stderr.write(f"{len(jobs)} scans: {len(passed_over)} finished before, {len(todo)} to process, {where}\n")
+    sys.stderr.write(f"{len(jobs)} scans: {len(skipped)} finished before, {len(todo)} to process, {where}\n")
     out.mkdir(parents=True, exist_ok=True)
     for job in todo:
         (job.out / FINISHED).unlink(missing_ok=True)  # from now on a mark is one of this run
-    results = run_on_dask(todo, dask) if dask else run_here(todo, jobs_at_once)
-    for n, outcome in enumerate(results if todo else (), 1):
+    if not todo:
+        results = iter(())
+    elif dask:
+        results = run_on_dask(todo, dask)
+    else:
+        results = run_here(todo, jobs_at_once)
+    for n, outcome in enumerate(results, 1):
         outcomes[outcome.name] = outcome
-        tail = f": {outcome.message}" if outcome.message else ""
-        sys.stderr.write(f"[{n}/{len(todo)}] {outcome.name}: {outcome.status}, {outcome.seconds:.0f} s{tail}\n")
+        line = f"[{n}/{len(todo)}] {outcome.name}: {outcome.status}, {outcome.seconds:.0f} s"
+        if outcome.message:
+            line += f": {outcome.message}"
+        sys.stderr.write(f"{line}\n")
         write_json(out / SUMMARY, {"scans": [asdict(outcomes[j.name]) for j in jobs if j.name in outcomes]})
     return [outcomes[j.name] for j in jobs]
 
@@ -359,13 +383,13 @@ def process_several(
         raise ConfigError(f"{out} is a file", "several scans need a folder", "give another --out")
     jobs = make_jobs(scans, out)
     positions = max((_positions(folder) for folder, _ in scans), default=0)
-    n = at_a_time or at_once(positions, cores(), free_memory_bytes())
+    n = at_a_time or fit_scans(positions, cores(), free_memory_bytes())
     n = min(n, len(jobs))
     if dask is None:
         jobs = [msgspec.structs.replace(job, threads=max(1, cores() // n)) for job in jobs]
     outcomes = process_many(jobs, out, n, dask, again)
     sys.stdout.write(table(outcomes, out))
-    return 0 if all(o.status in ("done", "skipped") for o in outcomes) else 1
+    return exit_status(all(o.has_products for o in outcomes))
 
 
 def _positions(data: Path) -> int:
@@ -383,7 +407,9 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
     """Table of the results of all scans, and their counts."""
     rows = [("scan", "result", "seconds", "memory", "masked", "patches", "")]
     for o in outcomes:
-        masked, patches, verdict = _results(out / o.name) if o.status in ("done", "skipped") else ("", "", "")
+        masked = patches = verdict = ""
+        if o.has_products:
+            masked, patches, verdict = _results(out / o.name)
         seconds = f"{o.seconds:.0f}" if o.seconds else ""
         memory = f"{o.memory_gb:.1f} GB" if o.memory_gb else ""
         rows.append((o.name, o.status, seconds, memory, masked, patches, o.message or verdict))
@@ -407,15 +433,22 @@ def _results(products: Path) -> tuple[str, str, str]:
         if not boards or saved.materials is None:
             return "", "", ""
         # Absent positions count for each board.
-        absent = saved.quality.coverage.positions_absent if saved.quality.coverage else 0
-        lost = sum((board.positions_masked or 0) + absent for board in boards)
-        share = lost / max(1, sum((board.positions or 0) + absent for board in boards))
-        masked, patches, verdict = f"{100 * share:.2g} %", str(len(saved.segments)), saved.verdict
+        absent = 0
+        if saved.quality.coverage:
+            absent = saved.quality.coverage.positions_absent
+        unused = sum((board.positions_masked or 0) + absent for board in boards)
+        share = unused / max(1, sum((board.positions or 0) + absent for board in boards))
+        masked = f"{100 * share:.2g} %"
+        patches = str(len(saved.segments))
+        verdict = saved.verdict
     except PolysightError:
         return "", "", ""
     if verdict is None or verdict.level == "good":
         return masked, patches, ""
-    return masked, patches, f"{verdict.text}: {verdict.reasons[0].what}" if verdict.reasons else verdict.text
+    text = verdict.text
+    if verdict.reasons:
+        text += f": {verdict.reasons[0].what}"
+    return masked, patches, text
 
 
 # --- the program of one scan: `python -m polysight.jobs.batch` ---
@@ -450,9 +483,10 @@ def main() -> int:
     if status == NoResult.exit_status:
         status = 0  # the scan is processed: its products say that nothing can be named
     if status == 0:
-        used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+        memory_bytes_used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _MAXRSS_BYTES
         seconds = round(time.monotonic() - began, 1)
-        write_json(job.out / FINISHED, {"made_with": job.made_with, "seconds": seconds, "memory_gb": used / 1e9})
+        mark = {"made_with": job.made_with, "seconds": seconds, "memory_gb": memory_bytes_used / 1e9}
+        write_json(job.out / FINISHED, mark)
     return status
 
 

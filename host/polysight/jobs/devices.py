@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 
 from polysight.capture import CardClient, CardSurvey, EepromSettings, program_eeprom, survey_cards
-from polysight.jobs.output import confirm, print_json
+from polysight.jobs.output import confirm, exit_status, print_json
 from polysight.radar import (
     Clock,
     Image,
@@ -50,7 +50,7 @@ def show_cards(config: Path, listen_s: float, as_json: bool) -> int:
         print_json([_facts(s) for s in surveys])
     else:
         sys.stdout.write("\n".join(_survey_text(s) for s in surveys))
-    return 0 if all(s.ok for s in surveys if s.board.record) else 1
+    return exit_status(all(s.ok for s in surveys if s.board.record))
 
 
 def _facts(survey: CardSurvey) -> dict[str, object]:
@@ -80,19 +80,22 @@ def _hop(finding: Finding) -> dict[str, str]:
 def _survey_text(survey: CardSurvey) -> str:
     """Survey results as text."""
     b = survey.board
-    unused = "" if b.record else ", not recorded: only asked"
-    head = (
-        f"{b.name} ({b.role}{unused}): card {b.card_address}:{b.command_port}, data to {b.host_address}:{b.data_port}\n"
-    )
+    role = b.role if b.record else f"{b.role}, not recorded: only asked"
     unchecked = [hop.where for hop in survey.hops if hop.level == "note" and not hop.what]
-    tail = f"  not checked {', '.join(unchecked)}\n" if unchecked else ""
-    return head + "".join(_line(hop) for hop in survey.hops if hop.where not in unchecked) + tail
+    text = f"{b.name} ({role}): card {b.card_address}:{b.command_port}, data to {b.host_address}:{b.data_port}\n"
+    text += "".join(_line(hop) for hop in survey.hops if hop.where not in unchecked)
+    if unchecked:
+        text += f"  not checked {', '.join(unchecked)}\n"
+    return text
 
 
 def _line(finding: Finding) -> str:
     hop = _hop(finding)
-    more = "".join(f"{'':24}{word}: {text}\n" for word, text in (("why", finding.why), ("do", finding.do)) if text)
-    return f"  {hop['verdict']:12}{finding.where:10}{finding.what}".rstrip() + f"\n{more}"
+    line = f"  {hop['verdict']:12}{finding.where:10}{finding.what}".rstrip() + "\n"
+    for word, text in (("why", finding.why), ("do", finding.do)):
+        if text:
+            line += f"{'':24}{word}: {text}\n"
+    return line
 
 
 def _board(rig: Instrument, name: str, config: Path) -> Board:
@@ -106,7 +109,7 @@ def _board(rig: Instrument, name: str, config: Path) -> Board:
         ) from None
 
 
-def _present(board: Board, at: str) -> Board:
+def _with_address(board: Board, at: str) -> Board:
     """Return the board with its card's present address, `ADDRESS` or `ADDRESS:PORT`. Raises ConfigError."""
     address, _, port = at.partition(":")
     number = int(port) if port.isdigit() else board.command_port
@@ -137,7 +140,7 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
             "two cards share one address",
             "give each its own card_address",
         )
-    now = _present(board, at)
+    now = _with_address(board, at)
     with CardClient(now, rig.limits.command_timeout_s) as card:
         what = (
             f"{name}: a card, FPGA {card.version()}, answers at {now.card_address}:{now.command_port}; its EEPROM is"
@@ -147,7 +150,7 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
     sys.stdout.write(f"{name}: written, and the card reports no failure. Now switch the card off and on.\n")
     sys.stdout.flush()
     if wait_s > 0:
-        version = _seen_again(board, wait_s, same_place=now == board)
+        version = _wait_for_card(board, wait_s, same_place=now == board)
         sys.stdout.write(f"{name}: it answers at {board.card_address}:{board.command_port}, FPGA {version}.\n")
         sys.stdout.write("Whether it sends data to the right port is seen with `polysight card --listen 10`.\n")
     else:
@@ -155,7 +158,7 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
     return 0
 
 
-def _seen_again(board: Board, wait_s: float, same_place: bool) -> str:
+def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
     """Return the FPGA version that the card reports at its new address."""
     sys.stdout.write(f"{board.name}: looking for it at {board.card_address} for at most {wait_s:g} s\n")
     sys.stdout.flush()
@@ -171,10 +174,11 @@ def _seen_again(board: Board, wait_s: float, same_place: bool) -> str:
             if was_off:
                 return version
         time.sleep(_PAUSE_S)  # an interface that is down answers at once
+    missing = "the card was not switched off"
+    if was_off:
+        missing = f"not seen at {board.card_address}:{board.command_port}"
     raise DeviceError(
-        f"{board.name}: written, but "
-        + (f"not seen at {board.card_address}:{board.command_port}" if was_off else "the card was not switched off")
-        + f" within {wait_s:g} s",
+        f"{board.name}: written, but {missing} within {wait_s:g} s",
         "a card takes its addresses when it is switched on; with its EEPROM switch off it keeps its defaults",
         "switch it off and on, then `polysight card`; if it stays silent, its EEPROM switch brings the defaults back",
     )
@@ -204,13 +208,13 @@ def plan_radars(config: Path) -> int:
     """
     lines, holds = plan_lines(_native(config))
     sys.stdout.write("\n".join(lines) + "\n")
-    return 0 if holds else 1
+    return exit_status(holds)
 
 
 def check_radar(config: Path, name: str, trace: Path | None, slow: bool, as_json: bool) -> int:
     """Check one board from USB to one frame, step by step; return 0 if all pass. Raises ConfigError, OSError."""
-    rig = _checked(config, name)
-    _fresh(trace)
+    rig = _load_native_rig(config, name)
+    _check_trace(trace)
     clock = SystemClock()
     return _check(rig, name, clock, lambda: _open(rig, name, clock, trace, slow), as_json)
 
@@ -221,7 +225,7 @@ def replay_radar(config: Path, trace: Path, as_json: bool) -> int:
     name = str(words.facts.get("board", ""))
     if not as_json:
         sys.stdout.write(f"replayed from {trace}, not a board\n")
-    return _check(_checked(config, name), name, words, lambda: words, as_json)
+    return _check(_load_native_rig(config, name), name, words, lambda: words, as_json)
 
 
 def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path | None, slow: bool) -> int:
@@ -229,11 +233,11 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
 
     Raises ConfigError, DeviceError, OSError.
     """
-    rig = _checked(config, name)
+    rig = _load_native_rig(config, name)
     checked = read_image(image)
     clock = SystemClock()
     sys.stdout.write(f"{image.name}: whole, for an AWR2243, patches {' and '.join(checked.patches)}\n")
-    _fresh(trace)
+    _check_trace(trace)
     words = _open(rig, name, clock, trace, slow)
     board = radar_board(rig, name, words, clock, None if flash else checked)
     try:
@@ -262,8 +266,9 @@ def _check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], Wo
     firmware = firmware_of(rig)
     transmits = rig.transmitter.name == name
     board = check_board(open_words, lambda w: radar_board(rig, name, w, clock, firmware), transmits, tell)
-    report = board.report() if board else {}
+    report = {}
     if board:
+        report = board.report()
         board.close()
     if as_json:
         steps = [row._asdict() for row in rows]
@@ -271,7 +276,7 @@ def _check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], Wo
     else:
         for line in report.get("warnings", []):
             sys.stdout.write(f"      note: {line}\n")
-    return 0 if all(row.holds for row in rows) else 1
+    return exit_status(all(row.holds for row in rows))
 
 
 def _step_text(name: str, row: Row) -> str:
@@ -283,39 +288,41 @@ def _step_text(name: str, row: Row) -> str:
 
 def _write_flash(board: RadarBoard, file: Path, image: Image) -> str:
     """Write the flash; report the progress if stopped. Raises DeviceError, ConfigError."""
-    done = [0, 0]
+    parts_sent = 0
+    parts = 0
 
-    def progress(sent: int, of: int) -> None:
-        done[:] = sent, of
-        _progress(sent, of)
+    def progress(sent: int, total: int) -> None:
+        nonlocal parts_sent, parts
+        parts_sent = sent
+        parts = total
+        sys.stderr.write(f"\r{sent} of {total} parts written")
+        if sent == total:
+            sys.stderr.write("\n")
 
     try:
         return board.write_flash(image, progress)
     except KeyboardInterrupt:
-        sent, of = done
-        again = f"`polysight radar firmware {board.name} {file} --flash`"
-        if of and sent < of:
-            note = f"stopped after {sent} of {of} parts: its flash holds no whole image now; again: {again}"
+        command = f"`polysight radar firmware {board.name} {file} --flash`"
+        if parts_sent < parts:
+            note = f"stopped after {parts_sent} of {parts} parts: its flash holds no whole image now; again: {command}"
             sys.stderr.write(f"\n{board.name}: {note}\n")
-        elif of:
-            sys.stderr.write(f"\n{board.name}: stopped: its flash was written, not verified; again: {again}\n")
+        elif parts:
+            sys.stderr.write(f"\n{board.name}: stopped: its flash was written, not verified; again: {command}\n")
         raise
 
 
-def _fresh(trace: Path | None) -> None:
+def _check_trace(trace: Path | None) -> None:
     if trace is not None and trace.is_file():
         raise ConfigError(
             f"{trace}: is there already", "a trace of before, which is never written over", "another name"
         )
 
 
-def _progress(sent: int, of: int) -> None:
-    sys.stderr.write(f"\r{sent} of {of} parts written" + ("\n" if sent == of else ""))
-
-
 def _open(rig: Instrument, name: str, clock: SystemClock, trace: Path | None, slow: bool) -> WordLink:
     words = open_board(rig.radar.native[name].place, slow or rig.radar.slow_spi)
-    return words if trace is None else traced(words, clock, trace, rig, name)
+    if trace is None:
+        return words
+    return traced(words, clock, trace, rig, name)
 
 
 def _native(config: Path) -> Instrument:
@@ -329,7 +336,7 @@ def _native(config: Path) -> Instrument:
     return rig
 
 
-def _checked(config: Path, name: str) -> Instrument:
+def _load_native_rig(config: Path, name: str) -> Instrument:
     rig = _native(config)
     if name not in rig.radar.native:
         raise ConfigError(f"radar.native has no board {name!r}", "a typing error", f"one of {sorted(rig.radar.native)}")

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.cells import cell_len
 
-from polysight.jobs.output import print_lines
+from polysight.jobs.output import print_lines, simulated_scan
 from polysight.materials import (
     SPECIMEN,
     Box,
@@ -97,34 +97,38 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     """
     products = find_products(folder)
     if products is None:
-        out = folder / "products" if (folder / "manifest.jsonl").exists() else "OUT"
+        is_scan = (folder / "manifest.jsonl").exists()
+        out = folder / "products" if is_scan else "OUT"
         raise DataError(
             f"{folder}: no {IMAGE} to draw on",
             "the scan was not processed yet, its products lie elsewhere, or the path is wrong",
             f"polysight process {folder} --out {out}; or give the folder of its products",
             code=ErrorCode.FILE_MISSING,
         )
-    there = find_labels(folder)
-    found = found_patches(products)
+    saved_labels = find_labels(folder)
+    patches = list_patches(products)
     if edits.given and list_only:
         raise ConfigError(
             "--list with other options would not do them", "it writes nothing", "leave --list out",
             code=ErrorCode.VALUES_CONFLICT,
         )  # fmt: skip
-    labels = there[1].in_mm(products.x_m, products.y_m) if there else Labels({}, "mm")
+    labels = Labels({}, "mm")
+    if saved_labels:
+        labels = saved_labels[1].in_mm(products.x_m, products.y_m)
     if edits.given:
-        labels, left_out = apply_edits(labels, found, edits)
+        labels, left_out = apply_edits(labels, patches, edits)
     elif list_only or ask is None:
-        sys.stdout.write(_listing(folder, products, there, found))
+        sys.stdout.write(_listing(folder, products, saved_labels, patches))
         return 0
     else:
-        sys.stdout.write(_listing(folder, products, there, found))
-        if there and ask("name the patches anew, in place of the boxes drawn by hand? type yes: ").strip() != "yes":
+        sys.stdout.write(_listing(folder, products, saved_labels, patches))
+        question = "name the patches anew, in place of the boxes drawn by hand? type yes: "
+        if saved_labels and ask(question).strip() != "yes":
             raise ConfigError(
                 "nothing was changed", "yes was asked for", "options edit boxes: polysight label --help",
                 code=ErrorCode.VALUE_INVALID,
             )  # fmt: skip
-        labels = ask_for_names(found, ask)
+        labels = ask_for_names(patches, ask)
         left_out = []
     place = label_folder(products.folder)
     checked, notes = save_labels(place, products, labels)
@@ -161,8 +165,9 @@ def save_labels(place: Path, products: ProcessedScan, labels: Labels) -> tuple[L
     # The boxes last: where they are, their picture is.
     write_together({place / LABELS_PICTURE: picture, place / LABELS: pack_labels(checked)})
     masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked.boxes.items()}
-    few = [name for name, mask in masks.items() if (mask & products.valid).sum() < FEW]
-    notes = [f"fewer than {FEW} pixels: {', '.join(few)}; speckle decides what is learnt of so few"] if few else []
+    notes = []
+    if few := [name for name, mask in masks.items() if (mask & products.valid).sum() < FEW]:
+        notes.append(f"fewer than {FEW} pixels: {', '.join(few)}; speckle decides what is learnt of so few")
     if dark := _find_dark_boxes(products, masks):
         notes.append(f"dark, as where nothing lies: {', '.join(dark)}; look at the picture")
     if checked.metal is None:
@@ -178,10 +183,10 @@ def remove_labels(folder: Path) -> Path:
     DataError
         if there are none.
     """
-    found = find_labels(folder)
-    if found is None:
+    saved_labels = find_labels(folder)
+    if saved_labels is None:
         raise DataError(f"{folder}: has no boxes", "none were saved", "draw some first", code=ErrorCode.FILE_MISSING)
-    path = found[0]
+    path = saved_labels[0]
     path.unlink()
     path.with_name(LABELS_PICTURE).unlink(missing_ok=True)
     return path
@@ -197,7 +202,7 @@ def _find_dark_boxes(products: ProcessedScan, masks: Mapping[str, npt.NDArray[np
     return [name for name, p in inside.items() if p.size and np.nanmedian(p) < least]
 
 
-def found_patches(products: ProcessedScan) -> list[FoundPatch]:
+def list_patches(products: ProcessedScan) -> list[FoundPatch]:
     """Patches of materials.json, each with a box inside it that avoids its edges if it is wide enough."""
     margin_mm = SegmentSettings().margin_mm
     out = []
@@ -212,8 +217,9 @@ def found_patches(products: ProcessedScan) -> list[FoundPatch]:
         elif patch.metal_reference:
             text = REFERENCE
         elif patch.name:
-            sure = f" {100 * patch.confidence:.0f} %" if patch.confidence is not None else ""
-            text = f"named {patch.name}{sure}"
+            text = f"named {patch.name}"
+            if patch.confidence is not None:
+                text += f" {100 * patch.confidence:.0f} %"
         out.append(FoundPatch(patch.label, (x0 + mx, y0 + my, x1 - mx, y1 - my), text))
     return out
 
@@ -239,10 +245,12 @@ def apply_edits(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tu
     for name in (_find_box(n, boxes) for n in edits.removed):
         del boxes[name], names[name]
         specimens.pop(name, None)
-        metal = None if name == metal else metal
+        if name == metal:
+            metal = None
     if edits.from_patches and edits.metal in boxes:  # a patch's number: it is called metal, unless it gets a name
-        given = {old for old, _ in (_split(text, boxes) for text in edits.renames)}
-        edits = edits if edits.metal in given else replace(edits, renames=(*edits.renames, f"{edits.metal}={METAL}"))
+        renamed = {old for old, _ in (_split(text, boxes) for text in edits.renames)}
+        if edits.metal not in renamed:
+            edits = replace(edits, renames=(*edits.renames, f"{edits.metal}={METAL}"))
     for text in edits.renames:
         old, new = _split(text, boxes)
         names[old] = box_name(new)
@@ -258,11 +266,13 @@ def apply_edits(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tu
     left_out = [name for name in boxes if name.isdecimal()]
     boxes = {n: b for n, b in boxes.items() if n not in left_out}
     for text in edits.specimens:
-        name, which = _split(text, boxes)
-        specimens[name] = clean_name(which, "specimen")
+        name, specimen = _split(text, boxes)
+        specimens[name] = clean_name(specimen, "specimen")
     if edits.metal is not None:
-        metal = names.get(edits.metal) if edits.from_patches and edits.metal in names else None
-        metal = metal or _find_box(edits.metal, boxes)
+        if edits.from_patches and edits.metal in names:
+            metal = names[edits.metal]
+        else:
+            metal = _find_box(edits.metal, boxes)
     return Labels(boxes, "mm", metal, specimens), left_out
 
 
@@ -275,15 +285,19 @@ def _rename_boxes(boxes: Mapping[str, Box], names: Mapping[str, str]) -> dict[st
 
 
 def _refuse_twin(name: str, boxes: Mapping[str, Box]) -> None:
-    if twin := next((other for other in boxes if other.casefold() == name.casefold()), None):
-        raise name_taken(name, twin)
+    for twin in boxes:
+        if twin.casefold() == name.casefold():
+            raise name_taken(name, twin)
 
 
 def _find_box(name: str, boxes: Mapping[str, Box]) -> str:
     """Find the box that an option names. Raises DataError if there is none."""
     if name in boxes:
         return name
-    clean = box_name(name) if not name.strip().isdecimal() else name.strip()
+    # A patch that has no name yet is called by its number.
+    clean = name.strip()
+    if not clean.isdecimal():
+        clean = box_name(name)
     if clean not in boxes:
         raise no_box(clean, boxes)
     return clean
@@ -292,10 +306,10 @@ def _find_box(name: str, boxes: Mapping[str, Box]) -> str:
 def _split(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
     """Split `NAME=TEXT`, where NAME is a box and may contain `=`. Raises DataError."""
     parts = text.split("=")
-    for at in range(len(parts) - 1, 0, -1):
-        name = "=".join(parts[:at])
+    for count in range(len(parts) - 1, 0, -1):
+        name = "=".join(parts[:count])
         if name in boxes:
-            return name, "=".join(parts[at:])
+            return name, "=".join(parts[count:])
     name, _, rest = text.partition("=")
     return _find_box(name, boxes), rest
 
@@ -313,7 +327,8 @@ def ask_for_names(found: Sequence[FoundPatch], ask: Ask) -> Labels:
             name, is_metal = _ask_for_name(question, boxes, ask, metal is None)
             if name:
                 boxes[name] = patch.box
-                metal = name if is_metal else metal
+            if is_metal:
+                metal = name
         if len(boxes) > 1 and metal is None:
             metal = _ask_for_metal(boxes, ask)
     except EOFError:
@@ -366,19 +381,18 @@ def _table(labels: Labels) -> list[str]:
 
 
 def _listing(
-    folder: Path, products: ProcessedScan, there: tuple[Path, Labels] | None, found: Sequence[FoundPatch]
+    folder: Path, products: ProcessedScan, saved_labels: tuple[Path, Labels] | None, patches: Sequence[FoundPatch]
 ) -> str:
     """Text of the boxes drawn, the patches found, and how to name them."""
-    kind = "simulated " if products.simulated else ""
-    lines = [f"{products.folder}: {kind}scan {products.scan_id}"]
+    lines = [f"{products.folder}: {simulated_scan(products.scan_id, bool(products.simulated))}"]
     lines.append(f"image: {format_box(image_extent_mm(products.x_m, products.y_m))} from its centre")
-    if there:
-        boxes = there[1].in_mm(products.x_m, products.y_m)
-        lines += [f"drawn by hand: {there[0]}", *(f"  {line}" for line in _table(boxes))]
-    if found:
+    if saved_labels:
+        boxes = saved_labels[1].in_mm(products.x_m, products.y_m)
+        lines += [f"drawn by hand: {saved_labels[0]}", *(f"  {line}" for line in _table(boxes))]
+    if patches:
         lines += ["patches that were found, a box inside each:"]
-        lines += [f"  {f.number:>3}  {format_box(f.box)}  {f.description}" for f in found]
-        metal = next((f.number for f in found if f.description == REFERENCE), "NUMBER")
+        lines += [f"  {f.number:>3}  {format_box(f.box)}  {f.description}" for f in patches]
+        metal = next((f.number for f in patches if f.description == REFERENCE), "NUMBER")
         lines.append(f"to name them: polysight label {folder} --from-patches --metal {metal} --rename NUMBER=NAME ...")
     lines.append(f"to draw one:  polysight label {folder} --box NAME=-20,-20,20,20 (x0,y0,x1,y1 in mm)")
     return "".join(f"{line}\n" for line in lines)

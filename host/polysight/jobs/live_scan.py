@@ -46,9 +46,11 @@ def _clock(seconds: float | None) -> str:
     """`1:02:03` or `2:03` left; empty when unknown."""
     if seconds is None:
         return ""
-    whole = round(seconds)
-    hours, minutes = divmod(whole // 60, 60)
-    return f"{hours}:{minutes:02d}:{whole % 60:02d} left" if hours else f"{minutes}:{whole % 60:02d} left"
+    minutes, second = divmod(round(seconds), 60)
+    hours, minute = divmod(minutes, 60)
+    if hours:
+        return f"{hours}:{minute:02d}:{second:02d} left"
+    return f"{minute}:{second:02d} left"
 
 
 class _PlainConsole(Console):
@@ -90,7 +92,9 @@ class ScanBar:
         """Show the progress of the scan."""
         self._bars.update(self._rows, total=p.rows, completed=p.committed, left=_clock(p.remaining_s))
         if p.row_points:
-            text = f"row {p.row}" + (f" take {p.take}" if p.take > 1 else "")
+            text = f"row {p.row}"
+            if p.take > 1:
+                text += f" take {p.take}"
             self._bars.update(self._points, description=text, total=p.row_points, completed=p.points, visible=True)
         if p.phase in ("warning", "retake", "home", "check", "connect", "stop", "held", "wait"):
             self._console.print(f"{p.phase}: {p.message}", highlight=False)
@@ -117,10 +121,12 @@ def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan) -> 
     if result.exit_status == "success":
         _print(f"{folder}: every row is committed\n")
     if result.processing_error is not None:
-        raise _unprocessed(folder, result, result.processing_error)
+        raise _add_advice(folder, result, result.processing_error)
     if result.exit_status != "success":
         raise ScanError(f"{folder}: {result.reason}", "", f"polysight resume {folder}")
-    return 0 if processing is None else processing.finish()
+    if processing is None:
+        return 0
+    return processing.finish()
 
 
 def _print(text: str) -> None:
@@ -130,19 +136,19 @@ def _print(text: str) -> None:
         sys.stdout.flush()
 
 
-def _unprocessed(folder: Path, result: ScanResult, e: BaseException) -> PolysightError:
+def _add_advice(folder: Path, result: ScanResult, e: BaseException) -> PolysightError:
     """Return the error to raise if processing failed while the scan continued."""
-    again = f"the rows are safe: `polysight process {folder} --out DIR` processes them again"
+    remedy = f"the rows are safe: `polysight process {folder} --out DIR` processes them again"
     if result.exit_status != "success":
-        again = f"{result.reason}: `polysight resume {folder}` goes on, and processes all of them again"
+        remedy = f"{result.reason}: `polysight resume {folder}` goes on, and processes all of them again"
     if isinstance(e, PolysightError):
-        e.remedy = advice(e.remedy, again)
+        e.remedy = advice(e.remedy, remedy)
         return e
     traceback.print_exception(e)
     return ScanError(
         f"processing failed, the scan did not: {type(e).__name__}: {e}",
         "a fault of this program, or there was no memory or room on the disk; the lines above tell where",
-        again,
+        remedy,
     )
 
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from rich.cells import cell_len
 
 from polysight.imaging import sub_bands
-from polysight.jobs.output import print_json, print_lines
+from polysight.jobs.output import print_json, print_lines, simulated_scan
 from polysight.materials import (
     AMPLITUDE_ERROR,
     PATCHES,
@@ -67,12 +67,16 @@ def print_verdict(products: ProcessedScan, to_terminal: bool = True) -> int:
         return 0
     if to_terminal:
         print_lines(verdict.lines(_REASONS))
-    return 0 if verdict.usable else NoResult.exit_status
+    if verdict.usable:
+        return 0
+    return NoResult.exit_status
 
 
 def _chirp(products: ProcessedScan, config: Path | None) -> Chirp:
     """The chirp of the products, or that of `config` if given. Raises DataError, ConfigError."""
-    rig = load_instrument(config) if config is not None else products.rig
+    rig = products.rig
+    if config is not None:
+        rig = load_instrument(config)
     if rig is None:
         raise DataError(
             f"{products.folder}: no {SCAN}, which names the chirp",
@@ -84,13 +88,15 @@ def _chirp(products: ProcessedScan, config: Path | None) -> Chirp:
 
 def _check_bands(patch: PatchFigures, chirp: Chirp, source: str) -> None:
     """Raise DataError if the sub-bands of a patch are not those of this chirp."""
-    recorded = [(band.first_hz, band.last_hz) for band in patch.bands or ()]
-    expected = [(b.first_hz, b.last_hz) for b in sub_bands(chirp, len(recorded))] if recorded else []
-    for saved, own in zip(recorded, expected, strict=True):
-        if not all(math.isclose(a, b, rel_tol=_SAME_FREQUENCY) for a, b in zip(saved, own, strict=True)):
+    if not patch.bands:
+        return
+    for saved, expected in zip(patch.bands, sub_bands(chirp, len(patch.bands)), strict=True):
+        same_first = math.isclose(saved.first_hz, expected.first_hz, rel_tol=_SAME_FREQUENCY)
+        same_last = math.isclose(saved.last_hz, expected.last_hz, rel_tol=_SAME_FREQUENCY)
+        if not (same_first and same_last):
             raise DataError(
-                f"segment {patch.label} covers {saved[0] / 1e9:.4f} to {saved[1] / 1e9:.4f} GHz; the chirp"
-                f" of {source} has that part from {own[0] / 1e9:.4f} to {own[1] / 1e9:.4f} GHz",
+                f"segment {patch.label} covers {saved.first_hz / 1e9:.4f} to {saved.last_hz / 1e9:.4f} GHz; the chirp"
+                f" of {source} has that part from {expected.first_hz / 1e9:.4f} to {expected.last_hz / 1e9:.4f} GHz",
                 "that is another rig file than the scan's",
                 "leave --config out: the products bring their own",
             )
@@ -134,7 +140,9 @@ def permittivity(
             f"its number is not in {MATERIALS}",
             f"`polysight materials {products.folder}` lists them",
         )
-    chirp = _chirp(products, config) if stack else None
+    chirp = None
+    if stack:
+        chirp = _chirp(products, config)
     out: list[dict[str, Any]] = []
     lines: list[str] = []
     for patch in patches:
@@ -186,23 +194,36 @@ def _estimate(e: PermittivityFigures) -> str:
     text = f"{format_permittivity(e.value, width=6):15s}"
     if e.spread is not None:
         text += f"  +- {e.spread.real_std:.2f}, {e.spread.loss_std:.2f}"
-    return f"{text}  mostly {e.dominated_by}" if e.dominated_by else text
+    if e.dominated_by:
+        text += f"  mostly {e.dominated_by}"
+    return text
 
 
-def concentration(data: Path, given: Mapping[str, float], confidence: float, as_json: bool) -> int:
+def _load_library(data: Path) -> Library:
+    """Load a library (.npz), or a folder of the published material files."""
+    if data.is_dir():
+        return read_materials(data)
+    return Library.load(data)
+
+
+def _measured_or_simulated(is_simulated: bool) -> str:
+    return "simulated" if is_simulated else "measured"
+
+
+def concentration(data: Path, values: Mapping[str, float], confidence: float, as_json: bool) -> int:
     """Fit concentration against polarisation angle, with leave-one-out errors; return the exit status.
 
     `data` is a library (.npz) or a folder of the published material files. Raises DataError.
     """
-    library = read_materials(data) if data.is_dir() else Library.load(data)
-    unknown = sorted(set(given) - set(library.names))
+    library = _load_library(data)
+    unknown = sorted(set(values) - set(library.names))
     if unknown:
         raise ConfigError(
             f"{data}: no material {unknown[0]!r}", f"it holds {', '.join(library.names)}", "correct --value"
         )
-    result = fit_concentration(library, given, confidence)
-    left_out = sorted(set(library.names) - set(concentrations(library.names, given)))
-    source = "simulated" if library.simulated else "measured"
+    result = fit_concentration(library, values, confidence)
+    left_out = sorted(set(library.names) - set(concentrations(library.names, values)))
+    source = _measured_or_simulated(library.simulated)
     if as_json:
         content = {
             "source": source,
@@ -248,8 +269,7 @@ def materials(data: Sequence[Path], as_json: bool) -> int:
         return max((print_verdict(s, to_terminal=False) for s in scans), default=0)
     worst = 0
     for scan in scans:
-        kind = "simulated " if scan.simulated else ""
-        sys.stdout.write(f"{scan.folder}: {kind}scan {scan.scan_id}\n")
+        sys.stdout.write(f"{scan.folder}: {simulated_scan(scan.scan_id, bool(scan.simulated))}\n")
         status = print_verdict(scan)
         if status == 0:
             sys.stdout.write("".join(map(_patch_line, scan.segments)))
@@ -278,21 +298,31 @@ def _catalogue_line(material: CatalogueMaterial, number: Mapping[str, int]) -> s
     star = "*" if material.spread_is_default else " "
     cited = "".join(f"[{number[source.key]}]" for source in material.sources)
     spread = f"+-{real:3.0f} %, {loss:3.0f} %{star}"
-    at = f"{material.frequency_hz / 1e9:5.4g} GHz"
-    return f"{_pad_name(material.name, 30)} {value:19s} {spread} {at}  {material.kind:10s} {cited}"
+    frequency = f"{material.frequency_hz / 1e9:5.4g} GHz"
+    return f"{_pad_name(material.name, 30)} {value:19s} {spread} {frequency}  {material.kind:10s} {cited}"
 
 
 def _patch_line(patch: PatchFigures) -> str:
-    drawn = f"   drawn as {patch.box}" if patch.box else ""
+    box = ""
+    if patch.box:
+        box = f"   drawn as {patch.box}"
     if patch.refused is not None:
-        return f"{patch.label:>3}  {'not judged':24s} {patch.refused_text}{drawn}\n"
-    name = patch.name or ("metal reference" if patch.metal_reference else "not named")
-    sure = f"{100 * patch.confidence:.0f} %" if patch.confidence is not None else ""
-    value = "metal-like" if patch.metal_like else "-"
+        return f"{patch.label:>3}  {'not judged':24s} {patch.refused_text}{box}\n"
+    name = patch.name or "not named"
+    if patch.metal_reference and not patch.name:
+        name = "metal reference"
+    confidence = ""
+    if patch.confidence is not None:
+        confidence = f"{100 * patch.confidence:.0f} %"
+    value = "-"
     if patch.permittivity is not None:
         value = _estimate(patch.permittivity)
-    why = f"\n     {patch.why}" if patch.why else ""
-    return f"{patch.label:>3}  {_pad_name(name)} {sure:>5s}  {value}{drawn}".rstrip() + f"{why}\n"
+    elif patch.metal_like:
+        value = "metal-like"
+    line = f"{patch.label:>3}  {_pad_name(name)} {confidence:>5s}  {value}{box}".rstrip() + "\n"
+    if patch.why:
+        line += f"     {patch.why}\n"
+    return line
 
 
 def _pad_name(name: str, width: int = 24) -> str:
@@ -308,17 +338,19 @@ def report(folder: Path) -> int:
     PolysightError
         as processing the scan does.
     """
-    found = find_products(folder, REPORT)
-    if found is None:
+    saved = find_products(folder, REPORT)
+    if saved is None:
         if not is_source(folder):
             read_products(folder, REPORT)  # raises with the reason
         from polysight.jobs.process import process
 
         status = process(folder, folder / "products")
-        made = find_products(folder, REPORT)
-        return status if status or made is None else print_verdict(made, to_terminal=False)
-    status = print_verdict(found)
-    sys.stdout.write(f"report:   {found.folder / REPORT}\n")
+        new = find_products(folder, REPORT)
+        if status or new is None:
+            return status
+        return print_verdict(new, to_terminal=False)
+    status = print_verdict(saved)
+    sys.stdout.write(f"report:   {saved.folder / REPORT}\n")
     return status
 
 
@@ -340,20 +372,21 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
     Where one of the scans has no result (verdict `none`) nothing is named; the exit status is that of NoResult.
     """
     scans = [find_products(folder, PATCHES) for folder in data]
-    found = [s for s in scans if s is not None]
-    if len({s.folder.resolve() for s in found}) < len(found):
+    products = [s for s in scans if s is not None]
+    if len({s.folder.resolve() for s in products}) < len(products):
         raise ConfigError(
             f"{' '.join(map(str, data))}: one scan is given twice",
             "it tells nothing more the second time",
             "give scans of the same patches under different angles",
         )
-    if len(found) == len(scans):
-        return _name_patches(found, library or SIMULATED_LIBRARY, model, as_json)
+    if len(products) == len(scans):
+        return _name_patches(products, library or SIMULATED_LIBRARY, model, as_json)
     if len(data) > 1:
-        other = data[scans.index(None)]
+        unprocessed = data[scans.index(None)]
         raise ConfigError(
-            f"{other}: not a folder of products", "several scans are named together from what polysight process wrote",
-            f"polysight process SCAN --out {other}",
+            f"{unprocessed}: not a folder of products",
+            "several scans are named together from what polysight process wrote",
+            f"polysight process SCAN --out {unprocessed}",
         )  # fmt: skip
     if library is not None or model is not None:
         raise ConfigError(
@@ -369,13 +402,13 @@ def _score_models(data: Path, as_json: bool) -> int:
     """Cross-validate every model on a library; print shares of right names."""
     from polysight.materials import MODELS, Samples, score
 
-    library = read_materials(data) if data.is_dir() else Library.load(data)
+    library = _load_library(data)
     if len(library.angles_deg) > 1:
         sys.stderr.write(f"{data}: angles {library.angles_deg} degrees; judged at {library.angles_deg[-1]:g}\n")
         library = library.at(library.angles_deg[-1])
     samples = Samples.of(library)
     scores = [score(samples, model, by_pixel=by_pixel) for model in MODELS for by_pixel in (False, True)]
-    source = "simulated" if library.simulated else "measured"
+    source = _measured_or_simulated(library.simulated)
     if as_json:
         rows = [{k: v for k, v in asdict(s).items() if "confusion" not in k and k != "names"} for s in scores]
         best = max(scores[::2], key=lambda s: s.pixels + s.patches)
@@ -388,9 +421,10 @@ def _score_models(data: Path, as_json: bool) -> int:
         f"{'':44s}{'whole scans left out':>22s}{'by pixel (optimistic)':>24s}\n"
         f"{'model':44s}{'pixels':>11s}{'patches':>11s}{'pixels':>12s}{'patches':>12s}\n"
     )
-    for held, mixed in zip(scores[::2], scores[1::2], strict=True):
+    for by_scan, by_pixel in zip(scores[::2], scores[1::2], strict=True):
         sys.stdout.write(
-            f"{held.model:44s}{held.pixels:11.1%}{held.patches:11.1%}{mixed.pixels:12.1%}{mixed.patches:12.1%}\n"
+            f"{by_scan.model:44s}{by_scan.pixels:11.1%}{by_scan.patches:11.1%}"
+            f"{by_pixel.pixels:12.1%}{by_pixel.patches:12.1%}\n"
         )
     if missing := scores[0].not_judged:
         sys.stdout.write(f"not judged with scans left out, because one scan alone holds them: {', '.join(missing)}\n")
@@ -416,10 +450,12 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
             "the object was moved between the scans, or these are scans of other objects",
             "scan the same patches in the same places",
         )
-    errors = scans[0].errors_of([m.label for m in matched]) if len(scans) == 1 else None
+    errors = None
+    if len(scans) == 1:
+        errors = scans[0].errors_of([m.label for m in matched])
     named = classifier.scan([m.features for m in matched], errors)
     content = {
-        "source": "simulated" if any(s.simulated for s in scans) else "measured",
+        "source": _measured_or_simulated(any(s.simulated for s in scans)),
         "incidence_deg": [s.angle_deg for s in scans],
         "model": classifier.model,
         "library": classifier_sentence(classifier),
@@ -454,16 +490,24 @@ def _classifiable(products: ProcessedScan) -> ScanPatches:
 def _print_names(content: dict[str, Any], several: bool) -> None:
     """Print a line for each named patch, contradiction and refused patch."""
     angles = " and ".join(f"{a:.1f}" for a in content["incidence_deg"])
-    source = "simulated: " if content["source"] == "simulated" else ""
-    sys.stdout.write(f"{source}{len(content['patches'])} patches at {angles} degrees\n")
+    head = f"{len(content['patches'])} patches at {angles} degrees"
+    if content["source"] == "simulated":
+        head = f"simulated: {head}"
+    sys.stdout.write(f"{head}\n")
     for row in content["patches"]:
         votes = ", ".join(f"{name} {share:.0%}" for name, share in list(row["votes"].items())[:2])
-        truth = f"   truly {row['truth']}" if row["truth"] else ""
-        sure = f"{row['confidence']:6.1%}" if row["pixels"] else "no pixel of it can be used"
-        sys.stdout.write(f"{row['label']:>3}  {row['name']:28s} {sure}   pixels: {votes}{truth}\n")
+        confidence = "no pixel of it can be used"
+        if row["pixels"]:
+            confidence = f"{row['confidence']:6.1%}"
+        line = f"{row['label']:>3}  {row['name']:28s} {confidence}   pixels: {votes}"
+        if row["truth"]:
+            line += f"   truly {row['truth']}"
+        sys.stdout.write(f"{line}\n")
     print_lines(f"note: {line}" for line in content["contradictions"])
     for refused in content["refused"]:
-        where = f" in {refused['products']}" if several else ""
+        where = ""
+        if several:
+            where = f" in {refused['products']}"
         text = one_line(Finding("error", refused["what"], refused["why"], refused["do"]))
         sys.stdout.write(f"{refused['label']:>3}  not judged{where}: {text}\n")
 
@@ -495,17 +539,17 @@ def _contradictions(
 
 def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
     """Count right names; unknown patches of materials that the library lacks do not count."""
-    strange = [r for r in rows if r["truth"] and r["truth"] not in names]
-    known = [r for r in rows if r["truth"] and not (r in strange and r["name"] == UNKNOWN)]
-    if strange:
-        unknown = sum(r["name"] == UNKNOWN for r in strange)
+    foreign = [r for r in rows if r["truth"] and r["truth"] not in names]
+    judged = [r for r in rows if r["truth"] and not (r in foreign and r["name"] == UNKNOWN)]
+    if foreign:
+        unknown = sum(r["name"] == UNKNOWN for r in foreign)
         sys.stdout.write(
-            f"{len(strange)} patches of materials that the library lacks, {unknown} of them named unknown\n"
+            f"{len(foreign)} patches of materials that the library lacks, {unknown} of them named unknown\n"
         )
-    if known:
-        right = sum(r["name"] == r["truth"] for r in known)
-        share = np.mean([r["pixels_right"] for r in known])
-        sys.stdout.write(f"{right} of {len(known)} patches named right, {share:.1%} of their pixels\n")
+    if judged:
+        right = sum(r["name"] == r["truth"] for r in judged)
+        share = np.mean([r["pixels_right"] for r in judged])
+        sys.stdout.write(f"{right} of {len(judged)} patches named right, {share:.1%} of their pixels\n")
 
 
 def _nothing_named(products: Sequence[ProcessedScan]) -> dict[str, Any]:

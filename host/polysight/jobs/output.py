@@ -16,6 +16,16 @@ T = TypeVar("T")
 _LINE_S = 5.0  # at least, from one line to the next
 
 
+def exit_status(worked: bool) -> int:
+    """Exit status of a command: 0 if it worked, else 1."""
+    return int(not worked)
+
+
+def simulated_scan(scan_id: str, is_simulated: bool) -> str:
+    """`scan NAME`, or `simulated scan NAME`."""
+    return f"simulated scan {scan_id}" if is_simulated else f"scan {scan_id}"
+
+
 def print_json(content: Any) -> None:
     """Print a result for programs."""
     sys.stdout.write(json.dumps(content, indent=1) + "\n")
@@ -43,7 +53,7 @@ def steps(things: Sequence[T], names: Sequence[str]) -> Iterator[T]:
         sys.stderr.write(f" {monotonic() - began:.0f} s\n")
 
 
-def counted(things: Iterable[T], total: int, name: str) -> Iterator[T]:
+def count_steps(things: Iterable[T], total: int, name: str) -> Iterator[T]:
     """Yield the things with a bar; without a terminal a line at the start, then at tenths, 5 s apart or more."""
     from rich.console import Console
     from rich.progress import track

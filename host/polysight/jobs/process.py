@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from polysight.calibration import Calibration, calibration_of_rig, calibration_of_scan
 from polysight.data import packaged
 from polysight.imaging import PLANE_REACH_M, Focus, Images, PlaneEstimate, focus_sweep, image_grid
-from polysight.jobs.output import counted, current_step, print_lines, say
+from polysight.jobs.output import count_steps, current_step, print_lines, say, simulated_scan
 from polysight.materials import Plates, find_truth, read_labels, read_truth
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference, plane_reference
@@ -58,7 +58,7 @@ def add_rows(pipeline: Pipeline, data: Path, threads: int | None = None) -> None
     Rows whose samples the scan folder keeps are not synchronised again; others are, and then kept.
     """
     rows = pipeline.samples.processable(pipeline.source, data)
-    for _ in counted(map_rows(pipeline.add_row, rows, threads), len(rows), "rows"):
+    for _ in count_steps(map_rows(pipeline.add_row, rows, threads), len(rows), "rows"):
         pass
 
 
@@ -72,7 +72,9 @@ def processed_rows(source: Source, data: Path, settings: Settings = DEFAULT) -> 
 def pixel_axes(pipeline: Pipeline) -> Axes:
     """Pixel centres of the images, x and y, ascending."""
     grid = pipeline.images.grid
-    return (grid.y_m, grid.x_m) if pipeline.source.mirrored else (grid.x_m, grid.y_m)
+    if pipeline.source.mirrored:
+        return grid.y_m, grid.x_m
+    return grid.x_m, grid.y_m
 
 
 def imaged(data: Path, settings: Settings = DEFAULT) -> tuple[Pipeline, Images]:
@@ -147,14 +149,15 @@ def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
 def _why_no_pixel(pipeline: Pipeline) -> str:
     """Name the boards without any valid position, which leave no pixel valid; "" if there are none."""
     boards = " and ".join(pipeline.quality.boards_masked)
-    return f"no position of {boards} has a direct path: TX or RX is off, or its data are constant" if boards else ""
+    if not boards:
+        return ""
+    return f"no position of {boards} has a direct path: TX or RX is off, or its data are constant"
 
 
 def plane_of(pipeline: Pipeline, images: Images) -> PlaneReference:
     """Make a reference from images of a metal plate. Raises DataError if they show none."""
-    name = pipeline.source.scan_id
-    found = plane_reference(images.level(images.valid), name=name)
-    return replace(found, made_with=pipeline.calibration.imaged_with(pipeline.rig))
+    reference = plane_reference(images.level(images.valid), name=pipeline.source.scan_id)
+    return replace(reference, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 
 def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> PlaneReference:
@@ -176,12 +179,13 @@ def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> 
 
 def load_inputs(settings: Settings) -> Inputs:
     """Read the label file of the settings, and process their scan of a metal plate. Raises PolysightError."""
-    labels = settings.path("labels")
-    plate = settings.path("reference")
-    return Inputs(
-        labels=None if labels is None else read_labels(labels),
-        reference=None if plate is None else load_reference(plate, settings.path("config"), settings.bands),
-    )
+    inputs = Inputs()
+    if (labels := settings.path("labels")) is not None:
+        inputs = replace(inputs, labels=read_labels(labels))
+    if (plate := settings.path("reference")) is not None:
+        reference = load_reference(plate, settings.path("config"), settings.bands)
+        inputs = replace(inputs, reference=reference)
+    return inputs
 
 
 def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | None = None) -> int:
@@ -213,7 +217,7 @@ def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | 
 
 def rig_of_images(config: Path | None) -> Instrument:
     """Return the rig file for given images: `config`, or the packaged one. Raises ConfigError."""
-    return load_instrument(packaged(Path("instrument.toml")) if config is None else config)
+    return load_instrument(config or packaged(Path("instrument.toml")))
 
 
 def process_images(data: Path, out: Path, settings: Settings, inputs: Inputs) -> int:
@@ -222,14 +226,17 @@ def process_images(data: Path, out: Path, settings: Settings, inputs: Inputs) ->
     `data` is an `.npz` file, or a folder `labels/<scan>` of the published data. Raises PolysightError.
     """
     if settings.bands > 1 or settings.sparse:
+        option = "--sparse" if settings.sparse else "--bands"
         raise ConfigError(
-            f"{'--sparse' if settings.sparse else '--bands'} with given images", "it needs the rows of a recorded scan",
+            f"{option} with given images", "it needs the rows of a recorded scan",
             "leave it out", code=ErrorCode.VALUES_CONFLICT,
         )  # fmt: skip
     rig = rig_of_images(settings.path("config"))
     pair = read_given_images(data, rig)
     check_products_folder(out, pair.scan_id)
-    plates = find_plates(data) if data.is_dir() else ()
+    plates: Plates = ()
+    if data.is_dir():
+        plates = find_plates(data)
     scan, findings, unnamed = analyse_given_images(pair, settings, inputs, rig, plates)
     with making_products(out, pair.scan_id) as new, current_step("figures and report"):
         products = replace(save_materials(new, scan, findings.found, unnamed), folder=out)
@@ -341,26 +348,25 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     pipeline.place_plane(images, move=False)
     plates = pipeline.plane
     say("the plane at which the image is sharpest")
-    found = focus_sweep(builder, depth_m=depth_mm / 1e3)
-    depth_m = plates.offset_m if plates.known else found.depth_mm / 1e3
+    sharpest = focus_sweep(builder, depth_m=depth_mm / 1e3)
+    depth_m = plates.offset_m if plates.known else sharpest.depth_mm / 1e3
     grid = builder.grid
     board = builder.boards[source.instrument.receivers[0].name]
     pictures = (board.image()[0], board.image(replace(grid, z_m=grid.z_m + depth_m))[0])
     if source.mirrored:  # the builder's image is that of the mirrored rig
-        found = found.transposed()
+        sharpest = sharpest.transposed()
         plates = plates.transposed()
         pictures = (pictures[0].T, pictures[1].T)
-    sweep = found.to_dict() | {"plates": plates.to_dict()}
+    sweep = sharpest.to_dict() | {"plates": plates.to_dict()}
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
     (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *pixel_axes(pipeline), source.simulated))
-    head = f"{'simulated ' if source.simulated else ''}scan {source.scan_id}"
-    at = pipeline.rig.geometry.object_distance_mm
-    print_lines(_focus_lines(head, at, found, plates))
+    head = simulated_scan(source.scan_id, source.simulated)
+    print_lines(_focus_lines(head, pipeline.rig.geometry.object_distance_mm, sharpest, plates))
     sys.stdout.write(f"figure: {out / 'focus.png'}\n")
     return 0
 
 
-def _focus_lines(head: str, distance_mm: float, found: Focus, plates: PlaneEstimate) -> list[str]:
+def _focus_lines(head: str, distance_mm: float, sharpest: Focus, plates: PlaneEstimate) -> list[str]:
     """Text of `focus`: the plane by the plates, if there are any, and by sharpness."""
     lines = []
     if plates.known:
@@ -374,15 +380,15 @@ def _focus_lines(head: str, distance_mm: float, found: Focus, plates: PlaneEstim
             f" object_distance_mm = {distance_mm + mm:.2f}",
             f"tilt: {tilt[0]:+.2f} +- {tilt_std[0]:.2f} degrees along x, {tilt[1]:+.2f} +- {tilt_std[1]:.2f} along y",
         ]
-    if plates.known and not found.certain:
+    if plates.known and not sharpest.certain:
         return [*lines, "sharpness does not tell (a narrow scan, or no points and edges in it); the plates do"]
     lines += [
-        f"{head}: the plane is sharpest {found.depth_mm:+.2f} mm from the rig file's:"
-        f" object_distance_mm = {distance_mm + found.depth_mm:.2f}",
-        f"tilt: {found.tilt_deg[0]:+.2f} degrees along x, {found.tilt_deg[1]:+.2f} along y;"
-        f" sharpness {found.gain:.3f} times the rig file's plane",
+        f"{head}: the plane is sharpest {sharpest.depth_mm:+.2f} mm from the rig file's:"
+        f" object_distance_mm = {distance_mm + sharpest.depth_mm:.2f}",
+        f"tilt: {sharpest.tilt_deg[0]:+.2f} degrees along x, {sharpest.tilt_deg[1]:+.2f} along y;"
+        f" sharpness {sharpest.gain:.3f} times the rig file's plane",
     ]
-    if not plates.known and not found.certain:
+    if not plates.known and not sharpest.certain:
         lines.append(
             "do not rely on it: there is no flat plate, and the sharpness hardly changes over the sweep (a narrow scan,"
             " or no points and edges in it), or the plane lies at the end of the sweep (give a larger --depth)"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.capture import PACKETS, CardReport, Code, Layout, Report, inspect_bin, inspect_pcap, is_pcap
-from polysight.jobs.output import print_json, print_lines
+from polysight.jobs.output import exit_status, print_json, print_lines
 from polysight.store import (
     MANIFEST,
     PlacedAgain,
@@ -39,14 +39,18 @@ BOTTOM_DB = -20.0  # of the plot of a range profile
 def main_text(report: Report) -> str:
     """The report as text."""
     r = report
-    lines = [f"{r.path}: {r.bytes} bytes{' of a simulated scan' if r.simulated else ''}"]
+    head = f"{r.path}: {r.bytes} bytes"
+    if r.simulated:
+        head += " of a simulated scan"
+    lines = [head]
     if r.card is not None:
         lines += _card_lines(r.card)
     if r.chirps:
         shape = r.layout
+        first = "Q" if shape.q_first else "I"
         lines += [
             f"shape      {r.chirps} chirps x {shape.rx} RX x {shape.samples} samples, {shape.lanes}-lane,"
-            f" {'Q' if shape.q_first else 'I'} first",
+            f" {first} first",
             f"peak       {r.peak_db:.1f} dB over the median at bin {r.peak_bin} of {shape.samples}",
             f"level      rms {', '.join(f'{v:.0f}' for v in r.rx_rms)} counts on RX 0.., DC {max(r.rx_dc):.1f}",
             f"clipping   {r.clipped} values at full scale",
@@ -90,7 +94,7 @@ def validate_folder(folder: Path, as_json: bool) -> int:
         sys.stdout.write(to_json(findings) + "\n")
     else:
         sys.stdout.write("".join(f"{to_text(f)}\n" for f in findings) or f"{folder}: whole\n")
-    return 1 if any(f.level == "error" for f in findings) else 0
+    return exit_status(not any(f.level == "error" for f in findings))
 
 
 def _is_pcap(file: Path) -> bool:
@@ -99,7 +103,7 @@ def _is_pcap(file: Path) -> bool:
         return is_pcap(f.read(4)) or file.suffix == ".pcap"
 
 
-def scan_of(file: Path) -> ScanFolder | None:
+def find_scan(file: Path) -> ScanFolder | None:
     """The scan of a row's file, if its manifest can be read."""
     folders = file.resolve().parents
     if len(folders) < 3 or folders[1].name != "raw" or not (folders[2] / MANIFEST).is_file():
@@ -116,18 +120,24 @@ def inspect_file(
     plot: Path | None,
     card_address: str,
     as_json: bool,
-    given: dict[str, Any] | None = None,
+    changes: dict[str, Any] | None = None,
 ) -> int:
     """Describe a capture and draw its range profile; return the exit status, that of DataError if it holds no signal.
 
-    `config` is the rig file it was recorded with; a row of a scan folder brings its own. `given` are fields of `Layout`
-    that replace the rig's. Raises PolysightError.
+    `config` is the rig file it was recorded with; a row of a scan folder brings its own. `changes` are fields of
+    `Layout` that replace the rig's. Raises PolysightError.
     """
-    scan = scan_of(file)
-    rig = load_instrument(config) if config is not None else None if scan is None else scan.instrument
-    layout = replace(Layout() if rig is None else Layout(samples=rig.chirp.samples), **(given or {}))
-    pcap = file.is_file() and _is_pcap(file)
-    report = inspect_pcap(file, layout, card_address) if pcap else inspect_bin(file, layout)
+    scan = find_scan(file)
+    layout = Layout()
+    if config is not None:
+        layout = Layout(samples=load_instrument(config).chirp.samples)
+    elif scan is not None:
+        layout = Layout(samples=scan.instrument.chirp.samples)
+    layout = replace(layout, **(changes or {}))
+    if file.is_file() and _is_pcap(file):
+        report = inspect_pcap(file, layout, card_address)
+    else:
+        report = inspect_bin(file, layout)
     report.simulated = scan is not None and scan.simulated
     if as_json:
         from polysight.results import plain
@@ -140,7 +150,9 @@ def inspect_file(
     if plot is not None:
         plot_profile(report, plot)
         sys.stderr.write(f"range profile: {plot}\n")
-    return DataError.exit_status if report.chirps and not any(report.rx_rms) else 0
+    if report.chirps and not any(report.rx_rms):
+        return DataError.exit_status
+    return 0
 
 
 def plot_profile(report: Report, path: Path) -> None:
@@ -160,13 +172,17 @@ def plot_profile(report: Report, path: Path) -> None:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for rx, profile in enumerate(report.rx_profile_db):
-        silent = " (no signal)" if profile.max() < BOTTOM_DB else ""
-        axes.plot(profile, linewidth=0.8, label=f"RX{rx}{silent}")
+        label = f"RX{rx}"
+        if profile.max() < BOTTOM_DB:
+            label += " (no signal)"
+        axes.plot(profile, linewidth=0.8, label=label)
     axes.plot(report.profile_db, color="black", linewidth=1.4, label="mean")
     axes.axvline(report.peak_bin, color="grey", linestyle=":", linewidth=1.0)
     axes.set_xlabel(f"range bin of {report.layout.samples} samples")
     axes.set_ylabel("power over the median [dB]")
-    name = f"{'simulated ' if report.simulated else ''}{report.path.name}"
+    name = report.path.name
+    if report.simulated:
+        name = f"simulated {name}"
     axes.set_title(f"{name}: {report.chirps} chirps, peak {report.peak_db:.1f} dB at bin {report.peak_bin}")
     axes.set_ylim(bottom=BOTTOM_DB)
     axes.grid(alpha=0.3)
@@ -187,15 +203,17 @@ def inspect_placement(file: Path, as_json: bool) -> int:
     the scan's manifest has committed.
     """
     row = file.with_suffix(".bin")
-    if scan := scan_of(row):
-        if strange := damage_of(scan, row):
-            why = "a damaged file, or one of another row"
-            remedy = "`polysight validate SCAN`"
-            raise DataError(f"{row}: {strange}", why, remedy, code=ErrorCode.FILE_DAMAGED)
-        if not row.with_suffix(PACKETS).exists():
-            why = "the scan was simulated without cards, or recorded by an older release"
+    if scan := find_scan(row):
+        if damage := damage_of(scan, row):
             raise DataError(
-                f"{row}: its packets were not kept", why, "`polysight validate SCAN` says whether it is whole"
+                f"{row}: {damage}", "a damaged file, or one of another row", "`polysight validate SCAN`",
+                code=ErrorCode.FILE_DAMAGED,
+            )  # fmt: skip
+        if not row.with_suffix(PACKETS).exists():
+            raise DataError(
+                f"{row}: its packets were not kept",
+                "the scan was simulated without cards, or recorded by an older release",
+                "`polysight validate SCAN` says whether it is whole",
             )
     again = place_again(row)
     same = again.moved or again.missing == again.placed.missing
@@ -203,7 +221,7 @@ def inspect_placement(file: Path, as_json: bool) -> int:
         print_json({**again.placed.facts(), "committed_missing": again.missing, "same": same})
     else:
         sys.stdout.write("\n".join(_placement_lines(file, again, same)) + "\n")
-    return 0 if same else 1
+    return exit_status(same)
 
 
 def _placement_lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
@@ -213,21 +231,25 @@ def _placement_lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
     start = "known from the record before, or from a reset"
     if e.past.start is None:
         start = "not known from the records before"
-    missing = ", ".join(f"{a}..{b}" for a, b in p.missing[:_SHOWN]) + (", ..." if len(p.missing) > _SHOWN else "")
+    missing = ", ".join(f"{a}..{b}" for a, b in p.missing[:_SHOWN])
+    if len(p.missing) > _SHOWN:
+        missing += ", ..."
+    located = "yes" if p.located else f"no: {p.reason}"
     lines = [
         f"{file}: {p.received} of {p.expected} bytes in place",
         f"packets    {counts or 'none'}",
         f"start      {start}",
-        f"located    {'yes' if p.located else f'no: {p.reason}'}",
+        f"located    {located}",
         f"missing    {missing or 'nothing'}",
     ]
     if e.dropped_by_card:
         lines.append(f"card       dropped data before numbering it ({e.dropped_by_card})")
     if again.moved:
         lines.append("committed  with its frames at their pulses")
+    elif same:
+        lines.append("committed  the same")
     else:
-        result = "the same" if same else "differently: `polysight validate SCAN --replace` commits it as it is here"
-        lines.append(f"committed  {result}")
+        lines.append("committed  differently: `polysight validate SCAN --replace` commits it as it is here")
     return lines
 
 
@@ -238,12 +260,11 @@ def replace_folder(folder: Path, as_json: bool) -> int:
         print_json([asdict(r) for r in rows])
     else:
         print_lines(_replaced_lines(folder, rows))
-    return 1 if any(r.damaged for r in rows) else 0
+    return exit_status(not any(r.damaged for r in rows))
 
 
 def _replaced_lines(folder: Path, rows: list[Replaced]) -> list[str]:
-    lines = [f"row {r.row} of {r.board}: {r.before} bytes missing before, {r.after} now" for r in rows if r.changed] + [
-        f"row {r.row} of {r.board}: left as it is: {r.left}" for r in rows if r.left
-    ]
+    changed = [f"row {r.row} of {r.board}: {r.before} bytes missing before, {r.after} now" for r in rows if r.changed]
+    unchanged = [f"row {r.row} of {r.board}: left as it is: {r.left}" for r in rows if r.left]
     same = sum(not (r.changed or r.left) for r in rows)
-    return [*lines, f"{folder}: {same} of {len(rows)} files come out as they were committed"]
+    return [*changed, *unchanged, f"{folder}: {same} of {len(rows)} files come out as they were committed"]

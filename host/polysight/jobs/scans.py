@@ -42,29 +42,39 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
     odd = ""
     if left_out := catalogue.left_out():
         odd = f"; not listed, because they are links or have unprintable names: {', '.join(left_out)}"
-    found = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _searchable_text(s)]
+    matching = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _searchable_text(s)]
     if as_json:
-        rows = [msgspec.to_builtins(s) | {"bytes": _bytes_of(root, s)} for s in found]
+        rows = [msgspec.to_builtins(s) | {"bytes": _count_bytes(root, s)} for s in matching]
         print_json({"scans": rows})
         return 0
-    width = min(max((len(s.name) for s in found), default=0), _NAME_WIDTH)
-    for s in found:
-        sys.stdout.write(f"{s.name:{width}}  {_bytes_of(root, s) / 1e6:8.1f} MB  {printable(_line(s))}\n")
-    sys.stdout.write(f"{len(found)} scans under {root}{odd}\n")
+    width = min(max((len(s.name) for s in matching), default=0), _NAME_WIDTH)
+    for s in matching:
+        sys.stdout.write(f"{s.name:{width}}  {_count_bytes(root, s) / 1e6:8.1f} MB  {printable(_line(s))}\n")
+    sys.stdout.write(f"{len(matching)} scans under {root}{odd}\n")
     return 0
 
 
-def _bytes_of(root: Path, s: Summary) -> int:
+def _count_bytes(root: Path, s: Summary) -> int:
     """Size on the disk; 0 for a folder that does not answer."""
-    return 0 if s.state == "silent" else folder_bytes(root / s.name)
+    if s.state == "silent":
+        return 0
+    return folder_bytes(root / s.name)
 
 
 def _line(s: Summary) -> str:
     """State, rows, verdict, materials and tags of a scan."""
-    parts = [s.state, f"{s.committed}/{s.rows} rows" if s.rows else "", s.verdict]
-    parts += ["images only" if s.images_only else "", ", ".join(map(_shown_name, s.materials))]
-    parts += ["simulated" if s.simulated else "", " ".join(f"#{tag}" for tag in s.tags)]
-    parts.append(s.reason if s.state == "failed" and not s.rows else "")
+    parts = [s.state]
+    if s.rows:
+        parts.append(f"{s.committed}/{s.rows} rows")
+    parts.append(s.verdict)
+    if s.images_only:
+        parts.append("images only")
+    parts.append(", ".join(map(_shown_name, s.materials)))
+    if s.simulated:
+        parts.append("simulated")
+    parts.append(" ".join(f"#{tag}" for tag in s.tags))
+    if s.state == "failed" and not s.rows:
+        parts.append(s.reason)
     return "  ".join(part for part in parts if part)
 
 
@@ -79,9 +89,13 @@ def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> i
     notes = read_notes(folder)
     if text is not None or add or remove:
         tags = tuple(t for t in dict.fromkeys((*notes.tags, *add)) if t not in remove)
-        notes = write_notes(folder, Notes(notes.notes if text is None else text, tags))
-    text = f"{notes.notes}\n" if notes.notes else ""
-    sys.stdout.write(printable(f"{text}tags: {', '.join(notes.tags) or 'none'}", keep="\n") + "\n")
+        if text is None:
+            text = notes.notes
+        notes = write_notes(folder, Notes(text, tags))
+    lines = [f"tags: {', '.join(notes.tags) or 'none'}"]
+    if notes.notes:
+        lines.insert(0, notes.notes)
+    sys.stdout.write(printable("\n".join(lines), keep="\n") + "\n")
     return 0
 
 
@@ -96,36 +110,36 @@ def ask_scan(folder: Path, command: str) -> int:
 
 def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None, as_json: bool) -> int:
     """Print the results of a processed scan at one place; return 0. Raises DataError."""
-    found = probe(folder, *place_mm, library)
+    result = probe(folder, *place_mm, library)
     if as_json:
-        print_json(plain(found))
+        print_json(plain(result))
         return 0
-    lines = [f"x {found.place_mm[0]:g} mm, y {found.place_mm[1]:g} mm from the image's centre"]
-    if not found.lit:
+    lines = [f"x {result.place_mm[0]:g} mm, y {result.place_mm[1]:g} mm from the image's centre"]
+    if not result.lit:
         lines.append("the scan does not light this place")
-    lines.append(f"|H| {_value(found.h_db)} dB, |V| {_value(found.v_db)} dB")
-    lines.append(f"P = {_complex(found.p)} +- {_value(found.p_sigma)} a part")
-    if found.permittivity:
-        error = _value(found.permittivity_sigma)
-        lines.append(f"permittivity {_complex(found.permittivity)} +- {error} a part, as a half space")
+    lines.append(f"|H| {_value(result.h_db)} dB, |V| {_value(result.v_db)} dB")
+    lines.append(f"P = {_complex(result.p)} +- {_value(result.p_sigma)} a part")
+    if result.permittivity:
+        error = _value(result.permittivity_sigma)
+        lines.append(f"permittivity {_complex(result.permittivity)} +- {error} a part, as a half space")
     else:
-        lines.append(f"no permittivity: {found.why}")
-    if found.patch is not None:
-        lines.append(f"in patch {found.patch.label}: {_shown_name(found.patch.name)}")
-    lines += [f"  {n.sigmas:g} standard deviations from {n.name}" for n in found.nearest]
-    lines.append(found.profile_why or "range profile: --json")
+        lines.append(f"no permittivity: {result.why}")
+    if result.patch is not None:
+        lines.append(f"in patch {result.patch.label}: {_shown_name(result.patch.name)}")
+    lines += [f"  {n.sigmas:g} standard deviations from {n.name}" for n in result.nearest]
+    lines.append(result.profile_why or "range profile: --json")
     sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
     return 0
 
 
 def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool) -> int:
     """Print the differences of two processed scans; returns 0. Raises DataError."""
-    found = compare(first, second)
-    values = found.figures
+    comparison = compare(first, second)
+    values = comparison.figures
     if picture is not None:
         from polysight.catalogue import draw_comparison
 
-        write_atomically(picture, draw_comparison(found, "sigmas").png)
+        write_atomically(picture, draw_comparison(comparison, "sigmas").png)
     if as_json:
         print_json(plain(values))
         return 0
@@ -139,26 +153,33 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
         if pair.difference is None:
             lines.append(f"{place}: no permittivity in one of them")
             continue
-        sure = "" if pair.sigmas is None else f": {pair.sigmas:g} standard deviations"
-        lines.append(f"{place}: permittivity differs by {_complex(pair.difference)}{sure}")
+        line = f"{place}: permittivity differs by {_complex(pair.difference)}"
+        if pair.sigmas is not None:
+            line += f": {pair.sigmas:g} standard deviations"
+        lines.append(line)
     sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
     return 0
 
 
 def _shown_name(name: str | None) -> str:
     """A material's name as people read it."""
-    return "not in the library" if name == UNKNOWN else name or "not named"
+    if name == UNKNOWN:
+        return "not in the library"
+    return name or "not named"
 
 
 def _value(value: float | None) -> str:
-    return "not known" if value is None else f"{value:.3g}"
+    if value is None:
+        return "not known"
+    return f"{value:.3g}"
 
 
 def _complex(number: ComplexNumber | PermittivityDifference) -> str:
     """`3.1 - 0.2j`."""
     if number.real is None or number.imag is None:
         return "not known"
-    return f"{number.real:.3g} {'-' if number.imag < 0 else '+'} {abs(number.imag):.3g}j"
+    sign = "-" if number.imag < 0 else "+"
+    return f"{number.real:.3g} {sign} {abs(number.imag):.3g}j"
 
 
 WORD = "drop"  # confirms the removal of raw rows
@@ -190,11 +211,11 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
 
 def _drop(scan: ScanFolder, folder: Path, products: Path, yes: bool) -> int:
     processed = processed_digests(products)
-    what = droppable(scan, processed)
-    for line in what.kept:
+    rows = droppable(scan, processed)
+    for line in rows.kept:
         sys.stdout.write(f"kept: {line}\n")
-    if not what.files:
-        if what.kept:
+    if not rows.files:
+        if rows.kept:
             raise DataError(
                 f"{folder}: nothing can be dropped",
                 f"{products} is made from none of its rows",
@@ -202,14 +223,16 @@ def _drop(scan: ScanFolder, folder: Path, products: Path, yes: bool) -> int:
             )
         sys.stdout.write(f"{folder}: every processed row is dropped already\n")
         return 0
-    _check_samples(scan, set(what.files))
+    _check_samples(scan, set(rows.files))
     text = (
-        f"{folder}: the raw data of {len(what.files)} rows, {what.bytes / 1e6:.1f} MB, is removed. {products} and"
+        f"{folder}: the raw data of {len(rows.files)} rows, {rows.bytes / 1e6:.1f} MB, is removed. {products} and"
         " the kept samples stay: images and materials can be made again, but not synchronised again."
     )
-    for where in sorted({path.parent for boards in what.files.values() for path in boards.values()}):
-        names = sorted(path.name for boards in what.files.values() for path in boards.values() if path.parent == where)
-        sys.stdout.write(f"to be removed: {where.relative_to(folder)}: {', '.join(names)}\n")
+    for folder_of_board in sorted({path.parent for boards in rows.files.values() for path in boards.values()}):
+        names = sorted(
+            path.name for boards in rows.files.values() for path in boards.values() if path.parent == folder_of_board
+        )
+        sys.stdout.write(f"to be removed: {folder_of_board.relative_to(folder)}: {', '.join(names)}\n")
     answer = confirm(text, WORD, yes)
     if answer != WORD:
         raise ConfigError(f"nothing dropped: answered {answer!r}", f"{WORD!r} was asked for", f"type {WORD}, or --yes")

@@ -70,14 +70,20 @@ def training_scan(data: Path, config: Path) -> TrainingScan:
     """
     scan = scan_folder_of(data) or data
     check_labelled(data)
-    if (there := find_labels(data)) is not None:
-        path, labels = there
-        try:
-            saved = _products_without_rows(data, scan)
-            return _from_images(saved, labels) if saved is not None else _from_rows(scan, config, labels)
-        except DataError as e:
-            raise DataError(f"{path}: {e.what}" if str(path) not in e.what else e.what, e.why, e.remedy) from None
-    return _from_truth(scan, config)
+    saved_labels = find_labels(data)
+    if saved_labels is None:
+        return _from_truth(scan, config)
+    path, labels = saved_labels
+    try:
+        saved = _products_without_rows(data, scan)
+        if saved is not None:
+            return _from_images(saved, labels)
+        return _from_rows(scan, config, labels)
+    except DataError as e:
+        what = e.what
+        if str(path) not in what:
+            what = f"{path}: {what}"
+        raise DataError(what, e.why, e.remedy) from None
 
 
 def check_labelled(data: Path) -> None:
@@ -91,7 +97,8 @@ def check_labelled(data: Path) -> None:
     scan = scan_folder_of(data) or data
     if not data.is_dir():
         raise DataError(f"{data}: no such folder", "the path is wrong", "give scan folders, or folders of products")
-    if (there := find_labels(data)) is None:
+    saved_labels = find_labels(data)
+    if saved_labels is None:
         if (scan / TRUTH).exists():
             return
         raise DataError(
@@ -100,7 +107,7 @@ def check_labelled(data: Path) -> None:
             f"polysight label {data}; then train again",
         )
     if (saved := find_products(data)) is not None:
-        path, labels = there
+        path, labels = saved_labels
         try:
             check_labels(labels, saved.x_m, saved.y_m)
         except DataError as e:
@@ -113,7 +120,8 @@ def _products_without_rows(data: Path, scan: Path) -> ProcessedScan | None:
         return read_products(data)
     if (scan / "products" / IMAGE).exists():
         saved = ProcessedScan(scan / "products")
-        return saved if saved.quality.raw_dropped else None
+        if saved.quality.raw_dropped:
+            return saved
     return None
 
 
@@ -129,7 +137,7 @@ def _from_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
     findings = pipeline.examine(images)
     if not findings.verdict.usable:
         raise findings.verdict.error("no library was written")
-    return _labelled(source.scan_id, findings.found, source.simulated, checked)
+    return _with_labels(source.scan_id, findings.found, source.simulated, checked)
 
 
 def _from_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
@@ -142,11 +150,11 @@ def _from_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
     if metal is None:
         raise _no_metal(saved.folder)
     pair = Images(saved.h, saved.v, saved.x_m, saved.y_m, saved.valid)
-    found = analyse(pair, _optics_of(saved), KnownScene(segmentation, metal))
-    return _labelled(saved.scan_id, found, saved.simulated is not False, checked)
+    materials = analyse(pair, _read_optics(saved), KnownScene(segmentation, metal))
+    return _with_labels(saved.scan_id, materials, saved.simulated is not False, checked)
 
 
-def _optics_of(saved: ProcessedScan) -> Optics:
+def _read_optics(saved: ProcessedScan) -> Optics:
     """Return incidence angle and leakage of saved images; leakage that processing removed is zero here."""
     rig = saved.rig
     path = saved.folder / SCAN
@@ -156,7 +164,9 @@ def _optics_of(saved: ProcessedScan) -> Optics:
     budget = (saved.materials and saved.materials.error_budget) or None
     if budget is None or budget.incidence is None or budget.leakage is None:
         return optics
-    angle_deg, angle_std_deg, leakage_std = budget.incidence.deg, budget.incidence.std_deg, budget.leakage.std
+    angle_deg = budget.incidence.deg
+    angle_std_deg = budget.incidence.std_deg
+    leakage_std = budget.leakage.std
     if angle_deg is None or angle_std_deg is None or leakage_std is None:
         return optics
     return replace(
@@ -172,15 +182,15 @@ def _optics_of(saved: ProcessedScan) -> Optics:
     )
 
 
-def _labelled(scan: str, found: MaterialsResult, simulated: bool, labels: Labels) -> TrainingScan:
+def _with_labels(scan: str, materials: MaterialsResult, simulated: bool, labels: Labels) -> TrainingScan:
     """Return the training scan with names and specimens of the boxes."""
     boxes = dict(enumerate(labels.boxes, 1))
-    for patch in found.patches:
-        if patch.patch.label in boxes and not (patch.patch.interior & (found.p != 0)).any():
+    for patch in materials.patches:
+        if patch.patch.label in boxes and not (patch.patch.interior & (materials.p != 0)).any():
             sys.stderr.write(f"note: {scan}: the box of {boxes[patch.patch.label]} holds no pixel that can be used\n")
     names = {label: material_of(box) for label, box in boxes.items()}
     specimens = {label: piece for label, box in boxes.items() if (piece := labels.specimen(box)) is not None}
-    return TrainingScan(scan, found, simulated, versions=versions(), names=names, specimens=specimens)
+    return TrainingScan(scan, materials, simulated, versions=versions(), names=names, specimens=specimens)
 
 
 def _from_truth(data: Path, config: Path) -> TrainingScan:
@@ -192,11 +202,15 @@ def _from_truth(data: Path, config: Path) -> TrainingScan:
         raise DataError(f"{data}: no metal plate in {TRUTH}", "features are relative to metal", "add one to the scene")
     pipeline = processed_rows(source, data)
     images = pipeline.form_images()
-    known, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
-    found = pipeline.find_materials(images, KnownScene(known, metal.box_mm, plates=plates))
-    drawn = specimen_seed(data / TRUTH)
-    specimens = {} if drawn is None else {n: f"{source.scan_id}/{drawn}/{n}" for n in names}
-    return TrainingScan(source.scan_id, found, source.simulated, versions=versions(), names=names, specimens=specimens)
+    segmentation, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
+    materials = pipeline.find_materials(images, KnownScene(segmentation, metal.box_mm, plates=plates))
+    seed = specimen_seed(data / TRUTH)
+    specimens = {}
+    if seed is not None:
+        specimens = {label: f"{source.scan_id}/{seed}/{label}" for label in names}
+    return TrainingScan(
+        source.scan_id, materials, source.simulated, versions=versions(), names=names, specimens=specimens
+    )
 
 
 def _no_metal(folder: Path) -> DataError:
@@ -218,7 +232,9 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
         if a file is wrong (checked before anything is simulated), or a scan cannot be used.
     """
     data = list(data)
-    files = [] if scenes is None else sorted(scenes.glob("*.toml"))
+    files = []
+    if scenes is not None:
+        files = sorted(scenes.glob("*.toml"))
     if not data and scenes is None:
         raise ConfigError(
             "no scans to train on",
@@ -245,11 +261,9 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
                     raise ScanError(f"{file}: simulation failed", "the lines above say why", "correct the scene file")
                 scans.append(training_scan(folder, config))
                 shutil.rmtree(folder)
-    note = (
-        "simulated scans of " + ", ".join(dict.fromkeys(s.scan for s in scans))
-        if all(s.simulated for s in scans)
-        else ""
-    )
+    note = ""
+    if all(s.simulated for s in scans):
+        note = "simulated scans of " + ", ".join(dict.fromkeys(s.scan for s in scans))
     library = make_library(with_unique_names(scans), note)
     library.save(out)
     print_lines([*_summary(out, library), *accuracy_lines(library)])
@@ -266,33 +280,42 @@ def with_unique_names(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
     """
     out: list[TrainingScan] = []
     for scan in scans:
-        alike = [s for s in scans[: len(out)] if s.scan == scan.scan]
-        if any(np.array_equal(s.result.h, scan.result.h, equal_nan=True) for s in alike):
+        namesakes = [s for s in scans[: len(out)] if s.scan == scan.scan]
+        if any(np.array_equal(s.result.h, scan.result.h, equal_nan=True) for s in namesakes):
             raise DataError(
                 f"scan {scan.scan} is given twice",
                 "cross-validation would test it on itself",
                 "leave one out (a scan folder and its products are one scan)",
             )
-        out.append(replace(scan, scan=f"{scan.scan} ({len(alike) + 1})") if alike else scan)
+        if namesakes:
+            scan = replace(scan, scan=f"{scan.scan} ({len(namesakes) + 1})")
+        out.append(scan)
     return out
+
+
+def _count(number: int, singular: str, plural: str) -> str:
+    return f"{number} {singular if number == 1 else plural}"
 
 
 def _summary(out: Path, library: Library) -> list[str]:
     """Describe the contents of a library by material; note names that differ only in case."""
     lines = [f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans"]
     for name in library.names:
-        mine = [e for e in library.entries if e.name == name]
-        pieces = len({e.specimen for e in mine if e.specimen is not None})
-        specimens = f", {pieces} specimens" if pieces > 1 else ""
-        scans = len({e.scan for e in mine})
-        patches = "1 patch" if len(mine) == 1 else f"{len(mine)} patches"
-        lines.append(f"  {name}: {patches} in {scans} scan{'s' * (scans > 1)}{specimens}")
+        entries = [e for e in library.entries if e.name == name]
+        scans = len({e.scan for e in entries})
+        specimens = len({e.specimen for e in entries if e.specimen is not None})
+        line = f"  {name}: {_count(len(entries), 'patch', 'patches')} in {_count(scans, 'scan', 'scans')}"
+        if specimens > 1:
+            line += f", {specimens} specimens"
+        lines.append(line)
     if all(e.specimen is None for e in library.entries):
         lines.append(
             "note: no box names its specimen, so differences between specimens and placements cannot be"
             " separated and probabilities are more cautious than necessary; polysight label SCAN --specimen NAME=WHICH"
         )
-    for one, other in combinations(library.names, 2):
-        if one.casefold() == other.casefold():
-            lines.append(f"note: {one} and {other} are two materials here; if they are one: polysight label --rename")
+    for first, second in combinations(library.names, 2):
+        if first.casefold() == second.casefold():
+            lines.append(
+                f"note: {first} and {second} are two materials here; if they are one: polysight label --rename"
+            )
     return lines

@@ -298,6 +298,13 @@ class Limits(Section, frozen=True):
     rows_waiting: Count = 8  # maximum number of rows that wait for processing while another is recorded
 
 
+class Notify(Section, frozen=True):
+    """Who is told when a scan ends: a command that gets the text, a web address that gets JSON. Never recorded."""
+
+    command: str = ""
+    url: Annotated[str, msgspec.Meta(pattern=r"^(https?://\S+)?$")] = ""
+
+
 class Instrument(Section, frozen=True):
     """All tables of the rig file."""
 
@@ -316,6 +323,7 @@ class Instrument(Section, frozen=True):
     polarimetry: Polarimetry = Polarimetry()
     limits: Limits = Limits()
     calibration: CalibrationFiles = CalibrationFiles()
+    notify: Notify = Notify()
 
     def __post_init__(self) -> None:
         for role in ("transmit", "receive_h", "receive_v"):

@@ -106,6 +106,9 @@ def test_a_missing_folder_is_refused_before_the_checks_run(tmp_path: Path) -> No
     [
         'secret-key = "{}"',
         "token: {}",
+        "psk={}",
+        'wpa_psk = "{} and more"',
+        'passphrase = "{} with words behind it"',
         '{{"password": "{}"}}',
         "http://h/?token={}",
         "-----BEGIN A KEY-----\n{}\n",

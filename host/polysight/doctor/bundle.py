@@ -51,8 +51,9 @@ _MANIFEST_BYTES = 64 << 20
 _KERNEL = ("proc/version", "proc/sys/net/core/rmem_max", "proc/sys/net/core/rmem_default", "proc/loadavg",
            "proc/meminfo", "proc/net/udp", "proc/net/snmp")  # fmt: skip
 _NAMED = re.compile(
-    r"""(?ix)((?:[\w-]*(?:secret|token|password|passphrase)[\w-]*|(?:private|public|curve|api)[_-]?key|authorization)
-    ["']?\s*[=:]\s*["']?(?:bearer\s+|basic\s+)?|\bbearer\s+)([^\s"',}]{2,})"""
+    r"""(?ix)((?:[\w-]*(?:secret|token|password|passwd|passphrase|psk)[\w-]*|(?:private|public|curve|api)[_-]?key
+    |authorization)["']?\s*[=:]\s*["']?(?:bearer\s+|basic\s+)?|\bbearer\s+)
+    ((?<=")[^"\n]+|(?<=')[^'\n]+|[^\s"',}]{2,})"""
 )
 _IN_URL = re.compile(r"(://[^\s/:@]+:)[^\s/@]+(?=@)")
 _TOKENS = re.compile(r"\b(?:gh[opsu]_|github_pat_|glpat-|sk-|xox[abp]-|AKIA)[A-Za-z0-9_-]{10,}")
@@ -121,7 +122,9 @@ def _contents(
     yield "kernel.txt", _kernel(root)
     yield "network.json", json.dumps(_network(root), indent=1)
     if (config := _tail(options.config, _TAIL_BYTES)) is not None:
-        yield "rig.toml", config
+        # Comments are for who wrote them, and whoever is told of a scan's end may be reached by a secret address.
+        config = re.sub(r"(?m)(^|[ \t])#.*$", "", config)
+        yield "rig.toml", re.sub(r"(?m)^(\s*(?:url|command)\s*=\s*).+$", rf'\1"{HIDDEN}"', config)
     for folder in _newest_scans(options.out):
         with suppress(OSError, DataError):
             lines = read_bounded(folder / MANIFEST, _MANIFEST_BYTES).decode("utf-8", "replace").splitlines()

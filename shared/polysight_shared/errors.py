@@ -104,6 +104,9 @@ def os_error(
 ) -> DeviceError:
     """Turn an OSError into a DeviceError with cause and remedy, so that a command ends without a traceback."""
     where = f"{e.filename}: " if e.filename else ""
+    if e.errno == errno.ENOENT:
+        # A folder that was renamed is no full disk.
+        why = "it was moved, renamed or deleted"
     code = ErrorCode.DISK_FULL if e.errno in (errno.ENOSPC, errno.EDQUOT) else ErrorCode.OTHER
     return DeviceError(f"{where}{e.strerror or e}", why, advice(remedy, *getattr(e, "__notes__", ())), code=code)
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import socket
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 from tests.support.page.live_view import open_control
 from tests.support.processes import wait_for
@@ -15,12 +18,15 @@ from tests.support.store.small_scan import SmallScan
 
 from polysight.acquisition import scan as host_run
 from polysight.acquisition.control import (
+    ALIVE,
     CONTROL,
     ControlFolder,
+    Life,
     ScanCommand,
     StopRequest,
-    last_alive_s,
+    read_life,
     send_command,
+    started_ticks,
 )
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
@@ -55,15 +61,43 @@ def test_touch_in_a_shell_is_a_command(control):
     wait_for(lambda: stop.paused, "the pause")
 
 
-def test_alive_is_touched_again_and_the_folder_is_removed_at_the_end(tmp_path):
-    assert last_alive_s(tmp_path) is None
-    with ControlFolder(tmp_path, StopRequest()) as control:
+def test_alive_says_who_scans_and_what_was_asked_and_goes_at_the_end(tmp_path):
+    assert read_life(tmp_path) is None
+    stop = StopRequest()
+    with ControlFolder(tmp_path, stop) as control:
         control.open()
         control.open()
-        wait_for(lambda: last_alive_s(tmp_path), "the first touch")
-        first = last_alive_s(tmp_path)
-        wait_for(lambda: last_alive_s(tmp_path) != first, "the next touch")
+        wait_for(lambda: read_life(tmp_path), "the first sign of life")
+        life = read_life(tmp_path)
+        assert (life.pid, life.ticks, life.killed) == (os.getpid(), started_ticks(os.getpid()), False)
+        assert (life.doing, life.asked, life.asker) == ("rows", "", "")
+        wait_for(lambda: read_life(tmp_path).written_s != life.written_s, "the next one")
+        send_command(tmp_path, ScanCommand.STOP, "the page at 192.168.1.7")
+        wait_for(lambda: read_life(tmp_path).asked, "what was asked")
+        assert (read_life(tmp_path).asked, read_life(tmp_path).asker) == ("stop", "the page at 192.168.1.7")
+        control.end_rows()
+        wait_for(lambda: read_life(tmp_path).doing == "materials", "that rows have ended")
+        with refused(ErrorCode.NO_ANSWER, "materials"):
+            send_command(tmp_path, ScanCommand.ABORT)
+        assert not stop.now
     assert not (tmp_path / CONTROL).exists()
+
+
+def test_a_killed_program_is_told_from_one_that_says_nothing(tmp_path):
+    """Also if its process number belongs to another process by now."""
+    (tmp_path / CONTROL).mkdir()
+    lives = [
+        (Life(os.getpid(), started_ticks(os.getpid()) or 0, socket.gethostname()), False),
+        (Life(os.getpid(), 1, socket.gethostname()), True),
+        (Life(2**22 + 1, 1, socket.gethostname()), True),
+        (Life(2**22 + 1, 1, "another machine"), False),
+    ]
+    for life, killed in lives:
+        (tmp_path / CONTROL / ALIVE).write_bytes(msgspec.json.encode(life))
+        assert read_life(tmp_path).killed is killed
+    for content in (b"", b"{", b"[]", b"\xff", b'{"pid": "x"}'):
+        (tmp_path / CONTROL / ALIVE).write_bytes(content)
+        assert not read_life(tmp_path).killed
 
 
 def test_commands_for_an_earlier_scan_are_deleted(tmp_path):

@@ -4,17 +4,20 @@
 and start the cards' records (`capture_rig`), let the Pi run the row (`pi_client`), compare the received data with the
 pulses sent, compare frames with pulses by arrival times (`pulse_times`), then commit the row or retake it.
 `ready` holds the checks before a row: homing, disk space, the Pi's configuration. `control` pauses and stops a running
-scan; `scan` also queues committed rows for processing and reports time left.
+scan, `states` says in words how it stands; `scan` also queues committed rows for processing and reports time left.
 """
 
 from polysight.acquisition.capture_rig import CaptureRig
 from polysight.acquisition.control import (
+    LAPSE_S,
     ControlFolder,
+    Life,
     ScanCommand,
     StopRequest,
     ignore_hangup,
-    last_alive_s,
+    read_life,
     send_command,
+    started_ticks,
 )
 from polysight.acquisition.pi_client import PiClient, RefusedError
 from polysight.acquisition.ready import make_ready, stage_differences
@@ -29,11 +32,17 @@ from polysight.acquisition.scan import (
     time_left,
     typical_row_s,
 )
+from polysight.acquisition.states import BADGES, STATES, Button, StateLevel
 
 __all__ = [
+    "BADGES",
+    "LAPSE_S",
+    "STATES",
+    "Button",
     "CaptureRig",
     "ControlFolder",
     "FaultKind",
+    "Life",
     "OnProgress",
     "OnRow",
     "PiClient",
@@ -41,14 +50,16 @@ __all__ = [
     "ScanCommand",
     "ScanProgress",
     "ScanResult",
+    "StateLevel",
     "StopRequest",
     "ignore_hangup",
-    "last_alive_s",
     "make_ready",
+    "read_life",
     "resume_scan",
     "run_scan",
     "send_command",
     "stage_differences",
+    "started_ticks",
     "time_left",
     "typical_row_s",
 ]

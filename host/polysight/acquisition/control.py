@@ -2,14 +2,17 @@
 
 Ctrl-C and SIGTERM set a `StopRequest`, which any thread may read. Other programs send a `ScanCommand` by creating an
 empty file with the command's name in `<scan>/control/`; `touch SCAN/control/pause` in a shell does the same. The scan
-creates that folder when it begins, removes each command file and then obeys it, touches `alive` once a second, and
-removes the folder at its end. File names are atomic, so there is nothing to parse. Specification:
+creates that folder when it begins, removes each command file and then obeys it, writes `alive` once a second, and
+removes the folder at its end. A command file may hold who sent it. `alive` says which process scans, what it does and
+what it was asked (`read_life`), so that page, list and terminal tell a killed scan from one that runs. Specification:
 docs/spec/scan-folder.md.
 """
 
 from __future__ import annotations
 
+import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -17,6 +20,9 @@ from contextlib import contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
 from types import FrameType
+from typing import Literal
+
+import msgspec
 
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError
@@ -25,19 +31,43 @@ CONTROL = "control"
 ALIVE = "alive"
 _POLL_S = 0.2
 _ALIVE_INTERVAL_S = 1.0
-_TIMEOUT_S = 5.0  # for a scan to accept a command
+# For a scan to accept a command.
+_TIMEOUT_S = 5.0
+LAPSE_S = 15.0
+"""Without a sign of life for so long, a scan's program hangs, or runs on a machine that is gone."""
+MAX_ASKER = 60
+Doing = Literal["rows", "materials"]
 
 
 class StopRequest:
-    """Counts requests to stop; safe in any thread and in signal handlers."""
+    """Counts requests to stop; safe in any thread and in signal handlers.
+
+    Attributes
+    ----------
+    paused
+        True if the next row must not begin yet.
+    asker
+        Who sent the last request.
+    """
 
     def __init__(self) -> None:
         self._count = 0
-        self.paused = False  # the next row must not begin yet
+        self.paused = False
+        self.asker = ""
 
-    def request(self) -> None:
+    def request(self, asker: str = "a program") -> None:
         """Request to stop: the first time after the current row, the second time now."""
+        self.asker = asker
         self._count += 1
+
+    @property
+    def pending(self) -> str:
+        """Name of the command that is not withdrawn: `abort`, `stop`, `pause`, or "" for none."""
+        if self.now:
+            return ScanCommand.ABORT
+        if self.after_row:
+            return ScanCommand.STOP
+        return ScanCommand.PAUSE if self.paused else ""
 
     @property
     def after_row(self) -> bool:
@@ -60,9 +90,11 @@ def stop_on_interrupt(stop: StopRequest) -> Iterator[None]:
 
     def handle(number: int, frame: FrameType | None) -> None:
         del frame
-        stop.request()
         if number == signal.SIGTERM:
-            stop.request()
+            stop.request("SIGTERM")
+            stop.request("SIGTERM")
+        else:
+            stop.request("Ctrl-C")
 
     numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
     before = {number: signal.signal(number, handle) for number in numbers}
@@ -105,6 +137,36 @@ class ScanCommand(StrEnum):
     ABORT = "abort"  # now
 
 
+class Life(msgspec.Struct, frozen=True):
+    """Content of `alive`: the scan's process with its start time (:func:`started_ticks`) and machine, what it does.
+
+    `asked` is the pending command of `asker`, "" for none.
+    """
+
+    pid: int = 0
+    ticks: int = 0
+    host: str = ""
+    doing: Doing = "rows"
+    asked: str = ""
+    asker: str = ""
+    written_s: float = 0.0
+
+    @property
+    def killed(self) -> bool:
+        """True if the process ran on this machine and is gone: a scan that ends by itself removes the file."""
+        return self.pid > 0 and self.host == socket.gethostname() and started_ticks(self.pid) != self.ticks
+
+
+def started_ticks(pid: int) -> int | None:
+    """Start time of a running process in clock ticks since boot, or None; it tells reused process numbers apart."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return None
+    fields = text.rpartition(")")[2].split()
+    return None if fields[0] == "Z" else int(fields[19])
+
+
 class ControlFolder:
     """Serve `<folder>/control` for a scan of this program and pass commands to `stop`.
 
@@ -112,7 +174,9 @@ class ControlFolder:
     """
 
     def __init__(self, folder: Path, stop: StopRequest) -> None:
-        self._folder, self._stop = folder / CONTROL, stop
+        self._folder = folder / CONTROL
+        self._stop = stop
+        self._doing: Doing = "rows"
         self._closed = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -122,40 +186,66 @@ class ControlFolder:
             self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
             self._thread.start()
 
+    def end_rows(self) -> None:
+        """The rows have ended, and materials are computed: commands are not taken any more."""
+        self._doing = "materials"
+
     def _serve(self) -> None:
-        next_alive, cleared = 0.0, False
+        written: Life | None = None
+        next_alive_s = 0.0
+        cleared = False
+        ticks = started_ticks(os.getpid()) or 0
         while not self._closed.wait(_POLL_S):
-            with suppress(OSError):  # a full disk must not end the scan
+            # A full disk must not end the scan.
+            with suppress(OSError):
                 if not cleared:
                     self._folder.mkdir(exist_ok=True)
                     self._clear()
                     cleared = True
-                if time.monotonic() >= next_alive:
-                    (self._folder / ALIVE).touch()
-                    next_alive = time.monotonic() + _ALIVE_INTERVAL_S
-                for command in ScanCommand:
-                    self._obey(command)
+                if self._doing == "rows":
+                    for command in ScanCommand:
+                        self._obey(command)
+                pending = self._stop.pending
+                asker = self._stop.asker if pending else ""
+                life = Life(os.getpid(), ticks, socket.gethostname(), self._doing, pending, asker)
+                if life != written or time.monotonic() >= next_alive_s:
+                    self._write(life)
+                    written = life
+                    next_alive_s = time.monotonic() + _ALIVE_INTERVAL_S
         with suppress(OSError):
             self._clear()
             self._folder.rmdir()
+
+    def _write(self, life: Life) -> None:
+        # A reader sees the old content or the new one; nothing needs to survive a power loss.
+        part = self._folder / f".{ALIVE}.part"
+        try:
+            part.write_bytes(msgspec.json.encode(life))
+            part.replace(self._folder / ALIVE)
+        except OSError:
+            # The disk is full: the old content with a new time is a sign of life, too.
+            (self._folder / ALIVE).touch()
 
     def _obey(self, command: ScanCommand) -> None:
         """Obey a command if its file exists. The file is removed first, or it would be obeyed again and again."""
         path = self._folder / command
         if not path.exists():
             return
+        asker = _read_asker(path)
         path.unlink()
         if command in (ScanCommand.PAUSE, ScanCommand.CONTINUE):
             self._stop.paused = command is ScanCommand.PAUSE
+            self._stop.asker = asker
         elif command is ScanCommand.ABORT:
-            self._stop.request()
-            self._stop.request()
-        elif not self._stop.after_row:  # a second `stop` (double click) must not abort the row
-            self._stop.request()
+            self._stop.request(asker)
+            self._stop.request(asker)
+        # A second `stop` (double click) must not abort the row.
+        elif not self._stop.after_row:
+            self._stop.request(asker)
 
     def _clear(self) -> None:
-        for name in (*ScanCommand, ALIVE):
-            (self._folder / name).unlink(missing_ok=True)
+        for path in self._folder.iterdir():
+            path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Stop serving and remove the folder."""
@@ -170,18 +260,37 @@ class ControlFolder:
         self.close()
 
 
-def send_command(folder: Path, command: ScanCommand, limit_s: float = _TIMEOUT_S) -> None:
-    """Send a command to the scan that runs in `folder`; return when it has been accepted.
+def _read_asker(path: Path) -> str:
+    """Who sent a command: the text of its file, which a shell's `touch` leaves empty."""
+    with path.open("rb") as f:
+        text = f.read(4 * MAX_ASKER).decode("utf-8", errors="replace")
+    printable = "".join(character for character in text if character.isprintable())
+    return printable.strip()[:MAX_ASKER] or "a file in control/"
+
+
+def send_command(folder: Path, command: ScanCommand, asker: str = "a program", limit_s: float = _TIMEOUT_S) -> None:
+    """Send a command to the scan that runs in `folder`, in the name of `asker`; return when it has been accepted.
 
     Raises ScanError if no scan runs there, or it does not accept the command in time; the command is then withdrawn.
     """
     path = folder / CONTROL / command
+    life = read_life(folder)
+    if life is not None and life.killed:
+        raise ScanError(
+            f"{folder}: no running scan takes `{command}`", "its program was killed",
+            f"`polysight resume {folder}`; the stage has stopped by itself", code=ErrorCode.NO_ANSWER,
+        )  # fmt: skip
+    if life is not None and life.doing == "materials":
+        raise ScanError(
+            f"{folder}: no running scan takes `{command}`", "its rows have ended, and materials are computed",
+            "wait; nothing moves any more", code=ErrorCode.NO_ANSWER,
+        )  # fmt: skip
     try:
-        path.touch()
+        _write_command(path, asker)
     except OSError as e:
         raise ScanError(
             f"{folder}: no running scan takes `{command}`: {e.strerror}",
-            "no scan runs in this folder, or you may not write to it",
+            "no scan runs in this folder, it was moved or renamed, or you may not write to it",
             f"if its program was killed, resume the scan with `polysight resume {folder}`",
             code=ErrorCode.NO_ANSWER,
         ) from None
@@ -199,9 +308,28 @@ def send_command(folder: Path, command: ScanCommand, limit_s: float = _TIMEOUT_S
         time.sleep(_POLL_S / 4)
 
 
-def last_alive_s(folder: Path) -> float | None:
-    """Return when the scan program last touched `alive` (file system's clock, seconds); None if it never did."""
+def _write_command(path: Path, asker: str) -> None:
+    """Create a command's file, complete at once; on a full disk it is empty, and still a command."""
+    part = path.with_name(f".{path.name}.part")
+    with part.open("wb", buffering=0) as f, suppress(OSError):
+        f.write(asker.encode())
+    part.replace(path)
+
+
+def read_life(folder: Path) -> Life | None:
+    """The scan program's last sign of life, with the file system's time of it; None if there is none.
+
+    A file that another program or an earlier release touched is a sign of life without content.
+    """
+    path = folder / CONTROL / ALIVE
     try:
-        return (folder / CONTROL / ALIVE).stat().st_mtime
+        with path.open("rb") as f:
+            content = f.read(4096)
+            written_s = os.fstat(f.fileno()).st_mtime
     except OSError:
         return None
+    try:
+        life = msgspec.json.decode(content, type=Life)
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        life = Life()
+    return msgspec.structs.replace(life, written_s=written_s)

@@ -454,6 +454,8 @@ class RunningScan:
                 rows_committed=len(self._committed),
                 events_refetched=self._pi.gaps_filled,
                 ended_utc=utc_now(),
+                asked=self._stop.pending if status == "abort" else "",
+                asker=self._stop.asker if status == "abort" else "",
             )
         )
         waiting = f"; {self._queue.left} rows wait to be processed" if self._queue.left else ""

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from msgspec.structs import replace
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -29,9 +30,10 @@ from polysight.acquisition import (
     resume_scan,
     run_scan,
 )
+from polysight.jobs.notify import notify
 from polysight.settings import Settings
 from polysight.store import MANIFEST, TRUTH, ScanFolder, check_same_scan, manifest, require_raw
-from polysight_shared.config import load_instrument
+from polysight_shared.config import Notify, load_instrument
 from polysight_shared.errors import ConfigError, PolysightError, ScanError, advice
 
 if TYPE_CHECKING:
@@ -107,9 +109,23 @@ class ScanBar:
                 self._console.print(f"{p.committed} of {p.rows} rows, {_clock(p.remaining_s)}", highlight=False)
 
 
-@ignore_hangup()
-def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan) -> int:
+def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, told: Notify) -> int:
+    """Run a scan, and tell whom the rig file names how it has ended."""
     stop = StopRequest()
+    try:
+        status = _run_rows(folder, processing, run_rows, stop)
+    except PolysightError as e:
+        notify(told, folder, "stopped" if stop.pending else "failed", str(e).splitlines()[0])
+        raise
+    except BaseException as e:
+        notify(told, folder, "failed", type(e).__name__)
+        raise
+    notify(told, folder, "finished", "every row is safe" + ("" if status == 0 else ", without a result"))
+    return status
+
+
+@ignore_hangup()
+def _run_rows(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, stop: StopRequest) -> int:
     with ScanBar() as bar, ControlFolder(folder, stop) as control:
 
         def show(progress: ScanProgress) -> None:
@@ -118,15 +134,17 @@ def _run(folder: Path, processing: LiveProcessing | None, run_rows: RunScan) -> 
             bar.update(progress)
 
         result = run_rows(None if processing is None else processing.add_row, show, stop)
-    if result.exit_status == "success":
-        _print(f"{folder}: every row is committed\n")
-    if result.processing_error is not None:
-        raise _add_advice(folder, result, result.processing_error)
-    if result.exit_status != "success":
-        raise ScanError(f"{folder}: {result.reason}", "", f"polysight resume {folder}")
-    if processing is None:
-        return 0
-    return processing.finish()
+        control.end_rows()
+        if result.exit_status == "success":
+            _print(f"{folder}: every row is committed\n")
+        if result.processing_error is not None:
+            raise _add_advice(folder, result, result.processing_error)
+        if result.exit_status != "success":
+            asker = f" (asked by {stop.asker})" if stop.asker else ""
+            raise ScanError(f"{folder}: {result.reason}{asker}", "", f"polysight resume {folder}")
+        if processing is None:
+            return 0
+        return processing.finish()
 
 
 def _print(text: str) -> None:
@@ -178,6 +196,9 @@ def scan(
 ) -> int:
     """Run a new scan into `folder`, and process it; returns the exit status. Raises PolysightError."""
     rig = load_instrument(config)
+    told = rig.notify
+    # A web address may hold a secret, and manifests are passed on.
+    rig = replace(rig, notify=Notify())
     _check_new(folder)
     if truth is not None and not truth.is_file():
         raise ConfigError(f"{truth}: no such file", "--truth names it", "give truth.json, or leave --truth out")
@@ -197,7 +218,7 @@ def scan(
             sys.stderr.write(f"note: {truth} was not copied into {folder}; a report does without\n")
         return result
 
-    return _run(folder, processing, run_rows)
+    return _run(folder, processing, run_rows, told)
 
 
 def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
@@ -219,4 +240,4 @@ def resume(folder: Path, settings: Settings, keep_incomplete: bool, process: boo
             folder, on_row=on_row, progress=on_progress, keep_incomplete=keep_incomplete, stop=stop, rig_now=rig_now
         )
 
-    return _run(folder, processing, run_rows)
+    return _run(folder, processing, run_rows, Notify() if rig_now is None else rig_now.notify)

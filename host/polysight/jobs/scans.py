@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 from msgspec import UNSET
 
-from polysight.acquisition import ScanCommand, send_command
+from polysight.acquisition import BADGES, STATES, ScanCommand, send_command
 from polysight.catalogue import (
     Notes,
     PermittivityDifference,
@@ -63,7 +63,8 @@ def _count_bytes(root: Path, s: Summary) -> int:
 
 def _line(s: Summary) -> str:
     """State, rows, verdict, materials and tags of a scan."""
-    parts = [s.state]
+    words, _ = BADGES[s.state]
+    parts = [words]
     if s.rows:
         parts.append(f"{s.committed}/{s.rows} rows")
     parts.append(s.verdict)
@@ -103,8 +104,11 @@ def ask_scan(folder: Path, command: str) -> int:
     """Send a command to a running scan; return 0 when it has received it. Raises ScanError."""
     if not folder.is_dir():
         raise no_such(folder)
-    send_command(folder, ScanCommand(command))
-    sys.stdout.write(f"{folder}: heard {command}\n")
+    send_command(folder, ScanCommand(command), "polysight ask")
+    states = {"pause": "pausing", "continue": "rows", "stop": "stopping", "abort": "aborting"}
+    state = STATES[states[command]]
+    words = state.headline if command != "continue" else "The scan goes on"
+    sys.stdout.write(f"{folder}: heard {command}: {words}\n")
     return 0
 
 

@@ -190,7 +190,10 @@ class ScanContinued(Fact, frozen=True, kw_only=True, tag="scan_continued"):
 
 
 class ScanEnded(Fact, frozen=True, kw_only=True, tag="scan_ended"):
-    """A run ended; `lost_mm` are the steps that the drives lost in x and y, None if they were not measured."""
+    """A run ended; `lost_mm` are the steps that the drives lost in x and y, None if they were not measured.
+
+    `asked` is the command that ended it, `stop` or `abort`, and `asker` who sent it; "" where nobody did.
+    """
 
     exit_status: str = ""
     reason: str = ""
@@ -200,6 +203,8 @@ class ScanEnded(Fact, frozen=True, kw_only=True, tag="scan_ended"):
     rows_committed: int | None = None
     events_refetched: int | None = None
     ended_utc: str = ""
+    asked: str = ""
+    asker: str = ""
 
 
 class OtherFact(Fact, frozen=True, kw_only=True, tag="other"):

@@ -1,0 +1,138 @@
+"""The states of a scan as people read them: the one table that page, list, terminal and `polysight ask` speak from.
+
+Each state has a colour, words, the buttons that may be pressed, and phrases that are never shown with it. Words in
+braces are filled in: `{folder}`, `{safe}` (rows that are safe), `{asker}` (who pressed the button), and what the
+state is about. `{since}` is filled in by the page, as the time since the status's `since_s`.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+StateLevel = Literal["good", "done", "wait", "warn", "bad"]
+Button = Literal["pause", "continue", "stop", "abort", "resume", "again", "repeat", "process"]
+"""`again` starts a scan that could not start once more; `repeat` plans a new one with this one's numbers."""
+RUNNING: tuple[Button, ...] = ("pause", "stop", "abort")
+ENDED: tuple[Button, ...] = ("resume", "repeat")
+
+
+class State(msgspec.Struct, frozen=True):
+    """One state: `level` sets colour and sign; `why` and `do` are empty if there is nothing to say."""
+
+    key: str
+    level: StateLevel
+    headline: str
+    detail: str = ""
+    why: str = ""
+    do: str = ""
+    press: tuple[Button, ...] = ()
+    never: tuple[str, ...] = ()
+
+
+_WELL = "All is well"
+_NO_FAULTS = "No faults"
+_FAILED = "has failed"
+_RESULT = "Result:"
+_UNTIL_RESUMED = "`polysight resume {folder}`"
+
+_TABLE = (
+    # --- before the first row ---
+    State("empty", "wait", "No scan here yet", "{folder} holds no scan. This page shows it when one begins.", "",
+          "`polysight scan --out {folder}`", never=(_WELL, _RESULT)),
+    State("starting", "wait", "The scan is starting", "Its program connects to the rig; this takes some seconds.",
+          never=(_WELL, _NO_FAULTS, _RESULT)),
+    State("start_failed", "bad", "The scan could not start", "{what}", "{why}", "{do}", ("again",),
+          (_WELL, _NO_FAULTS, "No scan here yet", _RESULT)),
+    State("homing", "good", "Homing the stage", "Rows begin when its position is known.", press=RUNNING,
+          never=(_RESULT,)),
+    # --- rows ---
+    State("rows", "good", _WELL, "{now}", press=RUNNING, never=(_RESULT, "starting")),
+    State("retake", "warn", "Row {row} is retaken (take {take})", "{what}", "{why}", "{do}", RUNNING,
+          (_WELL, _NO_FAULTS, _RESULT)),
+    State("after_fault", "warn", "Scanning, after a fault in a row", "{what}", "{why}", "{do}", RUNNING,
+          (_WELL, _NO_FAULTS, _RESULT)),
+    State("poor", "warn", "Scanning, but the data is poor", "{what}", "{why}", "{do}", RUNNING, (_WELL, _RESULT)),
+    State("late", "warn", "No row has ended for a while", "None for {since}, though the scan program runs.",
+          "It waits for the disk, for processing, or for the stage", "See its terminal", RUNNING, (_WELL, _RESULT)),
+    State("held", "warn", "The stage is held", "Within a row. Held for more than 2 s, the row is retaken.",
+          "A program other than polysight sent the Pi `Hold`", "That program sends `Resume`; or abort the scan",
+          RUNNING, (_WELL, _RESULT)),
+    State("pi_silent", "bad", "The Pi is silent", "No heartbeat for {since}. The stage stops by itself.",
+          "Network or power of the Pi, or its program ended", "On the Pi: `systemctl status polysight-pi`",
+          RUNNING, (_WELL, _RESULT)),
+    State("rig_fault", "bad", "The rig has stopped with a fault", "{what}", "{why}", "{do}", RUNNING,
+          (_WELL, _NO_FAULTS, _RESULT)),
+    # --- requests ---
+    State("pausing", "wait", "Pausing after this row", "Asked by {asker}. The stage stands still then.",
+          press=("continue", "stop", "abort"), never=(_WELL, _RESULT)),
+    State("paused", "wait", "Paused", "Asked by {asker}. {safe} Nothing moves.", "",
+          "Continue with the button, or `polysight ask {folder} continue`", ("continue", "stop", "abort"),
+          (_WELL, _RESULT)),
+    State("stopping", "wait", "Stopping after this row", "Asked by {asker}. The scan can be resumed later.",
+          press=("abort",), never=(_WELL, _RESULT)),
+    State("aborting", "wait", "Stopping now", "Asked by {asker}. The stage stops; the running row is lost.",
+          never=(_WELL, "fault", _RESULT)),
+    State("stopped", "wait", "Stopped on request", "By {asker}, after a row. {safe}", "", _UNTIL_RESUMED, ENDED,
+          (_WELL, _FAILED, "fault in a row", "exit status", _RESULT)),
+    State("aborted", "wait", "Aborted on request", "By {asker}. {safe}", "", _UNTIL_RESUMED, ENDED,
+          (_WELL, _FAILED, "fault in a row", "exit status", _RESULT)),
+    # --- ends without being asked ---
+    State("failed", "bad", "The scan has failed", "{what} {safe}", "{why}", "{do}", ENDED, (_WELL, _RESULT)),
+    State("killed", "bad", "The scan program was killed", "{safe} The stage stops by itself.",
+          "Its process is gone, and it did not say why: memory ran out, or somebody killed it", _UNTIL_RESUMED, ENDED,
+          (_WELL, _RESULT)),
+    State("frozen", "bad", "The scan program does not respond", "No sign of life for {since}; {safe}",
+          "It hangs, its machine is switched off, or its drive is gone",
+          "Look at its machine; if the program is gone, `polysight resume {folder}`", ("abort", "resume"),
+          (_WELL, _RESULT)),
+    State("resuming", "wait", "The scan is being resumed", "{safe} Its program connects to the rig.",
+          never=(_WELL, _FAILED, _RESULT)),
+    # --- the end ---
+    State("homing_again", "good", "Homing the stage again", "Every row is recorded; this measures lost steps.",
+          press=("abort",), never=("Rows begin", _RESULT)),
+    State("finishing", "good", "The scan is finishing", "Every row is recorded.", never=("Rows begin", _RESULT)),
+    State("materials", "wait", "Materials are being computed", "{gaps} The result comes when this has ended.",
+          never=(_RESULT, "not processed")),
+    State("finished", "done", "The scan is finished", "{gaps} It was not processed.", press=("process", "repeat"),
+          never=(_RESULT,)),
+    State("unprocessed", "bad", "Every row is safe, but processing failed", "{what}", "{why}", "{do}",
+          ("process", "repeat"), (_WELL, _RESULT)),
+    State("result_good", "done", "The scan is finished", "{gaps}", press=("repeat",), never=("not processed",)),
+    State("result_care", "warn", "Finished: use the result with care", "{gaps}", press=("repeat",),
+          never=("not processed",)),
+    State("result_none", "bad", "Finished without a result", "{gaps}", press=("repeat",), never=("not processed",)),
+    State("processing", "wait", "Processing again", "What is shown is the earlier result, until this has ended."),
+    # --- what cannot be read ---
+    State("unreadable", "bad", "This scan cannot be shown", "{what}",
+          "It was written by another release, or is damaged", "`polysight validate {folder}`", never=(_WELL, _RESULT)),
+    State("folder_gone", "bad", "The scan's folder is gone", "{folder} was there before.",
+          "It was moved, renamed or deleted, or its drive is gone", "Look for it in the list of scans",
+          never=(_WELL, "disk is full")),
+    # --- the page itself, which keeps these words for when it is alone ---
+    State("offline", "wait", "No connection to the server", "Reconnecting. The scan goes on without this page.",
+          "`polysight serve` was ended, or the network is gone",
+          "In a shell on the host: `polysight ask {folder} abort`; the emergency stop stops the stage",
+          never=(_WELL,)),
+    State("server_frozen", "wait", "The server does not respond", "The scan goes on without it.",
+          "Its machine is very busy, or its drive is gone",
+          "In a shell on the host: `polysight ask {folder} abort`; the emergency stop stops the stage",
+          never=(_WELL,)),
+)  # fmt: skip
+STATES = {state.key: state for state in _TABLE}
+
+BADGES: dict[str, tuple[str, StateLevel]] = {
+    "running": ("is being scanned", "wait"),
+    "paused": ("paused", "wait"),
+    "finished": ("finished", "good"),
+    "stopped": ("stopped on request", "wait"),
+    "failed": ("failed", "bad"),
+    "lost": ("killed", "bad"),
+    "frozen": ("does not respond", "bad"),
+    "begun": ("not begun", "warn"),
+    "products": ("products only", "good"),
+    "damaged": ("damaged", "bad"),
+    "silent": ("folder does not answer", "bad"),
+}
+"""Words and colours of lists, by the state of a :class:`polysight.catalogue.Summary`."""

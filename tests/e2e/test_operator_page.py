@@ -15,8 +15,7 @@ from tests.support.processes import Program
 from tests.support.scenes import small_scene
 from tests.support.simulated_rig import Rig, running
 
-from polysight.catalogue import PROGRAM
-from polysight.serve.site import find_program
+from polysight.catalogue import PROGRAM, find_program
 from polysight.store import ScanFolder, validate
 
 ROWS = 40
@@ -136,7 +135,8 @@ def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
     lab.wait_rows(folder, stopped + 1)
     lab.click("abort")
     lab.browser.value("document.querySelector('#confirm button[value=yes]').click()")
-    lab.wait_headline("Stopped on request")
+    lab.wait_headline("Aborted on request")
+    assert "the page" in lab.browser.text("detail")
     lab.ended(folder)
 
 
@@ -160,11 +160,11 @@ def test_a_scan_outlives_its_server_and_the_next_one_finds_it(lab):
     lab.ended(folder)
 
 
-def test_a_scan_has_the_priority_of_a_terminals_not_of_the_servers(lab):
+def test_a_scan_has_the_priority_of_a_terminals_not_of_the_reading_process(lab):
     folder = lab.start("fourth", rows=ROWS)
     lab.wait_rows(folder, 1)
     pid = json.loads((folder / PROGRAM / "scan.json").read_text())["pid"]
-    assert os.getpriority(os.PRIO_PROCESS, lab.server.process.pid) > os.getpriority(os.PRIO_PROCESS, pid)
+    assert os.getpriority(os.PRIO_PROCESS, lab.server.process.pid) == os.getpriority(os.PRIO_PROCESS, pid)
     assert (
         Path(f"/proc/{pid}/oom_score_adj").read_text().strip() == Path("/proc/self/oom_score_adj").read_text().strip()
     )
@@ -196,6 +196,12 @@ def test_a_scan_that_cannot_begin_says_why(lab):
     assert not (folder / "manifest.jsonl").exists()
     lab.rig.wait_for(lambda: not _program(folder).running, "the end of the program")
     assert _program(folder).status not in (0, None)
+    lab.wait_headline("The scan could not start")
+    assert "did not answer" in lab.browser.text("detail")
     lab.rig.start_pi()
     lab.open("/")
     lab.browser.wait("/failed[^]*did not answer/.test(document.getElementById('list').innerText)", "state and reason")
+    lab.open("/watch?scan=sixth", PHONE)
+    lab.click("again")
+    lab.browser.wait("document.getElementById('count')?.innerText == '3 of 3 rows'", "all rows")
+    lab.ended(folder)

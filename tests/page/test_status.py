@@ -6,17 +6,22 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace as replace_struct
 from tests.support.page.live_view import add_fact, begin_history
 from tests.support.store.facts import facts_of
 
-from polysight.acquisition.control import ScanCommand
+from polysight.acquisition import STATES
+from polysight.acquisition.control import Life
+from polysight.catalogue import Program
 from polysight.page.history import PiState, notice_of_fault
-from polysight.page.status import Inputs, LifeSigns, RowSync, Shown, judge, no_scan
+from polysight.page.status import Inputs, LifeSigns, RowSync, Shown, judge, make_snapshot
+from polysight.results import Verdict
 from polysight_shared.faults import EXPLANATIONS, PiFault
+from polysight_shared.findings import Finding
 from polysight_shared.messages import Fault
 
 FOLDER = Path("scans/one")
-LIVELY = LifeSigns(alive=True, alive_s=0, pi_silent_s=0.3, pi_limit_s=6.0, now_s=1.8e9)
+LIVELY = LifeSigns(life=Life(), alive=True, killed=False, alive_s=0, pi_silent_s=0.3, pi_limit_s=6.0, now_s=1.8e9)
 RUNNING = PiState(heard_s=1.0, state="running", row=1, take=1)
 ROW = {"fact": "row_committed", "take": 2, "direction": 1, "pulses": 0, "boards": {}}
 REJECTED = {"fact": "row_rejected", "row": 1, "take": 1, "reasons": ["RV: no data"], "boards": {}}
@@ -32,8 +37,12 @@ def history(finished):
     return history
 
 
-def status(history, signs=LIVELY, heard=RUNNING, shown=Shown(), asked=None):  # noqa: B008
-    return judge(Inputs(FOLDER, history, signs, heard, shown, asked), history)
+def status(history, signs=LIVELY, heard=RUNNING, shown=Shown(), **more):  # noqa: B008
+    return judge(Inputs(FOLDER, history, signs, heard, shown, **more))
+
+
+def asked(command, doing="rows"):
+    return replace(LIVELY, life=Life(asked=command, asker="the page", doing=doing))
 
 
 def test_all_is_well_needs_nothing_done(history):
@@ -43,9 +52,9 @@ def test_all_is_well_needs_nothing_done(history):
 
 
 def test_a_dead_program_outranks_everything_but_the_end(history):
-    gone = replace(LIVELY, alive=False, alive_s=1.7e9, pi_silent_s=99.0)
-    s = status(history, gone, replace(RUNNING, state="fault"), asked=ScanCommand.ABORT)
-    assert (s.level, s.headline) == ("bad", "The scan program has ended")
+    gone = replace(asked("abort"), alive=False, killed=True, alive_s=1.7e9, pi_silent_s=99.0)
+    s = status(history, gone, replace(RUNNING, state="fault"))
+    assert (s.level, s.headline) == ("bad", "The scan program was killed")
     assert f"polysight resume {FOLDER}" in s.do
     assert "1 of 3 rows are safe" in s.detail
     add_fact(history, {"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request"})
@@ -89,12 +98,9 @@ def test_a_row_taken_again_is_a_warning_for_a_while(history):
     assert s.level == "warn"
     assert "Row 1 is retaken" in s.headline
     assert "polysight card" in s.do
-    row = ROW
-    for n in (1, 2):
-        add_fact(history, row | {"row": n})
-        assert status(history).level == "warn"
-    add_fact(history, row | {"row": 0})
-    assert status(history).level == "good"
+    for row, level in ((1, "warn"), (0, "warn"), (1, "good")):
+        add_fact(history, ROW | {"row": row})
+        assert status(history).level == level
 
 
 @pytest.mark.parametrize(("direct_rad", "masked", "level"), [(0.004, 0, "good"), (0.3, 0, "warn"), (0.004, 2, "warn")])
@@ -105,19 +111,71 @@ def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, le
     assert bool(s.do) == (level == "warn")
 
 
-def test_wishes_are_said_until_they_come_to_pass(history):
-    assert status(history, asked=ScanCommand.PAUSE).headline == "Pausing after this row"
+def test_requests_are_said_with_who_sent_them_until_they_come_to_pass(history):
+    s = status(history, asked("pause"))
+    assert (s.headline, s.press) == ("Pausing after this row", ("continue", "stop", "abort"))
+    assert "the page" in s.detail
     add_fact(history, {"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"})
-    assert status(history, asked=ScanCommand.PAUSE).headline == "Paused"
-    assert status(history, asked=ScanCommand.STOP).headline == "Stopping after this row"
-    assert status(history, asked=ScanCommand.ABORT).headline == "Stopping now"
+    assert status(history, asked("pause")).headline == "Paused"
+    assert status(history, asked("stop")).press == ("abort",)
+    assert status(history, asked("abort")).headline == "Stopping now"
+
+
+def test_an_abort_is_no_fault(history):
+    """Neither in the row that it ends, nor at the Pi, nor when the scan has ended."""
+    aborted = REJECTED | {"faults": [{"kind": "on_request"}]}
+    add_fact(history, aborted)
+    fault = notice_of_fault(Fault(scan_id="s", seq=1, t_mono_ns=1, number=PiFault.ABORTED, what="aborted"))
+    history.notices.append(fault)
+    stopped = replace(RUNNING, state="fault", faults=(fault,))
+    assert status(history, asked("abort"), stopped).key == "aborting"
+    assert [notice.level for notice in history.notices] == ["note", "note"]
+    end = {"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request", "asked": "abort"}
+    add_fact(history, end | {"asker": "the page"})
+    s = status(history, replace(LIVELY, alive=False, life=None))
+    assert (s.key, s.press) == ("aborted", ("resume", "repeat"))
+    assert "the page" in s.detail
+
+
+def test_there_is_no_result_before_materials(history):
+    for row in (1, 2):
+        add_fact(history, ROW | {"row": row})
+    assert status(history, heard=replace(RUNNING, state="homing")).key == "homing_again"
+    assert status(history, heard=replace(RUNNING, row=-1)).key == "finishing"
+    add_fact(history, {"fact": "scan_ended", "exit_status": "success", "reason": ""})
+    good = Verdict("good")
+    assert status(history, asked("", "materials"), verdict=good).key == "materials"
+    assert make_snapshot(Inputs(FOLDER, history, asked("", "materials"), verdict=good)).verdict is None
+    for level in ("good", "care", "none"):
+        assert status(history, replace(LIVELY, life=None), verdict=Verdict(level)).key == f"result_{level}"
+    running = Program("process", True, None, (), "2026-01-01T00:00:00", "")
+    assert status(history, replace(LIVELY, life=None), verdict=good, program=running).key == "processing"
+    killed = replace(asked("", "materials"), alive=False, killed=True)
+    assert "killed" in status(history, killed).detail
+
+
+def test_a_start_that_failed_says_why_and_is_offered_again():
+    failure = Finding("error", "no Pi answers", "it is off", "switch it on")
+    failed = Program("scan", False, 4, (), "2026-01-01T00:00:00", "")
+    s = status(None, program=failed, failure=failure)
+    assert (s.detail, s.why, s.do, s.press) == ("no Pi answers.", "it is off", "switch it on", ("again",))
+    assert make_snapshot(Inputs(FOLDER, None, LIVELY, program=failed, failure=failure)).notices == [failure]
+    assert status(None, program=replace_struct(failed, running=True)).key == "starting"
+
+
+def test_no_state_says_what_it_must_not():
+    for state in STATES.values():
+        words = " ".join((state.headline, state.detail, state.why, state.do))
+        assert not [phrase for phrase in state.never if phrase in words], state.key
+        assert bool(state.why or "{" in state.detail) or state.level not in ("bad", "warn"), state.key
 
 
 def test_ends_say_how(history):
     ended = {"fact": "scan_ended", "exit_status": "fail", "reason": "the Pi did not answer"}
     add_fact(history, ended | {"why": "it is off", "remedy": "switch it on"})
     s = status(history)
-    assert (s.level, s.detail, s.why, s.do) == ("bad", "The Pi did not answer", "It is off", "Switch it on")
+    assert (s.level, s.why, s.do) == ("bad", "It is off", "Switch it on")
+    assert s.detail == "The Pi did not answer. 1 of 3 rows are safe."
     add_fact(history, ended)
     assert f"polysight resume {FOLDER}" in status(history).do
     for row in (1, 2):
@@ -127,4 +185,8 @@ def test_ends_say_how(history):
 
 
 def test_no_scan_says_how_to_begin_one():
-    assert f"polysight scan --out {FOLDER}" in no_scan(FOLDER).do
+    assert f"polysight scan --out {FOLDER}" in status(None).do
+
+
+def test_a_folder_that_was_renamed_is_said_to_be_gone(history):
+    assert status(history, gone=True).headline == "The scan's folder is gone"

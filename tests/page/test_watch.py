@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
+import subprocess
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 from tests.support.page.chromium import DESK, PHONE
 from tests.support.page.live_view import GrowingScan, served
 from tests.support.processes import wait_for
 from tests.support.products import REASON, judged_products
 from tests.support.store.facts import typed
 
+from polysight.acquisition.control import ALIVE, CONTROL, Life, started_ticks
 from polysight.page.watch import EventTail, ManifestTail, ProductsTail, Watch, draw
 from polysight.pipeline import Pipeline
+from polysight.products import SCAN, write_json
+from polysight.results import ScanFacts
 from polysight.store import manifest
 from polysight.store.logs import read_events
 from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
@@ -90,7 +97,7 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
         return state["status"]["level"] == "good" and state["running"]
 
     wait_for(lives, "that it lives")
-    watch.wait_for(lambda s: s["status"]["headline"] == "The scan program has ended")
+    watch.wait_for(lambda s: s["status"]["key"] in ("frozen", "killed"))
     state = answer(watch)
     assert not state["running"]
     assert "polysight resume" in state["status"]["do"]
@@ -98,9 +105,24 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
     wait_for(lives, "that it lives again")
 
 
+def test_a_killed_program_is_said_at_once_however_long_its_timeout_is(growing, watching):
+    growing.grow_to("row_committed")
+    program = subprocess.Popen(["sleep", "600"])
+    life = Life(program.pid, started_ticks(program.pid) or 0, socket.gethostname())
+    growing.live()
+    (growing.path / CONTROL / ALIVE).write_bytes(msgspec.json.encode(life))
+    watch = watching(growing.path, lapse_s=1e6)
+    watch.wait_for(lambda s: s["running"])
+    program.kill()
+    program.wait()
+    watch.wait_for(lambda s: s["status"]["key"] == "killed")
+    assert answer(watch)["status"]["level"] == "bad"
+    assert answer(watch)["status"]["press"] == ["resume", "repeat"]
+
+
 def test_an_unfinished_folder_without_a_program_is_said_to_be_at_once(growing, watching):
     growing.grow_to("row_committed")
-    assert answer(watching(growing.path))["status"]["headline"] == "The scan program has ended"
+    assert answer(watching(growing.path))["status"]["key"] in ("frozen", "killed")
 
 
 def test_a_damaged_row_is_named_and_the_others_are_shown(growing, watching):
@@ -208,14 +230,25 @@ def test_another_and_longer_file_is_found_after_a_single_look(finished, tmp_path
 
 def test_the_verdict_follows_the_products(tmp_path):
     tail = ProductsTail(tmp_path)
-    assert tail.look() is None
+    assert tail.look("") is None
     for level in ("care", "none", None, "good"):
         shutil.rmtree(tmp_path / "products", ignore_errors=True)
         judged_products(tmp_path / "products", level)
-        found = tail.look()
+        found = tail.look("")
         assert (found.level if found else None) == level
     (tmp_path / "products" / "materials.json").write_text("{", encoding="utf-8")
-    assert tail.look() is None
+    assert tail.look("") is None
+
+
+def test_images_before_materials_and_earlier_products_are_no_result(tmp_path):
+    judged_products(tmp_path / "products", "good")
+    facts = ScanFacts.read(tmp_path / "products" / SCAN)
+    write_json(tmp_path / "products" / SCAN, replace(facts, processed_utc="2026-01-01T00:00:00+00:00"))
+    tail = ProductsTail(tmp_path)
+    assert tail.look("2000-01-01T00:00:00+00:00") is not None
+    assert tail.look("2999-01-01T00:00:00+00:00") is None
+    (tmp_path / "products" / "materials.json").unlink()
+    assert tail.look("") is None
 
 
 def test_it_is_shown_when_the_scan_has_ended(growing: GrowingScan, watching):

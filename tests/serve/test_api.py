@@ -19,9 +19,12 @@ import pytest
 from tests.support.page.asking import TOKEN, ask, get, post
 from tests.support.page.live_view import Served, open_control, served_folder
 from tests.support.paths import RIG_FILE
+from tests.support.processes import wait_for
 from tests.support.products import judged_products
 
-from polysight.serve import control, site
+from polysight.products.folder import making_products
+from polysight.serve import commands as control
+from polysight.serve import site
 from polysight.serve.guard import TOKEN_HEADER
 from polysight_shared.error_codes import ErrorCode
 
@@ -152,6 +155,68 @@ def test_open_live_views_keep_nobody_from_pausing_and_stopping(view, scans):
         assert stop.after_row
         assert post(view, "/api/control/abort?scan=one")[0] == 200
         assert stop.now
+
+
+def test_a_scan_is_put_away_by_who_types_its_name(view, scans):
+    for path in ("archive", "delete"):
+        status, answer = post(view, f"/api/{path}?scan=one", {"name": "two"})
+        assert (status, answer["code"]) == (400, ErrorCode.MISMATCH)
+    assert post(view, "/api/archive?scan=one", {"name": "one"})[0] == 200
+    assert [s["name"] for s in get(view, "/api/scans")["scans"]] == ["two"]
+    archived = list((scans / ".polysight" / "archive").glob("*/one/products/image.npz"))
+    assert len(archived) == 1
+    assert post(view, "/api/delete?scan=two", {"name": "two"})[0] == 200
+    wait_for(lambda: not list((scans / ".polysight").glob("*/*/two")), "that its files are gone")
+
+
+def test_a_request_can_be_repeated_and_is_checked_again(view, scans):
+    plan = {"rows": 5, "columns": 7}
+    (scans / "one" / "program" / "request.json").write_text(json.dumps({"name": "other", "plan": plan}))
+    request = get(view, "/api/request?scan=one")
+    assert (request["name"], request["plan"]["rows"], request["plan"]["columns"]) == ("one", 5, 7)
+    assert post(view, "/api/again?scan=one")[0] == 400  # it holds products: it could start
+    (scans / "one" / "program" / "request.json").write_text('{"plan": {"rows": 0}}')
+    assert post(view, "/api/again?scan=one")[0] == 400
+    assert ask(view, "/api/request?scan=two")[0] == 404
+
+
+def test_a_page_gets_products_of_one_generation(view, scans):
+    """Of the one that it shows, or an answer that there is another."""
+    shown = get(view, "/api/result?scan=one")["generation"]
+    assert get(view, "/api/scan?scan=one")["generation"] == shown
+    assert ask(view, f"/api/map/h_amplitude?scan=one&generation={shown}")[0] == 200
+    shutil.move(scans / "one" / "products", scans / "old")
+    judged_products(scans / "one" / "products", "none")
+    status, body, _ = ask(view, f"/api/map/h_amplitude?scan=one&generation={shown}")
+    assert (status, json.loads(body)["code"]) == (409, ErrorCode.MISMATCH)
+    result = get(view, "/api/result?scan=one")
+    assert result["generation"] != shown
+    assert result["verdict"]["level"] == "none"
+
+
+def test_a_result_that_is_polled_while_products_are_replaced_is_never_a_mixture(view, scans):
+    """Names and permittivities of one verdict under the reasons of another would be believed."""
+    out = scans / "one" / "products"
+    ended = threading.Event()
+
+    def replace_products() -> None:
+        for k in range(20):
+            with making_products(out, "s") as new:
+                judged_products(new, "none" if k % 2 else "good")
+        ended.set()
+
+    worker = threading.Thread(target=replace_products)
+    worker.start()
+    levels = []
+    while not ended.is_set():
+        status, body, _ = ask(view, "/api/result?scan=one")
+        assert status in (200, 409)
+        if status == 200:
+            result = json.loads(body)
+            levels.append(result["verdict"]["level"])
+            assert any(patch["name"] for patch in result["patches"]) is (levels[-1] != "none")
+    worker.join()
+    assert levels
 
 
 def test_exports_stay_in_the_scan(view, scans, tmp_path):

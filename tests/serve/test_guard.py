@@ -18,11 +18,12 @@ from urllib.request import urlopen
 import pytest
 from tests.support.page.asking import TOKEN, ask, digest_of, get, post, raw
 from tests.support.page.live_view import served_folder
-from tests.support.processes import LIMIT_S, wait_for
+from tests.support.processes import LIMIT_S
 from tests.support.products import judged_products
 from tests.support.refusals import refused
 
 from polysight.serve import guard, server
+from polysight.serve.front import ConnectionLimit
 from polysight.serve.guard import TOKEN_HEADER, Access
 from polysight_shared.error_codes import ErrorCode
 
@@ -127,14 +128,51 @@ def test_open_connections_and_unread_answers_lock_nobody_out(scans):
         operator.close()
 
 
-def test_more_connections_than_allowed_are_answered_503_until_some_are_closed(scans, monkeypatch):
+def test_of_too_many_connections_those_without_a_request_are_closed(scans, monkeypatch):
+    """Neither one that is answered, nor one whose request lies unread; who comes anew finds room."""
     monkeypatch.setattr(server, "MAX_CONNECTIONS", 20)
-    with served_folder(scans, TOKEN) as view:
-        with ExitStack() as clients:
-            for _ in range(20):
-                clients.enter_context(socket.create_connection(("127.0.0.1", view.port), LIMIT_S))
-            wait_for(lambda: ask(view, "/api/scans")[0] == 503, "that no more are answered")
-        wait_for(lambda: ask(view, "/api/scans")[0] == 200, "that there is room again")
+    with served_folder(scans, TOKEN) as view, ExitStack() as clients:
+        operator = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
+        operator.request("GET", "/api/scans")
+        assert operator.getresponse().read()
+        stream = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
+        stream.request("GET", "/api/events?scan=one")
+        events = stream.getresponse()
+        assert events.readline().startswith(b"event: ")
+        for _ in range(200):
+            clients.enter_context(socket.create_connection(("127.0.0.1", view.port), LIMIT_S))
+        operator.request("GET", "/api/scans")
+        assert operator.getresponse().status == 200
+        assert post(view, "/api/notes?scan=one", {"notes": "n"})[0] == 200
+        assert any(events.readline().startswith(b"event: ") for _ in range(20))
+        operator.close()
+        stream.close()
+
+
+def test_a_connection_with_unread_bytes_is_not_closed():
+    """Whatever comes behind it, a request that was sent is read."""
+
+    class Connection:
+        def __init__(self, unread: bool) -> None:
+            self.unread = unread
+            self.is_working = False
+            self.is_closed = False
+            self.transport = self
+
+        def has_unread_bytes(self) -> bool:
+            return self.unread
+
+        def close(self) -> None:
+            self.is_closed = True
+
+    limit = ConnectionLimit(2)
+    connections = [Connection(unread) for unread in (True, False, False, False)]
+    for connection in connections:
+        limit.add(connection)
+        for closed in connections:
+            if closed.is_closed and closed in limit._silent:
+                limit.remove(closed)
+    assert [connection.is_closed for connection in connections] == [False, True, True, False]
 
 
 def test_a_download_that_is_aborted_leaves_no_file_open(scans):

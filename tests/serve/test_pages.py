@@ -11,16 +11,16 @@ from typing import Any
 import pytest
 from tests.support.page.asking import TOKEN
 from tests.support.page.chromium import DESK, PHONE, Browser
-from tests.support.page.live_view import Served, served_folder
+from tests.support.page.live_view import Served, open_control, served_folder
 from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
-from tests.support.products import judged_products
+from tests.support.products import REASON, judged_products
 from tests.support.scenes import COPPER, PET
 
-from polysight.catalogue import Notes, read_notes, write_notes
+from polysight.catalogue import Notes, find_program, read_notes, write_notes
 from polysight.materials import Library, read_labels
 from polysight.products import ProcessedScan
-from polysight.serve.site import find_program
+from polysight.serve import queue as serve_queue
 
 pytestmark = pytest.mark.xdist_group("browser")
 SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
@@ -239,6 +239,73 @@ def test_notes_are_kept_beside_the_scan(page, scans):
     page.open("/")
     page.browser.fill("#find", "brett")
     page.browser.wait("document.querySelectorAll('#list li').length == 1", "the search finds it")
+
+
+@SIZES
+def test_every_page_has_the_abort_of_the_running_scan(page, scans, size):
+    abort = "document.querySelector('#running button.danger')"
+    for path in PAGES:
+        with open_control(scans / "two") as stop:
+            page.open(path, size)
+            page.browser.wait(f"{abort}?.checkVisibility()", path)
+            page.whole()
+            page.browser.value(f"{abort}.click()")
+            page.browser.click("#confirm button[value=yes]")
+            wait_for(lambda s=stop: s.now, "the abort")
+            page.browser.wait(f"!{abort}", "that it was heard")
+
+
+def test_a_plan_is_repeated_and_waits_in_the_queue(page, scans, monkeypatch):
+    monkeypatch.setattr(serve_queue, "LOOK_S", 1e6)
+    with served_folder(scans, TOKEN, config=RIG_FILE) as view:
+        again = Page(page.browser, view)
+        again.open("/new?from=one", PHONE)
+        again.browser.wait("document.querySelector('.time') && document.getElementById('rows').value == 17", "the plan")
+        # Start is on the first screen of a phone.
+        start = "document.getElementById('start').getBoundingClientRect()"
+        assert again.browser.value(f"{start}.bottom <= innerHeight && {start}.top > 0")
+        again.browser.fill("#name", "over-night")
+        again.browser.click("#enqueue")
+        again.browser.wait("document.querySelectorAll('#waiting li').length == 1", "that it waits")
+        again.whole()
+        again.browser.click("#waiting button")
+        again.browser.wait("document.querySelectorAll('#waiting li').length == 0", "that it is out")
+
+
+def test_a_wrong_number_is_said_in_the_words_of_the_page(page):
+    page.open("/new")
+    page.browser.fill("#columns", "0")
+    page.browser.wait("document.getElementById('plan-wrong')?.innerText.length > 0", "the refusal")
+    said = page.browser.text("plan-wrong")
+    assert "Positions in a row" in said
+    assert "columns" not in said
+    assert page.browser.value("document.getElementById('start').disabled")
+    page.browser.errors.clear()  # the refused request
+
+
+def test_metal_is_drawn_for_processing_again(page):
+    page.open("/scan?scan=one")
+    extent = page.browser.value("fetch('/api/result?scan=one').then(r => r.json()).then(r => r.extent_mm)")
+    page.browser.value(f"window.extent = {json.dumps(extent)}")
+    page.browser.click("#process-open")
+    page.browser.click("#draw-metal")
+    x, y = COPPER["centre_mm"]
+    page.drag(x - 12, y - 12, x + 12, y + 12)
+    page.browser.wait("/mm$/.test(document.getElementById('draw-metal').innerText)", "the box")
+    sides = page.browser.text("draw-metal").partition(": ")[2].replace("\u2212", "-").removesuffix(" mm").split(", ")
+    assert [float(side) for side in sides] == pytest.approx([x - 12, y - 12, x + 12, y + 12], abs=1.5)
+    page.whole()
+
+
+def test_the_page_follows_products_that_another_program_has_made(page, scans):
+    page.open("/scan?scan=one")
+    judged = "document.getElementById('badges').innerText"
+    assert "no result" not in page.browser.value(judged)
+    shutil.move(scans / "one" / "products", scans / "old")
+    judged_products(scans / "one" / "products", "none")
+    page.browser.wait(f"{judged}.includes('no result')", "the new verdict")
+    assert REASON["what"] in page.browser.text("reasons")
+    page.browser.errors.clear()
 
 
 def test_without_the_token_nothing_can_be_asked_and_the_page_asks_for_it(page, scans):

@@ -16,10 +16,10 @@ from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
-from polysight.catalogue import PROGRAM
+from polysight.catalogue import PROGRAM, find_program
 from polysight.jobs.live_scan import _check_new
 from polysight.serve import launcher
-from polysight.serve.site import Programs, find_program
+from polysight.serve.site import Programs
 from polysight.store import validate
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError

@@ -15,7 +15,7 @@ from tests.support.refusals import refused
 
 from polysight.cli.main import build_parser
 from polysight.cli.options import joined
-from polysight.serve.control import (
+from polysight.serve.commands import (
     MAX_POSITIONS,
     ExportRequest,
     LabelRequest,

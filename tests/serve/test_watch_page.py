@@ -10,6 +10,7 @@ from tests.support.page.live_view import GrowingScan, open_control, served
 from tests.support.processes import wait_for
 from tests.support.rigs import published_rig
 
+from polysight.acquisition import STATES
 from polysight_simulators.loopback import on_free_subnet
 
 TOKEN = "0123456789"
@@ -88,7 +89,7 @@ def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, wa
     with served(watch, host=host, port=int(port)) as view:
         opened(browser, view)
     browser.wait("document.body.classList.contains('lost')", "that the view is gone is said")
-    assert "lost" in browser.text("headline")
+    assert browser.text("headline") == STATES["offline"].headline
     time.sleep(0.5)  # some of its attempts to come back fail
     with served(watch, host=host, port=int(port)):
         browser.wait("!document.body.classList.contains('lost')", "the way back")

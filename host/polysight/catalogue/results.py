@@ -12,6 +12,7 @@ import skimage
 from numpy.typing import NDArray
 
 from polysight.catalogue.pictures import MAPS, Map, Picture, Pixels, draw_values, mask_values, percentile
+from polysight.catalogue.scans import read_generation
 from polysight.materials import PATCHES, SIMULATED_LIBRARY, Library, is_metal
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import permittivity_from_ratio
@@ -73,8 +74,12 @@ class File(msgspec.Struct, frozen=True):
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
-    """A processed scan for its page; `metal` says how the metal reference was chosen."""
+    """A processed scan for its page; `metal` says how the metal reference was chosen.
 
+    `generation` tells these products from those that replace them.
+    """
+
+    generation: str
     processed_utc: str
     extent_mm: tuple[float, float, float, float]
     pictures: list[Map]
@@ -96,6 +101,7 @@ def read_result(folder: Path) -> Result:
     pixels = Pixels(read_products(folder).folder)
     source = None if pixels.materials is None else pixels.materials.metal_reference
     return Result(
+        generation=read_generation(pixels.folder),
         processed_utc=pixels.facts.processed_utc or "",
         extent_mm=pixels.extent_mm,
         pictures=[drawn for drawn in MAPS.values() if pixels.referenced or not drawn.needs_metal],

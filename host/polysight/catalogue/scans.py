@@ -16,17 +16,19 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import datetime
+from itertools import islice
 from pathlib import Path, PurePosixPath
 
 import msgspec
 from msgspec.structs import replace
 
-from polysight.acquisition import last_alive_s
-from polysight.products import IMAGE, MATERIALS, QUALITY, ProcessedScan
+from polysight.acquisition import LAPSE_S, Life, read_life, started_ticks
+from polysight.products import IMAGE, MATERIALS, QUALITY, SCAN, ProcessedScan
 from polysight.store import MANIFEST, Manifest, manifest
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, PolysightError, ScanError, no_such
 from polysight_shared.files import write_atomically
+from polysight_shared.findings import Finding
 
 READ_S = 3.0
 """Time limit for reading one folder of the list; it is then listed as `silent` until the read returns."""
@@ -42,8 +44,6 @@ MAX_DEPTH = 4
 MAX_SCANS = 5000
 LOG_BYTES = 16384
 CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
-# Without a sign of life for so long, a scan's program is gone.
-LAPSE_S = 15.0
 # From a manifest's last line to the first sign of life.
 GRACE_S = 20.0
 Stamp = tuple[tuple[int, int], ...]
@@ -150,9 +150,9 @@ class Summary(msgspec.Struct, frozen=True):
     name
         Its path below the folder that is listed, with `/`.
     state
-        `running`, `paused`, `finished`, `stopped`, `failed`, `lost` (no program writes it, and none said why), `begun`
-        (a folder in which a program was started and no scan is yet), `products` (no rows beside), `damaged`, `silent`
-        (its folder does not answer: a network drive that is gone).
+        One of :data:`polysight.acquisition.BADGES`: `lost` (its program was killed), `frozen` (it gives no sign of
+        life), `begun` (a folder in which a program was started and no scan is yet), `products` (no rows beside),
+        `silent` (its folder does not answer: a network drive that is gone), ...
     rows, committed
         Of the plan, and those that count.
     verdict
@@ -163,6 +163,8 @@ class Summary(msgspec.Struct, frozen=True):
         True if there are images without materials: by `polysight image`, or before processing has ended.
     seconds
         When it began, since 1970; 0 where nothing says.
+    generation
+        Changes whenever its products do, see :func:`read_generation`.
     """
 
     name: str
@@ -181,13 +183,31 @@ class Summary(msgspec.Struct, frozen=True):
     notes: str = ""
     tags: tuple[str, ...] = ()
     seconds: float = 0.0
+    generation: str = ""
+
+
+def read_generation(products: Path) -> str:
+    """What tells the products in a folder from those that replace them; the folder is exchanged as a whole.
+
+    Who reads several files compares it before and after: equal ones mean that all files belong together.
+    """
+    stamps = []
+    for path in (products, *(products / name for name in (IMAGE, MATERIALS, QUALITY, SCAN))):
+        try:
+            status = path.stat()
+        except OSError:
+            stamps.append("-")
+            continue
+        # Files come and go in the folder without being products: its own time says nothing.
+        stamps.append(f"{status.st_ino:x}" if path == products else f"{status.st_mtime_ns:x}")
+    return ".".join(stamps)
 
 
 def _stamp(folder: Path) -> Stamp:
     """Times and sizes of the files that a summary is made from."""
-    files = (MANIFEST, NOTES, f"products/{IMAGE}", f"products/{QUALITY}", IMAGE, QUALITY, f"{PROGRAM}/scan.status")
+    products = (IMAGE, MATERIALS, QUALITY)
     stamps = []
-    for name in files:
+    for name in (MANIFEST, NOTES, *products, *(f"products/{name}" for name in products)):
         try:
             status = (folder / name).stat()
             stamps.append((status.st_mtime_ns, status.st_size))
@@ -208,8 +228,7 @@ def summarise(folder: Path, name: str) -> Summary:
     if content is None:
         if summary.processed or summary.images_only:
             return replace(summary, state="products")
-        reason = _start_failure(folder)
-        return replace(summary, state="failed" if reason else "begun", reason=reason)
+        return summary
     started = content.started
     if started is None:
         return replace(summary, state="damaged")
@@ -241,8 +260,9 @@ def _add_products(folder: Path, summary: Summary) -> Summary:
     places = [place for place in (folder / "products", folder) if (place / IMAGE).exists()]
     if not places:
         return summary
+    generation = read_generation(places[0])
     processed = (places[0] / MATERIALS).exists()
-    summary = replace(summary, processed=processed, images_only=not processed)
+    summary = replace(summary, processed=processed, images_only=not processed, generation=generation)
     try:
         products = ProcessedScan(places[0])
         if products.materials is not None:
@@ -257,17 +277,84 @@ def _add_products(folder: Path, summary: Summary) -> Summary:
     return summary
 
 
-def _start_failure(folder: Path) -> str:
-    """Why the program of a scan ended before its first row, from its log; "" if it runs, or was killed."""
-    status = folder / PROGRAM / "scan.status"
+# --- programs ---
+
+KINDS = ("scan", "process", "export", "doctor", "train", "stage")
+"""Programs that a page starts; each has its record, log and exit status in `<folder>/program/`."""
+NO_RESULT = 7
+"""Exit status of a program that ended well, but without a result."""
+
+
+class Program(msgspec.Struct, frozen=True):
+    """A program that was started: its exit status is None while it runs, and if it was killed."""
+
+    kind: str
+    running: bool
+    status: int | None
+    words: tuple[str, ...]
+    started_utc: str
+    log: str
+
+
+class _Record(msgspec.Struct, frozen=True):
+    """Content of `program/<kind>.json`, which `polysight.serve.launcher` writes."""
+
+    pid: int
+    ticks: int
+    words: list[str]
+    started_utc: str
+
+
+def find_programs(folder: Path) -> list[Program]:
+    """All programs started for a folder, the newest first."""
+    programs = [find_program(folder, kind) for kind in KINDS]
+    return sorted((p for p in programs if p is not None), key=lambda p: p.started_utc, reverse=True)
+
+
+def find_program(folder: Path, kind: str) -> Program | None:
+    """The program of a kind that was started last for a folder; None if there is none."""
+    base = folder / PROGRAM / kind
+    path = base.with_suffix(".json")
+    if (folder / PROGRAM).is_symlink() or not is_plain(path):
+        return None
     try:
-        if not is_plain(status) or status.read_text(encoding="ascii")[:8].strip() in ("", "0"):
-            return ""
+        record = msgspec.json.decode(path.read_bytes()[:100_000], type=_Record)
     except (OSError, ValueError):
-        return ""
-    lines = log_tail(folder / PROGRAM / "scan.log").splitlines()
-    errors = [line.partition(": ")[2] for line in lines if line.startswith(("polysight scan: ", "polysight resume: "))]
-    return (errors or lines or ["its program ended without a message"])[-1][:300]
+        return None
+    words = record.words
+    if words[1:3] == ["-m", "polysight"]:
+        words = ["polysight", *words[3:]]
+    running = started_ticks(record.pid) == record.ticks
+    status = None if running else _read_status(base.with_suffix(".status"))
+    return Program(kind, running, status, tuple(words), record.started_utc, log_tail(base.with_suffix(".log")))
+
+
+def _read_status(path: Path) -> int | None:
+    try:
+        return int(path.read_text(encoding="ascii")[:8]) if is_plain(path) else None
+    except (OSError, ValueError):
+        return None
+
+
+def explain_failure(program: Program | None) -> Finding | None:
+    """Why a program failed, from the last error in its log; None if it runs, or has ended well."""
+    if program is None or program.running or program.status in (0, NO_RESULT):
+        return None
+    if program.status is None:
+        return Finding("error", f"polysight {program.kind} was killed", "Memory ran out, or somebody killed it")
+    lines = program.log.splitlines()
+    heads = [k for k, line in enumerate(lines) if re.match(r"polysight \w+: ", line)]
+    if not heads:
+        last = lines[-1] if lines else "its program ended without a message"
+        return Finding("error", last[:300])
+    start = heads[-1]
+    parts = {"why": "", "do": ""}
+    for line in lines[start + 1 :]:
+        name, _, text = line.strip().partition(": ")
+        if name in parts:
+            parts[name] = text[:500]
+    what = lines[start].partition(": ")[2]
+    return Finding("error", what[:300], parts["why"], parts["do"])
 
 
 def log_tail(path: Path) -> str:
@@ -287,16 +374,23 @@ def log_tail(path: Path) -> str:
 
 def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
     """The summary with the present state: `running` or `paused` if the scan's program lives."""
+    if summary.state == "begun":
+        # A killed program changes no file.
+        failure = explain_failure(find_program(folder, "scan"))
+        return summary if failure is None else replace(summary, state="failed", reason=failure.what)
     if summary.state not in ("lost", "paused"):
         return summary
-    life_s = last_alive_s(folder)
-    patience_s = LAPSE_S
-    if life_s is None:
+    life = read_life(folder)
+    if life is not None:
+        written_s = life.written_s
+        patience_s = LAPSE_S
+    else:
+        written_s = _modified_s(folder / MANIFEST)
         patience_s = GRACE_S
-        with suppress(OSError):
-            life_s = (folder / MANIFEST).stat().st_mtime
-    if life_s is None or time.time() - life_s >= patience_s:
+    if life is not None and life.killed:
         return replace(summary, state="lost")
+    if time.time() - written_s >= patience_s:
+        return replace(summary, state="lost" if life is None else "frozen")
     return summary if summary.state == "paused" else replace(summary, state="running")
 
 
@@ -383,6 +477,16 @@ class Scans:
             return iter([entry])
         return _scan_names(self.root / entry, f"{entry}/", 2)
 
+    def lives(self) -> Iterator[tuple[str, Life]]:
+        """Name and last sign of life of each scan that runs, or was killed; no scan is read."""
+        places = _places(self.root, "", 1)
+        if self.only is not None:
+            places = iter([(self.only, self.root / self.only)])
+        for name, path in places:
+            life = read_life(path)
+            if life is not None:
+                yield name, life
+
     def left_out(self) -> list[str]:
         """Names in the folder that hold a scan and are not listed: links, and names that cannot be shown; in ASCII."""
         if self.only is not None:
@@ -463,17 +567,19 @@ def folder_bytes(folder: Path) -> int:
 
 
 def _scan_names(root: Path, prefix: str, depth: int) -> Iterator[str]:
-    """Names of the scans below a folder. Links, hidden folders and the insides of scans are not looked at."""
-    count = 0
+    """Names of the scans below a folder."""
+    names = (name for name, _ in _places(root, prefix, depth))
+    yield from islice(names, MAX_SCANS)
+
+
+def _places(root: Path, prefix: str, depth: int) -> Iterator[tuple[str, Path]]:
+    """Names and paths of the scans below a folder; links, hidden folders and insides of scans are left out."""
     for entry, path in _folders(root):
         name = f"{prefix}{entry}"
         if is_scan(path):
-            yield name
-            count += 1
+            yield name, path
         elif depth < MAX_DEPTH:
-            yield from _scan_names(path, f"{name}/", depth + 1)
-        if count >= MAX_SCANS:
-            return
+            yield from _places(path, f"{name}/", depth + 1)
 
 
 def _folders(root: Path) -> list[tuple[str, Path]]:

@@ -95,13 +95,16 @@ def notice_of_error(error: PolysightError, level: Level = "warning") -> Finding:
 
 
 def notice_of_fault(event: Fault) -> Finding:
-    """Notice of a fault of the Pi; a warning if the Pi retakes the row by itself."""
+    """Notice of a fault of the Pi; a warning if the Pi retakes the row by itself, a note if somebody asked for it."""
     table = explain(event.number)
-    passing = PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in (
-        PiFault.HOST_LOST, PiFault.POINTS_MISMATCH, PiFault.ABORTED,
-    )  # fmt: skip
+    passing = (PiFault.HOST_LOST, PiFault.POINTS_MISMATCH)
+    level: Level = "error"
+    if event.number == PiFault.ABORTED:
+        level = "note"
+    elif PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in passing:
+        level = "warning"
     return Finding(
-        "warning" if passing else "error",
+        level,
         f"Fault {event.number} at the Pi: {table.what}",
         sentence(event.why or table.why),
         sentence(event.remedy or table.remedy),
@@ -121,10 +124,18 @@ def _cause(faults: Sequence[RowFault]) -> tuple[str, str]:
 
 
 def notice_of_rejection(row: int, take: int, reasons: Sequence[str], faults: Sequence[RowFault], utc: str) -> Finding:
-    """Notice of a rejected take."""
+    """Notice of a rejected take; one that somebody asked for is no fault."""
     why, do = _cause(faults)
     do = do or "Nothing: the row is retaken automatically"
+    if is_on_request(faults):
+        notice = _row_notice(row, f"Row {row} was ended on request", (why, do), reasons, utc)
+        return msgspec.structs.replace(notice, level="note")
     return _row_notice(row, f"Row {row}, take {take}, was rejected", (why, do), reasons, utc)
+
+
+def is_on_request(faults: Sequence[RowFault]) -> bool:
+    """True if a take was rejected only because somebody aborted the scan."""
+    return bool(faults) and all(fault.kind == K.ON_REQUEST for fault in faults)
 
 
 def _row_notice(row: int, what: str, why_do: tuple[str, str], reasons: Sequence[str], utc: str) -> Finding:
@@ -203,6 +214,8 @@ class ScanHistory:
         Faults in the order of the facts and events.
     run_started_s, last_commit_s
         Times of the last run and the last row, seconds since 1970; without pauses.
+    last_row_utc
+        Time of the last row as the manifest has it; "" before.
     rows_since_trouble
         Rows committed whole since one was rejected or kept with gaps.
     trigger
@@ -218,6 +231,7 @@ class ScanHistory:
         self.notices: list[Finding] = []
         self.run_started_s = seconds(started.started_utc or "1970-01-01T00:00:00+00:00")
         self.last_commit_s = 0.0
+        self.last_row_utc = ""
         self.rows_since_trouble = 0
         self.trigger: TriggerHealth | None = None
         self._row_seconds: list[float] = []
@@ -271,12 +285,22 @@ class ScanHistory:
                         total.counts[kind] = total.counts.get(kind, 0) + count
         return list(totals.values())
 
+    @property
+    def lost_shares(self) -> dict[str, dict[int, float]]:
+        """Share of the bytes that are missing in each committed row, percent, by board and row."""
+        shares: dict[str, dict[int, float]] = {}
+        for row, fact in sorted(self.content.rows.items()):
+            for name, part in fact.boards.items():
+                shares.setdefault(name, {})[row] = round(100 * part.missing_bytes / max(1, part.bytes), 3)
+        return shares
+
     def add_fact(self, fact: Fact) -> None:
         """Add times and notices of the next fact of `content`. Raises ValueError for a time of another form."""
         if isinstance(fact, RowCommitted):
             self._row_committed(fact)
         elif isinstance(fact, RowRejected):
-            self.rows_since_trouble = 0
+            if not is_on_request(fact.faults):
+                self.rows_since_trouble = 0
             self.notices.append(notice_of_rejection(fact.row, fact.take, fact.reasons, fact.faults, fact.rejected_utc))
         elif isinstance(fact, RowWithdrawn):
             what = f"Row {fact.row} on the disk differs from what was committed"
@@ -304,6 +328,7 @@ class ScanHistory:
             # Made in one step, by `polysight simulate`.
             return
         at = seconds(fact.committed_utc)
+        self.last_row_utc = fact.committed_utc
         if self.last_commit_s > self.run_started_s:
             self._row_seconds.append(at - self.last_commit_s)
         self.last_commit_s = at

@@ -9,19 +9,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
-from polysight.acquisition import ScanCommand, time_left
-from polysight.catalogue import Picture
+from polysight.acquisition import STATES, Button, Life, StateLevel, time_left
+from polysight.catalogue import Picture, Program
 from polysight.page.history import BoardCounts, PiState, ScanHistory, TriggerHealth, sentence
 from polysight.results import Verdict
 from polysight.store import ScanEnded
 from polysight_shared.findings import Finding
 from polysight_shared.raster import WIDTH_US
 
-StatusLevel = Literal["good", "done", "wait", "warn", "bad"]
 SINCE = "{since}"
 """The page puts the elapsed time here."""
 PAPER_PHASE_RAD = 0.022
@@ -36,15 +35,21 @@ DIRECT_RAD = 0.1
 # Share of positions without a direct path that gives a warning.
 MASKED_SHARE = 0.05
 MAX_NOTICES = 30
+# Characters of an ISO time up to its seconds.
+SECONDS = 19
 MARKS = {"committed": "c", "kept": "k", "rejected": "r"}
 
 
 class RowSync(NamedTuple):
-    """Synchronisation of one board in one row: phase std after all stages and of the direct path (nan: unknown)."""
+    """Synchronisation of one board in one row: phase std after all stages and of the direct path (nan: unknown).
+
+    `snr_db` is the direct path over its scatter from burst to burst.
+    """
 
     object_rad: float
     direct_rad: float
     masked: int
+    snr_db: float = math.nan
 
 
 class Profile(msgspec.Struct, frozen=True):
@@ -88,15 +93,21 @@ class LifeSigns:
 
     Attributes
     ----------
-    alive, alive_s
-        True if the scan program gives signs of life; otherwise the time of the last one.
+    life
+        What the scan program wrote last; None where there is nothing.
+    alive, killed
+        True if it gives signs of life; if its process is gone without having said so.
+    alive_s
+        Time of the last sign of life of a program that is not alive.
     pi_silent_s, pi_limit_s
         Time since the last event of the Pi (None before the first), and its timeout.
     now_s
         Now. Times are seconds since 1970.
     """
 
+    life: Life | None
     alive: bool
+    killed: bool
     alive_s: float
     pi_silent_s: float | None
     pi_limit_s: float
@@ -105,30 +116,46 @@ class LifeSigns:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a snapshot is made from; `asked` is the command that the scan has not yet carried out."""
+    """What a snapshot is made from.
+
+    Attributes
+    ----------
+    program
+        The last program of this scan that a page started, `scan` or `process`.
+    failure
+        Why that program failed, from its log.
+    gone
+        True if the folder was there, and is not any more.
+    verdict
+        Of the products with materials, see :class:`polysight.page.watch.ProductsTail`.
+    """
 
     folder: Path
     history: ScanHistory | None
     signs: LifeSigns
     pi: PiState = field(default_factory=PiState)
     shown: Shown = field(default_factory=Shown)
-    asked: ScanCommand | None = None
     control: bool = False
     problem: str = ""
+    program: Program | None = None
+    failure: Finding | None = None
+    gone: bool = False
     verdict: Verdict | None = None
 
 
 class Status(msgspec.Struct, frozen=True):
-    """The headline: `level` sets colour and sign; `do` is empty if there is nothing to do.
+    """The headline: one of `STATES` with its words filled in, and the buttons that may be pressed.
 
     `SINCE` in `detail` stands for the time elapsed since `since_s` (seconds since 1970).
     """
 
-    level: StatusLevel
+    key: str
+    level: StateLevel
     headline: str
     detail: str = ""
     why: str = ""
     do: str = ""
+    press: tuple[Button, ...] = ()
     since_s: float = 0.0
 
 
@@ -163,8 +190,8 @@ class PicturesState(msgspec.Struct, frozen=True):
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """The whole state of a scan; `scan` and what follows are empty where there is no scan yet.
 
-    `control`: it may be controlled; `asked`: what it was asked and has not carried out. `sync` is the phase left over
-    by board and row, degrees (nan: unknown).
+    `control`: it may be controlled. `sync` is the phase left over by board and row, degrees (nan: unknown); `snr_db`
+    the direct path over its scatter, and `lost` the share of bytes that are missing, likewise.
     """
 
     status: Status
@@ -172,13 +199,14 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     control: bool
     running: bool = False
     paused: bool = False
-    asked: ScanCommand | None = None
     scan: ScanState | None = None
     boards: list[BoardCounts] = []
     trigger: TriggerHealth | None = None
     pictures: PicturesState | None = None
     profile: Profile | None = None
     sync: dict[str, dict[int, float]] = {}
+    snr_db: dict[str, dict[int, float]] = {}
+    lost: dict[str, dict[int, float]] = {}
     paper_deg: float = round(math.degrees(PAPER_PHASE_RAD), 2)
     verdict: Verdict | None = None
 
@@ -199,8 +227,7 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
     history = inputs.history
     shown = inputs.shown
     if history is None:
-        status = _unreadable(inputs) if inputs.problem else no_scan(inputs.folder)
-        return Snapshot(status=status, notices=_notices(inputs), control=inputs.control)
+        return Snapshot(status=judge(inputs), notices=_notices(inputs), control=inputs.control)
     plan = history.plan
     marks = history.marks
     boards = history.boards
@@ -211,12 +238,11 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
         for name, rows in shown.sync.items()
     }
     return Snapshot(
-        status=judge(inputs, history),
+        status=judge(inputs),
         notices=_notices(inputs),
         control=inputs.control,
         running=history.ended is None and inputs.signs.alive,
         paused=history.paused,
-        asked=inputs.asked,
         scan=ScanState(
             folder=str(inputs.folder),
             rig=history.instrument.name,
@@ -236,8 +262,9 @@ def make_snapshot(inputs: Inputs) -> Snapshot:
         pictures=_pictures(history, shown),
         profile=shown.profile,
         sync=sync,
-        # Products of an earlier run may lie there while the scan goes on.
-        verdict=inputs.verdict if history.ended is not None else None,
+        snr_db={name: {row: round(sync.snr_db, 1) for row, sync in rows.items()} for name, rows in shown.sync.items()},
+        lost=history.lost_shares,
+        verdict=inputs.verdict if _may_have_result(inputs, history) else None,
     )
 
 
@@ -281,6 +308,8 @@ def _notices(inputs: Inputs) -> list[Finding]:
         why = "It was written by another release, or is damaged"
         notices.append(Finding("warning", inputs.problem, why, f"`polysight validate {inputs.folder}`"))
     history = inputs.history
+    if inputs.failure is not None:
+        notices.append(inputs.failure)
     if history is not None:
         if inputs.pi.deaf is not None and history.ended is None:
             notices.append(inputs.pi.deaf)
@@ -317,125 +346,177 @@ def sync_notices(shown: Shown, columns: int) -> list[Finding]:
 # --- the headline ---
 
 
-def no_scan(folder: Path) -> Status:
-    """Status of a folder without a scan."""
-    detail = f"{folder} holds no scan. This page starts when one does."
-    return Status("wait", "No scan here yet", detail, "", f"`polysight scan --out {folder}`")
+def say(key: str, **words: str | int) -> Status:
+    """The status of a state of the table, with its words filled in."""
+    state = STATES[key]
+    filled = {"since": SINCE, **words}
+    return Status(
+        key=key,
+        level=state.level,
+        headline=state.headline.format(**filled),
+        detail=state.detail.format(**filled).strip(),
+        why=state.why.format(**filled),
+        do=state.do.format(**filled),
+        press=state.press,
+    )
 
 
-def _unreadable(inputs: Inputs) -> Status:
-    """Status of a scan whose first fact cannot be read."""
-    why = "It was written by another release, or is damaged"
-    return Status("bad", "This scan cannot be shown", inputs.problem, why, f"`polysight validate {inputs.folder}`")
+def say_since(key: str, since_s: float, **words: str) -> Status:
+    """The status of a state that has lasted since a time."""
+    return msgspec.structs.replace(say(key, **words), since_s=since_s)
 
 
-def judge(inputs: Inputs, history: ScanHistory) -> Status:
+def say_finding(key: str, finding: Finding | None, **words: str | int) -> Status:
+    """The status of a state that is about something that was found."""
+    if finding is None:
+        return say(key, what="", why="", do="", **words)
+    return say(key, what=f"{finding.what}.", why=finding.why, do=finding.do, **words)
+
+
+def judge(inputs: Inputs) -> Status:
     """The status of a scan; the worst condition wins."""
+    history = inputs.history
+    folder = str(inputs.folder)
+    if inputs.gone:
+        return say("folder_gone", folder=folder)
+    if history is None:
+        return _judge_start(inputs)
     if history.ended is not None:
         return _judge_end(inputs, history, history.ended)
-    status = _judge_trouble(inputs, history) or _judge_command(inputs, history) or _judge_rows(inputs, history)
+    status = _judge_trouble(inputs, history) or _judge_rig(inputs, history) or _judge_rows(inputs, history)
     if status is not None:
         return status
     now = _safe_rows(history)
     if inputs.pi.row >= 0:
         now = f"Row {inputs.pi.row} is being scanned."
-    return Status("good", "All is well", now)
+    return say("rows", now=now)
 
 
 def _safe_rows(history: ScanHistory) -> str:
     return f"{len(history.takes)} of {history.plan.rows} rows are safe."
 
 
+def _judge_start(inputs: Inputs) -> Status:
+    """A folder without a manifest."""
+    folder = str(inputs.folder)
+    if inputs.problem:
+        return say("unreadable", what=inputs.problem, folder=folder)
+    if inputs.program is not None and inputs.program.running:
+        return say("starting")
+    if inputs.failure is not None:
+        return say_finding("start_failed", inputs.failure)
+    return say("empty", folder=folder)
+
+
+def _may_have_result(inputs: Inputs, history: ScanHistory) -> bool:
+    """False while the scan goes on or materials are computed: products of an earlier run may lie there."""
+    life = inputs.signs.life
+    computing = life is not None and life.doing == "materials" and inputs.signs.alive
+    return history.ended is not None and not computing
+
+
 def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status:
-    resume = f"`polysight resume {inputs.folder}`"
+    """A scan whose last run has ended."""
+    folder = str(inputs.folder)
+    safe = _safe_rows(history)
+    gaps = sum(mark == "kept" for mark in history.marks.values())
+    words = f"Every row is safe; {gaps} are kept with gaps, masked." if gaps else "Every row is safe."
+    program = inputs.program
+    if not _may_have_result(inputs, history):
+        return say("materials", gaps=words)
+    if program is not None and program.running and program.started_utc[:SECONDS] > ended.ended_utc[:SECONDS]:
+        return say("processing") if program.kind == "process" else say("resuming", safe=safe)
     if ended.exit_status == "success" and len(history.takes) == history.plan.rows:
-        gaps = sum(mark == "kept" for mark in history.marks.values())
-        detail = f"Every row is safe; {gaps} are kept with gaps, masked." if gaps else "Every row is safe."
-        return Status("done", "The scan is finished", detail)
+        return _judge_result(inputs, words)
     if ended.exit_status == "abort":
-        return Status("wait", "Stopped on request", _safe_rows(history), "", resume)
-    why = sentence(ended.why) or "See its terminal"
-    do = sentence(ended.remedy) or resume
-    return Status("bad", "The scan has failed", sentence(ended.reason), why, do)
+        key = "aborted" if ended.asked == "abort" else "stopped"
+        return say(key, asker=ended.asker or "somebody", safe=safe, folder=folder)
+    what = f"{sentence(ended.reason)}."
+    do = sentence(ended.remedy) or f"`polysight resume {folder}`"
+    return say("failed", what=what, safe=safe, why=sentence(ended.why) or "See its terminal", do=do)
+
+
+def _judge_result(inputs: Inputs, gaps: str) -> Status:
+    """A scan of which every row is recorded."""
+    if inputs.verdict is not None:
+        return say(f"result_{inputs.verdict.level}", gaps=gaps)
+    if inputs.signs.killed:
+        do = f"`polysight process {inputs.folder} --out {inputs.folder}/products`"
+        return say("unprocessed", what="Its program was killed while it computed materials.", why="", do=do)
+    if inputs.failure is not None:
+        return say_finding("unprocessed", inputs.failure)
+    return say("finished", gaps=gaps)
 
 
 def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
-    """A program or Pi that does not answer, or a rig that has stopped."""
+    """A program or Pi that does not answer, and what the scan was asked."""
     signs = inputs.signs
+    folder = str(inputs.folder)
+    safe = _safe_rows(history)
+    program = inputs.program
+    if not signs.alive and program is not None and program.kind == "scan" and program.running:
+        return say("resuming", safe=safe)
+    if signs.killed or (not signs.alive and signs.life is None):
+        return say("killed", safe=safe, folder=folder)
     if not signs.alive:
-        return Status(
-            "bad", "The scan program has ended", f"No sign of life for {SINCE}; {_safe_rows(history)}",
-            "It was killed, or the computer was switched off", f"`polysight resume {inputs.folder}`", signs.alive_s,
-        )  # fmt: skip
+        return say_since("frozen", signs.alive_s, safe=safe, folder=folder)
     if signs.pi_silent_s is not None and signs.pi_silent_s > signs.pi_limit_s:
-        return Status(
-            "bad", "The Pi is silent", f"No heartbeat for {SINCE}. The stage stops by itself.",
-            "Network or power of the Pi, or its program ended", "On the Pi: `systemctl status polysight-pi`",
-            inputs.pi.heard_utc_s,
-        )  # fmt: skip
-    if inputs.pi.state != "fault":
-        return None
-    headline = "The rig has stopped with a fault"
-    if not inputs.pi.faults:
-        do = "On the Pi: `journalctl -u polysight-pi`"
-        return Status("bad", headline, "It occurred before this view.", "See the Pi's log", do)
-    fault = inputs.pi.faults[-1]
-    return Status("bad", headline, fault.what, fault.why, fault.do)
+        return say_since("pi_silent", inputs.pi.heard_utc_s)
+    return _judge_request(signs.life or Life(), history, folder)
 
 
-def _judge_command(inputs: Inputs, history: ScanHistory) -> Status | None:
-    """A scan that was asked to stop or pause, or is held."""
-    folder = inputs.folder
-    if inputs.asked is ScanCommand.ABORT:
-        return Status("wait", "Stopping now", "The stage stops; the running row will be retaken.")
-    if inputs.asked is ScanCommand.STOP:
-        return Status("wait", "Stopping after this row", f"Resume later: `polysight resume {folder}`.")
+def _judge_request(life: Life, history: ScanHistory, folder: str) -> Status | None:
+    """A scan that was asked to pause, stop or abort, whoever did."""
+    asker = life.asker or "somebody"
+    if life.asked == "abort":
+        return say("aborting", asker=asker)
+    if life.asked == "stop":
+        return say("stopping", asker=asker)
     if history.paused:
-        do = f"Continue with the button, or `touch {folder}/control/continue`"
-        return Status("wait", "Paused", f"{_safe_rows(history)} Nothing moves.", "", do)
-    if inputs.asked is ScanCommand.PAUSE:
-        return Status("wait", "Pausing after this row", "The stage stands still then, until you continue.")
-    if inputs.pi.state == "held":
-        return Status(
-            "warn", "The stage is held", "Within a row. Held for more than 2 s, the row is retaken.",
-            "A program other than polysight sent the Pi `Hold`",
-            f"That program sends `Resume`; or end the scan: `touch {folder}/control/abort`",
-        )  # fmt: skip
+        return say("paused", asker=asker, safe=_safe_rows(history), folder=folder)
+    if life.asked == "pause":
+        return say("pausing", asker=asker)
     return None
+
+
+def _judge_rig(inputs: Inputs, history: ScanHistory) -> Status | None:
+    """A rig that has stopped, is held, or homes."""
+    pi = inputs.pi
+    every_row = len(history.takes) == history.plan.rows
+    if pi.state == "fault" and pi.faults:
+        return say_finding("rig_fault", pi.faults[-1])
+    if pi.state == "fault":
+        do = "On the Pi: `journalctl -u polysight-pi`"
+        return say("rig_fault", what="It occurred before this view.", why="See the Pi's log", do=do)
+    if pi.state == "held":
+        return say("held")
+    if pi.state == "homing":
+        return say("homing_again" if every_row else "homing")
+    return say("finishing") if every_row else None
 
 
 def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
     """Rows that are retaken, late, or poor."""
     pi = inputs.pi
-    if pi.state == "homing":
-        return Status("good", "Homing the stage", "Rows begin when its position is known.")
+    warnings = [notice for notice in history.notices if notice.level == "warning"]
+    newest = warnings[-1] if warnings else None
     if pi.row >= 0 and history.marks.get(pi.row) == "rejected":
-        return _recent_warning(history, f"Row {pi.row} is retaken (take {pi.take})")
-    if late := _judge_lateness(history, inputs.signs):
-        return late
-    if history.rows_since_trouble < RECENT_ROWS and any(n.level == "warning" for n in history.notices):
-        return _recent_warning(history, "Scanning, after a fault in a row")
-    if poor := sync_notices(inputs.shown, history.plan.columns):
-        return Status("warn", "Scanning, but the data is poor", poor[0].what, poor[0].why, poor[0].do)
-    return None
+        return say_finding("retake", newest, row=pi.row, take=pi.take)
+    late_since_s = _late_since_s(history, inputs.signs)
+    if late_since_s:
+        return say_since("late", late_since_s)
+    if history.rows_since_trouble < RECENT_ROWS and newest is not None:
+        return say_finding("after_fault", newest)
+    poor = sync_notices(inputs.shown, history.plan.columns)
+    return say_finding("poor", poor[0]) if poor else None
 
 
-def _recent_warning(history: ScanHistory, headline: str) -> Status:
-    for notice in reversed(history.notices):
-        if notice.level == "warning":
-            return Status("warn", headline, f"{notice.what}.", notice.why, notice.do)
-    return Status("warn", headline)
-
-
-def _judge_lateness(history: ScanHistory, signs: LifeSigns) -> Status | None:
-    """A warning if no row has ended for much longer than a row takes."""
+def _late_since_s(history: ScanHistory, signs: LifeSigns) -> float:
+    """When the last row ended, if that is much longer ago than a row takes; otherwise 0."""
     if history.row_seconds is None:
-        return None
+        return 0.0
     row_s, basis = history.row_seconds
-    since = max(history.last_commit_s, history.run_started_s)
-    if basis == "first row" or signs.now_s - since < max(LATE_ROWS * row_s, LATE_S):
-        return None
-    return Status(
-        "warn", "No row has ended for a while", f"None for {SINCE}, though the scan program runs.",
-        "It waits for the disk, for processing, or for the stage", "See its terminal", since,
-    )  # fmt: skip
+    since_s = max(history.last_commit_s, history.run_started_s)
+    if basis == "first row" or signs.now_s - since_s < max(LATE_ROWS * row_s, LATE_S):
+        return 0.0
+    return since_s

@@ -23,11 +23,12 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from polysight.acquisition import ScanCommand, last_alive_s, send_command
-from polysight.catalogue import Picture, draw
+from polysight.acquisition import LAPSE_S, read_life
+from polysight.catalogue import Picture, Program, draw, explain_failure, find_program, read_generation
 from polysight.imaging import Antennas, image_grid, scene_gate_m
 from polysight.page.history import PiState, ScanHistory, notice_of_error, notice_of_fault
 from polysight.page.status import (
+    SECONDS,
     Inputs,
     LifeSigns,
     Motion,
@@ -39,7 +40,7 @@ from polysight.page.status import (
     make_snapshot,
 )
 from polysight.pipeline import Pipeline
-from polysight.products import MATERIALS, QUALITY, find_products
+from polysight.products import QUALITY, find_products
 from polysight.results import Verdict
 from polysight.store import (
     EVENTS,
@@ -47,11 +48,7 @@ from polysight.store import (
     Fact,
     Manifest,
     OtherFact,
-    ScanContinued,
-    ScanEnded,
     ScanFolder,
-    ScanPaused,
-    ScanResumed,
     ScanStarted,
 )
 from polysight.sync import SyncedRow
@@ -87,8 +84,6 @@ HEAD_BYTES = 256
 TURN_S = 0.2
 LISTEN_MS = 200
 MAX_FAULTS = 20
-# The scan program touches its file once a second.
-LAPSE_S = 15.0
 # From a manifest's first line to the first sign of life.
 GRACE_S = 6.0
 # Timeout of the Pi's heartbeat.
@@ -187,7 +182,9 @@ class RowViewer:
             phases = {stage: phase_rad for stage, (_, phase_rad, _) in figures.residuals.items()}
             object_rad = phases.get("referenced", math.nan)
             direct_rad = phases.get("averaged", math.nan)
-            sync = RowSync(object_rad, direct_rad, figures.positions_masked)
+            scatter = figures.residuals.get("averaged", (math.nan,) * 3)[2]
+            snr_db = -20 * math.log10(scatter) if scatter > 0 else math.nan
+            sync = RowSync(object_rad, direct_rad, figures.positions_masked, snr_db)
             self._sync.setdefault(name, {})[row] = sync
         if draws or time.monotonic() - self._drawn_at > PICTURE_INTERVAL_S:
             self._publish(draw(pipeline.images.current()), self._profile(pipeline, row))
@@ -303,30 +300,65 @@ class EventTail:
 
 
 class ProductsTail:
-    """The verdict of the products of a scan folder, read again when they change."""
+    """The verdict of the products of a scan folder, read again when they change.
+
+    Images are published before materials are computed, with a verdict on the recording alone, and a resumed scan has
+    the products of its earlier runs: neither is a result of this scan.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._stamp: list[tuple[int, int]] = []
+        self._generation = ""
         self._verdict: Verdict | None = None
+        self._processed_utc = ""
 
-    def look(self) -> Verdict | None:
-        """The verdict; None if not processed yet, by an earlier release, or if the products cannot be read."""
+    def look(self, last_row_utc: str) -> Verdict | None:
+        """The verdict of products that were made after the last row; None where there are none."""
         products = find_products(self._folder, QUALITY)
         if products is None:
             return None
-        stamp = []
-        for name in (MATERIALS, QUALITY):
-            with suppress(OSError):
-                status = (products.folder / name).stat()
-                stamp.append((status.st_mtime_ns, status.st_size))
-        if stamp != self._stamp:
-            self._stamp = stamp
-            self._verdict = None
-            # They are being replaced, or damaged.
+        generation = read_generation(products.folder)
+        if generation != self._generation:
+            verdict = None
+            processed_utc = ""
+            # They are damaged.
             with suppress(PolysightError):
-                self._verdict = products.verdict
-        return self._verdict
+                processed_utc = products.facts.processed_utc or ""
+                verdict = products.verdict if products.materials is not None else None
+            if read_generation(products.folder) != generation:
+                # They were replaced meanwhile: the next look reads the new ones.
+                return None
+            self._generation = generation
+            self._verdict = verdict
+            self._processed_utc = processed_utc
+        # Releases before this one did not say when.
+        is_final = not self._processed_utc or self._processed_utc[:SECONDS] >= last_row_utc[:SECONDS]
+        return self._verdict if is_final else None
+
+
+class ProgramTail:
+    """The program that a page started last for a scan, `scan` or `process`, and why it failed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._stamp: list[int] = []
+        self._newest: Program | None = None
+
+    def look(self) -> tuple[Program | None, Finding | None]:
+        """The program, and the reason of a failure."""
+        stamp = []
+        for name in ("scan.json", "scan.status", "process.json", "process.status"):
+            try:
+                stamp.append((self._folder / "program" / name).stat().st_mtime_ns)
+            except OSError:
+                stamp.append(0)
+        # A killed program changes no file.
+        was_running = self._newest is not None and self._newest.running
+        if stamp != self._stamp or was_running:
+            self._stamp = stamp
+            programs = [find_program(self._folder, kind) for kind in ("scan", "process")]
+            self._newest = max((p for p in programs if p is not None), key=lambda p: p.started_utc, default=None)
+        return self._newest, explain_failure(self._newest)
 
 
 class PiListener:
@@ -404,9 +436,9 @@ class Versioned(NamedTuple):
 
 
 class Watch:
-    """Follows a scan folder, which may not exist yet, in a thread of its own; only :meth:`ask` writes into it.
+    """Follows a scan folder, which may not exist yet, in a thread of its own, and writes nothing.
 
-    `lapse_s` is the timeout of the scan program's signs of life.
+    `control`: pages may offer to pause and stop the scan. `lapse_s` is the timeout of the scan program's signs of life.
     """
 
     def __init__(self, folder: Path, control: bool = False, lapse_s: float = LAPSE_S) -> None:
@@ -417,9 +449,9 @@ class Watch:
         self.shown = Shown()
         self._lapse_s = lapse_s
         self._ended = threading.Event()
-        # The last command, and how many facts there were then.
-        self._asked: tuple[ScanCommand, int] | None = None
         self._looked = False
+        # The folder was there.
+        self._existed = False
         self._begin()
         self._turn()
         self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
@@ -433,6 +465,7 @@ class Watch:
         self._manifest = ManifestTail(self.folder / MANIFEST)
         self._events = EventTail(self.folder / EVENTS)
         self._products = ProductsTail(self.folder)
+        self._programs = ProgramTail(self.folder)
         self._history: ScanHistory | None = None
         self._viewer: RowViewer | None = None
         self._listener: PiListener | None = None
@@ -457,16 +490,22 @@ class Watch:
         if self._viewer is not None:
             self.shown = self._viewer.shown
         pi = self._listener.state if self._listener is not None else PiState()
+        exists = self.folder.is_dir()
+        self._existed |= exists
+        program, failure = self._programs.look()
+        last_row_utc = "" if self._history is None else self._history.last_row_utc
         inputs = Inputs(
             folder=self.folder,
             history=self._history,
             signs=self._signs(pi),
             pi=pi,
             shown=self.shown,
-            asked=self._pending(),
             control=self.control,
             problem=self._problem,
-            verdict=self._products.look(),
+            program=program,
+            failure=failure,
+            gone=self._existed and not exists,
+            verdict=self._products.look(last_row_utc),
         )
         self.state = self.state.publish(make_snapshot(inputs))
         self.motion = self.motion.publish(make_motion(inputs))
@@ -515,42 +554,24 @@ class Watch:
         """Signs of life of the scan program and the Pi."""
         now = time.monotonic()
         wall_s = time.time()
-        life_s = last_alive_s(self.folder)
+        life = read_life(self.folder)
+        life_s = None if life is None else life.written_s
         if life_s is not None and life_s != self._life_s:
             # The first sign may be old; from then on changes count, not clocks.
             age_s = max(0.0, wall_s - life_s) if self._life_s is None else 0.0
             self._life_s = life_s
             self._life_at = now - age_s
-        if life_s is None:
+        killed = life is not None and life.killed
+        if life is None:
             patience_s = GRACE_S
             if self._history is not None and self._history.row_seconds is not None:
                 patience_s = max(GRACE_S, UNATTENDED_ROWS * self._history.row_seconds[0])
             alive = now - self._grown_at < patience_s
         else:
-            alive = now - self._life_at < self._lapse_s
+            alive = not killed and now - self._life_at < self._lapse_s
         alive_s = 0 if alive else round(life_s or self._manifest.file.modified_s)
         pi_silent_s = now - pi.heard_s if pi.heard_s else None
-        return LifeSigns(alive, alive_s, pi_silent_s, PI_LIMIT_S, wall_s)
-
-    def _pending(self) -> ScanCommand | None:
-        """The pending request, until the manifest shows that it was carried out."""
-        if self._asked is None or self._history is None:
-            return None
-        command, facts = self._asked
-        since = self._manifest.content.facts[facts:]
-        if any(isinstance(fact, ScanEnded | ScanResumed | ScanPaused | ScanContinued) for fact in since):
-            self._asked = None
-            return None
-        return command
-
-    def ask(self, command: ScanCommand) -> None:
-        """Ask the scan to pause, continue, stop or abort; returns when it has taken the request. Raises ScanError."""
-        facts = len(self._manifest.content.facts)
-        send_command(self.folder, command)
-        self._asked = (command, facts)
-        if command is ScanCommand.CONTINUE and not (self._history is not None and self._history.paused):
-            # It withdraws a request to pause.
-            self._asked = None
+        return LifeSigns(life, alive, killed, alive_s, pi_silent_s, PI_LIMIT_S, wall_s)
 
     def _close_parts(self) -> None:
         for part in (self._viewer, self._listener):

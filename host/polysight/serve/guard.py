@@ -2,22 +2,22 @@
 
 One middleware in front of the application. Reading needs the token too unless the server is bound to loopback. The
 token comes in a header, which no form, link or image of another page can send; requests that only read (images, event
-streams) may bring the session's cookie instead. How many connections may be open is uvicorn's to limit (`server`).
+streams) may bring the session's cookie instead. How many connections may be open is limited in `front`.
 """
 
 from __future__ import annotations
 
 import hmac
 import ipaddress
-import secrets
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import cookie_parser
-from starlette.responses import JSONResponse, Response
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from polysight.serve.errors import refuse
 from polysight_shared.error_codes import ErrorCode
 
 TOKEN_HEADER = "X-Polysight-Token"
@@ -34,7 +34,7 @@ HEADERS = {
     "Cache-Control": "no-store",
 }
 # With these a page finds out that its token is missing.
-OPEN_PATHS = ("/api/session", "/api/page")
+OPEN_PATHS = ("/api/page",)
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,6 @@ class Access:
         True if POST requests are allowed.
     secure
         True with TLS.
-    session
-        Secret of the session cookie, new at each start of the server.
     """
 
     token: str = ""
@@ -62,7 +60,11 @@ class Access:
     hosts: tuple[str, ...] = ()
     control: bool = False
     secure: bool = False
-    session: str = field(default_factory=lambda: secrets.token_urlsafe(18))
+
+    @property
+    def session(self) -> str:
+        """Secret of the session cookie: it follows from the token, and so survives a restart as that does."""
+        return hmac.new(self.token.encode(), b"session of the operator's page", "sha256").hexdigest()
 
     def accepts_host(self, host: str) -> bool:
         """True if a `Host` header names this server (a foreign name that resolves to it does not)."""
@@ -87,6 +89,8 @@ class Access:
 
     def has_session(self, scope: Scope) -> bool:
         """True if the request has the session's cookie; compared in constant time."""
+        if not self.token:
+            return False
         cookies = cookie_parser(Headers(scope=scope).get("cookie", ""))
         return hmac.compare_digest(cookies.get(cookie_name(scope), "").encode(), self.session.encode())
 
@@ -110,6 +114,11 @@ class Guard:
             return
         headers = Headers(scope=scope)
         refusal = self._check_head(scope, headers) or self._check_token(scope, headers)
+        if refusal is None and scope["method"] == "POST":
+            body = await _read_body(receive)
+            receive = _replay(body or b"", receive)
+            if body is None:
+                refusal = refuse_body()
         await (_close_after(refusal) if refusal else self._app)(scope, receive, _add_headers(send))
 
     def _check_head(self, scope: Scope, headers: Headers) -> Response | None:
@@ -154,9 +163,28 @@ class Guard:
         return None if access.has_token(headers) else _refuse_token(403)
 
 
-def refuse(status: int, code: ErrorCode, what: str, why: str, do: str) -> Response:
-    """An error as JSON: its code, and the three parts that people read."""
-    return JSONResponse({"code": code, "what": what, "why": why, "do": do}, status)
+async def _read_body(receive: Receive) -> bytes | None:
+    """The whole body of a request; None for one that is too large. Half of one if the client is gone."""
+    body = bytearray()
+    while True:
+        message = await receive()
+        body += message.get("body", b"")
+        if len(body) > BODY_BYTES:
+            return None
+        if not message.get("more_body", False):
+            return bytes(body)
+
+
+def _replay(body: bytes, receive: Receive) -> Receive:
+    """Give the application a body that was read already."""
+    waiting = [body]
+
+    async def receive_again() -> Message:
+        if waiting:
+            return {"type": "http.request", "body": waiting.pop(), "more_body": False}
+        return await receive()
+
+    return receive_again
 
 
 def refuse_body() -> Response:
@@ -173,8 +201,8 @@ def _close_after(answer: Response) -> Response:
 
 def _refuse_token(status: int) -> Response:
     return refuse(
-        status, ErrorCode.TOKEN_WRONG, "The token is wrong or missing", "another server start has another token",
-        "open the address that the server printed when it started",
+        status, ErrorCode.TOKEN_WRONG, "The token is wrong or missing", "the address was opened without it, or it was"
+        " replaced", "open the address that the server printed when it started",
     )  # fmt: skip
 
 

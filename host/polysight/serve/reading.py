@@ -27,24 +27,31 @@ from polysight.catalogue import (
     PHASE,
     Comparison,
     Picture,
+    Program,
     Summary,
     colour_bar,
     draw_comparison,
+    find_program,
+    find_programs,
     list_files,
     probe,
+    read_generation,
     read_notes,
     read_result,
 )
 from polysight.page import Watch
 from polysight.products import REPORT, read_products
-from polysight.serve.guard import refuse
-from polysight.serve.site import THUMBNAIL, Program, Site, compare_products, draw_map, find_program, find_programs
+from polysight.serve.errors import refuse
+from polysight.serve.queue import Waiting
+from polysight.serve.site import THUMBNAIL, Site, compare_products, draw_map
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, PolysightError, ScanError
 
 # A report may come from anywhere: no script runs in it, and nothing is loaded.
 REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"
 CHUNK_BYTES = 1 << 18
+# Reads of products that are replaced meanwhile.
+MAX_TRIES = 5
 T = TypeVar("T")
 Endpoint = Callable[[Site, Request], Awaitable[Response]]
 
@@ -52,9 +59,9 @@ Endpoint = Callable[[Site, Request], Awaitable[Response]]
 def reading_routes(site: Site) -> list[Route]:
     """Routes of everything that GET answers."""
     endpoints: dict[str, Endpoint] = {
-        "page": _page,
         "scans": _scans,
         "scan": _scan,
+        "queue": _queue,
         "thumbnail": _thumbnail,
         "program/{kind}": _program,
         "state": _state,
@@ -108,22 +115,6 @@ class ScanDetails(ListedScan, frozen=True, kw_only=True):
     programs: list[Program]
 
 
-class PageFacts(msgspec.Struct, frozen=True):
-    """What a page may show; `known`: its token is right, or not needed."""
-
-    control: bool
-    starts: bool
-    known: bool
-    only: str | None
-
-
-async def _page(site: Site, request: Request) -> Response:
-    access = site.access
-    may_read = not access.token or access.loopback or access.has_session(request.scope)
-    known = may_read or access.has_token(request.headers)
-    return json_answer(PageFacts(access.control, site.starts, known, site.scans.only))
-
-
 async def _scans(site: Site, request: Request) -> Response:
     del request
     root = site.scans.root
@@ -147,6 +138,11 @@ async def _scan(site: Site, request: Request) -> Response:
     return json_answer(await site.read_scan(request, read_details))
 
 
+async def _queue(site: Site, request: Request) -> Response:
+    del request
+    return json_answer(await site.read("", lambda: site.queue.waiting() if site.starts else Waiting([])))
+
+
 async def _thumbnail(site: Site, request: Request) -> Response:
     def draw(folder: Path) -> bytes:
         try:
@@ -163,7 +159,9 @@ async def _thumbnail(site: Site, request: Request) -> Response:
 
 async def _program(site: Site, request: Request) -> Response:
     kind = request.path_params["kind"]
-    return json_answer(find_program(site.logs, kind) if kind in ("doctor", "train") else None)
+    if kind not in ("doctor", "train"):
+        return json_answer(None)
+    return json_answer(find_program(site.logs, kind))
 
 
 # --- the live view ---
@@ -205,7 +203,36 @@ async def _bar(site: Site, request: Request) -> Response:
 
 
 async def _result(site: Site, request: Request) -> Response:
-    return json_answer(await site.read_scan(request, read_result))
+    return json_answer(await _read_products(site, request, read_result))
+
+
+async def _read_products(site: Site, request: Request, work: Callable[[Path], T]) -> T:
+    """Read products of one generation: the one that the request names, or the present one.
+
+    Raises ScanError if the page shows another one, which it then loads, or if they are replaced again and again.
+    """
+    shown = request.query_params.get("generation", "")
+
+    def read(folder: Path) -> T:
+        for _ in range(MAX_TRIES):
+            before = read_generation(read_products(folder).folder)
+            if shown and before != shown:
+                break
+            try:
+                result = work(folder)
+            except (PolysightError, OSError):
+                # Half of it may be of the folder before, half of the one behind.
+                if read_generation(read_products(folder).folder) == before:
+                    raise
+                continue
+            if read_generation(read_products(folder).folder) == before:
+                return result
+        raise ScanError(
+            "the scan was processed again meanwhile", "another program replaced its products", "load the page again",
+            code=ErrorCode.MISMATCH,
+        )  # fmt: skip
+
+    return await site.read_scan(request, read)
 
 
 async def _map(site: Site, request: Request) -> Response:
@@ -215,14 +242,15 @@ async def _map(site: Site, request: Request) -> Response:
         low = _number(request, "low")
         high = _number(request, "high")
         limits = (low, high) if low < high else None
-    return _picture_answer(await site.read_scan(request, lambda folder: draw_map(folder, name, limits)))
+    return _picture_answer(await _read_products(site, request, lambda folder: draw_map(folder, name, limits)))
 
 
 async def _probe(site: Site, request: Request) -> Response:
     x_mm = _number(request, "x")
     y_mm = _number(request, "y")
     name = request.query_params.get("library", "")
-    return json_answer(await site.read_scan(request, lambda f: probe(f, x_mm, y_mm, site.libraries().get(name))))
+    library = site.libraries().get(name)
+    return json_answer(await _read_products(site, request, lambda folder: probe(folder, x_mm, y_mm, library)))
 
 
 async def _file(site: Site, request: Request) -> Response:

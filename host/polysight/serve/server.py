@@ -1,56 +1,56 @@
-"""`polysight serve` and `polysight preview`: the web application, its address, and the server until Ctrl-C.
+"""`polysight serve` and `polysight preview`: the address, the token, and the two processes until Ctrl-C.
 
-uvicorn limits the number of connections and closes idle ones; each request passes the access checks of `guard`.
+This process is the one that browsers reach (`front`); it starts the reading process, and starts it again should it
+end. Both are uvicorn; the reading process listens on a socket in a folder that only this user may enter.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import ipaddress
 import logging
+import multiprocessing
 import os
 import resource
 import secrets
 import socket
 import ssl
+import stat
 import sys
+import tempfile
 import threading
-import traceback
+from collections.abc import Iterator
 from dataclasses import dataclass
+from multiprocessing import connection
 from pathlib import Path
 
 import uvicorn
 from starlette.applications import Starlette
-from starlette.middleware import Middleware
-from starlette.requests import ClientDisconnect, Request
-from starlette.responses import RedirectResponse, Response
-from starlette.routing import Route
+from starlette.types import ASGIApp
 
 from polysight.catalogue import Scans
 from polysight.page import Watch
-from polysight.serve.control import control_routes
-from polysight.serve.guard import HEAD_BYTES, Access, Guard, refuse
+from polysight.serve.commands import command_routes, start_waiting
+from polysight.serve.errors import HANDLERS
+from polysight.serve.front import Front, Reader, counted_connections, make_app
+from polysight.serve.guard import HEAD_BYTES, Access
 from polysight.serve.reading import reading_routes
 from polysight.serve.site import Programs, Site, Watches
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError, os_error
+from polysight_shared.errors import ConfigError, DeviceError
 
-STATIC = Path(__file__).parent / "static"
-PAGES = {
-    "/": "catalogue.html",
-    "/scan": "scan.html",
-    "/watch": "watch.html",
-    "/new": "new.html",
-    "/compare": "compare.html",
-}
-MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-# Priority of the server, below capture and scan.
+# Priority of the reading process, below capture and scan.
 NICE = 10
-# Connections that are answered at a time; a page holds up to six. Above it uvicorn answers 503.
+# A page holds up to six.
 MAX_CONNECTIONS = 2048
-# Longer than the pages' intervals: a server that closes at the moment of the next request breaks it.
-KEEP_ALIVE_S = 75
+# Connections that may be accepted before the next one that has sent something is read.
+ACCEPTED_AT_ONCE = 128
+# Idle connections are closed when there are too many, never for their age.
+KEEP_ALIVE_S = 10**6
 CLOSE_S = 1
+RESTART_S = 1.0
+TOKEN_BYTES = 18
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,21 @@ class Place:
             ) from None
 
 
+@dataclass(frozen=True)
+class Shown:
+    """What is served: a folder of scans, or `only` one in it; programs are started with the rig file `config`."""
+
+    root: Path
+    only: str | None
+    control: bool
+    config: Path | None = None
+
+    @property
+    def starts(self) -> bool:
+        """True if programs and scans can be started from the page."""
+        return self.control and self.only is None and self.config is not None
+
+
 def serve(root: Path, place: Place, config: Path | None, control: bool = True) -> int:
     """Serve all scans under a folder until Ctrl-C; returns the exit status.
 
@@ -103,39 +118,72 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
     PolysightError
         if the folder or a file is missing, or the address cannot be bound.
     """
-    place.check()
     if not root.is_dir():
         raise ConfigError(f"{root}: no such folder", "scans are listed under it", "make it, or give another")
-    listener = _bind(place)
-    programs = Programs() if control else None
-    lower_priority()
     if config is not None:
         config = config.absolute()
-    site = Site(Scans(root.absolute()), _access(place, listener, control), Watches(control), programs, config)
-    # The list is cached before the page asks for it.
-    threading.Thread(target=site.scans.list, name="first list", daemon=True).start()
-    return _run(site, place, listener, f"scans in {root}")
+    shown = Shown(root.absolute(), None, control, config)
+    return _run(shown, place, f"scans in {root}")
 
 
 def preview(folder: Path, place: Place, control: bool) -> int:
     """Serve the live view of one scan folder until Ctrl-C; returns the exit status. Raises as :func:`serve`."""
+    folder = folder.absolute()
+    return _run(Shown(folder.parent, folder.name, control), place, f"live view of {folder}")
+
+
+def _run(shown: Shown, place: Place, what: str) -> int:
     place.check()
     listener = _bind(place)
-    lower_priority()
-    folder = folder.absolute()
-    watch = Watch(folder, control)
-    watch.start()
-    watches = Watches(control, {folder.name: watch})
-    site = Site(Scans(folder.parent, folder.name), _access(place, listener, control), watches)
-    return _run(site, place, listener, f"live view of {folder}")
+    try:
+        access = _access(place, listener, shown.control)
+        with tempfile.TemporaryDirectory(prefix="polysight-") as folder, _reading(shown, Path(folder) / "reader"):
+            front = Front(Scans(shown.root, shown.only), access, shown.starts, Reader(Path(folder) / "reader"))
+            sys.stderr.write(_welcome(access, place, listener, what))
+            sys.stderr.flush()
+            make_server(front, place).run(sockets=[listener])
+    finally:
+        listener.close()
+    return 0
 
 
 def _access(place: Place, listener: socket.socket, control: bool) -> Access:
-    token = secrets.token_urlsafe(18) if control or not place.loopback else ""
+    token = load_token() if control or not place.loopback else ""
     hosts = set(place.hosts)
     if not place.loopback:
         hosts |= {place.host, socket.gethostname(), str(listener.getsockname()[0])} - {"0.0.0.0", "::"}
-    return Access(token, place.loopback, tuple(hosts), control, secure=place.certificate is not None)
+    # Behind a reverse proxy everybody comes from this machine.
+    is_private = place.loopback and not place.hosts
+    return Access(token, is_private, tuple(hosts), control, secure=place.certificate is not None)
+
+
+def load_token() -> str:
+    """The token of this user's servers, made at the first call; open pages keep control when a server is restarted.
+
+    Raises ConfigError if its file can be read by others. Who removes it makes the next server print a new one.
+    """
+    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    path = Path(state) / "polysight" / "token"
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with contextlib.suppress(FileExistsError):
+        part = path.with_name(f".token.{os.getpid()}")
+        part.unlink(missing_ok=True)
+        descriptor = os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
+        with os.fdopen(descriptor, "w", encoding="ascii") as f:
+            f.write(secrets.token_urlsafe(TOKEN_BYTES))
+        try:
+            os.link(part, path)
+        finally:
+            part.unlink()
+    status = path.lstat()
+    token = path.read_text(encoding="ascii", errors="replace").strip()
+    is_safe = stat.S_ISREG(status.st_mode) and not status.st_mode & 0o077 and status.st_uid == os.getuid()
+    if not is_safe or len(token) < TOKEN_BYTES:
+        raise ConfigError(
+            f"{path} is no token of this user alone", "others may read it, or it was edited",
+            "remove it: the next start makes another", code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
+    return token
 
 
 def _bind(place: Place) -> socket.socket:
@@ -144,7 +192,7 @@ def _bind(place: Place) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((place.host, place.port))
-        listener.listen(MAX_CONNECTIONS)
+        listener.listen(ACCEPTED_AT_ONCE)
     except OSError as e:
         listener.close()
         raise DeviceError(
@@ -155,53 +203,115 @@ def _bind(place: Place) -> socket.socket:
     return listener
 
 
+@contextlib.contextmanager
+def _reading(shown: Shown, path: Path) -> Iterator[None]:
+    """Keep the reading process running for the block."""
+    ended = threading.Event()
+    # Threads do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+
+    def keep_running() -> None:
+        while not ended.is_set():
+            process = context.Process(target=run_reader, args=(shown, path), name="reading", daemon=True)
+            process.start()
+            while process.is_alive() and not ended.is_set():
+                process.join(0.2)
+            if ended.is_set():
+                process.terminate()
+                process.join()
+                return
+            ended.wait(RESTART_S)
+
+    keeper = threading.Thread(target=keep_running, name="keeper", daemon=True)
+    keeper.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        keeper.join(10)
+
+
+def run_reader(shown: Shown, path: Path) -> None:
+    """Run the reading process until it is ended, or the process that started it is gone."""
+    programs = Programs() if shown.control and shown.only is None else None
+    lower_priority()
+    watches = Watches(shown.control)
+    if shown.only is not None:
+        watch = Watch(shown.root / shown.only, shown.control)
+        watch.start()
+        watches = Watches(shown.control, {shown.only: watch})
+    site = Site(Scans(shown.root, shown.only), watches, programs, shown.config)
+    # The list is cached before the page asks for it.
+    threading.Thread(target=site.scans.list, name="first list", daemon=True).start()
+    path.unlink(missing_ok=True)
+    server = uvicorn.Server(_configure(make_reader_app(site), uds=str(path)))
+    site.is_ending = lambda: server.should_exit
+    parent = multiprocessing.parent_process()
+
+    def end_with_parent() -> None:
+        if parent is not None:
+            connection.wait([parent.sentinel])
+            server.should_exit = True
+
+    threading.Thread(target=end_with_parent, name="parent", daemon=True).start()
+    try:
+        server.run()
+    finally:
+        site.close()
+
+
+def make_reader_app(site: Site) -> Starlette:
+    """Build the application of the reading process, with its queue; nobody but `front` reaches it."""
+    site.open_queue(lambda request: start_waiting(site, request))
+    return Starlette(routes=reading_routes(site) + command_routes(site), exception_handlers=HANDLERS)
+
+
 def lower_priority() -> None:
     """Give capture and scan the processor first, and have the kernel end this process first when memory runs out."""
-    with contextlib.suppress(OSError, ValueError):
-        # Connections are files.
-        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, 1 << 16), most))
     with contextlib.suppress(OSError):
         os.nice(NICE)
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
 
-def _run(site: Site, place: Place, listener: socket.socket, what: str) -> int:
-    try:
-        sys.stderr.write(_welcome(site, place, listener, what))
-        sys.stderr.flush()
-        make_server(site, place).run(sockets=[listener])
-    finally:
-        site.close()
-        listener.close()
-    return 0
-
-
-def _welcome(site: Site, place: Place, listener: socket.socket, what: str) -> str:
+def _welcome(access: Access, place: Place, listener: socket.socket, what: str) -> str:
     host, port = listener.getsockname()[:2]
     name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname(), "::1": "localhost"}.get(host, str(host))
     if ":" in name:
         name = f"[{name}]"
-    scheme = "https" if site.access.secure else "http"
-    token = f"#token={site.access.token}" if site.access.token else ""
-    lines = [f"{what}: {scheme}://{name}:{port}/{token}"]
-    if site.access.control:
+    scheme = "https" if access.secure else "http"
+    token = f"#token={access.token}" if access.token else ""
+    address = f"{scheme}://{name}:{port}/{token}"
+    lines = [f"{what}: {address}"]
+    if access.control:
         lines.append("anyone with this address and its token can start, pause and stop scans")
     else:
         lines.append("read-only; --control adds buttons to pause and stop the scan")
     if not place.loopback:
-        plain = "" if site.access.secure else "; nothing is encrypted: --certificate and --key do that"
+        plain = "" if access.secure else "; nothing is encrypted: --certificate and --key do that"
         lines.append(f"anyone who reaches this machine and has the token can read all scans{plain}")
-    return "\n".join(lines) + "\nCtrl-C ends the page; started programs go on\n"
+        lines.append(draw_code(address))
+    return "\n".join(line for line in lines if line) + "\nCtrl-C ends the page; started programs go on\n"
 
 
-def make_server(site: Site, place: Place) -> uvicorn.Server:
-    """Build the server of a site: limited, without logging, and stopping within a second."""
+def draw_code(address: str) -> str:
+    """The address as a QR code for a phone's camera, in half blocks; "" without the library, or for no terminal."""
+    try:
+        import segno
+    except ImportError:
+        return ""
+    if not sys.stderr.isatty():
+        return ""
+    text = io.StringIO()
+    segno.make(address, error="l").terminal(text, compact=True)
+    return text.getvalue().rstrip("\n")
+
+
+def _configure(app: ASGIApp, **more: object) -> uvicorn.Config:
+    """Options of both servers: without logging, and stopping within a second."""
     logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
-    config = uvicorn.Config(
-        make_app(site),
-        http="h11",
+    return uvicorn.Config(
+        app,
         ws="none",
         lifespan="off",
         log_config=None,
@@ -210,93 +320,27 @@ def make_server(site: Site, place: Place) -> uvicorn.Server:
         proxy_headers=False,
         server_header=False,
         h11_max_incomplete_event_size=HEAD_BYTES,
-        limit_concurrency=MAX_CONNECTIONS,
-        timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=CLOSE_S,
-        ssl_certfile=place.certificate,
-        ssl_keyfile=place.key,
-    )
-    server = uvicorn.Server(config)
-    site.is_ending = lambda: server.should_exit
-    return server
-
-
-# --- the application ---
-
-
-def make_app(site: Site) -> Starlette:
-    """Build the application of a site: static pages, GET and POST routes, error answers, behind the guard."""
-    # They are small, and stay in memory.
-    files = {
-        path.name: Response(path.read_bytes(), media_type=MEDIA_TYPES[path.suffix])
-        for path in STATIC.iterdir()
-        if path.suffix in MEDIA_TYPES
-    }
-    files["favicon.ico"] = files["icon.svg"]
-
-    async def show_page(request: Request) -> Response:
-        path = request.url.path
-        only = site.scans.only
-        if path == "/" and only is not None:
-            # A browser keeps the fragment, and the token in it.
-            return RedirectResponse("/watch")
-        if path in ("/scan", "/watch") and only is None and not request.query_params.get("scan"):
-            return RedirectResponse("/")
-        return files[PAGES[path]]
-
-    async def send_file(request: Request) -> Response:
-        answer = files.get(request.path_params["name"])
-        if answer is not None:
-            return answer
-        return await _tell_no_page(request, DataError("no such file", "the address is wrong", "go to the first page"))
-
-    routes = [Route(path, show_page) for path in PAGES]
-    routes.append(Route("/{name}", send_file))
-    routes += reading_routes(site) + control_routes(site)
-    return Starlette(
-        routes=routes,
-        middleware=[Middleware(Guard, access=site.access)],
-        exception_handlers={
-            PolysightError: _tell_error,
-            OSError: _tell_error,
-            ClientDisconnect: _tell_nobody,
-            404: _tell_no_page,
-            Exception: _tell_defect,
-        },
+        **more,  # type: ignore[arg-type]
     )
 
 
-async def _tell_error(request: Request, e: Exception) -> Response:
-    # A file that cannot be written or read is no defect of this program.
-    error = os_error(e) if isinstance(e, OSError) else e
-    if not isinstance(error, PolysightError):
-        raise e
-    wrong_values = (ErrorCode.VALUE_INVALID, ErrorCode.VALUES_CONFLICT, ErrorCode.TYPE_WRONG, ErrorCode.KEY_MISSING)
-    if isinstance(error, ConfigError) or (request.method == "POST" and error.code in wrong_values):
-        status = 400
-    elif isinstance(error, DataError):
-        status = 404
-    elif isinstance(error, DeviceError) and error.code is ErrorCode.NO_ANSWER:
-        status = 503
-    else:
-        status = 409
-    return refuse(status, error.code, error.what, error.why, error.remedy)
-
-
-async def _tell_nobody(request: Request, e: Exception) -> Response:
-    """The client disconnected in the middle of its request."""
-    del request, e
-    return Response(status_code=400)
-
-
-async def _tell_no_page(request: Request, e: Exception) -> Response:
-    del request, e
-    return refuse(404, ErrorCode.OTHER, "There is no such page", "the address is wrong", "begin at the list of scans")
-
-
-async def _tell_defect(request: Request, e: Exception) -> Response:
-    sys.stderr.write(f"{request.method} {request.url.path}\n{''.join(traceback.format_exception(e))}")
-    sys.stderr.flush()
-    what = f"An internal error of the server: {type(e).__name__}"
-    do = "report it, with the server's terminal output"
-    return refuse(500, ErrorCode.OTHER, what, "a defect of this program", do)
+def make_server(front: Front, place: Place) -> uvicorn.Server:
+    """Build the server that browsers reach."""
+    with contextlib.suppress(OSError, ValueError):
+        # Connections are files.
+        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, 1 << 16), most))
+    return uvicorn.Server(
+        _configure(
+            make_app(front),
+            http=counted_connections(MAX_CONNECTIONS),
+            # Reached only when every connection has a request at work: then it answers 503. Connections that were
+            # closed a moment ago still count there.
+            limit_concurrency=MAX_CONNECTIONS + 2 * ACCEPTED_AT_ONCE,
+            backlog=ACCEPTED_AT_ONCE,
+            timeout_keep_alive=KEEP_ALIVE_S,
+            ssl_certfile=place.certificate,
+            ssl_keyfile=place.key,
+        )
+    )

@@ -1,4 +1,4 @@
-"""State shared by all requests: scans, access, open live views, threads for reads, caches, and the programs started.
+"""State shared by requests of the reading process: scans, live views, threads for reads, caches, started programs.
 
 `Programs` are commands of `polysight` that the page starts, each a process that outlives page and server. A program's
 process number and log lie in `<folder>/program/`, where another server finds them. It is paused and stopped as from a
@@ -21,10 +21,8 @@ from pathlib import Path
 from typing import TypeVar
 
 import anyio
-import msgspec
 from starlette.requests import Request
 
-from polysight.acquisition import ScanCommand, send_command
 from polysight.catalogue import (
     PROGRAM,
     Comparison,
@@ -33,16 +31,16 @@ from polysight.catalogue import (
     Scans,
     compare,
     draw_products,
+    find_program,
     folder_bytes,
     is_plain,
-    log_tail,
+    read_generation,
     thumbnail,
 )
 from polysight.page import Watch
-from polysight.products import IMAGE, MATERIALS, QUALITY, read_products
+from polysight.products import read_products
 from polysight.serve import launcher
-from polysight.serve.guard import Access
-from polysight.serve.launcher import started_ticks
+from polysight.serve.queue import Queue
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError, ScanError
 
@@ -68,8 +66,6 @@ STREAM_INTERVAL_S = 0.1
 ALIVE_INTERVAL_S = 2.0
 T = TypeVar("T")
 
-KINDS = ("scan", "process", "export", "doctor", "train")
-
 
 class Site:
     """Shared state of the requests to one server.
@@ -80,26 +76,25 @@ class Site:
     def __init__(
         self,
         scans: Scans,
-        access: Access,
         watches: Watches,
         programs: Programs | None = None,
         config: Path | None = None,
     ) -> None:
         self.scans = scans
-        self.access = access
         self.watches = watches
         self.is_ending: Callable[[], bool] = lambda: False
         # Held from the check that the rig is free until a program has it.
         self.rig = threading.Lock()
         self._programs = programs
         self._config = config
+        self._queue: Queue | None = None
         self._readers = Readers()
         self._sizes = Sizes()
 
     @property
     def starts(self) -> bool:
         """True if programs and scans can be started from the page."""
-        return self._programs is not None and self._config is not None and self.access.control
+        return self._programs is not None and self._config is not None
 
     @property
     def programs(self) -> Programs:
@@ -114,6 +109,18 @@ class Site:
         if self._config is None:
             raise ConfigError("this server has no rig file", "it was started without", "polysight serve --config FILE")
         return self._config
+
+    @property
+    def queue(self) -> Queue:
+        """Scans that wait for the rig. Raises ConfigError where none can be started."""
+        if self._queue is None:
+            raise ConfigError("nothing can be started here", "there is no queue", "polysight serve --config FILE")
+        return self._queue
+
+    def open_queue(self, start: Callable[[bytes], None]) -> None:
+        """Start the scans that wait, as `start` does with a request."""
+        if self.starts:
+            self._queue = Queue(self.logs / "queue", start, lambda name: self.scans.summary(name).state)
 
     def name(self, request: Request, key: str = "scan") -> str:
         """Name of the scan that a request asks for: as given, or the only one. Raises ConfigError without one."""
@@ -156,8 +163,10 @@ class Site:
         return {path.stem: path for path in files}
 
     def close(self) -> None:
-        """Close the live views; started programs go on."""
+        """Close the live views and the queue; started programs go on."""
         self.watches.close()
+        if self._queue is not None:
+            self._queue.close()
         if self._programs is not None:
             self._programs.close()
 
@@ -172,25 +181,21 @@ def compare_products(first: Path, second: Path) -> Comparison:
     return _compare(first, second, _stamp_products(first), _stamp_products(second))
 
 
-Stamp = tuple[int, ...]
-
-
-def _stamp_products(folder: Path) -> tuple[Path, Stamp]:
+def _stamp_products(folder: Path) -> tuple[Path, str]:
     """The folder of a scan's products, and what changes when these do."""
     products = read_products(folder).folder
-    files = [products / name for name in (IMAGE, MATERIALS, QUALITY)]
-    return products, tuple(path.stat().st_mtime_ns for path in files if path.exists())
+    return products, read_generation(products)
 
 
 @lru_cache(maxsize=MAX_PICTURES)
-def _draw(products: Path, stamp: Stamp, name: str, limits: tuple[float, float] | None) -> Picture:
+def _draw(products: Path, stamp: str, name: str, limits: tuple[float, float] | None) -> Picture:
     del stamp
     pixels = Pixels(products)
     return thumbnail(pixels) if name == THUMBNAIL else draw_products(pixels, name, limits)
 
 
 @lru_cache(maxsize=MAX_COMPARISONS)
-def _compare(first: Path, second: Path, *stamps: tuple[Path, Stamp]) -> Comparison:
+def _compare(first: Path, second: Path, *stamps: tuple[Path, str]) -> Comparison:
     del stamps
     return compare(first, second)
 
@@ -327,14 +332,6 @@ class Watches:
             watch.close()
         return opened.watch
 
-    def ask(self, name: str, folder: Path, command: ScanCommand) -> None:
-        """Pause, continue, stop or abort a scan, whether it is shown or not. Raises ScanError."""
-        watch = self._find(name)
-        if watch is None:
-            send_command(folder, command)
-        else:
-            watch.ask(command)
-
     def _find(self, name: str) -> Watch | None:
         with self._lock:
             if name in self._open:
@@ -396,17 +393,6 @@ class Watches:
                 watch.close()
             self._open = {}
             self._lasting = {}
-
-
-class Program(msgspec.Struct, frozen=True):
-    """A program that was started: its exit status is None while it runs, and if it was killed."""
-
-    kind: str
-    running: bool
-    status: int | None
-    words: tuple[str, ...]
-    started_utc: str
-    log: str
 
 
 class Programs:
@@ -476,34 +462,3 @@ def _check_place(place: Path, kind: str) -> None:
                 f"{path} is no file of its own", "the folder was made by another program",
                 "remove it, and find out who made it", code=ErrorCode.PATH_OUTSIDE,
             )  # fmt: skip
-
-
-def find_programs(folder: Path) -> list[Program]:
-    """All programs started for a folder, the newest first."""
-    programs = [find_program(folder, kind) for kind in KINDS]
-    return sorted((p for p in programs if p is not None), key=lambda p: p.started_utc, reverse=True)
-
-
-def find_program(folder: Path, kind: str) -> Program | None:
-    """The program of a kind that was started last for a folder; None if there is none."""
-    base = folder / PROGRAM / kind
-    path = base.with_suffix(".json")
-    if (folder / PROGRAM).is_symlink() or not is_plain(path):
-        return None
-    try:
-        record = msgspec.json.decode(path.read_bytes()[:100_000], type=launcher.Record)
-    except (OSError, ValueError):
-        return None
-    words = record.words
-    if words[1:3] == ["-m", "polysight"]:
-        words = ["polysight", *words[3:]]
-    running = started_ticks(record.pid) == record.ticks
-    status = None if running else _read_status(base.with_suffix(".status"))
-    return Program(kind, running, status, tuple(words), record.started_utc, log_tail(base.with_suffix(".log")))
-
-
-def _read_status(path: Path) -> int | None:
-    try:
-        return int(path.read_text(encoding="ascii")[:8])
-    except (OSError, ValueError):
-        return None

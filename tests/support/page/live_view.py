@@ -13,8 +13,9 @@ from polysight.acquisition.control import ALIVE, CONTROL, ControlFolder, StopReq
 from polysight.catalogue import Scans
 from polysight.page.history import ScanHistory
 from polysight.page.watch import Watch
+from polysight.serve.front import Front
 from polysight.serve.guard import Access
-from polysight.serve.server import Place, make_server
+from polysight.serve.server import Place, make_reader_app, make_server
 from polysight.serve.site import Programs, Site, Watches
 from polysight.store import EVENTS, MANIFEST, manifest, utc_now
 from tests.support.processes import LIMIT_S, wait_for
@@ -83,11 +84,15 @@ def open_control(folder: Path) -> Iterator[StopRequest]:
 
 
 class Served:
-    """A site on a free port, or at the given address."""
+    """A site on a free port, or at the given address; both processes' applications in one thread."""
 
-    def __init__(self, site: Site, host: str = "127.0.0.1", port: int = 0, place: Place | None = None) -> None:
+    def __init__(
+        self, site: Site, access: Access, host: str = "127.0.0.1", port: int = 0, place: Place | None = None
+    ) -> None:
         self.site = site
-        self._server = make_server(site, place or Place())
+        front = Front(site.scans, access, site.starts and access.control, make_reader_app(site))
+        self._server = make_server(front, place or Place())
+        site.is_ending = lambda: self._server.should_exit
         self._server.config.host, self._server.config.port = host, port
         self._thread = threading.Thread(target=self._server.run)
         self._thread.start()
@@ -107,7 +112,7 @@ def served(watch: Watch, token: str = "", host: str = "127.0.0.1", port: int = 0
     """A server of one live view for the block."""
     access = Access(token, loopback=host == "127.0.0.1", control=bool(token))
     scans = Scans(watch.folder.parent, watch.folder.name)
-    made = Served(Site(scans, access, Watches(bool(token), {watch.folder.name: watch})), host, port)
+    made = Served(Site(scans, Watches(bool(token), {watch.folder.name: watch})), access, host, port)
     try:
         yield made
     finally:
@@ -121,7 +126,7 @@ def served_folder(
     """A server of all scans under a folder for the block; with a rig file it starts programs."""
     access = access or Access(token, control=bool(token))
     programs = Programs() if config is not None else None
-    made = Served(Site(Scans(root), access, Watches(access.control), programs, config))
+    made = Served(Site(Scans(root), Watches(access.control), programs, config), access)
     try:
         yield made
     finally:
@@ -132,7 +137,7 @@ def served_folder(
 @contextmanager
 def served_place(root: Path, place: Place, access: Access) -> Iterator[Served]:
     """The same at a place with a certificate."""
-    made = Served(Site(Scans(root), access, Watches(access.control)), place=place)
+    made = Served(Site(Scans(root), Watches(access.control)), access, place=place)
     try:
         yield made
     finally:

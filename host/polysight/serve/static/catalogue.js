@@ -12,10 +12,10 @@ function card(s) {
   const item = make("li"), [state, level] = STATES[s.state] ?? [s.state, "warn"];
   const box = make("input", null, null, { type: "checkbox", checked: chosen.has(s.name), onchange: () => choosing(s.name), "aria-label": `Choose ${s.name}` });
   const choose = nest(make("label", null, "choose"), box);
-  const live = ["running", "paused", "lost", "begun"].includes(s.state) || !(s.processed || s.images_only);
+  const live = ["running", "paused", "lost", "frozen", "begun"].includes(s.state) || !(s.processed || s.images_only);
   const link = make("a", s.name, "name", { href: pageOf(live ? "watch" : "scan", s.name) });
   const picture = s.processed || s.images_only
-    ? make("img", null, "thumb", { loading: "lazy", decoding: "async", alt: "", src: address("thumbnail", { scan: s.name, at: s.seconds }) })
+    ? make("img", null, "thumb", { loading: "lazy", decoding: "async", alt: "", src: address("thumbnail", { scan: s.name, at: s.generation }) })
     : make("div", s.state === "running" ? "being scanned" : "not processed", "thumb none");
   picture.addEventListener("error", () => picture.replaceWith(make("div", "no picture", "thumb none")));
   const badges = make("div", null, "badges");

@@ -1,5 +1,13 @@
 // What all pages share: the token, asking the server, and making elements. No text from the server is ever taken as HTML.
 const KEY = "polysight-token";
+const ANSWER_MS = 40000; // a read may take 30 s on a network drive
+const CONTROL_MS = 8000; // a scan takes a command within 5 s, or it is withdrawn
+const RUNNING_MS = 2000;
+// What advice for a terminal is called on a page.
+const ON_PAGE = [
+  [/\(--metal [A-Z,]+\)/g, "(Process again, metal reference)"],
+  [/\(polysight label; process --labels[^)]*\)/g, "(Label, then Process again with the boxes)"],
+];
 
 export const by = (id) => document.getElementById(id);
 export const query = new URLSearchParams(location.search);
@@ -20,7 +28,7 @@ export let token = readToken();
 export class Refused extends Error {
   constructor(told, status) {
     super([told.what, told.why, told.do].filter(Boolean).join(". "));
-    Object.assign(this, { what: told.what, why: told.why, do: told.do, status });
+    Object.assign(this, { what: told.what, why: told.why, do: told.do, code: told.code, status });
   }
 }
 
@@ -30,12 +38,19 @@ export const address = (path, given = {}) => {
   return `/api/${path}${text ? `?${text}` : ""}`;
 };
 
-async function answer(path, given, options) {
+async function answer(path, given, options, limit = ANSWER_MS) {
   let reply;
   try {
-    reply = await fetch(address(path, given), { ...options, headers: { ...options?.headers, "X-Polysight-Token": token } });
-  } catch {
-    throw new Refused({ what: "The server is not responding", why: "`polysight serve` was ended, or the network is gone", do: "start it again; scans go on regardless" }, 0);
+    const headers = { ...options?.headers, "X-Polysight-Token": token };
+    reply = await fetch(address(path, given), { ...options, headers, signal: AbortSignal.timeout(limit) });
+  } catch (error) {
+    const shell = "in a shell on the host `polysight ask SCAN abort` stops a scan; the emergency stop stops the stage";
+    const late = error.name === "TimeoutError";
+    throw new Refused({
+      what: late ? `No answer within ${limit / 1000} s` : "The server is not responding",
+      why: late ? "the server or its machine is very busy, or it hangs" : "`polysight serve` was ended, or the network is gone",
+      do: shell,
+    }, 0);
   }
   if (!reply.ok) {
     const told = await reply.json().catch(() => ({ what: `The server answered ${reply.status}` }));
@@ -47,8 +62,9 @@ async function answer(path, given, options) {
 
 export const get = async (path, given) => (await answer(path, given)).json();
 export const reach = (path, given) => answer(path, given);
-export const post = async (path, given, body = {}) =>
-  (await answer(path, given, { method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } })).json();
+export const post = async (path, given, body = {}, limit = ANSWER_MS) =>
+  (await answer(path, given, { method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } }, limit)).json();
+export const control = (command, scan) => post(`control/${command}`, { scan }, {}, CONTROL_MS);
 
 /** A picture, and what the ends of its colours mean. */
 export async function picture(path, given) {
@@ -73,7 +89,7 @@ export const nest = (node, ...children) => { node.append(...children); return no
 
 /** Text with `commands` in it, as nodes. */
 export const rich = (text) =>
-  String(text).split("`").map((part, i) => (i % 2 ? make("code", part) : document.createTextNode(part)));
+  ON_PAGE.reduce((words, [option, name]) => words.replace(option, name), String(text)).split("`").map((part, i) => (i % 2 ? make("code", part) : document.createTextNode(part)));
 
 export function tell(id, text) {
   const node = by(id);
@@ -114,11 +130,8 @@ export function permittivity(p) {
 /** A material's name as people read it. */
 export const called = (name) => (name === "unknown" ? "not in the library" : name ?? "not named");
 
-export const STATES = {
-  running: ["is being scanned", "wait"], paused: ["paused", "wait"], finished: ["finished", "good"], stopped: ["stopped", "warn"],
-  failed: ["failed", "bad"], lost: ["interrupted", "bad"], begun: ["not begun", "warn"], products: ["products only", "good"], damaged: ["damaged", "bad"],
-  silent: ["does not answer", "bad"],
-};
+/** Words and colours of states in lists: the server's table. */
+export const STATES = {};
 export const VERDICTS = { good: ["good", "good"], care: ["usable with care", "warn"], none: ["no result", "bad"], damaged: ["products damaged", "bad"] };
 
 /** How a program of `polysight` stands: 7 is the exit status of a scan that supports no result. */
@@ -133,12 +146,13 @@ export function badge([text, level]) {
   return make("span", text, "badge", { "data-level": level });
 }
 
-/** The bar at the top, and what the server allows. */
+/** The bar at the top, with the running scan and its abort, and what the server allows. */
 export async function begin(title) {
   const bar = make("header", null, "bar"), nav = make("nav", null, null, { "aria-label": "Pages" });
-  bar.append(make("a", "polysight", "brand", { href: "/" }), nav);
+  bar.append(make("a", "polysight", "brand", { href: "/" }), nav, make("div", null, "running", { id: "running" }));
   document.body.prepend(make("a", "Skip to the content", "skip", { href: "#main" }), bar);
   const told = await get("page");
+  Object.assign(STATES, told.badges);
   if (!told.only) {
     for (const [text, href] of [["Scans", "/"], ["New scan", "/new"], ["Compare", "/compare"]]) {
       if (href === "/new" && !told.starts) continue;
@@ -148,7 +162,76 @@ export async function begin(title) {
   if (title) document.title = `${title} · polysight`;
   if (token) openSession(told);
   else if (!told.known) askForToken();
+  if (told.known) watchRunning(told);
   return told;
+}
+
+// --- the running scan, on every page ---
+
+let runs = null;
+
+async function watchRunning(told) {
+  try {
+    const now = await get("running");
+    for (const scan of runs ?? []) if (!now.some((s) => s.name === scan.name)) tellEnd(scan.name);
+    for (const scan of now) if (scan.killed && runs?.some((s) => s.name === scan.name && !s.killed)) tellEnd(scan.name);
+    if (JSON.stringify(now) !== JSON.stringify(runs)) showRunning(now, told);
+    runs = now;
+  } catch (error) { if (!(error instanceof Refused)) throw error; }
+  setTimeout(() => watchRunning(told), RUNNING_MS);
+}
+
+function showRunning(now, told) {
+  by("running").replaceChildren(...now.flatMap((scan) => {
+    const name = make("a", scan.name, "running-name", { href: pageOf("watch", scan.name) });
+    if (scan.killed) return [badge(STATES.lost), name];
+    const nodes = [badge(scan.doing === "rows" ? STATES.running : ["computes materials", "wait"]), name];
+    if (told.control && scan.doing === "rows" && scan.asked !== "abort") {
+      nodes.push(make("button", "Abort", "danger", { type: "button", onclick: () => confirmAbort(scan.name) }));
+    }
+    if ("Notification" in window && Notification.permission === "default") {
+      nodes.push(make("button", "Notify me", null, { type: "button", title: "when it ends", onclick: askToNotify }));
+    }
+    return nodes;
+  }));
+}
+
+async function askToNotify(event) {
+  const button = event.target;
+  await Notification.requestPermission();
+  button.remove();
+}
+
+/** A browser's notification when a scan has ended, whatever page is open. */
+async function tellEnd(name) {
+  if (!("Notification" in window) || Notification.permission !== "granted") return;
+  let words = "ended";
+  try {
+    const scan = await get("scan", { scan: name });
+    words = [STATES[scan.state]?.[0] ?? scan.state, scan.reason].filter(Boolean).join(": ");
+  } catch { /* its folder is gone: it has ended */ }
+  new Notification(name, { body: words, tag: name });
+}
+
+/** Ask, then stop the stage; `told` shows the answer. */
+export function confirmAbort(scan, told = alertError) {
+  by("confirm")?.remove();
+  const dialog = make("dialog", null, null, { id: "confirm", "aria-label": "Abort" });
+  const form = make("form", null, null, { method: "dialog" });
+  form.append(make("button", "Keep scanning", null, { value: "no" }), make("button", "Abort now", "danger", { value: "yes" }));
+  dialog.append(nest(make("p"), make("strong", "Stop the stage now?")),
+    nest(make("p"), ...rich(`The running row of ${scan} is lost; all others are safe, and it can be resumed later.`)), form);
+  dialog.addEventListener("close", async () => {
+    if (dialog.returnValue !== "yes") return;
+    try { await control("abort", scan); told(null); } catch (error) { told(error); }
+  });
+  document.body.append(dialog);
+  dialog.showModal();
+}
+
+function alertError(error) {
+  if (!by("header-told")) document.querySelector(".bar").after(make("p", "", "header-told", { id: "header-told", role: "alert" }));
+  complain("header-told", error);
 }
 
 async function openSession(told) {
@@ -160,7 +243,7 @@ async function openSession(told) {
   }
 }
 
-/** Where the token can be typed: another tab, another phone, a server that was started anew. */
+/** Where the token can be typed: another tab, another phone. */
 export function askForToken() {
   if (by("token-bar")) return;
   const field = make("input", null, null, { id: "token-field", type: "password", autocomplete: "off", required: true });

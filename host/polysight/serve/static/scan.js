@@ -6,15 +6,16 @@ import { showProbe } from "./probe.js";
 
 const scan = { scan: scanName };
 let server = {}, summary = {}, result = null, view = null, labels = null, shown = "h_amplitude", running = "";
+let metal = null, drawsMetal = false; // the box of "Process again"
 
 // --- the head ---
 
 function showHead() {
   by("name").textContent = scanName;
   const [state, level] = STATES[summary.state] ?? [summary.state, "warn"];
-  const verdict = VERDICTS[summary.verdict];
+  const verdict = VERDICTS[result?.verdict?.level]; // of the same products as everything below
   by("badges").replaceChildren(badge([state, level]), ...(verdict ? [badge(verdict)] : []), ...(summary.simulated ? [make("span", "simulated", "stamp")] : []));
-  if (verdict) by("head").dataset.level = verdict[1];
+  by("head").dataset.level = verdict?.[1] ?? "";
   const rows = summary.rows ? `${summary.committed} of ${summary.rows} rows` : "";
   by("facts").textContent = [summary.seconds && day(summary.seconds), summary.rig, rows, bytes(summary.bytes), summary.folder].filter(Boolean).join(" · ");
   const recorded = summary.rows > 0, live = ["running", "paused"].includes(summary.state);
@@ -23,6 +24,9 @@ function showHead() {
   by("with").href = `/compare?${new URLSearchParams({ a: scanName })}`;
   by("with").hidden = Boolean(server.only) || !result?.referenced;
   by("resume").hidden = !(server.starts && recorded && !live && summary.committed < summary.rows);
+  by("repeat").hidden = !(server.starts && recorded);
+  by("repeat").href = `/new?${new URLSearchParams({ from: scanName })}`;
+  by("away").hidden = !(server.starts && !live);
   by("process-open").hidden = !(server.starts && recorded && !live);
   by("report").hidden = !result?.files.some((f) => f.name === "report.html");
   by("report").href = address("file/report.html", scan);
@@ -47,11 +51,11 @@ async function showMap(name) {
   shown = name;
   for (const button of by("maps").children) button.setAttribute("aria-pressed", String(button.value === name));
   try {
-    const made = await picture(`map/${name}`, { ...scan, at: result.processed_utc });
+    const made = await picture(`map/${name}`, { ...scan, generation: result.generation });
     if (shown !== name) return; // another was asked for meanwhile
     view.show({ image: made.image });
     by("scale").replaceChildren(...scale(result.pictures.find((p) => p.name === name), made));
-  } catch (error) { complain("told", error); }
+  } catch (error) { if (error.code !== "mismatch") complain("told", error); } // the next look loads the new products
 }
 
 export function scale(map, made) {
@@ -72,6 +76,26 @@ function overlay(pen, at) {
     caption(pen, `${patch.label} ${patchName(patch)}`, x, y);
   }
   labels?.overlay(pen, at);
+  if (metal) {
+    const [x0, y1] = at(metal[0], metal[1]), [x1, y0] = at(metal[2], metal[3]);
+    outline(pen, () => pen.strokeRect(x0, y0, x1 - x0, y1 - y0), "#f2b632");
+    caption(pen, "metal", (x0 + x1) / 2, (y0 + y1) / 2);
+  }
+}
+
+/** The box that is metal when the scan is processed again; a second press takes it back. */
+function setMetal(box) {
+  metal = box;
+  drawsMetal = false;
+  by("draw-metal").textContent = box ? `Metal reference: ${box.map((v) => signed(v)).join(", ")} mm` : "Metal reference: found by itself";
+  drawing(labels?.open);
+}
+
+function drawing(on) {
+  view.drawing = Boolean(on);
+  by("view").classList.toggle("drawing", Boolean(on));
+  by("draw-metal").setAttribute("aria-pressed", String(drawsMetal));
+  view.draw();
 }
 
 const patchName = (p) => (p.metal_reference ? "metal reference" : p.refused ? "not judged" : called(p.name));
@@ -92,7 +116,7 @@ function showPatches() {
 
 async function pick(x, y) {
   if (labels?.open) return;
-  const found = await showProbe(scan, x, y, by("library").value);
+  const found = await showProbe({ ...scan, generation: result.generation }, x, y, by("library").value);
   for (const row of by("rows").children) row.classList.toggle("here", row.id === `patch-${found?.patch?.label}`);
 }
 
@@ -123,7 +147,7 @@ async function follow() {
   const was = running;
   running = program?.running ? program.kind : "";
   showHead();
-  if (was && !running) await load();
+  if ((was && !running) || (result && summary.generation !== result.generation)) await load();
   if (running) by("told").textContent = "";
 }
 
@@ -169,13 +193,11 @@ async function load() {
   by("use-labels").disabled = !result.labels;
   by("use-labels").checked = Boolean(result.labels);
   if (!view || String(view.extent) !== String(result.extent_mm)) {
-    view = new ImageView(by("view"), { extent: result.extent_mm, label: "Image of the scan", overlay, onpick: pick, onbox: (box) => labels.add(box) });
+    view = new ImageView(by("view"), { extent: result.extent_mm, label: "Image of the scan", overlay, onpick: pick, onbox: (box) => (drawsMetal ? setMetal(box) : labels.add(box)) });
   }
   labels ??= new Labels(scan, () => view.draw(), (open) => {
-    view.drawing = open;
-    by("view").classList.toggle("drawing", open);
     by("label-open").setAttribute("aria-pressed", String(open));
-    view.draw();
+    drawing(open);
   });
   labels.load(result);
   buildMaps();
@@ -195,7 +217,21 @@ by("process-open").addEventListener("click", () => {
 by("process").addEventListener("submit", (event) => {
   event.preventDefault();
   by("process").hidden = true;
-  run("process", { library: by("library").value, labels: by("use-labels").checked });
+  run("process", { library: by("library").value, labels: by("use-labels").checked, metal });
+});
+by("draw-metal").addEventListener("click", () => {
+  if (metal || drawsMetal) { setMetal(null); return; }
+  drawsMetal = true;
+  by("draw-metal").textContent = "Draw a box on the metal";
+  drawing(true);
+  by("view").scrollIntoView({ block: "nearest" });
+});
+by("away-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  try {
+    await post(event.submitter.value, scan, { name: by("away-name").value });
+    location.href = "/";
+  } catch (error) { complain("away-told", error); }
 });
 by("export").addEventListener("submit", (event) => {
   event.preventDefault();

@@ -1,14 +1,27 @@
 // The live view's page: hears the newest state from the server, shows it, and asks for what a button says.
-import { address, begin, by, clock, complain, ending, get, grouped, make, pageOf, post, rich, scanName, signed, span, tell, VERDICTS } from "./common.js";
+import { address, begin, by, clock, complain, confirmAbort, control, ending, get, grouped, make, pageOf, post, rich, scanName, signed, span, tell, VERDICTS } from "./common.js";
 import { plot, raster } from "./plots.js";
 
 const SILENT_MS = 7000; // the server says something every two seconds
 const SIGNS = { good: "✓", done: "✓", warn: "!", bad: "✕", wait: "…" };
 const CHANNELS = [["h", "H", "s-polarised"], ["v", "V", "p-polarised"], ["p", "P = H / V", ""]];
 const FEW = 4;
+// Name, class, and what a press does; what may be pressed says the status.
+const BUTTONS = {
+  pause: ["Pause after this row", "", () => ask("pause")],
+  continue: ["Continue", "", () => ask("continue")],
+  stop: ["Stop after this row", "", () => ask("stop")],
+  resume: ["Resume the scan", "main", () => start("resume")],
+  again: ["Try again", "main", () => start("again")],
+  process: ["Process", "main", () => start("process")],
+  repeat: ["Repeat this plan", "", () => { location.href = `/new?${new URLSearchParams({ from: name })}`; }],
+  abort: ["Abort now", "danger", () => confirmAbort(name, (error) => complain("answer", error))],
+};
+const CONTROLS = ["pause", "continue", "stop", "abort"];
+const CURVES = { sync: ["phase left over", "degrees (std)"], snr_db: ["SNR", "dB"], lost: ["lost packets", "%"] };
 
 let state = null, motion = {}, source = null, heardAt = 0, allNotices = false, toldNotices = "", revision = -1;
-let server = {}, name = scanName, summary = {};
+let server = {}, name = scanName, summary = {}, curve = "sync";
 
 // --- what is shown ---
 
@@ -61,18 +74,13 @@ function showResult() {
 }
 
 function showButtons() {
-  const { control, running, paused, asked } = state;
-  const open = state.scan && state.scan.committed < state.scan.rows;
-  const resumes = Boolean(server.starts && open && !running && !asked && !summary.programs?.some((p) => p.kind === "scan" && p.running));
-  by("buttons").hidden = !(control && running) && !resumes;
-  by("resume").hidden = !resumes;
-  for (const id of ["pause", "continue", "stop", "abort"]) by(id).hidden = !running;
-  if (!running) return;
-  by("pause").hidden = paused || asked === "pause";
-  by("continue").hidden = !(paused || asked === "pause");
-  const ending = asked === "stop" || asked === "abort";
-  for (const id of ["pause", "continue", "stop"]) by(id).disabled = ending;
-  by("abort").disabled = asked === "abort";
+  const allowed = (key) => (CONTROLS.includes(key) ? state.control : server.starts);
+  const keys = Object.keys(BUTTONS).filter((key) => state.status.press.includes(key) && allowed(key));
+  if (keys.join() === [...by("buttons").children].map((b) => b.id).join()) return; // a button that has the focus stays
+  by("buttons").replaceChildren(...keys.map((key) => {
+    const [text, className, press] = BUTTONS[key];
+    return make("button", text, className, { id: key, type: "button", onclick: press });
+  }));
 }
 
 function buildChannels() {
@@ -106,8 +114,9 @@ function showImages() {
   const waiting = p.waiting ? `, ${p.waiting} more on their way` : "";
   const early = p.rows && p.rows < state.scan.rows / 3 ? "; sharp when more rows are in" : "";
   by("images-note").textContent = `${p.rows} rows in${waiting}; ${p.width_mm} × ${p.height_mm} mm${early}`;
-  by("p_note").textContent = summary.processed ? "as received; relative to metal under Result"
-    : state.running ? "not referenced to metal yet" : "not referenced to metal: not processed";
+  const notes = { finished: "not referenced to metal: not processed", unprocessed: "not referenced to metal: not processed" };
+  by("p_note").textContent = state.verdict ? "as received; relative to metal under Result"
+    : notes[state.status.key] ?? "not referenced to metal yet";
   if (p.revision === revision) return;
   revision = p.revision;
   for (const [key, [low, high, unit]] of Object.entries(p.scales)) {
@@ -155,6 +164,8 @@ function showNotices() {
     }
     return item;
   });
+  const isWell = ["good", "done"].includes(state.status.level);
+  by("faults").hidden = !items.length && !isWell;
   if (!items.length) items.push(make("li", "No faults.", "none"));
   by("notices").replaceChildren(...items);
   by("more").hidden = notices.length <= FEW;
@@ -193,7 +204,7 @@ function showBoards() {
 }
 
 function showPlots() {
-  const names = state.scan.receivers, p = state.profile, boards = state.sync;
+  const names = state.scan.receivers, p = state.profile;
   if (p) {
     const levels = Object.values(p.boards).flat();
     by("range-note").textContent = `row ${p.row}, dB below the direct path`;
@@ -204,16 +215,17 @@ function showPlots() {
       upright: [{ x: 0, name: "direct path" }], scene: p.scene_m, sceneName: "scene",
     });
   } else by("profile").replaceChildren(make("p", "After the first row.", "empty"));
-  const lines = names.filter((n) => boards[n]).map((n) => (
-    { x: Object.keys(boards[n]).map(Number), y: Object.values(boards[n]), name: n, style: `receiver${names.indexOf(n)}` }));
+  by("curves").replaceChildren(...Object.entries(CURVES).map(([key, [text]]) => make("button", text, null, {
+    type: "button", "aria-pressed": String(key === curve), onclick: () => { curve = key; showPlots(); },
+  })));
+  const figures = state[curve], [, unit] = CURVES[curve];
+  const lines = names.filter((n) => figures[n]).map((n) => (
+    { x: Object.keys(figures[n]).map(Number), y: Object.values(figures[n]), name: n, style: `receiver${names.indexOf(n)}` }));
   const values = lines.flatMap((l) => l.y).filter((v) => v !== null);
-  if (values.length) {
-    by("sync-note").textContent = "phase left over, by row";
-    plot(by("sync"), {
-      x: [0, Math.max(1, state.scan.rows - 1)], y: [0, Math.max(2 * state.paper_deg, 1.15 * Math.max(...values))],
-      xLabel: "row", yLabel: "degrees (std)", lines, level: [{ y: state.paper_deg, name: "the paper's" }],
-    });
-  } else by("sync").replaceChildren(make("p", "After the first row.", "empty"));
+  if (!values.length) { by("sync").replaceChildren(make("p", "After the first row.", "empty")); return; }
+  const paper = curve === "sync" ? [{ y: state.paper_deg, name: "the paper's" }] : [];
+  const top = Math.max(curve === "lost" ? 1 : 0, ...paper.map((l) => 2 * l.y), 1.15 * Math.max(...values));
+  plot(by("sync"), { x: [0, Math.max(1, state.scan.rows - 1)], y: [0, top], xLabel: "row", yLabel: unit, lines, level: paper });
 }
 
 function showAll() {
@@ -250,61 +262,61 @@ function connect() {
     if (state) showStatus();
     if (state?.scan) showStage();
   }));
-  source.onerror = lost;
+  source.onerror = () => lost(server.states.offline);
 }
 
-function lost() {
+/** The page is alone: its own words, from the same table as the server's. */
+function lost(words) {
+  const fill = (text) => text.replaceAll("{folder}", state?.scan?.folder ?? name);
   document.body.classList.add("lost");
-  by("status").dataset.level = "wait";
+  by("status").dataset.level = words.level;
   by("sign").textContent = "?";
-  by("headline").textContent = "Connection to the live view lost";
-  tell("detail", "Reconnecting. The scan continues without this page.");
-  tell("why", "Likely: the server was ended, or the network is gone.");
-  tell("do", "");
+  by("headline").textContent = words.headline;
+  tell("detail", fill(words.detail));
+  tell("why", `Likely: ${fill(words.why)}.`);
+  tell("do", fill(words.do));
+  by("buttons").replaceChildren();
   document.title = "? · polysight";
 }
 
 setInterval(() => {
   if (!source || Date.now() - heardAt < SILENT_MS) return;
-  lost();
+  const isClosed = source.readyState !== EventSource.OPEN;
   connect();
+  lost(isClosed ? server.states.offline : server.states.server_frozen);
 }, 1000);
 
-async function ask(wish) {
-  by("answer").textContent = "…";
+async function ask(command) {
+  by("answer").textContent = "Asking…";
   try {
-    await post(`control/${wish}`, { scan: name });
+    await control(command, name);
+    by("answer").textContent = "";
     complain("answer");
   } catch (error) { complain("answer", error); }
 }
 
-/** The program that a page started for this scan: what it says when it has not come as far as the manifest. */
+/** What the scan's program printed, while that says more than the status, and the way to the result. */
 async function showProgram() {
   try { summary = await get("scan", { scan: name }); } catch { return; } // not there yet, or gone for a moment
   by("to-result").hidden = !(summary.processed || summary.images_only);
   by("to-result").href = pageOf("scan", name);
-  const program = summary.programs.find((p) => p.kind === "scan");
-  const ill = program && !program.running && ![0, 7].includes(program.status) && by("to-result").hidden;
-  by("program").hidden = !program || !(program.running || ill) || (program.running && Boolean(state?.scan) && !ill);
+  const [program] = summary.programs.filter((p) => ["scan", "process"].includes(p.kind));
+  const isNews = ["starting", "start_failed", "resuming", "failed", "unprocessed", "processing"].includes(state?.status.key);
+  by("program").hidden = !program || !isNews;
   if (by("program").hidden) return;
-  by("program-title").textContent = program.running ? "The program is starting" : `polysight scan ${ending(program)}`;
+  by("program-title").textContent = `polysight ${program.kind} ${ending(program)}`;
   if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "No output yet.";
-  if (state) showButtons();
 }
 
-async function resume() {
-  by("answer").textContent = "…";
+async function start(path) {
+  by("answer").textContent = "Starting…";
   try {
-    await post("resume", { scan: name });
-    by("answer").textContent = "Starting; this takes some seconds.";
-    await showProgram();
+    await post(path, { scan: name });
+    by("answer").textContent = "";
+    complain("answer");
   } catch (error) { complain("answer", error); }
 }
 
-by("resume").addEventListener("click", resume);
-for (const wish of ["pause", "continue", "stop"]) by(wish).addEventListener("click", () => ask(wish));
-by("abort").addEventListener("click", () => by("confirm").showModal());
-by("confirm").addEventListener("close", () => { if (by("confirm").returnValue === "yes") ask("abort"); });
 by("more").addEventListener("click", () => { allNotices = !allNotices; showNotices(); });
 new ResizeObserver(() => { if (state?.scan) { showStage(); showPlots(); } }).observe(document.body);
 server = await begin();

@@ -1,10 +1,13 @@
-"""POST requests below /api, for whoever holds the token: plan, doctor, scans, control, labels, notes, processing.
+"""POST requests of the reading process: plan, doctor, scans, labels, notes, processing; `front` has checked the token.
 
 Each is a command of `polysight` as well; what takes long runs as that command, in a process of its own.
 """
 
 from __future__ import annotations
 
+import shutil
+import threading
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,24 +15,25 @@ from typing import Annotated, Any, Literal
 import msgspec
 import tomli_w
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import Response
 from starlette.routing import Route
 
-from polysight.acquisition import ScanCommand
-from polysight.catalogue import NOTES, PROGRAM, Notes, Summary, write_notes
+from polysight.catalogue import NOTES, PROGRAM, Notes, Summary, find_program, find_programs, is_plain, write_notes
 from polysight.jobs.label import remove_labels, save_labels
 from polysight.materials import Labels
 from polysight.plan import Changes, forecast, forecast_values
 from polysight.products import find_labels, label_folder, read_products
-from polysight.serve.guard import BODY_BYTES, cookie_name, refuse_body
 from polysight.serve.reading import json_answer
-from polysight.serve.site import LIBRARIES, Site, find_program
+from polysight.serve.site import LIBRARIES, Site
+from polysight.store import ScanFolder
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, ScanError
 from polysight_shared.tables import decode, to_builtins
 
 RIG = "instrument.toml"
+REQUEST = "request.json"
+MAX_REQUEST_BYTES = 1 << 16
 Format = Literal["csv", "mat", "netcdf"]
 """Formats of exports, which are written into `<scan>/export`."""
 # Positions of a row, and rows.
@@ -83,6 +87,12 @@ class StartRequest(Body, frozen=True):
     tags: Annotated[tuple[Text, ...], msgspec.Meta(max_length=20)] = ()
 
 
+class ScanName(Body, frozen=True):
+    """The name of a scan, typed by who archives or deletes it, or takes it out of the queue."""
+
+    name: Text = ""
+
+
 class ResumeRequest(Body, frozen=True):
     """An interrupted scan to resume."""
 
@@ -131,32 +141,30 @@ Answer = Callable[[Site, Request, Any], Awaitable[object]]
 Words = list[str | Path]
 
 
-def control_routes(site: Site) -> list[Route]:
-    """Routes of everything that POST asks for; the guard has checked the token."""
+def command_routes(site: Site) -> list[Route]:
+    """Routes of everything that POST asks for."""
 
     def make_route(path: str, kind: type[Body], answer: Answer) -> Route:
         async def endpoint(request: Request) -> Response:
-            content = bytearray()
-            async for chunk in request.stream():
-                content += chunk
-                if len(content) > BODY_BYTES:
-                    return refuse_body()
-            return json_answer(await answer(site, request, _decode_body(bytes(content), kind)))
+            return json_answer(await answer(site, request, _decode_body(await request.body(), kind)))
 
         return Route(f"/api/{path}", endpoint, methods=["POST"])
 
-    async def open_session(request: Request) -> Response:
-        answer = JSONResponse({"what": "opened"})
-        name = cookie_name(request.scope)
-        answer.set_cookie(name, site.access.session, httponly=True, samesite="strict", secure=site.access.secure)
-        return answer
+    async def show_request(request: Request) -> Response:
+        name = site.name(request)
+        return json_answer(await site.read_scan(request, lambda folder: read_request(folder, name)))
 
     return [
-        Route("/api/session", open_session, methods=["POST"]),
-        make_route("control/{command}", Body, _control),
+        Route("/api/request", show_request),
         make_route("plan", PlanRequest, _plan),
         make_route("doctor", Body, _doctor),
         make_route("start", StartRequest, _start),
+        make_route("again", Body, _again),
+        make_route("queue", StartRequest, _enqueue),
+        make_route("unqueue", ScanName, _unqueue),
+        make_route("release", Body, _release),
+        make_route("archive", ScanName, _archive),
+        make_route("delete", ScanName, _delete),
         make_route("resume", ResumeRequest, _resume),
         make_route("process", ProcessRequest, _process),
         make_route("labels", LabelRequest, _labels),
@@ -176,19 +184,6 @@ def _decode_body(body: bytes, kind: type[Body]) -> Body:
             code=ErrorCode.MESSAGE_INVALID,
         ) from None  # fmt: skip
     return decode(table, kind, "the request", "send what the page sends")
-
-
-async def _control(site: Site, request: Request, body: Body) -> None:
-    """Pause, continue, stop or abort: behind no read, and whatever else is open."""
-    del body
-    name = site.name(request)
-    command = request.path_params["command"]
-    if command not in list(ScanCommand):
-        raise DataError(
-            f"a scan cannot be asked to {command[:40]!r}", "the name is wrong", f"one of {', '.join(ScanCommand)}",
-            code=ErrorCode.VALUE_INVALID,
-        )  # fmt: skip
-    await site.act(lambda: site.watches.ask(name, site.scans.folder(name), ScanCommand(command)))
 
 
 async def _plan(site: Site, request: Request, body: PlanRequest) -> dict[str, Any]:
@@ -214,36 +209,131 @@ async def _doctor(site: Site, request: Request, body: Body) -> None:
 
 async def _start(site: Site, request: Request, body: StartRequest) -> None:
     del request
-    config = site.config
-    programs = site.programs
+    await site.act(lambda: start_scan(site, body))
+
+
+def start_scan(site: Site, body: StartRequest) -> None:
+    """Start a scan as a request says. Raises PolysightError."""
+    rig = check_request(site, body)
+    folder = site.scans.folder(body.name, new=True)
+    words: Words = ["scan", "--out", folder, *_processing_words(site, body.library, body.metal)]
+    if body.keep_incomplete:
+        words.append("--keep-incomplete")
+    with site.rig:
+        _check_free(site)
+        path = _write_files(folder, rig, body)
+        if body.plan == PlanRequest():
+            # Paths in it are relative to its place.
+            path = site.config.absolute()
+        words += ["--config", path]
+        if body.notes or body.tags:
+            write_notes(folder, Notes(body.notes, body.tags))
+        site.programs.start(folder, "scan", words)
+
+
+def start_waiting(site: Site, request: bytes) -> None:
+    """Start a request of the queue. Raises PolysightError."""
+    body = _decode_body(request, StartRequest)
+    if isinstance(body, StartRequest):
+        start_scan(site, body)
+
+
+def check_request(site: Site, body: StartRequest) -> Instrument:
+    """The rig file with a request's plan. Raises PolysightError if the scan cannot be started with it."""
     if not body.name:
         raise ConfigError("the scan has no name", "`name` is empty", "give it one", code=ErrorCode.KEY_MISSING)
-    rig = body.plan.apply(config)
+    rig = body.plan.apply(site.config)
+    _processing_words(site, body.library, body.metal)
+    folder = site.scans.folder(body.name, new=True)
+    if folder.exists() and any(p.name not in (PROGRAM, NOTES) for p in folder.iterdir()):
+        raise ConfigError(
+            f"{body.name} is there already", "scans are never overwritten", "give another name",
+            code=ErrorCode.NAME_TAKEN,
+        )  # fmt: skip
+    return rig
 
-    def start() -> None:
-        folder = site.scans.folder(body.name, new=True)
-        if folder.exists() and any(p.name not in (PROGRAM, NOTES) for p in folder.iterdir()):
-            raise ConfigError(
-                f"{body.name} is there already", "scans are never overwritten", "give another name",
-                code=ErrorCode.NAME_TAKEN,
-            )  # fmt: skip
-        words: Words = ["scan", "--out", folder, *_processing_words(site, body.library, body.metal)]
-        if body.keep_incomplete:
-            words.append("--keep-incomplete")
-        with site.rig:
-            _check_free(site)
-            words += ["--config", config.absolute() if body.plan == PlanRequest() else _write_rig(folder, rig)]
-            if body.notes or body.tags:
-                folder.mkdir(parents=True, exist_ok=True)
-                write_notes(folder, Notes(body.notes, body.tags))
-            programs.start(folder, "scan", words)
 
-    await site.act(start)
+async def _again(site: Site, request: Request, body: Body) -> None:
+    """Start a scan once more that could not start; its request is checked as at first, wherever its file is from."""
+    del body
+    await site.read_scan(request, lambda folder: start_scan(site, read_request(folder, site.name(request))))
+
+
+def read_request(folder: Path, name: str) -> StartRequest:
+    """The request that a scan was started with, or one with its plan. Raises PolysightError if it has neither."""
+    path = folder / PROGRAM / REQUEST
+    if is_plain(path) and not path.parent.is_symlink():
+        request = _decode_body(path.read_bytes()[:MAX_REQUEST_BYTES], StartRequest)
+        if isinstance(request, StartRequest):
+            return msgspec.structs.replace(request, name=name)
+    rig = ScanFolder.load(folder).instrument
+    plan = PlanRequest(
+        columns=rig.grid.columns,
+        rows=rig.grid.rows,
+        step_x_mm=rig.grid.step_x_mm,
+        step_y_mm=rig.grid.step_y_mm,
+        speed_mm_s=rig.stage.speed_mm_s,
+        pulses=rig.burst.pulses,
+    )
+    return StartRequest(name=name, plan=plan)
+
+
+async def _enqueue(site: Site, request: Request, body: StartRequest) -> None:
+    del request
+
+    def add() -> None:
+        check_request(site, body)
+        site.queue.add(body.name, msgspec.json.encode(body))
+
+    await site.act(add)
+
+
+async def _unqueue(site: Site, request: Request, body: ScanName) -> None:
+    del request
+    await site.act(lambda: site.queue.remove(body.name))
+
+
+async def _release(site: Site, request: Request, body: Body) -> None:
+    del request, body
+    site.queue.release()
+
+
+async def _archive(site: Site, request: Request, body: ScanName) -> None:
+    await site.read_scan(request, lambda folder: _put_away(site, folder, site.name(request), body.name))
+
+
+async def _delete(site: Site, request: Request, body: ScanName) -> None:
+    def delete(folder: Path) -> None:
+        # Out of the list at once; the files take their time.
+        place = _put_away(site, folder, site.name(request), body.name)
+        threading.Thread(target=shutil.rmtree, args=(place, True), name="delete").start()
+
+    await site.read_scan(request, delete)
+
+
+def _put_away(site: Site, folder: Path, name: str, typed: str) -> Path:
+    """Move a scan into the hidden archive; returns its new place. Raises PolysightError."""
+    if typed != name:
+        raise ConfigError(
+            "the name that was typed is another one", f"the scan is called {name}", "type it as it is shown",
+            code=ErrorCode.MISMATCH,
+        )  # fmt: skip
+    with site.rig:
+        working = [p.kind for p in find_programs(folder) if p.running]
+        summary = site.scans.summary(name)
+        if working or summary.state in ("running", "paused", "frozen"):
+            raise ScanError(
+                f"{name} is at work", "its files are being written", "wait, or stop it", code=ErrorCode.BUSY
+            )
+        place = site.logs / "archive" / f"{time.time_ns()}" / folder.name
+        place.parent.mkdir(parents=True)
+        folder.rename(place)
+    return place
 
 
 def _check_free(site: Site) -> None:
     """Refuse what needs the rig while a program that the list shows has it. Raises ScanError."""
-    running = [s.name for s in site.scans.list() if s.state in ("running", "paused") or _is_starting(site, s)]
+    running = [s.name for s in site.scans.list() if s.state in ("running", "paused", "frozen") or _is_starting(site, s)]
     doctor = find_program(site.logs, "doctor")
     if running:
         what = f"{running[0]} is being scanned"
@@ -260,16 +350,17 @@ def _is_starting(site: Site, s: Summary) -> bool:
     return program is not None and program.running
 
 
-def _write_rig(folder: Path, rig: Instrument) -> Path:
-    """Write the rig file of a scan that differs from the usual one; returns its path. Raises ConfigError."""
-    path = folder / PROGRAM / RIG
-    if path.parent.is_symlink():
-        raise ConfigError(f"{path.parent} is a link", "the folder was made by another program", "give another name")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Through a link there, another file would be written.
-    path.unlink(missing_ok=True)
-    path.write_text(tomli_w.dumps(to_builtins(rig)), encoding="utf-8")
-    return path
+def _write_files(folder: Path, rig: Instrument, request: StartRequest) -> Path:
+    """Write a scan's rig file, and its request for another start; returns the rig file's path. Raises ConfigError."""
+    place = folder / PROGRAM
+    if place.is_symlink():
+        raise ConfigError(f"{place} is a link", "the folder was made by another program", "give another name")
+    place.mkdir(parents=True, exist_ok=True)
+    for name, content in ((RIG, tomli_w.dumps(to_builtins(rig)).encode()), (REQUEST, msgspec.json.encode(request))):
+        # Through a link there, another file would be written.
+        (place / name).unlink(missing_ok=True)
+        (place / name).write_bytes(content)
+    return place / RIG
 
 
 async def _resume(site: Site, request: Request, body: ResumeRequest) -> None:

@@ -1,0 +1,381 @@
+"""The process that browsers reach: access checks, static pages, and the control of running scans.
+
+It reads no scan, so that nothing that is read can hold up pause, stop or abort: all other requests are forwarded to
+the reading process (`Reader`), which has a low priority. A command goes into the scan's control folder, in a thread of
+its own. The number of connections has one limit (`ConnectionLimit`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import struct
+import termios
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import anyio
+import h11
+import msgspec
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import JSONResponse, RedirectResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from polysight.acquisition import BADGES, STATES, Life, ScanCommand, send_command
+from polysight.catalogue import Scans
+from polysight.serve.errors import HANDLERS, refuse, tell_no_page
+from polysight.serve.guard import Access, Guard, cookie_name
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
+
+STATIC = Path(__file__).parent / "static"
+PAGES = {
+    "/": "catalogue.html",
+    "/scan": "scan.html",
+    "/watch": "watch.html",
+    "/new": "new.html",
+    "/compare": "compare.html",
+}
+MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+# While the reading process starts, or is started again.
+READER_PATIENCE_S = 20.0
+CONNECT_INTERVAL_S = 0.1
+CHUNK_BYTES = 1 << 16
+# Running scans are looked for at most this often, however many pages ask.
+RUNNING_AGE_S = 0.5
+# Headers of one connection, and those that this process adds by itself.
+OWN_HEADERS = (b"connection", b"keep-alive", b"transfer-encoding", b"date", b"server")
+T = TypeVar("T")
+
+
+class PageFacts(msgspec.Struct, frozen=True):
+    """What a page may show; `known`: its token is right, or not needed. `states` are those of a page that is alone."""
+
+    control: bool
+    starts: bool
+    known: bool
+    only: str | None
+    badges: dict[str, tuple[str, str]]
+    states: dict[str, Any]
+
+
+class RunningScan(msgspec.Struct, frozen=True):
+    """A scan whose program lives, or was killed without having said so."""
+
+    name: str
+    killed: bool
+    doing: str
+    asked: str
+
+
+@dataclass(frozen=True)
+class Front:
+    """State of the process: `starts` as programs can be started, `reader` answers everything else."""
+
+    scans: Scans
+    access: Access
+    starts: bool
+    reader: ASGIApp
+
+
+def make_app(front: Front) -> Starlette:
+    """Build the application: the guard, pages, control; the reading process for everything else."""
+    routes = [*page_routes(front), *control_routes(front), Route("/api/{path:path}", front.reader)]
+    guard = Middleware(Guard, access=front.access)
+    return Starlette(routes=routes, middleware=[guard], exception_handlers=HANDLERS)
+
+
+def page_routes(front: Front) -> list[Route]:
+    """Routes of the static pages, and of what a page may show."""
+    # They are small, and stay in memory.
+    files = {
+        path.name: Response(path.read_bytes(), media_type=MEDIA_TYPES[path.suffix])
+        for path in STATIC.iterdir()
+        if path.suffix in MEDIA_TYPES
+    }
+    files["favicon.ico"] = files["icon.svg"]
+
+    async def show_page(request: Request) -> Response:
+        path = request.url.path
+        only = front.scans.only
+        if path == "/" and only is not None:
+            # A browser keeps the fragment, and the token in it.
+            return RedirectResponse("/watch")
+        if path in ("/scan", "/watch") and only is None and not request.query_params.get("scan"):
+            return RedirectResponse("/")
+        return files[PAGES[path]]
+
+    async def send_file(request: Request) -> Response:
+        answer = files.get(request.path_params["name"])
+        if answer is not None:
+            return answer
+        return await tell_no_page(request, DataError("no such file", "the address is wrong", "go to the first page"))
+
+    async def describe_page(request: Request) -> Response:
+        access = front.access
+        may_read = not access.token or access.loopback or access.has_session(request.scope)
+        known = may_read or access.has_token(request.headers)
+        states = {key: msgspec.to_builtins(STATES[key]) for key in ("offline", "server_frozen")}
+        facts = PageFacts(access.control, front.starts, known, front.scans.only, dict(BADGES), states)
+        return Response(msgspec.json.encode(facts), media_type="application/json")
+
+    pages = [Route(path, show_page) for path in PAGES]
+    return [*pages, Route("/{name}", send_file), Route("/api/page", describe_page)]
+
+
+def control_routes(front: Front) -> list[Route]:
+    """Routes of the running scans, their control, and the session of who has the token."""
+    running = RunningScans(front.scans)
+
+    async def open_session(request: Request) -> Response:
+        answer = JSONResponse({"what": "opened"})
+        access = front.access
+        cookie = cookie_name(request.scope)
+        answer.set_cookie(cookie, access.session, httponly=True, samesite="strict", secure=access.secure)
+        return answer
+
+    async def list_running(request: Request) -> Response:
+        del request
+        return Response(msgspec.json.encode(await run_in_own_thread(running.list)), media_type="application/json")
+
+    async def control(request: Request) -> Response:
+        name = request.query_params.get("scan") or front.scans.only or ""
+        command = request.path_params["command"]
+        if command not in list(ScanCommand):
+            commands = ", ".join(ScanCommand)
+            what = f"a scan cannot be asked to {command[:40]!r}"
+            return refuse(400, ErrorCode.VALUE_INVALID, what, "the name is wrong", f"one of {commands}")
+        asker = "the page"
+        if request.client is not None and not front.access.loopback:
+            asker = f"the page at {request.client.host}"
+        await run_in_own_thread(lambda: send_command(front.scans.folder(name), ScanCommand(command), asker))
+        return JSONResponse(None)
+
+    return [
+        Route("/api/running", list_running),
+        Route("/api/session", open_session, methods=["POST"]),
+        Route("/api/control/{command}", control, methods=["POST"]),
+    ]
+
+
+async def run_in_own_thread(work: Callable[[], T]) -> T:
+    """Run something that may wait for a drive in a thread of its own: no other request can have taken it."""
+    one_thread = anyio.CapacityLimiter(1)
+    return await anyio.to_thread.run_sync(work, abandon_on_cancel=True, limiter=one_thread)
+
+
+class RunningScans:
+    """The scans that run under a folder, found by their control folders."""
+
+    def __init__(self, scans: Scans) -> None:
+        self._scans = scans
+        self._listed_at = float("-inf")
+        self._running: list[RunningScan] = []
+
+    def list(self) -> list[RunningScan]:
+        """All of them."""
+        if time.monotonic() - self._listed_at > RUNNING_AGE_S:
+            self._running = [self._describe(name, life) for name, life in self._scans.lives()]
+            self._listed_at = time.monotonic()
+        return self._running
+
+    def _describe(self, name: str, life: Life) -> RunningScan:
+        return RunningScan(name, life.killed, life.doing, life.asked)
+
+
+# --- the reading process ---
+
+
+class Reader:
+    """Forwards requests to the reading process over a socket in the file system, each over a connection of its own."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Forward one request, and its answer until the browser is gone."""
+        # The guard has read it whole.
+        body = (await receive()).get("body", b"") if scope["method"] == "POST" else b""
+        async with anyio.create_task_group() as tasks:
+
+            async def cancel_when_gone() -> None:
+                while (await receive())["type"] != "http.disconnect":
+                    pass
+                tasks.cancel_scope.cancel()
+
+            tasks.start_soon(cancel_when_gone)
+            await self._relay(scope, receive, send, body)
+            tasks.cancel_scope.cancel()
+
+    async def _relay(self, scope: Scope, receive: Receive, send: Send, body: bytes) -> None:
+        try:
+            reader, writer = await self._connect()
+        except OSError:
+            what = "The reading part of the server does not answer"
+            do = "load the page again; control goes on without it"
+            await refuse(503, ErrorCode.NO_ANSWER, what, "it starts, or was ended", do)(scope, receive, send)
+            return
+        try:
+            connection = h11.Connection(h11.CLIENT)
+            writer.write(_encode_request(connection, scope, body))
+            await _relay_answer(connection, reader, send)
+        finally:
+            writer.close()
+
+    async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        deadline = time.monotonic() + READER_PATIENCE_S
+        while True:
+            try:
+                return await asyncio.open_unix_connection(str(self._path))
+            except OSError:
+                if time.monotonic() > deadline:
+                    raise
+            await asyncio.sleep(CONNECT_INTERVAL_S)
+
+
+def _encode_request(connection: h11.Connection, scope: Scope, body: bytes) -> bytes:
+    target = scope["raw_path"]
+    if scope["query_string"]:
+        target += b"?" + scope["query_string"]
+    headers = [("Host", "reader"), ("Connection", "close"), ("Content-Length", str(len(body)))]
+    parts = (
+        connection.send(h11.Request(method=scope["method"], target=target, headers=headers)),
+        connection.send(h11.Data(data=body)),
+        connection.send(h11.EndOfMessage()),
+    )
+    return b"".join(part or b"" for part in parts)
+
+
+async def _relay_answer(connection: h11.Connection, reader: asyncio.StreamReader, send: Send) -> None:
+    """Pass on the answer of the reading process. Raises OSError or h11.RemoteProtocolError if it breaks off."""
+    while True:
+        event = connection.next_event()
+        if event is h11.NEED_DATA:
+            connection.receive_data(await reader.read(CHUNK_BYTES))
+        elif isinstance(event, h11.Response):
+            headers = [(name, value) for name, value in event.headers if name not in OWN_HEADERS]
+            await send({"type": "http.response.start", "status": event.status_code, "headers": headers})
+        elif isinstance(event, h11.Data):
+            await send({"type": "http.response.body", "body": bytes(event.data), "more_body": True})
+        elif isinstance(event, h11.EndOfMessage):
+            await send({"type": "http.response.body", "body": b"", "more_body": False})
+            return
+
+
+# --- connections ---
+
+
+class ConnectionLimit:
+    """The most connections at a time. When there are more, one without a request is closed: the longest unread one.
+
+    Each step takes the same time however many there are. Nothing is measured in seconds: a process that is busy must
+    not take its own delay for a client's. A connection of which bytes wait to be read is not closed.
+    """
+
+    # Connections with unread bytes that are passed over for one that is closed.
+    MAX_PASSED = 8
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._open = 0
+        # Those that have never sent a whole request are closed first.
+        self._silent: OrderedDict[CountedConnection, None] = OrderedDict()
+        self._idle: OrderedDict[CountedConnection, None] = OrderedDict()
+
+    def add(self, connection: CountedConnection) -> None:
+        """A connection was opened; another one is closed if there are too many."""
+        self._open += 1
+        self._silent[connection] = None
+        if self._open > self._most:
+            self._close_one()
+
+    def note_read(self, connection: CountedConnection) -> None:
+        """Bytes of a connection were read."""
+        if connection.is_working:
+            self._forget(connection)
+        elif connection in self._idle:
+            self._idle.move_to_end(connection)
+        else:
+            self._silent[connection] = None
+            self._silent.move_to_end(connection)
+
+    def note_answered(self, connection: CountedConnection) -> None:
+        """A request was answered, and no other one is at work."""
+        if not connection.is_working:
+            self._idle[connection] = None
+
+    def remove(self, connection: CountedConnection) -> None:
+        """A connection was closed."""
+        self._open -= 1
+        self._forget(connection)
+
+    def _forget(self, connection: CountedConnection) -> None:
+        self._silent.pop(connection, None)
+        self._idle.pop(connection, None)
+
+    def _close_one(self) -> None:
+        for group in (self._silent, self._idle):
+            for _ in range(min(self.MAX_PASSED, len(group))):
+                connection, _ = group.popitem(last=False)
+                if not connection.has_unread_bytes():
+                    connection.transport.close()
+                    return
+                group[connection] = None
+
+
+class CountedConnection(H11Protocol):
+    """A connection of uvicorn that tells its limit what was read."""
+
+    def __init__(self, *arguments: Any, limit: ConnectionLimit, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._limit = limit
+
+    @property
+    def is_working(self) -> bool:
+        """True from a whole request to the end of its answer."""
+        is_whole = self.conn.their_state not in (h11.IDLE, h11.SEND_BODY)
+        return is_whole and self.cycle is not None and not self.cycle.response_complete
+
+    def has_unread_bytes(self) -> bool:
+        """True if bytes of the client lie in the kernel."""
+        descriptor = self.transport.get_extra_info("socket").fileno()
+        if descriptor < 0:
+            return False
+        (count,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)))
+        return count > 0
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Count it."""
+        super().connection_made(transport)
+        self._limit.add(self)
+
+    def data_received(self, data: bytes) -> None:
+        """Note that it was read."""
+        super().data_received(data)
+        if not self.transport.is_closing():
+            self._limit.note_read(self)
+
+    def on_response_complete(self) -> None:
+        """Note that it waits for the next request."""
+        super().on_response_complete()
+        if not self.transport.is_closing():
+            self._limit.note_answered(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Count it out."""
+        super().connection_lost(exc)
+        self._limit.remove(self)
+
+
+def counted_connections(most: int) -> Any:
+    """Make uvicorn's protocol class for connections that share a limit."""
+    return partial(CountedConnection, limit=ConnectionLimit(most))

@@ -1,0 +1,105 @@
+"""The two processes of `polysight serve`: control answers whatever becomes of the reading one, and after a restart."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from tests.support.page.asking import ask, get, post
+from tests.support.page.live_view import open_control
+from tests.support.processes import wait_for
+from tests.support.products import judged_products
+from tests.support.refusals import refused
+
+from polysight.serve.guard import TOKEN_HEADER
+from polysight.serve.server import load_token
+from polysight_shared.error_codes import ErrorCode
+
+
+@dataclass
+class Server:
+    """A server that runs as its command."""
+
+    program: subprocess.Popen[str]
+    port: int
+    token: str
+
+    def reading_process(self) -> int | None:
+        """Number of the reading process; None while there is none."""
+        children = Path(f"/proc/{self.program.pid}/task").glob("*/children")
+        for pid in " ".join(path.read_text() for path in children).split():
+            if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                return int(pid)
+        return None
+
+
+@contextmanager
+def serving(root: Path, state: Path) -> Iterator[Server]:
+    command = [sys.executable, "-m", "polysight", "serve", str(root), "--port", "0"]
+    environment = os.environ | {"XDG_STATE_HOME": str(state)}
+    program = subprocess.Popen(command, cwd=state, env=environment, stderr=subprocess.PIPE, text=True)
+    try:
+        assert program.stderr is not None
+        for line in program.stderr:
+            if address := re.search(r":(\d+)/#token=(\S+)", line):
+                yield Server(program, int(address[1]), address[2])
+                break
+    finally:
+        program.terminate()
+        program.wait()
+        if program.stderr is not None:
+            program.stderr.close()
+
+
+@pytest.fixture
+def scans(tmp_path: Path) -> Path:
+    judged_products(tmp_path / "scans" / "one" / "products", "care")
+    (tmp_path / "scans" / "one" / "program").mkdir()
+    (tmp_path / "state").mkdir()
+    return tmp_path / "scans"
+
+
+def test_a_scan_is_aborted_while_the_reading_process_is_frozen_killed_and_started_again(scans, tmp_path):
+    with serving(scans, tmp_path / "state") as server, open_control(scans / "one") as stop:
+        wait_for(lambda: ask(server, "/api/scans")[0] == 200, "the list")
+        first = server.reading_process()
+        assert first is not None
+        assert os.getpriority(os.PRIO_PROCESS, first) > os.getpriority(os.PRIO_PROCESS, server.program.pid)
+        os.kill(first, signal.SIGSTOP)
+        assert post(server, "/api/control/pause?scan=one", token="wrong")[0] == 403
+        assert post(server, "/api/control/pause?scan=one", token=server.token)[0] == 200
+        assert stop.paused
+        assert [(s["name"], s["killed"]) for s in get(server, "/api/running")] == [("one", False)]
+        os.kill(first, signal.SIGKILL)
+        assert post(server, "/api/control/abort?scan=one", token=server.token)[0] == 200
+        assert stop.now
+        assert "the page" in stop.asker
+        wait_for(lambda: server.reading_process() not in (None, first), "another one")
+        wait_for(lambda: ask(server, "/api/scans")[0] == 200, "the list again")
+
+
+def test_the_token_survives_a_restart_and_nobody_else_can_read_it(scans, tmp_path, monkeypatch):
+    with serving(scans, tmp_path / "state") as server:
+        token = server.token
+        status, _, headers = ask(server, "/api/session", "POST", {}, **{TOKEN_HEADER: token})
+        assert status == 200
+        cookie = headers["set-cookie"]
+    path = tmp_path / "state" / "polysight" / "token"
+    assert (path.stat().st_mode & 0o777, path.read_text()) == (0o600, token)
+    with serving(scans, tmp_path / "state") as server:
+        assert server.token == token
+        _, _, headers = ask(server, "/api/session", "POST", {}, **{TOKEN_HEADER: token})
+        # Another port has another name; the secret is the same.
+        assert cookie.partition("=")[2] == headers["set-cookie"].partition("=")[2]
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    path.chmod(0o644)
+    with refused(ErrorCode.VALUE_INVALID, path):
+        load_token()

@@ -1,0 +1,88 @@
+"""Scans that wait for the rig: one after another, in order, and never past one that did not finish."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.support.processes import wait_for
+from tests.support.refusals import refused
+
+from polysight.serve import queue as serve_queue
+from polysight.serve.queue import Queue
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError, ScanError
+
+
+class Rig:
+    """Starts what it is told to, unless it is busy or out of order."""
+
+    def __init__(self) -> None:
+        self.started: list[str] = []
+        self.is_busy = True
+        self.is_broken = False
+        self.states: dict[str, str] = {}
+
+    def start(self, request: bytes) -> None:
+        if self.is_busy:
+            raise ScanError("another is being scanned", code=ErrorCode.BUSY)
+        if self.is_broken:
+            raise DeviceError("no launcher")
+        self.started.append(json.loads(request)["name"])
+        self.is_busy = True
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+@pytest.fixture
+def queue(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Queue]:
+    monkeypatch.setattr(serve_queue, "LOOK_S", 0.01)
+    made = Queue(tmp_path / "queue", rig.start, lambda name: rig.states.get(name, "finished"))
+    for name in ("first", "second", "third"):
+        made.add(name, json.dumps({"name": name}).encode())
+    yield made
+    made.close()
+
+
+def test_scans_start_in_order_when_the_rig_is_free(queue, rig):
+    assert queue.waiting().names == ["first", "second", "third"]
+    with refused(ErrorCode.NAME_TAKEN):
+        queue.add("second", b'{"name": "second"}')
+    queue.remove("second")
+    for count, name in enumerate(("first", "third"), 1):
+        rig.is_busy = False
+        wait_for(lambda n=count: len(rig.started) == n, name)
+        assert rig.started[-1] == name
+    wait_for(lambda: queue.waiting().names == [], "an empty queue")
+
+
+@pytest.mark.parametrize("state", ["failed", "stopped", "lost"])
+def test_after_a_scan_that_did_not_finish_the_queue_waits_for_a_person(queue, rig, state):
+    rig.states["first"] = state
+    rig.is_busy = False
+    wait_for(lambda: rig.started == ["first"], "the first")
+    rig.is_busy = False
+    wait_for(lambda: queue.waiting().held, "that it waits")
+    assert "first" in queue.waiting().held
+    assert rig.started == ["first"]
+    queue.release()
+    wait_for(lambda: rig.started == ["first", "second"], "the second")
+
+
+def test_what_cannot_be_started_stays_and_says_why(queue, rig):
+    rig.is_broken = True
+    rig.is_busy = False
+    wait_for(lambda: "no launcher" in queue.waiting().held, "the reason")
+    assert queue.waiting().names[0] == "first"
+
+
+def test_a_queue_survives_a_restart(queue, rig, tmp_path):
+    queue.close()
+    again = Queue(tmp_path / "queue", rig.start, lambda _: "finished")
+    assert again.waiting().names == ["first", "second", "third"]
+    again.close()

@@ -1,0 +1,114 @@
+"""Every state of the table in a real browser: its words, its colour, its buttons, and nothing that it must not say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+from tests.support.page.asking import TOKEN
+from tests.support.page.chromium import DESK, PHONE, Browser
+from tests.support.page.live_view import Served, begin_history
+from tests.support.paths import RIG_FILE
+from tests.support.store.facts import facts_of
+
+from polysight.acquisition import STATES
+from polysight.acquisition.control import Life
+from polysight.catalogue import Scans
+from polysight.page.history import ScanHistory
+from polysight.page.status import Inputs, LifeSigns, Motion, Shown, make_snapshot, say
+from polysight.page.watch import Versioned
+from polysight.results import Verdict
+from polysight.serve import site as serve_site
+from polysight.serve.guard import Access
+from polysight.serve.site import Programs, Site, Watches
+
+pytestmark = pytest.mark.xdist_group("browser")
+WITHOUT_SCAN = ("empty", "starting", "start_failed", "unreadable", "folder_gone")
+OF_THE_PAGE = ("offline", "server_frozen")
+WORDS: dict[str, Any] = {
+    "folder": "scans/one", "safe": "1 of 3 rows are safe.", "asker": "the page", "row": 1, "take": 2,
+    "what": "RV: no data.", "why": "The cable is out", "do": "Put it in", "now": "Row 1 is being scanned.",
+    "gaps": "Every row is safe.",
+}  # fmt: skip
+
+
+class StillWatch:
+    """A live view that shows what it is told to."""
+
+    def __init__(self, folder: Path, history: ScanHistory) -> None:
+        self.folder = folder
+        self.shown = Shown()
+        self.state = Versioned(0, b"{}")
+        self.motion = Versioned(0, b"{}").publish(Motion(now_s=1_800_000_000))
+        self._history = history
+
+    def show(self, key: str) -> None:
+        """Publish a state of the table."""
+        signs = LifeSigns(Life(), True, False, 0.0, 0.1, 6.0, 1.8e9)
+        history = None if key in WITHOUT_SCAN else self._history
+        snapshot = make_snapshot(Inputs(self.folder, history, signs, control=True))
+        verdict = Verdict(key.removeprefix("result_")) if key.startswith("result_") else None  # type: ignore[arg-type]
+        status = replace(say(key, **WORDS), since_s=1.79e9)
+        self.state = self.state.publish(replace(snapshot, status=status, verdict=verdict))
+
+    def close(self) -> None:
+        """Nothing runs."""
+
+
+@pytest.fixture
+def still(finished: Path, tmp_path: Path) -> Iterator[tuple[StillWatch, Served]]:
+    watch = StillWatch(tmp_path / "one", begin_history(facts_of(finished)[0]))
+    watch.show("rows")
+    watches = Watches(True, {"one": watch})  # type: ignore[dict-item]
+    site = Site(Scans(tmp_path, "one"), watches, Programs(), RIG_FILE)
+    served = Served(site, Access(TOKEN, control=True))
+    try:
+        yield watch, served
+    finally:
+        served.close()
+        site.close()
+
+
+@pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+def test_every_state_says_what_the_table_says(browser: Browser, still, size):
+    watch, view = still
+    browser.visit(f"{view.address}/watch#token={TOKEN}", size)
+    for key, state in STATES.items():
+        if key in OF_THE_PAGE:
+            continue
+        watch.show(key)
+        version = watch.state.version
+        headline = state.headline.format(**WORDS)
+        browser.wait(
+            f"document.getElementById('headline')?.innerText == {headline!r}"
+            f" && document.getElementById('status')?.dataset.level == {state.level!r}",
+            f"{key}, version {version}",
+        )
+        pressed = browser.value("[...document.getElementById('buttons').children].map(b => b.id).join()")
+        assert set(filter(None, pressed.split(","))) == set(state.press), key
+        shown = browser.value("document.body.innerText")
+        assert not [phrase for phrase in state.never if phrase.casefold() in shown.casefold()], (key, shown)
+        assert browser.value("document.documentElement.scrollWidth <= innerWidth"), key
+        if state.do:
+            assert browser.text("do"), key
+    assert browser.errors == []
+
+
+def test_a_page_that_is_alone_says_so_and_how_to_abort(browser: Browser, still, monkeypatch):
+    _, view = still
+    monkeypatch.setattr(serve_site, "ALIVE_INTERVAL_S", 1e9)
+    browser.visit(f"{view.address}/watch#token={TOKEN}")
+    for key in ("server_frozen", "offline"):
+        state = STATES[key]
+        if key == "offline":
+            view.close()
+        # One look: it may find back at once.
+        browser.wait(
+            f"document.getElementById('headline')?.innerText == {state.headline!r}"
+            " && document.body.innerText.includes('polysight ask')"
+            f" && !{list(state.never)!r}.some(phrase => document.body.innerText.includes(phrase))",
+            key,
+        )

@@ -15,6 +15,7 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +38,35 @@ def loopback_up() -> None:
         fcntl.ioctl(s, SIOCSIFFLAGS, struct.pack("16sH14x", b"lo", IFF_UP))
 
 
-def trigger_wire(listener: socket.socket, chip: SimChip) -> None:
-    """The wire from the board's trigger pin to the chip: every edge is driven into the input."""
-    peer, _ = listener.accept()
-    with peer, peer.makefile("r", encoding="ascii") as lines:
-        for line in lines:
-            message = parse(line)
-            if isinstance(message, WireEdge):
-                chip.pull(message.line, bool(message.value))
+class TriggerWire(threading.Thread):
+    """The wire from the board's trigger pin to the chip: every edge is driven into the input.
+
+    `late_ns`: the largest difference between an interval on the board and the same interval at the input. A wire of
+    copper has none; this one is a thread, which a busy machine keeps waiting.
+    """
+
+    def __init__(self, listener: socket.socket, chip: SimChip) -> None:
+        super().__init__(daemon=True)
+        self.late_ns = 0
+        self._listener = listener
+        self._chip = chip
+        self.start()
+
+    def run(self) -> None:
+        peer, _ = self._listener.accept()
+        last_delay_ns = None
+        with peer, peer.makefile("r", encoding="ascii") as lines:
+            for line in lines:
+                message = parse(line)
+                if not isinstance(message, WireEdge):
+                    continue
+                self._chip.pull(message.line, bool(message.value))
+                if not message.value:
+                    continue
+                delay_ns = time.monotonic_ns() - message.t_ns
+                if last_delay_ns is not None:
+                    self.late_ns = max(self.late_ns, abs(delay_ns - last_delay_ns))
+                last_delay_ns = delay_ns
 
 
 def start(*command: str) -> subprocess.Popen[str]:
@@ -98,8 +120,9 @@ def main() -> None:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(str(WIRES))
     listener.listen()
-    threading.Thread(target=trigger_wire, args=(listener, chip), daemon=True).start()
+    wire = TriggerWire(listener, chip)
     result = one_row(config, chip)
+    result["late_ns"] = wire.late_ns
     changes: list[Change] = list(chip.changes())
     result["changes"] = [[c.t_ns, c.line, c.value] for c in changes]
     result["digest"] = hashlib.sha256(repr(changes).encode()).hexdigest()

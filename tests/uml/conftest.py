@@ -42,9 +42,10 @@ def kernel(request: pytest.FixtureRequest) -> Path:
 def run_row(kernel: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
     """Runs chain.py in the guest for a row of so many points; kernel options such as time-travel can be given."""
 
-    def run(points: int, *options: str, real_time: bool = False) -> dict[str, Any]:
+    def run(points: int, *options: str, real_time: bool = False, speed_mm_s: float = 20.0) -> dict[str, Any]:
         config = tmp_path / "instrument.toml"
-        config.write_bytes(tomli_w.dumps(to_builtins(_rig(points, one_shot=real_time))).encode())
+        rig = _rig(points, one_shot=real_time, speed_mm_s=speed_mm_s)
+        config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
         program = [
             f"PYTHON={sys.executable}",
             f"PYTHONPATH={REPO}",
@@ -76,7 +77,7 @@ def _before_others() -> None:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
 
 
-def _rig(points: int, one_shot: bool) -> Instrument:
+def _rig(points: int, one_shot: bool, speed_mm_s: float) -> Instrument:
     """The published rig with one row, near the home corner.
 
     In real time a system call takes some 10 us in user-mode Linux: there pulses are not short enough without one shot.
@@ -87,6 +88,8 @@ def _rig(points: int, one_shot: bool) -> Instrument:
     return replace(
         rig,
         grid=replace(rig.grid, columns=points, rows=1),
-        stage=replace(rig.stage, heartbeat_ms=5000, centre_x_mm=10 + width_mm / 2, centre_y_mm=5.0),
+        stage=replace(
+            rig.stage, heartbeat_ms=5000, centre_x_mm=10 + width_mm / 2, centre_y_mm=5.0, speed_mm_s=speed_mm_s
+        ),
         pi=replace(rig.pi, one_shot=one_shot, journal_dir="/run/journal", key_dir="/run/keys"),
     )

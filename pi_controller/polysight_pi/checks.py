@@ -42,8 +42,8 @@ VERDICTS = {"ok": "ok", "note": "ok", "warning": "warn", "error": "fail"}  # wor
 
 def to_json(finding: Finding) -> dict[str, Any]:
     """Return a finding in the form that `check --json` prints."""
-    found = finding.what + (f" ({finding.why})" if finding.why else "")
-    return {"name": finding.where, "verdict": VERDICTS[finding.level], "found": found, "remedy": finding.do}
+    text = finding.what + (f" ({finding.why})" if finding.why else "")
+    return {"name": finding.where, "verdict": VERDICTS[finding.level], "found": text, "remedy": finding.do}
 
 
 def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Finding:
@@ -54,7 +54,9 @@ def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Fi
         return Finding.of_error(e, where=name)
     except OSError as e:
         return Finding("error", os_error(e).what, do=AS_THE_SERVICE, where=name)
-    return result if isinstance(result, Finding) else Finding("ok", result, where=name)
+    if isinstance(result, Finding):
+        return result
+    return Finding("ok", result, where=name)
 
 
 def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
@@ -100,12 +102,12 @@ def _stage(instrument: Instrument) -> str:
         return f"{instrument.stage.port} answers, firmware {stage.firmware or '?'}, at {x_mm:.2f}, {y_mm:.2f} mm"
 
 
-def _journal(path: Path, needed: int) -> str:
+def _journal(path: Path, needed_bytes: int) -> str:
     Journal(path).close()
     free = shutil.disk_usage(path).free
-    if free < needed:
-        what = f"{path}: {free >> 20} MiB free, {needed >> 20} MiB wanted"
-        raise DeviceError(what, "the disk fills", "remove old journals there", code=ErrorCode.DISK_FULL)
+    if free < needed_bytes:
+        summary = f"{path}: {free >> 20} MiB free, {needed_bytes >> 20} MiB wanted"
+        raise DeviceError(summary, "the disk fills", "remove old journals there", code=ErrorCode.DISK_FULL)
     return f"{path} can be written, {free >> 20} MiB are free"
 
 
@@ -116,9 +118,9 @@ def _keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
     if not secret.is_file():
         raise DeviceError(f"{secret} is missing", "keys were not made yet", "polysight-pi keys")
     if secret.stat().st_mode & 0o077:
-        what = f"{secret} can be read by others than its owner"
+        summary = f"{secret} can be read by others than its owner"
         do = f"chmod 600 {secret}; new ones with `polysight-pi keys --replace`"
-        return Finding("warning", what, do=do, where="keys")
+        return Finding("warning", summary, do=do, where="keys")
     return f"{secret}"
 
 
@@ -128,7 +130,9 @@ def _address(make: Callable[..., zmq.Socket[bytes]], address: str, key_dir: Path
         make(context, address, key_dir).close()
     finally:
         context.destroy(linger=0)
-    return f"{address} can be bound" + (" (loopback, no keys needed)" if is_loopback(address) else " with CURVE keys")
+    if is_loopback(address):
+        return f"{address} can be bound (loopback, no keys needed)"
+    return f"{address} can be bound with CURVE keys"
 
 
 # --- the lines --------------------------------------------------------------------------------------------------------
@@ -144,9 +148,12 @@ def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MOD
     yield chip
     if chip.level == "ok":
         yield attempt(f"trigger line {pi.trigger_in}", _trigger, pi)
-        yield attempt(f"SYNC_IN line {pi.sync_out[0]}", _spi if pi.wiring == "spi" else _output, pi)
+        check_output, measure = _output, measure_width
+        if pi.wiring == "spi":
+            check_output, measure = _spi, measure_clock
+        yield attempt(f"SYNC_IN line {pi.sync_out[0]}", check_output, pi)
         yield Finding("ok", pi.pulse_source, where="pulses")
-        yield attempt("pulse width", measure_clock if pi.wiring == "spi" else measure_width, instrument)
+        yield attempt("pulse width", measure, instrument)
     if pi.wiring != "spi" and model.exists() and model.read_bytes().startswith(b"Raspberry Pi"):
         yield _release(modules)
 
@@ -193,17 +200,17 @@ def measure_clock(instrument: Instrument) -> str | Finding:
     """Time transfers of zeros as long as a burst; the shortest gives the SPI clock. Raises DeviceError."""
     device = SpiDevice(instrument.pi.spi_device)
     try:
-        burst = spi_burst(BurstSpec.of(instrument.burst), device.bufsiz)
+        burst = spi_burst(BurstSpec.from_burst(instrument.burst), device.bufsiz)
         zeros = bytes(len(burst.data))
         times_ns = [device.transfer(zeros, burst.clock_hz) for _ in range(TRANSFERS)]
     finally:
         device.close()
-    bit_ns = min(after - before for before, after in times_ns) / (8 * len(zeros))
-    what = f"a bit lasts {bit_ns / 1e3:.3f} us, nominal {burst.bit_ns / 1e3:.3f} us; the same clock sets the period"
+    bit_ns = min(end_ns - begin_ns for begin_ns, end_ns in times_ns) / (8 * len(zeros))
+    summary = f"a bit lasts {bit_ns / 1e3:.3f} us, nominal {burst.bit_ns / 1e3:.3f} us; the same clock sets the period"
     if MIN_PART <= bit_ns / burst.bit_ns <= MAX_PART:
-        return what + " (SPI controller, measured now with the line low)"
+        return summary + " (SPI controller, measured now with the line low)"
     do = "fix the Pi's core clock in /boot/firmware/config.txt: `core_freq=250` on a 3, `core_freq_min=500` on a 4"
-    return Finding("error", what, do=do, where="pulse width")
+    return Finding("error", summary, do=do, where="pulse width")
 
 
 def judge_widths(widths_ns: list[int], one_shot: bool) -> str | Finding:
@@ -211,22 +218,22 @@ def judge_widths(widths_ns: list[int], one_shot: bool) -> str | Finding:
     widths_ns = sorted(widths_ns)
     median_us = widths_ns[len(widths_ns) // 2] / 1e3
     high_ns = widths_ns[-1]
-    what = f"two system calls take {median_us:.1f} us (median), {high_ns / 1e3:.1f} us (longest)"
+    summary = f"two system calls take {median_us:.1f} us (median), {high_ns / 1e3:.1f} us (longest)"
     if one_shot:
-        return f"{what}; a one-shot sets the width"
+        return f"{summary}; a one-shot sets the width"
     if high_ns <= MAX_WIDTH_NS:
-        return f"{what} (measured now with the line low)"
-    what += f": the radar accepts {WIDTH_TEXT}; rows would end with fault 105"
+        return f"{summary} (measured now with the line low)"
+    summary += f": the radar accepts {WIDTH_TEXT}; rows would end with fault 105"
     do = 'fit a one-shot and set one_shot = true, or wire SYNC_IN to MOSI and set wiring = "spi"'
-    return Finding("error", what, do=f"{do} (docs/how-to/wiring.md)", where="pulse width")
+    return Finding("error", summary, do=f"{do} (docs/how-to/wiring.md)", where="pulse width")
 
 
 def _release(modules: Path) -> Finding:
-    what = "this kernel does not say if outputs are released when their program dies"
+    summary = "this kernel does not say if outputs are released when their program dies"
     for module in ("pinctrl_bcm2835", "pinctrl_rp1"):
         parameter = modules / module / "parameters" / "persist_gpio_outputs"
         if parameter.exists():
             if parameter.read_text().strip() != "Y":
                 return Finding("ok", "lines become inputs again when their program ends", where="line release")
-            what = f"{module} keeps outputs as they were: a program killed during a pulse leaves them high"
-    return Finding("warning", what, do=STRICT, where="line release")
+            summary = f"{module} keeps outputs as they were: a program killed during a pulse leaves them high"
+    return Finding("warning", summary, do=STRICT, where="line release")

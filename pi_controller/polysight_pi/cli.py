@@ -69,7 +69,7 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
             for sentence in dict.fromkeys(system.prepare_process() + system.prepare_thread()):  # each once
                 log(sentence)
         lines.check_width = False  # the width is printed below
-        spec = BurstSpec.of(instrument.burst)
+        spec = BurstSpec.from_burst(instrument.burst)
         end_ns = lines.now_ns()
         records = []
         for _ in range(args.count):
@@ -91,7 +91,7 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
         e = explain(number)
         sys.stderr.write(f"error: fault {number} in {faults.count(number)} of {len(records)} bursts: {e.what}\n")
         sys.stderr.write(f"  why: {e.why}\n  do: {e.remedy}\n")
-    return 1 if faults else 0
+    return int(bool(faults))
 
 
 def _jog(args: argparse.Namespace, instrument: Instrument) -> int:
@@ -130,8 +130,11 @@ def _home(args: argparse.Namespace, instrument: Instrument) -> int:
 
 
 def _print_position(args: argparse.Namespace, at: Any) -> int:
-    where = {"x_mm": at.x_mm, "y_mm": at.y_mm}
-    _write(json.dumps(where) if args.json else f"stage at x {at.x_mm:.3f} mm, y {at.y_mm:.3f} mm")
+    position_mm = {"x_mm": at.x_mm, "y_mm": at.y_mm}
+    if args.json:
+        _write(json.dumps(position_mm))
+    else:
+        _write(f"stage at x {at.x_mm:.3f} mm, y {at.y_mm:.3f} mm")
     return 0
 
 
@@ -197,9 +200,9 @@ def _option(*names: str, **how: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
 def _rig(args: argparse.Namespace) -> Instrument:
     """Load the rig file, with the values given on the command line."""
     rig = load_instrument(args.config)
-    given = {key: value for key, value in vars(args).items() if value is not None}
-    pi_values = {key: given[key] for key in ("journal_dir", "command_address", "event_address") if key in given}
-    stage_values = {"port": given["stage_port"]} if "stage_port" in given else {}
+    overrides = {key: value for key, value in vars(args).items() if value is not None}
+    pi_values = {key: overrides[key] for key in ("journal_dir", "command_address", "event_address") if key in overrides}
+    stage_values = {"port": overrides["stage_port"]} if "stage_port" in overrides else {}
     replace = msgspec.structs.replace
     return replace(rig, pi=replace(rig.pi, **pi_values), stage=replace(rig.stage, **stage_values))
 
@@ -277,8 +280,8 @@ def _parser() -> argparse.ArgumentParser:
         p.add_argument(
             "--config", type=Path, default=Path("instrument.toml"), metavar="FILE", help="rig file (%(default)s)"
         )
-        for names, how in options:
-            p.add_argument(*names, **how)
+        for flags, how in options:
+            p.add_argument(*flags, **how)
     return parser
 
 

@@ -26,8 +26,8 @@ Ask = Callable[..., Any]
 
 
 def _no_answer(address: str) -> DeviceError:
-    why = "polysight-pi run is not running here"
-    return DeviceError(f"no answer from {address}", why, "start it", code=ErrorCode.NO_ANSWER)
+    cause = "polysight-pi run is not running here"
+    return DeviceError(f"no answer from {address}", cause, "start it", code=ErrorCode.NO_ANSWER)
 
 
 @contextmanager
@@ -47,8 +47,8 @@ def _service(instrument: Instrument) -> Iterator[Ask]:
                 raise _no_answer(address)
             reply = m.unpack_reply(client.recv())
             if isinstance(reply, m.Refused):
-                what = f"{type(command).__name__} was refused: {reply.what}"
-                raise DeviceError(what, reply.why, reply.remedy, code=ErrorCode.REFUSED_BY_PEER)
+                summary = f"{type(command).__name__} was refused: {reply.what}"
+                raise DeviceError(summary, reply.why, reply.remedy, code=ErrorCode.REFUSED_BY_PEER)
             return reply
 
         yield ask
@@ -98,7 +98,7 @@ def home_by_service(instrument: Instrument) -> m.StatusReply | None:
         raise DeviceError("homing has not ended", "the motors stall", "look at the stage")
 
 
-def take_over(instrument: Instrument, what: str) -> str:
+def take_over(instrument: Instrument, action: str) -> str:
     """Hold, resume, abort or end the active run of any client; return the state after it.
 
     Raises DeviceError if the service refuses or does not answer, or if the take-over key cannot be read.
@@ -109,12 +109,12 @@ def take_over(instrument: Instrument, what: str) -> str:
         raise os_error(e, "polysight-pi run is not running here, or you are not its user", AS_THE_SERVICE) from None
     reason = "a person at the Pi took over"
     with _service(instrument) as ask:
-        if what == "end":
+        if action == "end":
             scan_id = ask(m.Status()).scan_id
             return ask(m.EndRun(scan_id=scan_id, exit_status="abort", reason=reason, owner=owner)).state
-        if what == "abort":
+        if action == "abort":
             return ask(m.Abort(reason=reason, owner=owner)).state
-        if what == "hold":
+        if action == "hold":
             return ask(m.Hold(owner=owner)).state
         return ask(m.Resume(owner=owner)).state
 
@@ -137,8 +137,8 @@ def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterat
         while True:
             reply = ask(m.Replay(scan_id=scan_id, from_seq=from_seq))
             if reply.last_seq == 0:
-                what = f"the Pi has no journal of scan {scan_id!r}"
-                raise DeviceError(what, "another name", "see its journal folder", code=ErrorCode.FILE_MISSING)
+                summary = f"the Pi has no journal of scan {scan_id!r}"
+                raise DeviceError(summary, "another name", "see its journal folder", code=ErrorCode.FILE_MISSING)
             if not reply.events:
                 return
             yield from map(msgspec.to_builtins, reply.events)

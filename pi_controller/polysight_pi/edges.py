@@ -59,6 +59,11 @@ class RowMotion(NamedTuple):
         return self.x_start, self.step, self.points, self.y, self.feed
 
     @property
+    def direction(self) -> int:
+        """+1 towards larger x, else -1."""
+        return int(math.copysign(1, self.step))
+
+    @property
     def ramp(self) -> int:
         """Steps from rest to full speed."""
         if self.feed <= slowest_feed(self.accel):
@@ -78,13 +83,11 @@ class RowMotion(NamedTuple):
     @property
     def end(self) -> tuple[int, int]:
         """X and y where the stage rests after the row."""
-        direction = 1 if self.step > 0 else -1
-        return self.x_start + (self.points - 1) * self.step + direction * self.run_up, self.y
+        return self.x_start + (self.points - 1) * self.step + self.direction * self.run_up, self.y
 
     def distance(self, x: int) -> int:
         """Return the steps from the beginning of the motion to this x."""
-        direction = 1 if self.step > 0 else -1
-        return direction * (x - self.x_start) + self.run_up
+        return self.direction * (x - self.x_start) + self.run_up
 
     def time_points(self, stops: list[int]) -> tuple[list[float], float]:
         """Return the time of each point and that of the row's end, seconds, if the stage rests at these distances.
@@ -190,7 +193,9 @@ class EdgeTimes:
         """Compare the points that the stage has passed with the edges; return what is wrong, or ""."""
         self._statuses.append((points, written_ns))
         edges = bisect_right(self._edges_ns, asked_ns)
-        return f"a spurious edge: {edges} edges came before {points} points were passed" if edges > points else ""
+        if edges <= points:
+            return ""
+        return f"a spurious edge: {edges} edges came before {points} points were passed"
 
     def judge(self, was_held: bool, done_ns: int) -> str:
         """Judge a row whose counts are right, with its `done` written by `done_ns`; return what is wrong, or ""."""
@@ -232,13 +237,13 @@ class EdgeTimes:
         """Say what is wrong with the edge of a point, or ""."""
         tolerance_s = TOLERANCE * max(self._interval_s, expected_s)
         late_s = interval_s - expected_s
-        lost = round(late_s / self._interval_s)
+        lost_edges = round(late_s / self._interval_s)
         if abs(late_s) <= tolerance_s:
             return ""
         if late_s < 0:
             kind = "a spurious or early edge"
-        elif lost and abs(late_s - lost * self._interval_s) <= (lost + 1) * tolerance_s:
-            kind = f"{lost} edges lost"
+        elif lost_edges and abs(late_s - lost_edges * self._interval_s) <= (lost_edges + 1) * tolerance_s:
+            kind = f"{lost_edges} edges lost"
         else:
             kind = "a late edge, or lost ones beside a spurious one"
         return f"{kind} at point {point}: {interval_s * 1e3:.2f} ms after the one before, not {expected_s * 1e3:.2f} ms"

@@ -54,19 +54,19 @@ class Request(NamedTuple):
     answer: Callable[[m.AnyReply], None]
 
 
-def make_refusal(number: int, what: str, why: str = "", remedy: str = "") -> m.Refused:
+def make_refusal(number: int, summary: str, cause: str = "", remedy: str = "") -> m.Refused:
     """Return a refusal, with texts of limited length; missing ones are those of shared/polysight_shared/faults.py."""
     table = explain(number)
     return m.Refused(
-        number=int(number), what=what[:1000], why=(why or table.why)[:1000], remedy=(remedy or table.remedy)[:1000]
+        number=int(number), what=summary[:1000], why=(cause or table.why)[:1000], remedy=(remedy or table.remedy)[:1000]
     )
 
 
 def refuse(error: PolysightError | OSError) -> m.Refused:
     """Return the refusal of a command that raised this error."""
     if isinstance(error, OSError):
-        why = "the operating system refused it"
-        return make_refusal(PiFault.BAD_REQUEST, os_error(error).what, why, "check the Pi's disk")
+        cause = "the operating system refused it"
+        return make_refusal(PiFault.BAD_REQUEST, os_error(error).what, cause, "check the Pi's disk")
     return make_refusal(getattr(error, "number", PiFault.BAD_REQUEST), error.what, error.why, error.remedy)
 
 
@@ -215,7 +215,9 @@ class Executor:
             if error is not None:
                 self._inbox.put(lambda: self._machine.happen("lasting fault", PiFault.JOURNAL_FULL, str(error)))
             for request, reply in behind_journal:
-                request.answer(reply if error is None else refuse(error))
+                if error is not None:
+                    reply = refuse(error)
+                request.answer(reply)
 
         if behind_journal or self.journal.has_batch:
             self.journal.commit(answer)
@@ -313,7 +315,10 @@ class Executor:
             return m.ReplayReply(events=[m.unpack_event(raw) for raw in packed], last_seq=last_seq)
 
         def answer(result: m.ReplayReply | PolysightError | OSError) -> None:
-            request.answer(result if isinstance(result, m.ReplayReply) else refuse(result))
+            if isinstance(result, m.ReplayReply):
+                request.answer(result)
+            else:
+                request.answer(refuse(result))
 
         self.journal.call(read, answer)
 
@@ -326,15 +331,17 @@ class Executor:
     def _pulse(self, request: Request, command: m.Pulse) -> None:
         """Pass a burst to the trigger loop; the reply follows when it has been sent."""
         if self._run is not None:
-            what = f"run {self._run.scan_id} is begun"
-            raise RefusedError(PiFault.NOT_READY, what, "pulses would belong to no point", "wait for the scan's end")
+            summary = f"run {self._run.scan_id} is begun"
+            raise RefusedError(PiFault.NOT_READY, summary, "pulses would belong to no point", "wait for the scan's end")
         self._machine.require("Pulse")
         if not self._loop.alive:
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
         spec = read_burst(command)
         if spec.pulses * spec.period_ns > m.MAX_PULSES_AT_REST_S * 1e9:
-            what = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MAX_PULSES_AT_REST_S:g} s"
-            raise RefusedError(PiFault.NOT_READY, what, "the lines are busy meanwhile", "ask for fewer pulses")
+            summary = (
+                f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MAX_PULSES_AT_REST_S:g} s"
+            )
+            raise RefusedError(PiFault.NOT_READY, summary, "the lines are busy meanwhile", "ask for fewer pulses")
         self._pulsing.append(request)
         self._loop.send(spec)
 
@@ -361,18 +368,18 @@ class Executor:
         takes: dict[int, int] = {}
 
         def write(journal: Journal) -> None:
-            resumed, lost = journal.open(run.scan_id, run.plan, run.last_seq)
-            journal.add(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
+            resumed, missing_events = journal.open(run.scan_id, run.plan, run.last_seq)
+            journal.add(m.RunStarted, plan=run.plan, resumed=resumed, lost=missing_events)
             journal.commit()
             takes.update(journal.takes)
 
-        def begun() -> m.Accepted:
+        def accept_begin() -> m.Accepted:
             self._forget_run()
             self._run = run
             self._takes = takes
             return self._accept("BeginRun", run.heartbeat_ms)
 
-        self._write_synced(request, write, begun)
+        self._write_synced(request, write, accept_begin)
 
     def _forget_run(self) -> None:
         self._run = self._last_row = None
@@ -390,11 +397,11 @@ class Executor:
             journal.add(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
             journal.commit()
 
-        def ended() -> m.Accepted:
+        def accept_end() -> m.Accepted:
             self._run = None
             return self._accept("EndRun")
 
-        return self._write_synced(request, write, ended)
+        return self._write_synced(request, write, accept_end)
 
     def _write_synced(
         self, request: Request, write: Callable[[Journal], None], written: Callable[[], m.Accepted]
@@ -423,9 +430,11 @@ class Executor:
 
     def _need_run(self, scan_id: str) -> m.BeginRun:
         if self._run is None or self._run.scan_id != scan_id:
-            active = f"run {self._run.scan_id}" if self._run else "no run"
-            what = f"{active} is active, not {scan_id}"
-            raise RefusedError(PiFault.NOT_READY, what, "the Pi was restarted", "BeginRun")
+            active = "no run"
+            if self._run is not None:
+                active = f"run {self._run.scan_id}"
+            summary = f"{active} is active, not {scan_id}"
+            raise RefusedError(PiFault.NOT_READY, summary, "the Pi was restarted", "BeginRun")
         return self._run
 
     def _run_row(self, command: m.RunRow) -> m.Accepted:
@@ -527,6 +536,6 @@ def check_run(run: m.BeginRun, stage: Stage) -> None:
     _require(not misfit, misfit)
 
 
-def _require(ok: bool, what: str) -> None:
+def _require(ok: bool, summary: str) -> None:
     if not ok:
-        raise RefusedError(PiFault.BAD_REQUEST, what)
+        raise RefusedError(PiFault.BAD_REQUEST, summary)

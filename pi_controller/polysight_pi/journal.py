@@ -53,9 +53,11 @@ class JournalFullError(DeviceError):
     number = PiFault.JOURNAL_FULL
 
     def __init__(self, path: Path, e: OSError) -> None:
-        why = "the disk is full" if e.errno in (errno.ENOSPC, errno.EDQUOT) else "the disk is read-only or broken"
-        what = f"journal {path} cannot be written: {e.strerror}"
-        super().__init__(what, why, "free space on the Pi", code=ErrorCode.DISK_FULL)
+        cause = "the disk is read-only or broken"
+        if e.errno in (errno.ENOSPC, errno.EDQUOT):
+            cause = "the disk is full"
+        summary = f"journal {path} cannot be written: {e.strerror}"
+        super().__init__(summary, cause, "free space on the Pi", code=ErrorCode.DISK_FULL)
 
 
 def _crc(seq: int, payload: bytes) -> int:
@@ -71,9 +73,9 @@ def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
     if magic != MAGIC:
         if MAGIC.startswith(magic.rstrip(b"\0")):
             return  # the power was cut before the first bytes were on the disk
-        what = f"{getattr(file, 'name', 'journal')}: not a journal"
+        summary = f"{getattr(file, 'name', 'journal')}: not a journal"
         remedy = "move it out of the journal folder"
-        raise DataError(what, "another program wrote it", remedy, code=ErrorCode.FILE_FOREIGN)
+        raise DataError(summary, "another program wrote it", remedy, code=ErrorCode.FILE_FOREIGN)
     offset = len(MAGIC)
     last = 0
     while len(head := file.read(_HEAD.size)) == _HEAD.size:
@@ -164,9 +166,9 @@ class JournalFile:
 
     def number_behind(self, seq: int) -> int:
         """Continue numbering after `seq`, the host's newest event. Return the number of skipped (lost) events."""
-        lost = max(0, seq - self.last_seq)
-        self.last_seq += lost
-        return lost
+        missing_events = max(0, seq - self.last_seq)
+        self.last_seq += missing_events
+        return missing_events
 
     def write(self, payloads: Sequence[bytes], sync: bool = False) -> None:
         """Append all records or none; with `sync`, wait until everything is on the disk.
@@ -203,8 +205,8 @@ class JournalFile:
             length, _, crc = _HEAD.unpack(os.pread(self._fd, _HEAD.size, offset))
             payload = os.pread(self._fd, length, offset + _HEAD.size)
             if _crc(seq, payload) != crc:
-                what = f"{self.path}: record {seq} is damaged"
-                raise DataError(what, "the disk or card fails", "replace it", code=ErrorCode.FILE_DAMAGED)
+                summary = f"{self.path}: record {seq} is damaged"
+                raise DataError(summary, "the disk or card fails", "replace it", code=ErrorCode.FILE_DAMAGED)
             payloads.append(payload)
         return payloads
 
@@ -252,9 +254,9 @@ class Journal:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(self._lock)
-            what = f"journal folder {folder} is in use"
+            summary = f"journal folder {folder} is in use"
             remedy = "stop it, or give another --journal"
-            raise DeviceError(what, "another polysight-pi runs", remedy, code=ErrorCode.BUSY) from None
+            raise DeviceError(summary, "another polysight-pi runs", remedy, code=ErrorCode.BUSY) from None
 
     @property
     def last_seq(self) -> int:
@@ -264,7 +266,9 @@ class Journal:
     @property
     def takes(self) -> dict[int, int]:
         """Return the newest take of each row of the current scan."""
-        return dict(self._file.takes) if self._file else {}
+        if self._file is None:
+            return {}
+        return dict(self._file.takes)
 
     def journal_path(self, scan_id: str) -> Path:
         """Return the path of a scan's journal file."""
@@ -277,7 +281,7 @@ class Journal:
         -------
         resumed
             True if the scan was begun before.
-        lost
+        missing_events
             Number of the host's events that are missing in the journal.
 
         Raises
@@ -313,9 +317,9 @@ class Journal:
                 self._file.close()
             self._file = file
             self.scan_id = scan_id
-        lost = file.number_behind(host_seq)
+        missing_events = file.number_behind(host_seq)
         self.position = (scan_id, file.last_seq)
-        return begun is not None or host_seq > 0, lost
+        return begun is not None or host_seq > 0, missing_events
 
     def check_room(self, scan_id: str, positions: int) -> None:
         """Raise JournalFullError if the disk has no space for the rest of the scan's journal."""
@@ -325,9 +329,9 @@ class Journal:
             free = shutil.disk_usage(self.folder).free
         except OSError as e:
             raise JournalFullError(self.folder, e) from None
-        needed = max(0, positions * CAPTURE_BYTES - written) + SPARE_BYTES
-        if free < needed:
-            room = f"{free / 1e6:.1f} MB free, {needed / 1e6:.1f} MB needed for {positions} positions"
+        needed_bytes = max(0, positions * CAPTURE_BYTES - written) + SPARE_BYTES
+        if free < needed_bytes:
+            room = f"{free / 1e6:.1f} MB free, {needed_bytes / 1e6:.1f} MB needed for {positions} positions"
             raise JournalFullError(self.folder, OSError(errno.ENOSPC, room))
 
     def add(self, kind: type[m.AnyEvent], t_mono_ns: int = 0, **fields: Any) -> None:

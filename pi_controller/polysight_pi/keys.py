@@ -93,7 +93,7 @@ def allow(folder: Path, name: str) -> list[Path]:
 def revoke(folder: Path, name: str) -> None:
     """Remove a client from the list: its next command is refused, and it cannot connect again."""
     names = read_allowed(folder)
-    remaining = {key: other for key, other in names.items() if other != name}
+    remaining = {key: client for key, client in names.items() if client != name}
     if remaining == names:
         remedy = f"allowed: {', '.join(names.values())}"
         raise ConfigError(f"no client {name!r} is allowed", "a typing error", remedy, code=ErrorCode.KEY_UNKNOWN)

@@ -130,12 +130,12 @@ def _request(pi: Pi, line: int, buffer: int | None = None, **settings: Any) -> A
         return gpiod.request_lines(path, config, consumer="polysight", event_buffer_size=buffer)
     except (OSError, ValueError) as e:
         number = (e.errno if isinstance(e, OSError) else errno.EINVAL) or 0
-        why, remedy = _REASONS.get(number, (f"the kernel says: {e}", "gpioinfo shows what the chip can do"))
+        cause, remedy = _REASONS.get(number, (f"the kernel says: {e}", "gpioinfo shows what the chip can do"))
         if number == errno.EBUSY:
             with gpiod.Chip(path) as chip:
-                why = f"it is held by {chip.get_line_info(line).consumer!r}"
-        what = f"fault {int(PiFault.TRIGGER_LINE_LOST)}: GPIO line {line} of {path}: {why}"
-        raise DeviceError(what, str(e), remedy) from None
+                cause = f"it is held by {chip.get_line_info(line).consumer!r}"
+        summary = f"fault {int(PiFault.TRIGGER_LINE_LOST)}: GPIO line {line} of {path}: {cause}"
+        raise DeviceError(summary, str(e), remedy) from None
 
 
 def request_output(pi: Pi) -> Any:
@@ -159,6 +159,13 @@ def _request_edges(pi: Pi, number: int, debounce_us: int = 0) -> Any:
     )
 
 
+def _is_stamped_by_the_kernel(pi: Pi) -> bool:
+    """True if edges have times of CLOCK_MONOTONIC; a chip with a timestamp engine of its own has another clock."""
+    gpiod = load_gpiod()
+    with gpiod.Chip(find_chip(pi.gpio_chip)) as chip:
+        return chip.get_line_info(pi.trigger_in).event_clock == gpiod.line.Clock.MONOTONIC
+
+
 def _lost(e: OSError) -> DeviceError:
     return DeviceError(
         f"GPIO lines are gone: {e.strerror}", "the chip vanished or its driver was unloaded", "`polysight-pi check`"
@@ -175,11 +182,7 @@ class TriggerInput:
         self.check_width = not pi.one_shot
         self._events: deque[Any] = deque()
         self._input = _request_edges(pi, pi.trigger_in, pi.trigger_debounce_us)
-        gpiod = load_gpiod()
-        with gpiod.Chip(find_chip(pi.gpio_chip)) as chip:
-            clock = chip.get_line_info(pi.trigger_in).event_clock
-        # A chip with a timestamp engine of its own has another clock.
-        self.is_real_time = clock == gpiod.line.Clock.MONOTONIC
+        self.is_real_time = _is_stamped_by_the_kernel(pi)
 
     def now_ns(self) -> int:
         """Return the time of CLOCK_MONOTONIC, nanoseconds."""
@@ -262,20 +265,20 @@ class GpiodLines(TriggerInput):
 
     def measure(self) -> int:
         """Return the duration of a pulse, nanoseconds, without sending one: both system calls leave the line low."""
-        before, after = self._make_pulse(self._clear)
-        return after - before
+        begin_ns, end_ns = self._make_pulse(self._clear)
+        return end_ns - begin_ns
 
     def _make_pulse(self, set_line: Callable[[], object], width_ns: int = 0) -> tuple[int, int]:
         # Looked up before the line is set: nothing but the two calls is inside a pulse.
         now = time.monotonic_ns
         clear = self._clear
         try:
-            before = now()
+            begin_ns = now()
             set_line()
             if width_ns > TWO_CALLS_NS:
-                super().sleep_until(before + width_ns)
+                super().sleep_until(begin_ns + width_ns)
             clear()
-            return before, now()
+            return begin_ns, now()
         except OSError as e:
             raise _lost(e) from None
 
@@ -333,16 +336,16 @@ class SpiDevice:
         addresses = buffer.buffer_info()[0], self.received.buffer_info()[0]
         message = _TRANSFER.pack(*addresses, len(data), clock_hz, 0, 8, 0, 0, 0, 0, 0)
         try:
-            before = time.monotonic_ns()
+            begin_ns = time.monotonic_ns()
             fcntl.ioctl(self._fd, MESSAGE, message)
-            return before, time.monotonic_ns()
+            return begin_ns, time.monotonic_ns()
         except OSError as e:
             raise self._error(e) from None
 
     def _error(self, e: OSError) -> DeviceError:
         unknown = f"the kernel says: {e.strerror}", "look at the kernel's log (dmesg)"
-        why, remedy = _SPI_REASONS.get(e.errno or 0, unknown)
-        return DeviceError(f"fault {int(PiFault.TRIGGER_LINE_LOST)}: {self.path}: {e.strerror}", why, remedy)
+        cause, remedy = _SPI_REASONS.get(e.errno or 0, unknown)
+        return DeviceError(f"fault {int(PiFault.TRIGGER_LINE_LOST)}: {self.path}: {e.strerror}", cause, remedy)
 
     def close(self) -> None:
         """Close the device."""
@@ -379,9 +382,11 @@ class SpiLines(TriggerInput):
 
     def look_back(self, sent: int) -> Seen | None:  # noqa: ARG002 - MISO was read with the transfers
         """Return the pulses that MISO has received since the last call; None without the wire."""
-        seen = self._seen
+        returned = self._seen
         self._seen = Seen(0)
-        return seen if self._has_return else None
+        if not self._has_return:
+            return None
+        return returned
 
     def close(self) -> None:
         """Release the lines; MOSI is low."""

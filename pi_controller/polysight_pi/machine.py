@@ -36,8 +36,8 @@ POSITION_LOST = (
 class RefusedError(PolysightError):
     """A command is refused with a PiFault number; polysight_shared/faults.py has the default texts of each number."""
 
-    def __init__(self, number: int, what: str, why: str = "", remedy: str = "") -> None:
-        super().__init__(what, why, remedy, code=ErrorCode.REFUSED_BY_PEER)
+    def __init__(self, number: int, summary: str, cause: str = "", remedy: str = "") -> None:
+        super().__init__(summary, cause, remedy, code=ErrorCode.REFUSED_BY_PEER)
         self.number = int(number)
 
 
@@ -134,9 +134,11 @@ class RunningRow:
         pulses = points * self.job.spec.pulses
         if self.points == points and counts == Counts(points, points, pulses):
             wrong = self.edges.judge(self.was_held, self.done_ns)
-            self.status = "fault" if wrong else "done"
-            self.fault = int(PiFault.EDGE_TIME) if wrong else 0
-            self.reason = wrong or self.reason
+            self.status = "done"
+            if wrong:
+                self.status = "fault"
+                self.fault = int(PiFault.EDGE_TIME)
+                self.reason = wrong
             return
         self.status = "fault"
         self.fault = int(PiFault.POINTS_MISMATCH)
@@ -203,7 +205,9 @@ class Machine:
         return True
 
     def _enter(self, state: State) -> None:
-        timeout_s = self.row_timeout_s if state == "running" else TIMEOUTS_S.get(state, math.inf)
+        timeout_s = TIMEOUTS_S.get(state, math.inf)
+        if state == "running":
+            timeout_s = self.row_timeout_s
         self.state = state
         self._deadline_s = self._clock() + timeout_s
         if state == "ending":  # after the bursts that are still in the queue
@@ -212,11 +216,13 @@ class Machine:
     def require(self, event: str) -> None:
         """Raise RefusedError if this command has no rule in the current state."""
         if (self.state, event) not in self._rules:
-            what = f"no {event} in state {self.wire_state}" + (f": {self.reason}" if self.reason else "")
+            summary = f"no {event} in state {self.wire_state}"
+            if self.reason:
+                summary += f": {self.reason}"
             remedy = "begin a run, home the stage, start a row"
             if self.row is not None:
                 remedy = "wait for the row's end, or abort it"
-            raise RefusedError(PiFault.NOT_READY, what, f"the state is {self.wire_state}", remedy)
+            raise RefusedError(PiFault.NOT_READY, summary, f"the state is {self.wire_state}", remedy)
 
     def command(self, event: str, *args: Any) -> None:
         """Execute a command. Raises RefusedError."""
@@ -235,7 +241,7 @@ class Machine:
 
     def watch_host(self, heartbeat_ms: int) -> None:
         """Expect the host's heartbeat at this interval; 0 disables the check."""
-        self._host_timeout_s = HOST_MISSES * heartbeat_ms / 1e3 if heartbeat_ms else math.inf
+        self._host_timeout_s = HOST_MISSES * heartbeat_ms / 1e3 or math.inf
         self._host_alive_s = self._clock()
 
     def note_host_alive(self) -> None:
@@ -320,8 +326,8 @@ class Machine:
             self.happen("stopped")
         elif reply.kind == "alarm":
             e = explain(reply.number)
-            what = f"stage alarm {reply.number}: {e.what} ({e.why}); {e.remedy}"
-            self.happen("stage lost", PiFault.STAGE_ALARM, what)
+            summary = f"stage alarm {reply.number}: {e.what} ({e.why}); {e.remedy}"
+            self.happen("stage lost", PiFault.STAGE_ALARM, summary)
         elif reply.kind == "done" and homing and answers_home:
             self.stage.note_position(reply)
             self.happen("homed", reply)
@@ -411,7 +417,9 @@ class Machine:
         lost_x, lost_y = (max(-limit, min(_number(reply, key), limit)) for key in ("lostx", "losty"))
         self.lost_mm = (lost_x / self.stage.config.steps_per_mm, lost_y / self.stage.config.steps_per_mm)
         self.homed = True
-        return "ready" if self.in_run else "homed"
+        if self.in_run:
+            return "ready"
+        return "homed"
 
     def _begin_run(self, heartbeat_ms: int) -> None:
         self.in_run = True
@@ -531,7 +539,9 @@ class Machine:
         if end != row.motion.end and row.status is None:
             self.homed = False
             self._fail_row(PiFault.POSITION, f"the row ended at {end}, not at {row.motion.end} (x, y in steps)")
-        return "ending" if row.bursts >= row.row.points else None
+        if row.bursts >= row.row.points:
+            return "ending"
+        return None
 
     def _note_stopped(self, reply: Reply | None = None) -> None:
         """Handle the stage at rest after STOP; it may have reached the row's end before."""
@@ -565,7 +575,9 @@ class Machine:
         self.row = None
         if row.lasting:
             return "fault"
-        return "ready" if self.homed else "idle"
+        if self.homed:
+            return "ready"
+        return "idle"
 
     @property
     def _current(self) -> RunningRow:

@@ -285,8 +285,8 @@ class Service:
         self._close_journal()
         self.server.finish()
         if self.executor.crash is not None:
-            what = f"the executor failed: {self.executor.crash!r}"
-            raise DeviceError(what, "an internal error", "report it with its trace")
+            summary = f"the executor failed: {self.executor.crash!r}"
+            raise DeviceError(summary, "an internal error", "report it with its trace")
 
     def stop(self) -> None:
         """End :meth:`serve`. From any thread, or a signal handler."""
@@ -311,8 +311,8 @@ def _write_secret(path: Path, secret: str) -> None:
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "w") as file:
             file.write(secret)
     except OSError as e:
-        why = "the disk is full or read-only"
-        raise ConfigError(f"{path}: {e.strerror}", why, "free space there", code=ErrorCode.DISK_FULL) from None
+        cause = "the disk is full or read-only"
+        raise ConfigError(f"{path}: {e.strerror}", cause, "free space there", code=ErrorCode.DISK_FULL) from None
 
 
 def run(instrument: Instrument, wires: Path | None) -> int:

@@ -65,8 +65,8 @@ class StageRefusedError(DeviceError):
 
     def __init__(self, verb: str, number: int) -> None:
         e = explain(number)
-        what = f"stage refused {verb}: error {number}, {e.what}"
-        super().__init__(what, e.why, e.remedy, code=ErrorCode.REFUSED_BY_PEER)
+        summary = f"stage refused {verb}: error {number}, {e.what}"
+        super().__init__(summary, e.why, e.remedy, code=ErrorCode.REFUSED_BY_PEER)
         self.number = number
 
 
@@ -226,7 +226,7 @@ class StageLink:
             if answer is not None and answer.number not in RETRIED:
                 return answer
         raise StageLostError(
-            f"stage at {self.port} does not answer {verb}" + (f": {self.lost}" if self.lost else ""),
+            f"stage at {self.port} does not answer {verb} {self.lost}".rstrip(),
             "cable unplugged, board without the sketch, or wrong port",
             "check the USB cable, stage.port and stage.baud; `make flash` puts the sketch on the board",
             code=ErrorCode.NO_ANSWER,
@@ -523,8 +523,8 @@ class BenchStage:
 
     def jog(self, dx_mm: float, dy_mm: float, speed_mm_s: float) -> Position:
         """Move by (dx, dy); return the new position."""
-        here = self.position()
-        return self._finish(self._driver.move(here.x_mm + dx_mm, here.y_mm + dy_mm, speed_mm_s))
+        position = self.position()
+        return self._finish(self._driver.move(position.x_mm + dx_mm, position.y_mm + dy_mm, speed_mm_s))
 
     def position(self) -> Position:
         """Ask the stage for its position."""

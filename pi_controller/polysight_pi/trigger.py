@@ -50,7 +50,7 @@ class BurstSpec(NamedTuple):
     width_ns: int
 
     @staticmethod
-    def of(burst: Burst) -> BurstSpec:
+    def from_burst(burst: Burst) -> BurstSpec:
         """Return the burst of the rig file."""
         return BurstSpec(burst.pulses, us_to_ns(burst.period_us), us_to_ns(burst.width_us))
 
@@ -160,13 +160,13 @@ def spi_burst(spec: BurstSpec, bufsiz: int = DEFAULT_BUFSIZ) -> SpiBurst:
         for bit in bits:
             data[bit // 8] |= 0x80 >> bit % 8
         return SpiBurst(bytes(data), clock_hz, bits)
-    needed = max(4096, 1 << (size - 1).bit_length())
+    needed_bytes = max(4096, 1 << (size - 1).bit_length())
     raise ConfigError(
         f"a burst of {spec.pulses} pulses every {spec.period_ns / 1e3:g} us needs an SPI transfer of {size} bytes,"
         f" spidev allows {bufsiz}",
         "spidev's buffer has 4096 bytes by default",
-        f"write `options spidev bufsiz={needed}` into /etc/modprobe.d/spidev.conf (a kernel with spidev built in:"
-        f" `spidev.bufsiz={needed}` in /boot/firmware/cmdline.txt) and reboot the Pi; or use fewer pulses",
+        f"write `options spidev bufsiz={needed_bytes}` into /etc/modprobe.d/spidev.conf (a kernel with spidev built in:"
+        f" `spidev.bufsiz={needed_bytes}` in /boot/firmware/cmdline.txt) and reboot the Pi; or use fewer pulses",
         code=ErrorCode.VALUES_CONFLICT,
     )
 
@@ -413,7 +413,9 @@ class TriggerLoop:
                 self._lines.close()
 
     def _take(self, edge: Edge) -> None:
-        edges_lost = 0 if self._last_seqno is None else edge.seqno - self._last_seqno - 1
+        edges_lost = 0
+        if self._last_seqno is not None:
+            edges_lost = edge.seqno - self._last_seqno - 1
         self._last_seqno = edge.seqno
         job = self._job
         if job is None or edge.t_ns <= job.armed_ns:
@@ -445,16 +447,18 @@ class TriggerLoop:
 
     def _look_back(self, record: BurstRecord) -> tuple[BurstRecord, str]:
         """Return the record with the pulses that were seen instead of those sent, and how they differ, or ""."""
-        seen = self._lines.look_back(record.pulses)
-        self.sees_pulses = seen is not None
-        if seen is None:
+        returned = self._lines.look_back(record.pulses)
+        self.sees_pulses = returned is not None
+        if returned is None:
             return record, ""
-        differ = "" if seen.pulses == record.pulses else f"{record.pulses} pulses sent, {seen.pulses} seen"
-        width_ns = seen.width_max_ns or record.width_max_ns
+        differ = ""
+        if returned.pulses != record.pulses:
+            differ = f"{record.pulses} pulses sent, {returned.pulses} seen"
+        width_ns = returned.width_max_ns or record.width_max_ns
         fault = record.fault
-        if seen.width_max_ns > MAX_WIDTH_NS:
+        if returned.width_max_ns > MAX_WIDTH_NS:
             fault = fault or int(PiFault.PULSE_TOO_LONG)
-        return record._replace(pulses=seen.pulses, width_max_ns=width_ns, fault=fault), differ
+        return record._replace(pulses=returned.pulses, width_max_ns=width_ns, fault=fault), differ
 
     def _send_without_edge(self, spec: BurstSpec) -> None:
         self._bench = None

@@ -115,7 +115,8 @@ class Pi(Section, frozen=True):
         )
         controller = self.spi_device.rpartition(".")[0]
         if self.wiring == "spi" and controller in _MOSI:
-            mosi, miso = _MOSI[controller], _MISO[controller]
+            mosi = _MOSI[controller]
+            miso = _MISO[controller]
             require(self.sync_out == (mosi,), f"MOSI of {self.spi_device} is GPIO {mosi}: sync_out = [{mosi}]")
             require(
                 self.pulses_in in (None, miso), f"MISO of {self.spi_device} is GPIO {miso}: pulses_in = {miso}, or none"
@@ -131,10 +132,10 @@ class Pi(Section, frozen=True):
             spacing = "widths and spacing by its clock, which `polysight-pi check` measures"
         elif self.one_shot:
             source = "libgpiod on one line, widths by a one-shot"
-        seen = "sent, not seen: pi.pulses_in is not wired"
+        pulses = "sent, not seen: pi.pulses_in is not wired"
         if self.pulses_in is not None:
-            seen = f"counted at the connector by GPIO {self.pulses_in}"
-        return f"{source}; {spacing}; one clock buffer, skew of the boards below 1 ns; pulses {seen}"
+            pulses = f"counted at the connector by GPIO {self.pulses_in}"
+        return f"{source}; {spacing}; one clock buffer, skew of the boards below 1 ns; pulses {pulses}"
 
 
 class MountStep(Section, frozen=True):

@@ -51,7 +51,9 @@ def advice(*parts: str) -> str:
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return `did you mean 'step_mm'?` with the most similar known word; "" if none is similar."""
     near = get_close_matches(word, list(known), n=1, cutoff=0.7)
-    return f"did you mean {near[0]!r}?" if near else ""
+    if not near:
+        return ""
+    return f"did you mean {near[0]!r}?"
 
 
 class ConfigError(PolysightError):
@@ -103,12 +105,16 @@ def os_error(
     remedy: str = "check the path, its permissions and the free space (df -h)",
 ) -> DeviceError:
     """Turn an OSError into a DeviceError with cause and remedy, so that a command ends without a traceback."""
-    where = f"{e.filename}: " if e.filename else ""
+    summary = e.strerror or str(e)
+    if e.filename:
+        summary = f"{e.filename}: {summary}"
     if e.errno == errno.ENOENT:
         # A folder that was renamed is no full disk.
         why = "it was moved, renamed or deleted"
-    code = ErrorCode.DISK_FULL if e.errno in (errno.ENOSPC, errno.EDQUOT) else ErrorCode.OTHER
-    return DeviceError(f"{where}{e.strerror or e}", why, advice(remedy, *getattr(e, "__notes__", ())), code=code)
+    code = ErrorCode.OTHER
+    if e.errno in (errno.ENOSPC, errno.EDQUOT):
+        code = ErrorCode.DISK_FULL
+    return DeviceError(summary, why, advice(remedy, *getattr(e, "__notes__", ())), code=code)
 
 
 class ScanError(PolysightError):

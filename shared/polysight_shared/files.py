@@ -31,9 +31,12 @@ def open_regular(path: Path) -> BinaryIO:
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            what = f"{path}: is not a regular file"
-            why = "it is a folder, a device or a pipe"
-            raise DataError(what, why, "give a file", code=ErrorCode.FILE_FOREIGN)
+            raise DataError(
+                f"{path}: is not a regular file",
+                "it is a folder, a device or a pipe",
+                "give a file",
+                code=ErrorCode.FILE_FOREIGN,
+            )
         return os.fdopen(os.dup(descriptor), "rb")
     finally:
         os.close(descriptor)
@@ -140,5 +143,9 @@ def sync_folder(path: Path) -> None:
         finally:
             os.close(descriptor)
     except OSError as e:
-        what, why = f"{path}: cannot be made durable: {e.strerror}", "the disk is full or fails"
-        raise DeviceError(what, why, f"free space below {path}", code=ErrorCode.FILE_UNWRITABLE) from None
+        raise DeviceError(
+            f"{path}: cannot be made durable: {e.strerror}",
+            "the disk is full or fails",
+            f"free space below {path}",
+            code=ErrorCode.FILE_UNWRITABLE,
+        ) from None

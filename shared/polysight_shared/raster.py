@@ -125,7 +125,7 @@ class Stage(Section, frozen=True):
 
         `speed_mm_s`: speed of the row; default: the stage's. See docs/spec/stage-line.md, "A row".
         """
-        speed = self.speed_mm_s if speed_mm_s is None else speed_mm_s
+        speed = speed_mm_s or self.speed_mm_s
         return speed**2 / (2 * self.accel_mm_s2) + max(step_mm, self.backlash_mm)
 
     def misfit(self, raster: Grid | RasterPlan, speed_mm_s: float | None = None) -> str:
@@ -161,11 +161,15 @@ class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def direction(self) -> int:
         """+1 if the stage moves towards +x, otherwise -1."""
-        return 1 if self.step_mm > 0 else -1
+        if self.step_mm > 0:
+            return 1
+        return -1
 
     def column(self, i: int) -> int:
         """Return the grid column (0 = smallest x) of the i-th point in the order of the scan."""
-        return i if self.direction > 0 else self.points - 1 - i
+        if self.direction > 0:
+            return i
+        return self.points - 1 - i
 
     @property
     def x_mm(self) -> tuple[float, ...]:

@@ -100,13 +100,13 @@ def _make(
             socket.connect(address)
     except zmq.ZMQError as e:
         socket.close()
-        why = "the address does not exist on this machine"
+        cause = "the address does not exist on this machine"
         code = ErrorCode.OTHER
         if e.errno == zmq.EADDRINUSE:
-            why = "another program uses this port"
+            cause = "another program uses this port"
             code = ErrorCode.BUSY
         remedy = "stop the other program (ss -ltnp shows it), or change the address in instrument.toml"
-        raise DeviceError(f"{address}: {e.strerror or e}", why, remedy, code=code) from None
+        raise DeviceError(f"{address}: {e.strerror or e}", cause, remedy, code=code) from None
     except ConfigError:
         socket.close()
         raise

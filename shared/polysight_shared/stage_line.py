@@ -38,7 +38,9 @@ class Immediate(IntEnum):
     @property
     def sent(self) -> bytes:
         """Bytes to send."""
-        return bytes([self]) * (2 if self is Immediate.RESUME else 1)
+        if self is Immediate.RESUME:
+            return bytes([self, self])
+        return bytes([self])
 
 
 class Parameter(IntEnum):
@@ -157,10 +159,10 @@ class Reply(msgspec.Struct, frozen=True):
     def decode(line: bytes) -> Reply:
         """Parse a sealed reply line. Raises ProtocolError."""
         body = unseal(line)
-        words = body.split(" ")
-        head, rest = words[0], words[1:]
+        head, *rest = body.split(" ")
         kind, _, number = head.partition(":")
-        kind = "banner" if kind == "polysight-stage" else kind
+        if kind == "polysight-stage":
+            kind = "banner"
         if kind not in ("banner", "ok", "error", "done", "alarm", "status"):
             raise ProtocolError(f"not a stage reply: {body!r}")
         if (kind in ("error", "alarm")) != bool(re.fullmatch(r"[0-9]{1,3}", number)):
@@ -169,15 +171,16 @@ class Reply(msgspec.Struct, frozen=True):
         if kind in ("ok", "error", "done"):
             if not rest or not re.fullmatch(r"N([0-9]{1,5}|-)", rest[0]):
                 raise ProtocolError(f"stage reply without a sequence number: {body!r}")
-            sequence = None if rest[0] == "N-" else int(rest[0][1:])
-            rest = rest[1:]
+            tag = rest.pop(0)
+            if tag != "N-":
+                sequence = int(tag[1:])
         fields: dict[str, str] = {}
         for word in rest:
             m = _FIELD.fullmatch(word)
             if m is None or m[1] in fields:
                 raise ProtocolError(f"stage reply with an invalid field {word!r}: {body!r}")
             fields[m[1]] = m[2]
-        return Reply(kind, sequence, int(number) if number else 0, fields)
+        return Reply(kind, sequence, int(number or 0), fields)
 
     def integer(self, key: str) -> int:
         """Return an integer field. Raises ProtocolError if it is missing or not an integer."""

@@ -45,12 +45,12 @@ def read_toml(path: Path) -> dict[str, Any]:
     except DataError as e:
         raise ConfigError(e.what, e.why, e.remedy, code=ErrorCode.FILE_UNREADABLE) from None
     except (OSError, UnicodeDecodeError) as e:
-        what = f"{path}: cannot be read: {e}"
-        why = "it is not a readable text file"
-        raise ConfigError(what, why, "check the path", code=ErrorCode.FILE_UNREADABLE) from None
+        summary = f"{path}: cannot be read: {e}"
+        cause = "it is not a readable text file"
+        raise ConfigError(summary, cause, "check the path", code=ErrorCode.FILE_UNREADABLE) from None
     except (tomllib.TOMLDecodeError, RecursionError) as e:
-        what = f"{path}: not valid TOML: {e}"
-        raise ConfigError(what, "a typing error", "correct that line", code=ErrorCode.FILE_DAMAGED) from None
+        summary = f"{path}: not valid TOML: {e}"
+        raise ConfigError(summary, "a typing error", "correct that line", code=ErrorCode.FILE_DAMAGED) from None
 
 
 def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T:
@@ -143,7 +143,9 @@ def _lookup(data: Any, path: str) -> str:
             node = node[int(part[1:-1])] if part.startswith("[") else node[part]
         except (KeyError, IndexError, TypeError, ValueError):
             return ""
-    return "" if isinstance(node, dict | list) else repr(node)
+    if isinstance(node, dict | list):
+        return ""
+    return repr(node)
 
 
 def _without_none(node: Any) -> Any:

@@ -277,7 +277,7 @@ def test_a_width_that_the_controller_cannot_make_is_refused(width_ns):
 
 def test_the_published_burst_fits_every_pi_as_it_comes():
     b = published_rig().burst
-    made = spi_burst(BurstSpec.of(b))
+    made = spi_burst(BurstSpec.from_burst(b))
     assert SpiWireLines.bufsiz == DEFAULT_BUFSIZ == 4096
     assert (made.clock_hz, len(made.data)) == (1_000_000, 2815)
     assert [y - x for x, y in itertools.pairwise(made.bits)] == [1500] * 15

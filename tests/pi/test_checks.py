@@ -164,6 +164,7 @@ def test_a_short_pulse_is_two_calls_with_nothing_between_them(gpio_rig, monkeypa
 
     request = SimpleNamespace(fd=7, release=lambda: None)
     monkeypatch.setattr(pi_lines, "_request", lambda *_, **__: request)
+    monkeypatch.setattr(pi_lines, "_is_stamped_by_the_kernel", lambda _: True)
     monkeypatch.setattr(pi_lines.fcntl, "ioctl", ioctl)
     monkeypatch.setattr(pi_lines, "time", SimpleNamespace(monotonic_ns=lambda: clock.t))
     monkeypatch.setattr(pi_lines.TriggerInput, "sleep_until", lambda _, t_ns: setattr(clock, "t", max(clock.t, t_ns)))

@@ -108,8 +108,10 @@ def check_end(words: list[str]) -> None:
     assert isinstance(status, int), words
     assert shown.strip() or status == 0, words
     assert "Traceback" not in shown, words
-    numbers = [word.strip("(),;:+-").lower() for word in out.getvalue().split()]
-    assert status != 0 or not {"nan", "inf"} & set(numbers), (words, out.getvalue())
+    # A note says what was written into it.
+    numbers = {word.strip("(),;:+-").lower() for word in out.getvalue().split() if words[0] != "note"}
+    assert status != 0 or not {"nan", "inf"} & numbers, (words, out.getvalue())
+    assert status not in (2, 3, 5, 6) or "usage:" in shown or "\n  do: " in shown, (words, shown)
 
 
 def test_random_command_lines_end_with_a_message(folder, monkeypatch, request):
@@ -126,7 +128,7 @@ def test_random_command_lines_end_with_a_message(folder, monkeypatch, request):
 def test_each_option_takes_each_number_or_refuses_it(folder, monkeypatch, request):
     lines = [words for name, parser in commands().items() for words in each_number(name, parser)]
     if not request.config.getoption("--long"):
-        lines = random.Random(2).sample(lines, CASES)
+        lines = random.Random(2).sample(lines, CASES // 3)
     with chdir(folder):
         for words in lines:
             monkeypatch.setattr(sys, "stdin", io.StringIO(""))

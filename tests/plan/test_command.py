@@ -51,6 +51,7 @@ def test_a_plan_that_is_impossible_fails(options, status):
 @pytest.mark.parametrize(
     "option",
     [
+        ("--minutes", "5e-324"),
         ("--snr-db", "nan"),
         ("--snr-db", "1e308"),
         ("--row-overhead-s", "-1"),

@@ -57,7 +57,8 @@ def scanned(rig: Instrument) -> tuple[float, list[int]]:
     """Motion of a whole scan from the home corner, seconds, and the times of its triggers, ns."""
     stage = Stage(rig)
     total = sum(
-        stage.seconds("ROW", *RowMotion.plan(row, rig.stage, rig.stage.speed_mm_s).line) for row in plan_raster(rig.grid)
+        stage.seconds("ROW", *RowMotion.plan(row, rig.stage, rig.stage.speed_mm_s).line)
+        for row in plan_raster(rig.grid)
     )
     edges = [w.t_ns for w in stage.board.wires if isinstance(w, WireEdge) and w.value]
     return total, edges

@@ -31,6 +31,7 @@ _bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <=
 # Nearer than a few wavelengths (4 mm) no antenna sees a plane wave.
 _distance = number(float, "a distance from 20 to 10000 mm", lambda value: 20 <= value <= 10_000)
 _seconds = number(float, "a number of seconds from 0 to 3600", lambda value: 0 <= value <= 3600)
+_minutes = number(float, "a time of 0.01 to 100000 minutes", lambda value: 0.01 <= value <= 100_000)
 _decibels = number(float, "a ratio of -100 to 100 dB", lambda value: abs(value) <= 100)
 _scene_side = number(float, "a length above 0, at most 10000 mm", lambda value: 0 < value <= 10_000)
 
@@ -97,7 +98,7 @@ def _add_plan(add: Add) -> None:
         ("--minutes", "--like"),
     )
     add_config_option(sub, shipped=True)
-    sub.add_argument("--minutes", type=positive, metavar="M", help="propose the best plans within this time")
+    sub.add_argument("--minutes", type=_minutes, metavar="M", help="propose the best plans within this time")
     sub.add_argument("--count", type=count, default=5, metavar="N", help="number of proposals (default: 5)")
     sub.add_argument("--like", type=Path, metavar="SCAN", help="take noise and standstill between rows from this scan")
     sub.add_argument("--scene-mm", type=_size, metavar="W,H", help="size of the scene (default: the image's)")

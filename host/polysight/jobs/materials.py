@@ -143,26 +143,24 @@ def permittivity(
     chirp = None
     if stack:
         chirp = _chirp(products, config)
-    out: list[dict[str, Any]] = []
-    lines: list[str] = []
+    rows: list[dict[str, Any]] = []
     for patch in patches:
-        fit = None
-        if chirp is not None and not patch.metal_reference:
-            _check_bands(patch, chirp, str(config or products.folder / SCAN))
-            fit = fit_row(patch, chirp, stack, bands, amplitude_error, incidence_std_rad(products.materials))
         row = {"label": patch.label, "name": patch.name, "single_interface": plain(patch.permittivity)}
         if patch.refused is not None:
             row["refused"] = plain(patch.refused)
-        if fit is not None:
-            row["layer"] = layer_content(fit)
-        out.append(row)
-        lines.append(_line(patch, row.get("layer")))
+        if chirp is not None and not patch.metal_reference:
+            _check_bands(patch, chirp, str(config or products.folder / SCAN))
+            fit = fit_row(patch, chirp, stack, bands, amplitude_error, incidence_std_rad(products.materials))
+            if fit is not None:
+                row["layer"] = layer_content(fit)
+        rows.append(row)
     if as_json:
-        print_json(out)
+        print_json(rows)
         return print_verdict(products, to_terminal=False)
     status = print_verdict(products)
     if status == 0:
-        sys.stdout.write("".join(lines))
+        for patch, row in zip(patches, rows, strict=True):
+            sys.stdout.write(_line(patch, row.get("layer")))
     return status
 
 

@@ -22,6 +22,7 @@ from polysight.materials import (
     CHANNELS,
     DISCRIMINANT,
     PAPER,
+    Entry,
     Library,
     Permittivity,
     Samples,
@@ -175,6 +176,31 @@ class Judgements:
         return self._scores[key]
 
 
+FIG18_HEAD = (
+    "Task",
+    "source",
+    "scans",
+    "H, published",
+    f"H, KNN {OPTIMISTIC}",
+    f"H, KNN {LEFT_OUT}",
+    "H+V+P, published",
+    f"KNN, {OPTIMISTIC}",
+    f"KNN, {LEFT_OUT}",
+    f"discriminant, {OPTIMISTIC}",
+    f"discriminant, {LEFT_OUT}",
+    "discriminant, patches, scans left out",
+    "materials in two scans or more",
+)
+FIG18_NOTES = (
+    "The paper does not say how training and test pixels were kept apart; its numbers fit a split by pixel,"
+    " which lets a patch know itself and is optimistic. With whole scans left out no pixel of a test scan was"
+    " trained on; only materials that two scans or more hold can be judged so (last column), and a dash stands"
+    " where these, or the scans, are too few.",
+    "Solids and powders are taken at 60 degrees, liquids at 55; the second angle is 55. Two angles: scans in"
+    " pairs, those with most materials in common, and pairs left out.",
+)
+
+
 def authors_fig18(judge: Judgements) -> Item:
     """Accuracy of the paper's KNN and of the discriminant, with confusion matrices. Raises DataError."""
     printed = published()["classification"]
@@ -221,33 +247,11 @@ def authors_fig18(judge: Judgements) -> Item:
         pictures[key] = Picture(
             fig, f"{task[0].upper()}{task[1:]}, {source}, {split}. Rows are the truth, adding to 100 %."
         )
-    head = (
-        "Task",
-        "source",
-        "scans",
-        "H, published",
-        f"H, KNN {OPTIMISTIC}",
-        f"H, KNN {LEFT_OUT}",
-        "H+V+P, published",
-        f"KNN, {OPTIMISTIC}",
-        f"KNN, {LEFT_OUT}",
-        f"discriminant, {OPTIMISTIC}",
-        f"discriminant, {LEFT_OUT}",
-        "discriminant, patches, scans left out",
-        "materials in two scans or more",
-    )
     return Item(
         "fig18",
         "Fig. 18: classification of solids, liquids and powders",
-        (
-            "The paper does not say how training and test pixels were kept apart; its numbers fit a split by pixel,"
-            " which lets a patch know itself and is optimistic. With whole scans left out no pixel of a test scan was"
-            " trained on; only materials that two scans or more hold can be judged so (last column), and a dash stands"
-            " where these, or the scans, are too few.",
-            "Solids and powders are taken at 60 degrees, liquids at 55; the second angle is 55. Two angles: scans in"
-            " pairs, those with most materials in common, and pairs left out.",
-        ),
-        (Table("Share of pixels named right, mean over materials", head, tuple(rows)),),
+        FIG18_NOTES,
+        (Table("Share of pixels named right, mean over materials", FIG18_HEAD, tuple(rows)),),
         pictures,
         content,
     )
@@ -261,8 +265,6 @@ def authors_fig20(judge: Judgements) -> Item:
     content = {}
     judged_tasks = judge.found(tasks)
     sources = list(dict.fromkeys(s for s, _, _ in judged_tasks))
-    fig = new_figure(8.4, 4.2)
-    ax = fig.subplots()
     bars = [("published", [printed[c] for c in CHANNELS])]
     for source in sources:
         own_tasks = [(t, x) for s, t, x in judged_tasks if s == source]
@@ -297,17 +299,6 @@ def authors_fig20(judge: Judgements) -> Item:
         bars.append((f"{source}, {OPTIMISTIC}", [100 * means[c][0] for c in CHANNELS]))
         if all(means[c][1] is not None for c in CHANNELS):
             bars.append((f"{source}, {LEFT_OUT}", [100 * (means[c][1] or 0.0) for c in CHANNELS]))
-    width = 0.84 / len(bars)
-    for k, (label, heights) in enumerate(bars):
-        positions = np.arange(len(CHANNELS)) + width * (k - (len(bars) - 1) / 2)
-        drawn = ax.bar(
-            positions, heights, 0.92 * width, label=label, color=PALETTE[k], hatch="//" if OPTIMISTIC in label else ""
-        )
-        ax.bar_label(drawn, fmt="%.0f", fontsize=7)
-    dress(ax, "Accuracy by channel, weighted KNN of the paper", "", "pixels named right (%)")
-    ax.set_xticks(range(len(CHANNELS)), list(CHANNELS))
-    ax.set_ylim(0, 135)
-    ax.legend(fontsize=8, frameon=False, loc="upper left", ncols=2)
     head = ("Channels", "source", "published", OPTIMISTIC, LEFT_OUT, f"each group, {LEFT_OUT}")
     return Item(
         "fig20",
@@ -317,9 +308,33 @@ def authors_fig20(judge: Judgements) -> Item:
             " paper does not say how its mean was taken.",
         ),
         (Table("Share of pixels named right by the paper's KNN", head, tuple(rows)),),
-        {"channels": Picture(fig, "Accuracy of each channel, published and from the files.")},
+        {"channels": Picture(_channel_figure(bars), "Accuracy of each channel, published and from the files.")},
         content,
     )
+
+
+def _channel_figure(bars: list[tuple[str, list[float]]]) -> Any:
+    """Bars of accuracies in per cent: for each label one of each channel."""
+    fig = new_figure(8.4, 4.2)
+    ax = fig.subplots()
+    width = 0.84 / len(bars)
+    for k, (label, heights) in enumerate(bars):
+        positions = np.arange(len(CHANNELS)) + width * (k - (len(bars) - 1) / 2)
+        hatch = "//" if OPTIMISTIC in label else ""
+        drawn = ax.bar(positions, heights, 0.92 * width, label=label, color=PALETTE[k], hatch=hatch)
+        ax.bar_label(drawn, fmt="%.0f", fontsize=7)
+    dress(ax, "Accuracy by channel, weighted KNN of the paper", "", "pixels named right (%)")
+    ax.set_xticks(range(len(CHANNELS)), list(CHANNELS))
+    ax.set_ylim(0, 135)
+    ax.legend(fontsize=8, frameon=False, loc="upper left", ncols=2)
+    return fig
+
+
+FIG21_NOTE = (
+    "A straight line from the polarisation angle to the concentration, each concentration estimated by a line"
+    " through the others. The paper does not say whether its line had seen the concentration it was asked for;"
+    " the last row is for a line that has."
+)
 
 
 def authors_fig21(data: AuthorsData) -> Item:
@@ -334,10 +349,8 @@ def authors_fig21(data: AuthorsData) -> Item:
         angles = [e.incidence_deg for e in library.entries if e.name in concentration_of_name]
         if not angles:
             continue
-        best = max(set(angles), key=lambda a: len({e.name for e in library.entries if abs(e.incidence_deg - a) < 1}))
-        near = Library(
-            tuple(e for e in library.entries if e.name in concentration_of_name and abs(e.incidence_deg - best) < 1)
-        )
+        best = max(set(angles), key=lambda angle: len({e.name for e in _entries_near(library, angle)}))
+        near = Library(tuple(e for e in _entries_near(library, best) if e.name in concentration_of_name))
         try:
             result = fit_concentration(near, {WATER_IN_GLASS: 0.0})
         except DataError as e:
@@ -346,29 +359,11 @@ def authors_fig21(data: AuthorsData) -> Item:
         x = np.array([float(np.median(polarisation_angle_rad(e.p))) for e in near.entries])
         y = np.array([concentration_of_name[e.name] for e in near.entries])
         median_error = float(np.median(np.abs(result.line.percent(x) - y)))
-        rows = []
-        for name in sorted(near.names, key=lambda n: concentration_of_name[n]):
-            errors_of_name = [r for r in result.left_out if r.name == name]
-            error = np.median([abs(r.percent - r.true_percent) for r in errors_of_name])
-            rows.append(
-                (
-                    name,
-                    f"{concentration_of_name[name]:.1f} %",
-                    f"{np.mean([r.percent for r in errors_of_name]):.2f} %",
-                    str(len(errors_of_name)),
-                    f"{error:.2f} %",
-                )
-            )
-        rows.append(
-            (
-                "median error, each concentration left out",
-                f"published {printed:g} %",
-                f"{result.median_error:.3f} %",
-                str(len(result.left_out)),
-                "",
-            )
-        )
-        rows.append(("median error, line has seen them (optimistic)", "", f"{median_error:.3f} %", "", ""))
+        median = f"{result.median_error:.3f} %"
+        count = str(len(result.left_out))
+        left_out = ("median error, each concentration left out", f"published {printed:g} %", median, count, "")
+        optimistic = ("median error, line has seen them (optimistic)", "", f"{median_error:.3f} %", "", "")
+        rows = [*_solution_rows(result, concentration_of_name), left_out, optimistic]
         tables.append(
             Table(
                 f"Concentration estimated from the others, {source}, {best:.0f} degrees",
@@ -395,15 +390,35 @@ def authors_fig21(data: AuthorsData) -> Item:
     return Item(
         "fig21",
         "Fig. 21: concentration of sugar in water",
-        (
-            "A straight line from the polarisation angle to the concentration, each concentration estimated by a line"
-            " through the others. The paper does not say whether its line had seen the concentration it was asked for;"
-            " the last row is for a line that has.",
-        ),
+        (FIG21_NOTE,),
         tuple(tables),
         {"sugar": Picture(_sugar_figure(plots, printed), "The lines, and the distribution of errors.")},
         content,
     )
+
+
+def _entries_near(library: Library, angle_deg: float) -> list[Entry]:
+    """Entries within a degree of an incidence angle."""
+    return [e for e in library.entries if abs(e.incidence_deg - angle_deg) < 1]
+
+
+def _solution_rows(result: Any, concentration_of_name: Mapping[str, float]) -> list[tuple[str, ...]]:
+    """A row for each solution: name, true and mean estimated concentration, patches, median error."""
+    rows = []
+    names = {r.name for r in result.left_out}
+    for name in sorted(names, key=lambda n: concentration_of_name[n]):
+        estimates = [r for r in result.left_out if r.name == name]
+        error = np.median([abs(r.percent - r.true_percent) for r in estimates])
+        rows.append(
+            (
+                name,
+                f"{concentration_of_name[name]:.1f} %",
+                f"{np.mean([r.percent for r in estimates]):.2f} %",
+                str(len(estimates)),
+                f"{error:.2f} %",
+            )
+        )
+    return rows
 
 
 def _sugar_figure(plots: list[tuple[str, Any, Any, Any]], printed: float) -> Any:

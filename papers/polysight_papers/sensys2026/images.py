@@ -273,6 +273,14 @@ def _spread_deg(values: npt.NDArray[np.complexfloating]) -> float:
     return float(np.degrees(np.sqrt(-2 * np.log(length))))
 
 
+FIG14_NOTE = (
+    "Water, oil and metal; everything outside their interiors is masked. In the paper the phases of H and V"
+    " change over a target, because it is not parallel to the plane of the scan, and the phase of P does not."
+    " In this simulation the plane is parallel, so H and V are steady as well; what tells the materials apart"
+    " is the phase of P, in both."
+)
+
+
 def fig14(run: Run) -> Item:
     """Phase of H, V and P inside water, oil and metal."""
     view = view_scan("liquids", SETS["liquids"], run)
@@ -315,12 +323,7 @@ def fig14(run: Run) -> Item:
     return Item(
         "fig14",
         "Fig. 14: phase of H, V and P",
-        (
-            "Water, oil and metal; everything outside their interiors is masked. In the paper the phases of H and V"
-            " change over a target, because it is not parallel to the plane of the scan, and the phase of P does not."
-            " In this simulation the plane is parallel, so H and V are steady as well; what tells the materials apart"
-            " is the phase of P, in both.",
-        ),
+        (FIG14_NOTE,),
         (
             Table(
                 "Spread of the phase over each plate (circular standard deviation), and the phase of P",

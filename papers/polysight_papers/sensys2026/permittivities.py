@@ -158,6 +158,16 @@ def fig16(run: Run) -> Item:
     )
 
 
+def _draw_estimates(axes: Any, estimates: list[tuple[complex, complex, float]], colour: str, label: str) -> None:
+    """Draw estimated over true permittivities with their standard deviation: real parts, and losses."""
+    true = np.array([value for value, _, _ in estimates], np.complex128)
+    estimated = np.array([value for _, value, _ in estimates], np.complex128)
+    std = [deviation for _, _, deviation in estimates]
+    bars: dict[str, Any] = {"yerr": std, "fmt": "o", "ms": 4, "color": colour, "lw": 1, "label": label}
+    axes[0].errorbar(true.real, estimated.real, **bars)
+    axes[1].errorbar(-true.imag, -estimated.imag, **bars)
+
+
 def table2_item(run: Run) -> Item:
     """Estimate Table 2 by Eq. 3 from pixels drawn at the published permittivities."""
     rows = []
@@ -189,20 +199,10 @@ def table2_item(run: Run) -> Item:
                     f"{100 * relative_error:.1f} %",
                 )
             )
-            data.append(
-                row | {"published": true, "recovered": e.value, "std": e.real_std, "relative_error": relative_error}
-            )
+            figures = {"published": true, "recovered": e.value, "std": e.real_std, "relative_error": relative_error}
+            data.append(row | figures)
             estimated.append((true, e.value, e.real_std))
-        bars: dict[str, Any] = {
-            "yerr": [f[2] for f in estimated],
-            "fmt": "o",
-            "ms": 4,
-            "color": colour,
-            "lw": 1,
-            "label": f"{name}, {group.angle_deg:.0f}°",
-        }
-        axes[0].errorbar([f[0].real for f in estimated], [f[1].real for f in estimated], **bars)
-        axes[1].errorbar([-f[0].imag for f in estimated], [-f[1].imag for f in estimated], **bars)
+        _draw_estimates(axes, estimated, colour, f"{name}, {group.angle_deg:.0f}°")
     for ax, part in zip(axes, ("real part ε′", "loss ε″"), strict=True):
         dress(ax, part, f"published {part}", f"recovered {part}")
         ax.axline((1, 1), slope=1, color=INK, lw=0.8, ls=":")

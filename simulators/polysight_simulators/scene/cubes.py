@@ -98,10 +98,7 @@ def synced_cube(
     seed = scene.seed if seed is None else seed
     board = rig.by_name(board_name)
     d = scene.disturbances
-    if frequencies_hz is None:
-        f = sample_frequencies_hz(rig)
-    else:
-        f = np.asarray(frequencies_hz, np.float64)
+    f = sample_frequencies_hz(rig) if frequencies_hz is None else np.asarray(frequencies_hz, np.float64)
     channels = list(range(len(rig.antennas.rx_mm))) if rx is None else list(rx)
     field = build_field(rig, scene, board, f, cache_dir, channels)
     all_m = antennas(rig, board).direct_m
@@ -113,15 +110,17 @@ def synced_cube(
         level = direct_factor(board, scene) * d.direct_gain * all_m[0] / direct_m
         cube += (gains * level).astype(np.complex64)[:, None, None, None]
     if noise is None:
-        sigma = _burst_noise(rig, scene, board, seed, field.centre_path_m)
-    else:
-        sigma = noise
-    if sigma > 0:
-        rng = np.random.default_rng(stream_key(seed, "synced noise", board.name))
-        flat = rng.standard_normal((*cube.shape[:-1], 2 * len(f)), dtype=np.float32).view(np.complex64)
-        flat *= (sigma * np.sqrt(0.5) * np.abs(gains)).astype(np.float32)[:, None, None, None]
-        cube += flat
+        noise = _burst_noise(rig, scene, board, seed, field.centre_path_m)
+    if noise > 0:
+        cube += _draw_noise(cube.shape, noise * np.abs(gains), stream_key(seed, "synced noise", board.name))
     return cube
+
+
+def _draw_noise(shape: tuple[int, ...], rms_of_channel: Real, key: int) -> NDArray[np.complex64]:
+    """Complex noise of `shape`, whose first axis are the channels."""
+    rng = np.random.default_rng(key)
+    noise = rng.standard_normal((*shape[:-1], 2 * shape[-1]), dtype=np.float32).view(np.complex64)
+    return noise * (np.sqrt(0.5) * rms_of_channel).astype(np.float32)[:, None, None, None]
 
 
 def _drift_of_positions(rig: Instrument, scene: Scene, board: Board) -> NDArray[np.complex64]:

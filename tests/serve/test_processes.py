@@ -42,8 +42,8 @@ class Server:
 
 
 @contextmanager
-def serving(root: Path, state: Path) -> Iterator[Server]:
-    command = [sys.executable, "-m", "polysight", "serve", str(root), "--port", "0"]
+def serving(root: Path, state: Path, *options: str) -> Iterator[Server]:
+    command = [sys.executable, "-m", "polysight", "serve", str(root), "--port", "0", *options]
     environment = os.environ | {"XDG_STATE_HOME": str(state)}
     program = subprocess.Popen(command, cwd=state, env=environment, stderr=subprocess.PIPE, text=True)
     try:
@@ -103,3 +103,15 @@ def test_the_token_survives_a_restart_and_nobody_else_can_read_it(scans, tmp_pat
     path.chmod(0o644)
     with refused(ErrorCode.VALUE_INVALID, path):
         load_token()
+
+
+def test_behind_a_reverse_proxy_reading_needs_the_token_too(scans, tmp_path):
+    """Everybody comes from this machine then, under the proxy's name."""
+    with serving(scans, tmp_path / "state", "--allow-host", "lab.example.org") as server:
+        token = {TOKEN_HEADER: server.token}
+        for host in ("lab.example.org", "127.0.0.1"):
+            for path in ("/api/scans", "/api/running"):
+                assert ask(server, path, Host=host, X_Forwarded_For="10.0.0.7")[0] == 401
+            assert ask(server, "/api/running", Host=host, **token)[0] == 200
+            assert ask(server, "/", Host=host)[0] == 200
+        assert ask(server, "/", Host="elsewhere.example.org", **token)[0] == 400

@@ -27,7 +27,7 @@ from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import Route
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from polysight.acquisition import BADGES, STATES, Life, ScanCommand, send_command
@@ -217,19 +217,27 @@ class Reader:
             tasks.cancel_scope.cancel()
 
     async def _relay(self, scope: Scope, receive: Receive, send: Send, body: bytes) -> None:
+        is_answered = False
+
+        async def send_on(message: Message) -> None:
+            nonlocal is_answered
+            is_answered = True
+            await send(message)
+
         try:
             reader, writer = await self._connect()
-        except OSError:
-            what = "The reading part of the server does not answer"
-            do = "load the page again; control goes on without it"
-            await refuse(503, ErrorCode.NO_ANSWER, what, "it starts, or was ended", do)(scope, receive, send)
-            return
-        try:
-            connection = h11.Connection(h11.CLIENT)
-            writer.write(_encode_request(connection, scope, body))
-            await _relay_answer(connection, reader, send)
-        finally:
-            writer.close()
+            try:
+                connection = h11.Connection(h11.CLIENT)
+                writer.write(_encode_request(connection, scope, body))
+                await _relay_answer(connection, reader, send_on)
+            finally:
+                writer.close()
+        except (OSError, h11.RemoteProtocolError):
+            # It was ended in the middle, and is started again. Half an answer is cut off.
+            if not is_answered:
+                what = "The reading part of the server does not answer"
+                do = "load the page again; control goes on without it"
+                await refuse(503, ErrorCode.NO_ANSWER, what, "it starts, or was ended", do)(scope, receive, send)
 
     async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         deadline = time.monotonic() + READER_PATIENCE_S

@@ -73,7 +73,8 @@ function overlay(pen, at) {
       pen.stroke();
     }, patch.metal_reference ? "#f2b632" : "#ffffff");
     const [x0, y0, x1, y1] = patch.box_mm, [x, y] = at((x0 + x1) / 2, y1 - 0.25 * (y1 - y0));
-    caption(pen, `${patch.label} ${patchName(patch)}`, x, y);
+    const words = `${patch.label} ${patchName(patch)}`, isWide = at(x1, y1)[0] - at(x0, y0)[0] > 7.5 * words.length;
+    caption(pen, isWide ? words : String(patch.label), x, y); // names of neighbours would overlap on a phone
   }
   labels?.overlay(pen, at);
   if (metal) {

@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
+import msgspec
 import pytest
 from tests.support.page.asking import TOKEN, ask, get, post
 from tests.support.page.live_view import Served, open_control, served_folder
@@ -22,6 +23,7 @@ from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
 from tests.support.products import judged_products
 
+from polysight.acquisition.control import ALIVE, CONTROL, Life, started_ticks
 from polysight.products.folder import making_products
 from polysight.serve import commands as control
 from polysight.serve import site
@@ -155,6 +157,19 @@ def test_open_live_views_keep_nobody_from_pausing_and_stopping(view, scans):
         assert stop.after_row
         assert post(view, "/api/control/abort?scan=one")[0] == 200
         assert stop.now
+
+
+@pytest.mark.parametrize(
+    ("lives", "age_s", "state"), [(True, 0, "running"), (True, 60, "frozen"), (False, 0, "lost"), (False, 1e5, None)]
+)
+def test_every_page_knows_whether_a_scan_runs_was_killed_or_hangs(view, scans, lives, age_s, state):
+    alive = scans / "one" / CONTROL / ALIVE
+    alive.parent.mkdir()
+    pid = os.getpid() if lives else 1
+    alive.write_bytes(msgspec.json.encode(Life(pid, started_ticks(os.getpid()) or 0, socket.gethostname())))
+    os.utime(alive, (time.time() - age_s,) * 2)
+    running = get(view, "/api/running")
+    assert [scan["state"] for scan in running] == ([state] if state else [])
 
 
 def test_a_scan_is_put_away_by_who_types_its_name(view, scans):

@@ -77,7 +77,7 @@ def test_a_scan_is_aborted_while_the_reading_process_is_frozen_killed_and_starte
         assert post(server, "/api/control/pause?scan=one", token="wrong")[0] == 403
         assert post(server, "/api/control/pause?scan=one", token=server.token)[0] == 200
         assert stop.paused
-        assert [(s["name"], s["killed"]) for s in get(server, "/api/running")] == [("one", False)]
+        assert [(s["name"], s["state"]) for s in get(server, "/api/running")] == [("one", "running")]
         os.kill(first, signal.SIGKILL)
         assert post(server, "/api/control/abort?scan=one", token=server.token)[0] == 200
         assert stop.now

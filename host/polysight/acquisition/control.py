@@ -152,9 +152,14 @@ class Life(msgspec.Struct, frozen=True):
     written_s: float = 0.0
 
     @property
+    def is_here(self) -> bool:
+        """True if the process is or was one of this machine."""
+        return self.pid > 0 and self.host == socket.gethostname()
+
+    @property
     def killed(self) -> bool:
         """True if the process ran on this machine and is gone: a scan that ends by itself removes the file."""
-        return self.pid > 0 and self.host == socket.gethostname() and started_ticks(self.pid) != self.ticks
+        return self.is_here and started_ticks(self.pid) != self.ticks
 
 
 def started_ticks(pid: int) -> int | None:

@@ -390,7 +390,9 @@ def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
     if life is not None and life.killed:
         return replace(summary, state="lost")
     if time.time() - written_s >= patience_s:
-        return replace(summary, state="lost" if life is None else "frozen")
+        # A folder that was copied from another machine has that one's signs of life.
+        hangs = life is not None and life.is_here
+        return replace(summary, state="frozen" if hangs else "lost")
     return summary if summary.state == "paused" else replace(summary, state="running")
 
 

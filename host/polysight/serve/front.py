@@ -11,6 +11,7 @@ import asyncio
 import fcntl
 import struct
 import termios
+import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
@@ -30,7 +31,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from polysight.acquisition import BADGES, STATES, Life, ScanCommand, send_command
+from polysight.acquisition import BADGES, LAPSE_S, STATES, Life, ScanCommand, send_command
 from polysight.catalogue import Scans
 from polysight.serve.errors import HANDLERS, refuse, tell_no_page
 from polysight.serve.guard import Access, Guard, cookie_name
@@ -52,6 +53,8 @@ CONNECT_INTERVAL_S = 0.1
 CHUNK_BYTES = 1 << 16
 # Running scans are looked for at most this often, however many pages ask.
 RUNNING_AGE_S = 0.5
+# Who has not seen by then that a scan was killed, sees it in the list.
+KILLED_SHOWN_S = 3600.0
 # Headers of one connection, and those that this process adds by itself.
 OWN_HEADERS = (b"connection", b"keep-alive", b"transfer-encoding", b"date", b"server")
 T = TypeVar("T")
@@ -69,10 +72,10 @@ class PageFacts(msgspec.Struct, frozen=True):
 
 
 class RunningScan(msgspec.Struct, frozen=True):
-    """A scan whose program lives, or was killed without having said so."""
+    """A scan for the header of every page: `state` is `running`, `frozen` or `lost`, as lists have them."""
 
     name: str
-    killed: bool
+    state: str
     doing: str
     asked: str
 
@@ -180,16 +183,30 @@ class RunningScans:
         self._scans = scans
         self._listed_at = float("-inf")
         self._running: list[RunningScan] = []
+        self._lock = threading.Lock()
 
     def list(self) -> list[RunningScan]:
-        """All of them."""
-        if time.monotonic() - self._listed_at > RUNNING_AGE_S:
-            self._running = [self._describe(name, life) for name, life in self._scans.lives()]
+        """All of them, and those that were killed a short while ago; the last ones while their drive is waited for."""
+        if time.monotonic() - self._listed_at < RUNNING_AGE_S or not self._lock.acquire(blocking=False):
+            return self._running
+        try:
+            described = [self._describe(name, life) for name, life in self._scans.lives()]
+            self._running = [scan for scan in described if scan is not None]
             self._listed_at = time.monotonic()
+        finally:
+            self._lock.release()
         return self._running
 
-    def _describe(self, name: str, life: Life) -> RunningScan:
-        return RunningScan(name, life.killed, life.doing, life.asked)
+    def _describe(self, name: str, life: Life) -> RunningScan | None:
+        silent_s = time.time() - life.written_s
+        if silent_s > KILLED_SHOWN_S:
+            return None
+        state = "running"
+        if life.killed:
+            state = "lost"
+        elif silent_s > LAPSE_S:
+            state = "frozen"
+        return RunningScan(name, state, life.doing, life.asked)
 
 
 # --- the reading process ---

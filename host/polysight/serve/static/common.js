@@ -174,7 +174,7 @@ async function watchRunning(told) {
   try {
     const now = await get("running");
     for (const scan of runs ?? []) if (!now.some((s) => s.name === scan.name)) tellEnd(scan.name);
-    for (const scan of now) if (scan.killed && runs?.some((s) => s.name === scan.name && !s.killed)) tellEnd(scan.name);
+    for (const scan of now) if (scan.state !== "running" && runs?.some((s) => s.name === scan.name && s.state === "running")) tellEnd(scan.name);
     if (JSON.stringify(now) !== JSON.stringify(runs)) showRunning(now, told);
     runs = now;
   } catch (error) { if (!(error instanceof Refused)) throw error; }
@@ -184,8 +184,8 @@ async function watchRunning(told) {
 function showRunning(now, told) {
   by("running").replaceChildren(...now.flatMap((scan) => {
     const name = make("a", scan.name, "running-name", { href: pageOf("watch", scan.name) });
-    if (scan.killed) return [badge(STATES.lost), name];
-    const nodes = [badge(scan.doing === "rows" ? STATES.running : ["computes materials", "wait"]), name];
+    if (scan.state === "lost") return [badge(STATES.lost), name];
+    const nodes = [badge(scan.doing === "rows" ? STATES[scan.state] : ["computes materials", "wait"]), name];
     if (told.control && scan.doing === "rows" && scan.asked !== "abort") {
       nodes.push(make("button", "Abort", "danger", { type: "button", onclick: () => confirmAbort(scan.name) }));
     }

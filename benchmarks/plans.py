@@ -36,7 +36,7 @@ from polysight.materials import (
     pixel_accuracy,
     truth_plates,
 )
-from polysight.plan import Changes, scan_time
+from polysight.planning import Changes, scan_time
 from polysight.polarimetry import incidence_choice
 from polysight.sync import BoardSetup, synchronise_row
 from polysight_shared.config import Instrument, load_instrument

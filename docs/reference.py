@@ -1,4 +1,6 @@
-"""`python -m docs.reference --out DIR`: the API reference as HTML, made from the docstrings with pdoc, links checked.
+"""`python -m docs.reference --out DIR`: the documentation as static pages, its links checked.
+
+The API reference is made from the docstrings with pdoc, pages and notebooks by `docs.site`.
 
 A package that names its public functions (`__all__`) has one page with these; another one has a page for each module.
 """
@@ -19,6 +21,7 @@ from urllib.parse import unquote
 
 import pdoc.doc
 import pdoc.render
+from docs.site import build_site
 
 PACKAGES = ("polysight", "polysight_shared", "polysight_simulators", "polysight_pi")
 
@@ -83,7 +86,7 @@ def link_faults(out: Path) -> list[str]:
     faults = []
     for path, page in pages.items():
         for link in page.links:
-            if "://" in link or link.startswith(("mailto:", "data:")):
+            if "://" in link or link.startswith("file:") or link.startswith(("mailto:", "data:")):
                 continue
             name, _, anchor = unquote(link).partition("#")
             target = (path.parent / name).resolve() if name else path
@@ -102,13 +105,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the pages")
+    parser.add_argument("--quick", action="store_true", help="without results of notebooks, without the gallery")
     args = parser.parse_args(argv)
     names = list(dict.fromkeys(name for package in PACKAGES for name in modules_of(package)))
     build(names, args.out)
+    pages = build_site(args.out, run=not args.quick)
     faults = link_faults(args.out)
     for fault in faults:
         sys.stdout.write(f"broken link: {fault}\n")
-    sys.stdout.write(f"{args.out / 'index.html'}: {len(names)} modules, {len(faults)} broken links\n")
+    sys.stdout.write(
+        f"{args.out / 'index.html'}: {len(names)} modules, {len(pages)} pages, {len(faults)} broken links\n"
+    )
     return 1 if faults else 0
 
 

@@ -21,8 +21,9 @@ TARGET = os.environ.get("POLYSIGHT_WHEEL", "")
 
 
 def copy_data(folder):
-    """Copy the rig file and the scenes into the package that is built."""
-    files = [Path("instrument.toml"), *(p.relative_to(TOP) for p in (TOP / "examples").rglob("*.toml"))]
+    """Copy the rig file, the scenes and the pages that errors name into the package that is built."""
+    found = [*(TOP / "examples").rglob("*.toml"), *(TOP / "docs").rglob("*.md"), *(TOP / "docs").rglob("*.svg")]
+    files = [Path("instrument.toml"), *(path.relative_to(TOP) for path in found)]
     for file in files:
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(TOP / file, folder / file)

@@ -116,18 +116,18 @@ def _is_open(command: str) -> bool:
     return False
 
 
-def _slug(heading: str, used: dict[str, int]) -> str:
+def slug_of(heading: str, used: dict[str, int]) -> str:
     """The anchor that GitHub gives a heading."""
     slug = re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
     used[slug] = used.get(slug, -1) + 1
     return f"{slug}-{used[slug]}" if used[slug] else slug
 
 
-def _inline(token: Token) -> Iterator[Token]:
+def inline_parts(token: Token) -> Iterator[Token]:
     """The parts of a line, those inside links and images too."""
     for child in token.children or ():
         yield child
-        yield from _inline(child)
+        yield from inline_parts(child)
 
 
 @cache
@@ -148,7 +148,7 @@ def read_page(path: Path) -> Page:
             blocks.append(Block(line + 1, tuple(words), token.content))
         elif token.type == "code_block":
             blocks.append(Block(line, (), token.content))
-        for part in (token, *_inline(token)):
+        for part in (token, *inline_parts(token)):
             if part.type in ("html_block", "html_inline"):
                 links += [(line, t) for t in _HTML_TARGET.findall(part.content)]
                 anchors.update(_HTML_ANCHOR.findall(part.content))
@@ -157,6 +157,6 @@ def read_page(path: Path) -> Page:
             elif part.type == "code_inline":
                 spans.append((line, part.content))
         if token.type == "heading_open":
-            said = "".join(p.content for p in _inline(tokens[number + 1]) if p.type in ("text", "code_inline"))
-            anchors.add(_slug(said, used))
+            said = "".join(p.content for p in inline_parts(tokens[number + 1]) if p.type in ("text", "code_inline"))
+            anchors.add(slug_of(said, used))
     return Page(path, tuple(links), frozenset(anchors), tuple(blocks), tuple(spans))

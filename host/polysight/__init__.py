@@ -15,29 +15,50 @@ from polysight_shared import __version__
 
 if TYPE_CHECKING:
     from polysight.api import Scan, open_scan, read_netcdf
+    from polysight.api.classifier import Classifier, train
+    from polysight.api.functions import Plan, check, compare, plan, simulate
     from polysight.imaging import backproject
-    from polysight.polarimetry import fresnel, multilayer, permittivity_from_ratio
+    from polysight.materials import Library, PaperKNeighborsClassifier
+    from polysight.polarimetry.xarray_labels import fresnel, multilayer, permittivity_from_ratio
+
+_HOME = {
+    "Classifier": "polysight.api.classifier",
+    "Library": "polysight.materials",
+    "PaperKNeighborsClassifier": "polysight.materials",
+    "Plan": "polysight.api.functions",
+    "Scan": "polysight.api",
+    "backproject": "polysight.imaging",
+    "check": "polysight.api.functions",
+    "compare": "polysight.api.functions",
+    "fresnel": "polysight.polarimetry.xarray_labels",
+    "multilayer": "polysight.polarimetry.xarray_labels",
+    "open_scan": "polysight.api",
+    "permittivity_from_ratio": "polysight.polarimetry.xarray_labels",
+    "plan": "polysight.api.functions",
+    "read_netcdf": "polysight.api",
+    "simulate": "polysight.api.functions",
+    "train": "polysight.api.classifier",
+}
 
 __all__ = [
+    "Classifier",
+    "Library",
+    "PaperKNeighborsClassifier",
+    "Plan",
     "Scan",
     "__version__",
     "backproject",
+    "check",
+    "compare",
     "fresnel",
     "multilayer",
     "open_scan",
     "permittivity_from_ratio",
+    "plan",
     "read_netcdf",
+    "simulate",
+    "train",
 ]
-
-_HOME = {
-    "Scan": "polysight.api",
-    "open_scan": "polysight.api",
-    "read_netcdf": "polysight.api",
-    "backproject": "polysight.imaging",
-    "fresnel": "polysight.polarimetry",
-    "multilayer": "polysight.polarimetry",
-    "permittivity_from_ratio": "polysight.polarimetry",
-}
 
 
 def __getattr__(name: str) -> Any:

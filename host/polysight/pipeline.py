@@ -97,7 +97,7 @@ class Pipeline:
             images = images.within(plane.valid_on(images.x_m, images.y_m))
             known = replace(known, metal=plane)
         found = self.find_materials(images, replace(known, plates=plates), classifier)
-        verdict = process.judge(self.quality, found, self.plane, classifier)
+        verdict = process.judge(self.quality, found, self.plane, classifier, self.rig.check)
         shown = found if verdict.usable else found.without_result()
         return process.Findings(images, shown, verdict, self.plane, classifier, plates)
 

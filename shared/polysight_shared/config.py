@@ -289,6 +289,19 @@ class CalibrationFiles(Section, frozen=True):
     sphere: str = ""
 
 
+class CheckPlate(Section, frozen=True):
+    """A plate of known permittivity that lies at the same place in every scan; `name` "" for none.
+
+    `permittivity` is [eps', loss], `std` how well both are known, `place_mm` a place on the plate from the image's
+    centre.
+    """
+
+    name: str = ""
+    permittivity: tuple[Positive, NonNegative] = (1.0, 0.0)
+    std: tuple[Positive, Positive] = (0.02, 0.02)
+    place_mm: tuple[float, float] = (0.0, 0.0)
+
+
 class Limits(Section, frozen=True):
     """Limits of a scan: retakes, timeouts, disk space, queue of rows."""
 
@@ -325,6 +338,7 @@ class Instrument(Section, frozen=True):
     limits: Limits = Limits()
     calibration: CalibrationFiles = CalibrationFiles()
     notify: Notify = Notify()
+    check: CheckPlate = CheckPlate()
 
     def __post_init__(self) -> None:
         for role in ("transmit", "receive_h", "receive_v"):

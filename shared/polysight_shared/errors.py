@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
+from importlib.util import find_spec
 from pathlib import Path
 
 from polysight_shared.error_codes import ErrorCode
@@ -40,7 +42,24 @@ class PolysightError(Exception):
             parts.append(f"why: {self.why}")
         if self.remedy:
             parts.append(f"do: {self.remedy}")
-        return "\n  ".join(parts)
+        return with_whole_paths("\n  ".join(parts))
+
+
+def with_whole_paths(text: str) -> str:
+    """Return a text with pages of the documentation, such as docs/how-to/install.md, as paths of this installation.
+
+    The host's wheel brings the pages; without it (on the Pi alone) the text stays as it is.
+    """
+    if "docs/" not in text:
+        return text
+    package = find_spec("polysight")
+    if package is None or package.origin is None:
+        return text
+    host = Path(package.origin).parent
+    folder = next((place for place in (host / "data", host.parents[1]) if (place / "docs").is_dir()), None)
+    if folder is None:
+        return text
+    return re.sub(r"(?<![\w/])docs/[\w/-]+\.md", lambda page: str(folder / page[0]), text)
 
 
 def advice(*parts: str) -> str:

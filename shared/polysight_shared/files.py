@@ -28,7 +28,8 @@ def open_regular(path: Path) -> BinaryIO:
     OSError
         if it cannot be opened.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    # Windows has no pipes in folders, and no flag for them.
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise DataError(
@@ -136,6 +137,9 @@ def write_together(files: Mapping[Path, bytes]) -> None:
 
 def sync_folder(path: Path) -> None:
     """Make names that were created, renamed or removed in a folder durable. Raises DeviceError."""
+    if not hasattr(os, "O_DIRECTORY"):
+        # Windows cannot open folders; NTFS writes their changes to its journal.
+        return
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
         try:

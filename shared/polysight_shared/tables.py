@@ -92,7 +92,7 @@ _TYPES = {  # names of the types of JSON and TOML for messages
 def _plain_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
     """Rewrite a message of msgspec in plain words, with its code; keep a rule of `require` as it is."""
     if match := re.search(r"unknown field `(.*)`", rule):
-        return f"no key {match[1]!r}: {_suggest_key(match[1], kind)}", ErrorCode.KEY_UNKNOWN
+        return f"unknown key {match[1]!r}: {_suggest_key(match[1], kind)}", ErrorCode.KEY_UNKNOWN
     if match := re.search(r"missing required field `(.*)`", rule):
         return f"the key {match[1]!r} is missing", ErrorCode.KEY_MISSING
     if match := re.fullmatch(r"Invalid enum value (.*)", rule):
@@ -116,7 +116,7 @@ def _suggest_key(key: str, kind: Any) -> str:
     if key in tables_of_key:
         tables = [f"[{table}]" if table else "the top" for table in sorted(tables_of_key[key])]
         return f"it belongs to {' or '.join(tables)}"
-    return did_you_mean(key, tables_of_key) or "no key is similar"
+    return did_you_mean(key, tables_of_key) or "it is not a key of this file"
 
 
 def _collect_keys(kind: Any, table: str, tables_of_key: dict[str, set[str]]) -> None:

@@ -17,7 +17,7 @@ from polysight.acquisition.pi_client import PiClient
 from polysight.acquisition.ready import STAGE_NOT_REPORTED, check_disk, make_ready
 from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.doctor.rig_checks import check_time
-from polysight.plan.forecast import forecast
+from polysight.planning.forecast import forecast
 from polysight.store.scan_folder import ScanFolder
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.faults import PiFault

@@ -32,8 +32,8 @@ def test_the_unknown_layer_of_each_patch(done):
     eps = found["permittivity"].values
     assert np.isnan(eps[0])
     assert eps[1] == pytest.approx(SHEET.permittivity, rel=0.01)
-    assert found["thickness"].values[1] == pytest.approx(1.7e-3)
-    assert found["thickness"].attrs["units"] == "m"
+    assert found["thickness_mm"].values[1] == pytest.approx(1.7)
+    assert found["thickness_mm"].attrs["units"] == "mm"
     same = layer_dataset(done, CHIRP, [Layer("sheet", None, 1.7e-3)], 1, 10.0)
     assert same.equals(found)
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import ast
 from pathlib import Path
 from typing import Any
 
 import nbformat
 import pytest
+from docs.notebooks import run_notebook
 
 import polysight
 
@@ -16,19 +16,8 @@ NOTEBOOKS = sorted((REPO / "examples" / "notebooks").glob("*.ipynb"))
 
 
 def run(notebook: Path) -> dict[str, Any]:
-    """Run the code cells in the current folder; the value of each cell's last line is shown as a notebook would."""
-    names: dict[str, Any] = {"__name__": "__main__"}
-    for cell in nbformat.read(notebook, as_version=4).cells:
-        if cell.cell_type != "code":
-            continue
-        tree = ast.parse(cell.source, f"{notebook.name}, {cell.id}")
-        last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
-        exec(compile(tree, f"{notebook.name}, {cell.id}", "exec"), names)
-        if isinstance(last, ast.Expr):
-            value = eval(compile(ast.Expression(last.value), f"{notebook.name}, {cell.id}", "eval"), names)
-            show = getattr(value, "_repr_png_", None) or getattr(value, "_repr_html_", None) or value.__repr__
-            assert show()
-    return names
+    """Run a notebook in the current folder; return its names."""
+    return run_notebook(notebook)[0]
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda p: p.stem)
@@ -43,12 +32,12 @@ def test_notebooks_are_valid_and_stripped(notebook):
             assert not [line for line in cell.source.splitlines() if "import _" in line or "._" in line]
 
 
-def test_simulate_and_image(tmp_path, monkeypatch, capsys):
+def test_simulate_and_image(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    names = run(REPO / "examples" / "notebooks" / "simulate-and-image.ipynb")
+    names, outputs = run_notebook(REPO / "examples" / "notebooks" / "simulate-and-image.ipynb")
     assert abs(complex(names["dielectric"]["permittivity"]) - (6 - 0.3j)) < 0.6
     assert polysight.read_netcdf(tmp_path / "out" / "own-scene.nc").attrs["simulated"] is True
-    assert "expected from Fresnel" in capsys.readouterr().out
+    assert "expected from Fresnel" in "".join(outputs)
 
 
 def test_own_material(tmp_path, monkeypatch):
@@ -57,5 +46,20 @@ def test_own_material(tmp_path, monkeypatch):
     assert list(names["materials"]["name"].values) == ["", "my material"]
 
 
+def test_liquids(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = run(REPO / "examples" / "notebooks" / "liquids.ipynb")
+    water = complex(names["at"](names["CENTRES_MM"][0])["permittivity"])
+    assert abs(water - (9.37 - 18j)) < 0.12 * abs(9.37 - 18j)
+    assert abs(names["share"] - 0.1) < 0.05
+
+
+def test_own_images(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = run(REPO / "examples" / "notebooks" / "own-images.ipynb")
+    value = complex(names["scan"].permittivity()["permittivity"].isel(patch=1))
+    assert abs(value - (3.8 - 0.7j)) < 0.3
+
+
 def test_every_notebook_is_run():
-    assert {p.stem for p in NOTEBOOKS} == {"simulate-and-image", "own-material"}
+    assert {p.stem for p in NOTEBOOKS} == {"simulate-and-image", "own-material", "liquids", "own-images"}

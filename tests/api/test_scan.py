@@ -43,27 +43,39 @@ def without_rows(folder: Path, out: Path, *rows: int) -> Path:
 # --- what a dataset says of itself ------------------------------------------------------------------------------------
 
 
-def test_images_have_named_dimensions_and_coordinates_in_metres(scan):
+def test_images_have_named_dimensions_and_places_from_the_centre(scan):
     image = scan.image()
-    assert {name: v.dims for name, v in image.data_vars.items()} == {
-        "h": ("y", "x"), "v": ("y", "x"), "p": ("y", "x"), "valid": ("y", "x"), "p_sigma": ("y", "x"),
-        "incidence_deg": (),
+    assert {name for name, v in image.data_vars.items() if v.dims == ("y_mm", "x_mm")} == {
+        "h", "v", "p", "valid", "p_sigma"
     }  # fmt: skip
     assert {image[name].dtype for name in "hvp"} == {np.dtype(np.complex64)}
     assert image["valid"].dtype == bool
-    assert image.sizes == {"y": 60, "x": 90}
+    assert image.sizes == {"y_mm": 60, "x_mm": 90}
     for axis in "xy":
-        assert np.diff(image[axis]) == pytest.approx(2e-3)
+        assert np.diff(image[f"{axis}_mm"]) == pytest.approx(2)
+        assert np.diff(image[f"{axis}_m"]) == pytest.approx(2e-3)
     assert float(image["incidence_deg"]) == pytest.approx(54.9, abs=0.2)
+    assert float(image["incidence_rad"]) == pytest.approx(np.radians(float(image["incidence_deg"])))
+
+
+def test_a_place_on_the_command_line_is_the_same_pixel_in_python(scan):
+    """The frames differ by 75 mm here: a place in the other one would be another pixel, or none."""
+    image = scan.image()
+    assert abs(image.attrs["image_centre_y_m"]) > 0.05
+    plate = image.sel(x_mm=PET["centre_mm"][0], y_mm=PET["centre_mm"][1], method="nearest")
+    metal = image.sel(x_mm=COPPER["centre_mm"][0], y_mm=COPPER["centre_mm"][1], method="nearest")
+    assert abs(complex(metal["p"]) - 1) < 0.2 < abs(complex(plate["p"]) - 1)
+    with pytest.raises(KeyError):
+        image.sel(x=0.045)
 
 
 @pytest.mark.parametrize("name", DATASETS)
 def test_every_variable_has_units_and_a_name_and_every_dataset_its_provenance(scan, name):
     dataset = getattr(scan, name)()
     for variable in dataset.variables.values():
-        assert set(variable.attrs) == {"units", "long_name"}
+        assert {"units", "long_name"} <= set(variable.attrs) <= {"units", "long_name", "axis"}
         assert variable.attrs["long_name"]
-    assert {"x", "y"} <= set(dataset.coords) or dataset.sizes == {"patch": 2}
+    assert {"x_mm", "y_mm", "x_m", "y_m"} <= set(dataset.coords) or dataset.sizes == {"patch": 2}
     assert "(simulated)" in dataset.attrs["title"]
     assert dataset.attrs["rig"] == scan.rig.name
     assert polysight.__version__ in dataset.attrs["versions"]
@@ -73,10 +85,9 @@ def test_patches_are_where_the_plates_are(scan):
     patches = scan.patches()
     assert list(patches["patch"]) == [1, 2]
     for patch, plate in zip((1, 2), (COPPER, PET), strict=True):
-        one, image = patches.sel(patch=patch), scan.image()
-        offset = (float(one["centre_x"] - image["x"].mean()), float(one["centre_y"] - image["y"].mean()))
-        assert 1e3 * np.array(offset) == pytest.approx(plate["centre_mm"], abs=6)
-        here = patches["label"].sel(x=one["centre_x"], y=one["centre_y"], method="nearest")
+        one = patches.sel(patch=patch)
+        assert [float(one["centre_x_mm"]), float(one["centre_y_mm"])] == pytest.approx(plate["centre_mm"], abs=6)
+        here = patches["label"].sel(x_mm=one["centre_x_mm"], y_mm=one["centre_y_mm"], method="nearest")
         assert here == patch
         inside = patches["interior"] & (patches["label"] == patch)
         assert inside.sum() == one["pixels"]
@@ -113,7 +124,7 @@ def test_sub_bands_are_a_dimension_of_their_own(folder):
 
 def test_each_pixel_can_have_its_own_incidence(folder):
     angles = open_scan(folder, incidence="pixel").image()["incidence_deg"]
-    assert angles.dims == ("y", "x")
+    assert angles.dims == ("y_mm", "x_mm")
     assert abs(angles - 54.9).max() < 10
 
 
@@ -125,8 +136,8 @@ def same_image(image: xarray.Dataset, file: Path) -> None:
     for name in ("h", "v", "p"):
         np.testing.assert_allclose(image[name].values, getattr(saved, name), rtol=1e-6, atol=1e-6)
     assert (image["valid"].values == saved.valid).all()
-    assert (image["x"].values == saved.x_m).all()
-    assert (image["y"].values == saved.y_m).all()
+    assert (image["x_m"].values == saved.x_m).all()
+    assert (image["y_m"].values == saved.y_m).all()
 
 
 def test_the_image_is_what_process_writes(scan, products):
@@ -231,7 +242,7 @@ def test_results_are_the_callers_to_change(scan):
     before = scan.image()
     changed = scan.image()
     changed["h"][:] = 0
-    changed["x"].attrs.clear()
+    changed["x_mm"].attrs.clear()
     xarray.testing.assert_identical(scan.image(), before)
 
 

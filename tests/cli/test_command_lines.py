@@ -45,7 +45,7 @@ def scan(tmp_path) -> Path:
         (["classify", str(SIMULATED_LIBRARY), "--model", "knn"], ["--model"]),
         (["permittivity", "out", "--bands", "3"], ["--bands", "--layer"]),
         (["permittivity", "out", "--amplitude", "5"], ["--amplitude", "--layer"]),
-        (["scan", "--out", "o", "--no-process", "--metal", "0,0,9,9"], ["--metal", "--no-process"]),
+        (["scan", "--out", "o", "--no-process", "--metal-box", "0,0,9,9"], ["--metal-box", "--no-process"]),
         (["resume", "s", "--no-process", "--labels", "x", "--model", "knn"], ["--labels and --model", "--no-process"]),
         (["process", "scan", "--out", "o", "--library", "l.npz", "--model", "none"], ["--library", "--model none"]),
         (["doctor", "--move", "--no-pulse"], ["--move", "--no-pulse"]),
@@ -83,7 +83,7 @@ def test_a_number_that_is_none_is_refused_in_words(words, rule, text):
 @pytest.mark.parametrize("text", ["nan", "inf", "-inf", "1e5"])
 @pytest.mark.parametrize("place", ["{},0,40,40", "0,{},40,40", "0,0,{},40", "0,0,40,{}"])
 def test_a_metal_box_is_a_place_on_the_image(text, place):
-    assert place.format(text) in refusal("process", "s", "--out", "o", f"--metal={place.format(text)}")
+    assert place.format(text) in refusal("process", "s", "--out", "o", f"--metal-box={place.format(text)}")
 
 
 @pytest.mark.parametrize("text", ["nan", "inf", "0.499", "19.9", "10001", "-200"])
@@ -105,8 +105,7 @@ def test_a_shift_of_the_plane_is_a_length_in_the_lab(text):
 
 @pytest.mark.parametrize(
     ("words", "value"),
-    [(["--metal", "-45,0,40,40"], (-65, -20, -25, 20)), (["--metal", "45,-10,40,40"], (25, -30, 65, 10)),
-     (["--metal=-45,0,40,40"], (-65, -20, -25, 20)), (["--metal", "-.5,-1,1,2"], (-1, -2, 0, 0))],
+    [(["--metal-box", "-65,-20,-25,20"], (-65, -20, -25, 20)), (["--metal-box=-.5,-1,1,2"], (-0.5, -1, 1, 2))],
 )  # fmt: skip
 def test_a_place_left_of_the_middle_needs_no_equals_sign(words, value):
     given = joined(["process", "scan", *words, "--out", "o"])
@@ -128,6 +127,18 @@ def test_both_programs_take_a_tilde(tmp_path, monkeypatch, capsys):
         status = polysight_pi(program[1:]) if program[0] == "pi" else main(program)
         assert status > 0
         assert str(tmp_path / "nowhere") in capsys.readouterr().err
+
+
+def test_the_earlier_form_of_a_box_is_read_with_a_notice(capsys):
+    given = joined(["process", "scan", "--metal", "-45,0,40,40", "--out", "o"])
+    assert build_parser().parse_args(given).metal == (-65, -20, -25, 20)
+    assert "--metal-box -65,-20,-25,20" in capsys.readouterr().err
+    assert build_parser().parse_args(["permittivity", "out", "--segment", "3"]).patch == 3
+
+
+@pytest.mark.parametrize("text", ["20,0,-20,10", "0,20,10,20", "1,2,3", "a,b,c,d"])
+def test_a_box_has_a_lower_left_and_an_upper_right_corner(text):
+    assert text in refusal("process", "s", "--out", "o", f"--metal-box={text}")
 
 
 def test_other_words_are_left_as_they_are():

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from docs.reference import build, link_faults, modules_of
+from docs.site import build_site
 
 import polysight
 
@@ -18,6 +19,7 @@ def reference(tmp_path_factory) -> Path:
     names = [name for room in rooms for name in modules_of(room)]
     assert names == list(rooms), "a package that names its public functions has one page"
     build(names, out)
+    build_site(out, run=False)
     return out
 
 
@@ -25,7 +27,7 @@ def test_every_public_name_is_on_the_page_with_its_text(reference):
     page = (reference / "polysight.html").read_text(encoding="utf-8")
     for name in set(polysight.__all__) - {"__version__"}:
         assert f'id="{name}"' in page
-    for text in ("metal_box_mm", "Reference library of the materials", "complex64 [y, x]"):
+    for text in ("metal_box_mm", "Reference library of the materials", "complex64 [y_mm, x_mm]"):
         assert text in page
 
 
@@ -33,6 +35,8 @@ def test_links_between_the_pages_lead_somewhere(reference):
     assert link_faults(reference) == []
     pages = " ".join(p.read_text(encoding="utf-8") for p in reference.rglob("*.html"))
     assert 'href="#open_scan"' in pages
+    assert (reference / "docs/how-to/python.html").exists()
+    assert (reference / "examples/notebooks/liquids.html").exists()
 
 
 @pytest.mark.parametrize("link", ["gone.html", "other.html#gone", "#gone", "folder/other.html#here"])

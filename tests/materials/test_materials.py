@@ -22,8 +22,8 @@ from polysight.materials import (
     read_truth,
 )
 from polysight.materials.analyse import Optics
-from polysight.materials.classify import Weights, ratio_distance
-from polysight.materials.library import FORMAT, majority
+from polysight.materials.classify import Weights
+from polysight.materials.library import FORMAT, majority, ratio_distance
 from polysight.materials.measure import median_ratio
 from polysight.materials.result import features_of
 from polysight.polarimetry import fresnel

@@ -15,7 +15,7 @@ from tests.support.paths import REPO
 from tests.support.pi.machine_bench import Bench
 from tests.support.rigs import published_rig
 
-from polysight.plan.forecast import row_motion_s
+from polysight.planning.forecast import row_motion_s
 from polysight_pi.executor import check_run, read_burst
 from polysight_pi.machine import RULES, TIMEOUTS_S, WIRE_STATE, RefusedError, State
 from polysight_pi.stage import STATUS_PER_HEARTBEAT, StatusWatch

@@ -12,9 +12,9 @@ from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 
 from polysight.cli.main import main
-from polysight.plan import Changes, row_motion_s
-from polysight.plan.forecast import tail_s, turn_s
-from polysight.plan.plan_command import measure_noise
+from polysight.planning import Changes, row_motion_s
+from polysight.planning.forecast import tail_s, turn_s
+from polysight.planning.plan_command import measure_noise
 from polysight.store import manifest
 from polysight.store.logs import EventWriter
 from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder

@@ -10,8 +10,8 @@ from tests.support.refusals import refused
 from polysight.imaging import ImageBuilder, PhaseSlope, backproject, field_limits
 from polysight.imaging.geometry import Antennas
 from polysight.imaging.resolution import board_facts
-from polysight.plan import Changes, Noise, forecast, propose
-from polysight.plan.forecast import aperture_of, find_warnings, predict_burst, predict_noise
+from polysight.planning import Changes, Noise, forecast, propose
+from polysight.planning.forecast import aperture_of, find_warnings, predict_burst, predict_noise
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 

@@ -5,7 +5,7 @@ import pytest
 from tests.support.doctor.case import context_of
 
 from polysight.doctor.rig_checks import check_library
-from polysight.plan import forecast
+from polysight.planning import forecast
 from polysight_shared.geometry import incidence_deg
 
 

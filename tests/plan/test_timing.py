@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.plan import Changes, row_motion_s, scan_time, straight_move_s
-from polysight.plan.forecast import tail_s, turn_s, whole_packets
+from polysight.planning import Changes, row_motion_s, scan_time, straight_move_s
+from polysight.planning.forecast import tail_s, turn_s, whole_packets
 from polysight_pi.edges import RowMotion
 from polysight_shared.config import CARD_TAIL_S, Instrument
 from polysight_shared.raster import plan_raster

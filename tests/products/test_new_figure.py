@@ -45,10 +45,10 @@ def test_a_declared_figure_is_a_column_of_the_tables(scan, tmp_path):
     assert table["roughness_mm"].tolist() == [0.25] * 3
 
 
-def test_a_declared_figure_is_a_variable_of_the_dataset_in_si_units(scan):
-    roughness = patch_dataset(scan)["roughness"]
-    assert roughness.values.tolist() == pytest.approx([0.25e-3] * 3)
-    assert roughness.attrs == {"units": "m", "long_name": "roughness of the surface"}
+def test_a_declared_figure_is_a_variable_of_the_dataset(scan):
+    roughness = patch_dataset(scan)["roughness_mm"]
+    assert roughness.values.tolist() == pytest.approx([0.25] * 3)
+    assert roughness.attrs == {"units": "mm", "long_name": "roughness of the surface"}
 
 
 def test_a_declared_figure_stands_in_the_report(scan):

@@ -76,7 +76,7 @@ def test_a_rig_file_may_replace_the_chirp_unless_sub_bands_contradict_it(folder,
     for bands in ("1", "3"):
         assert main([*arguments, "--bands", bands]) == DataError.exit_status
         message = capsys.readouterr().err
-        assert "segment 3" in message
+        assert "patch 3" in message
         assert "instrument.toml" in message
     materials = json.loads((folder / MATERIALS).read_text())
     del materials["segments"][0]["bands"]  # nothing contradicts the given chirp

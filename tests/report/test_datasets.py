@@ -58,13 +58,17 @@ def test_the_file_holds_the_products(folder):
         for name in ("h", "v", "p", "valid"):
             np.testing.assert_array_equal(dataset[name], saved[name])
             assert dataset[name].dtype == saved[name].dtype
-            assert dataset[name].dims == ("y", "x")
+            assert dataset[name].dims == ("y_mm", "x_mm")
         for axis in "xy":
-            np.testing.assert_array_equal(dataset[axis], saved[f"{axis}_m"])
-            assert dataset[axis].attrs["units"] == "m"
+            rig_m = saved[f"{axis}_m"]
+            np.testing.assert_array_equal(dataset[f"{axis}_m"], rig_m)
+            centre_m = dataset.attrs[f"image_centre_{axis}_m"]
+            np.testing.assert_allclose(dataset[f"{axis}_mm"], 1e3 * (rig_m - centre_m), atol=1e-5)
+            assert float(dataset[f"{axis}_mm"].mean()) == pytest.approx(0, abs=1e-9)
+            assert (dataset[f"{axis}_m"].attrs["units"], dataset[f"{axis}_mm"].attrs["units"]) == ("m", "mm")
 
 
-def test_the_table_is_that_of_the_materials_in_si_units(folder):
+def test_the_table_is_that_of_the_materials(folder):
     dataset = exported(folder)
     pet, metal = dataset.sel(patch=4), dataset.sel(patch=5)
     assert (pet["name"], pet["runner_up"], metal["name"]) == ("PET", "glass", "")
@@ -73,12 +77,12 @@ def test_the_table_is_that_of_the_materials_in_si_units(folder):
     assert (pet["permittivity_real_standard_error"], pet["permittivity_loss_standard_error"]) == (0.0625, 0.125)
     assert complex(pet["ratio"]) == 10j
     assert np.isnan(metal["permittivity"])
-    assert float(pet["centre_x"]) == pytest.approx(0.01)
-    assert float(pet["centre_y"]) == pytest.approx(0.1)
-    assert float(pet["width"]) == pytest.approx(0.08)
+    # The same numbers as in materials.json, in the same frame.
+    assert (float(pet["centre_x_mm"]), float(pet["centre_y_mm"]), float(pet["width_mm"])) == (10, 0, 80)
+    assert float(pet["patch_incidence_rad"]) == pytest.approx(np.radians(54.5))
     assert dataset["label"].dtype == np.int32
-    inside = dataset["label"].sel(x=pet["centre_x"], y=pet["centre_y"], method="nearest")
-    assert (inside, dataset["label"].sel(x=-0.1, y=0.1, method="nearest")) == (4, 5)
+    inside = dataset["label"].sel(x_mm=pet["centre_x_mm"], y_mm=pet["centre_y_mm"], method="nearest")
+    assert (inside, dataset["label"].sel(x_mm=-100, y_mm=0, method="nearest")) == (4, 5)
 
 
 def test_the_attributes_say_where_it_comes_from(folder):
@@ -121,7 +125,7 @@ def test_images_alone_export_too(folder):
     for name in ("materials.json", "scan.json", "quality.json"):
         (folder / name).unlink()
     dataset = exported(folder)
-    assert set(dataset.dims) == {"y", "x"}
+    assert set(dataset.dims) == {"y_mm", "x_mm"}
     assert dataset.attrs["simulated"] == "unknown"
     assert dataset.attrs["metal_reference"].startswith("none")
 

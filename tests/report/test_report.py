@@ -7,6 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from matplotlib import colormaps
+from tests.support.page.chromium import PHONE
 from tests.support.products import changed, computed, unrendered
 from tests.support.rigs import rig_table
 
@@ -125,6 +126,14 @@ def page(scan, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
     path = write_report(out, scan)
     return out, path.read_text(encoding="utf-8")
+
+
+def test_a_phone_shows_the_result_before_anything_is_opened(page, browser):
+    """Two screens of verdict and picture, then the names: not the images, tables and settings."""
+    browser.visit((page[0] / "report.html").as_uri(), PHONE)
+    assert browser.value("document.documentElement.scrollHeight") <= 4000
+    assert browser.value("document.documentElement.scrollWidth") == PHONE[0]
+    assert browser.value("document.querySelectorAll('details[open]').length") == 0
 
 
 def test_nothing_is_loaded_from_elsewhere(page):

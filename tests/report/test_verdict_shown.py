@@ -86,7 +86,7 @@ def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
     folder = judged_products(tmp_path, level)
     with unrendered():
         page = unescape(write_report(folder, processed(folder)).read_text(encoding="utf-8"))
-    head = page[page.index("<main>") : page.index("<h2>Images")]
+    head = page[page.index("<main>") : page.index('<ul class="keys">')]
     assert f'<span class="badge">{LEVELS[level]}</span>' in head
     for part in REASON.values():
         assert (part in head) == (level != "good")

@@ -1,4 +1,4 @@
-"""At which pulse each frame of a row was taken, by the times at which its packets came (docs/spec/pulse-times.md).
+"""At which pulse each frame of a row was taken, by the times at which its packets came (docs/spec/placement.md).
 
 A record says how many frames a radar sent, not at which pulses: a missed SYNC_IN pulse and a spurious edge leave no
 other trace. The host's arrival times do. Every packet bounds the pulse of its frame from both sides: it cannot come

@@ -4,46 +4,61 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 from msgspec import UNSET
 
 from polysight.data import packaged
 from polysight.imaging import Images
+from polysight.jobs.label import save_labels
 from polysight.materials import (
     LAYER_FORMS,
     MODELS,
     SHORT,
+    Labels,
     Layer,
-    LayerFit,
     find_truth,
     fit_row,
+    format_permittivity,
     incidence_std_rad,
     parse_layer,
 )
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import Incidence
-from polysight.process import imaged_scan, processed_scan, why_unnamed
+from polysight.process import (
+    Inputs,
+    analyse_given_images,
+    imaged_scan,
+    is_given_images,
+    processed_scan,
+    read_given_images,
+    why_unnamed,
+)
 from polysight.products import (
     IMAGE,
+    LABELS,
     ProcessedScan,
     Rows,
     find_products,
     full_dataset,
     image_dataset,
+    label_folder,
     patch_dataset,
+    permittivity_dataset,
     ranges_text,
     surface_dataset,
     write_netcdf,
 )
-from polysight.results import Verdict
+from polysight.results import PatchFigures, Verdict, figures_of
 from polysight.settings import Settings
 from polysight.store import MANIFEST, ScanFolder, Source, open_source
-from polysight_shared.config import Chirp, Instrument
+from polysight_shared.config import Chirp, Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 
@@ -68,6 +83,7 @@ def open_scan(
     metal_box_mm: Box | None = None,
     bands: int = 1,
     incidence: Incidence = "one",
+    incidence_deg: float | None = None,
     fresh: bool = False,
 ) -> Scan:
     """Open a scan. Rows are read later, when a result is asked for.
@@ -75,9 +91,10 @@ def open_scan(
     Parameters
     ----------
     folder
-        A scan folder, a folder `unsynced/<scan>` or `raw/<scan>` of the published data, or a folder of products that
-        `polysight process` or `polysight image` wrote. Saved products in a scan folder are used if they hold all of
-        its rows and none of the parameters below is given; otherwise the rows are processed.
+        A scan folder, a folder `unsynced/<scan>` or `raw/<scan>` of the published data, a folder of products that
+        `polysight process` or `polysight image` wrote, or images of another program: an `.npz` file or a folder
+        `labels/<scan>` (docs/spec/given-images.md). Saved products in a scan folder are used if they hold all of its
+        rows and none of the parameters below is given; otherwise the rows are processed.
     rig
         Rig file of published data, or the rig itself: `instrument.toml` in that folder, in the current folder or the
         packaged one if not given. Scan folders bring their own.
@@ -92,6 +109,8 @@ def open_scan(
         Number of sub-bands of the sweep to image as well, for thin layers.
     incidence
         "one": one incidence angle for the image; "pixel": each pixel's own.
+    incidence_deg
+        Incidence angle of images of another program; that of their file, or of the rig, if not given.
     fresh
         Process the rows even where saved products could be used.
 
@@ -110,7 +129,10 @@ def open_scan(
         model=model,
         bands=bands,
         incidence=incidence,
+        incidence_deg=incidence_deg,
     )
+    if is_given_images(path):
+        return Scan(path, None, _analyse_images(path, rig, settings), settings)
     anew = fresh or settings != Settings()
     if (path / IMAGE).exists() and not (path / MANIFEST).exists():
         return _products_only(path, settings, anew)
@@ -138,6 +160,16 @@ def _check_arguments(
         wrong = f"library {library}: no such file"
     if wrong:
         raise ConfigError(wrong, "the argument is wrong", "see help(polysight.open_scan)", code=ErrorCode.VALUE_INVALID)
+
+
+def _analyse_images(path: Path, rig: str | os.PathLike[str] | Instrument | None, settings: Settings) -> ProcessedScan:
+    """Find the materials of images that another program made. Raises PolysightError."""
+    if settings.bands > 1:
+        raise ConfigError(f"bands = {settings.bands} with given images", "it needs the rows of a scan", "leave it out")
+    if not isinstance(rig, Instrument):
+        rig = load_instrument(packaged(RIG) if rig is None else Path(rig))
+    scan, _, _ = analyse_given_images(read_given_images(path, rig), settings, Inputs(), rig)
+    return scan
 
 
 def _products_only(path: Path, settings: Settings, anew: bool) -> Scan:
@@ -171,9 +203,11 @@ class Scan:
     """A recorded scan, or the products of one. Made by :func:`open_scan`.
 
     Results are computed once and kept. Each call returns new arrays, so that changing them changes no later result.
-    Every dataset has named dimensions (`y`, `x` in metres in the rig frame, `patch`), `units` and `long_name` on each
-    variable, and its provenance as attributes: `scan_id`, `simulated`, `rig`, `versions`, `processed_utc`,
-    `rows_missing`, `positions_masked`, `verdict`.
+    Every dataset has named dimensions: `y_mm`, `x_mm` (millimetres from the image's centre, as boxes and the command
+    line count them) and `patch`. `y_m`, `x_m` are the places in the rig frame, in which the centre lies at the
+    attributes `image_centre_x_m`, `image_centre_y_m`. Every variable has `units` and `long_name`. The attributes hold
+    the provenance: `scan_id`, `simulated`, `rig`, `versions`, `processed_utc`, `rows_missing`, `positions_masked`,
+    `verdict`.
 
     Attributes
     ----------
@@ -183,7 +217,9 @@ class Scan:
 
     def __init__(self, folder: Path, source: Source | None, saved: ProcessedScan | None, settings: Settings) -> None:
         self.folder = folder
-        self._source, self._saved_products, self._settings = source, saved, settings
+        self._source = source
+        self._saved_products = saved
+        self._settings = settings
 
     @property
     def scan_id(self) -> str:
@@ -201,7 +237,7 @@ class Scan:
 
         Processes recorded rows where there are no products. Raises as :meth:`image`.
         """
-        return self._saved.verdict if self._saved_products is not None else self._processed(True).verdict
+        return self._saved.verdict if self._saved_products is not None else self.processed(True).verdict
 
     @property
     def rig(self) -> Instrument:
@@ -241,15 +277,15 @@ class Scan:
         Returns
         -------
         xarray.Dataset
-            `h` (s-polarised), `v` (p-polarised), `p` (H / V) complex64 [y, x], `valid` bool [y, x], `incidence_deg`;
-            `p_sigma` (standard deviation of `p`) where it is known.
+            `h` (s-polarised), `v` (p-polarised), `p` (H / V) complex64 [y_mm, x_mm], `valid` bool; `incidence_deg` and
+            `incidence_rad` (functions take radians); `p_sigma` (standard deviation of `p`) where it is known.
 
         Raises
         ------
         DataError
             when no row is whole, no metal is found, or the products hold the other kind and the rows are not there.
         """
-        return image_dataset(self._processed(metal_referenced))
+        return image_dataset(self.processed(metal_referenced))
 
     def patches(self) -> xarray.Dataset:
         """Patches found in the image, with everything known about each.
@@ -257,15 +293,16 @@ class Scan:
         Returns
         -------
         xarray.Dataset
-            `label` int32 [y, x] and `interior` bool [y, x]; on dimension `patch` the variables of `permittivity` and
-            `materials`, `metal_like`, `width` and `height` (m), and `band_ratio` where sub-bands were asked for.
+            `label` int32 [y_mm, x_mm] and `interior` bool; on dimension `patch` the variables of `permittivity` and
+            `materials`, `metal_like`, `width_mm`, `height_mm`, and `band_ratio` where sub-bands were asked for.
+            Coordinates `centre_x_mm` and `centre_y_mm` say where each patch is.
 
         Raises
         ------
         DataError
             as :meth:`image`.
         """
-        return patch_dataset(self._processed(True))
+        return patch_dataset(self.processed(True))
 
     def permittivity(self) -> xarray.Dataset:
         """Relative permittivity eps' - j eps'' of each patch; not a number where P is too close to metal.
@@ -276,8 +313,8 @@ class Scan:
             On dimension `patch`: `permittivity` complex128, `permittivity_real_standard_error`,
             `permittivity_loss_standard_error`, `permittivity_real_loss_covariance`, `dominated_by` (what most of the
             error comes from), `refused` (why a patch was not judged), `ratio` (P) complex128,
-            `inverse_ratio_standard_error` (of 1 / P), `patch_incidence_deg`, `name`, `pixels`; `true_permittivity` for
-            a simulated scene.
+            `inverse_ratio_standard_error` (of 1 / P), `patch_incidence_deg` and `patch_incidence_rad`, `name`,
+            `pixels`; `true_permittivity` for a simulated scene.
 
         Raises
         ------
@@ -285,9 +322,85 @@ class Scan:
             as :meth:`image`.
         """
         return self._columns(
-            *_PERMITTIVITY, "ratio", "inverse_ratio_standard_error", "patch_incidence_deg", "name", "pixels",
-            "true_permittivity",
+            *_PERMITTIVITY, "ratio", "inverse_ratio_standard_error", "patch_incidence_deg", "patch_incidence_rad",
+            "name", "pixels", "true_permittivity",
         )  # fmt: skip
+
+    def permittivity_map(self) -> xarray.Dataset:
+        """Permittivity of each pixel as a half space, with its standard errors.
+
+        Returns
+        -------
+        xarray.Dataset
+            `permittivity` complex128 [y_mm, x_mm], eps' - j eps''; `permittivity_real_standard_error` and
+            `permittivity_loss_standard_error`; `mask` bool: True where the errors are below half of the value. Errors
+            of neighbouring pixels are mostly the same ones: a mean over a patch is no more certain than its pixels.
+
+        Raises
+        ------
+        DataError
+            as :meth:`image`; when the verdict is "no result".
+        """
+        return permittivity_dataset(self.processed())
+
+    def probe(self, x_mm: float, y_mm: float) -> xarray.Dataset:
+        """All results at the pixel nearest to a place, mm from the image's centre. Raises as :meth:`image`."""
+        import xarray
+
+        maps = [self.image(), self.permittivity_map(), self.patches()[["label"]]]
+        return xarray.merge(maps, compat="override", join="exact", combine_attrs="override").sel(
+            x_mm=x_mm, y_mm=y_mm, method="nearest"
+        )
+
+    def columns(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
+        """Pixels inside the patches for a classifier, and the number of the patch of each.
+
+        Returns
+        -------
+        X, patch
+            float64 [n, 4]: |H|, |V|, real and imaginary part of P; int32 [n].
+
+        Raises
+        ------
+        DataError
+            as :meth:`image`; when the products do not say which pixels are inside.
+        """
+        done = self.processed()
+        if done.interior is None:
+            raise self._unknown("pixels inside the patches")
+        inside = done.interior & (done.labels > 0) & np.isfinite(done.p)
+        p = done.p[inside]
+        X = np.stack([np.abs(done.h[inside]), np.abs(done.v[inside]), p.real, p.imag], axis=1)
+        return X.astype(np.float64), done.labels[inside]
+
+    def label(
+        self, boxes: Mapping[str, Box], *, metal: str | None = None, specimens: Mapping[str, str] | None = None
+    ) -> Path:
+        """Say what lies where, for training; replaces earlier boxes of this scan.
+
+        Parameters
+        ----------
+        boxes
+            Name of the material to its box (x0, y0, x1, y1), mm from the image's centre. A second piece of a material
+            is called `oak#2`.
+        metal
+            Box of the metal reference; the one with a metal's name if not given.
+        specimens
+            Box to the name of the piece in it, where several scans show the same piece.
+
+        Returns
+        -------
+        Path
+            The label file; a picture of the boxes lies beside it.
+
+        Raises
+        ------
+        DataError
+            when a box or name cannot be used; nothing was written then.
+        """
+        place = label_folder(self.folder)
+        save_labels(place, self.processed(), Labels(dict(boxes), "mm", metal, dict(specimens or {})))
+        return place / LABELS
 
     def materials(self) -> xarray.Dataset:
         """Name of each patch, and its permittivity with errors.
@@ -296,7 +409,9 @@ class Scan:
         -------
         xarray.Dataset
             On dimension `patch`: `name` ("" when not named, "unknown" when it is none of the library), `confidence`,
-            `runner_up` and `runner_up_share` (the next name by number of pixels), `metal_reference`, `pixels`;
+            `runner_up` and `runner_up_share` (the next name and its probability; in products without probabilities
+            the share of the patch's pixels that have it),
+            `metal_reference`, `pixels`;
             `permittivity`, its errors, `dominated_by` and `refused` as of :meth:`permittivity`; `true_name` for a
             simulated scene. Attributes `library`, `model`, `verdict`.
 
@@ -315,7 +430,7 @@ class Scan:
         are the sub-bands used (None: all where a thickness is fitted), `amplitude_percent` says how far |H| may be
         trusted. `ambiguous` and `notes` tell what the data leave open. Raises as :meth:`image`, and ConfigError.
         """
-        return layer_dataset(self._processed(True), self.rig.chirp, stack, bands, amplitude_percent)
+        return layer_dataset(self.processed(True), self.rig.chirp, stack, bands, amplitude_percent)
 
     def surface(self, *, reference: str | os.PathLike[str] | None = None) -> xarray.Dataset:
         """Shape and permittivity of curved and tilted objects, as `polysight surface` finds them.
@@ -355,7 +470,7 @@ class Scan:
         """
         from polysight.api.plot import plot_scan
 
-        return plot_scan(self._processed(metal_referenced))
+        return plot_scan(self.processed(metal_referenced))
 
     def to_netcdf(self, path: str | os.PathLike[str], *, metal_referenced: bool = True) -> None:
         """Write all results as one NetCDF file: complex variables as `h_real` and `h_imag`, see :func:`read_netcdf`.
@@ -367,18 +482,50 @@ class Scan:
         DataError
             as :meth:`image`.
         """
-        write_netcdf(Path(path), full_dataset(self._processed(metal_referenced)))
+        write_netcdf(Path(path), full_dataset(self.processed(metal_referenced)))
 
     def __repr__(self) -> str:
+        simulated = "SIMULATED, " if self.simulated else ""
+        return f"<Scan {self._title}: {simulated}{self._row_count}, {self._kind} in {self.folder}>"
+
+    def _repr_html_(self) -> str:
+        """Table of the scan, and of its patches where they are known without processing rows."""
+        lines = {"rows": self._row_count, "read from": f"{self._kind} in {self.folder}"}
+        done = self._result_at_hand
+        patches = ""
+        if done is not None:
+            if done.verdict is not None:
+                lines["verdict"] = "; ".join([done.verdict.text, *(reason.what for reason in done.verdict.reasons)])
+            if done.metal_referenced and done.segments:
+                patches = patch_table(done)
+        cells = "".join(f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in lines.items())
+        stamp = " <b>SIMULATED</b>" if self.simulated else ""
+        return f"<div><h4>Scan {escape(self._title)}{stamp}</h4><table>{cells}</table>{patches}</div>"
+
+    @property
+    def _title(self) -> str:
+        return self.scan_id or "without a name"
+
+    @property
+    def _kind(self) -> str:
+        return "recorded rows" if self._saved_products is None else "saved products"
+
+    @property
+    def _row_count(self) -> str:
         try:
             rows = self.rows
-            count = f"{len(rows.committed)} of {rows.planned} rows"
-            count += f" (missing {ranges_text(rows.missing)})" if rows.missing else ""
         except DataError:
-            count = "number of rows not known"
-        simulated = "SIMULATED, " if self.simulated else ""
-        kind = "saved products" if self._saved_products is not None else "recorded rows"
-        return f"<Scan {self.scan_id or 'without a name'}: {simulated}{count}, {kind} in {self.folder}>"
+            return "number of rows not known"
+        missing = f" (missing {ranges_text(rows.missing)})" if rows.missing else ""
+        return f"{len(rows.committed)} of {rows.planned} rows{missing}"
+
+    @property
+    def _result_at_hand(self) -> ProcessedScan | None:
+        """The result if it is saved or was computed already."""
+        if self._saved_products is not None:
+            return self._saved
+        computed = vars(self).get("_processing")
+        return None if computed is None else vars(computed).get("referenced")
 
     @cached_property
     def _processing(self) -> Processing:
@@ -389,16 +536,16 @@ class Scan:
             )  # fmt: skip
         return Processing(self._source, self.folder, self._settings)
 
-    @cached_property
+    @property
     def _saved(self) -> ProcessedScan:
         if self._saved_products is None:
             raise DataError(
                 f"{self.folder}: holds no products", "it was not processed", "polysight process", code=ErrorCode.NO_DATA
             )
-        return ProcessedScan(self._saved_products.folder)
+        return self._saved_products
 
-    def _processed(self, metal_referenced: bool) -> ProcessedScan:
-        """The saved products if they are of this kind, otherwise processed rows. Raises DataError."""
+    def processed(self, metal_referenced: bool = True) -> ProcessedScan:
+        """Saved products of this kind, otherwise processed rows: what the datasets are made of. Raises as `image`."""
         if self._saved_products is not None and self._saved.metal_referenced == metal_referenced:
             return self._saved
         if self._source is None:
@@ -426,7 +573,8 @@ class Scan:
     def _columns(self, *names: str) -> xarray.Dataset:
         """These variables of the patches, where they exist, with the coordinates of their dimension."""
         patches = self.patches()
-        return patches[[name for name in names if name in patches]].drop_vars(["x", "y"], errors="ignore")
+        chosen = patches[[name for name in names if name in patches]]
+        return chosen.drop_vars(["x_mm", "y_mm", "x_m", "y_m"], errors="ignore")
 
 
 class Processing:
@@ -436,7 +584,9 @@ class Processing:
     """
 
     def __init__(self, source: Source, folder: Path, settings: Settings) -> None:
-        self.source, self.folder, self.settings = source, folder, settings
+        self.source = source
+        self.folder = folder
+        self.settings = settings
 
     @cached_property
     def pipeline(self) -> Pipeline:
@@ -476,6 +626,22 @@ class Processing:
         return processed_scan(self.folder, self.source, pipeline.rig, findings, pipeline.quality, unnamed)
 
 
+def patch_table(done: ProcessedScan) -> str:
+    """Return the patches as an HTML table: the figures that reports show."""
+    figures = [figure for figure in figures_of(PatchFigures) if figure.column.title]
+    lines = ["<tr><th>patch</th><th>name</th><th>permittivity</th>"]
+    lines += [f"<th>{escape(figure.column.title)}</th>" for figure in figures]
+    for patch in done.segments:
+        name = "metal reference" if patch.metal_reference else patch.name or "not named"
+        value = patch.permittivity
+        text = "–"
+        if value is not None and value.real is not None and value.imag is not None:
+            text = format_permittivity(complex(value.real, value.imag))
+        cells = [str(patch.label), name, text, *(figure.shown(patch) for figure in figures)]
+        lines.append("</tr><tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells))
+    return f"<table>{''.join(lines)}</tr></table>"
+
+
 def layer_dataset(
     done: ProcessedScan, chirp: Chirp, stack: Sequence[str | Layer], bands: int | None, amplitude_percent: float
 ) -> xarray.Dataset:
@@ -484,42 +650,41 @@ def layer_dataset(
 
     if done.verdict is not None and not done.verdict.usable:
         raise done.verdict.error("the images are kept")
-    layers, std = [_layer(one) for one in stack], incidence_std_rad(done.materials)
-    fits = [fit_row(row, chirp, layers, bands, amplitude_percent / 100, std) for row in done.segments]
+    layers = [_parse_layer(layer) for layer in stack]
+    angle_std_rad = incidence_std_rad(done.materials)
+    fits = [fit_row(row, chirp, layers, bands, amplitude_percent / 100, angle_std_rad) for row in done.segments]
 
-    def column(of: str, factor: float = 1.0) -> list[float]:
-        values = [None if fit is None else getattr(fit, of) for fit in fits]
-        return [np.nan if value is None else factor * value for value in values]
-
-    def described(values: Sequence[object], units: str, about: str) -> tuple[str, np.ndarray, dict[str, str]]:
+    def describe(values: Sequence[object], units: str, about: str) -> tuple[str, np.ndarray, dict[str, str]]:
         return "patch", np.asarray(values), {"units": units, "long_name": about}
 
-    unknown = [complex(np.nan, np.nan) if fit is None else fit.permittivity for fit in fits]
-    notes = [str((fit and "; ".join(fit.warnings())) or "") for fit in fits]
+    def read(attribute: str, factor: float = 1.0) -> list[float]:
+        values = [getattr(fit, attribute, None) for fit in fits]
+        return [np.nan if value is None else factor * value for value in values]
+
+    unknown = complex(np.nan, np.nan)
+    values = [unknown if fit is None else fit.permittivity for fit in fits]
+    notes = ["" if fit is None else "; ".join(map(str, fit.warnings())) for fit in fits]
+    ambiguous = [fit is not None and fit.ambiguous for fit in fits]
+    thickness = "thickness of the unknown layer; not a number: half space"
     table = {
-        "permittivity": described(unknown, "1", "relative permittivity of the unknown layer"),
-        "permittivity_real_standard_error": described(column("std_real"), "1", "standard error, real part"),
-        "permittivity_loss_standard_error": described(column("std_loss"), "1", "standard error, loss"),
-        "thickness": described(column("thickness_m"), "m", "thickness of the unknown layer; not a number: half space"),
-        "thickness_standard_error": described(column("std_thickness_m"), "m", "standard error; 0 where it was given"),
-        "ambiguous": described([_ambiguous(fit) for fit in fits], "1", "another solution fits, or it is open by 5 %"),
-        "notes": described(notes, "", "rivals and other warnings"),
+        "permittivity": describe(values, "1", "relative permittivity of the unknown layer"),
+        "permittivity_real_standard_error": describe(read("std_real"), "1", "standard error, real part"),
+        "permittivity_loss_standard_error": describe(read("std_loss"), "1", "standard error, loss"),
+        "thickness_mm": describe(read("thickness_m", 1e3), "mm", thickness),
+        "thickness_standard_error_mm": describe(read("std_thickness_m", 1e3), "mm", "0 where it was given"),
+        "ambiguous": describe(ambiguous, "1", "another solution fits, or it is open by 5 %"),
+        "notes": describe(notes, "", "rivals and other warnings"),
     }
-    return xarray.Dataset(
-        table, {"patch": described([patch.label for patch in done.segments], "1", "number of the patch")}
-    )
+    numbers = [patch.label for patch in done.segments]
+    return xarray.Dataset(table, {"patch": describe(numbers, "1", "number of the patch")})
 
 
-def _layer(one: str | Layer) -> Layer:
-    if isinstance(one, Layer):
-        return one
+def _parse_layer(layer: str | Layer) -> Layer:
+    if isinstance(layer, Layer):
+        return layer
     try:
-        return parse_layer(one)
+        return parse_layer(layer)
     except ValueError:
         raise ConfigError(
-            f"{one!r} is no layer", "it has another form", f"write {LAYER_FORMS}", code=ErrorCode.VALUE_INVALID
+            f"{layer!r} is no layer", "it has another form", f"write {LAYER_FORMS}", code=ErrorCode.VALUE_INVALID
         ) from None
-
-
-def _ambiguous(fit: LayerFit | None) -> bool:
-    return fit is not None and fit.ambiguous

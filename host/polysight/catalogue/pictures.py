@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import msgspec
 import numpy as np
@@ -40,6 +40,13 @@ THUMBNAIL_PIXELS = 96
 @dataclass(frozen=True)
 class Pixels(ProcessedScan):
     """Saved products with permittivity and errors of each pixel. Arrays are [ny, nx], row 0 the smallest y."""
+
+    @classmethod
+    def of(cls, scan: ProcessedScan) -> Self:
+        """Return the pixels of a result, saved or just computed."""
+        pixels = cls(scan.folder)
+        vars(pixels).update(vars(scan))
+        return pixels
 
     @property
     def referenced(self) -> bool:

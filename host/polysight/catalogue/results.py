@@ -394,18 +394,24 @@ class Comparison:
 
 
 def compare(first: Path, second: Path) -> Comparison:
-    """Compare two processed scans, pixel by pixel and patch by patch.
+    """Compare two folders of products, see :func:`compare_pixels`. Raises DataError."""
+    a = Pixels(read_products(first).folder)
+    b = Pixels(read_products(second).folder)
+    return compare_pixels(a, b, names=(str(first), str(second)))
+
+
+def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
+    """Compare two processed scans, pixel by pixel and patch by patch; `names` call them in errors.
 
     Raises
     ------
     DataError
-        if one of them has no products or is not referenced to metal, or they show different places.
+        if one of them is not referenced to metal, or they show different places.
     """
-    a, b = (Pixels(read_products(folder).folder) for folder in (first, second))
-    for folder, pixels in ((first, a), (second, b)):
+    for name, pixels in zip(names, (a, b), strict=True):
         if not pixels.referenced:
             raise DataError(
-                f"{folder}: cannot be compared", "its images are not referenced to metal, or support no result",
+                f"{name}: cannot be compared", "its images are not referenced to metal, or support no result",
                 "process it with a metal reference", code=ErrorCode.NO_DATA,
             )  # fmt: skip
     rows, row_inside = _match_axes(a.y_mm, b.y_mm)
@@ -459,8 +465,8 @@ def _notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
     notes = []
     if scatter < 1:
         notes.append(
-            f"P of unchanged pixels scatters by {scatter:.2f} of the stated errors, of which the scans share a part:"
-            " significance counts from that scatter"
+            f"unchanged pixels differ by {scatter:.2f} of their stated errors only, because the two scans share most of"
+            " these errors; significance is counted in units of that scatter"
         )
     a_deg = float(np.degrees(a.theta_rad))
     b_deg = float(np.degrees(b.theta_rad))

@@ -31,7 +31,7 @@ FAMILIES = {
         *("demo", "simulate", "reproduce"),
         *("plan", "doctor", "card", "inspect", "radar", "scan", "resume", "validate", "drop-raw"),
     ),
-    "serve": ("serve", "preview", "scans", "note", "ask", "probe", "compare"),
+    "serve": ("serve", "preview", "scans", "note", "ask", "probe", "compare", "check"),
     "process": ("process", "surface", "image", "focus", "sync-report", "calibrate", "leakage"),
     "materials": ("materials", "report", "permittivity", "concentration", "classify", "train", "export", "label"),
 }

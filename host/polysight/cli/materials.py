@@ -50,7 +50,7 @@ def _permittivity(args: argparse.Namespace) -> int:
             code=ErrorCode.VALUES_CONFLICT,
         )
     amplitude = 10.0 if args.amplitude is None else args.amplitude
-    return permittivity(args.products, args.config, args.layer, args.segment, args.json, args.bands, amplitude / 100)
+    return permittivity(args.products, args.config, args.layer, args.patch, args.json, args.bands, amplitude / 100)
 
 
 def _concentration(args: argparse.Namespace) -> int:
@@ -121,11 +121,11 @@ def _add_permittivity(add: Add) -> None:
         "permittivity",
         _permittivity,
         "print the permittivity of patches, also of a layer in a stack",
-        "polysight permittivity out/one --segment 3 --layer glass,5.5,0.05,3 --layer liquid,?\n"
+        "polysight permittivity out/one --patch 3 --layer glass,5.5,0.05,3 --layer liquid,?\n"
         "  polysight permittivity out/one --layer sheet,?,0.5-3 --layer plate,metal",
     )
     sub.add_argument("products", type=Path, metavar="PRODUCTS", help="folder of products, or a scan folder")
-    sub.add_argument("--segment", type=int, metavar="N", help="this patch only (default: all)")
+    sub.add_argument("--patch", "--segment", type=int, metavar="N", help="this patch only (default: all)")
     sub.add_argument(
         "--layer",
         type=_layer,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -111,7 +112,7 @@ def material_settings(args: argparse.Namespace) -> Settings:
     ConfigError
         when an option would have no effect.
     """
-    options = {"--library": args.library, "--metal": args.metal, "--labels": args.labels, "--model": args.model}
+    options = {"--library": args.library, "--metal-box": args.metal, "--labels": args.labels, "--model": args.model}
     options_used = [name for name, value in options.items() if value is not None]
     if options_used and getattr(args, "no_process", False):
         raise ConfigError(
@@ -135,23 +136,40 @@ def rig_file(config: Path | None, data: Path) -> Path | None:
     return config or next((rig for rig in (data / RIG, RIG) if rig.exists()), None)
 
 
-def box(text: str) -> tuple[float, float, float, float]:
-    """Parse `x,y,width,height` in millimetres into corners (x0, y0, x1, y1)."""
-    try:
-        x, y, w, h = (float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not of the form x,y,width,height in mm, e.g. 0,0,40,40"
-        ) from None
-    if not all(abs(value) <= _FARTHEST_MM for value in (x, y, w, h)):
-        raise argparse.ArgumentTypeError(f"{text!r} is no place on the image: numbers of at most {_FARTHEST_MM} mm")
-    if w <= 0 or h <= 0:
+Box = tuple[float, float, float, float]
+
+
+def box(text: str) -> Box:
+    """Parse the corners `x0,y0,x1,y1` of a box, millimetres from the image's centre."""
+    x0, y0, x1, y1 = _four_numbers(text, "x0,y0,x1,y1 in mm, e.g. -20,-20,20,20")
+    if x0 >= x1 or y0 >= y1:
+        raise argparse.ArgumentTypeError(f"{text!r}: x0 must be below x1 and y0 below y1")
+    return x0, y0, x1, y1
+
+
+def centred_box(text: str) -> Box:
+    """Parse `x,y,width,height`, the form of a box in earlier releases; say how it is written now."""
+    x, y, width, height = _four_numbers(text, "x,y,width,height in mm, e.g. 0,0,40,40")
+    if width <= 0 or height <= 0:
         raise argparse.ArgumentTypeError(f"width and height of {text!r} must be positive")
-    return x - w / 2, y - h / 2, x + w / 2, y + h / 2
+    corners = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+    text_now = ",".join(f"{corner:g}" for corner in corners)
+    sys.stderr.write(f"note: --metal is read as centre and size; write --metal-box {text_now}, as all other boxes\n")
+    return corners
+
+
+def _four_numbers(text: str, form: str) -> Box:
+    try:
+        a, b, c, d = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form {form}") from None
+    if not all(abs(value) <= _FARTHEST_MM for value in (a, b, c, d)):
+        raise argparse.ArgumentTypeError(f"{text!r} is no place on the image: numbers of at most {_FARTHEST_MM} mm")
+    return a, b, c, d
 
 
 def joined(words: Sequence[str]) -> list[str]:
-    """Return the words such that argparse takes `-45,0,40,40` for a value: `--metal -45,0,40,40`, `probe -60,0`."""
+    """Return the words such that argparse takes `-45,0,40,40` for a value: `--metal-box -45,0,40,40`, `probe -60,0`."""
     out: list[str] = []
     for word in words:
         if not re.fullmatch(r"-[\d.]+(,[-\d.]+)+", word):
@@ -187,11 +205,13 @@ def add_material_options(sub: argparse.ArgumentParser) -> None:
     """Add the options that say how patches are named."""
     sub.add_argument("--library", type=Path, metavar="FILE", help="reference library (default: the simulated one)")
     sub.add_argument(
-        "--metal",
+        "--metal-box",
+        dest="metal",
         type=box,
-        metavar="X,Y,W,H",
-        help="metal reference: centre and size in mm from the image centre, e.g. -60,0,40,40 (default: found)",
+        metavar="X0,Y0,X1,Y1",
+        help="metal reference: corners in mm from the image's centre, e.g. -80,-20,-40,20 (default: found)",
     )
+    sub.add_argument("--metal", type=centred_box, help=argparse.SUPPRESS)
     sub.add_argument(
         "--labels",
         type=Path,

@@ -102,7 +102,7 @@ def add_commands(add: Add) -> None:
         _process,
         "make images, material names and a report from recorded data",
         "polysight process scans/one --out out/one",
-        ("--library", "--metal"),
+        ("--library", "--metal-box", "--metal"),
     )
     _add_data(sub, several=True)
     add_material_options(sub)

@@ -25,7 +25,7 @@ from polysight.cli.options import (
 from polysight.data import packaged
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, PolysightError
 
 _bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
 # Nearer than a few wavelengths (4 mm) no antenna sees a plane wave.
@@ -65,7 +65,7 @@ _NUMBERS = (
 
 
 def _plan(args: argparse.Namespace) -> int:
-    from polysight.plan import Changes, PlanOptions, run_plan
+    from polysight.planning import Changes, PlanOptions, run_plan
 
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
     options = PlanOptions(
@@ -75,6 +75,7 @@ def _plan(args: argparse.Namespace) -> int:
         snr_db=args.snr_db,
         row_overhead_s=args.row_overhead_s,
         scene_mm=args.scene_mm,
+        scene=None if args.scene is None else packaged(args.scene),
         as_json=args.json,
     )
     return run_plan(args.config, Changes(**{name: getattr(args, name) for name in names}), options)
@@ -101,6 +102,7 @@ def _add_plan(add: Add) -> None:
     sub.add_argument("--minutes", type=_minutes, metavar="M", help="propose the best plans within this time")
     sub.add_argument("--count", type=count, default=5, metavar="N", help="number of proposals (default: 5)")
     sub.add_argument("--like", type=Path, metavar="SCAN", help="take noise and standstill between rows from this scan")
+    sub.add_argument("--scene", type=Path, metavar="FILE", help="scene file whose plates are checked, with its grid")
     sub.add_argument("--scene-mm", type=_size, metavar="W,H", help="size of the scene (default: the image's)")
     sub.add_argument(
         "--snr-db",
@@ -431,11 +433,24 @@ def _demo(args: argparse.Namespace) -> int:
 def _simulate(args: argparse.Namespace) -> int:
     from polysight.jobs.demo import run_simulator
 
+    _warn_of_plates(packaged(args.scene), args.config)
     command = ["simulate", str(packaged(args.scene)), "--config", str(args.config), "--out", str(args.out)]
     command += ["--layout", args.layout]
     if args.seed is not None:
         command += ["--seed", str(args.seed)]
     return run_simulator(command)
+
+
+def _warn_of_plates(scene: Path, config: Path) -> None:
+    """Print the warnings about the plates of a scene; what is wrong with the file, the simulator says."""
+    from polysight.planning import read_scene, warn_of_scene
+
+    try:
+        rig, plates = read_scene(scene, load_instrument(config))
+    except PolysightError:
+        return
+    for warning in warn_of_scene(rig, plates):
+        sys.stderr.write(f"note, {warning.where}: {warning.what}\n")
 
 
 def _reproduce(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""The operator's page, and its functions as commands: serve, preview, scans, note, ask, probe, compare."""
+"""The operator's page, and its functions as commands: serve, preview, scans, note, ask, probe, compare, check."""
 
 from __future__ import annotations
 
@@ -169,6 +169,12 @@ def _compare(args: argparse.Namespace) -> int:
     return compare_scans(args.first, args.second, args.png, args.json)
 
 
+def _check(args: argparse.Namespace) -> int:
+    from polysight.jobs.check import check
+
+    return check(args.data, args.chart, args.json)
+
+
 def _point(text: str) -> tuple[float, float]:
     try:
         x, y = (float(part) for part in text.split(","))
@@ -192,4 +198,13 @@ def _add_results(add: Add) -> None:
     for name in ("first", "second"):
         sub.add_argument(name, type=Path, metavar="DATA", help="scan folder, or a folder of products")
     sub.add_argument("--png", type=Path, metavar="FILE", help="draw the difference of P in standard deviations")
+    add_json_option(sub)
+    sub = add(
+        "check",
+        _check,
+        "compare the check plate of scans with its known permittivity",
+        "polysight check scans/today\n  polysight check scans --chart check.png",
+    )
+    sub.add_argument("data", type=Path, nargs="+", metavar="DATA", help="processed scan, or a folder of scans")
+    sub.add_argument("--chart", type=Path, metavar="FILE", help="draw the control chart (PNG)")
     add_json_option(sub)

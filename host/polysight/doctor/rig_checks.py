@@ -43,7 +43,7 @@ from polysight.doctor.context import (
     with_boards,
 )
 from polysight.materials import SIMULATED_LIBRARY, Library
-from polysight.plan import scan_time
+from polysight.planning import scan_time
 from polysight.process import why_unnamed
 from polysight.radar import RadarState, require
 from polysight.settings import DEFAULT

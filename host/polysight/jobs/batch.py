@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import resource
 import subprocess
 import sys
 import threading
@@ -56,7 +55,6 @@ ALIVE = "POLYSIGHT_PARENT_ALIVE"
 # Leave a fifth of the free memory to the system.
 SHARE_OF_FREE_MEMORY = 0.8
 # Unit of `ru_maxrss`, getrusage(2).
-_MAXRSS_BYTES = 1 if sys.platform == "darwin" else 1024
 _POLL_S = 0.2
 
 
@@ -332,6 +330,9 @@ def free_memory_bytes() -> int:
                 return int(line.split()[1]) * 1024
     except OSError:
         pass
+    if not hasattr(os, "sysconf"):
+        # Windows does not say: enough for one scan at a time.
+        return 0
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
@@ -483,11 +484,20 @@ def main() -> int:
     if status == NoResult.exit_status:
         status = 0  # the scan is processed: its products say that nothing can be named
     if status == 0:
-        memory_bytes_used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _MAXRSS_BYTES
         seconds = round(time.monotonic() - began, 1)
-        mark = {"made_with": job.made_with, "seconds": seconds, "memory_gb": memory_bytes_used / 1e9}
+        mark = {"made_with": job.made_with, "seconds": seconds, "memory_gb": peak_memory_bytes() / 1e9}
         write_json(job.out / FINISHED, mark)
     return status
+
+
+def peak_memory_bytes() -> int:
+    """Largest memory of this process until now; 0 where the system does not tell."""
+    try:
+        import resource
+    except ModuleNotFoundError:
+        return 0
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return used if sys.platform == "darwin" else 1024 * used
 
 
 if __name__ == "__main__":

@@ -51,6 +51,19 @@ def run_simulator(arguments: Sequence[str]) -> int:
     return subprocess.run([sys.executable, "-m", "polysight_simulators", *arguments], check=False).returncode
 
 
+def simulate_scene(scene: Path, config: Path, out: Path, seed: int | None = None) -> None:
+    """Write the simulated scan of a scene into `out`, quietly. Raises PolysightError with the simulator's message."""
+    require_package("polysight_simulators", "simulators")
+    command = [sys.executable, "-m", "polysight_simulators", "simulate", str(scene), "--config", str(config)]
+    command += ["--out", str(out), "--json"]
+    if seed is not None:
+        command += ["--seed", str(seed)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise _error_of(done.returncode, done.stderr)
+    sys.stderr.write(done.stderr)
+
+
 def check_scenes(scenes: Iterable[Path], config: Path) -> None:
     """Check scene files against the rig before they are used.
 

@@ -95,7 +95,7 @@ def _check_bands(patch: PatchFigures, chirp: Chirp, source: str) -> None:
         same_last = math.isclose(saved.last_hz, expected.last_hz, rel_tol=_SAME_FREQUENCY)
         if not (same_first and same_last):
             raise DataError(
-                f"segment {patch.label} covers {saved.first_hz / 1e9:.4f} to {saved.last_hz / 1e9:.4f} GHz; the chirp"
+                f"patch {patch.label} covers {saved.first_hz / 1e9:.4f} to {saved.last_hz / 1e9:.4f} GHz; the chirp"
                 f" of {source} has that part from {expected.first_hz / 1e9:.4f} to {expected.last_hz / 1e9:.4f} GHz",
                 "that is another rig file than the scan's",
                 "leave --config out: the products bring their own",
@@ -106,7 +106,7 @@ def permittivity(
     folder: Path,
     config: Path | None,
     stack: Sequence[Layer],
-    segment: int | None,
+    number: int | None,
     as_json: bool,
     bands: int | None = None,
     amplitude_error: float = AMPLITUDE_ERROR,
@@ -123,7 +123,7 @@ def permittivity(
     Raises
     ------
     DataError
-        when the folder holds no materials, not that segment, or not so many sub-bands; when nothing says with which
+        when the folder holds no materials, not that patch, or not so many sub-bands; when nothing says with which
         chirp it was made, or its sub-bands are of another one.
     ConfigError
         when `config` cannot be read.
@@ -133,10 +133,10 @@ def permittivity(
     products = read_products(folder, MATERIALS)
     if stack and products.verdict is not None and not products.verdict.usable:
         raise products.verdict.error("the images are kept")
-    patches = [patch for patch in products.segments if segment is None or patch.label == segment]
+    patches = [patch for patch in products.segments if number is None or patch.label == number]
     if not patches:
         raise DataError(
-            f"{products.folder}: no segment {segment}",
+            f"{products.folder}: no patch {number}",
             f"its number is not in {MATERIALS}",
             f"`polysight materials {products.folder}` lists them",
         )

@@ -122,10 +122,10 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
     if not result.lit:
         lines.append("the scan does not light this place")
     lines.append(f"|H| {_value(result.h_db)} dB, |V| {_value(result.v_db)} dB")
-    lines.append(f"P = {_complex(result.p)} +- {_value(result.p_sigma)} a part")
+    lines.append(f"P = {_complex(result.p)} {_error(result.p_sigma)}")
     if result.permittivity:
-        error = _value(result.permittivity_sigma)
-        lines.append(f"permittivity {_complex(result.permittivity)} +- {error} a part, as a half space")
+        error = _error(result.permittivity_sigma)
+        lines.append(f"permittivity {_complex(result.permittivity)} {error}, as a half space")
     else:
         lines.append(f"no permittivity: {result.why}")
     if result.patch is not None:
@@ -170,6 +170,11 @@ def _shown_name(name: str | None) -> str:
     if name == UNKNOWN:
         return "not in the library"
     return name or "not named"
+
+
+def _error(std: float | None) -> str:
+    """Standard error of a complex number as text."""
+    return "(its error is not known)" if std is None else f"+- {std:.3g} (real and imaginary part)"
 
 
 def _value(value: float | None) -> str:

@@ -221,6 +221,19 @@ def _no_metal(folder: Path) -> DataError:
     )
 
 
+def library_of(data: Sequence[Path], config: Path, note: str = "") -> Library:
+    """Return a library of labelled scans; `config` is the rig file of data without one.
+
+    Raises
+    ------
+    PolysightError
+        as :func:`training_scan`; with fewer than two scans.
+    """
+    for folder in data:
+        check_labelled(folder)
+    return make_library(with_unique_names([training_scan(folder, config) for folder in data]), note)
+
+
 def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, times: int = 1) -> int:
     """Make a library from labelled scans, simulated scans with truth, or scenes; return the exit status.
 

@@ -10,6 +10,8 @@ reads boxes with names and true plates, `catalogue.py` the permittivities of the
 data set.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from polysight.materials.analyse import (
     KnownScene,
     Optics,
@@ -37,7 +39,8 @@ from polysight.materials.classify import (
     classifier_sentence,
 )
 from polysight.materials.copies import Copies, find_copies
-from polysight.materials.discriminant import REJECTED
+from polysight.materials.discriminant import REJECTED, ErrorDiscriminant
+from polysight.materials.inversion import slope
 from polysight.materials.labels import (
     METALS,
     SPECIMEN,
@@ -73,6 +76,7 @@ from polysight.materials.library import (
     Samples,
     by_angle,
     feature_matrix,
+    ratio_columns,
 )
 from polysight.materials.measure import NOT_PASSIVE, Permittivity, estimate_permittivity, format_permittivity
 from polysight.materials.names import LAYER, UNKNOWN, NamedPatch, PatchName
@@ -119,6 +123,9 @@ from polysight.materials.train import (
     score_unseen_materials,
 )
 
+if TYPE_CHECKING:
+    from polysight.materials.paper_knn import PaperKNeighborsClassifier
+
 __all__ = [
     "AMPLITUDE_ERROR",
     "CATALOGUE",
@@ -144,6 +151,7 @@ __all__ = [
     "ConcentrationResult",
     "Copies",
     "Entry",
+    "ErrorDiscriminant",
     "KnownScene",
     "LabelledScan",
     "Labels",
@@ -155,6 +163,7 @@ __all__ = [
     "Model",
     "NamedPatch",
     "Optics",
+    "PaperKNeighborsClassifier",
     "PatchName",
     "Permittivity",
     "Plates",
@@ -212,6 +221,7 @@ __all__ = [
     "permittivity_change",
     "pixel_accuracy",
     "polarisation_angle_rad",
+    "ratio_columns",
     "read_catalogue",
     "read_labelled_scan",
     "read_labels",
@@ -222,7 +232,17 @@ __all__ = [
     "same_material",
     "score",
     "score_unseen_materials",
+    "slope",
     "specimen_seed",
     "truth_plates",
     "with_bands",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the estimator when it is first used: it imports scikit-learn, which most commands do not need."""
+    if name != "PaperKNeighborsClassifier":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from polysight.materials.paper_knn import PaperKNeighborsClassifier
+
+    return PaperKNeighborsClassifier

@@ -3,14 +3,8 @@
 `MODELS` lists the models: the paper's KNN and the discriminant of error sources. `Classifier` uses the library's model,
 or the requested one.
 
-`PaperKnn` is the paper's weighted k-nearest-neighbour classifier on |H|, |V| and complex P (section 6.3). The distance
-of two pixels is lambda_H |d|H|| + lambda_V |d|V|| + lambda_P d_P, summed over the incidence angles. The paper uses |dP|
-for d_P. There are two other measures, because errors of a ratio are not additive:
-
-* `inverse`: |d(1/P)|. 1/P = V/H stays below 1 for every dielectric, while P and its noise grow without bound near the
-  Brewster angle.
-* `log`: |d ln P| = sqrt((d ln|P|)^2 + (d arg P)^2). A gain error is the same distance for every material; materials of
-  nearly the same permittivity differ by 4 to 10 % in P.
+`PaperKnn` is the paper's weighted k-nearest-neighbour classifier on |H|, |V| and complex P: scikit-learn's, with the
+distance of `library.py`.
 
 The three weights and the measure are fitted by cross-validation on the training data, with whole scans left out. A
 nearest neighbour exists for every patch; unknown patches are recognised by the materials' distributions
@@ -22,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,31 +24,32 @@ import numpy.typing as npt
 from polysight.materials.discriminant import ErrorDiscriminant
 from polysight.materials.kinds import Kind, literature
 from polysight.materials.library import (
+    MEASURES,
+    Distances,
     Library,
+    Measure,
     Model,
     NamedScan,
     Real,
     Samples,
     SceneErrors,
-    by_angle,
+    channel_distances,
+    count_votes,
+    find_neighbours,
     majority,
+    ratio_columns,
     usable,
 )
 from polysight.materials.names import INCLUSIONS, LIKELY, UNKNOWN, NamedPatch, PatchName
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
-Measure = Literal["paper", "inverse", "log"]
-MEASURES: tuple[Measure, ...] = get_args(Measure)
 GRID = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Values of lambda_H and lambda_V to try, relative to lambda_P = 1, with each channel scaled by its spread."""
 MARGIN = 2.0
 """Largest distance of a known pixel, relative to the distances between the library's own patches."""
 FIT_PIXELS = 3
 """Pixels of each patch to fit weights: pixels of a patch are similar, and the cost grows with the square."""
-_CHUNK = 512
-_FAR = 1e9
-Distances = tuple[Real, Real, Real]
 
 
 @dataclass(frozen=True)
@@ -89,55 +84,9 @@ class Weights:
         return w
 
 
-def ratio_distance(a: npt.NDArray[np.complex128], b: npt.NDArray[np.complex128], measure: Measure) -> Real:
-    """Return the distance of ratios P, broadcast; the measures are in the module's docstring."""
-    if measure == "paper":
-        return np.abs(a - b)
-    if measure == "inverse":
-        return np.abs(1 / a - 1 / b)
-    quotient = a / b
-    return np.hypot(np.log(np.abs(quotient)), np.angle(quotient))
-
-
-def channel_distances(a: Real, b: Real, measure: Measure) -> Distances:
-    """Return the distances of features a [n, 4 * angles] to b [m, 4 * angles], summed over angles, [n, m] each."""
-    (ah, av, aq), (bh, bv, bq) = by_angle(a), by_angle(b)
-    angles = range(ah.shape[1])
-    return (
-        sum((np.abs(ah[:, None, i] - bh[None, :, i]) for i in angles), np.zeros((len(a), len(b)))),
-        sum((np.abs(av[:, None, i] - bv[None, :, i]) for i in angles), np.zeros((len(a), len(b)))),
-        sum(
-            (ratio_distance(1 / aq[:, None, i], 1 / bq[None, :, i], measure) for i in angles),
-            np.zeros((len(a), len(b))),
-        ),
-    )
-
-
 def combine(channels: Distances, w: Weights) -> Real:
     """Return the weighted sum of the three distances."""
     return w.h * channels[0] + w.v * channels[1] + w.p * channels[2]
-
-
-class Voters:
-    """Votes of the nearest labelled pixels, from distances.
-
-    The names are those of scikit-learn's KNeighborsClassifier, a test compares them. That one spends ten times as long
-    on its checks, and a fit of weights asks for names 80 times.
-    """
-
-    def __init__(self, names: npt.NDArray, neighbours: int) -> None:
-        self.neighbours = min(neighbours, names.size)
-        self._names, kind_of_pixel = np.unique(names, return_inverse=True)
-        self._is_kind = np.eye(self._names.size, dtype=np.int16)[kind_of_pixel]
-
-    def predict(self, distance: Real) -> npt.NDArray:
-        """Return the name of each query from its distances to the labelled pixels, [queries, pixels].
-
-        Of names with equally many votes the first in the alphabet is taken.
-        """
-        nearest = np.argpartition(distance, self.neighbours - 1, axis=1)[:, : self.neighbours]
-        votes = self._is_kind[nearest].sum(axis=1)
-        return self._names[votes.argmax(axis=1)]
 
 
 class PaperKnn(Model):
@@ -163,7 +112,14 @@ class PaperKnn(Model):
             self.weights = Weights()
         else:
             self.weights = fit_weights(samples, channels=self.channels).weights
-        self.x, self.voters = samples.x, Voters(samples.names, self.weights.neighbours)
+        # Slow imports, which most commands do not need.
+        from polysight.materials.paper_knn import PaperKNeighborsClassifier
+
+        w = self.weights
+        count = min(w.neighbours, samples.names.size)
+        self._knn = PaperKNeighborsClassifier(count, weight_h=w.h, weight_v=w.v, weight_p=w.p, measure=w.measure)
+        self._knn.fit(ratio_columns(samples.x), samples.names)
+        self._materials, self._material = np.unique(samples.names, return_inverse=True)
         self._samples, self._distributions = samples, None
         return self
 
@@ -185,22 +141,11 @@ class PaperKnn(Model):
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Name each pixel; return name, and mean distance of its neighbours over the material's threshold."""
-        names, relative = [], []
-        for start in range(0, len(x), _CHUNK):
-            distance = combine(self._distances(x[start : start + _CHUNK]), self.weights)
-            k = self.voters.neighbours
-            near = np.partition(distance, k - 1, axis=1)[:, :k].mean(axis=1)
-            names.append(self.voters.predict(distance))
-            relative.append(near / np.array([self.thresholds.get(str(n), np.inf) for n in names[-1]]))
-        return np.concatenate(names), np.concatenate(relative)
-
-    def _distances(self, x: Real) -> Distances:
-        if self.weights.p:
-            return channel_distances(x, self.x, self.weights.measure)
-        h, v = (
-            np.abs(a[:, None] - b[None]).sum(axis=2) for a, b in zip(by_angle(x)[:2], by_angle(self.x), strict=False)
-        )
-        return h, v, np.zeros_like(h)
+        distance, nearest = self._knn.kneighbors(ratio_columns(x))
+        votes = count_votes(self._material[nearest], self._materials.size)
+        names = self._materials[votes.argmax(axis=1)]
+        thresholds = np.array([self.thresholds.get(str(name), np.inf) for name in names])
+        return names, distance.mean(axis=1) / thresholds
 
 
 @dataclass(frozen=True)
@@ -243,7 +188,8 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
         )
     few, neighbours = _few(samples), Weights.neighbours
     same_scan = few.groups[:, None] == few.groups[None, :]
-    knn = Voters(few.names, min(neighbours, int((~same_scan).sum(axis=1).min())))
+    # Every pixel must find so many in other scans.
+    voters = min(neighbours, int((~same_scan).sum(axis=1).min()))
     grid = [(0.0, 0.0)] if channels == "P" else [(0.0, 0.0), *product(GRID, GRID)]
     tried: list[tuple[float, float, Weights]] = []
     alone: dict[str, float] = {}
@@ -252,14 +198,14 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
         scale = [1 / max(float(np.median(c)), 1e-12) for c in distances]
         for wh, wv in grid:
             w = Weights(wh * scale[0], wv * scale[1], scale[2], measure)
-            accuracy = _left_out(combine(distances, w), knn, few, same_scan)
+            accuracy = _left_out(combine(distances, w), voters, few, same_scan)
             tried.append((accuracy, -abs(np.log(max(wh, 0.1))) - abs(np.log(max(wv, 0.1))), w))
             if wh == wv == 0:
                 alone[measure] = accuracy
     top = max(accuracy for accuracy, _, _ in tried)
     accuracy, _, weights = max((t for t in tried if t[0] >= top - 0.005), key=lambda t: t[1])
     distances = channel_distances(few.x, few.x, weights.measure)
-    by_channel = {c: _left_out(distances[i], knn, few, same_scan) for i, c in enumerate("hv")}
+    by_channel = {c: _left_out(distances[i], voters, few, same_scan) for i, c in enumerate("hv")}
     by_channel["p"] = alone[weights.measure]
     return Fit(weights, accuracy, by_channel, _thresholds(combine(distances, weights), neighbours, few))
 
@@ -271,9 +217,11 @@ def _few(samples: Samples) -> Samples:
     return samples.take(np.sort(np.concatenate(at)))
 
 
-def _left_out(distance: Real, knn: Voters, few: Samples, same_scan: npt.NDArray[np.bool_]) -> float:
+def _left_out(distance: Real, voters: int, few: Samples, same_scan: npt.NDArray[np.bool_]) -> float:
     """Return the pixel accuracy, mean over the materials of two or more scans, without votes of the same scan."""
-    found = knn.predict(np.where(same_scan, _FAR, distance))
+    names, classes = np.unique(few.names, return_inverse=True)
+    nearest = find_neighbours(np.where(same_scan, np.inf, distance), voters)
+    found = names[count_votes(classes[nearest], names.size).argmax(axis=1)]
     return float(np.mean([(found[few.names == n] == n).mean() for n in np.unique(few.names[few.shared])]))
 
 

@@ -297,6 +297,11 @@ class ErrorDiscriminant(Model):
         best = cost.argmin(axis=1)
         return self.names[best], np.sqrt(q[np.arange(len(x)), best] / self.pixel_level)
 
+    def pixel_probabilities(self, x: Real) -> Real:
+        """Return the probability of each material for pixels classified independently, [n, materials]."""
+        _, cost = costs(self._deviations(x) - self.level, self._pixel_covariances())
+        return probabilities(cost, np.full(len(x), np.inf))[:, :-1]
+
     def by_scan(
         self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
     ) -> NamedScan:

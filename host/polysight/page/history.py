@@ -14,7 +14,7 @@ from typing import Literal
 import msgspec
 
 from polysight.acquisition import FaultKind, typical_row_s
-from polysight.plan import scan_time
+from polysight.planning import scan_time
 from polysight.store import (
     Fact,
     Manifest,

@@ -40,6 +40,8 @@ from polysight.results import (
     apart_reasons,
     background_reasons,
     brightness_reasons,
+    check_plate,
+    check_reasons,
     copies_reasons,
     direct_path_reasons,
     disturbance_reasons,
@@ -60,7 +62,7 @@ from polysight.results import (
 )
 from polysight.store import CubeRow, RowData, Source
 from polysight.sync import SyncedRow, block_sweep_of, estimate_backlash, object_filter, sweep_of
-from polysight_shared.config import Board, Instrument
+from polysight_shared.config import Board, CheckPlate, Instrument
 from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
 
@@ -373,7 +375,11 @@ def _disturbances(name: str, rows: list[RowFigures]) -> list[Finding]:
 
 
 def judge(
-    quality: Quality, found: MaterialsResult, plane: PlaneEstimate | None, classifier: Classifier | None
+    quality: Quality,
+    found: MaterialsResult,
+    plane: PlaneEstimate | None,
+    classifier: Classifier | None,
+    check: CheckPlate,
 ) -> Verdict:
     """Return the verdict on a processed scan.
 
@@ -387,8 +393,13 @@ def judge(
         Plane of the plates; None if it was not estimated.
     classifier
         The classifier that named the patches; None without naming.
+    check
+        The rig file's plate of known permittivity.
     """
-    return verdict_of(recording_verdict(quality) + scene_reasons(found, plane, classifier))
+    reasons = recording_verdict(quality) + scene_reasons(found, plane, classifier)
+    if check.name:
+        reasons += check_reasons(check_plate(check, found.rows()))
+    return verdict_of(reasons)
 
 
 def scene_reasons(found: MaterialsResult, plane: PlaneEstimate | None, classifier: Classifier | None) -> list[Finding]:

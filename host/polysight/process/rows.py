@@ -11,7 +11,6 @@ File format: docs/spec/samples.md.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import math
@@ -49,6 +48,7 @@ from polysight.store import (
     Source,
     dropped_rows,
     inside,
+    lock_file,
     manifest,
     open_records,
     raw_digest,
@@ -369,7 +369,7 @@ class KeptSamples:
         rows = os.open(self._folder / SAMPLE_ROWS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
         weakref.finalize(self, os.close, rows)
         try:
-            fcntl.flock(rows, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(rows)
         except BlockingIOError:
             self._keep = False
             return None

@@ -7,10 +7,12 @@ context manager: products are written to a temporary folder, which replaces the 
 """
 
 from polysight.products.exports import (
+    PLANE,
     export,
     full_dataset,
     image_dataset,
     patch_dataset,
+    permittivity_dataset,
     ranges_text,
     read_netcdf,
     surface_dataset,
@@ -49,6 +51,7 @@ __all__ = [
     "LABELS",
     "LABELS_PICTURE",
     "MATERIALS",
+    "PLANE",
     "QUALITY",
     "REPORT",
     "SCAN",
@@ -63,6 +66,7 @@ __all__ = [
     "label_folder",
     "making_products",
     "patch_dataset",
+    "permittivity_dataset",
     "products_locked",
     "ranges_text",
     "raw_dropped",

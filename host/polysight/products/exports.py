@@ -1,7 +1,8 @@
 """Processed scans for other programs: xarray datasets, and files in NetCDF, MATLAB and CSV (`polysight export`).
 
 Notebooks and exports use the same names: `image_dataset` has the pixels, `patch_dataset` the patches, `full_dataset`
-both. Permittivity is eps' - j eps'' (eps'' is the loss); unknown values are NaN. xarray is imported at first use.
+both. Places are `x_mm`, `y_mm` from the image's centre; `x_m`, `y_m` are the same in the rig frame. Permittivity is
+eps' - j eps'' (eps'' is the loss); unknown values are NaN. xarray is imported at first use.
 
 NetCDF has no complex numbers: a complex variable `h` is stored as `h_real` and `h_imag`, each with the attribute
 `complex_part`; :func:`read_netcdf` joins them again.
@@ -12,6 +13,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -24,8 +26,8 @@ import numpy.typing as npt
 import scipy
 from msgspec import UNSET
 
-from polysight.materials import image_centre_mm
-from polysight.polarimetry import incidence_choice, specular_incidence_rad
+from polysight.materials import axis_mm, image_centre_mm, incidence_std_rad, slope
+from polysight.polarimetry import incidence_choice, permittivity_from_ratio, specular_incidence_rad
 from polysight.products.processed import ProcessedScan, read_products
 from polysight.results import Figure, PatchFigures, Verdict, figures_of, plain
 from polysight.store import MAX_BYTES
@@ -39,8 +41,14 @@ if TYPE_CHECKING:
 
 CONVENTION = (
     "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
-    " column 0 the smallest x; rig frame; permittivity is real - j loss"
+    " column 0 the smallest x; x_mm and y_mm from the image's centre, x_m and y_m in the rig frame; permittivity is"
+    " real - j loss"
 )
+PLANE = ("y_mm", "x_mm")
+# Largest error of a permittivity that says something, relative to its size.
+LARGEST_ERROR = 0.5
+# Step for the derivative by the incidence angle.
+_ANGLE_STEP_RAD = 1e-6
 _PART = "complex_part"
 UNREFERENCED = "none: h, v and p are in arbitrary units"
 
@@ -82,6 +90,9 @@ def provenance(scan: ProcessedScan) -> dict[str, Any]:
         "metal_reference": metal,
         **verdict_attributes(scan.verdict),
     }
+    centre_x_mm, centre_y_mm = image_centre_mm(scan.x_m, scan.y_m)
+    attrs["image_centre_x_m"] = centre_x_mm / 1e3
+    attrs["image_centre_y_m"] = centre_y_mm / 1e3
     if scan.rig is not None:
         attrs["rig"] = scan.rig.name
     if scan.facts.processed_utc:
@@ -115,42 +126,54 @@ def image_dataset(scan: ProcessedScan) -> xarray.Dataset:
     Returns
     -------
     xarray.Dataset
-        Dimensions `y`, `x` (metres, rig frame). `h`, `v`, `p` complex64 [y, x]: s-polarised and p-polarised channel
-        and their ratio, relative to metal unless `metal_reference` begins with "none". `valid` bool [y, x].
-        `p_sigma` float32 [y, x], the standard deviation of `p`, if the products have it.
-        `incidence_deg`: one angle, or [y, x] if the scan was processed with one angle per pixel; left out if the
-        rig is unknown. Attributes: :func:`provenance`.
+        Dimensions `y_mm`, `x_mm`: millimetres from the image's centre; coordinates `y_m`, `x_m`: metres in the rig
+        frame. `h`, `v`, `p` complex64 [y_mm, x_mm]: s-polarised and p-polarised channel and their ratio, relative to
+        metal unless `metal_reference` begins with "none". `valid` bool. `p_sigma` float32, the standard deviation of
+        `p`, if the products have it. `incidence_deg` and `incidence_rad`: one angle, or an angle per pixel if the scan
+        was processed so; left out if the rig is unknown. Attributes: :func:`provenance`.
     """
     import xarray
 
-    images, plane = scan.images, ("y", "x")
+    images = scan.images
     unit = "reflection relative to metal" if scan.metal_referenced else "arbitrary units"
     data = {
-        "h": _described(plane, images.h, "1", f"s-polarised channel, {unit}"),
-        "v": _described(plane, images.v, "1", f"p-polarised channel, {unit}"),
-        "p": _described(plane, images.p, "1", f"polarisation ratio H / V, {unit}"),
-        "valid": _described(plane, images.valid, "1", "True where the scan illuminates the pixel"),
+        "h": _described(PLANE, images.h, "1", f"s-polarised channel, {unit}"),
+        "v": _described(PLANE, images.v, "1", f"p-polarised channel, {unit}"),
+        "p": _described(PLANE, images.p, "1", f"polarisation ratio H / V, {unit}"),
+        "valid": _described(PLANE, images.valid, "1", "True where the scan illuminates the pixel"),
     }
     if images.p_sigma is not None:
         about = "standard deviation of p: root of the mean variance of its real and imaginary part"
-        data["p_sigma"] = _described(plane, images.p_sigma, "1", about)
-    if scan.rig is not None:
-        if scan.quality.incidence and scan.quality.incidence.used == "by pixel":
-            angles = incidence_choice(scan.rig, images.x_m, images.y_m, "pixel").used_rad
-            data["incidence_deg"] = _described(plane, np.degrees(angles), "degree", "incidence angle of the pixel")
-        else:
-            angle = np.degrees(specular_incidence_rad(scan.rig))
-            data["incidence_deg"] = _described((), angle, "degree", "incidence angle")
-    elif scan.quality.incidence and scan.quality.incidence.one_deg is not None:
-        data["incidence_deg"] = _described((), scan.quality.incidence.one_deg, "degree", "incidence angle")
+        data["p_sigma"] = _described(PLANE, images.p_sigma, "1", about)
+    angle_deg = _incidence_deg(scan)
+    if angle_deg is not None:
+        dims = PLANE if np.ndim(angle_deg) else ()
+        data["incidence_deg"] = _described(dims, angle_deg, "degree", "incidence angle")
+        data["incidence_rad"] = _described(dims, np.radians(angle_deg), "rad", "incidence angle")
     return xarray.Dataset(data, _axes(scan), provenance(scan))
 
 
+def _incidence_deg(scan: ProcessedScan) -> Any:
+    """Return the incidence angle, or one for each pixel; None if it is unknown."""
+    incidence = scan.quality.incidence
+    if scan.rig is None:
+        return incidence.one_deg if incidence else None
+    if incidence and incidence.used == "by pixel":
+        return np.degrees(incidence_choice(scan.rig, scan.x_m, scan.y_m, "pixel").used_rad)
+    return np.degrees(specular_incidence_rad(scan.rig))
+
+
 def _axes(scan: ProcessedScan) -> dict[str, Any]:
-    return {
-        "y": _described(("y",), scan.y_m, "m", "pixel centre, y of the rig frame"),
-        "x": _described(("x",), scan.x_m, "m", "pixel centre, x of the rig frame"),
-    }
+    """Return the coordinates of the pixels. `axis` lets programs for maps find x and y."""
+    axes: dict[str, Any] = {}
+    for name, place_m in (("y", scan.y_m), ("x", scan.x_m)):
+        dims = (f"{name}_mm",)
+        # Rounded, so that `.sel(x_mm=20)` finds a pixel whose centre is at 20 mm.
+        place_mm = np.round(axis_mm(place_m), 6)
+        axes[f"{name}_mm"] = _described(dims, place_mm, "mm", f"pixel centre, {name} from the image's centre")
+        axes[f"{name}_mm"][2]["axis"] = name.upper()
+        axes[f"{name}_m"] = _described(dims, place_m, "m", f"pixel centre, {name} of the rig frame")
+    return axes
 
 
 def patch_dataset(scan: ProcessedScan) -> xarray.Dataset:
@@ -159,9 +182,9 @@ def patch_dataset(scan: ProcessedScan) -> xarray.Dataset:
     Returns
     -------
     xarray.Dataset
-        `label` int32 [y, x] (0: no patch) and, if known, `interior` bool [y, x], the pixels used for the values.
+        `label` int32 [y_mm, x_mm] (0: no patch) and, if known, `interior` bool, the pixels used for the values.
         On dimension `patch` the figures declared in :class:`polysight.results.PatchFigures`, and with sub-bands
-        `band_ratio` [patch, band]. Coordinates `centre_x` and `centre_y` (m, rig frame). Attributes:
+        `band_ratio` [patch, band]. Coordinates `centre_x_mm` and `centre_y_mm` from the image's centre. Attributes:
         :func:`provenance`, `library`, `model`.
 
     Raises
@@ -172,47 +195,97 @@ def patch_dataset(scan: ProcessedScan) -> xarray.Dataset:
     import xarray
 
     if scan.materials is None:
-        raise DataError(
-            f"scan {scan.scan_id} has no materials",
-            "only images were made of this scan",
-            "`polysight process` finds patches and materials; give the folder it writes, or the scan folder",
-            code=ErrorCode.NO_DATA,
-        )
-    plane = ("y", "x")
-    data = {"label": _described(plane, scan.labels, "1", "number of the patch that holds the pixel, 0 for none")}
+        raise _no_materials(scan)
+    data = {"label": _described(PLANE, scan.labels, "1", "number of the patch that holds the pixel, 0 for none")}
     if scan.interior is not None:
-        data["interior"] = _described(plane, scan.interior, "1", "True where the pixel is used for the patch's numbers")
+        data["interior"] = _described(PLANE, scan.interior, "1", "True where the pixel is used for the patch's numbers")
     data |= _figure_variables(scan.segments) | _band_variables(scan.segments)
     naming = {"library": scan.materials.library, "model": scan.materials.model}
     attributes = provenance(scan) | {key: text for key, text in naming.items() if text}
     return xarray.Dataset(data, _axes(scan) | _patch_axes(scan), attributes)
 
 
+def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
+    """Return the permittivity of each pixel as a half space, with its standard errors.
+
+    Eq. 3 is analytic in 1 / P, so the error of P adds the same variance to both parts; that of the incidence angle adds
+    its own. `p_sigma` holds noise, leakage and the metal reference. Neighbouring pixels share most of their error:
+    averaging over a patch does not reduce it.
+
+    Returns
+    -------
+    xarray.Dataset
+        `permittivity` complex128 [y_mm, x_mm], eps' - j eps''; `permittivity_real_standard_error` and
+        `permittivity_loss_standard_error` float64; `mask` bool: True where the pixel is lit and the errors are below
+        half of the value. The values are not a number where the scan lights nothing.
+
+    Raises
+    ------
+    DataError
+        if only images were made, or the verdict is "no result".
+    """
+    import xarray
+
+    if scan.materials is None:
+        raise _no_materials(scan)
+    if scan.verdict is not None and not scan.verdict.usable:
+        raise scan.verdict.error("the images are kept")
+    image = image_dataset(scan)
+    theta_rad = np.asarray(image["incidence_rad"]) if "incidence_rad" in image else np.float64(np.nan)
+    p = np.where(scan.valid, scan.p, np.nan).astype(np.complex128)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        value = permittivity_from_ratio(p, theta_rad)
+        value = np.where(np.isfinite(value), value, complex(np.nan, np.nan))
+        # d eps / d P = -slope(1 / P) / P^2.
+        by_ratio = np.abs(slope(1 / p, theta_rad) / p**2)
+        by_angle = (permittivity_from_ratio(p, theta_rad + _ANGLE_STEP_RAD) - value) / _ANGLE_STEP_RAD
+        p_std = np.nan if scan.images.p_sigma is None else scan.images.p_sigma.astype(np.float64)
+        angle_std_rad = incidence_std_rad(scan.materials)
+        real_std = np.hypot(by_ratio * p_std, by_angle.real * angle_std_rad)
+        loss_std = np.hypot(by_ratio * p_std, by_angle.imag * angle_std_rad)
+        mask = np.hypot(real_std, loss_std) < LARGEST_ERROR * np.abs(value)
+    data = {
+        "permittivity": _described(PLANE, value, "1", "relative permittivity eps' - j eps'' as a half space"),
+        "permittivity_real_standard_error": _described(PLANE, real_std, "1", "standard error of eps'"),
+        "permittivity_loss_standard_error": _described(PLANE, loss_std, "1", "standard error of eps''"),
+        "mask": _described(PLANE, mask, "1", "True where the permittivity is known to half of its size"),
+    }
+    return xarray.Dataset(data, _axes(scan), provenance(scan))
+
+
+def _no_materials(scan: ProcessedScan) -> DataError:
+    return DataError(
+        f"scan {scan.scan_id} has no materials",
+        "only images were made of this scan",
+        "`polysight process` finds patches and materials; give the folder it writes, or the scan folder",
+        code=ErrorCode.NO_DATA,
+    )
+
+
 def _patch_axes(scan: ProcessedScan) -> dict[str, Any]:
     numbers = np.array([patch.label for patch in scan.segments], np.int32)
-    x_mm, y_mm = image_centre_mm(scan.x_m, scan.y_m)
-    centre_x_m = (_numbers([patch.centre_x_mm for patch in scan.segments]) + x_mm) / 1e3
-    centre_y_m = (_numbers([patch.centre_y_mm for patch in scan.segments]) + y_mm) / 1e3
+    centre_x_mm = _numbers([patch.centre_x_mm for patch in scan.segments])
+    centre_y_mm = _numbers([patch.centre_y_mm for patch in scan.segments])
     return {
         "patch": _described(("patch",), numbers, "1", "number of the patch in label"),
-        "centre_x": _described(("patch",), centre_x_m, "m", "middle of the patch, x of the rig frame"),
-        "centre_y": _described(("patch",), centre_y_m, "m", "middle of the patch, y of the rig frame"),
+        "centre_x_mm": _described(("patch",), centre_x_mm, "mm", "middle of the patch, x from the image's centre"),
+        "centre_y_mm": _described(("patch",), centre_y_mm, "mm", "middle of the patch, y from the image's centre"),
     }
 
 
 def _figure_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
-    """Return a variable on dimension `patch` for each declared figure; lengths in metres."""
+    """Return a variable on dimension `patch` for each declared figure, and angles in radians too."""
     variables = {}
     for figure in figures_of(type(patches[0]) if patches else PatchFigures):
         values = figure.values(patches)
         if not figure.variable or (figure.column.optional and not any(values)):
             continue
-        unit = figure.column.unit
         array = figure.array(patches)
-        if unit == "mm":
-            array = array / 1e3
-            unit = "m"
-        variables[figure.variable] = _described(("patch",), array, unit, figure.column.about)
+        column = figure.column
+        variables[figure.variable] = _described(("patch",), array, column.unit, column.about)
+        if column.unit == "degree":
+            name = f"{figure.variable.removesuffix('_deg')}_rad"
+            variables[name] = _described(("patch",), np.radians(array), "rad", column.about)
     return variables
 
 
@@ -260,6 +333,7 @@ def surface_dataset(surface: Surface) -> xarray.Dataset:
             "normal": _described(("point", "axis"), surface.normals, "1", "unit normal towards the antennas"),
             "curvature": _described(square, surface.curvature, "1/m", "curvature, positive for convex bodies"),
             "incidence_deg": _described(("point",), surface.incidence_deg, "degree", "angle of incidence"),
+            "incidence_rad": _described(("point",), np.radians(surface.incidence_deg), "rad", "angle of incidence"),
             "permittivity": _described(("point",), surface.permittivity, "1", "relative permittivity"),
             "permittivity_covariance": _described(square, surface.covariance, "1", "covariance of (real, imaginary)"),
             "position_std": _described(("point",), surface.position_std_m, "m", "standard deviation along the normal"),
@@ -337,8 +411,8 @@ def pack_netcdf(dataset: xarray.Dataset) -> bytes:
     return buffer.getvalue()
 
 
-def read_netcdf(path: Path) -> xarray.Dataset:
-    """Load a file of :func:`write_netcdf` into memory, with complex variables.
+def read_netcdf(path: str | os.PathLike[str]) -> xarray.Dataset:
+    """Load a file of `Scan.to_netcdf` or `polysight export --netcdf` into memory, with complex variables.
 
     Raises
     ------
@@ -350,6 +424,7 @@ def read_netcdf(path: Path) -> xarray.Dataset:
     import xarray
 
     _require_h5netcdf()
+    path = Path(path)
     try:
         _check_hdf5(path)
         dataset = xarray.load_dataset(path, engine="h5netcdf")
@@ -425,10 +500,11 @@ _LONGEST_NAME = 63
 
 
 def pack_mat(scan: ProcessedScan) -> bytes:
-    """Return a MATLAB file: `h`, `v`, `p`, `valid` [y, x], `x_m`, `y_m`, structs `materials`, `config`, `versions`.
+    """Return a MATLAB file.
 
-    If known also `p_sigma` [y, x], `verdict` and `verdict_reasons` (JSON). `quality_json` and `materials_json` are the
-    files as text, for jsondecode.
+    `h`, `v`, `p`, `valid` [y, x]; `x_mm`, `y_mm` from the image's centre, `x_m`, `y_m` in the rig frame; structs
+    `materials`, `config`, `versions`. If known also `p_sigma` [y, x], `verdict` and `verdict_reasons` (JSON).
+    `quality_json` and `materials_json` are the files as text, for jsondecode.
     """
     images = scan.images
     content = {
@@ -436,6 +512,8 @@ def pack_mat(scan: ProcessedScan) -> bytes:
         "v": images.v,
         "p": images.p,
         "valid": images.valid,
+        "x_mm": axis_mm(images.x_m)[None, :],
+        "y_mm": axis_mm(images.y_m)[:, None],
         "x_m": images.x_m[None, :],
         "y_m": images.y_m[:, None],
         "materials": {figure.column.name: _column(figure, scan) for figure in table_figures(scan)},

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import fcntl
 import os
 import shutil
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from polysight.materials import PATCHES, Labels, read_labels
@@ -30,7 +30,7 @@ from polysight.products.processed import (
     ProcessedScan,
     raw_dropped,
 )
-from polysight.store import is_source
+from polysight.store import is_source, lock_file
 from polysight.surfaces import POINTS, SURFACE
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, DeviceError
@@ -42,6 +42,44 @@ PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, RE
 _BY_HAND = b'"by_hand": true'
 _HERE = -100  # AT_FDCWD of renameat2(2)
 _EXCHANGE = 2
+
+
+class FolderLock:
+    """Lock of a folder until it is closed; the folder is created.
+
+    POSIX systems lock the folder itself. Windows cannot open folders: there a file beside it is locked.
+
+    Raises
+    ------
+    BlockingIOError
+        if another program has locked it.
+    OSError
+        if it cannot be created or opened; also for a link, through which nothing is written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(exist_ok=True)
+        self._beside: Path | None = None
+        if hasattr(os, "O_DIRECTORY"):
+            self._descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        else:
+            self._beside = folder.with_name(f"{folder.name}.lock")
+            self._descriptor = os.open(self._beside, os.O_RDWR | os.O_CREAT)
+        try:
+            lock_file(self._descriptor)
+            if self._beside is None and not os.path.samestat(os.fstat(self._descriptor), folder.stat()):
+                raise BlockingIOError("it has just replaced another folder")
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Unlock."""
+        os.close(self._descriptor)
+        if self._beside is not None:
+            # Another program may hold it by now.
+            with suppress(OSError):
+                self._beside.unlink()
 
 
 def check_products_folder(out: Path, scan_id: str) -> None:
@@ -97,12 +135,14 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
         if the new folder cannot replace `out`; the error names the new folder, which is kept.
     """
     place = out.resolve()  # the target of a link
-    new, old = place.with_name(f".{place.name}.new"), place.with_name(f".{place.name}.old")
+    new = place.with_name(f".{place.name}.new")
+    old = place.with_name(f".{place.name}.old")
     if old.exists() and not place.exists():
         old.rename(place)  # a program was killed between the two renames of _replace
     shutil.rmtree(old, ignore_errors=True)  # or after them
     check_products_folder(out, scan_id)
-    lock, keep = _lock(out, new), False
+    lock = _lock(out, new)
+    keep = False
     try:
         yield new
         for name, content in _hand_labels(place, scan_id).items():
@@ -117,7 +157,7 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
                 f"the new products are in {new}: copy them before the next run; then give another --out",
             ) from None
     finally:
-        os.close(lock)
+        lock.close()
         if not keep:
             shutil.rmtree(new, ignore_errors=True)
 
@@ -131,12 +171,12 @@ def products_locked(out: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        os.close(lock)
+        lock.close()
         shutil.rmtree(new, ignore_errors=True)
 
 
-def _lock(out: Path, new: Path) -> int:
-    """Create and lock the new folder beside `out`; return the file descriptor of the lock. Raises ConfigError."""
+def _lock(out: Path, new: Path) -> FolderLock:
+    """Create and lock the new folder beside `out`, and empty it. Raises ConfigError."""
     try:
         new.parent.mkdir(parents=True, exist_ok=True)
         return _create_locked(new)
@@ -169,18 +209,17 @@ def _check_writable(folder: Path) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(parent))
 
 
-def _create_locked(new: Path) -> int:
-    """Create and lock the folder, delete leftovers of a killed program; return the file descriptor of the lock."""
-    new.mkdir(exist_ok=True)
-    lock = os.open(new, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)  # never follow a link
+def _create_locked(new: Path) -> FolderLock:
+    """Create and lock the folder, delete leftovers of a killed program."""
+    lock = FolderLock(new)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if not os.path.samestat(os.fstat(lock), new.stat()):
-            raise BlockingIOError(errno.EAGAIN, "it has just replaced the old folder")
         for entry in new.iterdir():
-            shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink()
     except BaseException:
-        os.close(lock)
+        lock.close()
         raise
     return lock
 
@@ -204,6 +243,8 @@ def _replace(new: Path, place: Path, old: Path) -> None:
 
 def _exchange(a: Path, b: Path) -> bool:
     """Swap two folders atomically (Linux, renameat2). False if system or file system do not support it."""
+    if sys.platform != "linux":
+        return False
     renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if renameat2 is None:
         return False

@@ -15,11 +15,9 @@ it was armed, because an armed radar sends nothing before its first pulse.
 
 from __future__ import annotations
 
-import fcntl
 import select
 import socket
 import struct
-import termios
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -461,6 +459,10 @@ class LineServers(RadarControl):
 
 def _unacknowledged(connection: socket.socket) -> int:
     """Return the sent bytes that the other kernel has not acknowledged (SIOCOUTQ, tcp(7))."""
+    # Modules of POSIX systems: this file is imported on laptops, too.
+    import fcntl
+    import termios
+
     return struct.unpack("=i", fcntl.ioctl(connection, termios.TIOCOUTQ, b"\0\0\0\0"))[0]
 
 

@@ -7,6 +7,7 @@ cannot hold names or permittivities. The functions `*_reasons` are the rules of 
 `plain` converts all of it to JSON types.
 """
 
+from polysight.results.check_plate import WARNING_SIGMAS, CheckResult, check_plate, check_reasons
 from polysight.results.json_files import damaged, json_text, one_line, plain, read_object
 from polysight.results.materials import (
     BandFigures,
@@ -71,11 +72,13 @@ from polysight.results.verdict import (
 )
 
 __all__ = [
+    "WARNING_SIGMAS",
     "Backlash",
     "BandFigures",
     "BoardImaging",
     "BoardQuality",
     "CalibrationSource",
+    "CheckResult",
     "ComplexNumber",
     "Coverage",
     "ErrorBudget",
@@ -106,6 +109,8 @@ __all__ = [
     "apart_reasons",
     "background_reasons",
     "brightness_reasons",
+    "check_plate",
+    "check_reasons",
     "copies_reasons",
     "damaged",
     "direct_path_reasons",

@@ -45,7 +45,7 @@ class Column:
     unit
         Of the value; "1" for a pure number, "" for text.
     variable
-        Variable of datasets; "" leaves it out. None: `name`, without the ending `_mm`. Millimetres become metres.
+        Variable of datasets; "" leaves it out. None: `name`.
     title, digits
         Heading in tables for people ("": not shown there), and digits behind the point.
     optional
@@ -74,7 +74,7 @@ class Figure:
     def variable(self) -> str:
         """Name of the variable in datasets; "" if it is not one."""
         if self.column.variable is None:
-            return self.column.name.removesuffix("_mm")
+            return self.column.name
         return self.column.variable
 
     def values(self, patches: "Sequence[PatchFigures]") -> list[Any]:

@@ -349,7 +349,7 @@ def metal_reasons(
     path; `only_patch`: there are no others; `culprit`: the other patch that fits it least, if they speak against it.
     `given`: the user chose it.
     """
-    do = "lay a metal plate into the scene and name it (--metal X,Y,W,H), or use `polysight calibrate metal`"
+    do = "lay a metal plate into the scene and name it (--metal-box X0,Y0,X1,Y1), or use `polysight calibrate metal`"
     if given and contradicted:
         return [reason(
             "care" if likely or only_patch else "none",

@@ -21,7 +21,7 @@ from starlette.routing import Route
 from polysight.catalogue import NOTES, PROGRAM, Notes, Summary, find_program, find_programs, is_plain, write_notes
 from polysight.jobs.label import remove_labels, save_labels
 from polysight.materials import Labels
-from polysight.plan import Changes, forecast, forecast_values
+from polysight.planning import Changes, forecast, forecast_values
 from polysight.products import find_labels, label_folder, read_products
 from polysight.serve.reading import json_answer
 from polysight.serve.site import LIBRARIES, Site
@@ -459,5 +459,5 @@ def _processing_words(site: Site, library: str, metal: Box | None) -> Words:
         words += ["--library", libraries[library].absolute()]
     if metal is not None:
         x0, y0, x1, y1 = metal
-        words.append(f"--metal={(x0 + x1) / 2:g},{(y0 + y1) / 2:g},{x1 - x0:g},{y1 - y0:g}")
+        words.append(f"--metal-box={x0:g},{y0:g},{x1:g},{y1:g}")
     return words

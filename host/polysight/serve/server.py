@@ -12,7 +12,6 @@ import ipaddress
 import logging
 import multiprocessing
 import os
-import resource
 import secrets
 import socket
 import ssl

@@ -27,6 +27,7 @@ from polysight.store.manifest import (
     ScanPaused,
     ScanResumed,
     ScanStarted,
+    lock_file,
 )
 from polysight.store.open import is_source, open_source
 from polysight.store.published import COLLECTION, mirrored, read_settings, rig_of
@@ -119,6 +120,7 @@ __all__ = [
     "dropped_rows",
     "inside",
     "is_source",
+    "lock_file",
     "locked_samples",
     "manifest",
     "mirrored",

@@ -9,7 +9,6 @@ is cut off before appending; the journal of the Pi contains it.
 
 from __future__ import annotations
 
-import fcntl
 import os
 import zlib
 from collections.abc import Iterator
@@ -58,24 +57,9 @@ class AppendFile:
         except OSError as e:
             raise write_error(path, "created" if fresh else "opened", e) from None
 
-    def lock(self) -> bool:
-        """Lock this file until it is closed; return False if another program has locked it.
-
-        Raises DeviceError if the file system cannot lock, and closes the file then.
-        """
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError as e:
-            self._file.close()
-            raise DeviceError(
-                f"{self.path}: cannot be locked: {e.strerror}",
-                "a network disk whose server offers no locks, or the disk fails",
-                "put the scan on a local disk, or have its server offer locks",
-                code=ErrorCode.FILE_UNWRITABLE,
-            ) from None
-        return True
+    def fileno(self) -> int:
+        """Return the descriptor of the open file, to lock it."""
+        return self._file.fileno()
 
     def cut(self, length: int) -> None:
         """Truncate the file to `length` bytes. Raises DeviceError."""

@@ -11,14 +11,14 @@ lines are found. Lines of earlier releases have no chain and are still read.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
+import os
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import IO, Any, Literal, TypeVar
 
 import msgspec
 
@@ -28,6 +28,11 @@ from polysight_shared.errors import DataError, DeviceError, PolysightError, no_s
 from polysight_shared.files import MAX_JSON_BYTES, open_regular, read_bounded
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan
+
+try:
+    import fcntl
+except ModuleNotFoundError:
+    fcntl = None  # type: ignore[assignment]
 
 MANIFEST = "manifest.jsonl"
 State = Literal["open", "paused", "finished", "stopped", "failed"]
@@ -467,14 +472,47 @@ def read(path: Path) -> Manifest:
         ) from None
 
 
-# --- the writer ---
+# --- locks, and the writer ---
+
+# A byte behind the end of any file, which Windows locks.
+_LOCKED_BYTE = 1 << 30
+
+
+def lock_file(file: IO[Any] | int, *, shared: bool = False) -> None:
+    """Lock an open file until it is closed, also by a kill; `shared` with other shared locks.
+
+    POSIX systems lock with flock(2), Windows with `msvcrt` (which was not tried on Windows).
+
+    Raises
+    ------
+    BlockingIOError
+        if another program has locked it.
+    OSError
+        if the file system has no locks.
+    """
+    if fcntl is not None:
+        kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+        return
+    import msvcrt
+
+    descriptor = file if isinstance(file, int) else file.fileno()
+    position = os.lseek(descriptor, 0, os.SEEK_CUR)
+    # A byte behind the end, because Windows keeps others from reading what is locked. All its locks are exclusive.
+    os.lseek(descriptor, _LOCKED_BYTE, os.SEEK_SET)
+    try:
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+    except PermissionError as e:
+        raise BlockingIOError(e.errno, e.strerror) from None
+    finally:
+        os.lseek(descriptor, position, os.SEEK_SET)
 
 
 def is_being_written(path: Path) -> bool:
     """True if another program holds the manifest: it records the scan, or changes it."""
     with open_regular(path) as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            lock_file(file, shared=True)
         except BlockingIOError:
             return True
         except OSError:
@@ -504,7 +542,7 @@ class ManifestWriter:
             what, why = f"{path}: does not exist", f"{path.parent} is no scan folder"
             raise DeviceError(what, why, "give the folder of a scan", code=ErrorCode.FILE_MISSING)
         self._file = AppendFile(path, create)
-        if not self._file.lock():
+        if not self._lock():
             self._file.close()
             what = f"{path}: another program is writing this scan"
             raise DeviceError(what, "a scan runs", "wait for it, or stop it first", code=ErrorCode.BUSY)
@@ -516,6 +554,22 @@ class ManifestWriter:
         except PolysightError:
             self._file.close()
             raise
+
+    def _lock(self) -> bool:
+        """Lock the scan; return False if another program has it. Raises DeviceError, and closes the file then."""
+        try:
+            lock_file(self._file.fileno())
+        except BlockingIOError:
+            return False
+        except OSError as e:
+            self._file.close()
+            raise DeviceError(
+                f"{self._file.path}: cannot be locked: {e.strerror}",
+                "a network disk whose server offers no locks, or the disk fails",
+                "put the scan on a local disk, or have its server offer locks",
+                code=ErrorCode.FILE_UNWRITABLE,
+            ) from None
+        return True
 
     def append(self, fact: Fact | Mapping[str, Any]) -> None:
         """Append one fact durably. After a DeviceError the manifest does not contain it."""

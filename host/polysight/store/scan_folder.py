@@ -12,7 +12,6 @@ read here, without anything of the processing, so that `validate` and `drop-raw`
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import platform
 import secrets
@@ -45,6 +44,7 @@ from polysight.store.manifest import (
     ScanEnded,
     ScanResumed,
     ScanStarted,
+    lock_file,
     manifest_fault,
 )
 from polysight.store.source import HEADER_LOCK, RowData
@@ -468,7 +468,7 @@ def locked_samples(scan: ScanFolder) -> Iterator[None]:
             code=ErrorCode.FILE_MISSING,
         ) from None
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock_file(file)
         yield
     except BlockingIOError:
         raise DeviceError(

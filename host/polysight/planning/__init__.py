@@ -2,27 +2,42 @@
 
 `forecast` predicts the scan of a rig file to which `Changes` were applied; `propose` searches for the plans with the
 least noise within a time. `scan_time` estimates the duration. `run_plan`
-is the command; it can take noise and standstill from an earlier scan.
+is the command; it can take noise and standstill from an earlier scan. `warn_of_scene` checks the plates of a scene.
 """
 
-from polysight.plan.forecast import (
+from polysight.planning.forecast import (
+    Forecast,
     Noise,
     forecast,
     row_motion_s,
     scan_time,
     straight_move_s,
 )
-from polysight.plan.plan_command import Changes, PlanOptions, forecast_values, propose, run_plan
+from polysight.planning.plan_command import (
+    Changes,
+    PlanOptions,
+    describe,
+    forecast_scene,
+    forecast_values,
+    propose,
+    run_plan,
+)
+from polysight.planning.scene_warnings import read_scene, warn_of_scene
 
 __all__ = [
     "Changes",
+    "Forecast",
     "Noise",
     "PlanOptions",
+    "describe",
     "forecast",
+    "forecast_scene",
     "forecast_values",
     "propose",
+    "read_scene",
     "row_motion_s",
     "run_plan",
     "scan_time",
     "straight_move_s",
+    "warn_of_scene",
 ]

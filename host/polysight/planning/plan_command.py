@@ -12,7 +12,7 @@ import math
 import sys
 import textwrap
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from polysight.capture import row_words
-from polysight.plan.forecast import (
+from polysight.planning.forecast import (
     MAX_STEPS_PER_S,
     ROW_OVERHEAD_S,
     Forecast,
@@ -37,6 +37,7 @@ from polysight.plan.forecast import (
     turn_s,
     whole_packets,
 )
+from polysight.planning.scene_warnings import Plate, read_scene, warn_of_scene
 from polysight.radar import INTER_FRAME_US, TRIGGER_MARGIN_US, chirp_us
 from polysight.store import EVENTS, RawSource, ScanFolder, read_events
 from polysight.surfaces import VisibleNormals, visible_normals
@@ -433,7 +434,25 @@ class PlanOptions:
     snr_db: float | None = None
     row_overhead_s: float | None = None
     scene_mm: tuple[float, float] | None = None
+    scene: Path | None = None
     as_json: bool = False
+
+
+def forecast_scene(
+    rig: Instrument,
+    changes: Changes,
+    scene: Path | None,
+    noise: Noise | None = None,
+    row_overhead_s: float = ROW_OVERHEAD_S,
+    scene_mm: tuple[float, float] | None = None,
+) -> Forecast:
+    """Predict a scan, with warnings about the plates of a scene file, if there is one. Raises ConfigError."""
+    plates: list[Plate] = []
+    if scene is not None:
+        rig, plates = read_scene(scene, rig)
+    prediction = forecast(changes.apply(rig), noise, row_overhead_s, scene_mm)
+    notes = tuple(warn_of_scene(prediction.rig, plates))
+    return replace(prediction, warnings=prediction.warnings + notes)
 
 
 def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
@@ -445,7 +464,7 @@ def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
     rig = changes.apply(original)
     noise, overhead = _assumptions(options)
     if options.minutes is None:
-        f = forecast(rig, noise, overhead, options.scene_mm)
+        f = forecast_scene(original, changes, options.scene, noise, overhead, options.scene_mm)
         sys.stdout.write(json.dumps(forecast_values(f), indent=1) + "\n" if options.as_json else describe(f))
         return int(not f.possible)
     plans = propose(rig, options.minutes, options.count, noise, overhead, options.scene_mm)

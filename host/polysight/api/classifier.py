@@ -1,0 +1,142 @@
+"""Own libraries and classifiers, with scikit-learn's conventions.
+
+Columns of X are |H|, |V|, real and imaginary part of P, relative to metal, for each incidence angle. A row is a pixel.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self, cast
+
+import numpy as np
+import numpy.typing as npt
+from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from polysight.data import packaged
+from polysight.jobs.train import library_of
+from polysight.materials import (
+    SHORT,
+    ErrorDiscriminant,
+    Library,
+    PaperKNeighborsClassifier,
+    Samples,
+    Score,
+    ratio_columns,
+    score,
+)
+
+if TYPE_CHECKING:
+    from polysight.api.scan import Scan
+
+RIG = Path("instrument.toml")
+# Neighbours that vote, as in libraries (polysight.materials.classify.Weights).
+NEIGHBOURS = 15
+# scikit-learn declares X as text.
+_validate = cast(Any, validate_data)
+Columns = npt.NDArray[np.float64]
+Names = npt.NDArray[np.str_]
+
+
+def train(
+    scans: Sequence[str | os.PathLike[str] | Scan], *, rig: str | os.PathLike[str] | None = None, note: str = ""
+) -> Library:
+    """Make a library of labelled scans, as `polysight train`.
+
+    Parameters
+    ----------
+    scans
+        Scans, scan folders or folders of products; labelled by :meth:`Scan.label`, or simulated with their truth. Two
+        at least: the library is judged on scans left out.
+    rig
+        Rig file of published data; `instrument.toml` here or the packaged one if not given.
+    note
+        Text that goes with the library.
+
+    Returns
+    -------
+    Library
+        `names`, `scans`, `columns()`; `save(path)` writes it, `Library.load(path)` reads it. `library.fit` holds its
+        scores on scans left out.
+
+    Raises
+    ------
+    DataError
+        if a scan has no labels, or fewer than two scans were given.
+    """
+    folders = [scan if isinstance(scan, str | os.PathLike) else scan.folder for scan in scans]
+    config = packaged(RIG) if rig is None else Path(rig)
+    return library_of([Path(folder) for folder in folders], config, note)
+
+
+class Classifier(ClassifierMixin, BaseEstimator):
+    """Name pixels by their material.
+
+    Parameters
+    ----------
+    model
+        "knn": the paper's nearest neighbours, a :class:`PaperKNeighborsClassifier`. "discriminant": the discriminant of
+        error sources, which knows what the pixels of a patch and of a scan share; columns of every angle are needed.
+    """
+
+    def __init__(self, model: Literal["knn", "discriminant"] = "discriminant") -> None:
+        self.model = model
+
+    def fit(self, X: npt.ArrayLike, y: npt.ArrayLike, groups: npt.ArrayLike | None = None) -> Self:
+        """Fit to pixels X [n, 4 * angles] of materials y [n].
+
+        `groups` [n] is the scan of each pixel: what the pixels of a scan share is no difference of materials. Without
+        it all pixels are of one scan.
+        """
+        pixels, names = _validate(self, X, y)
+        if self.model not in SHORT:
+            raise ValueError(f"model is {self.model!r}: one of {', '.join(SHORT)}")
+        self.classes_ = np.unique(names)
+        if self.model == "knn":
+            count = min(NEIGHBOURS, len(pixels))
+            self._model: Any = PaperKNeighborsClassifier(count).fit(pixels, names)
+        else:
+            self._model = ErrorDiscriminant().fit(_samples(pixels, names, groups))
+        return self
+
+    def predict_proba(self, X: npt.ArrayLike) -> Columns:
+        """Return the probability of each material, [n, materials] in the order of `classes_`."""
+        check_is_fitted(self)
+        pixels: Columns = _validate(self, X, reset=False)
+        if self.model == "knn":
+            return np.asarray(self._model.predict_proba(pixels))
+        return self._model.pixel_probabilities(ratio_columns(pixels))
+
+    def predict(self, X: npt.ArrayLike) -> Names:
+        """Return the likeliest material of each pixel, [n]."""
+        check_is_fitted(self)
+        return self.classes_[self.predict_proba(X).argmax(axis=1)]
+
+    def score_by_scans(self, library: Library) -> Score:
+        """Judge this model on scans left out of a library of one incidence angle.
+
+        Returns
+        -------
+        Score
+            `pixels` and `patches` (shares named right, mean over materials), `confusion` with `names`, `unknown`,
+            `calibration`, `not_judged` (materials of one scan).
+
+        Raises
+        ------
+        DataError
+            if no material is in two scans.
+        """
+        return score(Samples.of(library), SHORT[self.model])
+
+
+def _samples(X: Columns, y: Names, groups: npt.ArrayLike | None) -> Samples:
+    """Return labelled pixels; those of one material in one scan are a patch."""
+    scans = np.zeros(len(X), np.intp) if groups is None else np.asarray(groups)
+    if scans.shape != (len(X),):
+        raise ValueError(f"groups has the shape {scans.shape}, X has {len(X)} rows")
+    material = np.unique(y, return_inverse=True)[1]
+    scan = np.unique(scans, return_inverse=True)[1]
+    patches = scan * (material.max() + 1) + material
+    return Samples(ratio_columns(X), np.asarray(y), scan, patches)

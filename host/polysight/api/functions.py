@@ -1,0 +1,220 @@
+"""Functions beside a scan: plan one, simulate one, compare two."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import tomli_w
+
+from polysight.api.scan import RIG, Scan, open_scan
+from polysight.catalogue import Pixels, compare_pixels
+from polysight.data import packaged
+from polysight.jobs.check import check_scan, checked_scans
+from polysight.jobs.demo import simulate_scene
+from polysight.planning import Changes, Forecast, describe, forecast_scene
+from polysight.products import PLANE, image_dataset
+from polysight.results import CheckResult
+from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.errors import ConfigError
+
+if TYPE_CHECKING:
+    import xarray
+
+PathText = str | os.PathLike[str]
+Scene = PathText | Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Forecast of a scan: print it, or use its parts.
+
+    Attributes
+    ----------
+    forecast
+        `rig` (with the changes), `time`, `response.width_mm` (resolution), `field`, `noise`, `warnings`, `possible`.
+    """
+
+    forecast: Forecast
+
+    @property
+    def warnings(self) -> list[str]:
+        """What to change before scanning."""
+        return [f"{warning.where}: {warning.what}" for warning in self.forecast.warnings]
+
+    def __str__(self) -> str:
+        return describe(self.forecast)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(str(self))}</pre>"
+
+
+def plan(rig: PathText | Instrument | None = None, *, scene: Scene | None = None, **changes: float) -> Plan:
+    """Predict time, data, resolution and noise of a scan, as `polysight plan`.
+
+    Parameters
+    ----------
+    rig
+        Rig file or rig; `instrument.toml` here or the packaged one if not given.
+    scene
+        Scene file or its content: its grid replaces the rig file's, and its plates are checked for gaps, size and
+        thickness.
+    changes
+        Values that replace the rig file's, by their names there: `speed_mm_s`, `pulses`, `period_us`, `step_x_mm`,
+        `step_y_mm`, `columns`, `rows`, `width_mm`, `height_mm`, `accel_mm_s2`, `object_distance_mm`.
+
+    Raises
+    ------
+    ConfigError
+        if the rig file or a value is wrong.
+    """
+    instrument = rig if isinstance(rig, Instrument) else load_instrument(_rig_path(rig))
+    with _scene_file(scene) as path:
+        return Plan(forecast_scene(instrument, Changes(**changes), path))  # type: ignore[arg-type]
+
+
+def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: int | None = None) -> Scan:
+    """Simulate the scan of a scene with the simulated rig, and open it.
+
+    Parameters
+    ----------
+    scene
+        Scene file, such as "examples/own-scene.toml" (also from an installed package), or its content as a dict:
+        `{"name": "two plates", "plates": [{"name": "PET", "centre_mm": [30, 0], "size_mm": [45, 45], ...}]}`;
+        docs/spec/scene-file.md lists all keys.
+    out
+        Folder of the scan, which must not exist or be empty.
+    rig
+        Rig file; `instrument.toml` here or the packaged one if not given.
+    seed
+        Seed of noise and disturbances, instead of the scene's.
+
+    Raises
+    ------
+    PolysightError
+        if the scene is wrong or does not fit the rig, the folder is not empty, or the simulators are not installed.
+    """
+    with _scene_file(scene) as path:
+        if path is None:
+            raise ConfigError("no scene was given", "it says what lies where", "see help(polysight.simulate)")
+        simulate_scene(path, _rig_path(rig), Path(out), seed)
+    return open_scan(out)
+
+
+def compare(first: Scan | PathText, second: Scan | PathText) -> xarray.Dataset:
+    """Compare two processed scans of one place, pixel by pixel and patch by patch: the first minus the second.
+
+    Returns
+    -------
+    xarray.Dataset
+        On the first scan's pixels: `p_difference` and `permittivity_difference` complex128, `sigmas` (size of the
+        difference of P in standard deviations of such differences). On dimension `pair`, of patches at one place:
+        `pair_x_mm`, `pair_y_mm`, `first_name`, `second_name`, `pair_difference` (permittivity), `pair_sigmas`.
+        Attributes `notes` (what makes them hard to compare), `compared` (pixels), `significant_share`.
+
+    Raises
+    ------
+    DataError
+        if one of them is not relative to metal, or they show different places.
+    """
+    import xarray
+
+    scans = [scan if isinstance(scan, Scan) else open_scan(scan) for scan in (first, second)]
+    pixels = [Pixels.of(scan.processed()) for scan in scans]
+    found = compare_pixels(*pixels, names=(str(scans[0].folder), str(scans[1].folder)))
+    pairs = found.figures.patches
+    differences = [pair.difference for pair in pairs]
+    unknown = complex(np.nan, np.nan)
+    values = [unknown if d is None else complex(d.real, d.imag) for d in differences]
+    table: dict[str, Any] = {
+        "p_difference": (PLANE, found.p, {"units": "1", "long_name": "difference of P"}),
+        "permittivity_difference": (PLANE, found.permittivity, {"units": "1", "long_name": "difference"}),
+        "sigmas": (PLANE, found.sigmas, {"units": "1", "long_name": "difference of P in standard deviations"}),
+        "pair_x_mm": ("pair", [pair.place_mm[0] for pair in pairs], {"units": "mm", "long_name": "x from the centre"}),
+        "pair_y_mm": ("pair", [pair.place_mm[1] for pair in pairs], {"units": "mm", "long_name": "y from the centre"}),
+        "first_name": ("pair", [pair.names[0] or "" for pair in pairs]),
+        "second_name": ("pair", [pair.names[1] or "" for pair in pairs]),
+        "pair_difference": ("pair", values, {"units": "1", "long_name": "difference of the permittivity"}),
+        "pair_sigmas": ("pair", [np.nan if pair.sigmas is None else pair.sigmas for pair in pairs]),
+    }
+    image = image_dataset(scans[0].processed())
+    attributes = {
+        "first": scans[0].scan_id,
+        "second": scans[1].scan_id,
+        "notes": "; ".join(found.figures.notes),
+        "compared": found.figures.compared,
+    }
+    if found.figures.significant_share is not None:
+        attributes["significant_share"] = found.figures.significant_share
+    return xarray.Dataset(table, image.drop_vars(list(image.data_vars)).coords, attributes)
+
+
+def check(*scans: Scan | PathText) -> xarray.Dataset:
+    """Compare the check plates of scans with the known permittivity of the rig file, as `polysight check`.
+
+    Parameters
+    ----------
+    scans
+        Scans, or folders: a processed scan, or a folder of scans, whose order is that of their start.
+
+    Returns
+    -------
+    xarray.Dataset
+        On dimension `scan` (its name): `permittivity`, `permittivity_real_standard_error`,
+        `permittivity_loss_standard_error`, `expected_permittivity`, `sigmas` (distance in standard deviations) and
+        `level`: "good", "warning" (as 5 % of good scans), "action" (as 0.3 %), "missing".
+
+    Raises
+    ------
+    ConfigError
+        if a rig file names no check plate.
+    """
+    import xarray
+
+    checked: list[tuple[str, CheckResult]] = []
+    for scan in scans:
+        if isinstance(scan, Scan):
+            checked.append((scan.scan_id, check_scan(scan.processed())))
+        else:
+            checked += [(below.scan_id, result) for below, result in checked_scans([Path(scan)])]
+    results = [result for _, result in checked]
+    unknown = (np.nan, np.nan)
+    measured = np.array([result.measured or unknown for result in results])
+    errors = np.array([result.measured_std or unknown for result in results])
+    expected = np.array([result.expected for result in results])
+    sigmas = [np.nan if result.sigmas is None else result.sigmas for result in results]
+    values: dict[str, Any] = {
+        "permittivity": measured[:, 0] - 1j * measured[:, 1],
+        "permittivity_real_standard_error": errors[:, 0],
+        "permittivity_loss_standard_error": errors[:, 1],
+        "expected_permittivity": expected[:, 0] - 1j * expected[:, 1],
+        "sigmas": sigmas,
+        "level": [result.level for result in results],
+    }
+    table = {name: ("scan", value) for name, value in values.items()}
+    return xarray.Dataset(table, {"scan": [name for name, _ in checked]}, {"plate": results[-1].name})
+
+
+def _rig_path(rig: PathText | None) -> Path:
+    return packaged(RIG) if rig is None else Path(rig)
+
+
+@contextmanager
+def _scene_file(scene: Scene | None) -> Iterator[Path | None]:
+    """Yield the path of a scene file; the content of a scene is written into a temporary one."""
+    if scene is None:
+        yield None
+    elif isinstance(scene, str | os.PathLike):
+        yield packaged(Path(scene))
+    else:
+        with tempfile.TemporaryDirectory(prefix="polysight-scene-") as folder:
+            path = Path(folder) / "scene.toml"
+            path.write_bytes(tomli_w.dumps(dict(scene)).encode("utf-8"))
+            yield path

@@ -1,0 +1,112 @@
+"""The paper's nearest-neighbour classifier as an estimator of scikit-learn.
+
+It imports scikit-learn, which takes a second: import it where it is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Self, cast
+
+import numpy as np
+import numpy.typing as npt
+from sklearn.neighbors import KNeighborsClassifier
+from sklearn.utils import check_array, gen_batches
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from polysight.materials.library import WIDTH, Measure, Real, channel_distances, find_neighbours, ratio_columns
+
+# Pixels whose distances are computed at once: 512 x 20,000 numbers are 80 MB.
+_CHUNK = 512
+
+
+def paper_distance(
+    a: Real, b: Real, *, h: float = 1.0, v: float = 1.0, p: float = 1.0, measure: Measure = "log"
+) -> Real:
+    """Return the paper's distance of pixels a [n, columns] to b [m, columns], [n, m]; of two single pixels a number.
+
+    Columns are |H|, |V|, real and imaginary part of P for each incidence angle; `h`, `v` and `p` are the weights
+    lambda_H, lambda_V and lambda_P. A number of columns that is no multiple of four is not of this kind, such as |H|
+    alone: then each column counts by itself.
+    """
+    first = np.atleast_2d(np.asarray(a, np.float64))
+    second = np.atleast_2d(np.asarray(b, np.float64))
+    if first.shape[1] % WIDTH:
+        distance = np.abs(first[:, None, :] - second[None, :, :]).sum(axis=2)
+    else:
+        channels = channel_distances(ratio_columns(first), ratio_columns(second), measure if p else None)
+        distance = h * channels[0] + v * channels[1] + p * channels[2]
+    return distance if np.ndim(a) > 1 or np.ndim(b) > 1 else float(distance[0, 0])  # type: ignore[return-value]
+
+
+class PaperKNeighborsClassifier(KNeighborsClassifier):
+    """k nearest neighbours by the paper's distance (section 6.3): :func:`paper_distance`.
+
+    Parameters
+    ----------
+    n_neighbors
+        Number of neighbours that vote, each with one vote; all pixels if there are fewer.
+    weight_h, weight_v, weight_p
+        lambda_H, lambda_V and lambda_P.
+    measure
+        Distance of two ratios: "paper", "inverse" or "log", see `polysight.materials.library`.
+    """
+
+    def __init__(
+        self,
+        n_neighbors: int = 15,
+        *,
+        weight_h: float = 1.0,
+        weight_v: float = 1.0,
+        weight_p: float = 1.0,
+        measure: Measure = "log",
+    ) -> None:
+        super().__init__(n_neighbors=n_neighbors, algorithm="brute")
+        self.weight_h = weight_h
+        self.weight_v = weight_v
+        self.weight_p = weight_p
+        self.measure: Measure = measure
+
+    @property
+    def metric(self) -> Callable[[Any, Any], Any]:
+        """The paper's distance with these weights, as scikit-learn's `metric`."""
+        return partial(paper_distance, h=self.weight_h, v=self.weight_v, p=self.weight_p, measure=self.measure)
+
+    @metric.setter
+    def metric(self, value: object) -> None:
+        """Ignore the metric that the base class sets: the weights define it."""
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.sparse = False
+        return tags
+
+    def fit(self, X: npt.ArrayLike, y: npt.ArrayLike) -> Self:
+        """Store the pixels X [n, columns] and their materials y [n]."""
+        check_array(X, accept_sparse=False)
+        return super().fit(X, y)
+
+    def kneighbors(
+        self, X: npt.ArrayLike | None = None, n_neighbors: int | None = None, return_distance: bool = True
+    ) -> Any:
+        """Return the distances and indices of the nearest pixels, nearest first, [n, neighbours] each.
+
+        As that of scikit-learn, with distances of whole arrays: a metric that is called for each pair takes minutes.
+        """
+        check_is_fitted(self)
+        pixels = self._fit_X if X is None else cast(Any, validate_data)(self, X, reset=False)
+        available = self.n_samples_fit_ - (X is None)
+        asked: Any = n_neighbors or self.n_neighbors
+        count = min(int(asked), available)
+        nearest = np.empty((len(pixels), count), np.intp)
+        distances = np.empty((len(pixels), count))
+        for rows in gen_batches(len(pixels), _CHUNK):
+            distance = self.metric(pixels[rows], self._fit_X)
+            if X is None:
+                # A pixel is no neighbour of itself.
+                own = np.arange(rows.start, rows.stop)
+                distance[own - rows.start, own] = np.inf
+            nearest[rows] = find_neighbours(distance, count)
+            distances[rows] = np.take_along_axis(distance, nearest[rows], axis=1)
+        return (distances, nearest) if return_distance else nearest

@@ -1,0 +1,146 @@
+"""Warnings about the plates of a scene before it is scanned: gaps, size, aperture and thickness."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from polysight.imaging import field_limits, point_response
+from polysight.materials import SegmentSettings
+from polysight.planning.forecast import aperture_of
+from polysight.polarimetry import multilayer, specular_incidence_rad
+from polysight_shared.config import Instrument
+from polysight_shared.findings import Finding
+from polysight_shared.tables import decode, read_toml, to_builtins
+
+# Plates nearer to one another merge into one patch: their images overlap at half power.
+LEAST_GAP_CELLS = 1.5
+# Largest change of the ratio over the sweep, relative to a half space, that is not worth a warning.
+LARGEST_RIPPLE = 0.05
+_OVERRIDES = ("grid", "burst", "image", "stage")
+_SWEEP_POINTS = 41
+Pair = tuple[float, float]
+
+
+class Plate(msgspec.Struct, frozen=True):
+    """A plate of a scene file, as far as the warnings need it; millimetres from the image's centre."""
+
+    name: str
+    centre_mm: Pair
+    size_mm: Pair
+    permittivity: Pair | None = None
+    thickness_mm: float | None = None
+    background: bool = False
+
+    def edges(self, axis: int) -> Pair:
+        """Return the lower and upper edge along x (0) or y (1)."""
+        half = self.size_mm[axis] / 2
+        return self.centre_mm[axis] - half, self.centre_mm[axis] + half
+
+
+def read_scene(path: Path, rig: Instrument) -> tuple[Instrument, list[Plate]]:
+    """Return the rig with the scene's grid, burst, image, stage and distance, and the plates.
+
+    Raises
+    ------
+    ConfigError
+        if the file or one of these values is wrong.
+    """
+    scene = read_toml(path)
+    table: dict[str, Any] = to_builtins(rig)
+    for name in _OVERRIDES:
+        table[name] = {**table[name], **scene.get(name, {})}
+    if "object_distance_mm" in scene:
+        table["geometry"] = {**table["geometry"], "object_distance_mm": scene["object_distance_mm"]}
+    plates = [_plate(raw, path) for raw in scene.get("plates", [])]
+    return decode(table, Instrument, str(path)), [plate for plate in plates if not plate.background]
+
+
+def _plate(raw: Mapping[str, Any], path: Path) -> Plate:
+    known = {key: value for key, value in raw.items() if key in Plate.__struct_fields__}
+    return decode(known, Plate, f"{path}: plates")
+
+
+def warn_of_scene(rig: Instrument, plates: Sequence[Plate]) -> Iterator[Finding]:
+    """Yield a note for each gap, size, place or thickness that spoils the result of a plate."""
+    aperture, taper = aperture_of(rig)
+    cell_mm = point_response(aperture, taper).width_mm
+    for plate in plates:
+        yield from _warn_of_size(plate, cell_mm)
+        yield from _warn_of_aperture(plate, rig)
+        yield from _warn_of_thickness(plate, rig)
+    for first, second in combinations(plates, 2):
+        yield from _warn_of_gap(first, second, cell_mm)
+
+
+def _warn_of_gap(first: Plate, second: Plate, cell_mm: Pair) -> Iterator[Finding]:
+    gaps_mm = []
+    for axis in (0, 1):
+        low, high = first.edges(axis)
+        other_low, other_high = second.edges(axis)
+        gaps_mm.append(max(low, other_low) - min(high, other_high))
+    cells = [gap / cell for gap, cell in zip(gaps_mm, cell_mm, strict=True)]
+    # Plates side by side overlap along one axis; diagonal ones are apart along both.
+    axis = int(np.argmax(cells))
+    if cells[axis] < LEAST_GAP_CELLS:
+        least_mm = LEAST_GAP_CELLS * cell_mm[axis]
+        text = (
+            f"{first.name} and {second.name} are {max(gaps_mm[axis], 0):.0f} mm apart in {'xy'[axis]}; below"
+            f" {math.ceil(least_mm)} mm (1.5 resolution cells) they may be found as one patch: move them apart, or draw"
+            " boxes (polysight label)"
+        )
+        yield Finding("note", text, where="gap")
+
+
+def _warn_of_size(plate: Plate, cell_mm: Pair) -> Iterator[Finding]:
+    margin_mm = SegmentSettings().margin_mm
+    for axis in (0, 1):
+        least_mm = 2 * margin_mm + cell_mm[axis]
+        if plate.size_mm[axis] < least_mm:
+            text = (
+                f"{plate.name} is {plate.size_mm[axis]:.0f} mm wide in {'xy'[axis]}; below {math.ceil(least_mm)} mm no"
+                " pixel is free of its edges"
+            )
+            yield Finding("note", text, where="size")
+
+
+def _warn_of_aperture(plate: Plate, rig: Instrument) -> Iterator[Finding]:
+    zone_mm = field_limits(rig).mirror_zone_mm
+    steps = ((rig.grid.columns - 1) * rig.grid.step_x_mm, (rig.grid.rows - 1) * rig.grid.step_y_mm)
+    for axis in (0, 1):
+        reach_mm = steps[axis] / 2 - zone_mm[axis]
+        low, high = plate.edges(axis)
+        beyond_mm = max(-low, high) - reach_mm
+        if beyond_mm > 0:
+            text = (
+                f"{plate.name} reaches {beyond_mm:.0f} mm beyond the {max(2 * reach_mm, 0):.0f} mm in {'xy'[axis]} that"
+                f" this aperture of {steps[axis]:.0f} mm images well: a larger aperture, or nearer to the centre"
+            )
+            yield Finding("note", text, where="aperture")
+
+
+def _warn_of_thickness(plate: Plate, rig: Instrument) -> Iterator[Finding]:
+    if plate.permittivity is None or plate.thickness_mm is None:
+        return
+    first, last = rig.chirp.linear_samples
+    samples = np.linspace(first, last, _SWEEP_POINTS)
+    frequencies_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * samples
+    eps = complex(plate.permittivity[0], -plate.permittivity[1])
+    theta_rad = specular_incidence_rad(rig)
+    sheet_s, sheet_p = multilayer(eps, plate.thickness_mm / 1e3, frequencies_hz, theta_rad)
+    bulk_s, bulk_p = multilayer(eps, np.inf, frequencies_hz, theta_rad)
+    # V / H stays finite at the Brewster angle.
+    change = np.abs(sheet_p / sheet_s - bulk_p / bulk_s) / np.maximum(np.abs(bulk_p / bulk_s), LARGEST_RIPPLE)
+    if change.max() > LARGEST_RIPPLE:
+        text = (
+            f"{plate.name}: {plate.thickness_mm:g} mm are thin enough for its back to change the ratio by up to"
+            f" {100 * change.max():.0f} % over the sweep: process with --bands 4 and fit it as a layer"
+            " (docs/how-to/layers.md), or take a thicker piece"
+        )
+        yield Finding("note", text, where="thickness")

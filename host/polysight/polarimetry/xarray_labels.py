@@ -1,0 +1,71 @@
+"""`fresnel`, `permittivity_from_ratio`, `multilayer` for people: they keep xarray's labels.
+
+Rooms use the plain functions of `fresnel.py`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from functools import wraps
+from typing import Any, TypeVar
+
+from polysight.polarimetry.fresnel import fresnel as plain_fresnel
+from polysight.polarimetry.fresnel import multilayer as plain_multilayer
+from polysight.polarimetry.fresnel import permittivity_from_ratio as plain_permittivity
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def keep_labels(*results: str) -> Callable[[Function], Function]:
+    """Decorate a function of arrays that broadcast: with a `DataArray` among its arguments it returns such arrays.
+
+    `results` are the long names of what it returns. An argument may be a list of arrays. Coordinates are aligned as
+    xarray aligns them; attributes are those of the first argument, with the result's own unit (1) and long name.
+    """
+
+    def decorate(function: Function) -> Function:
+        @wraps(function)
+        def call(*arguments: Any, **named: Any) -> Any:
+            # A DataArray can only be there if xarray was imported.
+            xarray = sys.modules.get("xarray")
+            if xarray is None:
+                return function(*arguments, **named)
+            values = [*arguments, *named.values()]
+            entries = [entry for value in values for entry in _entries(value)]
+            if not any(isinstance(entry, xarray.DataArray) for entry in entries):
+                return function(*arguments, **named)
+
+            def compute(*arrays: Any) -> Any:
+                remaining = iter(arrays)
+                filled = [_fill(value, remaining) for value in values]
+                keywords = dict(zip(named, filled[len(arguments) :], strict=True))
+                return function(*filled[: len(arguments)], **keywords)
+
+            cores: list[list[str]] = [[] for _ in results]
+            out = xarray.apply_ufunc(compute, *entries, output_core_dims=cores, keep_attrs="override")
+            for array, name in zip(out if len(results) > 1 else (out,), results, strict=True):
+                array.attrs |= {"units": "1", "long_name": name}
+                array.name = None
+            return out
+
+        return call  # type: ignore[return-value]
+
+    return decorate
+
+
+def _entries(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, list | tuple) else [value]
+
+
+def _fill(value: Any, arrays: Iterator[Any]) -> Any:
+    """Return the next array, or a list of as many arrays as `value` has entries."""
+    if isinstance(value, list | tuple):
+        return [next(arrays) for _ in value]
+    return next(arrays)
+
+
+_REFLECTION = ("s-polarised reflection coefficient", "p-polarised reflection coefficient")
+fresnel = keep_labels(*_REFLECTION)(plain_fresnel)
+multilayer = keep_labels(*_REFLECTION)(plain_multilayer)
+permittivity_from_ratio = keep_labels("relative permittivity")(plain_permittivity)

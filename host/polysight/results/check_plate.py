@@ -1,0 +1,100 @@
+"""The check plate: a plate of known permittivity in every scan, measured as any other patch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+
+from polysight.results.materials import PatchFigures
+from polysight.results.verdict import reason
+from polysight_shared.config import CheckPlate
+from polysight_shared.findings import Finding
+
+# Distances in standard deviations that 95 and 99.7 % of good scans stay below (chi-square of two values).
+WARNING_SIGMAS = 2.45
+ACTION_SIGMAS = 3.41
+
+
+class CheckResult(msgspec.Struct, frozen=True, kw_only=True):
+    """Check plate of one scan.
+
+    Attributes
+    ----------
+    name
+        The plate's, of the rig file.
+    level
+        "good", "warning" (expected in 5 % of good scans), "action" (in 0.3 %), or "missing".
+    expected, expected_std
+        Permittivity [eps', loss] of the rig file and its standard errors.
+    measured, measured_std
+        The same of the patch; None if it is missing.
+    sigmas
+        Distance in standard deviations, of both errors and their correlation.
+    why
+        Why it is missing.
+    """
+
+    name: str
+    level: str
+    expected: tuple[float, float]
+    expected_std: tuple[float, float]
+    measured: tuple[float, float] | None = None
+    measured_std: tuple[float, float] | None = None
+    sigmas: float | None = None
+    why: str = ""
+
+
+def check_plate(plate: CheckPlate, patches: Sequence[PatchFigures]) -> CheckResult | None:
+    """Compare the patch at the place of the check plate with its permittivity; None without a plate in the rig file."""
+    if not plate.name:
+        return None
+    missing = CheckResult(name=plate.name, level="missing", expected=plate.permittivity, expected_std=plate.std)
+    x_mm, y_mm = plate.place_mm
+    patch = next((patch for patch in patches if _holds(patch, x_mm, y_mm)), None)
+    if patch is None:
+        return msgspec.structs.replace(missing, why=f"no patch at x {x_mm:g}, y {y_mm:g} mm from the image's centre")
+    value = patch.permittivity
+    if value is None or value.covariance is None:
+        return msgspec.structs.replace(missing, why=f"patch {patch.label} there has no permittivity")
+    covariance = np.array(value.covariance, np.float64)
+    # Of (eps', loss): the loss is minus the imaginary part.
+    covariance[0, 1] *= -1
+    covariance[1, 0] *= -1
+    total = covariance + np.diag(np.square(plate.std))
+    off = np.array([value.real, -value.imag]) - plate.permittivity
+    sigmas = float(np.sqrt(off @ np.linalg.solve(total, off)))
+    level = "good"
+    if sigmas > WARNING_SIGMAS:
+        level = "action" if sigmas > ACTION_SIGMAS else "warning"
+    return msgspec.structs.replace(
+        missing,
+        level=level,
+        measured=(value.real, -value.imag),
+        measured_std=(math.sqrt(covariance[0, 0]), math.sqrt(covariance[1, 1])),
+        sigmas=round(sigmas, 3),
+    )
+
+
+def _holds(patch: PatchFigures, x_mm: float, y_mm: float) -> bool:
+    x0, y0, x1, y1 = patch.box_mm
+    return x0 <= x_mm <= x1 and y0 <= y_mm <= y1
+
+
+def check_reasons(result: CheckResult | None) -> list[Finding]:
+    """Judge the check plate: "care" beyond the action limit, and where it is missing."""
+    if result is None or result.level in ("good", "warning"):
+        return []
+    do = "scan it again; if it stays, check calibration, antennas and the metal reference (polysight doctor)"
+    if result.measured is None:
+        why = "the rig file says that it lies in every scan"
+        return [reason("care", f"the check plate {result.name} was not measured: {result.why}", why, do, 2.0)]
+    real, loss = result.measured
+    known_real, known_loss = result.expected
+    what = (
+        f"the check plate {result.name} was measured as {real:.2f}, loss {loss:.2f}, instead of {known_real:.2f}, loss"
+        f" {known_loss:.2f}: {result.sigmas:.1f} standard deviations"
+    )
+    return [reason("care", what, "three good scans in a thousand are so far off: the rig has changed", do, 3.8)]

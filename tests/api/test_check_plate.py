@@ -1,0 +1,98 @@
+"""The check plate: its distance from what is known of it, the verdict, the command and the chart."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import msgspec
+import numpy as np
+import pytest
+
+import polysight
+from polysight.cli.main import main
+from polysight.products import SCAN, read_products, write_json
+from polysight.results import PatchFigures, PermittivityFigures, check_plate, check_reasons
+from polysight_shared.config import CheckPlate
+
+from .conftest import PET
+
+PLATE = CheckPlate(name="PTFE", permittivity=(2.05, 0.01), std=(0.02, 0.01), place_mm=(30.0, 0.0))
+
+
+def patch(real: float, loss: float, covariance: list[list[float]] | None = None) -> PatchFigures:
+    covariance = covariance or [[0.01, 0.0], [0.0, 0.01]]
+    value = PermittivityFigures(real=real, imag=-loss, covariance=covariance)
+    return PatchFigures(label=1, box_mm=(10.0, -20.0, 50.0, 20.0), permittivity=value)
+
+
+@pytest.mark.parametrize(
+    ("real", "level", "reasons"), [(2.1, "good", 0), (2.34, "warning", 0), (2.5, "action", 1), (1.6, "action", 1)]
+)
+def test_limits_are_those_of_good_scans(real, level, reasons):
+    result = check_plate(PLATE, [patch(real, 0.01)])
+    assert result is not None
+    assert result.level == level
+    assert len(check_reasons(result)) == reasons
+
+
+def test_the_error_of_both_parts_and_their_correlation_count():
+    """An error along the axis of the covariance is likelier than one across it; the loss is -imag."""
+    covariance = [[0.01, -0.0095], [-0.0095, 0.01]]
+    along = check_plate(PLATE, [patch(2.25, 0.21, covariance)])
+    across = check_plate(PLATE, [patch(2.25, -0.19, covariance)])
+    assert along is not None
+    assert across is not None
+    assert along.sigmas < 2.1 < 5 < across.sigmas
+
+
+def test_good_scans_are_within_the_limits():
+    rng = np.random.default_rng(1)
+    covariance = np.array([[0.04, -0.01], [-0.01, 0.02]])
+    levels = []
+    for _ in range(2000):
+        real, imag = rng.multivariate_normal([2.05, -0.01], covariance + np.diag([0.02**2, 0.01**2]))
+        levels.append(check_plate(PLATE, [patch(real, -imag, covariance.tolist())]).level)
+    assert levels.count("good") / 2000 == pytest.approx(0.95, abs=0.02)
+    assert levels.count("action") / 2000 < 0.01
+
+
+@pytest.mark.parametrize("patches", [[], [PatchFigures(label=1, box_mm=(10.0, -20.0, 50.0, 20.0))]])
+def test_a_plate_that_is_not_measured_is_a_reason(patches):
+    result = check_plate(PLATE, patches)
+    assert result is not None
+    assert result.level == "missing"
+    assert len(check_reasons(result)) == 1
+    assert check_plate(CheckPlate(), patches) is None
+
+
+@pytest.fixture
+def saved(products, tmp_path):
+    return shutil.copytree(products, tmp_path / "products")
+
+
+def with_plate(products, plate: CheckPlate) -> None:
+    """Name a check plate in the rig of saved products."""
+    facts = read_products(products).facts
+    rig = {**facts.instrument, "check": msgspec.to_builtins(plate)}
+    write_json(products / SCAN, msgspec.structs.replace(facts, instrument=rig))
+
+
+@pytest.mark.parametrize(("permittivity", "status"), [((3.78, 0.7), 0), ((9.0, 0.01), 1)])
+def test_the_command_says_and_draws_it(saved, tmp_path, capsys, permittivity, status):
+    x_mm, y_mm = PET["centre_mm"]
+    with_plate(saved, CheckPlate(name="PET", permittivity=permittivity, place_mm=(x_mm, y_mm)))
+    chart = tmp_path / "chart.png"
+    assert main(["check", str(saved), "--chart", str(chart), "--json"]) == status
+    (shown,) = json.loads(capsys.readouterr().out)
+    assert (shown["level"] == "action") == bool(status)
+    assert chart.read_bytes().startswith(b"\x89PNG")
+    table = polysight.check(saved)
+    assert table["level"].item() == shown["level"]
+    assert table["sigmas"].item() == shown["sigmas"]
+
+
+def test_a_rig_file_without_a_plate_is_an_error(saved, capsys):
+    with_plate(saved, CheckPlate())
+    assert main(["check", str(saved)]) == 2
+    assert "names no check plate" in capsys.readouterr().err

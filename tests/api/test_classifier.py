@@ -1,0 +1,70 @@
+"""The classifiers as estimators of scikit-learn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sklearn.base import clone
+from sklearn.model_selection import LeaveOneGroupOut, cross_val_score
+from sklearn.utils.estimator_checks import check_estimator
+
+from polysight import Classifier, Library, PaperKNeighborsClassifier
+from polysight.materials import SIMULATED_LIBRARY, Samples, ratio_columns
+from polysight.materials.classify import PAPER, PaperKnn, Weights
+
+# What scikit-learn leaves out by itself here: array API without its switch, and what has no decision_function.
+NOT_CHECKED = {"check_array_api_input", "check_classifiers_multilabel_output_format_decision_function"}
+
+
+@pytest.fixture(scope="module")
+def library():
+    """Six scans of the packaged library, few pixels of each patch."""
+    whole = Library.load(SIMULATED_LIBRARY)
+    angle = whole.angles_deg[0]
+    return Library(tuple(entry for entry in whole.at(angle).entries if entry.scan in whole.scans[:6]))
+
+
+@pytest.mark.parametrize("measure", ["log", "paper"])
+def test_the_paper_s_classifier_passes_scikit_learn_s_checks(measure):
+    results = check_estimator(PaperKNeighborsClassifier(measure=measure), on_skip=None)
+    assert {result["check_name"] for result in results if result["status"] != "passed"} == NOT_CHECKED
+
+
+def test_its_metric_is_the_distance_that_it_votes_with(library):
+    X, y, _ = library.columns()
+    knn = PaperKNeighborsClassifier(3, weight_h=0.5, weight_v=2.0).fit(X[::7], y[::7])
+    distance, nearest = knn.kneighbors(X[1:5])
+    for row, pixel in enumerate(X[1:5]):
+        assert distance[row] == pytest.approx([knn.metric(pixel, X[::7][near]) for near in nearest[row]])
+        assert (np.diff(distance[row]) >= 0).all()
+
+
+def test_it_names_as_the_model_of_libraries(library):
+    X, _, _ = library.columns()
+    samples = Samples.of(library)
+    model = PaperKnn(weights=Weights(0.7, 1.3, 1.0, "inverse", 5)).fit(samples)
+    knn = PaperKNeighborsClassifier(5, weight_h=0.7, weight_v=1.3, measure="inverse")
+    knn.fit(ratio_columns(samples.x), samples.names)
+    ours = model.by_pixel(ratio_columns(X[::29]))[0]
+    assert (knn.predict(X[::29]) == ours).mean() > 0.99  # ties
+
+
+@pytest.mark.parametrize("model", ["knn", "discriminant"])
+def test_a_classifier_is_an_estimator(library, model):
+    X, y, scans = library.columns()
+    classifier = clone(Classifier(model)).fit(X, y, scans)
+    probability = classifier.predict_proba(X[::50])
+    assert probability.shape == (len(X[::50]), len(classifier.classes_))
+    assert probability.sum(axis=1) == pytest.approx(1)
+    assert (classifier.predict(X[::50]) == classifier.classes_[probability.argmax(axis=1)]).all()
+    assert classifier.score(X[::50], y[::50]) > 0.7
+    with pytest.raises(ValueError, match="features"):
+        classifier.predict(X[:, :3])
+
+
+def test_scans_left_out_are_judged_by_scikit_learn_and_by_us_alike(library):
+    X, y, scans = library.columns()
+    theirs = cross_val_score(Classifier("knn"), X[::9], y[::9], groups=scans[::9], cv=LeaveOneGroupOut())
+    ours = Classifier("knn").score_by_scans(library)
+    assert ours.model == PAPER
+    assert abs(theirs.mean() - ours.pixels) < 0.15

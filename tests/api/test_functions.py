@@ -1,0 +1,151 @@
+"""Functions beside a scan: labels kept by the maths, maps of permittivity, plan, simulate, compare, label, train."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+import xarray
+from tests.support.refusals import refused
+
+import polysight
+from polysight import compare, fresnel, multilayer, open_scan, permittivity_from_ratio
+from polysight.products.processed import read_image
+from polysight_shared.error_codes import ErrorCode
+
+from .conftest import COPPER, PET, simulated
+
+BOXES = {"copper": (-60.0, -15.0, -30.0, 15.0), "PET": (30.0, -15.0, 60.0, 15.0)}
+
+
+@pytest.fixture(scope="module")
+def scan(products):
+    return open_scan(products)
+
+
+# --- the maths keeps labels -------------------------------------------------------------------------------------------
+
+
+def test_the_permittivity_of_an_image_is_an_image(scan):
+    image = scan.image()
+    eps = permittivity_from_ratio(image["p"], image["incidence_rad"])
+    assert isinstance(eps, xarray.DataArray)
+    assert eps.dims == image["p"].dims
+    xarray.testing.assert_identical(eps["x_mm"], image["x_mm"])
+    assert eps.attrs["long_name"] == "relative permittivity"
+    np.testing.assert_array_equal(eps, permittivity_from_ratio(image["p"].values, float(image["incidence_rad"])))
+
+
+def test_reflection_coefficients_broadcast_by_name():
+    theta = xarray.DataArray(np.radians([50.0, 55.0]), dims="angle", coords={"angle": [50, 55]})
+    eps = xarray.DataArray([3.8 - 0.7j, 6 - 0.3j, np.inf], dims="material")
+    for r in fresnel(eps, theta):
+        assert r.dims == ("material", "angle")
+    frequency_hz = xarray.DataArray([77e9, 78e9], dims="frequency")
+    r_s, r_p = multilayer([5.5 - 0.05j, eps], [3e-3], frequency_hz, theta_rad=theta)
+    assert set(r_s.dims) == set(r_p.dims) == {"frequency", "angle", "material"}
+    plain = multilayer([5.5 - 0.05j, 6 - 0.3j], [3e-3], 78e9, np.radians(55))[0]
+    assert complex(r_s.isel(frequency=1, material=1).sel(angle=55)) == pytest.approx(plain)
+
+
+# --- maps -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_map_of_permittivity_agrees_with_the_patch_and_knows_its_error(scan):
+    eps = scan.permittivity_map()
+    inside = eps.where(scan.patches()["label"] == 2).sel(x_mm=slice(30, 60), y_mm=slice(-15, 15))
+    z = np.abs(inside["permittivity"].real - PET["permittivity"][0]) / inside["permittivity_real_standard_error"]
+    assert float(z.median()) < 2
+    assert bool(inside["mask"].mean() > 0.9)
+    metal = eps.sel(x_mm=slice(-60, -30), y_mm=slice(-15, 15))
+    assert not metal["mask"].any()
+    at = scan.probe(45, 0)
+    assert complex(at["permittivity"]) == complex(eps["permittivity"].sel(x_mm=45, y_mm=0, method="nearest"))
+    assert int(at["label"]) == 2
+
+
+def test_the_errors_of_the_map_are_those_of_its_ratio(scan):
+    """A ratio off by its standard deviation moves the permittivity by its standard error."""
+    image = scan.image().sel(x_mm=45, y_mm=0, method="nearest")
+    eps = scan.permittivity_map().sel(x_mm=45, y_mm=0, method="nearest")
+    moved = permittivity_from_ratio(complex(image["p"]) + float(image["p_sigma"]) * 1e-3, float(image["incidence_rad"]))
+    change = abs(complex(moved) - complex(eps["permittivity"])) * 1e3
+    for part in ("real", "loss"):
+        assert float(eps[f"permittivity_{part}_standard_error"]) >= 0.99 * change
+
+
+# --- compare ----------------------------------------------------------------------------------------------------------
+
+
+def test_two_scans_are_compared_on_labelled_pixels(folder, products):
+    same = compare(products, open_scan(folder))
+    assert float(abs(same["p_difference"]).max()) < 1e-5
+    assert same.sizes["pair"] == 1
+    assert [same["pair_x_mm"].item(), same["pair_y_mm"].item()] == pytest.approx(PET["centre_mm"], abs=6)
+    assert abs(same["pair_difference"].item()) < 1e-5
+    assert set(same["p_difference"].dims) == {"y_mm", "x_mm"}
+
+
+# --- labels, libraries ------------------------------------------------------------------------------------------------
+
+
+def test_labelled_scans_make_a_library_that_names_them(products, tmp_path):
+    folders = [shutil.copytree(products, tmp_path / name) for name in ("one", "two")]
+    for place in folders:
+        assert open_scan(place).label(BOXES).exists()
+    image = read_image(folders[1] / "image.npz")
+    image.h[:] *= 1.01
+    from polysight.products import write_image
+
+    write_image(folders[1] / "image.npz", image)
+    library = polysight.train([open_scan(folders[0]), folders[1]])
+    assert library.names == ("PET", "copper")
+    X, y, scans = library.columns()
+    assert X.shape == (len(y), 4)
+    assert set(scans) == set(library.scans)
+    library.save(tmp_path / "own.npz")
+    assert polysight.Library.load(tmp_path / "own.npz").names == library.names
+    X_new, patch = open_scan(products).columns()
+    named = polysight.Classifier("knn").fit(X, y).predict(X_new)
+    assert (named[patch == 2] == "PET").mean() > 0.9
+
+
+def test_a_box_outside_the_image_is_refused_and_nothing_is_written(products, tmp_path):
+    place = shutil.copytree(products, tmp_path / "one")
+    (place / "labels.json").unlink(missing_ok=True)
+    with refused(ErrorCode.VALUE_INVALID):
+        open_scan(place).label({"copper": (900, 900, 910, 910)})
+    assert not (place / "labels.json").exists()
+
+
+# --- plan, simulate, show ---------------------------------------------------------------------------------------------
+
+
+def test_a_plan_is_a_text_and_its_numbers():
+    planned = polysight.plan(step_x_mm=2.0, step_y_mm=2.0)
+    assert planned.forecast.rig.grid.step_x_mm == 2.0
+    assert planned.forecast.time.total_s > 0
+    assert "resolution" in str(planned)
+    assert planned._repr_html_().startswith("<pre>")
+
+
+def test_a_scene_can_be_written_in_python(tmp_path):
+    scene = {
+        "name": "one plate",
+        "grid": {"columns": 9, "rows": 9, "step_x_mm": 16.0, "step_y_mm": 16.0},
+        "burst": {"pulses": 2},
+        "plates": [COPPER],
+    }
+    made = polysight.simulate(scene, tmp_path / "scan", seed=5)
+    assert made.simulated is True
+    assert made.rows.planned == 9
+    with refused(ErrorCode.OTHER):
+        polysight.simulate({"name": "wrong", "plates": [{"nme": "x"}]}, tmp_path / "other")
+
+
+def test_a_scan_shows_itself_without_processing(products, tmp_path):
+    assert "recorded rows" in open_scan(simulated(tmp_path / "scan"))._repr_html_()
+    shown = open_scan(products)._repr_html_()
+    for text in ("SIMULATED", "<td>metal reference</td>", "verdict"):
+        assert text in shown

@@ -1,0 +1,53 @@
+"""Processing, notebooks and results need no module of POSIX systems: laptops with Windows have none."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import textwrap
+
+HIDDEN = """
+import os, subprocess, sys, types  # subprocess takes a msvcrt for Windows' own
+for name in ("fcntl", "resource", "termios", "tty", "pty", "grp", "pwd", "syslog"):
+    sys.modules[name] = None
+for name in ("O_DIRECTORY", "O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "sysconf"):
+    delattr(os, name)
+locked = []
+msvcrt = types.ModuleType("msvcrt")
+msvcrt.LK_NBLCK = 2
+msvcrt.locking = lambda file, mode, count: locked.append((mode, count))
+sys.modules["msvcrt"] = msvcrt
+"""
+
+
+def run_hidden(program: str, *arguments: object) -> str:
+    """Run a program where these modules and functions are not there; Windows' locks are a stand-in."""
+    code = HIDDEN + textwrap.dedent(program)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_every_public_name_is_imported_without_posix():
+    run_hidden("import polysight\nfor name in polysight.__all__: getattr(polysight, name)")
+    run_hidden("import polysight.jobs.process, polysight.jobs.batch, polysight.catalogue, polysight.serve")
+
+
+def test_a_scan_is_processed_read_and_exported_without_posix(folder, tmp_path):
+    scan = shutil.copytree(folder, tmp_path / "scan")
+    program = """
+    from polysight.cli.main import main
+    scan, out = sys.argv[1:]
+    assert main(["process", scan, "--out", out]) == 0
+    assert main(["process", scan, "--out", out]) == 0
+    assert (2, 1) in locked
+    import polysight
+    print(polysight.open_scan(out).materials().sizes["patch"])
+    assert main(["export", out, "--csv", "--mat", "--out", out + "-export"]) == 0
+    """
+    assert "\n2\n" in run_hidden(program, scan, tmp_path / "products")
+    assert {path.name for path in (tmp_path / "products-export").iterdir()} == {"image.mat", "materials.csv"}
+    assert not list(tmp_path.glob(".products*"))

@@ -1,0 +1,62 @@
+"""Warnings about the plates of a scene, before it is scanned or simulated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+from tests.support.rigs import published_rig
+
+import polysight
+from polysight.cli.main import main
+from polysight.planning import read_scene, warn_of_scene
+
+OWN_SCENE = Path(__file__).resolve().parents[2] / "examples" / "own-scene.toml"
+GRID = {"columns": 61, "rows": 61, "step_x_mm": 6.0, "step_y_mm": 6.0}
+
+
+def plate(x_mm: float, y_mm: float = 0.0, side_mm: float = 45.0, **more: Any) -> dict[str, Any]:
+    kind = {"permittivity": [4.0, 0.4]} | more
+    return {"name": f"plate at {x_mm:g}, {y_mm:g}", "centre_mm": [x_mm, y_mm], "size_mm": [side_mm, side_mm], **kind}
+
+
+def topics(tmp_path: Path, *plates: dict[str, Any], grid: dict[str, Any] = GRID) -> list[str]:
+    path = tmp_path / "scene.toml"
+    path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "plates": list(plates)}))
+    return [warning.where for warning in warn_of_scene(*read_scene(path, published_rig()))]
+
+
+def test_the_own_scene_is_good_as_it_is():
+    assert not list(warn_of_scene(*read_scene(OWN_SCENE, published_rig())))
+
+
+@pytest.mark.parametrize(
+    ("plates", "expected"),
+    [
+        ([plate(-30), plate(30)], ["gap"]),
+        ([plate(-40), plate(40)], []),
+        ([plate(-25, -40), plate(25, 40)], []),
+        ([plate(-60, background=True, side_mm=400.0), plate(0)], []),
+        ([plate(0, side_mm=15.0)], ["size", "size"]),
+        ([plate(150)], ["aperture"]),
+        ([plate(0, thickness_mm=1.2)], ["thickness"]),
+        ([plate(0, thickness_mm=40.0)], []),
+    ],
+)
+def test_each_fault_of_a_scene_is_named(tmp_path, plates, expected):
+    assert topics(tmp_path, *plates) == expected
+
+
+def test_plan_and_simulate_say_it(tmp_path, capsys):
+    path = tmp_path / "scene.toml"
+    plates = [plate(-30, metal=True) | {"permittivity": None}, plate(30)]
+    del plates[0]["permittivity"]
+    grid = {"columns": 9, "rows": 9, "step_x_mm": 40.0, "step_y_mm": 40.0}
+    path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "burst": {"pulses": 2}, "plates": plates}))
+    assert main(["plan", "--scene", str(path)]) == 0
+    assert "note, gap:" in capsys.readouterr().out
+    assert main(["simulate", str(path), "--out", str(tmp_path / "scan")]) == 0
+    assert "note, gap:" in capsys.readouterr().err
+    assert any(text.startswith("gap: ") for text in polysight.plan(scene=path).warnings)

@@ -41,7 +41,7 @@ def build_site(out: Path, *, run: bool) -> list[Path]:
         notebooks = sorted(NOTEBOOKS.glob("*.ipynb"))
         made += [_write(path, out, _from_notebook(path, folder if run else None)) for path in notebooks]
         if run:
-            polysight.simulate("examples/own-scene.toml", folder / "out" / "own")
+            polysight.simulate("examples/own-scene.toml", folder / "out" / "gallery")
             made.append(_write(GALLERY, out, _with_pictures(_from_markdown(GALLERY), folder, out)))
     return made
 

@@ -218,18 +218,18 @@ class Scan:
     def __init__(self, folder: Path, source: Source | None, saved: ProcessedScan | None, settings: Settings) -> None:
         self.folder = folder
         self._source = source
-        self._saved_products = saved
+        self._saved = saved
         self._settings = settings
 
     @property
     def scan_id(self) -> str:
         """Name of the scan; "" when its products do not say."""
-        return self._source.scan_id if self._source is not None else self._saved.scan_id
+        return self._origin.scan_id
 
     @property
     def simulated(self) -> bool | None:
         """True if the data is simulated; None when the products do not say."""
-        return self._source.simulated if self._source is not None else self._saved.simulated
+        return self._origin.simulated
 
     @property
     def verdict(self) -> Verdict | None:
@@ -237,7 +237,8 @@ class Scan:
 
         Processes recorded rows where there are no products. Raises as :meth:`image`.
         """
-        return self._saved.verdict if self._saved_products is not None else self.processed(True).verdict
+        done = self._saved or self.processed()
+        return done.verdict
 
     @property
     def rig(self) -> Instrument:
@@ -248,22 +249,20 @@ class Scan:
         DataError
             when products do not say.
         """
-        known = self._saved.rig if self._saved_products is not None else self._processing.pipeline.rig
-        if known is None and self._source is not None:
-            known = self._processing.pipeline.rig
-        if known is None:
+        if self._saved is not None and self._saved.rig is not None:
+            return self._saved.rig
+        if self._source is None:
             raise self._unknown("rig")
-        return known
+        return self._processing.pipeline.rig
 
     @property
     def rows(self) -> Rows:
         """Rows of the scan: `indices`, `planned`, `committed`, `missing`. Raises DataError when products do not say."""
         if self._source is not None:
             return Rows(self._source.plan.rows, tuple(self._source.rows()))
-        known = self._saved.rows
-        if known is None:
+        if self._saved is None or self._saved.rows is None:
             raise self._unknown("rows")
-        return known
+        return self._saved.rows
 
     def image(self, *, metal_referenced: bool = True) -> xarray.Dataset:
         """Both channels and their ratio on one grid.
@@ -398,7 +397,8 @@ class Scan:
         DataError
             when a box or name cannot be used; nothing was written then.
         """
-        place = label_folder(self.folder)
+        # Images of another program are one file: its folder takes the labels.
+        place = label_folder(self.folder if self.folder.is_dir() else self.folder.parent)
         save_labels(place, self.processed(), Labels(dict(boxes), "mm", metal, dict(specimens or {})))
         return place / LABELS
 
@@ -508,7 +508,7 @@ class Scan:
 
     @property
     def _kind(self) -> str:
-        return "recorded rows" if self._saved_products is None else "saved products"
+        return "recorded rows" if self._saved is None else "saved products"
 
     @property
     def _row_count(self) -> str:
@@ -522,10 +522,10 @@ class Scan:
     @property
     def _result_at_hand(self) -> ProcessedScan | None:
         """The result if it is saved or was computed already."""
-        if self._saved_products is not None:
+        if self._saved is not None:
             return self._saved
-        computed = vars(self).get("_processing")
-        return None if computed is None else vars(computed).get("referenced")
+        processing = vars(self).get("_processing", self)
+        return vars(processing).get("referenced")
 
     @cached_property
     def _processing(self) -> Processing:
@@ -537,20 +537,24 @@ class Scan:
         return Processing(self._source, self.folder, self._settings)
 
     @property
-    def _saved(self) -> ProcessedScan:
-        if self._saved_products is None:
+    def _origin(self) -> Source | ProcessedScan:
+        """Recorded rows, or else the products."""
+        origin = self._source or self._saved
+        if origin is None:
             raise DataError(
-                f"{self.folder}: holds no products", "it was not processed", "polysight process", code=ErrorCode.NO_DATA
+                f"{self.folder}: holds no scan", "it is empty", "open another folder", code=ErrorCode.NO_DATA
             )
-        return self._saved_products
+        return origin
 
     def processed(self, metal_referenced: bool = True) -> ProcessedScan:
         """Saved products of this kind, otherwise processed rows: what the datasets are made of. Raises as `image`."""
-        if self._saved_products is not None and self._saved.metal_referenced == metal_referenced:
+        if self._saved is not None and self._saved.metal_referenced == metal_referenced:
             return self._saved
         if self._source is None:
             raise self._other_kind(metal_referenced)
-        return self._processing.referenced if metal_referenced else self._processing.unreferenced
+        if metal_referenced:
+            return self._processing.referenced
+        return self._processing.unreferenced
 
     def _other_kind(self, metal_referenced: bool) -> DataError:
         if metal_referenced:

@@ -54,7 +54,6 @@ ALIVE = "POLYSIGHT_PARENT_ALIVE"
 """Environment of the program: number of a pipe that ends with the program that started it."""
 # Leave a fifth of the free memory to the system.
 SHARE_OF_FREE_MEMORY = 0.8
-# Unit of `ru_maxrss`, getrusage(2).
 _POLL_S = 0.2
 
 

@@ -8,9 +8,7 @@ its own. The number of connections has one limit (`ConnectionLimit`).
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import struct
-import termios
 import threading
 import time
 from collections import OrderedDict
@@ -375,6 +373,10 @@ class CountedConnection(H11Protocol):
         descriptor = self.transport.get_extra_info("socket").fileno()
         if descriptor < 0:
             return False
+        # Modules of POSIX systems: the page's results are imported on laptops, too.
+        import fcntl
+        import termios
+
         (count,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)))
         return count > 0
 

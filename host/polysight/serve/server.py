@@ -326,7 +326,10 @@ def _configure(app: ASGIApp, **more: object) -> uvicorn.Config:
 
 def make_server(front: Front, place: Place) -> uvicorn.Server:
     """Build the server that browsers reach."""
-    with contextlib.suppress(OSError, ValueError):
+    with contextlib.suppress(OSError, ValueError, ModuleNotFoundError):
+        # A module of POSIX systems: the page's results are read on laptops, too.
+        import resource
+
         # Connections are files.
         _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, 1 << 16), most))

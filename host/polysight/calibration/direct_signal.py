@@ -37,7 +37,6 @@ from polysight.sync import (
     align_row,
     cis,
     fit_high_pass,
-    noise_power,
     reference,
     whole_blocks,
 )
@@ -144,7 +143,7 @@ def find_direct(
     good = aligned.good & done.found[:, None]
     cycles = (done.frequency[:, None] + aligned.frequency)[good]
     power = _power(words[good.ravel()], cycles, setup, drift + done.drift)
-    noise = _recorded_noise(aligned) * (np.abs(setup.path.estimator[0]) ** 2).sum() / FOLD
+    noise = _recorded_noise(aligned, done.noise) * (np.abs(setup.path.estimator[0]) ** 2).sum() / FOLD
     cycles = cycles % 1.0 if chirp.if_mode == "complex1x" else (cycles + 0.5) % 1.0 - 0.5
     rate = chirp.sample_rate_hz
     return DirectSignal(
@@ -157,10 +156,10 @@ def find_direct(
     )
 
 
-def _recorded_noise(aligned: AlignedRow) -> float:
+def _recorded_noise(aligned: AlignedRow, noise: NDArray[np.float64]) -> float:
     """Return the noise power of a recorded sample: the estimate divided by the gain of the filter compensation."""
     raised = (aligned.gain**2 * aligned.good).sum(axis=1) / np.maximum(aligned.good.sum(axis=1), 1)
-    recorded = noise_power(aligned) / np.maximum(raised, 1e-12)
+    recorded = noise / np.maximum(raised, 1e-12)
     return float(np.nanmedian(recorded)) if np.isfinite(recorded).any() else 0.0
 
 

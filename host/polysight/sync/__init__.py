@@ -8,8 +8,8 @@ otherwise in NumPy with equal results. `estimate_backlash` measures the backlash
 """
 
 from polysight.sync.backlash import estimate_backlash, object_filter
-from polysight.sync.chain import STAGES, BoardSetup, RowSynchroniser, SyncedRow, noise_power, synchronise_row
-from polysight.sync.decimate import FOLD
+from polysight.sync.chain import STAGES, BoardSetup, RowSynchroniser, SyncedRow, synchronise_row
+from polysight.sync.decimate import FOLD, decimation
 from polysight.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
 from polysight.sync.loops import cis
 from polysight.sync.offsets import AlignedRow, align_row, block_sweep_of, reference, sweep_of, whole_blocks
@@ -25,10 +25,10 @@ __all__ = [
     "align_row",
     "block_sweep_of",
     "cis",
+    "decimation",
     "estimate_backlash",
     "fit_high_pass",
     "high_pass",
-    "noise_power",
     "object_filter",
     "reference",
     "sweep_of",

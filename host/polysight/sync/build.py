@@ -23,7 +23,8 @@ LIBRARY = "kernels.so"
 SOURCES = ("burst.c", "direct_path.c")
 """Compiled once per vector width."""
 
-_FLAGS = "-std=c99 -O3 -fPIC -fopenmp-simd -ffp-contract=fast -fno-math-errno -fno-trapping-math -fno-signed-zeros"
+_FLAGS = "-std=c99 -Werror=implicit-function-declaration -O3 -fPIC"
+_FLAGS += " -fopenmp-simd -ffp-contract=fast -fno-math-errno -fno-trapping-math -fno-signed-zeros"
 _FLAGS += " -fassociative-math"  # not -ffast-math, which changes rounding in other libraries
 _WIDTHS = {
     128: "",

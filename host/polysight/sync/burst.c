@@ -12,7 +12,7 @@
 #define AT_LIMIT 32        /* `offsets._AT_LIMIT` */
 #define SMALLEST_GAIN 0.25 /* `high_pass_filter.SMALLEST_GAIN` */
 
-/* `high_pass_filter.Equaliser`; without corners the outer taps are 0. */
+/* `high_pass_filter.Equaliser`; without corners it changes nothing. */
 typedef struct {
     int is_signed, corners;
     double sample_rate_hz, reach, even, odd; /* even, odd: factors of `find_taps` */
@@ -36,26 +36,21 @@ static Complex inverse(const Equaliser *e, double frequency)
 /* `Equaliser.taps`. */
 static void find_taps(const Equaliser *e, double frequency, Complex *taps)
 {
-    if (!e->corners) {
-        taps[0] = taps[2] = (Complex){0, 0};
-        taps[1] = (Complex){1, 0};
-        return;
-    }
     Complex low = inverse(e, frequency - e->reach), middle = inverse(e, frequency), high = inverse(e, frequency + e->reach);
     Complex both = {((low.re + high.re) / 2 - middle.re) * e->even, ((low.im + high.im) / 2 - middle.im) * e->even};
     Complex apart = {(high.im - low.im) * e->odd, -(high.re - low.re) * e->odd}; /* divided by j */
     taps[0] = (Complex){(both.re - apart.re) / 2, (both.im - apart.im) / 2};
-    taps[1] = (Complex){middle.re - both.re, middle.im - both.im};
-    taps[2] = (Complex){(both.re + apart.re) / 2, (both.im + apart.im) / 2};
+    taps[1] = plus(middle, -1, both);
+    taps[2] = plus(taps[0], 1, apart);
 }
 
-/* Work arrays of one position, per chirp; padded to whole groups. */
+/* Arrays of one position, per chirp; whole groups of them are used. */
 typedef struct {
-    int *order;
-    double *frequency, *found, *coherence, *sorted, *left, *start, *turns;
-    Complex *product, *found_product, *taps;
-    float *energy, *first, *second;
-    uint8_t *usable, *whole;
+    double frequency[MOST], found[MOST], coherence[MOST], sorted[MOST], left[PARTS * MOST], start[MOST], turns[MOST];
+    Complex product[MOST], found_product[MOST], taps[3 * MOST];
+    float energy[MOST], first[MOST], second[MOST];
+    int peak[MOST];
+    uint8_t whole[MOST], usable[MOST]; /* received, not clipped, silent or disturbed; and those of this round */
 } Chirps;
 
 /* Results, [position][chirp] unless noted. */
@@ -66,6 +61,17 @@ typedef struct {
     double *frequency, *phase, *amplitude, *gain, *frequency_error, *phase_error, *coherence;
     uint8_t *clipped;
 } Aligned;
+
+/* Largest magnitude of words. */
+static int32_t largest(const int16_t *restrict words, int count)
+{
+    int16_t low = 0, high = 0;
+    for (int i = 0; i < count; i++) {
+        low = words[i] < low ? words[i] : low;
+        high = words[i] > high ? words[i] : high;
+    }
+    return high > -(int32_t)low ? high : -(int32_t)low;
+}
 
 /* `offsets.find_clipped` in the received chirps of a burst, words in each. */
 static void find_clipped(const int16_t *burst, const uint8_t *valid, int chirps, int words, int full_scale, int *peak,
@@ -80,8 +86,7 @@ static void find_clipped(const int16_t *burst, const uint8_t *valid, int chirps,
     const int16_t limit = (int16_t)(highest - highest / 2048), low = (int16_t)-limit;
     for (int k = 0; k < chirps && highest >= LEAST_LIMIT; k++) {
         const int16_t *restrict chirp = burst + (size_t)k * words;
-        int at_limit = 0;
-        const int count = valid[k] && peak[k] >= limit ? words : 0;
+        int at_limit = 0, count = valid[k] && peak[k] >= limit ? words : 0;
         for (int i = 0; i < count; i++)
             at_limit += (chirp[i] >= limit) | (chirp[i] <= low);
         clipped[k] |= at_limit > words / AT_LIMIT;
@@ -120,12 +125,12 @@ static int drop_disturbed(const Work *w, Chirps *c, int count)
         usable += c->usable[k];
     for (int p = 0; p < w->parts && usable >= 4; p++) {
         const double *left = c->left + p * chirps;
-        double negligible = NEGLIGIBLE * w->part_energy[p] / (count > 1 ? (double)count * count : 1), least = 1e300, most = 0;
-        for (int k = 0; k < chirps; k++)
-            if (c->usable[k]) {
-                least = left[k] < least ? left[k] : least;
-                most = left[k] > most ? left[k] : most;
-            }
+        double negligible = NEGLIGIBLE * w->part_energy[p] / fmax((double)count * count, 1);
+        double least = 1e300, most = 0;
+        for (int k = 0; k < chirps; k++) {
+            least = c->usable[k] && left[k] < least ? left[k] : least;
+            most = c->usable[k] && left[k] > most ? left[k] : most;
+        }
         if (most <= UNEXPLAINED * least + negligible)
             continue; /* the usual case, without a median */
         double middle = median(left, c->usable, chirps, c->sorted);
@@ -143,30 +148,23 @@ static int drop_disturbed(const Work *w, Chirps *c, int count)
     return dropped;
 }
 
-/* Chirps of a kind first, then the others, each in order of recording; the first `fixed` stay. */
-static void put_first(int *order, const uint8_t *kind, int chirps, int fixed)
-{
-    int at = fixed;
-    for (int wanted = 1; wanted >= 0; wanted--)
-        for (int k = 0; k < chirps; k++)
-            if ((kind[k] != 0) == wanted && !(fixed && k == order[0]))
-                order[at++] = k;
-}
-
-/* `offsets._against_one`: offsets relative to one chirp; try another if it is not usable or matches few of the others.
-   Returns the middle of the signal's band. */
+/* `offsets._against_one`: offsets relative to one usable chirp; try another if it matches few of the others. Returns the
+   middle of the signal's band. */
 static double against_one(Work *w, Chirps *c, const int16_t *words)
 {
-    int chirps = w->chirps, reference = 0, usable = 0;
+    int chirps = w->chirps, reference = 0, usable = 0, attempts = 0, is_found = 0;
     double best_sum = -1, best = 0, centre = 0, noise = 4 / sqrt((double)RX * w->n);
-    put_first(c->order, c->whole, chirps, 0);
-    for (int attempt = 0; attempt < REFERENCES && attempt < chirps; attempt++) {
-        int tried = c->order[attempt], matching = 0;
+    memset(c->coherence, 0, sizeof *c->coherence * chirps);
+    memset(c->frequency, 0, sizeof *c->frequency * chirps);
+    memset(c->product, 0, sizeof *c->product * chirps);
+    for (int k = 0; k < chirps; k++)
+        usable += c->usable[k];
+    for (int tried = 0; tried < chirps && attempts < REFERENCES && !is_found; tried++) {
+        if (!c->usable[tried])
+            continue;
+        attempts++;
+        int matching = 0;
         double sum = 0, middle = match(w, words, tried, c->found, c->found_product, c->energy);
-        for (int k = 0; attempt == 0 && k < chirps; k++)
-            usable += c->usable[k] = c->whole[k] && c->energy[k] > 0;
-        if (attempt == 0)
-            put_first(c->order, c->usable, chirps, 1);
         for (int k = 0; k < chirps; k++) {
             double energy = (double)c->energy[k] * c->energy[tried];
             double match = magnitude(c->found_product[k]) / sqrt(energy > 1e-30 ? energy : 1e-30);
@@ -174,8 +172,8 @@ static double against_one(Work *w, Chirps *c, const int16_t *words)
             sum += c->sorted[k];
             matching += c->sorted[k] > noise;
         }
-        sum = c->usable[tried] ? sum : -1;
-        if (sum >= best_sum) {
+        is_found = 2 * matching >= usable - 1;
+        if (sum > best_sum) {
             best_sum = sum;
             reference = tried;
             centre = middle;
@@ -183,8 +181,6 @@ static double against_one(Work *w, Chirps *c, const int16_t *words)
             memcpy(c->frequency, c->found, sizeof *c->frequency * chirps);
             memcpy(c->product, c->found_product, sizeof *c->product * chirps);
         }
-        if (!usable || (c->usable[tried] && 2 * matching >= usable - 1))
-            break;
     }
     for (int k = 0; k < chirps; k++)
         best = c->coherence[k] > best ? c->coherence[k] : best;
@@ -206,6 +202,7 @@ static void centre_errors(double *values, const uint8_t *good, int chirps, int c
 static int align_round(Work *w, Chirps *c, const Equaliser *e, const int16_t *words, Aligned out)
 {
     int chirps = w->chirps, half = 0;
+    memcpy(c->usable, c->whole, chirps);
     *out.centre = against_one(w, c, words);
     int count = choose_coherent(c->coherence, c->usable, chirps, c->sorted, out.good);
     for (int k = 0; k < chirps; k++) {
@@ -227,8 +224,7 @@ static int align_round(Work *w, Chirps *c, const Equaliser *e, const int16_t *wo
     double level = against_others(w, out.good, c->found, c->found_product, c->energy, out.frequency_error,
                                   out.phase_error, c->left);
     int disturbed = drop_disturbed(w, c, count);
-    level /= count > 1 ? (double)count * count : 1;
-    level = level > 1e-30 ? level : 1e-30;
+    level = fmax(level / fmax((double)count * count, 1), 1e-30);
     VECTOR
     for (int k = 0; k < chirps; k++) {
         int others = count - out.good[k];
@@ -258,80 +254,37 @@ static void align_position(Work *w, Chirps *c, const Equaliser *e, const int16_t
                            int full_scale, Aligned out)
 {
     const int chirp = WORDS * w->samples;
-    find_clipped(words, valid, w->chirps, chirp, full_scale, c->order, out.clipped);
+    find_clipped(words, valid, w->chirps, chirp, full_scale, c->peak, out.clipped);
     for (int k = 0; k < w->chirps; k++)
-        c->whole[k] = valid[k] && !out.clipped[k];
+        c->whole[k] = valid[k] && !out.clipped[k] && c->peak[k] > 0;
     for (int g = 0; g < w->groups; g++) {
         const int16_t *group[LANES];
         for (int k = 0; k < LANES; k++)
-            group[k] = g * LANES + k < w->chirps ? words + (size_t)(g * LANES + k) * chirp + WORDS * w->a : w->silence;
+            group[k] = g * LANES + k < w->chirps ? words + (size_t)(g * LANES + k) * chirp + WORDS * w->a : group[0];
         side_by_side(group, WORDS * w->n, w->words + (size_t)g * LANES * WORDS * w->n);
     }
     for (int round = 0; round < ROUNDS && align_round(w, c, e, words, out); round++)
         ; /* again without the disturbed chirps */
 }
 
-/* Reserve space for values of a size in `memory` on its own cache lines; only count it if memory is NULL. */
-static void *room(float *memory, size_t *used, size_t count, size_t size)
+/* Assign the arrays to memory, or count their size. */
+static void lay_out(Work *w, Memory *memory)
 {
-    void *here = memory ? memory + *used : NULL;
-    *used += (count * size / sizeof(float) + LANES) / LANES * LANES;
-    return here;
-}
-
-/* Assign all arrays to memory; return the number of floats needed. */
-static size_t lay_out(Work *w, Chirps *c, float *memory)
-{
-    size_t used = 0, chirps = whole_lanes(w->chirps), size = w->size, values = (size_t)RX * w->blocks, words = (size_t)WORDS * w->n;
-    float **floats[] = {&w->root_c, &w->root_s, &w->turn_c, &w->turn_s, &w->same, &w->turned, &w->re, &w->im, &w->phase_c,
-                        &w->phase_s, &w->row_re, &w->row_im, &w->folded_re, &w->folded_im, &w->all_re, &w->all_im,
-                        &c->energy, &c->first, &c->second};
-    const size_t row = LANES * (values + 2 * RX), counts[] = {
-        size, size, RX * size, RX * size, words, words, LANES * size, LANES * size, LANES * (size_t)w->blocks,
-        LANES * (size_t)w->blocks, row, row, chirps * values, chirps * values, values, values, chirps, chirps, chirps};
-    double **doubles[] = {&w->power, &w->smooth, &w->sums, &w->tones, &c->frequency, &c->found, &c->coherence, &c->sorted,
-                          &c->left, &c->start, &c->turns};
-    const size_t lengths[] = {3 * size, 3 * size, 6 * PARTS * chirps, 5 * chirps, chirps, chirps, chirps, chirps,
-                              PARTS * chirps, chirps, chirps};
+    const size_t chirps = LANES * (size_t)w->groups, values = (size_t)RX * w->blocks, words = (size_t)WORDS * w->n;
+    const size_t size = LANES * (size_t)w->table.size, row = LANES * (values + 2 * RX);
+    take_table(memory, &w->table, w->table.size);
+    w->words = take(memory, chirps * words, sizeof *w->words);
+    float **arrays[] = {&w->chosen, &w->re, &w->im, &w->phase_c, &w->phase_s, &w->row_re, &w->row_im, &w->folded_re,
+                        &w->folded_im, &w->all_re, &w->all_im};
+    const size_t counts[] = {words, size, size, LANES * (size_t)w->blocks, LANES * (size_t)w->blocks, row, row,
+                             chirps * values, chirps * values, values, values};
     for (size_t i = 0; i < sizeof counts / sizeof *counts; i++)
-        *floats[i] = room(memory, &used, counts[i], sizeof(float));
-    for (size_t i = 0; i < sizeof lengths / sizeof *lengths; i++)
-        *doubles[i] = room(memory, &used, lengths[i], sizeof(double));
-    w->words = room(memory, &used, chirps * words, sizeof *w->words);
-    w->silence = room(memory, &used, words, sizeof *w->silence);
-    w->bin = room(memory, &used, size, sizeof *w->bin);
-    w->place = room(memory, &used, size, sizeof *w->place);
-    c->order = room(memory, &used, chirps, sizeof *c->order);
-    c->product = room(memory, &used, chirps, sizeof(Complex));
-    c->found_product = room(memory, &used, chirps, sizeof(Complex));
-    c->taps = room(memory, &used, 3 * chirps, sizeof(Complex));
-    c->usable = room(memory, &used, chirps, 1);
-    c->whole = room(memory, &used, chirps, 1);
-    return used;
-}
-
-/* Compute tables that are the same for all positions. */
-static void prepare(Work *w)
-{
-    roots_of_unity(w->size, w->root_c, w->root_s);
-    for (int i = 0; i < w->size; i++) {
-        w->bin[i] = bin_at(i, w->size);
-        w->place[w->bin[i]] = i;
-    }
-    for (int i = 0; i < RX * w->size; i++) {
-        int root = i % LANES / RX * (w->bin[i / LANES] / FOLD);
-        w->turn_c[i] = w->root_c[root];
-        w->turn_s[i] = w->root_s[root];
-    }
-    for (int p = 0; p <= w->parts; p++)
-        w->edges[p] = p * w->blocks / w->parts;
-    for (int p = 0; p < w->parts; p++)
-        w->part_times[p] = FOLD * (w->edges[p] + w->edges[p + 1] - w->blocks) / 2.0;
+        *arrays[i] = floats(memory, counts[i]);
 }
 
 /* `offsets.align_row` for four RX. words: int16 [position][chirp][sample][2][RX]; valid [position][chirp]; [a, b): linear
-   samples, a whole number of blocks; size: of the transform; filter: sample rate, reach, IF signed, corners (none: no
-   compensation); taps and flat: `decimate.Decimator`. Returns 0, or 1 if there is not enough memory. */
+   samples, a whole number of blocks; size: of the transform; filter: sample rate, reach, IF signed, corners; taps and
+   flat: `decimate.Decimator`. Returns 0, or 1 if there is not enough memory. */
 int NAME(align)(const int16_t *words, const uint8_t *valid, int positions, int chirps, int samples, int a, int b,
                 int size, int full_scale, const double *filter, int corners, const float *taps, const float *flat,
                 float *halves, double *centre, uint8_t *good, double *frequency, double *phase, double *amplitude,
@@ -340,21 +293,26 @@ int NAME(align)(const int16_t *words, const uint8_t *valid, int positions, int c
     const double reach = TURN * filter[1] * FOLD; /* angle of a tap at this distance */
     const Equaliser e = {filter[2] != 0, corners, filter[0], filter[1], 1 / (cos(reach) - 1), 1 / (2 * sin(reach)), filter + 3};
     const int blocks = (b - a) / FOLD;
-    Work w = {.chirps = chirps, .samples = samples, .a = a, .n = b - a, .blocks = blocks, .size = size,
-              .groups = (int)(whole_lanes(chirps) / LANES), .taps = taps, .flat = flat};
-    Chirps c;
-    float *memory = reserve(lay_out(&w, &c, NULL));
-    if (!memory)
+    Work w = {.chirps = chirps, .samples = samples, .a = a, .n = b - a, .blocks = blocks, .table.size = size,
+              .groups = (chirps + LANES - 1) / LANES, .parts = blocks < PARTS ? blocks : PARTS, .taps = taps,
+              .flat = flat};
+    Chirps c = {.usable = {0}};
+    Memory memory = {NULL, 0};
+    lay_out(&w, &memory);
+    if (!reserve(&memory))
         return 1;
-    lay_out(&w, &c, memory);
-    w.parts = blocks < PARTS ? blocks : PARTS;
-    prepare(&w);
+    lay_out(&w, &memory);
+    fill_table(&w.table);
+    for (int p = 0; p < w.parts; p++) {
+        w.edges[p + 1] = (p + 1) * blocks / w.parts;
+        w.part_times[p] = FOLD * (w.edges[p] + w.edges[p + 1] - blocks) / 2.0;
+    }
     for (int p = 0; p < positions; p++) {
         size_t at = (size_t)p * chirps;
         const Aligned out = {halves + 4 * (size_t)p * RX * blocks, centre + p, good + at, frequency + at, phase + at,
                              amplitude + at, gain + at, error + 2 * at, error + 2 * at + chirps, coherence + at, clipped + at};
         align_position(&w, &c, &e, words + at * samples * WORDS, valid + at, full_scale, out);
     }
-    release(memory);
+    free(memory.block);
     return 0;
 }

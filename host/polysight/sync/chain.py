@@ -29,14 +29,15 @@ from polysight.capture import raw_words, row_words, valid_frames
 from polysight.store import CubeRow, RowData, Source
 from polysight.sync import high_pass_filter as hpf
 from polysight.sync import loops
-from polysight.sync.decimate import FOLD, decimator, flatten, fold
-from polysight.sync.loops import Complex, Real, block_edges, block_times, cis, phasor, refine
+from polysight.sync.decimate import FOLD, flatten, fold
+from polysight.sync.loops import Complex, Real, block_edges, block_times, cis, energy_of, phasor, refine
 from polysight.sync.offsets import (
     AlignedRow,
     DirectPath,
     Referenced,
     align_pieces,
     excess_path_m,
+    half_scale,
     prepare,
     reference,
     sweep_of,
@@ -214,8 +215,8 @@ def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bo
         residual[:, 0] * rate,
         residual[:, 1],
         errors(aligned, done, setup.path, rate, setup.examined),
-        noise_power(aligned),
-        _turn_along(done),
+        done.noise,
+        _turn_along(done.samples),
         int(aligned.clipped.sum()),
         int((received & ~aligned.clipped & ~aligned.good).sum()),
         int((aligned.clipped.any(axis=1) & (aligned.clipped == received).all(axis=1)).sum()),
@@ -250,11 +251,9 @@ def _mismatch(frames: int, shape: tuple[int, ...], setup: BoardSetup) -> DataErr
     )
 
 
-def _turn_along(done: Referenced) -> NDArray[np.float64]:
-    """Return `SyncedRow.turn`, from the valid neighbours of each position; 0 without any."""
-    signal = done.halves.sum(axis=1) * done.found[:, None, None]
-    flat = signal.reshape(len(signal), -1)
-    step = np.einsum("pi,pi->p", flat[:-1].conj(), flat[1:])  # from each to the next
+def _turn_along(samples: NDArray[np.complex64]) -> NDArray[np.float64]:
+    """Return `SyncedRow.turn` of samples [rx, position, block], from the valid neighbours; 0 without any."""
+    step = np.vecdot(samples[:, :-1], samples[:, 1:]).sum(axis=0)  # from each position to the next
     return np.angle(np.pad(step, (1, 0)) + np.pad(step, (0, 1)))
 
 
@@ -347,36 +346,25 @@ def errors(
     one = np.stack([*aligned.error[found].swapaxes(0, 1), aligned.amplitude[found] / own[:, None] - 1])[:, good]
 
     two = found & (aligned.good.sum(axis=1) > 1)
-    n = aligned.good[two].sum(axis=1)
-    whole = (n[:, None] / np.stack([(n + 1) // 2, n // 2], axis=1)).astype(np.float32)
+    halves = _referenced_halves(aligned, done, two) * half_scale(aligned.good[two])[..., None, None]
     with np.errstate(divide="ignore", invalid="ignore"):  # dead RX have no direct path: their figures are not finite
         out = {
             "received": received,
             "aligned": one,
-            "averaged": _direct_path_errors(done.halves[found].sum(axis=1), path),
-            "referenced": _object_errors(done.halves[two] * whole[..., None, None], path)
-            if two.any()
-            else np.zeros((3, 0)),
+            "averaged": _direct_path_errors(done.samples[:, found].swapaxes(0, 1), path),
+            "referenced": _object_errors(halves, path) if two.any() else np.zeros((3, 0)),
         }
     for values in out.values():
         values[0] *= sample_rate_hz
     return out
 
 
-def noise_power(aligned: AlignedRow) -> NDArray[np.float64]:
-    """Return the noise power of a sample of one channel of one chirp, [position], NaN with fewer than two chirps."""
-    n = aligned.good.sum(axis=1)
-    parts = np.stack([(n + 1) // 2, n // 2], axis=1)
-    whole = (n[:, None] / np.maximum(parts, 1)).astype(np.float32)[..., None, None]
-    apart = aligned.halves[:, 0] * whole[:, 0] - aligned.halves[:, 1] * whole[:, 1]
-    power = _energy(apart) / (apart.shape[1] * apart.shape[2])
-    return np.where(n > 1, power / decimator().noise / (1 / np.maximum(parts, 1)).sum(axis=1), np.nan)
-
-
-def _energy(signal: NDArray[np.complex64]) -> NDArray[np.float32]:
-    """Return the energy over RX and blocks of signals [position, rx, block]."""
-    parts = np.ascontiguousarray(signal).view(np.float32)
-    return np.einsum("prn,prn->p", parts, parts)
+def _referenced_halves(aligned: AlignedRow, done: Referenced, some: NDArray[np.bool_]) -> NDArray[np.complex64]:
+    """Return the two halves of some positions' bursts, referenced like `samples`, [position, 2, rx, block]."""
+    blocks = aligned.halves.shape[-1]
+    frequency = done.frequency[some] - aligned.centre[some]
+    turn = phasor(-frequency * FOLD, -np.angle(done.amplitude[some]), blocks, (blocks - 1) / 2)
+    return aligned.halves[some] * done.steering * turn[:, None, None]
 
 
 def _direct_path_errors(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
@@ -408,7 +396,7 @@ def _object_errors(halves: NDArray[np.complex64], path: DirectPath) -> NDArray[n
     edges = block_edges(n)
     tone = refine(np.add.reduceat(product, edges[:-1], axis=-1).astype(complex), block_times(edges) * FOLD, steps=2)
     # Amplitudes relative to the mean of both halves.
-    energy, common = np.stack([_energy(echo[:, h]) for h in (0, 1)], axis=1), product.sum(axis=1)
+    energy, common = np.stack([energy_of(echo[:, h]) for h in (0, 1)], axis=1), product.sum(axis=1)
     size = np.abs(energy + np.stack([common, common.conj()], axis=1))
     contrast = (size[:, 0] - size[:, 1]) / np.maximum(size.sum(axis=1), 1e-30)
     # Keep positions whose halves are more coherent than noise would be by chance.

@@ -1,14 +1,15 @@
 """Decimation of chirps: the linear samples, mixed down, become one sample for every block of `FOLD`.
 
 After mixing to the middle of its band, a chirp's signal lies within a few range bins of zero, far below the rate of its
-samples. `fold` weights the samples of each block and its neighbours with a low-pass filter of eight taps. A plain
-average of the block would let echoes from 4 m behind the scene through (-18 dB), which decimation moves into the scene;
-this filter has -43 dB there. It attenuates echoes away from the middle by some per cent. `flatten` undoes this with
-seven taps over the blocks, once for each average. Both together pass 0.45 m of path to either side of the middle within
-4e-5, and 1 m within 5e-4 (published chirp, inner blocks).
+samples. `fold` weights the samples of each block and its neighbours with a low-pass filter of ten taps. A plain average
+of the block would let echoes from 4 m behind the scene through (-18 dB), which decimation moves into the scene; this
+filter has -58 dB there. Noise from there would make images differ from those of all samples, too. It attenuates echoes
+away from the middle by some per cent. `flatten` undoes this with nine taps over the blocks, once for each average. Both
+together pass 0.45 m of path to either side of the middle within 7e-5, and 1 m within 5e-4 (published chirp, inner
+blocks).
 
 The filters are fitted by least squares. The first and last blocks lack neighbours: there `fold` is the plain average,
-and `flatten` has taps of its own for the three blocks at either end.
+and `flatten` has taps of its own for the four blocks at either end.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from numpy.typing import NDArray
 
 FOLD = 4
 """Samples of a block."""
-TAPS = 8
-"""Samples that `fold` weights for a block: two before it, its own, two after it."""
-FLAT = 7
+TAPS = 10
+"""Samples that `fold` weights for a block: three before it, its own, three after it."""
+FLAT = 9
 """Blocks that `flatten` weights."""
 
 _BESIDE = (TAPS - FOLD) // 2
@@ -32,6 +33,9 @@ _EDGE = FLAT // 2
 _PASS = 13 / 192
 # Within this distance of the middle, where the scene is, the filters are ten or twenty times as exact.
 _SCENE = 6 / 192
+
+# Weight of small taps for the first block.
+_SMALL = 0.08
 
 
 class Decimator(NamedTuple):
@@ -42,8 +46,8 @@ class Decimator(NamedTuple):
     taps
         float32 [3, TAPS]: of the first block, of inner ones, of the last block; 0 for samples beyond the ends.
     flat
-        float32 [4, FLAT]: of the first three blocks, over blocks 0 to 6, and of inner ones, over their neighbours. The
-        last three blocks have those of the first in reverse.
+        float32 [5, FLAT]: of the first four blocks, over blocks 0 to 8, and of inner ones, over their neighbours. The
+        last four blocks have those of the first in reverse.
     noise
         Noise power of a sample after both filters, relative to a sample before.
     """
@@ -69,9 +73,11 @@ def decimator() -> Decimator:
         if block < _EDGE:
             passed[:, 0] *= (turns @ first) / (turns @ inner)
         model = weight[:, None] * passed
-        # Real taps: real and imaginary parts are equations of their own.
-        equations, wanted = np.concatenate([model.real, model.imag]), np.concatenate([weight, 0 * weight])
-        flat.append(np.linalg.lstsq(equations, wanted, rcond=None)[0])
+        # Real taps: real and imaginary parts are equations of their own. At the very end, large taps would raise noise.
+        small = (_SMALL if block == 0 else 0) * np.eye(FLAT)
+        equations = np.concatenate([model.real, model.imag, small])
+        goal = np.concatenate([weight, np.zeros(cycles.size + FLAT)])
+        flat.append(np.linalg.lstsq(equations, goal, rcond=None)[0])
     both = np.zeros(FOLD * (FLAT - 1) + TAPS)
     for k, part in enumerate(flat[-1]):
         both[FOLD * k : FOLD * k + TAPS] += part * inner
@@ -124,3 +130,14 @@ def _flat_matrix(blocks: int) -> NDArray[np.float32]:
     for block in range(_EDGE, blocks - _EDGE):
         out[block - _EDGE : block + _EDGE + 1, block] = flat[_EDGE]
     return out
+
+
+def decimation(samples: int, middle: float) -> NDArray[np.complex128]:
+    """Return the decimation of samples whose band has its middle at `middle`, cycles per sample: [block, sample].
+
+    The blocks are turned back, so that an echo keeps its frequency.
+    """
+    time = np.arange(samples) - (samples - 1) / 2
+    mixed = np.diag(np.exp(-2j * np.pi * middle * time)).astype(np.complex64)
+    blocks = flatten(fold(mixed)).T.astype(np.complex128)
+    return blocks * np.exp(2j * np.pi * middle * time.reshape(-1, FOLD).mean(axis=1))[:, None]

@@ -2,7 +2,16 @@
    parts interleaved. */
 #include "signal.h"
 
-#define STEPS 3 /* `loops._STEPS` */
+/* exp(-j 2 pi (frequency FOLD (m - middle) + turns)) for m < blocks. */
+static inline void ramp(double frequency, double turns, int blocks, float *restrict c, float *restrict s)
+{
+    VECTOR
+    for (int m = 0; m < blocks; m++) {
+        Complex z = cis(-frequency * FOLD * (m - (blocks - 1) / 2.0) - turns);
+        c[m] = (float)z.re;
+        s[m] = (float)z.im;
+    }
+}
 
 /* Sum of a position's two halves, [rx][block], times weights, as real part x and imaginary part y. */
 static inline void weighted(const float *restrict halves, const float *restrict weights, int count, float *restrict x,
@@ -17,11 +26,11 @@ static inline void weighted(const float *restrict halves, const float *restrict 
     }
 }
 
-/* Medians of the magnitudes of sixteen spectra of `size` powers, an even number. The bits of positive floats sort like
-   the numbers, so the upper of the two middle values is found bit by bit, by counting smaller ones. */
-static inline void medians(const int32_t *restrict powers, int size, double *restrict median)
+/* Upper medians of the magnitudes of sixteen spectra of `size` powers. The bits of positive floats sort like the numbers,
+   so each is found bit by bit, by counting smaller ones. */
+static inline void medians(const int32_t *restrict powers, int size, int lanes, double *restrict median)
 {
-    int32_t upper[LANES] = {0}, lower[LANES] = {0}, tried[LANES], count[LANES] = {0};
+    int32_t upper[LANES] = {0}, tried[LANES], count[LANES];
     for (int bit = 30; bit >= 0; bit--) {
         for (int k = 0; k < LANES; k++)
             tried[k] = upper[k] | 1 << bit, count[k] = 0;
@@ -31,65 +40,57 @@ static inline void medians(const int32_t *restrict powers, int size, double *res
         for (int k = 0; k < LANES; k++)
             upper[k] = count[k] <= size / 2 ? tried[k] : upper[k];
     }
-    memset(count, 0, sizeof count);
-    for (int i = 0; i < size; i++)
-        for (int k = 0; k < LANES; k++) {
-            int32_t power = powers[LANES * i + k], below = power < upper[k];
-            count[k] += below;
-            lower[k] = below && power > lower[k] ? power : lower[k];
-        }
-    for (int k = 0; k < LANES; k++) {
-        float one, other;
-        memcpy(&one, count[k] == size / 2 ? &lower[k] : &upper[k], sizeof one);
-        memcpy(&other, &upper[k], sizeof other);
-        median[k] = (sqrt(one) + sqrt(other)) / 2;
+    for (int k = 0; k < lanes; k++) {
+        float power;
+        memcpy(&power, &upper[k], sizeof power);
+        median[k] = sqrt(power);
     }
 }
 
-/* `NumpyLoops.search` for one spectrum: power [size]. */
-static void choose_peaks(const float *power, int size, int nearest, int farthest, float comparable, int32_t *first,
-                         int32_t *second)
+/* `NumpyLoops.search` for one spectrum, strongest at the bin top. */
+static inline void choose_peaks(const Table *t, const float *re, const float *im, int top, int nearest, int farthest,
+                                double comparable, int32_t *first, int32_t *second)
 {
-    int top = 0, lower = -1;
-    float best = 0;
-    for (int i = 1; i < size; i++)
-        top = power[i] > power[top] ? i : top;
+    const int last = t->size - 1;
+    int lower = top;
+    double best = 0;
     for (int d = nearest; d <= farthest; d++) {
-        int i = (top - d) & (size - 1);
-        float value = power[i];
-        if (value > best && value >= power[(i + size - 1) & (size - 1)] && value >= power[(i + 1) & (size - 1)]) {
+        double value = magnitude(value_at(re, im, t->place[(top - d) & last]));
+        int is_peak = value >= magnitude(value_at(re, im, t->place[(top - d - 1) & last])) &&
+                      value >= magnitude(value_at(re, im, t->place[(top - d + 1) & last]));
+        if (is_peak && value > best) {
             best = value;
-            lower = i;
+            lower = (top - d) & last;
         }
     }
-    lower = lower < 0 ? top : lower;
-    int is_object = best > comparable * comparable * power[top];
+    int is_object = best > comparable * magnitude(value_at(re, im, t->place[top]));
     *first = is_object ? lower : top;
     *second = is_object ? top : lower;
 }
 
-/* `NumpyLoops.search`. halves: [position][2][rx][block]; weights [rx][block]: beam, steering and window; the
-   object is nearest..farthest bins above the direct path. Results: bins [2][position], median magnitude [position].
-   Returns 0, or 1 if there is not enough memory. */
-int NAME(search)(const float *halves, const float *weights, int positions, int blocks, int size, int nearest,
-                 int farthest, const double *comparable, int32_t *bins, double *median)
+/* `NumpyLoops.search`. halves: [position][2][rx][block]; weights [rx][block]: beam, steering and window;
+   preference [bin]; the object is nearest..farthest bins above the direct path. Results: bins [2][position], median
+   magnitude [position]. Returns 0, or 1 if there is not enough memory. */
+int NAME(search)(const float *halves, const float *weights, const float *preference, int positions, int blocks,
+                 int size, int nearest, int farthest, const double *comparable, int32_t *bins, double *median)
 {
-    int count = RX * blocks;
-    float *memory = reserve((size_t)(3 * LANES + 5) * size + 2 * (size_t)count + 64);
-    if (!memory)
+    const int count = RX * blocks;
+    Memory memory = {NULL, 0};
+    Table table;
+    take_table(&memory, &table, size);
+    memory.used += sizeof(float) * (size_t)(2 * count + 3 * LANES * size);
+    if (!reserve(&memory))
         return 1;
-    float *re = memory, *im = re + LANES * size, *c = im + LANES * size, *s = c + size, *power = s + size;
-    float *x = power + size, *y = x + count, *nearer = y + count;
-    int32_t *bin = (int32_t *)(nearer + size), *bits = bin + size;
-    roots_of_unity(size, c, s);
-    for (int i = 0; i < size; i++) {
-        bin[i] = bin_at(i, size);
-        double turn = TURN / 2 * (bin[i] < size / 2 ? bin[i] : bin[i] - size) / size, part = turn == 0 ? 1 : sin(turn) / turn;
-        nearer[i] = (float)(part * part);
-    }
+    take_table(&memory, &table, size);
+    float *re = floats(&memory, LANES * (size_t)size), *im = floats(&memory, LANES * (size_t)size);
+    float *power = floats(&memory, LANES * (size_t)size);
+    float *x = floats(&memory, 2 * (size_t)count), *y = x + count;
+    fill_table(&table);
     for (int first = 0; first < positions; first += LANES) {
         int lanes = positions - first < LANES ? positions - first : LANES;
-        memset(re, 0, sizeof *re * 2 * LANES * size);
+        int32_t at[LANES];
+        memset(re, 0, sizeof *re * LANES * size);
+        memset(im, 0, sizeof *im * LANES * size);
         for (int k = 0; k < lanes; k++) {
             weighted(halves + 4 * (size_t)(first + k) * count, weights, count, x, y);
             for (int m = 0; m < blocks; m++) {
@@ -97,21 +98,21 @@ int NAME(search)(const float *halves, const float *weights, int positions, int b
                 im[LANES * m + k] = (y[m] + y[blocks + m]) + (y[2 * blocks + m] + y[3 * blocks + m]);
             }
         }
-        transform(re, im, size, c, s, size);
-        for (int i = 0; i < LANES * size; i++)
-            re[i] = re[i] * re[i] + im[i] * im[i];
-        double middle[LANES];
-        memcpy(bits, re, sizeof *bits * LANES * size);
-        medians(bits, size, middle);
+        transform(re, im, size, &table);
+        for (int i = 0; i < LANES * size; i++) {
+            float weight = preference[table.bin[i / LANES]];
+            power[i] = re[i] * re[i] + im[i] * im[i];
+            re[i] *= weight;
+            im[i] *= weight;
+        }
+        medians((int32_t *)power, size, lanes, median + first);
+        strongest(re, im, size, at);
         for (int k = 0; k < lanes; k++) {
-            int p = first + k;
-            for (int i = 0; i < size; i++)
-                power[bin[i]] = re[LANES * i + k] * nearer[i];
-            choose_peaks(power, size, nearest, farthest, (float)*comparable, bins + p, bins + positions + p);
-            median[p] = middle[k];
+            int32_t *peak = bins + first + k;
+            choose_peaks(&table, re + k, im + k, table.bin[at[k]], nearest, farthest, *comparable, peak, peak + positions);
         }
     }
-    release(memory);
+    free(memory.block);
     return 0;
 }
 
@@ -119,7 +120,7 @@ int NAME(search)(const float *halves, const float *weights, int positions, int b
 static void estimate_at(const float *g_re, const float *g_im, int rows, int blocks, double frequency, float *c, float *s,
                         Complex *estimate)
 {
-    ramp(frequency, 0, FOLD, FOLD * (blocks - 1) / 2.0, blocks, c, s);
+    ramp(frequency, 0, blocks, c, s);
     for (int k = 0; k < rows; k++) {
         const float *re = g_re + k * blocks, *im = g_im + k * blocks;
         float x = 0, y = 0;
@@ -131,34 +132,39 @@ static void estimate_at(const float *g_re, const float *g_im, int rows, int bloc
     }
 }
 
-/* `NumpyLoops.refine`: steering [rx][block], estimator [row][rx][block]; changes frequency [position]. */
-int NAME(refine)(const float *halves, const float *steering, const float *estimator, int positions, int blocks, int rows,
-                 double *frequency, double *estimates, double *steps)
+/* Add (e + j f) (x + j y) to re + j im. */
+static inline void add_products(const float *restrict e, const float *restrict f, const float *restrict x,
+                                const float *restrict y, int count, float *restrict re, float *restrict im)
 {
-    int count = RX * blocks;
-    double reach = 1.0 / (blocks * FOLD);
-    float *memory = reserve((size_t)2 * count + (size_t)(2 * rows + 2) * blocks + 64);
-    if (!memory)
+    VECTOR
+    for (int m = 0; m < count; m++) {
+        re[m] += e[m] * x[m] - f[m] * y[m];
+        im[m] += e[m] * y[m] + f[m] * x[m];
+    }
+}
+
+/* `NumpyLoops.refine`: steering [rx][block], estimator [row][2][rx][block], real and imaginary part; changes frequency
+   [position]. */
+int NAME(refine)(const float *halves, const float *steering, const float *estimator, int positions, int blocks, int rows,
+                 int count_steps, double *frequency, double *estimates, double *steps)
+{
+    const int count = RX * blocks;
+    const double reach = 1.0 / (blocks * FOLD);
+    Memory memory = {NULL, 2 * sizeof(float) * ((size_t)count + rows * blocks + blocks)};
+    if (!reserve(&memory))
         return 1;
-    float *x = memory, *y = x + count, *re = y + count, *im = re + rows * blocks, *c = im + rows * blocks;
-    float *s = c + blocks + 16;
+    float *x = (float *)memory.block, *y = x + count, *re = y + count, *im = re + rows * blocks;
+    float *c = im + rows * blocks, *s = c + blocks;
     for (int p = 0; p < positions; p++) {
         Complex *estimate = (Complex *)(estimates + 2 * (size_t)p * rows);
         weighted(halves + 4 * (size_t)p * count, steering, count, x, y);
         memset(re, 0, sizeof *re * 2 * rows * blocks);
-        for (int k = 0; k < rows; k++)
-            for (int r = 0; r < RX; r++) {
-                const float *e = estimator + 2 * (k * count + r * blocks), *u = x + r * blocks, *v = y + r * blocks;
-                float *to_re = re + k * blocks, *to_im = im + k * blocks;
-                VECTOR
-                for (int m = 0; m < blocks; m++) {
-                    to_re[m] += e[2 * m] * u[m] - e[2 * m + 1] * v[m];
-                    to_im[m] += e[2 * m] * v[m] + e[2 * m + 1] * u[m];
-                }
-            }
-        steps[p] = 0;
+        for (int i = 0; i < rows * RX; i++) { /* the same demodulation for all RX: sum over them first */
+            const float *e = estimator + (i / RX * 2 * RX + i % RX) * blocks, *f = e + count;
+            add_products(e, f, x + i % RX * blocks, y + i % RX * blocks, blocks, re + i / RX * blocks, im + i / RX * blocks);
+        }
         estimate_at(re, im, rows, blocks, frequency[p], c, s, estimate);
-        for (int i = 0; i < STEPS; i++) {
+        for (int i = 0; i < count_steps; i++) {
             Complex a = estimate[0], aw = estimate[1];
             double size = a.re * a.re + a.im * a.im;
             double step = size > 0 ? (aw.re * a.re + aw.im * a.im) / size / TURN : 0;
@@ -167,45 +173,40 @@ int NAME(refine)(const float *halves, const float *steering, const float *estima
             estimate_at(re, im, rows, blocks, frequency[p], c, s, estimate);
         }
     }
-    release(memory);
+    free(memory.block);
     return 0;
 }
 
-/* Complex values times complex weights times c + j s. */
-static inline void turned(const float *restrict values, const float *restrict weights, const float *restrict c,
-                          const float *restrict s, int count, float *restrict out)
-{
-    VECTOR
-    for (int n = 0; n < count; n++) {
-        float a = weights[2 * n] * c[n] - weights[2 * n + 1] * s[n], b = weights[2 * n] * s[n] + weights[2 * n + 1] * c[n];
-        out[2 * n] = values[2 * n] * a - values[2 * n + 1] * b;
-        out[2 * n + 1] = values[2 * n] * b + values[2 * n + 1] * a;
-    }
-}
-
-/* `NumpyLoops.turn`: halves [position][2][RX][block], steering [RX][block], phase in turns; their sum to out
-   [RX][position][block]. */
+/* `NumpyLoops.turn`: halves [position][2][RX][block], steering [RX][block], phase in turns, scale [position][2]; the sum
+   to out [RX][position][block], the energy of the scaled halves' difference to apart [position]. */
 int NAME(turn)(const float *halves, const float *steering, int positions, int blocks, const double *frequency,
-               const double *phase, const uint8_t *found, float *out, float *halves_out)
+               const double *phase, const uint8_t *found, const float *scale, float *out, float *apart)
 {
-    float *memory = reserve((size_t)2 * blocks + 64);
-    if (!memory)
+    const int count = RX * blocks;
+    Memory memory = {NULL, 2 * sizeof(float) * ((size_t)count + blocks)};
+    if (!reserve(&memory))
         return 1;
-    float *c = memory, *s = c + blocks + 16;
+    float *x = (float *)memory.block, *y = x + count, *c = y + count, *s = c + blocks;
     for (int p = 0; p < positions; p++) {
-        const size_t values = (size_t)2 * RX * blocks, at = 2 * values * p;
-        float *one = halves_out + at, *other = one + values;
-        ramp(frequency[p], phase[p], FOLD, FOLD * (blocks - 1) / 2.0, blocks, c, s);
-        for (int m = 0; m < blocks && !found[p]; m++)
-            c[m] = s[m] = 0;
-        for (int i = 0; i < 2 * RX; i++)
-            turned(halves + at + 2 * i * blocks, steering + 2 * (i % RX) * blocks, c, s, blocks, one + 2 * i * blocks);
+        const float *first = halves + 4 * (size_t)p * count, *second = first + 2 * count;
+        float energy = 0;
+        for (int i = 0; i < 2 * count; i++) {
+            float difference = scale[2 * p] * first[i] - scale[2 * p + 1] * second[i];
+            energy += difference * difference;
+        }
+        apart[p] = energy;
+        ramp(frequency[p], phase[p], blocks, c, s);
+        weighted(first, steering, count, x, y);
         for (int r = 0; r < RX; r++) {
-            float *to = out + 2 * ((size_t)r * positions + p) * blocks;
-            for (int i = 0; i < 2 * blocks; i++)
-                to[i] = one[2 * r * blocks + i] + other[2 * r * blocks + i];
+            const float *re = x + r * blocks, *im = y + r * blocks;
+            float *restrict to = out + 2 * ((size_t)r * positions + p) * blocks;
+            VECTOR
+            for (int m = 0; m < blocks; m++) {
+                to[2 * m] = found[p] ? re[m] * c[m] - im[m] * s[m] : 0;
+                to[2 * m + 1] = found[p] ? re[m] * s[m] + im[m] * c[m] : 0;
+            }
         }
     }
-    release(memory);
+    free(memory.block);
     return 0;
 }

@@ -30,16 +30,13 @@ from polysight.sync.decimate import FOLD, decimator, flatten, fold
 CHUNK = 8
 """Positions per chunk: the working set fits in the second-level cache."""
 
-BAND_BINS = 9
-"""Width in IF bins of the signal's band: direct path and object lie within it."""
-
 RX = 4
 """Number of RX that the compiled loops support."""
 
 # Blocks of a record whose sums the Newton steps of `refine` use.
 _BLOCKS = 8
-# Gauss-Newton steps to the frequency of the direct path.
-_STEPS = 3
+MOST_CHIRPS = 256
+"""Chirps of a burst that the compiled loops support."""
 
 _log = logging.getLogger(__name__)
 _lock = threading.Lock()
@@ -164,9 +161,7 @@ def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
     top = np.argmax(spectrum.real**2 + spectrum.imag**2, axis=-1)
     every = np.arange(len(spectrum))
     left, at, right = (spectrum[every, (top + d) % size] for d in (-1, 0, 1))
-    below, peak, above = np.abs(left), np.abs(at), np.abs(right)
-    bend = below - 2 * peak + above
-    part = np.divide(0.5 * (below - above), bend, out=np.zeros(len(top)), where=bend < 0)
+    part = peak_between(np.abs(left), np.abs(at), np.abs(right))
     whole = np.where(top < size // 2, top, top - size) / size
     # The transform of a symmetrical window is real, so the phase of the bin is that of the tone at the centre.
     amplitude = at * cis(2 * np.pi * whole * (samples - 1) / 2)
@@ -208,26 +203,41 @@ def match(
     amplitude
         complex128 [position, chirp]: the tone's sum over RX and linear samples, at their middle.
     centre
-        float64 [position]: middle of the band of the reference chirp, cycles per sample 0..1: maximum of the power
-        spectrum of all RX after three passes of a box filter of half `BAND_BINS`.
+        float64 [position]: middle of the band of the reference chirp, from :func:`find_band`.
     energy
         float32 [position, chirp], over RX and linear samples.
     """
     inside = _complex(words[:, :, slice(*linear)])
-    positions, chirps, rx, n = inside.shape
+    positions, chirps, _, n = inside.shape
     size = search_size(n)
-    chosen = np.zeros((positions, rx, size), np.complex64)
-    chosen[..., :n] = inside[np.arange(positions), reference]
+    chosen = inside[np.arange(positions), reference]
     products = np.zeros((positions, chirps, size), np.complex64)
-    products[..., :n] = (inside * chosen[:, None, :, :n].conj()).sum(axis=2)
+    products[..., :n] = (inside * chosen[:, None].conj()).sum(axis=2)
     tone = strongest(products, n)
-
-    spectrum: NDArray[np.complex64] = np.asarray(scipy.fft.fft(chosen, axis=-1))
-    power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1)
-    for _ in range(3):  # nearly Gaussian: two tones give one peak between them
-        power = scipy.ndimage.uniform_filter1d(power, BAND_BINS * size // n // 2, axis=-1, mode="wrap")
     energy = (inside.real**2 + inside.imag**2).sum(axis=(2, 3))
-    return tone.frequency, tone.amplitude.astype(complex), np.argmax(power, axis=-1) / size, energy
+    return tone.frequency, tone.amplitude.astype(complex), find_band(chosen), energy
+
+
+def find_band(chirps: NDArray[np.complex64]) -> NDArray[np.float64]:
+    """Return the middle of the signal's band in chirps [position, rx, sample], cycles per sample 0..1.
+
+    The power spectra of the quarters of a chirp, summed over the RX and smoothed, show direct path and object as one
+    peak: a quarter resolves four range bins. A parabola through its top gives the middle.
+    """
+    positions, rx, n = chirps.shape
+    size = search_size(n) // 4
+    spectra: NDArray[np.complex64] = np.asarray(scipy.fft.fft(chirps.reshape(positions, rx, 4, n // 4), size, axis=-1))
+    power = (spectra.real**2 + spectra.imag**2).sum(axis=(1, 2))
+    smooth = np.roll(power, 1, axis=-1) + 2 * power + np.roll(power, -1, axis=-1)
+    top = np.argmax(smooth, axis=-1)
+    below, middle, above = (smooth[np.arange(positions), (top + d) % size] for d in (-1, 0, 1))
+    return (top + peak_between(below, middle, above)) / size % 1.0
+
+
+def peak_between(below: Real, middle: Real, above: Real) -> NDArray[np.float64]:
+    """Return the place of the maximum between three values, relative to the middle one, by a parabola."""
+    bend = below.astype(np.float64) - 2 * middle + above
+    return np.divide(0.5 * (below - above), bend, out=np.zeros(bend.shape), where=bend < 0)
 
 
 def reduce_chirps(
@@ -342,6 +352,18 @@ def _complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
     return out
 
 
+@lru_cache(maxsize=4)
+def _preference(size: int) -> NDArray[np.float32]:
+    """Return factors of a spectrum's bins: of equal peaks, as of a cupboard, that nearer the band's middle counts."""
+    return np.sinc(np.fft.fftfreq(size)).astype(np.float32)
+
+
+def energy_of(signal: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Return the energy over RX and blocks of signals [position, rx, block]."""
+    parts = np.ascontiguousarray(signal).view(np.float32)
+    return np.einsum("prn,prn->p", parts, parts)
+
+
 class NumpyLoops:
     """Loops over positions that find the direct path; the same methods as :class:`Library`.
 
@@ -380,14 +402,12 @@ class NumpyLoops:
         bins
             int32 [2, position]: direct path, and second candidate.
         median
-            float64 [position]: median magnitude of the spectrum.
+            float64 [position]: upper median of the spectrum's magnitude.
         """
         beamed = np.einsum("rn,prn->pn", weights, halves[:, 0] + halves[:, 1])
         spectrum = np.abs(np.asarray(scipy.fft.fft(beamed, size, axis=-1)))
-        # The mean of the middle two is the median, ten times as fast.
-        middle = np.sort(spectrum, axis=-1)[:, size // 2 - 1 : size // 2 + 1]
-        # Of equal peaks, as of a cupboard, the one closer to the middle of the band is preferred.
-        spectrum *= np.sinc(np.fft.fftfreq(size)).astype(np.float32)
+        median = np.sort(spectrum, axis=-1)[:, size // 2].astype(np.float64)
+        spectrum *= _preference(size)
         rows = np.arange(len(beamed))
         top = np.argmax(spectrum, axis=-1)
         below = top[:, None] - np.arange(object_bins[0], object_bins[1] + 1)
@@ -399,7 +419,7 @@ class NumpyLoops:
         best = np.argmax(values, axis=-1)
         lower = np.where(values[rows, best] > 0, below[rows, best] % size, top)
         is_object = values[rows, best] > comparable * spectrum[rows, top]
-        return np.where(is_object, [lower, top], [top, lower]).astype(np.int32), middle.mean(axis=-1).astype(np.float64)
+        return np.where(is_object, [lower, top], [top, lower]).astype(np.int32), median
 
     @staticmethod
     def refine(
@@ -407,6 +427,7 @@ class NumpyLoops:
         steering: NDArray[np.complex64],
         estimator: NDArray[np.complex64],
         frequency: NDArray[np.float64],
+        steps: int,
     ) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64]]:
         """Refine frequencies by Gauss-Newton steps.
 
@@ -422,6 +443,8 @@ class NumpyLoops:
             complex64 [2 or 3, rx * block]: see `offsets.DirectPath`.
         frequency
             [position]: starting values.
+        steps
+            Number of steps.
 
         Returns
         -------
@@ -436,7 +459,7 @@ class NumpyLoops:
             return np.einsum("pkn,pn->pk", g, phasor(-frequency * FOLD, zero, n, (n - 1) / 2)).astype(complex)
 
         estimate = estimate_at(frequency)
-        for _ in range(_STEPS):
+        for _ in range(steps):
             amplitude = np.where(estimate[:, 0] != 0, estimate[:, 0], np.inf)
             step = np.clip(np.real(estimate[:, 1] / amplitude) / (2 * np.pi), -reach, reach)
             frequency = frequency + step
@@ -450,28 +473,32 @@ class NumpyLoops:
         frequency: NDArray[np.float64],
         phase: NDArray[np.float64],
         found: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+        scale: NDArray[np.float32],
+    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """Apply the steering and remove frequency and phase of the direct path from a row.
 
         Parameters
         ----------
         halves
-            Both halves of the averages.
+            Both halves of the averages; they are added.
         steering
             complex64 [rx, block].
         frequency, phase
             [position], cycles per sample; radians at the middle of the linear samples.
         found
             bool [position]: other positions become zero.
+        scale
+            float32 [position, 2]: factors that make each half an average of its chirps.
 
         Returns
         -------
-        The averages complex64 [rx, position, block], and the halves.
+        The averages complex64 [rx, position, block], and the energy of the scaled halves' difference [position].
         """
         n = halves.shape[-1]
         turn = phasor(-frequency * FOLD, -phase, n, (n - 1) / 2) * found[:, None]
-        turned = (halves * steering * turn[:, None, None]).astype(np.complex64)
-        return np.ascontiguousarray((turned[:, 0] + turned[:, 1]).swapaxes(0, 1)), turned
+        turned = (halves[:, 0] + halves[:, 1]) * steering * turn[:, None]
+        apart = complex64(halves[:, 0] * scale[:, 0, None, None] - halves[:, 1] * scale[:, 1, None, None])
+        return complex64(turned.swapaxes(0, 1)), energy_of(apart)
 
 
 class LoadError(Exception):
@@ -522,7 +549,7 @@ class Library:
         """Align positions into the fields of an `offsets.AlignedRow`; parameters as in `offsets.align_in_numpy`."""
         positions, chirps, samples, _, _ = words.shape
         a, b = linear
-        filters = [0.0, 0.0, 0.0]
+        filters = [1.0, 1 / 8 / FOLD, 0.0]
         if equaliser is not None:
             filters = [equaliser.sample_rate_hz, equaliser.reach, equaliser.signed, *equaliser.model.corners_hz]
         self._call(
@@ -545,7 +572,7 @@ class Library:
         positions, blocks = halves.shape[0], halves.shape[-1]
         bins, median = np.empty((2, positions), np.int32), np.empty(positions)
         sizes = positions, blocks, size, *object_bins
-        self._call("search", halves, weights, *sizes, np.array([comparable]), bins, median)
+        self._call("search", halves, weights, _preference(size), *sizes, np.array([comparable]), bins, median)
         return bins, median
 
     def refine(
@@ -554,11 +581,13 @@ class Library:
         steering: NDArray[np.complex64],
         estimator: NDArray[np.complex64],
         frequency: NDArray[np.float64],
+        steps: int,
     ) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64]]:
         """See `NumpyLoops.refine`."""
         positions, blocks, rows = halves.shape[0], halves.shape[-1], len(estimator)
         found, estimate, step = frequency.copy(), np.empty((positions, rows), complex), np.empty(positions)
-        self._call("refine", halves, steering, estimator, positions, blocks, rows, found, estimate, step)
+        parts = np.stack([estimator.real, estimator.imag], axis=1)
+        self._call("refine", halves, steering, parts, positions, blocks, rows, steps, found, estimate, step)
         return found, estimate, step
 
     def turn(
@@ -568,13 +597,14 @@ class Library:
         frequency: NDArray[np.float64],
         phase: NDArray[np.float64],
         found: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+        scale: NDArray[np.float32],
+    ) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
         """See `NumpyLoops.turn`."""
         positions, _, rx, blocks = halves.shape
-        out, turned = np.empty((rx, positions, blocks), np.complex64), np.empty_like(halves)
+        out, apart = np.empty((rx, positions, blocks), np.complex64), np.empty(positions, np.float32)
         turns = phase / (2 * np.pi)
-        self._call("turn", halves, steering, positions, blocks, frequency, turns, found, out, turned)
-        return out, turned
+        self._call("turn", halves, steering, positions, blocks, frequency, turns, found, scale, out, apart)
+        return out, apart
 
     def _call(self, name: str, *arguments: NDArray[Any] | float) -> None:
         """Call a loop with arrays as pointers and numbers as int. Raises MemoryError."""

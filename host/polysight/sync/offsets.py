@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 
 from polysight.sync import high_pass_filter as hpf
 from polysight.sync import loops
-from polysight.sync.decimate import FOLD
+from polysight.sync.decimate import FOLD, decimator
 from polysight.sync.loops import Library, NumpyLoops, Real, Tone, cis, complex64
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
@@ -73,6 +73,9 @@ _SPREAD_M = 0.1
 _GAIN_SPREAD = 0.3
 # Noise power of a sample relative to an echo as strong as the direct path.
 _NOISE = 1e-2
+# Gauss-Newton steps from the peak of a spectrum; and those when only the drift has been removed since.
+_FIRST_STEPS = 3
+_LAST_STEPS = 2
 # A second peak this strong, one object distance below the first, is the direct path.
 _COMPARABLE = 0.35
 # Smallest amplitude of a direct path, relative to the row's median.
@@ -187,7 +190,7 @@ def align_pieces(
         here = slice(done, done + len(words))
         if words.shape[:2] != valid[here].shape:
             raise ValueError(f"bursts {words.shape[:2]} at position {done} of {valid.shape}")
-        align = by or _choose_loop(words.shape[-1])
+        align = by or _choose_loop(words.shape[1], words.shape[-1])
         align(words, valid[here], linear, equaliser, full_scale, row.part(here))
         done = here.stop
     if row is None or done != len(valid):
@@ -195,8 +198,9 @@ def align_pieces(
     return row
 
 
-def _choose_loop(rx: int) -> Align:
-    library = loops.library() if rx == loops.RX else None
+def _choose_loop(chirps: int, rx: int) -> Align:
+    is_supported = rx == loops.RX and chirps <= loops.MOST_CHIRPS
+    library = loops.library() if is_supported else None
     return library.align if library else align_in_numpy
 
 
@@ -351,7 +355,7 @@ def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
 def _against_one(
     words: NDArray[np.int16], whole: NDArray[np.bool_], linear: tuple[int, int]
 ) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Estimate offsets relative to one chirp per position; try another one if it is unusable or matches few others.
+    """Estimate offsets relative to one usable chirp per position; try another one if it matches few others.
 
     Returns the offsets, the middle of the signal's band [position], and [position, chirp]: coherence with the reference
     chirp, and usable chirps (whole, not silent).
@@ -359,31 +363,28 @@ def _against_one(
     positions, chirps = whole.shape
     # Threshold for two records of noise: four times the RMS of a sum of random phases.
     noise = 4.0 / np.sqrt(words.shape[-1] * (linear[1] - linear[0]))
-    order = np.argsort(~whole, axis=1, kind="stable")  # the whole ones, first to last
-    reference, todo, every = order[:, 0], np.arange(positions), np.arange(positions)
+    usable = whole & words.any(axis=(2, 3, 4))
+    count = usable.sum(axis=1)
+    order = np.argsort(~usable, axis=1, kind="stable")  # the usable ones, first to last
+    reference, every = order[:, 0].copy(), np.arange(positions)
     frequency, amplitude, centre = np.zeros(whole.shape), np.zeros(whole.shape, complex), np.zeros(positions)
-    coherence, usable = np.zeros(whole.shape), whole
-    best_sum = np.full(positions, -1.0)
+    coherence, best_sum = np.zeros(whole.shape), np.full(positions, -1.0)
+    todo = np.flatnonzero(count)
     for attempt in range(min(_REFERENCES, chirps)):
+        if todo.size == 0:
+            break
         tried = order[todo, attempt]
-        offset, product, middle, energy = loops.match(words if attempt == 0 else words[todo], tried, linear)
-        if attempt == 0:
-            usable = whole & (energy > 0)
-            rank = np.where(usable, 1, 2)
-            rank[every, tried] = 0
-            order = np.argsort(rank, axis=1, kind="stable")  # the one tried, then the usable ones
+        offset, product, middle, energy = loops.match(words[todo], tried, linear)
         at = np.arange(todo.size), tried
         c = np.abs(product) / np.sqrt(np.maximum(energy * energy[at][:, None], 1e-30)) * usable[todo]
         c[at] = 0  # a chirp always matches itself
-        total = np.where(usable[todo, tried], c.sum(axis=1), -1.0)
-        better = total >= best_sum[todo]
+        total = c.sum(axis=1)
+        better = total > best_sum[todo]
         won = todo[better]
         reference[won], coherence[won], best_sum[won] = tried[better], c[better], total[better]
         frequency[won], amplitude[won], centre[won] = offset[better], product[better], middle[better]
-        count, matching = usable[todo].sum(axis=1), (c > noise).sum(axis=1)
-        todo = todo[(count > 0) & (~usable[todo, tried] | (2 * matching < count - 1))]
-        if todo.size == 0:
-            break
+        matching = (c > noise).sum(axis=1)
+        todo = todo[(2 * matching < count[todo] - 1) & (attempt + 1 < count[todo])]
     best = coherence.max(axis=1)
     coherence[every, reference] = np.where(usable[every, reference], best, 0)  # as good as its best match
     return Tone(frequency, amplitude), centre, coherence, usable
@@ -456,8 +457,10 @@ class Referenced(NamedTuple):
         bool [position]: False without a credible direct path.
     drift
         IF drift of the row, radians per sample squared.
-    halves
-        complex64 [position, 2, rx, block]: the two halves of the burst, referenced like `samples`.
+    noise
+        float64 [position]: noise power of a sample of one channel of one chirp, NaN with fewer than two good chirps.
+    steering
+        complex64 [rx, block]: what aligned averages were multiplied by, beside their turn; without the drift.
     """
 
     samples: NDArray[np.complex64]
@@ -465,7 +468,8 @@ class Referenced(NamedTuple):
     amplitude: NDArray[np.complex128]
     found: NDArray[np.bool_]
     drift: float
-    halves: NDArray[np.complex64]
+    noise: NDArray[np.float64]
+    steering: NDArray[np.complex64]
 
 
 def excess_path_m(
@@ -559,11 +563,11 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     peaks = ((bins + _FFT // 2) % _FFT - _FFT // 2) / _FFT / FOLD
     floor = median**2 / np.log(2) / (window**2).sum()  # from the median bin, for tones fill few bins
     three, two = complex64(path.drift_estimator), complex64(path.estimator)
-    frequency, estimate, _ = run.refine(aligned.halves, path.folded_steering, three, peaks[0])
+    frequency, estimate, _ = run.refine(aligned.halves, path.folded_steering, three, peaks[0], _FIRST_STEPS)
     drifts = _ratio(estimate[:, 2], estimate[:, 0])[usable]
     drift = float(np.median(drifts)) if usable.any() else 0.0
     flat = complex64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
-    frequency, estimate, step = run.refine(aligned.halves, flat, two, frequency)
+    frequency, estimate, step = run.refine(aligned.halves, flat, two, frequency, _LAST_STEPS)
     _try_others(aligned.halves, peaks, usable, (run, flat, two), frequency, estimate, step)
 
     # An IF outside the receiver's band is an alias; if the last step is large, no tone was found.
@@ -581,8 +585,20 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     if found.any():
         found &= strength > _LOST * np.median(strength[found])
 
-    samples, halves = run.turn(aligned.halves, flat, frequency, np.angle(amplitude), found)
-    return Referenced(samples, heard, amplitude, found, drift, halves)
+    scale = half_scale(aligned.good)
+    samples, apart = run.turn(aligned.halves, flat, frequency, np.angle(amplitude), found, scale)
+    # A half of k of the K good chirps was scaled by K / k, so its noise is that of a chirp divided by k.
+    two = aligned.good.sum(axis=1) > 1
+    noise_power = np.full(len(two), np.nan)
+    noise_power[two] = (apart * chirps / (len(path.beam) * n) / decimator().noise)[two] / scale[two].sum(axis=1)
+    return Referenced(samples, heard, amplitude, found, drift, noise_power, flat)
+
+
+def half_scale(good: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return the factors that make each half an average of its own chirps, float32 [position, 2]."""
+    count = good.sum(axis=1)
+    halves = np.stack([(count + 1) // 2, count // 2], axis=1)
+    return (count[:, None] / np.maximum(halves, 1)).astype(np.float32)
 
 
 def _try_others(
@@ -606,7 +622,7 @@ def _try_others(
     if odd.size == 0:
         return
     run, steering, estimator = how
-    other = run.refine(halves[odd], steering, estimator, peaks[1, odd])
+    other = run.refine(halves[odd], steering, estimator, peaks[1, odd], _FIRST_STEPS)
     other_level = np.log(np.maximum(np.abs(other[1][:, 0]), 1e-30))
     better = np.abs(other_level - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
     for whole, part in zip(found, other, strict=True):

@@ -1,83 +1,36 @@
 /* Passes over the words of a burst, `loops.py` in C, for one position at a time. Words are int16 [chirp][sample][2][RX].
 
-   Chirps lie side by side, LANES to a group: value LANES i + k of a group is value i of its chirp k. So all loops run over
-   chirps that need the same operations, no sum crosses lanes until chirps are averaged, and words are used as they are:
-   `counts` converts them in registers. */
+   Chirps lie side by side, LANES to a group. So loops run over chirps that need the same operations, no sum crosses lanes
+   until chirps are averaged, and words are used as they are: `counts` converts them in registers. */
 #ifndef PASSES_H
 #define PASSES_H
 
 #include "signal.h"
 
-#define BAND_BINS 9 /* `loops.BAND_BINS` */
 #define PARTS 8     /* `loops._BLOCKS` */
-#define TAPS 8      /* `decimate.TAPS` */
-#define FLAT 7      /* `decimate.FLAT` */
+#define TAPS 10     /* `decimate.TAPS` */
+#define FLAT 9      /* `decimate.FLAT` */
 #define BESIDE ((TAPS - FOLD) / 2)
 #define WORDS (2 * RX) /* of a sample */
-
-/* As many floats as the processor handles at once: a part of LANES. Compilers do well with these vectors, except for the
-   conversion of words, and sums of products, which `-fassociative-math` takes apart. */
-#define STEP (WIDTH / 32)
-typedef float Vector __attribute__((vector_size(WIDTH / 8), aligned(4), may_alias));
-typedef int32_t Whole __attribute__((vector_size(WIDTH / 8)));
-#if WIDTH == 512
-#include <immintrin.h>
-static inline Vector counts(const int16_t *words)
-{
-    return _mm512_cvtepi32_ps(_mm512_cvtepi16_epi32(_mm256_loadu_si256((const __m256i *)words)));
-}
-static inline Vector add_product(Vector sum, Vector a, Vector b) { return _mm512_fmadd_ps(a, b, sum); }
-#elif WIDTH == 256
-#include <immintrin.h>
-static inline Vector counts(const int16_t *words)
-{
-    return _mm256_cvtepi32_ps(_mm256_cvtepi16_epi32(_mm_loadu_si128((const __m128i *)words)));
-}
-static inline Vector add_product(Vector sum, Vector a, Vector b) { return _mm256_fmadd_ps(a, b, sum); }
-#elif defined(__aarch64__)
-#include <arm_neon.h>
-static inline Vector counts(const int16_t *words) { return vcvtq_f32_s32(vmovl_s16(vld1_s16(words))); }
-static inline Vector add_product(Vector sum, Vector a, Vector b) { return vfmaq_f32(sum, a, b); }
-#else
-static inline Vector counts(const int16_t *words) { return (Vector){words[0], words[1], words[2], words[3]}; }
-static inline Vector add_product(Vector sum, Vector a, Vector b) { return sum + a * b; }
-#endif
-static inline Vector load(const float *at) { return *(const Vector *)at; }
-static inline void store(float *at, Vector x) { *(Vector *)at = x; }
-static inline Vector all(float x) { return x - (Vector){0}; }
+#define MOST 256       /* chirps of a burst, whole groups, `loops.MOST_CHIRPS` */
 
 /* Sizes, tables and work arrays. */
 typedef struct {
-    int chirps, samples, a, n, blocks, size, groups; /* n linear samples from a; size of the transform; groups of chirps */
+    int chirps, samples, a, n, blocks, groups; /* n linear samples from a; groups of chirps */
     int parts, edges[PARTS + 1];
     double part_times[PARTS];
-    const float *taps, *flat; /* `decimate.Decimator`: [3][TAPS], [4][FLAT] */
-    int16_t *words, *silence;     /* [group][word][LANES] of the linear samples; a chirp of zeros */
-    float *root_c, *root_s, *turn_c, *turn_s; /* `transform`; twiddle factors of `spectrum` */
-    float *same, *turned;                     /* the reference chirp: its words, and those of -j times it */
-    float *re, *im;                           /* records to transform [size][LANES] */
+    const float *taps, *flat;     /* `decimate.Decimator`: [3][TAPS], [5][FLAT] */
+    Table table;                  /* of the transform */
+    int16_t *words;               /* [group][word][LANES] of the linear samples; a chirp stands in for missing ones */
+    float *chosen;                /* words of the reference chirp */
+    float *re, *im;               /* records to transform, [size][LANES] */
     float *phase_c, *phase_s, *row_re, *row_im; /* [block][LANES]; [block][RX][LANES] with a spare block at either end */
     float *folded_re, *folded_im;               /* reduced chirps, [group][block][RX][LANES] */
     float *all_re, *all_im;                     /* sum of the good chirps, [block][RX] */
-    double *power, *smooth, *sums, *tones;
-    double part_energy[PARTS]; /* of that sum */
-    int *bin, *place;
+    double part_energy[PARTS];                  /* of that sum */
+    double sums[6 * PARTS * MOST], odd_frequency[MOST]; /* [6][part][chirp]; [chirp] */
+    Complex even_tone[MOST], odd_tone[MOST];
 } Work;
-
-/* A number of chirps, rounded up to whole groups. */
-static inline size_t whole_lanes(int chirps) { return (size_t)(chirps + LANES - 1) / LANES * LANES; }
-
-/* Interleave four records of words. */
-static inline void words_in_turn(const int16_t *const *record, int count, int16_t *restrict out)
-{
-    const int16_t *a = record[0], *b = record[1], *c = record[2], *d = record[3];
-    for (int i = 0; i < count; i++) {
-        out[4 * i] = a[i];
-        out[4 * i + 1] = b[i];
-        out[4 * i + 2] = c[i];
-        out[4 * i + 3] = d[i];
-    }
-}
 
 /* Put the words of a group's chirps side by side. */
 static inline void side_by_side(const int16_t *const chirp[LANES], int count, int16_t *restrict out)
@@ -87,35 +40,31 @@ static inline void side_by_side(const int16_t *const chirp[LANES], int count, in
     int16_t fours[4][4 * TILE] __attribute__((aligned(64)));
     for (int first = 0; first < count; first += TILE) {
         int here = count - first < TILE ? count - first : TILE;
-        for (int g = 0; g < 4; g++) {
-            const int16_t *const record[4] = {chirp[4 * g] + first, chirp[4 * g + 1] + first, chirp[4 * g + 2] + first,
-                                              chirp[4 * g + 3] + first};
-            words_in_turn(record, here, fours[g]);
-        }
-        const Four *a = (Four *)fours[0], *b = (Four *)fours[1], *c = (Four *)fours[2], *d = (Four *)fours[3];
+        for (int g = 0; g < 4; g++)
+            for (int i = 0; i < here; i++)
+                for (int k = 0; k < 4; k++)
+                    fours[g][4 * i + k] = chirp[4 * g + k][first + i];
+        const Four *four[4] = {(Four *)fours[0], (Four *)fours[1], (Four *)fours[2], (Four *)fours[3]};
         Four *restrict to = (Four *)(out + LANES * first);
-        for (int i = 0; i < here; i++) {
-            to[4 * i] = a[i];
-            to[4 * i + 1] = b[i];
-            to[4 * i + 2] = c[i];
-            to[4 * i + 3] = d[i];
-        }
+        for (int i = 0; i < here; i++)
+            for (int k = 0; k < 4; k++)
+                to[4 * i + k] = four[k][i];
     }
 }
 
 /* Chirps times the conjugate of the reference chirp, summed over the RX, to [sample][LANES]; and their energies. */
-static inline void correlate(const int16_t *words, const float *same, const float *turned, int samples, float *re,
-                             float *im, float *energy)
+static inline void correlate(const int16_t *words, const float *chosen, int samples, float *re, float *im, float *energy)
 {
     for (int part = 0; part < LANES; part += STEP) {
         Vector e = {0};
         for (int n = 0; n < samples; n++) {
             Vector a = {0}, b = {0}, own = {0};
-            for (int j = 0; j < WORDS; j++) {
-                Vector x = counts(words + LANES * (WORDS * n + j) + part);
-                a = add_product(a, x, all(same[WORDS * n + j]));
-                b = add_product(b, x, all(turned[WORDS * n + j]));
-                own = add_product(own, x, x);
+            for (int r = 0; r < RX; r++) {
+                const int i = WORDS * n + r, q = i + RX;
+                Vector x = counts(words + LANES * i + part), y = counts(words + LANES * q + part);
+                a = add_product(add_product(a, x, all(chosen[i])), y, all(chosen[q]));
+                b = add_product(add_product(b, y, all(chosen[i])), x, -all(chosen[q]));
+                own = add_product(add_product(own, x, x), y, y);
             }
             e += own;
             store(re + LANES * n + part, a);
@@ -125,147 +74,99 @@ static inline void correlate(const int16_t *words, const float *same, const floa
     }
 }
 
-/* Index of the strongest bin of each of sixteen spectra. */
-static inline void strongest(const float *re, const float *im, int size, int32_t *at)
+/* Place of the maximum between three values, relative to the middle one, by a parabola. */
+static inline double peak_between(double below, double middle, double above)
 {
-    for (int part = 0; part < LANES; part += STEP) {
-        Vector best = all(-1);
-        Whole place = {0};
-        for (int i = 0; i < size; i++) {
-            Vector x = load(re + LANES * i + part), y = load(im + LANES * i + part), power = x * x + y * y;
-            Whole higher = power > best;
-            best = (Vector)(((Whole)power & higher) | ((Whole)best & ~higher));
-            place = (i & higher) | (place & ~higher);
-        }
-        memcpy(at + part, &place, sizeof place);
-    }
+    double bend = below - 2 * middle + above;
+    return bend < 0 ? 0.5 * (below - above) / bend : 0;
 }
 
-static inline Complex bin_value(const float *re, const float *im, int place)
-{
-    return (Complex){re[LANES * place], im[LANES * place]};
-}
-
-/* `loops.strongest`: the tone at the strongest bin of a spectrum; frequency in cycles per sample. */
+/* `loops.strongest`: the tone at an index of a spectrum; frequency in cycles per sample. */
 static inline Complex interpolated(const Work *w, const float *re, const float *im, int at, double *frequency)
 {
-    int size = w->size, top = w->bin[at];
-    Complex peak = bin_value(re, im, at);
-    double middle = magnitude(peak);
-    double below = magnitude(bin_value(re, im, w->place[(top + size - 1) % size]));
-    double above = magnitude(bin_value(re, im, w->place[(top + 1) % size]));
-    double bend = below - 2 * middle + above, part = bend < 0 ? 0.5 * (below - above) / bend : 0;
+    const int size = w->table.size, top = w->table.bin[at], *place = w->table.place;
+    Complex peak = value_at(re, im, at);
+    double below = magnitude(value_at(re, im, place[(top + size - 1) % size]));
+    double above = magnitude(value_at(re, im, place[(top + 1) % size]));
     double whole = (double)(top < size / 2 ? top : top - size) / size;
-    *frequency = whole + part / size;
+    *frequency = whole + peak_between(below, magnitude(peak), above) / size;
     return times(peak, cis(whole * (w->n - 1) / 2));
 }
 
-/* Power of a chirp x + j y, summed over the RX, in every bin. Sixteen records, every fourth sample of each RX, are
-   transformed; a butterfly joins the four records of an RX. */
-static void spectrum(Work *w, const float *restrict x, const float *restrict y)
+/* Zeros after the samples of the records to transform. */
+static inline void clear(Work *w, int samples, int size)
 {
-    int quarter = w->size / FOLD, blocks = w->n / FOLD;
-    for (int i = 0; i < LANES * blocks; i++) {
-        w->re[i] = x[i];
-        w->im[i] = y[i];
-    }
-    memset(w->re + LANES * blocks, 0, sizeof *w->re * LANES * (quarter - blocks));
-    memset(w->im + LANES * blocks, 0, sizeof *w->im * LANES * (quarter - blocks));
-    transform(w->re, w->im, quarter, w->root_c, w->root_s, w->size);
-    for (int i = 0; i < quarter; i++) {
-        int bin = w->bin[i] / FOLD;
-        const float *re = w->re + LANES * i, *im = w->im + LANES * i;
-        const float *c = w->turn_c + LANES * i, *s = w->turn_s + LANES * i;
-        float a[LANES], b[LANES], power[FOLD][RX];
-        for (int k = 0; k < LANES; k++) {
-            a[k] = re[k] * c[k] - im[k] * s[k];
-            b[k] = re[k] * s[k] + im[k] * c[k];
-        }
-        for (int r = 0; r < RX; r++) {
-            const float *u = a + r, *v = b + r;
-            float c = u[0] + u[8], d = v[0] + v[8], e = u[0] - u[8], f = v[0] - v[8];
-            float g = u[4] + u[12], h = v[4] + v[12], k = u[4] - u[12], l = v[4] - v[12];
-            power[0][r] = (c + g) * (c + g) + (d + h) * (d + h);
-            power[1][r] = (e + l) * (e + l) + (f - k) * (f - k);
-            power[2][r] = (c - g) * (c - g) + (d - h) * (d - h);
-            power[3][r] = (e - l) * (e - l) + (f + k) * (f + k);
-        }
-        for (int q = 0; q < FOLD; q++)
-            w->power[bin + q * quarter] = (power[q][0] + power[q][1]) + (power[q][2] + power[q][3]);
-    }
+    memset(w->re + LANES * samples, 0, sizeof *w->re * LANES * (size - samples));
+    memset(w->im + LANES * samples, 0, sizeof *w->im * LANES * (size - samples));
 }
 
-/* Middle of the signal's band in linear samples x + j y, cycles per sample 0..1. */
-static double centre_of_band(Work *w, const float *restrict x, const float *restrict y)
+/* `loops.find_band`: middle of the band of a chirp of words, cycles per sample 0..1. The records are quarters of the RX. */
+static double centre_of_band(Work *w, const int16_t *chirp)
 {
-    int size = w->size, width = BAND_BINS * size / w->n / 2;
-    spectrum(w, x, y);
-    for (int box = 0; box < 3; box++) { /* three box filters are nearly Gaussian */
-        double *other = w->smooth;
-        for (int i = 0; i < width; i++)
-            w->power[size + i] = w->power[i];
-        memset(other, 0, sizeof *other * size);
-        for (int j = 0; j < width; j++)
-            for (int i = 0; i < size; i++)
-                other[i] += w->power[i + j]; /* sum of the box that starts here */
-        w->smooth = w->power;
-        w->power = other;
+    const int size = w->table.size / 4, samples = w->n / 4;
+    for (int m = 0; m < samples; m++)
+        for (int quarter = 0; quarter < 4; quarter++)
+            for (int r = 0; r < RX; r++) {
+                const int16_t *word = chirp + WORDS * (samples * quarter + m) + r;
+                w->re[LANES * m + RX * quarter + r] = word[0];
+                w->im[LANES * m + RX * quarter + r] = word[RX];
+            }
+    clear(w, samples, size);
+    transform(w->re, w->im, size, &w->table);
+    float *power = w->row_re, *smooth = w->row_im;
+    for (int i = 0; i < size; i++) {
+        float sum = 0;
+        for (int k = 0; k < LANES; k++)
+            sum += w->re[LANES * i + k] * w->re[LANES * i + k] + w->im[LANES * i + k] * w->im[LANES * i + k];
+        power[w->table.bin[i] / 4] = sum;
     }
-    return (double)((maximum(w->power, size) + 3 * (width / 2)) % size) / size;
+    int top = 0;
+    for (int i = 0; i < size; i++) {
+        smooth[i] = power[(i + size - 1) % size] + 2 * power[i] + power[(i + 1) % size];
+        top = smooth[i] > smooth[top] ? i : top;
+    }
+    double centre = (top + peak_between(smooth[(top + size - 1) % size], smooth[top], smooth[(top + 1) % size])) / size;
+    return centre - floor(centre);
 }
 
 /* First pass: the tone between each chirp and a reference chirp; see `loops.match`. Returns the middle of the band. */
 static double match(Work *w, const int16_t *burst, int reference, double *frequency, Complex *product, float *energy)
 {
     const int16_t *chosen = burst + WORDS * ((size_t)reference * w->samples + w->a);
-    for (int n = 0; n < w->n; n++)
-        for (int r = 0; r < RX; r++) {
-            float i = chosen[WORDS * n + r], q = chosen[WORDS * n + RX + r];
-            w->same[WORDS * n + r] = i, w->same[WORDS * n + RX + r] = q;
-            w->turned[WORDS * n + r] = -q, w->turned[WORDS * n + RX + r] = i;
-        }
-    for (int g = 0; g < w->groups; g++) {
-        int first = g * LANES, count = w->chirps - first < LANES ? w->chirps - first : LANES;
+    for (int i = 0; i < WORDS * w->n; i++)
+        w->chosen[i] = chosen[i];
+    for (int first = 0; first < w->chirps; first += LANES) {
         int32_t at[LANES];
-        correlate(w->words + (size_t)first * WORDS * w->n, w->same, w->turned, w->n, w->re, w->im, energy + first);
-        memset(w->re + LANES * w->n, 0, sizeof(float) * LANES * (w->size - w->n));
-        memset(w->im + LANES * w->n, 0, sizeof(float) * LANES * (w->size - w->n));
-        transform(w->re, w->im, w->size, w->root_c, w->root_s, w->size);
-        strongest(w->re, w->im, w->size, at);
-        for (int k = 0; k < count; k++)
+        correlate(w->words + (size_t)first * WORDS * w->n, w->chosen, w->n, w->re, w->im, energy + first);
+        clear(w, w->n, w->table.size);
+        transform(w->re, w->im, w->table.size, &w->table);
+        strongest(w->re, w->im, w->table.size, at);
+        for (int k = 0; k < LANES; k++)
             product[first + k] = interpolated(w, w->re + k, w->im + k, at[k], frequency + first + k);
     }
-    part_iq(chosen, w->n, w->row_re, w->row_im);
-    return centre_of_band(w, w->row_re, w->row_im);
+    return centre_of_band(w, chosen);
 }
 
-/* exp(-j 2 pi (frequency (origin + step m) + turns)) for m < count and the chirps of a group, [m][LANES]; outer products
-   of coarse and fine steps. */
+/* exp(-j 2 pi (frequency (origin + step m) + turns)) for m < count and the chirps of a group, [m][LANES]: each is the one
+   before times a constant. */
 static inline void ramps(const double *restrict frequency, const double *restrict turns, double origin, double step,
                          int count, float *restrict c, float *restrict s)
 {
-    enum { FINE = 8 };
-    float fine_c[FINE][LANES], fine_s[FINE][LANES], coarse_c[LANES], coarse_s[LANES];
-    for (int m = 0; m < FINE; m++) {
-        VECTOR
-        for (int k = 0; k < LANES; k++) {
-            Complex z = cis(-frequency[k] * (step * m));
-            fine_c[m][k] = (float)z.re;
-            fine_s[m][k] = (float)z.im;
-        }
+    double re[LANES], im[LANES], turn_re[LANES], turn_im[LANES];
+    VECTOR
+    for (int k = 0; k < LANES; k++) {
+        Complex start = cis(-frequency[k] * origin - turns[k]), turn = cis(-frequency[k] * step);
+        re[k] = start.re, im[k] = start.im, turn_re[k] = turn.re, turn_im[k] = turn.im;
     }
-    for (int first = 0; first < count; first += FINE) {
+    for (int m = 0; m < count; m++) {
         VECTOR
         for (int k = 0; k < LANES; k++) {
-            Complex z = cis(-frequency[k] * (origin + step * first) - turns[k]);
-            coarse_c[k] = (float)z.re;
-            coarse_s[k] = (float)z.im;
+            double x = re[k], y = im[k];
+            c[LANES * m + k] = (float)x;
+            s[LANES * m + k] = (float)y;
+            re[k] = x * turn_re[k] - y * turn_im[k];
+            im[k] = x * turn_im[k] + y * turn_re[k];
         }
-        for (int m = 0; m < FINE && first + m < count; m++)
-            for (int k = 0; k < LANES; k++) {
-                c[LANES * (first + m) + k] = coarse_c[k] * fine_c[m][k] - coarse_s[k] * fine_s[m][k];
-                s[LANES * (first + m) + k] = coarse_c[k] * fine_s[m][k] + coarse_s[k] * fine_c[m][k];
-            }
     }
 }
 
@@ -344,21 +245,11 @@ static void reduce(Work *w, const double *frequency, const Complex *taps)
     int values = RX * w->blocks;
     for (int g = 0; g < w->groups; g++) {
         size_t first = (size_t)g * LANES;
-        float *re = w->row_re + LANES * RX, *im = w->row_im + LANES * RX;
-        mix_and_fold(w, w->words + first * WORDS * w->n, frequency + first, re, im);
+        mix_and_fold(w, w->words + first * WORDS * w->n, frequency + first, w->row_re + LANES * RX, w->row_im + LANES * RX);
         extend(w->row_re, LANES * values, LANES * RX);
         extend(w->row_im, LANES * values, LANES * RX);
         equalise(w->row_re, w->row_im, taps + 3 * first, values, w->folded_re + first * values, w->folded_im + first * values);
     }
-}
-
-/* Sum over the chirps of a group with weights. */
-static inline float weighted_sum(const float *restrict x, const float *restrict weights)
-{
-    float sum = 0;
-    for (int k = 0; k < LANES; k++)
-        sum += x[k] * weights[k];
-    return sum;
 }
 
 /* Correlate the chirps of a group with the sum of all: over the values [from, to), of even and odd RX apart, and the
@@ -384,13 +275,12 @@ static inline void correlate_part(const float *re, const float *im, const float 
 
 /* Second pass: the tone between each reduced chirp and the sum of the good others, and what that sum does not explain of
    its energy in each part of the chirp, [part][chirp]; see `loops.against_others`. Returns the energy of the sum. */
-static double against_others(Work *w, const uint8_t *good, double *found, Complex *tone, float *energy, double *apart_f,
-                             double *apart_phase, double *left)
+static double against_others(Work *w, const uint8_t *good, double *frequency, Complex *tone, float *energy,
+                             double *apart_f, double *apart_phase, double *left)
 {
     int values = RX * w->blocks, chirps = w->chirps, all = w->parts * chirps;
     double *even_re = w->sums, *even_im = even_re + all, *odd_re = even_im + all, *odd_im = odd_re + all;
-    double *rest_re = odd_im + all, *rest_im = rest_re + all, *odd_f = w->tones, level = 0;
-    Complex *odd_tone = (Complex *)(odd_f + chirps), *even_tone = odd_tone + chirps;
+    double *rest_re = odd_im + all, *rest_im = rest_re + all, level = 0;
     memset(w->all_re, 0, sizeof(float) * values);
     memset(w->all_im, 0, sizeof(float) * values);
     for (int g = 0; g < w->groups; g++) {
@@ -398,8 +288,14 @@ static double against_others(Work *w, const uint8_t *good, double *found, Comple
         for (int k = 0; k < LANES; k++)
             used[k] = g * LANES + k < chirps && good[g * LANES + k];
         for (int i = 0; i < values; i++) {
-            w->all_re[i] += weighted_sum(w->folded_re + LANES * ((size_t)g * values + i), used);
-            w->all_im[i] += weighted_sum(w->folded_im + LANES * ((size_t)g * values + i), used);
+            const size_t at = LANES * ((size_t)g * values + i);
+            float x = 0, y = 0;
+            for (int k = 0; k < LANES; k++) {
+                x += w->folded_re[at + k] * used[k];
+                y += w->folded_im[at + k] * used[k];
+            }
+            w->all_re[i] += x;
+            w->all_im[i] += y;
         }
     }
     memset(energy, 0, sizeof *energy * chirps);
@@ -426,17 +322,14 @@ static double against_others(Work *w, const uint8_t *good, double *found, Comple
             }
         }
     }
-    newton_step(rest_re, rest_im, w->part_times, w->parts, chirps, 1, found, tone);
-    newton_step(rest_re, rest_im, w->part_times, w->parts, chirps, 0, found, tone);
-    for (int p = 0; p < w->parts; p++)
-        turn_back(found, w->part_times[p], chirps, even_re + p * chirps, even_im + p * chirps, odd_re + p * chirps,
-                  odd_im + p * chirps);
-    newton_step(even_re, even_im, w->part_times, w->parts, chirps, 1, apart_f, even_tone);
-    newton_step(odd_re, odd_im, w->part_times, w->parts, chirps, 1, odd_f, odd_tone);
+    newton_step(rest_re, rest_im, w->part_times, w->parts, chirps, NULL, frequency, tone);
+    newton_step(rest_re, rest_im, w->part_times, w->parts, chirps, frequency, frequency, tone);
+    newton_step(even_re, even_im, w->part_times, w->parts, chirps, frequency, apart_f, w->even_tone);
+    newton_step(odd_re, odd_im, w->part_times, w->parts, chirps, frequency, w->odd_frequency, w->odd_tone);
     VECTOR
     for (int k = 0; k < chirps; k++) {
-        apart_f[k] -= odd_f[k];
-        apart_phase[k] = angle(times(even_tone[k], conjugate(odd_tone[k])));
+        apart_f[k] -= w->odd_frequency[k];
+        apart_phase[k] = angle(times(w->even_tone[k], conjugate(w->odd_tone[k])));
     }
     return level;
 }
@@ -445,14 +338,16 @@ static double against_others(Work *w, const uint8_t *good, double *found, Comple
 static inline void flatten(const float *flat, const float *restrict in, int blocks, float *restrict out)
 {
     const int edge = FLAT / 2;
-    if (blocks < FLAT) {
-        memcpy(out, in, sizeof *in * 2 * blocks);
-        return;
-    }
     const float *inner = flat + FLAT * edge;
+    memcpy(out, in, sizeof *in * 2 * blocks);
+    if (blocks < FLAT)
+        return;
     for (int i = 2 * edge; i < 2 * (blocks - edge); i++) {
         const float *x = in + i - 2 * edge;
-        out[i] = inner[0] * (x[0] + x[12]) + inner[1] * (x[2] + x[10]) + inner[2] * (x[4] + x[8]) + inner[3] * x[6];
+        float sum = inner[edge] * x[2 * edge];
+        for (int t = 0; t < edge; t++)
+            sum += inner[t] * (x[2 * t] + x[2 * (FLAT - 1 - t)]);
+        out[i] = sum;
     }
     for (int m = 0; m < edge; m++)
         for (int part = 0; part < 2; part++) {

@@ -1,7 +1,6 @@
-/* Loops over one chirp of four RX, or over sixteen records at a time, for burst.c and direct_path.c.
+/* Loops over sixteen records at a time, for burst.c and direct_path.c.
 
-   Samples of a chirp are stored as the card sends them: value 4 n + r is sample n of RX r. Records that are transformed
-   together are interleaved: value 16 n + k is sample n of record k. So inner loops run over contiguous values and are
+   Records lie side by side: value 16 n + k is sample n of record k. So inner loops run over contiguous values and are
    vectorised by the compiler. The files are compiled once per vector width (`build.py`), with WIDTH in bits at the end of
    the functions' names (`width.c`).
 
@@ -9,6 +8,7 @@
 #ifndef SIGNAL_H
 #define SIGNAL_H
 
+#define _POSIX_C_SOURCE 200112L /* posix_memalign */
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -45,6 +45,7 @@ static inline Complex times(Complex a, Complex b)
     return (Complex){a.re * b.re - a.im * b.im, a.re * b.im + a.im * b.re};
 }
 
+static inline Complex plus(Complex a, double factor, Complex b) { return (Complex){a.re + factor * b.re, a.im + factor * b.im}; }
 static inline Complex conjugate(Complex a) { return (Complex){a.re, -a.im}; }
 static inline double magnitude(Complex a) { return sqrt(a.re * a.re + a.im * a.im); }
 
@@ -63,107 +64,85 @@ static inline double angle(Complex a)
     return a.im < 0 ? -sum : sum;
 }
 
-/* Allocate zeroed memory for `count` floats on its own cache lines; free it with `release`. */
-static inline float *reserve(size_t count)
+/* Parts of one block of memory, each on its own cache lines; without a block their size is only counted. */
+typedef struct { char *block; size_t used; } Memory;
+
+static inline void *take(Memory *memory, size_t count, size_t size)
 {
-    char *block = calloc(count * sizeof(float) + 128, 1);
-    if (!block)
-        return NULL;
-    char *aligned = block + 64 + (64 - (uintptr_t)block % 64);
-    memcpy(aligned - sizeof block, &block, sizeof block);
-    return (float *)aligned;
+    void *here = memory->block ? memory->block + memory->used : NULL;
+    memory->used += (count * size + 63) / 64 * 64;
+    return here;
 }
 
-static inline void release(float *memory)
+static inline float *floats(Memory *memory, size_t count) { return take(memory, count, sizeof(float)); }
+
+/* Allocate zeroed memory of the size counted, for `free`; returns 0 if there is not enough. */
+static inline int reserve(Memory *memory)
 {
-    char *block;
-    if (!memory)
-        return;
-    memcpy(&block, (char *)memory - sizeof block, sizeof block);
-    free(block);
+    void *block;
+    if (posix_memalign(&block, 64, memory->used + 64))
+        return 0;
+    *memory = (Memory){memset(block, 0, memory->used + 64), 0};
+    return 1;
 }
 
-/* Convert the words of some samples (I of four RX, then Q of four RX) to x + j y. */
-static inline void part_iq(const int16_t *restrict words, int samples, float *restrict x, float *restrict y)
+/* As many floats as the processor handles at once: a part of LANES. Compilers do well with these vectors, except for the
+   conversion of words, and sums of products, which `-fassociative-math` takes apart. */
+#define STEP (WIDTH / 32)
+typedef float Vector __attribute__((vector_size(WIDTH / 8), aligned(4), may_alias));
+typedef int32_t Whole __attribute__((vector_size(WIDTH / 8)));
+#if WIDTH == 512
+#include <immintrin.h>
+static inline Vector counts(const int16_t *words)
 {
-    for (int n = 0; n < samples; n++)
-        for (int r = 0; r < RX; r++) {
-            x[RX * n + r] = words[2 * RX * n + r];
-            y[RX * n + r] = words[2 * RX * n + RX + r];
+    return _mm512_cvtepi32_ps(_mm512_cvtepi16_epi32(_mm256_loadu_si256((const __m256i *)words)));
+}
+static inline Vector add_product(Vector sum, Vector a, Vector b) { return _mm512_fmadd_ps(a, b, sum); }
+#elif WIDTH == 256
+#include <immintrin.h>
+static inline Vector counts(const int16_t *words)
+{
+    return _mm256_cvtepi32_ps(_mm256_cvtepi16_epi32(_mm_loadu_si128((const __m128i *)words)));
+}
+static inline Vector add_product(Vector sum, Vector a, Vector b) { return _mm256_fmadd_ps(a, b, sum); }
+#elif defined(__aarch64__)
+#include <arm_neon.h>
+static inline Vector counts(const int16_t *words) { return vcvtq_f32_s32(vmovl_s16(vld1_s16(words))); }
+static inline Vector add_product(Vector sum, Vector a, Vector b) { return vfmaq_f32(sum, a, b); }
+#else
+static inline Vector counts(const int16_t *words) { return (Vector){words[0], words[1], words[2], words[3]}; }
+static inline Vector add_product(Vector sum, Vector a, Vector b) { return sum + a * b; }
+#endif
+static inline Vector load(const float *at) { return *(const Vector *)at; }
+static inline void store(float *at, Vector x) { *(Vector *)at = x; }
+static inline Vector all(float x) { return x - (Vector){0}; }
+
+/* Size of a transform, roots of unity exp(-j 2 pi k / size), the bin at each index of its output, the index of each bin. */
+typedef struct { int size, *bin, *place; float *c, *s; } Table;
+
+static inline void take_table(Memory *memory, Table *t, int size)
+{
+    t->size = size;
+    t->bin = take(memory, size, sizeof(int));
+    t->place = take(memory, size, sizeof(int));
+    t->c = floats(memory, size);
+    t->s = floats(memory, size);
+}
+
+static inline void fill_table(Table *t)
+{
+    for (int i = 0; i < t->size; i++) {
+        Complex root = cis(-(double)i / t->size);
+        t->c[i] = (float)root.re;
+        t->s[i] = (float)root.im;
+        int size = t->size, place = i, scale = 1, bin = 0;
+        for (; size >= 4; size /= 4, scale *= 4) {
+            bin += scale * (place / (size / 4));
+            place %= size / 4;
         }
-}
-
-/* Largest magnitude of words. */
-static inline int32_t largest(const int16_t *restrict words, int count)
-{
-    int16_t low = 0, high = 0;
-    for (int i = 0; i < count; i++) {
-        low = words[i] < low ? words[i] : low;
-        high = words[i] > high ? words[i] : high;
+        t->bin[i] = bin + scale * place;
+        t->place[t->bin[i]] = i;
     }
-    return high > -(int32_t)low ? high : -(int32_t)low;
-}
-
-/* Index of the first maximum. */
-static inline int maximum(const double *values, int count)
-{
-    double highest = values[0];
-    int i = 0;
-    for (int j = 1; j < count; j++)
-        highest = values[j] > highest ? values[j] : highest;
-    while (i < count - 1 && values[i] != highest)
-        i++;
-    return i;
-}
-
-/* exp(-j 2 pi (frequency (step m - origin) + turns)) for m < count, as an outer product of coarse and fine steps like
-   `loops.phasor`. Writes up to seven more values. */
-static inline void ramp(double frequency, double turns, int step, double origin, int count, float *restrict c,
-                        float *restrict s)
-{
-    enum { FINE = 8 };
-    float fine_c[FINE], fine_s[FINE], coarse_c[FINE], coarse_s[FINE];
-    for (int m = 0; m < FINE; m++) {
-        Complex z = cis(-frequency * step * m);
-        fine_c[m] = (float)z.re;
-        fine_s[m] = (float)z.im;
-    }
-    for (int first = 0; first < count; first += FINE * FINE) {
-        for (int i = 0; i < FINE; i++) {
-            Complex z = cis(-frequency * (step * (first + i * FINE) - origin) - turns);
-            coarse_c[i] = (float)z.re;
-            coarse_s[i] = (float)z.im;
-        }
-        for (int i = 0; i < FINE && first + i * FINE < count; i++) {
-            float *restrict to_c = c + first + i * FINE, *restrict to_s = s + first + i * FINE;
-            VECTOR
-            for (int m = 0; m < FINE; m++) {
-                to_c[m] = coarse_c[i] * fine_c[m] - coarse_s[i] * fine_s[m];
-                to_s[m] = coarse_c[i] * fine_s[m] + coarse_s[i] * fine_c[m];
-            }
-        }
-    }
-}
-
-/* exp(-j 2 pi k / size), k < size. */
-static inline void roots_of_unity(int size, float *c, float *s)
-{
-    for (int k = 0; k < size; k++) {
-        Complex z = cis(-(double)k / size);
-        c[k] = (float)z.re;
-        s[k] = (float)z.im;
-    }
-}
-
-/* The bin at an index of the output of `transform`. */
-static inline int bin_at(int place, int size)
-{
-    int bin = 0, scale = 1;
-    for (; size >= 4; size /= 4, scale *= 4) {
-        bin += scale * (place / (size / 4));
-        place %= size / 4;
-    }
-    return bin + scale * place;
 }
 
 /* Fourier transform of length four across four rows of sixteen values, times powers one to three of w. */
@@ -186,13 +165,14 @@ static inline void butterfly(float *restrict re, float *restrict im, int row, co
     }
 }
 
-/* Fourier transforms of sixteen records [size][LANES] in place, decimation in frequency; bin order as in `bin_at`. c, s
-   are the roots of unity of a multiple of the size, `roots`. */
-static inline void transform(float *restrict re, float *restrict im, int size, const float *c, const float *s, int roots)
+/* Fourier transforms of sixteen records [size][LANES] in place, decimation in frequency. The table may be that of four
+   times the size: then its bins are, too. */
+static inline void transform(float *restrict re, float *restrict im, int size, const Table *table)
 {
+    const float *c = table->c, *s = table->s;
     int n = size;
     for (; n >= 4; n /= 4) {
-        int q = n / 4, turn = roots / n;
+        int q = n / 4, turn = table->size / n;
         for (int first = 0; first < size; first += n)
             for (int j = 0; j < q; j++) {
                 int i = (first + j) * LANES, k = j * turn;
@@ -211,46 +191,46 @@ static inline void transform(float *restrict re, float *restrict im, int size, c
             }
 }
 
-/* A step of Newton's method on the periodograms of records [part][record], `loops.refine`: changes the frequency, cycles
-   per sample. `first`: the frequency is still zero. */
+/* Index of the strongest bin of each of sixteen spectra. */
+static inline void strongest(const float *re, const float *im, int size, int32_t *at)
+{
+    for (int part = 0; part < LANES; part += STEP) {
+        Vector best = all(-1);
+        Whole place = {0};
+        for (int i = 0; i < size; i++) {
+            Vector x = load(re + LANES * i + part), y = load(im + LANES * i + part), power = x * x + y * y;
+            Whole higher = power > best;
+            best = (Vector)(((Whole)power & higher) | ((Whole)best & ~higher));
+            place = (i & higher) | (place & ~higher);
+        }
+        memcpy(at + part, &place, sizeof place);
+    }
+}
+
+static inline Complex value_at(const float *re, const float *im, int i) { return (Complex){re[LANES * i], im[LANES * i]}; }
+
+/* A step of Newton's method on the periodograms of records [part][record], `loops.refine`, from a frequency in cycles per
+   sample; NULL: from zero. */
 static inline void newton_step(const double *restrict re, const double *restrict im, const double *restrict t, int parts,
-                               int count, int first, double *restrict f, Complex *restrict tone)
+                               int count, const double *start, double *f, Complex *restrict tone)
 {
     double limit = TURN / (t[parts - 1] - t[0]);
     VECTOR
     for (int k = 0; k < count; k++) {
-        double r0 = 0, i0 = 0, r1 = 0, i1 = 0, r2 = 0, i2 = 0, start = first ? 0 : f[k];
+        Complex s0 = {0, 0}, s1 = {0, 0}, s2 = {0, 0};
         for (int p = 0; p < parts; p++) {
-            Complex turn = first ? (Complex){1, 0} : cis(-start * t[p]);
-            double a = re[(size_t)p * count + k] * turn.re - im[(size_t)p * count + k] * turn.im;
-            double b = re[(size_t)p * count + k] * turn.im + im[(size_t)p * count + k] * turn.re;
-            r0 += a;
-            i0 += b;
-            r1 += t[p] * a;
-            i1 += t[p] * b;
-            r2 += t[p] * t[p] * a;
-            i2 += t[p] * t[p] * b;
+            Complex turn = start ? cis(-start[k] * t[p]) : (Complex){1, 0};
+            Complex value = times((Complex){re[(size_t)p * count + k], im[(size_t)p * count + k]}, turn);
+            s0 = plus(s0, 1, value);
+            s1 = plus(s1, t[p], value);
+            s2 = plus(s2, t[p] * t[p], value);
         }
-        double slope = r0 * i1 - i0 * r1, curvature = r1 * r1 + i1 * i1 - (r0 * r2 + i0 * i2);
+        double slope = s0.re * s1.im - s0.im * s1.re;
+        double curvature = s1.re * s1.re + s1.im * s1.im - (s0.re * s2.re + s0.im * s2.im);
         double d = curvature < 0 ? -slope / curvature : 0;
         d = d < -limit ? -limit : d > limit ? limit : d;
-        f[k] = start + d / TURN;
-        tone[k].re = r0 + d * i1 - d * d / 2 * r2;
-        tone[k].im = i0 - d * r1 - d * d / 2 * i2;
-    }
-}
-
-/* Multiply values a + j b and c + j d by exp(-j 2 pi frequency time). */
-static inline void turn_back(const double *restrict frequency, double time, int count, double *restrict a,
-                             double *restrict b, double *restrict c, double *restrict d)
-{
-    VECTOR
-    for (int k = 0; k < count; k++) {
-        Complex turn = cis(-frequency[k] * time), one = {a[k], b[k]}, other = {c[k], d[k]};
-        a[k] = one.re * turn.re - one.im * turn.im;
-        b[k] = one.re * turn.im + one.im * turn.re;
-        c[k] = other.re * turn.re - other.im * turn.im;
-        d[k] = other.re * turn.im + other.im * turn.re;
+        f[k] = (start ? start[k] : 0) + d / TURN;
+        tone[k] = plus(plus(s0, d, (Complex){s1.im, -s1.re}), -d * d / 2, s2);
     }
 }
 

@@ -73,9 +73,12 @@ class Recorder:
     def edges_ns(self) -> list[int]:
         return [w.t_ns for w in self._stage.wires if isinstance(w, WireEdge) and w.value]
 
-    def run(self, holds: list[tuple[float, float]]) -> list[Happening]:
-        """Hold at these times after the first point, for this long each (seconds)."""
+    def run(self, holds: list[tuple[float, float]], early_hold_s: float | None = None) -> list[Happening]:
+        """Hold at these times after the first point, or so long after ROW, for this long each (seconds)."""
         commands: list[tuple[int, str]] = []
+        if early_hold_s is not None:
+            begin_ns = self._tick * NS_PER_TICK + round(early_hold_s * 1e9)
+            commands = [(begin_ns, "Hold"), (begin_ns + 600_000_000, "Resume")]
         asked = next_status = 0
         while True:
             self._advance(0.001)
@@ -233,3 +236,12 @@ def test_drawn_edge_faults_are_found(speed_mm_s, accel_mm_s2, is_held, request):
             assert finished.status == "fault", (kind, [t_ns - sound_ns[0] for t_ns in edges_ns])
             assert finished.fault in FAULTS, finished
             assert finished.reason
+
+
+@pytest.mark.parametrize("early_hold_s", [0.01, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
+def test_a_row_that_was_held_before_its_first_point_is_sound(early_hold_s):
+    """In the travel to it, where the stage may cross the row's own place, or in the run-up."""
+    recorder = Recorder(20, 200, random.Random(1))
+    recorder.run([], early_hold_s)
+    assert any(h.what.fields.get("state") == "hold" for h in recorder.happenings if isinstance(h.what, Reply))
+    assert replay(recorder, recorder.edges_ns).status == "done"

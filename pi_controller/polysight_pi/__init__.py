@@ -12,5 +12,6 @@ connect) and creates the other parts, each with a thread of its own:
 scheduling, systemd notifications and the memory limit.
 """
 
-PROGRAM = "/opt/polysight/venv/bin/polysight-pi"  # where install.sh puts it
+# Where install.sh puts it.
+PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
 AS_THE_SERVICE = f"as the service's user: `sudo -u polysight {PROGRAM} ...`"

@@ -29,15 +29,20 @@ from polysight_shared.findings import Finding
 from polysight_shared.raster import MAX_WIDTH_NS, WIDTH_TEXT, check_burst_fits
 from polysight_shared.sockets import is_loopback, publisher, replier
 
-JOURNAL_BYTES = 100 << 20  # a scan of 70,000 positions journals about 20 MB
+# A scan of 70,000 positions journals about 20 MB.
+JOURNAL_BYTES = 100 << 20
 TRANSFERS = 5
-MAX_PART = 1.05  # of the nominal duration: the system call adds some 100 us to 22 ms
-PAIRS = 500  # pairs of system calls to time
-PAUSE_NS = 300_000  # between them
+# Of the nominal duration: the system call adds some 100 us to 22 ms.
+MAX_PART = 1.05
+# Pairs of system calls to time.
+PAIRS = 500
+# Between them.
+PAUSE_NS = 300_000
 MODEL = Path("/proc/device-tree/model")
 MODULES = Path("/sys/module")
 STRICT = "put `dtparam=strict_gpiod` into /boot/firmware/config.txt and reboot the Pi"
-VERDICTS = {"ok": "ok", "note": "ok", "warning": "warn", "error": "fail"}  # words of the command's output, by level
+# Words of the command's output, by level.
+VERDICTS = {"ok": "ok", "note": "ok", "warning": "warn", "error": "fail"}
 
 
 def to_json(finding: Finding) -> dict[str, Any]:

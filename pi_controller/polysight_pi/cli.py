@@ -23,7 +23,8 @@ from polysight_shared.raster import WIDTH_TEXT
 # Commands import their modules when they are called, so `--help` needs no other package.
 
 
-PAUSE_NS = 10_000_000  # between the bursts of `pulse`
+# Between the bursts of `pulse`.
+PAUSE_NS = 10_000_000
 
 
 def _write(text: str) -> None:

@@ -31,20 +31,29 @@ from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, 
 from polysight_shared.stage_line import Reply
 from polysight_shared.units import us_to_ns
 
-TURN_TIMEOUT_S = 0.2  # the rest of the queue waits for the next turn, so that a queue that never empties is not a hang
-TURN_S = 0.25  # longest turn without work
+# The rest of the queue waits for the next turn, so that a queue that never empties is not a hang.
+TURN_TIMEOUT_S = 0.2
+# Longest turn without work.
+TURN_S = 0.25
 # Silence of the executor, the journal or a socket after which motion stops and the watchdog is not fed. An answer of
 # the stage takes up to 2 s; writing to an SD card that tidies up takes about 1 s.
 LATE_S = 3.0
-HUNG_S = 10.0  # time without a turn after which the executor counts as hung
+# Time without a turn after which the executor counts as hung.
+HUNG_S = 10.0
 COMMANDS_WAITING = 64
 REPLAYS_WAITING = 4
-LINES_WAITING = 64  # of the stage: further lines are dropped, so that an endless flood cannot fill the memory
-REPLAYED_AT_REST = 1000  # events per reply: half a second on a Pi
-REPLAYED_IN_A_ROW = 20  # events per reply during a row: packing more would delay the trigger thread
-OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)  # commands that count as a heartbeat of the run's host
-OWNED = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)  # commands that only the run's owner may send
-JOURNALLED = (m.BeginRun, m.EndRun, m.RunRow)  # commands that are accepted once their event is on the disk
+# Of the stage: further lines are dropped, so that an endless flood cannot fill the memory.
+LINES_WAITING = 64
+# Events per reply: half a second on a Pi.
+REPLAYED_AT_REST = 1000
+# Events per reply during a row: packing more would delay the trigger thread.
+REPLAYED_IN_A_ROW = 20
+# Commands that count as a heartbeat of the run's host.
+OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)
+# Commands that only the run's owner may send.
+OWNED = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)
+# Commands that are accepted once their event is on the disk.
+JOURNALLED = (m.BeginRun, m.EndRun, m.RunRow)
 
 
 class Request(NamedTuple):

@@ -37,10 +37,14 @@ from polysight_shared.raster import RasterPlan
 
 MAGIC = b"PSJRNL1\n"
 MAX_RECORD_BYTES = 1 << 20
-CAPTURE_BYTES = 320  # upper limit of a position's record
-SPARE_BYTES = 4 << 20  # for faults and retakes
-SEARCHED_BYTES = 1 << 20  # length of the search for a good record after damage
-DAMAGED = ".damaged"  # suffix of the copy of a damaged journal
+# Upper limit of a position's record.
+CAPTURE_BYTES = 320
+# For faults and retakes.
+SPARE_BYTES = 4 << 20
+# Length of the search for a good record after damage.
+SEARCHED_BYTES = 1 << 20
+# Suffix of the copy of a damaged journal.
+DAMAGED = ".damaged"
 # Of the thread's queue: jobs, and events that wait for a place in it. A row stops long before (LATE_S).
 JOBS_WAITING = 256
 EVENTS_WAITING = 1000

@@ -27,13 +27,19 @@ from polysight_shared.faults import PiFault
 from polysight_shared.messages import GPIOD, SPI, WIRES
 from polysight_shared.wires import WireClient, WireEdge
 
-EVENT_BUFFER = 1024  # edges kept by the kernel; its default of 16 would lose edges of a program without CPU time
-SPIN_NS = 100_000  # a sleep may end this much late, so the rest of a wait polls the clock
+# Edges kept by the kernel; its default of 16 would lose edges of a program without CPU time.
+EVENT_BUFFER = 1024
+# A sleep may end this much late, so the rest of a wait polls the clock.
+SPIN_NS = 100_000
 WARM_NS = 30_000
-SIMULATED_LOOK_BACK_S = 2.0  # of a busy machine
-LOOK_BACK_S = 0.05  # timeout for pulses that were sent and are not seen; the kernel reports them within microseconds
-TWO_CALLS_NS = 1000  # pulses up to this width are as short as two system calls make them
-SET_VALUES = 0xC010B40F  # GPIO_V2_LINE_SET_VALUES_IOCTL, with the argument (bits, mask)
+# Of a busy machine.
+SIMULATED_LOOK_BACK_S = 2.0
+# Timeout for pulses that were sent and are not seen; the kernel reports them within microseconds.
+LOOK_BACK_S = 0.05
+# Pulses up to this width are as short as two system calls make them.
+TWO_CALLS_NS = 1000
+# GPIO_V2_LINE_SET_VALUES_IOCTL, with the argument (bits, mask).
+SET_VALUES = 0xC010B40F
 _VALUES = struct.Struct("=QQ")
 BUFSIZ = Path("/sys/module/spidev/parameters/bufsiz")
 # _IOW('k', 0, struct spi_ioc_transfer[1]), _IOW('k', 1, __u8): mode 0, without chip select where the driver supports it

@@ -25,8 +25,10 @@ from polysight_shared.raster import Row, Stage
 from polysight_shared.stage_line import END_OF_TIME_NS, HOMING_TIMEOUT_S, Immediate, Reply
 
 STATUS_EVENT_S = 0.24
-RESTS = 3  # consecutive statuses at rest after which the reply to the end of a motion counts as lost
-ASKED_AGAIN = 3  # times that such a reply is asked for; a stage whose banner was lost never gives it
+# Consecutive statuses at rest after which the reply to the end of a motion counts as lost.
+RESTS = 3
+# Times that such a reply is asked for; a stage whose banner was lost never gives it.
+ASKED_AGAIN = 3
 MOVING = ("homing", "running", "held", "stopping")
 POSITION_LOST = (
     StageError.NOT_HOMED, StageError.IN_ALARM, StageError.LIMIT_SWITCH, StageError.EMERGENCY_STOP, StageError.DISABLED,
@@ -103,8 +105,10 @@ TIMEOUTS_S: dict[State, float] = {
     "stopping": 3.0,  # from STOP to standstill
     "done": 1.0,  # from the stage's `done` to the last burst
 }  # running: set for each row; all others: no limit
-END_TIMEOUT_S = 0.5  # from STOP to standstill when the program is being ended
-HOST_MISSES = 4  # missing heartbeats after which the host is lost
+# From STOP to standstill when the program is being ended.
+END_TIMEOUT_S = 0.5
+# Missing heartbeats after which the host is lost.
+HOST_MISSES = 4
 WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}  # the others have the same name
 
 

@@ -38,7 +38,8 @@ from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, pu
 LINGER_MS = 200
 POLL_MS = 250
 END_TIMEOUT_S = 0.8
-TAKE_OVER_KEY = "take-over-key"  # file beside the journals with a key that every run accepts from a person at the Pi
+# File beside the journals with a key that every run accepts from a person at the Pi.
+TAKE_OVER_KEY = "take-over-key"
 Envelope = tuple[bytes, ...]
 
 

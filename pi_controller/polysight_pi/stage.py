@@ -37,21 +37,29 @@ from polysight_shared.stage_line import (
 )
 from polysight_shared.units import NS_PER_S
 
-BITS_PER_BYTE = 10  # on the line: with start and stop bit
-BANNER_TIMEOUT_S = 3.0  # the first opening of the port resets an UNO, whose boot loader takes up to 2 s
-ANSWER_TIMEOUT_S = 0.5  # the longest line and its answer take 14 ms at 115200 baud; the rest is for a busy machine
+# On the line: with start and stop bit.
+BITS_PER_BYTE = 10
+# The first opening of the port resets an UNO, whose boot loader takes up to 2 s.
+BANNER_TIMEOUT_S = 3.0
+# The longest line and its answer take 14 ms at 115200 baud; the rest is for a busy machine.
+ANSWER_TIMEOUT_S = 0.5
 TRIES = 4
 RETRIED = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
-STATUS_PER_HEARTBEAT = 4  # while moving
+# While moving.
+STATUS_PER_HEARTBEAT = 4
 # Timeout of a status request, in heartbeats. With the time until the next request and the read timeout, a silent stage
 # is noticed before its own heartbeat stops it.
 SILENT_HEARTBEATS = 0.5
 IDLE_STATUS_S = 1.0
-STOP_TIMEOUT_S = 3.0  # from STOP to standstill
+# From STOP to standstill.
+STOP_TIMEOUT_S = 3.0
 CLEAR_RETRY_S = 0.05
-CALLER_LATE_S = 3.0  # longer than a line and its retries take
-MAX_MM = 1e6  # limit of a position in the messages
-MOTION_TIMEOUT_S = HOMING_TIMEOUT_S  # no motion takes longer than homing
+# Longer than a line and its retries take.
+CALLER_LATE_S = 3.0
+# Limit of a position in the messages.
+MAX_MM = 1e6
+# No motion takes longer than homing.
+MOTION_TIMEOUT_S = HOMING_TIMEOUT_S
 
 
 class StageLostError(DeviceError):

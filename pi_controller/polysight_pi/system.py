@@ -20,9 +20,12 @@ _MCL_CURRENT_FUTURE_ONFAULT = 1 | 2 | 4
 # preempted by other programs.
 PRIORITY = 50
 OTHERS_PRIORITY = 40
-SWITCH_INTERVAL_S = 100e-6  # the default of 5 ms is three pulse periods
-MAX_BYTES = 160 << 20  # the program needs 30 to 60 MB, a subscriber that does not read up to 50
-SPARE_BYTES = 64 << 20  # minimum above the memory left after a cut: not all freed memory returns to the system
+# The default of 5 ms is three pulse periods.
+SWITCH_INTERVAL_S = 100e-6
+# The program needs 30 to 60 MB, a subscriber that does not read up to 50.
+MAX_BYTES = 160 << 20
+# Minimum above the memory left after a cut: not all freed memory returns to the system.
+SPARE_BYTES = 64 << 20
 LOOK_S = 0.05
 SETTLE_S = 0.5
 

@@ -26,13 +26,19 @@ from polysight_shared.units import us_to_ns
 # From edge to first pulse. A fixed delay, longer than the usual wake-up time, keeps the pulses of all positions at the
 # same distance behind their edges; 200 us are 4 um of travel at 20 mm/s.
 FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)
-LOOK_UP_S = 0.1  # timeout of waiting for an edge, after which the loop checks if it has to stop
-SILENT_STATUSES = 2  # consecutive stage statuses without an edge ...
-SILENT_POINTS = 2  # ... while at least this many points were passed: the trigger wire is off
-LEAD_BITS = 8  # low bits before the first pulse, and at least as many after the last: MOSI keeps the last bit's level
-MIN_BYTES = 96  # shorter transfers have gaps: spi-bcm2835 writes them byte by byte, longer ones by DMA
+# Timeout of waiting for an edge, after which the loop checks if it has to stop.
+LOOK_UP_S = 0.1
+# Consecutive stage statuses without an edge ...
+SILENT_STATUSES = 2
+# ... while at least this many points were passed: the trigger wire is off.
+SILENT_POINTS = 2
+# Low bits before the first pulse, and at least as many after the last: MOSI keeps the last bit's level.
+LEAD_BITS = 8
+# Shorter transfers have gaps: spi-bcm2835 writes them byte by byte, longer ones by DMA.
+MIN_BYTES = 96
 DEFAULT_BUFSIZ = 4096
-MIN_PART = 0.98  # of the nominal duration; a shorter transfer was clocked too fast, its frames too close
+# Of the nominal duration; a shorter transfer was clocked too fast, its frames too close.
+MIN_PART = 0.98
 
 
 class Edge(NamedTuple):

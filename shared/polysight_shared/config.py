@@ -26,10 +26,13 @@ MAX_PIXELS = 4_000_000
 MIN_PIXEL_MM = 0.05
 MAX_PIXEL_MM = 100.0
 PixelSize = Annotated[float, msgspec.Meta(ge=MIN_PIXEL_MM, le=MAX_PIXEL_MM)]
-CARD_TAIL_S = 2.0  # silence after which a card sends a packet that is not full (docs/spec/dca1000.md, observed)
-_MOSI = {"/dev/spidev0": 10, "/dev/spidev1": 20}  # GPIO lines of a Pi's header
+# Silence after which a card sends a packet that is not full (docs/spec/dca1000.md, observed).
+CARD_TAIL_S = 2.0
+# GPIO lines of a Pi's header.
+_MOSI = {"/dev/spidev0": 10, "/dev/spidev1": 20}
 _MISO = {"/dev/spidev0": 9, "/dev/spidev1": 19}
-SPI_WIDTH_US = (0.5, 2.0)  # a bit at 2 MHz and at 500 kHz
+# A bit at 2 MHz and at 500 kHz.
+SPI_WIDTH_US = (0.5, 2.0)
 
 
 class Chirp(Section, frozen=True):

@@ -20,8 +20,10 @@ WIRE_VERSION = "1.0"
 # Limits of `Pulse`; the reply arrives well before the timeout of a command.
 MAX_PULSES_AT_REST = 256
 MAX_PULSES_AT_REST_S = 2.0
-MAX_COMMAND_BYTES = 65_536  # the Pi closes the connection after a longer command
-MAX_HEARTBEAT_MS = 10_000  # of the host; after a missing heartbeat the rig stays locked for four periods
+# The Pi closes the connection after a longer command.
+MAX_COMMAND_BYTES = 65_536
+# Of the host; after a missing heartbeat the rig stays locked for four periods.
+MAX_HEARTBEAT_MS = 10_000
 # Every field has a finite and bounded type; a message outside the limits is refused.
 Natural = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Seq = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
@@ -41,10 +43,14 @@ RowStatus = Literal["done", "aborted", "fault"]
 ExitStatus = Literal["success", "abort", "fail"]
 State = Literal["idle", "homing", "homed", "ready", "running", "held", "done", "fault"]
 # Backends of the Pi's SYNC_IN output (`HelloReply.backend`).
-GPIOD = "gpiod"  # kernel
-SPI = "spi"  # SPI controller
-WIRES = "wires"  # simulated
-_HARDWARE = (GPIOD, SPI, "gpiomem")  # the last one in scans of old releases: GPIO registers
+# Kernel.
+GPIOD = "gpiod"
+# SPI controller.
+SPI = "spi"
+# Simulated.
+WIRES = "wires"
+# The last one in scans of old releases: GPIO registers.
+_HARDWARE = (GPIOD, SPI, "gpiomem")
 Timing = Literal["", "spi", "one-shot", "program"]
 """Timing source of a burst: SPI controller (widths and periods), one-shot (widths, periods by the program), program;
 "" in events of earlier releases."""

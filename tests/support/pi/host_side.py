@@ -75,14 +75,15 @@ class HostSide:
         self.until_state("ready")
 
     def until_state(self, *states: str) -> m.StatusReply:
-        seen: list[m.StatusReply] = []
+        replies: list[Any] = []
 
-        def there() -> bool:
-            seen.append(self.ask(m.Status()))
-            return seen[-1].state in states
+        def is_reached() -> bool:
+            # A program that gets no processor time refuses the question.
+            replies.append(self.ask(m.Status()))
+            return isinstance(replies[-1], m.StatusReply) and replies[-1].state in states
 
-        wait_for(there, f"a state of {states}", self.limit_s)
-        return seen[-1]
+        wait_for(is_reached, f"a state of {states}", self.limit_s)
+        return replies[-1]
 
     def wait(self, kind: type, where: Callable[[Any], bool] = lambda _: True, limit_s: float | None = None) -> Any:
         """The next event of a kind."""

@@ -198,8 +198,11 @@ def read_generation(products: Path) -> str:
         except OSError:
             stamps.append("-")
             continue
-        # Files come and go in the folder without being products: its own time says nothing.
-        stamps.append(f"{status.st_ino:x}" if path == products else f"{status.st_mtime_ns:x}")
+        # Files come and go in the folder without being products: of the folder, only its number counts.
+        stamp = status.st_mtime_ns
+        if path == products:
+            stamp = status.st_ino
+        stamps.append(f"{stamp:x}")
     return ".".join(stamps)
 
 
@@ -325,7 +328,9 @@ def find_program(folder: Path, kind: str) -> Program | None:
     if words[1:3] == ["-m", "polysight"]:
         words = ["polysight", *words[3:]]
     running = started_ticks(record.pid) == record.ticks
-    status = None if running else _read_status(base.with_suffix(".status"))
+    status = None
+    if not running:
+        status = _read_status(base.with_suffix(".status"))
     return Program(kind, running, status, tuple(words), record.started_utc, log_tail(base.with_suffix(".log")))
 
 
@@ -345,8 +350,8 @@ def explain_failure(program: Program | None) -> Finding | None:
     lines = program.log.splitlines()
     heads = [k for k, line in enumerate(lines) if re.match(r"polysight \w+: ", line)]
     if not heads:
-        last = lines[-1] if lines else "its program ended without a message"
-        return Finding("error", last[:300])
+        lines = lines or ["its program ended without a message"]
+        return Finding("error", lines[-1][:300])
     start = heads[-1]
     parts = {"why": "", "do": ""}
     for line in lines[start + 1 :]:
@@ -391,8 +396,9 @@ def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
         return replace(summary, state="lost")
     if time.time() - written_s >= patience_s:
         # A folder that was copied from another machine has that one's signs of life.
-        hangs = life is not None and life.is_here
-        return replace(summary, state="frozen" if hangs else "lost")
+        if life is not None and life.is_here:
+            return replace(summary, state="frozen")
+        return replace(summary, state="lost")
     return summary if summary.state == "paused" else replace(summary, state="running")
 
 

@@ -103,13 +103,11 @@ def notice_of_fault(event: Fault) -> Finding:
         level = "note"
     elif PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in passing:
         level = "warning"
-    return Finding(
-        level,
-        f"Fault {event.number} at the Pi: {table.what}",
-        sentence(event.why or table.why),
-        sentence(event.remedy or table.remedy),
-        facts={"detail": event.what} if event.what != table.what else {},
-    )
+    details = {}
+    if event.what != table.what:
+        details["detail"] = event.what
+    what = f"Fault {event.number} at the Pi: {table.what}"
+    return Finding(level, what, sentence(event.why or table.why), sentence(event.remedy or table.remedy), facts=details)
 
 
 def _cause(faults: Sequence[RowFault]) -> tuple[str, str]:

@@ -419,13 +419,17 @@ def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status
     """A scan whose last run has ended."""
     folder = str(inputs.folder)
     safe = _safe_rows(history)
+    words = "Every row is safe."
     gaps = sum(mark == "kept" for mark in history.marks.values())
-    words = f"Every row is safe; {gaps} are kept with gaps, masked." if gaps else "Every row is safe."
+    if gaps:
+        words = f"Every row is safe; {gaps} are kept with gaps, masked."
     program = inputs.program
     if not _may_have_result(inputs, history):
         return say("materials", gaps=words)
     if program is not None and program.running and program.started_utc[:SECONDS] > ended.ended_utc[:SECONDS]:
-        return say("processing") if program.kind == "process" else say("resuming", safe=safe)
+        if program.kind == "process":
+            return say("processing")
+        return say("resuming", safe=safe)
     if ended.exit_status == "success" and len(history.takes) == history.plan.rows:
         return _judge_result(inputs, words)
     if ended.exit_status == "abort":
@@ -490,16 +494,15 @@ def _judge_rig(inputs: Inputs, history: ScanHistory) -> Status | None:
         return say("rig_fault", what="It occurred before this view.", why="See the Pi's log", do=do)
     if pi.state == "held":
         return say("held")
-    if pi.state == "homing":
-        return say("homing_again" if every_row else "homing")
-    return say("finishing") if every_row else None
+    if every_row:
+        return say("homing_again") if pi.state == "homing" else say("finishing")
+    return say("homing") if pi.state == "homing" else None
 
 
 def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
     """Rows that are retaken, late, or poor."""
     pi = inputs.pi
-    warnings = [notice for notice in history.notices if notice.level == "warning"]
-    newest = warnings[-1] if warnings else None
+    newest = next((notice for notice in reversed(history.notices) if notice.level == "warning"), None)
     if pi.row >= 0 and history.marks.get(pi.row) == "rejected":
         return say_finding("retake", newest, row=pi.row, take=pi.take)
     late_since_s = _late_since_s(history, inputs.signs)
@@ -508,7 +511,9 @@ def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
     if history.rows_since_trouble < RECENT_ROWS and newest is not None:
         return say_finding("after_fault", newest)
     poor = sync_notices(inputs.shown, history.plan.columns)
-    return say_finding("poor", poor[0]) if poor else None
+    if poor:
+        return say_finding("poor", poor[0])
+    return None
 
 
 def _late_since_s(history: ScanHistory, signs: LifeSigns) -> float:

@@ -183,8 +183,9 @@ class RowViewer:
             object_rad = phases.get("referenced", math.nan)
             direct_rad = phases.get("averaged", math.nan)
             scatter = figures.residuals.get("averaged", (math.nan,) * 3)[2]
-            snr_db = -20 * math.log10(scatter) if scatter > 0 else math.nan
-            sync = RowSync(object_rad, direct_rad, figures.positions_masked, snr_db)
+            sync = RowSync(object_rad, direct_rad, figures.positions_masked)
+            if scatter > 0:
+                sync = sync._replace(snr_db=-20 * math.log10(scatter))
             self._sync.setdefault(name, {})[row] = sync
         if draws or time.monotonic() - self._drawn_at > PICTURE_INTERVAL_S:
             self._publish(draw(pipeline.images.current()), self._profile(pipeline, row))
@@ -332,8 +333,9 @@ class ProductsTail:
             self._verdict = verdict
             self._processed_utc = processed_utc
         # Releases before this one did not say when.
-        is_final = not self._processed_utc or self._processed_utc[:SECONDS] >= last_row_utc[:SECONDS]
-        return self._verdict if is_final else None
+        if self._processed_utc and self._processed_utc[:SECONDS] < last_row_utc[:SECONDS]:
+            return None
+        return self._verdict
 
 
 class ProgramTail:
@@ -493,7 +495,9 @@ class Watch:
         exists = self.folder.is_dir()
         self._existed |= exists
         program, failure = self._programs.look()
-        last_row_utc = "" if self._history is None else self._history.last_row_utc
+        last_row_utc = ""
+        if self._history is not None:
+            last_row_utc = self._history.last_row_utc
         inputs = Inputs(
             folder=self.folder,
             history=self._history,

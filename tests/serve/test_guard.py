@@ -246,7 +246,8 @@ def test_nothing_in_a_report_can_act(scans):
 
 
 POSTS = ("control/abort?scan=one", "notes?scan=one", "labels?scan=one", "start", "train", "process?scan=one",
-         "export?scan=one", "session", "doctor", "plan")  # fmt: skip
+         "export?scan=one", "session", "doctor", "plan", "queue", "unqueue", "release", "again?scan=one",
+         "archive?scan=one", "delete?scan=one")  # fmt: skip
 NO_NAMES = ("..", "%2e%2e%2f", "/etc", "one%00", "a" * 9000, "%ff%fe")
 NO_PATHS = ("../../etc/passwd", "..%2f..%2fetc/passwd", "static/../guard.py", "%00", "?" + "q" * 9000)
 NO_LENGTHS = ("99999999999", "-1", "1e9", "0x10", "2, 3")

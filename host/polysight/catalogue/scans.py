@@ -282,7 +282,7 @@ def _add_products(folder: Path, summary: Summary) -> Summary:
 
 # --- programs ---
 
-KINDS = ("scan", "process", "export", "doctor", "train", "stage")
+KINDS = ("scan", "process", "export", "doctor", "train")
 """Programs that a page starts; each has its record, log and exit status in `<folder>/program/`."""
 NO_RESULT = 7
 """Exit status of a program that ended well, but without a result."""

@@ -61,7 +61,6 @@ async function answer(path, given, options, limit = ANSWER_MS) {
 }
 
 export const get = async (path, given) => (await answer(path, given)).json();
-export const reach = (path, given) => answer(path, given);
 export const post = async (path, given, body = {}, limit = ANSWER_MS) =>
   (await answer(path, given, { method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } }, limit)).json();
 export const control = (command, scan) => post(`control/${command}`, { scan }, {}, CONTROL_MS);

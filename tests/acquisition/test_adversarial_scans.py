@@ -21,8 +21,6 @@ from polysight_shared.config import Board
 from polysight_shared.errors import ScanError
 from polysight_simulators.cards import KINDS, Adversary, Arrival
 
-NETWORK = tuple(kind for kind in KINDS if kind != "clock")  # the kernel's clock is its own
-
 
 class AdversarialCard(FakeCard):
     """Sends each row with randomly drawn faults; delayed packets arrive among the packets of later rows."""
@@ -38,7 +36,7 @@ class AdversarialCard(FakeCard):
         if not self.recording:
             return
         troubled = self._chance.random() < self.rate
-        troubles = tuple(self._chance.sample(NETWORK, self._chance.randint(1, 3))) if troubled else ()
+        troubles = tuple(self._chance.sample(KINDS, self._chance.randint(1, 3))) if troubled else ()
         sent = self.adversary.record(
             self.row_bytes // self._frame, troubles, payload_of(self.board.name, row, self.row_bytes)
         )

@@ -88,14 +88,14 @@ class Rows(RuleBasedStateMachine):
         self.sure = placed.located
         if placed.past.lost:  # as the host does before the next row
             self.card.reset_by_host()
-            self.past = placed.past.after_reset()
+            self.past = Past.after_reset()
         return sent, placed
 
     def check_mask(self, sent: Sent, placed: Placed) -> None:
         """Where the start is known and the card sent one whole record, the mask is what did not come."""
         if placed.complete:  # and right, as was seen before
             return
-        spoils = {"truncate", "turn_header_bit", "two_paths", "clock", "reset_between"}
+        spoils = {"truncate", "turn_header_bit", "two_paths", "reset_between"}
         if not (self.sure and self.past.start and sent.whole and self.card.resets == 0) or spoils & {*sent.troubles}:
             return
         came = {a.packet[:10] for a in sent.arrivals if a.record == sent.number}
@@ -130,7 +130,7 @@ class Rows(RuleBasedStateMachine):
     def resume(self):
         """The host's program is started anew: it knows nothing, and resets the card."""
         self.card.reset_by_host()
-        self.past, self.sure, self.refused = Past().after_reset(), True, 0
+        self.past, self.sure, self.refused = Past.after_reset(), True, 0
 
 
 def test_no_byte_is_wrong_and_none_is_masked_without_reason(request: pytest.FixtureRequest):

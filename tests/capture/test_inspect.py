@@ -228,7 +228,7 @@ def test_the_command_reads_the_layout_that_is_given(polysight, tmp_path):
     assert (tmp_path / "rig.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     found = json.loads(polysight("other.bin", "--samples", "128", "--lanes", "2", "--q-first", "--json").out)
     assert (found["lanes"], found["samples"], found["q_first"], found["remarks"]) == (2, 128, True, [])
-    assert polysight("rig.bin", "--plot", "absent/x.png").status == 3
+    assert polysight("rig.bin", "--plot", "absent/x.png").status == 5
 
 
 def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):

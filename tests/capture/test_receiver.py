@@ -247,17 +247,24 @@ def test_a_record_ends_with_whichever_is_first(progress, status, now_s, ended):
     assert record_ended(progress, status, 10**9, int(now_s * 1e9), 3 * 10**9) == ended
 
 
-def test_portable_way_receives_the_same(board, card):
+def test_a_packet_has_the_time_of_its_arrival_and_not_that_of_the_read(board, card):
     with closing(bind_udp(board.host_address, board.data_port, "x")) as sock:
-        batches = BatchReceiver(sock, board.card_address)
-        batches._recvmmsg = None
+        receiver = BatchReceiver(sock, board.card_address)
+        before_ns = time.monotonic_ns()
         card.sendto(b"0123456789abc", (board.host_address, board.data_port))
         sock.sendto(b"stranger", (board.host_address, board.data_port))
-        assert batches.receive() == 1
-        assert batches.packets[0, :13].tobytes() == b"0123456789abc"
-        assert batches.lengths[0] == 13
-        assert batches.receive() == 0
-        assert batches.strangers == 1
+        between_ns = time.monotonic_ns()
+        while time.monotonic_ns() < between_ns + 20_000_000:
+            time.sleep(0.005)
+        card.sendto(b"0123456789", (board.host_address, board.data_port))
+        assert receiver.receive() == 2
+        assert receiver.strangers == 1
+        assert receiver.packets[0, :13].tobytes() == b"0123456789abc"
+        assert receiver.lengths[:2].tolist() == [13, 10]
+        first, second = receiver.times_ns[:2].tolist()
+        # The clock of the day may run differently by a little.
+        assert before_ns - 1_000_000 < first < second <= time.monotonic_ns()
+        assert receiver.receive() == 0
 
 
 def test_address_of_another_machine():

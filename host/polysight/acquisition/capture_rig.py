@@ -26,7 +26,8 @@ from polysight_shared.errors import PolysightError
 
 GRACE_NS = 200_000_000
 """Silence after which a record that the card reported as completed has ended: status and data use different ports."""
-_COMPLETED_TIMEOUT_S = 0.2  # from a record's stop to its last packet and its status
+# From a record's stop to its last packet and its status.
+_COMPLETED_TIMEOUT_S = 0.2
 
 
 def record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int, silence_ns: int) -> bool:
@@ -36,7 +37,8 @@ def record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int,
     (last pulse) and `now_ns` are on the monotonic clock; `silence_ns` is the silence that ends a record.
     """
     silent_ns = now_ns - max(progress.last_arrival_ns, since_ns)
-    reported = progress.ended or Status.RECORD_COMPLETED in status  # its short last packet, or its status
+    # Its short last packet, or its status.
+    reported = progress.ended or Status.RECORD_COMPLETED in status
     return progress.complete or silent_ns >= (min(GRACE_NS, silence_ns) if reported else silence_ns)
 
 
@@ -52,18 +54,20 @@ class CaptureRig:
         self.cards: dict[str, CardClient] = {}
         self.receivers: dict[str, ReceiverProcess] = {}
         self._recording = False
-        self._start_lost = {board.name for board in instrument.recorded}  # it is unknown where their cards count
+        # It is unknown where their cards count.
+        self._start_lost = {board.name for board in instrument.recorded}
         with ExitStack() as stack:
             for board in instrument.recorded:
                 card = CardClient(board, instrument.limits.command_timeout_s)
                 self.cards[board.name] = stack.enter_context(card)
-            wanted, burst_bytes = instrument.card.receive_buffer_bytes, instrument.burst.pulses * instrument.frame_bytes
+            requested = instrument.card.receive_buffer_bytes
+            burst_bytes = instrument.burst.pulses * instrument.frame_bytes
             cores = receiver_cores(len(instrument.recorded))
             for board, core in zip(instrument.recorded, cores, strict=True):
-                receiver = stack.enter_context(ReceiverProcess(board, wanted, core))
+                receiver = stack.enter_context(ReceiverProcess(board, requested, core))
                 self.receivers[board.name] = receiver
                 self.warnings += receiver.warnings
-                if warning := check_receive_buffer(board.name, receiver.granted_bytes, wanted, burst_bytes):
+                if warning := check_receive_buffer(board.name, receiver.granted_bytes, requested, burst_bytes):
                     self.warnings.append(warning)
             if (silence_s := instrument.limits.end_of_record_s) <= CARD_TAIL_S:
                 self.warnings.append(
@@ -112,8 +116,8 @@ class CaptureRig:
     def complete(self) -> bool:
         """True if every expected byte of the row has arrived, on every board."""
         # Poll every receiver, also behind an incomplete one: polling is how a dead process is noticed.
-        found = [receiver.poll() for receiver in self.receivers.values()]
-        return all(progress.complete for progress in found)
+        reports = [receiver.poll() for receiver in self.receivers.values()]
+        return all(progress.complete for progress in reports)
 
     def reports(self) -> dict[str, Progress]:
         """Request the progress of every board's receiver."""
@@ -136,7 +140,8 @@ class CaptureRig:
         self.stop_records()
         deadline = time.monotonic() + _COMPLETED_TIMEOUT_S
         for name, receiver in self.receivers.items():
-            if not receiver.poll().complete:  # nothing follows a complete row
+            # Nothing follows a complete row.
+            if not receiver.poll().complete:
                 self.cards[name].wait_completed(max(0.0, deadline - time.monotonic()))
         statuses = self.statuses()
         rows = {name: receiver.end_row(statuses[name], not_before_ns) for name, receiver in self.receivers.items()}

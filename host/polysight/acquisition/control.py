@@ -97,11 +97,11 @@ def stop_on_interrupt(stop: StopRequest) -> Iterator[None]:
             stop.request("Ctrl-C")
 
     numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
-    before = {number: signal.signal(number, handle) for number in numbers}
+    old_handlers = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in old_handlers.items():
             signal.signal(number, handler)
 
 
@@ -111,30 +111,33 @@ def ignore_hangup() -> Iterator[None]:
     if not _in_main_thread():
         yield
         return
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    old_handler = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         yield
     finally:
-        signal.signal(signal.SIGHUP, before)
+        signal.signal(signal.SIGHUP, old_handler)
 
 
 @contextmanager
 def delay_interrupts() -> Iterator[None]:
     """Block SIGINT and SIGTERM in this thread until the block ends."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    old_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, old_mask)
 
 
 class ScanCommand(StrEnum):
     """Commands for a running scan; the values are the names of their files."""
 
-    PAUSE = "pause"  # after the current row, until `continue`
+    # After the current row, until `continue`.
+    PAUSE = "pause"
     CONTINUE = "continue"
-    STOP = "stop"  # after the current row
-    ABORT = "abort"  # now
+    # After the current row.
+    STOP = "stop"
+    # Now.
+    ABORT = "abort"
 
 
 class Life(msgspec.Struct, frozen=True):

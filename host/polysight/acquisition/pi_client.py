@@ -55,14 +55,20 @@ from polysight_shared.messages import (
 )
 from polysight_shared.sockets import HandshakeMonitor, requester, subscriber
 
-ATTEMPTS = 3  # to send a command
-REAL_TIME = 1  # real-time priority of the heartbeat: below the receiver processes
-_SILENT_BEATS = 10  # more than after which the Pi considers a host dead
-_ALIVE_TIMEOUT_S = 1.0  # for a reply to `Alive`, before it is sent again
-MOVING: tuple[State, ...] = ("homing", "running", "held", "done")  # states that change without a command
+# To send a command.
+ATTEMPTS = 3
+# Real-time priority of the heartbeat: below the receiver processes.
+REAL_TIME = 1
+# More than after which the Pi considers a host dead.
+_SILENT_BEATS = 10
+# For a reply to `Alive`, before it is sent again.
+_ALIVE_TIMEOUT_S = 1.0
+# States that change without a command.
+MOVING: tuple[State, ...] = ("homing", "running", "held", "done")
 _REST_TIMEOUT_S = 10.0
 _POLL_S = 0.05
-_REPLAY_LIMIT = 1000  # events
+# Events.
+_REPLAY_LIMIT = 1000
 R = TypeVar("R", bound=AnyReply)
 
 
@@ -76,16 +82,19 @@ class HostHeartbeat:
         self, context: zmq.Context[Any], instrument: Instrument, scan_id: str, interval_s: float, owner: str = ""
     ) -> None:
         self._socket = requester(context, instrument.pi.command_address, Path(instrument.pi.key_dir))
-        self._alive, self._interval_s = pack(Alive(scan_id=scan_id, owner=owner)), interval_s
+        self._alive = pack(Alive(scan_id=scan_id, owner=owner))
+        self._interval_s = interval_s
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
         self._thread.start()
 
     def _beat(self) -> None:
-        take_priority(REAL_TIME)  # without permission for that, a busy machine may cause a retake
+        # Without permission for that, a busy machine may cause a retake.
+        take_priority(REAL_TIME)
         try:
             while not self._stop.wait(self._interval_s):
-                with suppress(zmq.Again):  # no connection: the Pi will notice the missing heartbeat
+                # No connection: the Pi will notice the missing heartbeat.
+                with suppress(zmq.Again):
                     self._socket.send(self._alive)
                 waited_s = 0.0
                 while not self._stop.is_set() and waited_s < _ALIVE_TIMEOUT_S:
@@ -106,8 +115,8 @@ class RefusedError(ScanError):
     """The Pi refused a command; `number` is of shared/polysight_shared/faults.py."""
 
     def __init__(self, command: str, refusal: Refused) -> None:
-        what = f"the Pi refused {command}: {refusal.what}"
-        super().__init__(what, refusal.why, refusal.remedy, code=ErrorCode.REFUSED_BY_PEER)
+        problem = f"the Pi refused {command}: {refusal.what}"
+        super().__init__(problem, refusal.why, refusal.remedy, code=ErrorCode.REFUSED_BY_PEER)
         self.number = refusal.number
 
 
@@ -118,7 +127,8 @@ class PiClient:
     """
 
     def __init__(self, context: zmq.Context[Any], instrument: Instrument) -> None:
-        self._context, self._instrument = context, instrument
+        self._context = context
+        self._instrument = instrument
         self._heartbeat: HostHeartbeat | None = None
         self._address = instrument.pi.command_address
         self._event_address = instrument.pi.event_address
@@ -129,13 +139,16 @@ class PiClient:
         self._events = subscriber(context, self._event_address, keys)
         self._commands = requester(context, self._address, keys)
         self._handshake = HandshakeMonitor(self._commands)
-        self._owner = secrets.token_hex(16)  # identifies the runs that this client begins
+        # Identifies the runs that this client begins.
+        self._owner = secrets.token_hex(16)
         self._scan_id = ""
         self._last_seq = 0
         self._last_heard_s = time.monotonic()
         self._pending: deque[AnyEvent] = deque()
-        self.gaps_filled = 0  # events that PUB lost and the journal contained
-        self.state: State = "idle"  # in the last heartbeat
+        # Events that PUB lost and the journal contained.
+        self.gaps_filled = 0
+        # In the last heartbeat.
+        self.state: State = "idle"
 
     @property
     def event_socket(self) -> zmq.Socket[bytes]:
@@ -144,7 +157,9 @@ class PiClient:
 
     def follow(self, scan_id: str, last_seq: int, on_event: Callable[[AnyEvent], None]) -> None:
         """Follow the events of a scan: call `on_event` exactly once with each event after `last_seq`, in order."""
-        self._scan_id, self._last_seq, self._on_event = scan_id, last_seq, on_event
+        self._scan_id = scan_id
+        self._last_seq = last_seq
+        self._on_event = on_event
 
     # --- commands ---
 
@@ -199,13 +214,14 @@ class PiClient:
         for _ in range(ATTEMPTS):
             reply = self._once(command, self._timeout_s / ATTEMPTS)
             if isinstance(reply, Accepted):
-                self.state = reply.state  # newer than the last heartbeat
+                # Newer than the last heartbeat.
+                self.state = reply.state
                 return
             status = self.status()
             if status.state in ("running", "held") and (status.row_index, status.take) == (row_index, take):
                 return
             self._catch_up(status.last_seq)
-            if any(_is_of(e, row_index, take) for e in self._pending):
+            if any(_belongs_to_take(e, row_index, take) for e in self._pending):
                 return
         raise self._no_answer("RunRow")
 
@@ -242,8 +258,8 @@ class PiClient:
             if isinstance(reply, kind):
                 return reply
             if reply is not None:
-                what = f"the Pi answered {type(command).__name__} with {type(reply).__name__}"
-                raise ProtocolError(what, code=ErrorCode.MESSAGE_INVALID)
+                problem = f"the Pi answered {type(command).__name__} with {type(reply).__name__}"
+                raise ProtocolError(problem, code=ErrorCode.MESSAGE_INVALID)
         raise self._no_answer(type(command).__name__)
 
     def _once(self, command: AnyCommand, timeout_s: float) -> AnyReply | None:
@@ -297,7 +313,8 @@ class PiClient:
             elif event.seq > self._last_seq:
                 self._catch_up(event.seq)
         if time.monotonic() - self._last_heard_s > self._silence_s:
-            self._catch_up(self.status().last_seq)  # no heartbeats: check that it answers
+            # No heartbeats: check that it answers.
+            self._catch_up(self.status().last_seq)
         out = list(self._pending)
         self._pending.clear()
         return out
@@ -313,14 +330,15 @@ class PiClient:
             reply = self._ask(
                 Replay(scan_id=self._scan_id, from_seq=self._last_seq + 1, limit=_REPLAY_LIMIT), ReplayReply
             )
-            before = self._last_seq
+            seq_before = self._last_seq
             for event in reply.events:
                 if event.seq == self._last_seq + 1:
                     self._take(event)
                     self.gaps_filled += 1
-            if self._last_seq == before:
+            if self._last_seq == seq_before:
                 raise DeviceError(
-                    f"the Pi's journal of scan {self._scan_id} lacks event {before + 1} (it ends at {reply.last_seq})",
+                    f"the Pi's journal of scan {self._scan_id} lacks event {seq_before + 1}"
+                    f" (it ends at {reply.last_seq})",
                     "the journal on the Pi was removed or damaged",
                     "start a new scan; the committed rows of this one stay valid",
                     code=ErrorCode.NO_DATA,
@@ -349,7 +367,7 @@ class PiClient:
         self.close()
 
 
-def _is_of(event: AnyEvent, row_index: int, take: int) -> bool:
+def _belongs_to_take(event: AnyEvent, row_index: int, take: int) -> bool:
     if isinstance(event, RowStarted):
         return event.row.index == row_index and event.take == take
     return isinstance(event, RowFinished) and (event.row_index, event.take) == (row_index, take)

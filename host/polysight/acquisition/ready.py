@@ -23,8 +23,10 @@ from polysight_shared.messages import HelloReply, StatusReply
 from polysight_shared.raster import Stage
 from polysight_shared.stage_line import HOMING_TIMEOUT_S
 
-_HOMING_TIMEOUT_S = HOMING_TIMEOUT_S + 30.0  # longer than the Pi's own, which reports the exact reason
-STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)  # a person must look and home: `polysight-pi home`
+# Longer than the Pi's own, which reports the exact reason.
+_HOMING_TIMEOUT_S = HOMING_TIMEOUT_S + 30.0
+# A person must look and home: `polysight-pi home`.
+STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)
 STAGE_NOT_REPORTED = (
     "the Pi does not report its [stage], so it cannot be compared with the rig file's: install this release on the Pi"
 )
@@ -96,22 +98,28 @@ def _wait_ready(pi: PiClient, stop: StopRequest, scan_id: str) -> bool:
 
 def check_between_rows(status: StatusReply, scan_id: str, first: bool) -> None:
     """Raise ScanError if the next row needs homing and a person must look at the stage before that."""
-    problem: tuple[str, str, str] | None = None
+    needs_homing = status.state in ("idle", "homed") or (status.state == "ready" and not status.homed)
     if scan_id and status.scan_id not in ("", scan_id):
-        what = f"the Pi has begun another run in the meantime: {status.scan_id}"
-        problem = what, "another host uses it", "wait for its end"
+        problem = f"the Pi has begun another run in the meantime: {status.scan_id}"
+        cause = "another host uses it"
+        remedy = "wait for its end"
     elif scan_id and not status.scan_id:
-        why = "power was lost there, or the program ended"
-        problem = "the Pi's program restarted between two rows", why, "see `journalctl -u polysight-pi` on the Pi"
+        problem = "the Pi's program restarted between two rows"
+        cause = "power was lost there, or the program ended"
+        remedy = "see `journalctl -u polysight-pi` on the Pi"
     elif status.state == "fault" and (not first or status.fault in STAGE_FAULTS):
-        e = explain(status.fault)
-        problem = f"the stage is not ready: {e.what}: {status.reason}", e.why, e.remedy
-    elif not first and (status.state in ("idle", "homed") or (status.state == "ready" and not status.homed)):
-        what = f"the stage is {status.state!r} between two rows" + (f": {status.reason}" if status.reason else "")
-        why = "its position was lost, homing was stopped, or somebody ended the run at the Pi"
-        problem = what, why, "check that nothing is in the way, then `polysight-pi home`"
-    if problem:
-        raise ScanError(*problem, code=ErrorCode.STAGE_NOT_READY)
+        explained = explain(status.fault)
+        problem = f"the stage is not ready: {explained.what}: {status.reason}"
+        cause = explained.why
+        remedy = explained.remedy
+    elif not first and needs_homing:
+        reason = f": {status.reason}" if status.reason else ""
+        problem = f"the stage is {status.state!r} between two rows{reason}"
+        cause = "its position was lost, homing was stopped, or somebody ended the run at the Pi"
+        remedy = "check that nothing is in the way, then `polysight-pi home`"
+    else:
+        return
+    raise ScanError(problem, cause, remedy, code=ErrorCode.STAGE_NOT_READY)
 
 
 def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
@@ -137,11 +145,11 @@ def describe_pi(hello: HelloReply) -> PiDescription:
 
 def stage_differences(stage: Stage, hello: HelloReply) -> list[str]:
     """List the keys of `[stage]` that place rows and differ on the Pi, with both values; [] if it reports none."""
-    own = stage.placement_settings
+    settings = stage.placement_settings
     return [
-        f"stage.{key} is {own[key]:.10g} here and {hello.stage[key]:.10g} on the Pi"
-        for key in own
-        if hello.stage.get(key, own[key]) != own[key]
+        f"stage.{key} is {settings[key]:.10g} here and {hello.stage[key]:.10g} on the Pi"
+        for key in settings
+        if hello.stage.get(key, settings[key]) != settings[key]
     ]
 
 

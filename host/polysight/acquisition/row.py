@@ -56,22 +56,37 @@ from polysight_shared.units import NS_PER_S
 class FaultKind(StrEnum):
     """Kinds of faults of a take. The manifest stores the values: never change the meaning of one."""
 
-    ON_REQUEST = "on_request"  # the scan was aborted on request
-    RADAR_STOPPED = "radar_stopped"  # reported by the radar
-    RADAR_WAITS = "radar_waits"  # still armed after the last pulse
-    PI_FAULT = "pi_fault"  # the Pi ended the row; `number` is of shared/polysight_shared/faults.py
-    NO_END = "no_end"  # the Pi did not report how the row ended
-    COUNTS_DIFFER = "counts_differ"  # points or pulses are not as planned
+    # The scan was aborted on request.
+    ON_REQUEST = "on_request"
+    # Reported by the radar.
+    RADAR_STOPPED = "radar_stopped"
+    # Still armed after the last pulse.
+    RADAR_WAITS = "radar_waits"
+    # The Pi ended the row; `number` is of shared/polysight_shared/faults.py.
+    PI_FAULT = "pi_fault"
+    # The Pi did not report how the row ended.
+    NO_END = "no_end"
+    # Points or pulses are not as planned.
+    COUNTS_DIFFER = "counts_differ"
     NO_DATA = "no_data"
-    HELD = "held"  # the row was held so long that the cards ended their records
-    PULSES_MISSED = "pulses_missed"  # frames are missing at known pulses
-    SLIPPED = "slipped"  # as many frames as pulses, but not at the pulses' times
-    FRAMES_MISSING = "frames_missing"  # frames are missing at unknown pulses
-    CARD_DROPPED = "card_dropped"  # the card reports that it dropped data before numbering packets
-    LOST_BY_HOST = "lost_by_host"  # packets dropped by the kernel, possibly others too
-    LOST_ON_THE_WAY = "lost_on_the_way"  # packets that never reached this machine
-    CONFLICTING = "conflicting"  # packets with equal counters and different bytes
-    UNLOCATED = "unlocated"  # data with an uncertain place in the row
+    # The row was held so long that the cards ended their records.
+    HELD = "held"
+    # Frames are missing at known pulses.
+    PULSES_MISSED = "pulses_missed"
+    # As many frames as pulses, but not at the pulses' times.
+    SLIPPED = "slipped"
+    # Frames are missing at unknown pulses.
+    FRAMES_MISSING = "frames_missing"
+    # The card reports that it dropped data before numbering packets.
+    CARD_DROPPED = "card_dropped"
+    # Packets dropped by the kernel, possibly others too.
+    LOST_BY_HOST = "lost_by_host"
+    # Packets that never reached this machine.
+    LOST_ON_THE_WAY = "lost_on_the_way"
+    # Packets with equal counters and different bytes.
+    CONFLICTING = "conflicting"
+    # Data with an uncertain place in the row.
+    UNLOCATED = "unlocated"
 
 
 @dataclass(frozen=True)
@@ -115,20 +130,23 @@ class Take:
 
     def faults(self, pulses_per_point: int) -> list[TakeFault]:
         """List the faults of this take; empty if it is complete."""
-        found = [
+        faults = [
             TakeFault(FaultKind.RADAR_STOPPED, f"the radar has stopped: {s.detail}", name)
             for name, s in self.stopped_radars.items()
         ]
         if fault := self._fault_of_row(self.row.points * pulses_per_point):
-            found.append(fault)
-        found += [
+            faults.append(fault)
+        faults += [
             TakeFault(FaultKind.RADAR_WAITS, "the radar still waits for pulses, it missed some", name)
             for name in self.not_done
         ]
         if self.aborted and not self.events:
-            return found  # no pulses, no data
-        each = (self._fault_of(name, capture, pulses_per_point) for name, capture in self.captures.items())
-        return found + [fault for fault in each if fault is not None]
+            # No pulses, no data.
+            return faults
+        board_faults = (
+            self._find_board_fault(name, capture, pulses_per_point) for name, capture in self.captures.items()
+        )
+        return faults + [fault for fault in board_faults if fault is not None]
 
     def _fault_of_row(self, pulses: int) -> TakeFault | None:
         """Return the fault that the Pi reported; None if the row was run as planned."""
@@ -145,37 +163,38 @@ class Take:
             return TakeFault(FaultKind.COUNTS_DIFFER, text)
         return None
 
-    def displaced(self, name: str) -> PlacedFrames | None:
+    def find_displaced(self, name: str) -> PlacedFrames | None:
         """Return where a board's frames are if they are not at their pulses; None if they are, or it is unknown."""
         frames = self.frames.get(name)
         if frames is None or frames.reason:
             return None
         return frames if self.captures[name].slipped or frames.contradicted else None
 
-    def untimed(self, name: str, pulses_per_point: int) -> int:
+    def count_untimed(self, name: str, pulses_per_point: int) -> int:
         """Number of a board's frames whose pulse follows from their count alone, not from their arrival times."""
         frames = self.frames.get(name)
         if frames is None or frames.reason:
             return self.row.points * pulses_per_point
         return frames.uncertain
 
-    def _fault_of(self, name: str, capture: RowCapture, pulses_per_point: int) -> TakeFault | None:
+    def _find_board_fault(self, name: str, capture: RowCapture, pulses_per_point: int) -> TakeFault | None:
         """Return the fault of one board's data; None if it is complete."""
-        placed, radar = self.displaced(name), self.radars.get(name, BoardState(RadarState.UNKNOWN))
-        held = "; the row was held, and a card ends its record after 2 s without data" if self.note else ""
+        placed = self.find_displaced(name)
+        radar = self.radars.get(name, BoardState(RadarState.UNKNOWN))
+        held_text = "; the row was held, and a card ends its record after 2 s without data" if self.note else ""
         if capture.packets == 0:
             detail = f": its radar was {radar.detail}, and may not have obeyed" if radar.detail else ""
             return TakeFault(FaultKind.NO_DATA, f"no data{detail}", name)
         if placed is not None:
             missed = FaultKind.PULSES_MISSED if placed.slots.size < placed.pulses else FaultKind.SLIPPED
-            kind = FaultKind.HELD if held else missed
-            return TakeFault(kind, describe(placed, pulses_per_point) + held, name)
+            kind = FaultKind.HELD if held_text else missed
+            return TakeFault(kind, describe(placed, pulses_per_point) + held_text, name)
         if not capture.located:
             frames = self.frames.get(name)
             unplaced = f"; missed pulses cannot be located: {frames.reason}" if frames is not None else ""
             waits = "; the radar still waits for pulses" if radar.state is RadarState.ARMED else ""
-            kind = FaultKind.RADAR_WAITS if waits else FaultKind.HELD if held else _unlocated(capture)
-            return TakeFault(kind, capture.reason + unplaced + waits + held, name)
+            kind = FaultKind.RADAR_WAITS if waits else FaultKind.HELD if held_text else _classify_unlocated(capture)
+            return TakeFault(kind, capture.reason + unplaced + waits + held_text, name)
         if capture.conflicting and capture.missing:
             text = f"{capture.conflicting} packets have other bytes than packets with equal counters"
             return TakeFault(FaultKind.CONFLICTING, f"{text}; {capture.missing_bytes} bytes are masked", name)
@@ -184,8 +203,8 @@ class Take:
                 f"{capture.missing_bytes} bytes are missing in {len(capture.missing)} places"
                 f" ({capture.kernel_drops} packets dropped by this machine)"
             )
-            here = capture.kernel_drops > 0
-            return TakeFault(FaultKind.LOST_BY_HOST if here else FaultKind.LOST_ON_THE_WAY, text, name)
+            dropped_here = capture.kernel_drops > 0
+            return TakeFault(FaultKind.LOST_BY_HOST if dropped_here else FaultKind.LOST_ON_THE_WAY, text, name)
         return None
 
     @property
@@ -209,7 +228,7 @@ class Take:
         return [n for n, c in self.captures.items() if c.packets == 0 and (self.events or self.all_pulses_sent)]
 
 
-def _unlocated(capture: RowCapture) -> FaultKind:
+def _classify_unlocated(capture: RowCapture) -> FaultKind:
     """Return why a board's data cannot be located in the row."""
     if capture.lost_before_packets:
         return FaultKind.CARD_DROPPED
@@ -229,13 +248,14 @@ def commit_row(
     for name, capture in take.captures.items():
         final = scan.row_path(name, take.row.index)
         frames = take.frames.get(name)
-        moved = frames_to_move(capture, capture.late, frames)
-        untimed = take.untimed(name, scan.instrument.burst.pulses) if capture.located else 0
+        moved = frames_to_move(capture, frames)
+        untimed = take.count_untimed(name, scan.instrument.burst.pulses) if capture.located else 0
         missed = frames.pulses - frames.slots.size if capture.slipped and frames is not None else None
         if moved is not None:
             capture = rewrite_row(final.with_suffix(PART), capture, moved, scan.instrument.frame_bytes)
             take.captures[name] = capture
-            untimed = 0
+            # Of a whole row, the frames that came at no pulse's time are masked now.
+            untimed = 0 if faults else untimed - len(moved.doubtful)
         try:
             final.with_suffix(PART).rename(final)
         except OSError as e:
@@ -296,27 +316,29 @@ def _reception(capture: RowCapture) -> dict[str, Any]:
 
 def retakes_exhausted(take: Take, faults: list[TakeFault], scan: ScanFolder, takes: int) -> ScanError:
     """Return the error for a row whose retakes are used up, with the likeliest cause."""
-    why = "packets are lost on the network or in this machine, or a board misses SYNC_IN pulses"
+    cause = "packets are lost on the network or in this machine, or a board misses SYNC_IN pulses"
     remedy = "see the counts of row_rejected in the manifest; check cable, receive buffer and load"
     if take.stopped_radars:
-        why = "a radar has stopped by itself, or the link to it is gone"
+        cause = "a radar has stopped by itself, or the link to it is gone"
         remedy = "check its USB cable, its power and its SYNC_IN (docs/how-to/radar-bring-up.md)"
     elif take.silent_boards:
         silent = [silent_radar(scan.instrument.by_name(name), take.captures[name]) for name in take.silent_boards]
         states = [f"{n}'s radar was {take.radars[n].detail}" for n in take.silent_boards if n in take.radars]
-        why, remedy = "; ".join([f"{e.what}: {e.why}" for e in silent] + states), silent[0].remedy
+        cause, remedy = "; ".join([f"{e.what}: {e.why}" for e in silent] + states), silent[0].remedy
     elif take.finished is not None and take.finished.fault:
         explained = explain(take.finished.fault)
-        why, remedy = explained.why, explained.remedy
+        cause = explained.why
+        remedy = explained.remedy
     return ScanError(
         f"row {take.row.index} is not complete after {takes} takes: {reasons(faults)}",
-        why,
+        cause,
         advice(remedy, f"then `polysight resume {scan.path}`; with --keep-incomplete it keeps such rows, masked"),
         code=ErrorCode.ROW_INCOMPLETE,
     )
 
 
-_POLL_MS = 50  # interval at which stop requests and timeouts are checked
+# Interval at which stop requests and timeouts are checked.
+_POLL_MS = 50
 _ABORT_TIMEOUT_S = 10.0
 _DISK_NOTICE_S = 2.0
 
@@ -391,9 +413,15 @@ class RowTaker:
         on_point: Callable[[int], None],
         notify: Callable[[str, str], None],
     ) -> None:
-        self._instrument, self._rig, self._radars, self._pi = instrument, rig, radars, pi
-        self._scan_id, self._folder, self._stop = scan_id, folder, stop
-        self._on_point, self._notify = on_point, notify
+        self._instrument = instrument
+        self._rig = rig
+        self._radars = radars
+        self._pi = pi
+        self._scan_id = scan_id
+        self._folder = folder
+        self._stop = stop
+        self._on_point = on_point
+        self._notify = notify
         self._poller = zmq.Poller()
         self._poller.register(pi.event_socket, zmq.POLLIN)
         for part in (*rig.receivers.values(), *rig.cards.values()):
@@ -436,7 +464,7 @@ class RowTaker:
         limit_s = row_limit_s(self._instrument, take.row)
         deadline = time.monotonic() + limit_s
         silence = _SilenceCheck(self._instrument, self._rig)
-        held = False
+        is_held = False
         while take.finished is None:
             self._poll(take)
             fault = ON_REQUEST if self._stop.now else None if take.aborted else self._fatal_fault(take, silence)
@@ -448,10 +476,11 @@ class RowTaker:
             if take.finished is None and self._pi.state in ("fault", "idle"):
                 self._check_stopped(take)
             if self._pi.state == "held" and not take.aborted:
-                deadline = time.monotonic() + limit_s  # a held row has no timeout
-                if not held:
+                # A held row has no timeout.
+                deadline = time.monotonic() + limit_s
+                if not is_held:
                     self._notify("held", f"row {take.row.index} is held; send `Resume` from where `Hold` was sent")
-                held = True
+                is_held = True
             if time.monotonic() > deadline:
                 if take.aborted:
                     return
@@ -476,7 +505,8 @@ class RowTaker:
         """Raise ScanError if the Pi is in a fault or restarted, and its journal does not contain the row's end."""
         status = self._pi.status()
         if status.state not in ("fault", "idle"):
-            return  # the last heartbeat was from before this row
+            # The last heartbeat was from before this row.
+            return
         if status.scan_id == self._scan_id:
             self._pi.drain()
         self._collect(take)
@@ -498,8 +528,10 @@ class RowTaker:
 
     def _poll(self, take: Take) -> None:
         self._poller.poll(_POLL_MS)
-        self._rig.statuses()  # reads the cards' messages
-        _ = self._rig.complete  # reads the receivers' messages
+        # Reads the cards' messages.
+        self._rig.statuses()
+        # Reads the receivers' messages.
+        _ = self._rig.complete
         self._collect(take)
 
     def _collect(self, take: Take) -> None:
@@ -516,7 +548,9 @@ class RowTaker:
         limit_ns = int(self._instrument.limits.end_of_record_s * NS_PER_S)
         while not self._rig.complete and not self._stop.now:
             self._poller.poll(_POLL_MS)
-            now, statuses, reports = time.monotonic_ns(), self._rig.statuses(), self._rig.reports()
+            now = time.monotonic_ns()
+            statuses = self._rig.statuses()
+            reports = self._rig.reports()
             if all(record_ended(r, statuses[n], finished_ns, now, limit_ns) for n, r in reports.items()):
                 return
 
@@ -535,7 +569,7 @@ class RowTaker:
         for name, capture in take.captures.items():
             path = self._folder / "raw" / name / f"{take.row.index:04d}{PART}"
             if capture.located or capture.slipped:
-                take.frames[name] = find_frames(path, take.row, take.events, self._instrument, capture.holes)
+                take.frames[name] = find_frames(path, take.row, take.events, self._instrument)
 
 
 class _SilenceCheck:
@@ -545,7 +579,8 @@ class _SilenceCheck:
         self._rig = rig
         self._limit_ns = int(instrument.limits.end_of_record_s * NS_PER_S)
         burst_bytes = instrument.burst.pulses * instrument.frame_bytes
-        self._bursts = -(-2 * instrument.card.packet_bytes // burst_bytes)  # that fill at least two packets
+        # That fill at least two packets.
+        self._bursts = -(-2 * instrument.card.packet_bytes // burst_bytes)
         self._checked_ns = 0
         self._all_heard = False
 

@@ -75,7 +75,8 @@ from polysight_shared.tables import to_builtins
 
 OnRow = Callable[[int], None]
 NICE = 5
-_RECENT_ROWS = 25  # enough for a steady median, few enough to follow a faster rig
+# Enough for a steady median, few enough to follow a faster rig.
+_RECENT_ROWS = 25
 
 
 class ProcessingQueue:
@@ -85,7 +86,8 @@ class ProcessingQueue:
     """
 
     def __init__(self, on_row: OnRow | None, limit: int) -> None:
-        self._on_row, self._limit = on_row, limit
+        self._on_row = on_row
+        self._limit = limit
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="rows", initializer=_yield_to_capture)
         self._all: list[Future[None]] = []
         self._own: list[Future[None]] = []
@@ -181,7 +183,8 @@ def time_left(rows_left: int, row_s: float, elapsed_s: float = 0.0) -> float:
 
 
 _POLL_S = 0.05
-_LOST_STEPS_WARNING_MM = 0.05  # 9 degrees of phase at 77 GHz
+# 9 degrees of phase at 77 GHz.
+_LOST_STEPS_WARNING_MM = 0.05
 
 
 class RunningScan:
@@ -199,19 +202,29 @@ class RunningScan:
         keep_incomplete: bool,
         stop: StopRequest,
     ) -> None:
-        self._scan, self._writer, self._pi, self._rig = scan, writer, pi, rig
-        self._instrument, self._plan = scan.instrument, scan.plan
-        self._progress, self._keep_incomplete, self._stop = progress, keep_incomplete, stop
+        self._scan = scan
+        self._writer = writer
+        self._pi = pi
+        self._rig = rig
+        self._instrument = scan.instrument
+        self._plan = scan.plan
+        self._progress = progress
+        self._keep_incomplete = keep_incomplete
+        self._stop = stop
         self._radars = radars
         self._queue = ProcessingQueue(on_row, scan.instrument.limits.rows_waiting)
         self._committed = set(scan.committed())
         self._row_seconds: list[float] = []
-        self._row_began: float | None = None  # monotonic, plus pauses; None between rows
-        self._current = (-1, 0, 0)  # row, take, points
+        # Monotonic, plus pauses; None between rows.
+        self._row_began: float | None = None
+        # Row, take, points.
+        self._current = (-1, 0, 0)
         self._state = ""
         self._stop_announced = False
-        self._was_ready = False  # the stage, in this run
-        self._error: PolysightError | None = None  # that ended the scan
+        # The stage, in this run.
+        self._was_ready = False
+        # That ended the scan.
+        self._error: PolysightError | None = None
         self._lost_mm: tuple[float, float] | None = None
         self.result = ScanResult(scan, "fail", "ended unexpectedly")
 
@@ -229,7 +242,8 @@ class RunningScan:
                 self._pi.follow(self._scan.scan_id, events.last_seq, events.append)
                 self._pi.begin_run(self._begin_run(events.last_seq))
                 begun = True
-                self._pi.drain()  # events of an earlier program's takes
+                # Events of an earlier program's takes.
+                self._pi.drain()
                 self._warn_of_lost_events(self._pi.events())
                 events.sync()
                 self._queue.add_earlier(sorted(self._committed))
@@ -261,7 +275,8 @@ class RunningScan:
             self.result.reason = f"{type(e).__name__}: {e}"
         with stop_on_interrupt(self._stop):
             if begun:
-                with suppress(PolysightError):  # the first error is the one to report
+                # The first error is the one to report.
+                with suppress(PolysightError):
                     self._pi.come_to_rest(self.result.reason[:500])
             with suppress(PolysightError):
                 self._end(begun)
@@ -315,12 +330,13 @@ class RunningScan:
             self._row_seconds.append(time.monotonic() - self._row_began)
             self._row_began = None
             self._notify("committed", f"row {row.index} committed")
-        left = self._plan.rows - len(self._committed)
-        if left == 0:
-            self.result.exit_status, self.result.reason = "success", "every row is committed"
+        rows_left = self._plan.rows - len(self._committed)
+        if rows_left == 0:
+            self.result.exit_status = "success"
+            self.result.reason = "every row is committed"
         else:
             self.result.exit_status = "abort"
-            self.result.reason = f"stopped on request, {left} of {self._plan.rows} rows are missing"
+            self.result.reason = f"stopped on request, {rows_left} of {self._plan.rows} rows are missing"
 
     def _check_lost_steps(self) -> None:
         """Measure lost steps by homing after the last row; a failure is only a warning, the scan is complete."""
@@ -359,7 +375,8 @@ class RunningScan:
                 raise retakes_exhausted(take, faults, self._scan, number - first_take + 1)
             check_between_rows(self._pi.status(), self._scan.scan_id, first=False)
             if take.silent_boards:
-                self._rig.configure(take.silent_boards)  # a card that lost power has lost its configuration
+                # A card that lost power has lost its configuration.
+                self._rig.configure(take.silent_boards)
             self.result.retakes += 1
             self._notify("retake", f"row {row.index} is taken again: {reasons(faults)}")
 
@@ -368,7 +385,7 @@ class RunningScan:
         check_disk(self._scan.path, self._instrument, 1)
         if not self._wait_while_paused() or not self._wait_for_processing():
             return None
-        with self._untimed():
+        with self._exclude_time():
             ready = make_ready(self._pi, self._stop, self._notify, self._scan.scan_id, first=not self._was_ready)
         if not ready:
             return None
@@ -386,7 +403,7 @@ class RunningScan:
             self._writer.append({"fact": "radars", **of, **report})
 
     @contextmanager
-    def _untimed(self) -> Iterator[None]:
+    def _exclude_time(self) -> Iterator[None]:
         """Exclude the block from the row's duration, unlike waiting for processing."""
         began = time.monotonic()
         try:
@@ -401,7 +418,7 @@ class RunningScan:
             return not self._stop.now
         self._writer.append(ScanPaused(paused_utc=utc_now()))
         self._notify("wait", "paused on request; `continue` begins the next row")
-        with self._untimed():
+        with self._exclude_time():
             while self._stop.paused:
                 if self._stop.after_row:
                     return False
@@ -426,7 +443,8 @@ class RunningScan:
 
     def _settle(self, take: Take, last: bool, transaction: RowTransaction, events: EventWriter) -> bool:
         """Commit or reject the take; return True if it is committed."""
-        row, faults = take.row.index, take.faults(self._instrument.burst.pulses)
+        row = take.row.index
+        faults = take.faults(self._instrument.burst.pulses)
         keep = last and self._keep_incomplete and take.all_pulses_sent and not self._stop.now
         if faults and not keep:
             reject_row(self._scan, self._writer, take, [ON_REQUEST] if self._stop.now else faults)
@@ -443,7 +461,8 @@ class RunningScan:
 
     def _end(self, begun: bool) -> None:
         """Add `scan_ended` to the manifest and end the Pi's run."""
-        status, reason = self.result.exit_status, self.result.reason
+        status = self.result.exit_status
+        reason = self.result.reason
         self._writer.append(
             ScanEnded(
                 exit_status=status,
@@ -484,7 +503,8 @@ class RunningScan:
         """Report progress, if a callback was given; drop the callback if it fails."""
         if self._progress is None:
             return
-        rows, committed = self._plan.rows, len(self._committed)
+        rows = self._plan.rows
+        committed = len(self._committed)
         remaining = None
         if self._row_seconds:
             elapsed_s = time.monotonic() - self._row_began if self._row_began is not None else 0.0
@@ -508,7 +528,8 @@ def takes_so_far(scan: ScanFolder) -> dict[int, int]:
     begun = [(f.row, f.take) for f in (*scan.facts(RowCommitted), *scan.facts(RowRejected))]
     events = read_events(scan.path / EVENTS).events
     begun += [(e.row.index, e.take) for e in events if isinstance(e, RowStarted)]
-    return dict(sorted(begun))  # of one row's takes, the highest is the last
+    # Of one row's takes, the highest is the last.
+    return dict(sorted(begun))
 
 
 def run_scan(
@@ -602,8 +623,8 @@ def resume_scan(
         if not hello.stage or (scan.started.pi is not None and scan.started.pi.stage):
             warnings = check_same_stage(scan.instrument.stage, hello, f"{folder}")
         else:  # the earlier rows were placed by that Pi, not by the host's rig file
-            found = stage_differences(scan.instrument.stage, hello)
-            warnings = [f"not compared when the scan began: {d}" for d in found]
+            differences = stage_differences(scan.instrument.stage, hello)
+            warnings = [f"not compared when the scan began: {d}" for d in differences]
         writer.append(
             ScanResumed(
                 resumed_utc=utc_now(),

@@ -39,9 +39,11 @@ from polysight_shared.errors import ConfigError, DeviceError, ProtocolError
 from polysight_shared.findings import Finding
 
 ATTEMPTS = 3
-_TWIN_S = 0.05  # a second card answers a request as soon as the first
+# A second card answers a request as soon as the first.
+_TWIN_S = 0.05
 EEPROM_REPORT_S = 0.5
-_PORTS = struct.Struct("<HH")  # in the EEPROM
+# In the EEPROM.
+_PORTS = struct.Struct("<HH")
 DEFAULT_MAC = "12:34:56:78:90:12"
 _OTHER_MAC = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"
 
@@ -71,7 +73,8 @@ class CardClient:
         self._address = (board.card_address, board.command_port)
         self._socket = bind_udp(board.host_address, board.command_port, f"{board.name} commands")
         self._status = Status(0)
-        self.strangers = 0  # datagrams that were neither replies nor status of this card
+        # Datagrams that were neither replies nor status of this card.
+        self.strangers = 0
 
     def fileno(self) -> int:
         """Return the descriptor that becomes readable when the card reports a status."""
@@ -93,16 +96,17 @@ class CardClient:
         macs = {card_mac(self.board.card_address, self._kernel_root)}
         versions = [self.version()]
         deadline = time.monotonic() + _TWIN_S
-        while (left := deadline - time.monotonic()) > 0:
-            reply = self._receive(left)
+        while (remaining_s := deadline - time.monotonic()) > 0:
+            reply = self._receive(remaining_s)
             if reply is not None and reply.code == Code.VERSION:
                 versions.append(dca1000.decode_version(reply.status))
         macs.add(card_mac(self.board.card_address, self._kernel_root))
         macs.discard("")
         if len(versions) > 1 or len(macs) > 1:
-            seen = f"{len(versions)} answers to one request (FPGA {', '.join(map(str, versions))})"
+            answers = f"{len(versions)} answers to one request (FPGA {', '.join(map(str, versions))})"
             raise DeviceError(
-                f"{self._name()}: {seen}" + (f", MAC addresses {' and '.join(sorted(macs))}" if len(macs) > 1 else ""),
+                f"{self._name()}: {answers}"
+                + (f", MAC addresses {' and '.join(sorted(macs))}" if len(macs) > 1 else ""),
                 "two cards have this address, or the network doubles packets: rows of either look like the other's",
                 "give each card its own address (`polysight card`, docs/how-to/install.md), or unplug the second one;"
                 f" `arping {self.board.card_address}` shows who answers",
@@ -129,16 +133,19 @@ class CardClient:
         """
         self._status = Status(0)
         self._check(self._exchange(Code.CONFIGURE_EEPROM, body, 1), Code.CONFIGURE_EEPROM)
-        self._receive(EEPROM_REPORT_S)  # a failure is a separate message, perhaps after the reply
+        # A failure is a separate message, perhaps after the reply.
+        self._receive(EEPROM_REPORT_S)
         return self.take_status()
 
     def record_start(self) -> None:
         """Start a record; before a retry it is stopped, because it may run already. Raises DeviceError."""
         for attempt in range(ATTEMPTS):
             self.take_status()
-            self._status = Status(0)  # of the previous record
+            # Of the previous record.
+            self._status = Status(0)
             reply = self._try(Code.RECORD_START, b"", self._timeout_s / ATTEMPTS)
-            self._status &= ~Status.RECORD_COMPLETED  # before the reply: of the previous record
+            # Before the reply: of the previous record.
+            self._status &= ~Status.RECORD_COMPLETED
             if reply is not None:
                 self._check(reply, Code.RECORD_START)
                 return
@@ -157,8 +164,8 @@ class CardClient:
         which must not be taken for the next record's.
         """
         deadline = time.monotonic() + limit_s
-        while Status.RECORD_COMPLETED not in self.take_status() and (left := deadline - time.monotonic()) > 0:
-            select.select([self._socket], [], [], left)
+        while Status.RECORD_COMPLETED not in self.take_status() and (remaining_s := deadline - time.monotonic()) > 0:
+            select.select([self._socket], [], [], remaining_s)
 
     def take_status(self) -> Status:
         """Return the status bits that the card reported since the last record start, without waiting."""
@@ -198,17 +205,18 @@ class CardClient:
     def _try(self, code: Code, data: bytes, limit_s: float) -> Reply | None:
         """Send once and wait for the reply to this code."""
         while self._receive(0.0) is not None:
-            pass  # late replies to an earlier attempt
+            # Late replies to an earlier attempt.
+            pass
         try:
             self._socket.sendto(dca1000.encode_request(code, data), self._address)
         except OSError as e:
             if e.errno in (errno.ENETUNREACH, errno.EHOSTUNREACH):
                 raise no_route(self.board, f"no way to {self._name()} from {self.board.host_address}") from None
-            what = f"sending to {self._name()} failed: {e.strerror}"
-            raise silent_card(self.board, what, self._kernel_root) from e
+            problem = f"sending to {self._name()} failed: {e.strerror}"
+            raise silent_card(self.board, problem, self._kernel_root) from e
         deadline = time.monotonic() + limit_s
-        while (left := deadline - time.monotonic()) > 0:
-            reply = self._receive(left)
+        while (remaining_s := deadline - time.monotonic()) > 0:
+            reply = self._receive(remaining_s)
             if reply is not None and reply.code == code:
                 return reply
         return None
@@ -217,8 +225,8 @@ class CardClient:
         """Return the next reply, None after the timeout; collect status bits and count foreign datagrams."""
         deadline = time.monotonic() + limit_s
         while True:
-            left = max(0.0, deadline - time.monotonic())
-            if not select.select([self._socket], [], [], left)[0]:
+            remaining_s = max(0.0, deadline - time.monotonic())
+            if not select.select([self._socket], [], [], remaining_s)[0]:
                 return None
             try:
                 raw, (address, _) = self._socket.recvfrom(2048)
@@ -242,8 +250,8 @@ class CardClient:
     def _silent(self, code: Code, attempts: int) -> DeviceError:
         """Return the error for a card that does not answer, with the hop that does not work, if known."""
         tried = f"{attempts} attempts" if attempts > 1 else "1 attempt"
-        what = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({tried})"
-        return silent_card(self.board, what, self._kernel_root)
+        problem = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({tried})"
+        return silent_card(self.board, problem, self._kernel_root)
 
 
 @dataclass(frozen=True)
@@ -263,7 +271,8 @@ class EepromSettings:
     data_port: int = 4098
 
     def __post_init__(self) -> None:
-        host, card = self._address(self.host_address), self._address(self.card_address)
+        host = self._address(self.host_address)
+        card = self._address(self.card_address)
         if host == card:
             raise self._wrong(f"host and card both have the address {card}")
         if int(host) >> 8 != int(card) >> 8:
@@ -316,8 +325,8 @@ class EepromSettings:
 
     @staticmethod
     def _wrong(what: str, remedy: str = "correct the board in instrument.toml") -> ConfigError:
-        why = "a card with them could not be reached"
-        return ConfigError(f"EEPROM settings refused: {what}", why, remedy, code=ErrorCode.VALUE_INVALID)
+        cause = "a card with them could not be reached"
+        return ConfigError(f"EEPROM settings refused: {what}", cause, remedy, code=ErrorCode.VALUE_INVALID)
 
 
 def program_eeprom(card: CardClient, settings: EepromSettings, confirmed: str) -> None:
@@ -399,17 +408,17 @@ def survey_cards(instrument: Instrument, listen_s: float = 0.0) -> list[CardSurv
 
 def _survey(board: Board, instrument: Instrument, core: Core | None, listen_s: float) -> CardSurvey:
     survey = CardSurvey(board)
-    found = survey.hops
+    findings = survey.hops
     try:
         with CardClient(board, instrument.limits.command_timeout_s) as card:
-            found.append(_ok("host", f"{board.host_address}:{board.command_port} is free to listen at"))
-            found += _reach(survey, card)
+            findings.append(_ok("host", f"{board.host_address}:{board.command_port} is free to listen at"))
+            findings += _reach(survey, card)
             if survey.ok and board.record:
-                found += _receive(card, instrument, core, listen_s)
+                findings += _receive(card, instrument, core, listen_s)
     except DeviceError as e:
-        found.append(_wrong("host", e))
-    tried = {hop.where for hop in found}
-    found += [Finding("note", "", where=hop) for hop in HOPS if hop not in tried]
+        findings.append(_wrong("host", e))
+    tried = {hop.where for hop in findings}
+    findings += [Finding("note", "", where=hop) for hop in HOPS if hop not in tried]
     return survey
 
 
@@ -435,18 +444,19 @@ def _reach(survey: CardSurvey, card: CardClient) -> Iterator[Finding]:
     if error is not None:
         faulty = "card" if survey.version else _FAULTY_HOP.get(silent_hop(address), "card")
     interface = "loopback" if address.startswith("127.") else route_interface(address) or "unknown interface"
-    for hop, found in (("route", interface), ("link", interface), ("card", f"replies, FPGA {survey.version}")):
+    for hop, text in (("route", interface), ("link", interface), ("card", f"replies, FPGA {survey.version}")):
         if error is not None and hop == faulty:
             yield _wrong(hop, error)
             return
-        yield _ok(hop, found)
+        yield _ok(hop, text)
 
 
 def _receive(card: CardClient, instrument: Instrument, core: Core | None, listen_s: float) -> Iterator[Finding]:
     """Check the receiver process as a scan starts it, its buffer, and the radar's data."""
-    board, wanted = card.board, instrument.card.receive_buffer_bytes
+    board = card.board
+    requested = instrument.card.receive_buffer_bytes
     try:
-        receiver = ReceiverProcess(board, wanted, core)
+        receiver = ReceiverProcess(board, requested, core)
     except DeviceError as e:
         yield _wrong("receiver", e)
         return
@@ -458,14 +468,14 @@ def _receive(card: CardClient, instrument: Instrument, core: Core | None, listen
             yield _ok("receiver", receiver.scheduling)
         burst_bytes = instrument.burst.pulses * instrument.frame_bytes
         try:
-            warning = check_receive_buffer(board.name, receiver.granted_bytes, wanted, burst_bytes)
+            warning = check_receive_buffer(board.name, receiver.granted_bytes, requested, burst_bytes)
         except DeviceError as e:
             yield _wrong("buffer", e)
             return
         if warning:
             yield Finding("warning", warning.removeprefix(f"{board.name}: "), where="buffer")
         else:
-            yield _ok("buffer", f"{receiver.granted_bytes} bytes granted, {wanted} requested")
+            yield _ok("buffer", f"{receiver.granted_bytes} bytes granted, {requested} requested")
         if listen_s > 0:
             yield _listen(card, receiver, instrument, listen_s)
         else:

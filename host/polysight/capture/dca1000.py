@@ -16,13 +16,15 @@ from polysight_shared.errors import DataError, ProtocolError
 REQUEST_MAGIC = 0xA55A
 FOOTER = 0xEEAA
 MAX_REQUEST_DATA = 504
-CARD_SOURCE_PORT = 1024  # of replies and data, whatever port the card listens on
+# Of replies and data, whatever port the card listens on.
+CARD_SOURCE_PORT = 1024
 PACKET_HEADER_BYTES = 10
 MAX_PAYLOAD_BYTES = 1456
 MAX_PACKET_BYTES = PACKET_HEADER_BYTES + MAX_PAYLOAD_BYTES
 BYTE_COUNT_BITS = 48
 SEQUENCE_BITS = 32
-DELAY_TICKS_PER_US = 125  # the card counts 8 ns ticks
+# The card counts 8 ns ticks.
+DELAY_TICKS_PER_US = 125
 _HEAD = struct.Struct("<HHH")
 _REPLY = struct.Struct("<HHHH")
 _PACKET = struct.Struct("<IIH")
@@ -102,8 +104,8 @@ class Counters:
 def encode_request(code: int, data: bytes = b"") -> bytes:
     """Encode a request to the card. Raises ProtocolError if `data` is longer than the card takes."""
     if len(data) > MAX_REQUEST_DATA:
-        what = f"request data of {len(data)} bytes is longer than {MAX_REQUEST_DATA}"
-        raise ProtocolError(what, code=ErrorCode.VALUE_INVALID)
+        problem = f"request data of {len(data)} bytes is longer than {MAX_REQUEST_DATA}"
+        raise ProtocolError(problem, code=ErrorCode.VALUE_INVALID)
     return _HEAD.pack(REQUEST_MAGIC, code, len(data)) + data + _FOOTER.pack(FOOTER)
 
 
@@ -113,8 +115,8 @@ def decode_reply(raw: bytes) -> Reply:
         magic, code, status, footer = _REPLY.unpack(raw)
         if magic == REQUEST_MAGIC and footer == FOOTER:
             return Reply(code, status)
-    what = f"not a DCA1000 reply of {_REPLY.size} bytes: {len(raw)} bytes, {raw[:16].hex(' ')}"
-    raise ProtocolError(what, code=ErrorCode.MESSAGE_INVALID)
+    problem = f"not a DCA1000 reply of {_REPLY.size} bytes: {len(raw)} bytes, {raw[:16].hex(' ')}"
+    raise ProtocolError(problem, code=ErrorCode.MESSAGE_INVALID)
 
 
 def configure_fpga_data(lanes: int = 4, timer: int = 30) -> bytes:
@@ -128,8 +130,8 @@ def configure_packet_data(packet_bytes: int, delay_us: float) -> bytes:
     """Encode the body of 0x0B: packet size, delay in 8 ns ticks, zero. 1470 and 25 us gives `be 05 35 0c 00 00`."""
     ticks = round(delay_us * DELAY_TICKS_PER_US)
     if not 0 <= ticks <= 0xFFFF:
-        what = f"packet delay of {delay_us} us is {ticks} ticks of 8 ns, outside 0..65535"
-        raise ProtocolError(what, code=ErrorCode.VALUE_INVALID)
+        problem = f"packet delay of {delay_us} us is {ticks} ticks of 8 ns, outside 0..65535"
+        raise ProtocolError(problem, code=ErrorCode.VALUE_INVALID)
     return struct.pack("<HHH", packet_bytes, ticks, 0)
 
 
@@ -224,10 +226,9 @@ def decode_two_lane(
     `samples` must be even. Returns complex64 [rx, chirp, sample], ADC counts. Raises DataError as :func:`decode_row`.
     """
     if samples % 2:
-        what = f"a 2-lane chirp has an even number of samples, not {samples}"
-        raise DataError(
-            what, "a wrong number of samples was given", "correct the samples of a chirp", code=ErrorCode.VALUE_INVALID
-        )
+        problem = f"a 2-lane chirp has an even number of samples, not {samples}"
+        cause = "a wrong number of samples was given"
+        raise DataError(problem, cause, "correct the samples of a chirp", code=ErrorCode.VALUE_INVALID)
     words = _words(payload, chirps * samples * rx * 2).reshape(chirps, rx, samples // 2, 2, 2)
     return _complex(words.transpose(3, 1, 0, 2, 4).reshape(2, rx, chirps, samples), swap_iq)
 

@@ -36,12 +36,16 @@ from polysight_shared.files import read_bounded
 
 MAX_BYTES = 256 << 20
 """Part of a file that is read: eleven rows of the published scan."""
-MAX_CHIRPS = 4096  # enough for the statistics
-_HEADERS_READ = 16  # to recognise a file of whole packets
-_FULL_SCALE = 32767  # ADC counts
+# Enough for the statistics.
+MAX_CHIRPS = 4096
+# To recognise a file of whole packets.
+_HEADERS_READ = 16
+# ADC counts.
+_FULL_SCALE = 32767
 _PCAP_HEADS = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\n\r\r\n")
 _UDP_HEADER_BYTES = 8
-_MAX_PCAP_BYTES = 4 << 30  # half an hour of three boards
+# Half an hour of three boards.
+_MAX_PCAP_BYTES = 4 << 30
 _CLEAR_PEAK_DB = 10.0
 _MUCH_DC = 0.05 * _FULL_SCALE
 MAGIC = {
@@ -128,7 +132,8 @@ def packets_in_file(payload: NDArray[np.uint8]) -> list[bytes]:
         return []
     some = payload[: count * MAX_PACKET_BYTES].reshape(count, MAX_PACKET_BYTES)
     heads = [dca1000.decode_packet_header(row.tobytes()) for row in some]
-    (sequence, byte_count), k = heads[0], range(count)
+    (sequence, byte_count) = heads[0]
+    k = range(count)
     if heads != [(sequence + i, byte_count + i * MAX_PAYLOAD_BYTES) for i in k]:
         return []
     pieces = [payload[a : a + MAX_PACKET_BYTES].tobytes() for a in range(0, payload.size, MAX_PACKET_BYTES)]
@@ -145,9 +150,9 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
     sizes = np.array([len(p) for p in packets]) - dca1000.PACKET_HEADER_BYTES
     size = int((ahead + sizes).max() - ahead.min())
     if size > 1 << 34:
-        what = f"byte counts span {size} bytes"
-        why = "the file holds more than one record, or corrupted packets"
-        raise DataError(what, why, "cut the capture to one record", code=ErrorCode.FILE_DAMAGED)
+        problem = f"byte counts span {size} bytes"
+        cause = "the file holds more than one record, or corrupted packets"
+        raise DataError(problem, cause, "cut the capture to one record", code=ErrorCode.FILE_DAMAGED)
     log = PacketLog(size)
     for packet in packets:
         log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), 0)
@@ -168,8 +173,9 @@ def inspect_bin(path: Path, layout: Layout = Layout()) -> Report:
         raise _unreadable(path, e) from None
     kind = kind_of(payload[:4096].tobytes())
     if kind not in ("empty", "unknown bytes"):
-        what, remedy = f"{path}: not a capture: it begins as {kind}", "give a row (.bin) or a packet capture (.pcap)"
-        raise DataError(what, "a card records samples", remedy, code=ErrorCode.FILE_FOREIGN)
+        problem = f"{path}: not a capture: it begins as {kind}"
+        remedy = "give a row (.bin) or a packet capture (.pcap)"
+        raise DataError(problem, "a card records samples", remedy, code=ErrorCode.FILE_FOREIGN)
     packets = packets_in_file(payload)
     report = inspect_payload(path, place_packets(packets)[0] if packets else payload, layout)
     if packets:
@@ -181,8 +187,8 @@ def inspect_bin(path: Path, layout: Layout = Layout()) -> Report:
 
 def _unreadable(path: Path, e: OSError) -> DataError:
     """Return the error for a recording that cannot be read."""
-    what = f"{path}: cannot be read: {e.strerror}"
-    return DataError(what, "the path is wrong", "give a recording", code=ErrorCode.FILE_UNREADABLE)
+    problem = f"{path}: cannot be read: {e.strerror}"
+    return DataError(problem, "the path is wrong", "give a recording", code=ErrorCode.FILE_UNREADABLE)
 
 
 def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> Report:
@@ -204,8 +210,9 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
     power = (np.abs(np.fft.fft(cube * np.hanning(layout.samples), axis=-1)) ** 2).mean(axis=1)
     mean = power.mean(axis=0)
     floor = max(float(np.median(mean)), 1e-12)
-    profile, each = (10 * np.log10(np.maximum(p, 1e-12) / floor) for p in (mean, power))
-    peak = 2 + int(np.argmax(profile[2:-1]))  # without the bins that a constant offset fills, on both sides of zero
+    profile, profile_of_rx = (10 * np.log10(np.maximum(p, 1e-12) / floor) for p in (mean, power))
+    # Without the bins that a constant offset fills, on both sides of zero.
+    peak = 2 + int(np.argmax(profile[2:-1]))
     report = Report(
         path=path,
         bytes=int(payload.size),
@@ -218,7 +225,7 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
         rx_rms=[float(v) for v in np.sqrt(np.mean(np.abs(cube) ** 2, axis=(1, 2)))],
         left_over_bytes=int(payload.size % layout.chirp_bytes),
         profile_db=profile,
-        rx_profile_db=each,
+        rx_profile_db=profile_of_rx,
     )
     # Evenly spread values of 16 bits have 0.8 of full scale; a receiver with such a level clips, and has a peak.
     if report.peak_db < _CLEAR_PEAK_DB and min(report.rx_rms) > 0.5 * _FULL_SCALE:
@@ -238,27 +245,30 @@ def is_mirrored(power: NDArray[np.float64]) -> bool:
     For complex 1x (IF up to 0.9 sample rates) power in the upper half is no proof, so the last quarter is compared with
     the first: returns come from near. The bins next to zero are left out.
     """
-    n, rim = power.size, 3
+    n = power.size
+    rim = 3
     return bool(power[n - n // 4 : n - rim].sum() > 4 * power[rim + 1 : n // 4 + 1].sum())
 
 
 def _remarks(r: Report, mirrored: bool) -> list[str]:
-    found = []
+    remarks = []
     if max(r.rx_rms) == 0:
         return ["every sample is zero: nothing was recorded"]
     if mirrored:
-        found.append("most power is at negative frequencies: I and Q seem to be swapped (--q-first)")
+        remarks.append("most power is at negative frequencies: I and Q seem to be swapped (--q-first)")
     if silent := [k for k, v in enumerate(r.rx_rms) if v < 0.01 * max(r.rx_rms)]:
-        found.append(f"RX {', '.join(map(str, silent))} have no signal: antennas off, or another lane layout")
+        remarks.append(f"RX {', '.join(map(str, silent))} have no signal: antennas off, or another lane layout")
     if r.clipped:
-        found.append(f"{r.clipped} values are at full scale: the receiver clips, lower its gain")
+        remarks.append(f"{r.clipped} values are at full scale: the receiver clips, lower its gain")
     if r.left_over_bytes:
-        found.append(f"{r.left_over_bytes} bytes after the last complete chirp: truncated, or another layout")
+        remarks.append(f"{r.left_over_bytes} bytes after the last complete chirp: truncated, or another layout")
     if max(r.rx_dc) > _MUCH_DC:
-        found.append(f"constant offset of {max(r.rx_dc):.0f} counts, which this radar's high-pass filter would remove")
+        remarks.append(
+            f"constant offset of {max(r.rx_dc):.0f} counts, which this radar's high-pass filter would remove"
+        )
     if r.peak_db < _CLEAR_PEAK_DB:
-        found.append("no clear peak in the range profile: noise, or a wrong layout (--lanes, --samples)")
-    return found
+        remarks.append("no clear peak in the range profile: noise, or a wrong layout (--lanes, --samples)")
+    return remarks
 
 
 # --- packet captures ---
@@ -285,7 +295,8 @@ def read_pcap(path: Path) -> Iterator[Datagram]:
     DataError
         if the file is not a packet capture of an Ethernet interface, or ends within a packet.
     """
-    import dpkt  # here, because it loads a hundred protocols
+    # Here, because it loads a hundred protocols.
+    import dpkt
 
     try:
         raw = read_bounded(path, _MAX_PCAP_BYTES)
@@ -294,31 +305,28 @@ def read_pcap(path: Path) -> Iterator[Datagram]:
     try:
         reader = dpkt.pcap.UniversalReader(io.BytesIO(raw))
     except (dpkt.Error, ValueError, struct.error):
-        what = f"{path}: not a packet capture"
-        why, remedy = "another kind of file, or truncated", "record with `tcpdump -w`"
-        raise DataError(what, why, remedy, code=ErrorCode.FILE_FOREIGN) from None
+        problem = f"{path}: not a packet capture"
+        cause = "another kind of file, or truncated"
+        remedy = "record with `tcpdump -w`"
+        raise DataError(problem, cause, remedy, code=ErrorCode.FILE_FOREIGN) from None
     if reader.datalink() != dpkt.pcap.DLT_EN10MB:
-        what = f"{path}: link type {reader.datalink()}, expected {dpkt.pcap.DLT_EN10MB} (Ethernet)"
-        raise DataError(
-            what,
-            "recorded on `-i any`?",
-            "record on one Ethernet interface: tcpdump -i eth0",
-            code=ErrorCode.FILE_FOREIGN,
-        )
+        problem = f"{path}: link type {reader.datalink()}, expected {dpkt.pcap.DLT_EN10MB} (Ethernet)"
+        remedy = "record on one Ethernet interface: tcpdump -i eth0"
+        raise DataError(problem, "recorded on `-i any`?", remedy, code=ErrorCode.FILE_FOREIGN)
     count = 0
     try:
         for t_s, frame in reader:
-            datagram = _udp_of(float(t_s), frame)
+            datagram = _decode_udp(float(t_s), frame)
             count += 1
             if datagram is not None:
                 yield datagram
     except (dpkt.Error, ValueError, struct.error):
-        what = f"{path}: ends within packet {count + 1}"
+        problem = f"{path}: ends within packet {count + 1}"
         remedy = "record again: end tcpdump with Ctrl-C"
-        raise DataError(what, "truncated file", remedy, code=ErrorCode.FILE_DAMAGED) from None
+        raise DataError(problem, "truncated file", remedy, code=ErrorCode.FILE_DAMAGED) from None
 
 
-def _udp_of(t_s: float, frame: bytes) -> Datagram | None:
+def _decode_udp(t_s: float, frame: bytes) -> Datagram | None:
     """Return the unfragmented UDP datagram in an Ethernet frame, or None. Raises ValueError if it is cut short."""
     import dpkt
 
@@ -370,7 +378,8 @@ def inspect_pcap(path: Path, layout: Layout = Layout(), card_address: str = "") 
 
 def _from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram]]:
     """Return a card's replies and its other datagrams. Raises DataError for several cards."""
-    card, packets = CardReport("", [], "", Status(0), None, 0, 0.0), []
+    card = CardReport("", [], "", Status(0), None, 0, 0.0)
+    packets = []
     for datagram in read_pcap(path):
         if datagram.source[1] != dca1000.CARD_SOURCE_PORT or card_address not in ("", datagram.source[0]):
             continue

@@ -14,6 +14,7 @@ import os
 import socket
 import struct
 import sys
+import time
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -26,16 +27,28 @@ from polysight.capture.receiver import RowCapture
 from polysight_shared.config import Board
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
+from polysight_shared.units import NS_PER_S
 
-SO_RCVBUFFORCE = 33  # Linux; may exceed net.core.rmem_max, needs CAP_NET_ADMIN
-SO_MEMINFO = 55  # Linux: nine 32-bit words about the socket's memory
-KERNEL_BYTES_A_PACKET = 2304  # of a receive buffer that a full packet occupies (measured)
+# Linux; may exceed net.core.rmem_max, needs CAP_NET_ADMIN.
+SO_RCVBUFFORCE = 33
+# Linux: nine 32-bit words about the socket's memory.
+SO_MEMINFO = 55
+# Linux: each packet comes with the time at which the kernel got it.
+SO_TIMESTAMPNS = 35
+# Of a receive buffer that a full packet occupies (measured).
+KERNEL_BYTES_A_PACKET = 2304
 _MEMINFO_DROPS = 8
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
-_STRIDE = 1536  # bytes per packet: more than the largest, to detect longer ones
+# Between two reads NTP moves the clock by far less.
+_CLOCK_WAS_SET_NS = 1_000_000
+# Bytes per packet: more than the largest, to detect longer ones.
+_STRIDE = 1536
 _MSG_DONTWAIT = socket.MSG_DONTWAIT if hasattr(socket, "MSG_DONTWAIT") else 0x40
-_GATEWAY, _UP = 0x2, 0x1  # flags in /proc/net/route
-_ARP_COMPLETE = 0x2  # flag in /proc/net/arp
+# flags in /proc/net/route
+_GATEWAY = 0x2
+_UP = 0x1
+# Flag in /proc/net/arp.
+_ARP_COMPLETE = 0x2
 _ROOT = Path("/")
 
 
@@ -120,45 +133,50 @@ def kernel_drops(sock: socket.socket) -> int:
 
 
 class BatchReceiver:
-    """Receives up to `batch` packets at a time into one preallocated block."""
+    """Receives up to `batch` packets at a time into one preallocated block.
+
+    Attributes
+    ----------
+    packets, lengths, times_ns
+        Of the last :meth:`receive`: uint8 [batch, stride]; bytes of each packet with header; arrival of each at this
+        machine by its kernel, int64, monotonic clock.
+    strangers
+        Packets from another address than the card's.
+    """
 
     def __init__(self, sock: socket.socket, source_address: str, batch: int = 256) -> None:
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self._socket = sock
         self._source = int.from_bytes(socket.inet_aton(source_address), sys.byteorder)
-        self.packets: NDArray[np.uint8] = np.zeros((batch, _STRIDE), dtype=np.uint8)  # of the last `receive`
-        self.lengths: NDArray[np.uint32] = np.zeros(batch, dtype=np.uint32)  # bytes of each, with header
-        self.strangers = 0  # packets from another address than the card's
-        self._names = np.zeros((batch, 16), dtype=np.uint8)  # struct sockaddr_in of each packet
+        self.packets: NDArray[np.uint8] = np.zeros((batch, _STRIDE), dtype=np.uint8)
+        self.lengths: NDArray[np.uint32] = np.zeros(batch, dtype=np.uint32)
+        self.times_ns: NDArray[np.int64] = np.zeros(batch, dtype=np.int64)
+        self.strangers = 0
+        self._clocks_differ_ns = time.time_ns() - time.monotonic_ns()
+        # `struct sockaddr_in` of each packet.
+        self._names = np.zeros((batch, 16), dtype=np.uint8)
         self._sources = self._names[:, 4:8].view(np.uint32)[:, 0]
+        # `struct cmsghdr` of 16 bytes, then `struct timespec`.
+        self._control = np.zeros((batch, 4), dtype=np.int64)
         self._vectors = (_IoVec * batch)()
         self._messages = (_Message * batch)()
         for i in range(batch):
             self._vectors[i] = _IoVec(self.packets.ctypes.data + i * _STRIDE, _STRIDE)
             header = self._messages[i].header
-            header.name, header.name_length = self._names.ctypes.data + 16 * i, 16
-            header.vector, header.vector_length = ctypes.addressof(self._vectors[i]), 1
+            header.name = self._names.ctypes.data + 16 * i
+            header.vector = ctypes.addressof(self._vectors[i])
+            header.vector_length = 1
+            header.control = self._control[i].ctypes.data
         view: Any = np.frombuffer(memoryview(self._messages), dtype=np.dtype(_Message))
         self._received = view["received"]
         self._name_lengths = view["header"]["name_length"]
-        self._recvmmsg = getattr(ctypes.CDLL(None, use_errno=True), "recvmmsg", None)
+        self._control_lengths = view["header"]["control_length"]
+        self._recvmmsg = ctypes.CDLL(None, use_errno=True).recvmmsg
 
     def receive(self) -> int:
         """Fetch the pending packets; return the number from the card. Packets from elsewhere are counted, removed."""
-        n = self._fetch()
-        if n == 0:
-            return 0
-        known = self._sources[:n] == self._source
-        if not known.all():
-            self.strangers += int((~known).sum())
-            keep = np.flatnonzero(known)
-            self.packets[: keep.size] = self.packets[keep]
-            self.lengths[: keep.size] = self.lengths[keep]
-            n = int(keep.size)
-        return n
-
-    def _fetch(self) -> int:
-        if self._recvmmsg is None:
-            return self._fetch_one()
+        self._name_lengths[:] = 16
+        self._control_lengths[:] = self._control[0].nbytes
         n = self._recvmmsg(self._socket.fileno(), self._messages, len(self._messages), _MSG_DONTWAIT, None)
         if n < 0:
             number = ctypes.get_errno()
@@ -167,18 +185,29 @@ class BatchReceiver:
             what = f"receiving from the capture card failed: {os.strerror(number)}"
             raise DeviceError(what, "the network interface went down", "`polysight doctor` names the hop")
         self.lengths[:n] = self._received[:n]
-        self._name_lengths[:n] = 16
+        self.times_ns[:n] = self._read_times(n)
+        is_from_card = self._sources[:n] == self._source
+        if not is_from_card.all():
+            self.strangers += int((~is_from_card).sum())
+            keep = np.flatnonzero(is_from_card)
+            self.packets[: keep.size] = self.packets[keep]
+            self.lengths[: keep.size] = self.lengths[keep]
+            self.times_ns[: keep.size] = self.times_ns[keep]
+            n = int(keep.size)
         return n
 
-    def _fetch_one(self) -> int:
-        """Fetch one packet, where `recvmmsg` is missing."""
-        try:
-            size, sender = self._socket.recvfrom_into(memoryview(self.packets[0]))
-        except BlockingIOError:
-            return 0
-        self.lengths[0] = size
-        self._sources[0] = int.from_bytes(socket.inet_aton(sender[0]), sys.byteorder)
-        return 1
+    def _read_times(self, n: int) -> NDArray[np.int64]:
+        """Return the kernel's times of the packets, which are of the clock of the day; if that was set, the present."""
+        now_ns = time.monotonic_ns()
+        differ_ns = time.time_ns() - now_ns
+        was_set = abs(differ_ns - self._clocks_differ_ns) > _CLOCK_WAS_SET_NS
+        self._clocks_differ_ns = differ_ns
+        seconds = self._control[:n, 2]
+        nanoseconds = self._control[:n, 3]
+        times = seconds * NS_PER_S + nanoseconds - differ_ns
+        if was_set:
+            times[:] = now_ns
+        return np.maximum.accumulate(np.minimum(times, now_ns))
 
 
 def card_mac(address: str, root: Path = _ROOT) -> str:
@@ -252,7 +281,8 @@ def silent_hop(card_address: str, root: Path = _ROOT) -> Hop:
     `root` is the folder with `proc/net/route`, `proc/net/arp` and `sys/class/net`; unreadable files are skipped.
     """
     if card_address.startswith("127."):
-        return Hop.UNKNOWN  # loopback is in none of these tables
+        # Loopback is in none of these tables.
+        return Hop.UNKNOWN
     interface = route_interface(card_address, root)
     if interface == "":
         return Hop.ROUTE
@@ -273,17 +303,21 @@ def route_interface(address: str, root: Path = _ROOT) -> str | None:
         lines = (root / "proc/net/route").read_text(encoding="ascii").splitlines()[1:]
     except OSError:
         return None
-    wanted = struct.unpack("=I", socket.inet_aton(address))[0]
-    best, found = -1, ""
+    target = struct.unpack("=I", socket.inet_aton(address))[0]
+    longest_mask = -1
+    interface = ""
     for line in lines:
         words = line.split()
         if len(words) < 8:
             continue
-        destination, flags, mask = int(words[1], 16), int(words[3], 16), int(words[7], 16)
+        destination = int(words[1], 16)
+        flags = int(words[3], 16)
+        mask = int(words[7], 16)
         length = mask.bit_count()
-        if flags & _UP and wanted & mask == destination and length > best:
-            best, found = length, "" if flags & _GATEWAY else words[0]
-    return found
+        if flags & _UP and target & mask == destination and length > longest_mask:
+            longest_mask = length
+            interface = "" if flags & _GATEWAY else words[0]
+    return interface
 
 
 def has_link(interface: str, root: Path = _ROOT) -> bool | None:
@@ -292,7 +326,8 @@ def has_link(interface: str, root: Path = _ROOT) -> bool | None:
     try:
         return (folder / "carrier").read_text(encoding="ascii").strip() == "1"
     except OSError:
-        pass  # `carrier` of an interface that is down is not readable
+        # `carrier` of an interface that is down is not readable.
+        pass
     try:
         return False if (folder / "operstate").read_text(encoding="ascii").strip() == "down" else None
     except OSError:
@@ -314,19 +349,20 @@ def neighbour_answers(address: str, root: Path = _ROOT) -> bool | None:
 
 def silent_card(board: Board, what: str, root: Path = _ROOT) -> DeviceError:
     """Return the error for a card that does not answer: `what` happened, and the hop that does not work, if known."""
-    hop, interface = silent_hop(board.card_address, root), route_interface(board.card_address, root)
+    hop = silent_hop(board.card_address, root)
+    interface = route_interface(board.card_address, root)
     if hop is Hop.ROUTE:
         return no_route(board, what)
-    why = "the card is off, or listens at another address or port"
+    cause = "the card is off, or listens at another address or port"
     remedy = (
         f"the card answers to the host address and ports in its EEPROM: it must send to {board.host_address}"
         f" port {board.command_port}; `ss -ulnp` shows other programs that listen there"
     )
     if hop is Hop.LINK:
-        why = f"no link: network interface {interface} has no carrier, the cable is out or the card has no power"
+        cause = f"no link: network interface {interface} has no carrier, the cable is out or the card has no power"
         remedy = f"check the card's power, the cable and the LEDs; `ip link show {interface}` must contain LOWER_UP"
     elif hop is Hop.NEIGHBOUR:
-        why = (
+        cause = (
             f"the link is up, but no device has the address {board.card_address}: another card is on this cable, or its"
             " EEPROM holds another address"
         )
@@ -335,11 +371,11 @@ def silent_card(board: Board, what: str, root: Path = _ROOT) -> DeviceError:
             " instrument.toml`); with the card's EEPROM switch off it has its default address"
         )
     elif hop is Hop.CARD:
-        why = (
+        cause = (
             "the card is mute: a device has its address, but its program does not answer; wrong command port, or its"
             " replies go to another host address"
         )
-    return DeviceError(what, why, remedy, code=ErrorCode.NO_ANSWER)
+    return DeviceError(what, cause, remedy, code=ErrorCode.NO_ANSWER)
 
 
 def no_route(board: Board, what: str) -> DeviceError:
@@ -355,22 +391,22 @@ def no_route(board: Board, what: str) -> DeviceError:
 
 def silent_radar(board: Board, row: RowCapture | None = None) -> DeviceError:
     """Return the error for a card that replies but sends no data, with the likeliest cause from the capture `row`."""
-    what = f"no data from {board.name} (card {board.card_address} to {board.host_address}:{board.data_port})"
+    problem = f"no data from {board.name} (card {board.card_address} to {board.host_address}:{board.data_port})"
     remedy = "arm the radar, check the SYNC_IN wire (`polysight doctor` sends pulses), the data port in the EEPROM"
     status = Status(row.card_status) if row is not None else Status(0)
     if row is not None and row.strangers:
-        why = f"{row.strangers} packets came from another address than {board.card_address}"
+        cause = f"{row.strangers} packets came from another address than {board.card_address}"
         remedy = (
             "two boards may have each other's ports; check card_address and data_port in instrument.toml, then"
             " `polysight resume SCAN --config instrument.toml`"
         )
     elif Status.NO_LVDS_DATA in status:
-        why = "the card replies, and reports that the radar sends nothing over LVDS: it is not streaming"
+        cause = "the card replies, and reports that the radar sends nothing over LVDS: it is not streaming"
     elif Status.NO_HEADER in status:
-        why = "the card replies, and reports LVDS data without a header: it is set to another mode"
+        cause = "the card replies, and reports LVDS data without a header: it is set to another mode"
     else:
-        why = (
+        cause = (
             "the card replies, but the radar is not streaming (not armed, or SYNC_IN does not reach it), or the card"
             " sends its data to another address or port"
         )
-    return DeviceError(what, why, remedy, code=ErrorCode.NO_DATA)
+    return DeviceError(problem, cause, remedy, code=ErrorCode.NO_DATA)

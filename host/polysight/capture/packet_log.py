@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,10 @@ from polysight.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, PACKET
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 
-_SPARE_BYTES = 1 << 20  # of payload beyond the row, for left-over packets
-_MAX_ROWS = 4  # of payload that is kept; two network paths double it
+# Of payload beyond the row, for left-over packets.
+_SPARE_BYTES = 1 << 20
+# Rows of payload that are kept; two network paths double it.
+_MAX_ROWS = 4
 
 
 class PacketLog:
@@ -39,56 +42,62 @@ class PacketLog:
         self.expected = expected
         if memory is None or memory.size < expected + _SPARE_BYTES:
             memory = np.empty(expected + _SPARE_BYTES, dtype=np.uint8)
-        memory[:expected].fill(0)  # allocate the pages before the first packet
+        # Allocate the pages before the first packet.
+        memory[:expected].fill(0)
         self.payload = memory
         packets = 2 * expected // MAX_PAYLOAD_BYTES + 256
         self._heads = np.zeros((packets, PACKET_HEADER_BYTES), dtype=np.uint8)
         self._sizes = np.zeros(packets, dtype=np.uint16)
-        self._batches = np.zeros((packets, 2), dtype=np.int64)
-        self.count = self.kept = self.malformed = self.payload_bytes = 0
-        self._filled = self._noted = 0
-        self._quiet_ns = 0  # last time since the last batch at which the socket was empty
+        self._times = np.zeros(packets, dtype=np.int64)
+        self.count = 0
+        self.kept = 0
+        self.malformed = 0
+        self.payload_bytes = 0
+        self._filled = 0
 
-    def add(self, packets: Bytes, lengths: NDArray[np.integer], t_ns: int) -> None:
+    def add(self, packets: Bytes, lengths: NDArray[np.integer], times_ns: int | Counts) -> None:
         """Log packets in the order of their arrival.
 
-        `packets` is uint8 [n, >= longest length] with header and payload, `lengths` integer [n] bytes, `t_ns` the time
-        of reception, monotonic clock.
+        `packets` is uint8 [n, >= longest length] with header and payload, `lengths` integer [n] bytes, `times_ns` the
+        time of each one's arrival, int64 [n], or that of all; monotonic clock.
         """
         sizes = lengths.astype(np.int64) - PACKET_HEADER_BYTES
+        times = np.broadcast_to(np.asarray(times_ns, dtype=np.int64), sizes.shape)
         good = (sizes > 0) & (sizes <= MAX_PAYLOAD_BYTES)
         if not good.all():
             self.malformed += int((~good).sum())
-            packets, sizes = packets[good], sizes[good]
+            packets = packets[good]
+            sizes = sizes[good]
+            times = times[good]
         n = len(sizes)
         if n == 0:
             return
         if self.count + n > len(self._sizes):
-            self._heads, self._sizes = _doubled(self._heads, n), _doubled(self._sizes, n)
-        self._heads[self.count : self.count + n] = packets[:, :PACKET_HEADER_BYTES]
-        self._sizes[self.count : self.count + n] = sizes
+            self._heads = _double(self._heads, n)
+            self._sizes = _double(self._sizes, n)
+            self._times = _double(self._times, n)
+        new = slice(self.count, self.count + n)
+        self._heads[new] = packets[:, :PACKET_HEADER_BYTES]
+        self._sizes[new] = sizes
+        self._times[new] = times
         total = int(sizes.sum())
-        if self.kept == self.count and self._room_for(total):
+        if self.kept == self.count and self._make_room(total):
             self._copy(packets, sizes)
             self.kept += n
         self.count += n
         self.payload_bytes += total
-        self._note(t_ns)
-
-    def note_quiet(self, t_ns: int) -> None:
-        """Record that the socket was empty at this time."""
-        self._quiet_ns = t_ns
 
     def _copy(self, packets: Bytes, sizes: Counts) -> None:
-        bounds = np.flatnonzero(np.diff(sizes)) + 1
-        for i, j in zip([0, *bounds.tolist()], [*bounds.tolist(), len(sizes)], strict=True):
-            size = int(sizes[i])
-            to = self.payload[self._filled : self._filled + (j - i) * size].reshape(j - i, size)
-            to[:] = packets[i:j, PACKET_HEADER_BYTES : PACKET_HEADER_BYTES + size]
-            self._filled += to.size
+        """Append the payload of packets, in runs of one size."""
+        bounds = [0, *(np.flatnonzero(np.diff(sizes)) + 1).tolist(), len(sizes)]
+        for first, end in pairwise(bounds):
+            size = int(sizes[first])
+            target = self.payload[self._filled : self._filled + (end - first) * size].reshape(end - first, size)
+            target[:] = packets[first:end, PACKET_HEADER_BYTES : PACKET_HEADER_BYTES + size]
+            self._filled += target.size
 
-    def _room_for(self, more: int) -> bool:
-        """True if `more` bytes of payload can be kept; memory grows up to `_MAX_ROWS` rows."""
+    def _make_room(self, more: int) -> bool:
+        """Make room for `more` bytes of payload; False if that would be more than is kept."""
         if self._filled + more <= self.payload.size:
             return True
         size = min(2 * self.payload.size + more, self.max_kept_bytes(self.expected))
@@ -104,20 +113,10 @@ class PacketLog:
         """Return the largest payload that is kept of a row of `expected` bytes."""
         return _MAX_ROWS * (expected + _SPARE_BYTES)
 
-    def _note(self, t_ns: int) -> None:
-        if self._noted + 2 > len(self._batches):
-            self._batches = _doubled(self._batches, 2)
-        if self._quiet_ns and self._noted:
-            self._batches[self._noted] = self._quiet_ns, self._batches[self._noted - 1, 1]
-            self._noted += 1
-        self._quiet_ns = 0
-        self._batches[self._noted] = t_ns, self.count
-        self._noted += 1
-
     @property
-    def batches(self) -> Counts:
-        """int64 [n, 2]: time (monotonic, ns), packets received by then; without growth, the socket was empty."""
-        return self._batches[: self._noted]
+    def arrivals_ns(self) -> Counts:
+        """int64 [packet]: arrival time of each, monotonic clock."""
+        return self._times[: self.count]
 
     @property
     def sequences(self) -> Counts:
@@ -137,36 +136,34 @@ class PacketLog:
         return self._sizes[: self.count].astype(np.int64)
 
     @property
-    def arrivals_ns(self) -> Counts:
-        """int64 [packet]: latest possible arrival time of each."""
-        return np.repeat(self.batches[:, 0], np.diff(self.batches[:, 1], prepend=0))
-
-    @property
     def last_is_short(self) -> bool:
         """True if the last packet is smaller than the one before it: a record may have ended."""
         return self.count > 1 and bool(self._sizes[self.count - 1] < self._sizes[self.count - 2])
 
     @property
     def last_arrival_ns(self) -> int:
-        """Arrival time of the last batch; 0 before the first."""
-        return int(self._batches[self._noted - 1, 0]) if self._noted else 0
+        """Arrival time of the last packet; 0 before the first."""
+        return int(self._times[self.count - 1]) if self.count else 0
 
     @staticmethod
     def restore(
-        expected: int, sequences: Counts, byte_counts: Counts, sizes: Counts, batches: Counts, payload: Bytes
+        expected: int, sequences: Counts, byte_counts: Counts, sizes: Counts, times_ns: Counts, payload: Bytes
     ) -> PacketLog:
         """Restore a log from a file; arrays as of the properties."""
-        log = PacketLog(0, payload if payload.size >= _SPARE_BYTES else None)
-        log.expected, log.count, log.kept = expected, len(sizes), len(sizes)
+        log = PacketLog(0)
+        log.expected = expected
+        log.count = len(sizes)
+        log.kept = len(sizes)
         log._heads = np.zeros((len(sizes), PACKET_HEADER_BYTES), dtype=np.uint8)
         log._heads[:, 0:4] = (sequences % (1 << SEQUENCE_BITS)).astype("<u4")[:, None].view(np.uint8)
         log._heads[:, 4:10] = (byte_counts % (1 << BYTE_COUNT_BITS)).astype("<i8")[:, None].view(np.uint8)[:, :6]
         log._sizes = sizes.astype(np.uint16)
-        log._batches, log._noted = batches, len(batches)
-        log.payload, log._filled, log.payload_bytes = payload, payload.size, int(sizes.sum())
+        log._times = times_ns
+        log.payload = payload
+        log.payload_bytes = int(sizes.sum())
         return log
 
 
-def _doubled(array: NDArray[Any], more: int) -> NDArray[Any]:
+def _double(array: NDArray[Any], more: int) -> NDArray[Any]:
     """Return the array with space for twice as many entries, and `more`."""
     return np.concatenate([array, np.zeros((len(array) + more, *array.shape[1:]), dtype=array.dtype)])

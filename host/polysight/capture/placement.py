@@ -29,12 +29,6 @@ Gap = tuple[int, int]
 
 SWITCHED_ON = Counters(0, 1)
 """Counters of the first packet of a card that was switched on or reset."""
-SMALL_RECORD = 16
-"""Packets below which a whole record may come late; a later one is no evidence of where the card counts."""
-JOINS = 3
-"""Records that join a whole one at another place than predicted, after which the card is taken to count there."""
-RESTARTS = 2
-"""Whole records in which the card counts anew, after which it is taken to do so in every record."""
 # Fewer packets with strange counters are damaged ones.
 MIN_PACKETS_OF_A_RECORD = 3
 # Packets by which a network does not delay one behind others.
@@ -49,14 +43,11 @@ class Past:
 
     start: Counters | None = None  # of the next record's first byte; None: unknown
     lost: bool = False  # unknown, and packets of earlier records may still come
-    restarts: int = 0  # whole records that did not begin where they had to, but with a card's first counters
-    elsewhere: Counters | None = None  # end of a whole record at another place than predicted, alone in its row
-    joined: int = 0  # records that joined it without a gap
-    undelivered: tuple[Gap, ...] = ()  # of the last record, if the next has the same counters: may come with it
 
-    def after_reset(self) -> Past:
+    @staticmethod
+    def after_reset() -> Past:
         """Return the knowledge after the host has reset the card: its memory is empty and it counts anew."""
-        return replace(self, start=SWITCHED_ON, lost=False, undelivered=())
+        return Past(start=SWITCHED_ON)
 
 
 @dataclass
@@ -75,7 +66,6 @@ class PacketCounts:
     late_by_bytes: int = 0  # largest delay of these, bytes
     short: int = 0  # placed, not full; normally only the last of a record
     before_pulses: int = 0  # leftover, identified by arrival before the row's first pulse
-    clock_jumps: int = 0  # number of times the arrival clock went backwards
 
 
 @dataclass(frozen=True)
@@ -101,7 +91,7 @@ class Placed:
     losses: Losses  # missing bytes by kind; for a record that is not located, by its counters only
     past: Past  # knowledge for the next record
     at: Counts  # int64 [packet]: offset of its payload in the row, -1 outside the row
-    arrivals: Counts  # int64 [n, 2]: time (monotonic, ns), bytes received by then; no growth: the socket was empty
+    arrivals: Counts  # int64 [n, 2]: time (monotonic, ns), bytes received by then
     holes: list[Gap] = field(default_factory=list)  # missing ranges below the furthest byte, in the card's order
     slipped: bool = False  # not located only because whole frames are missing: triggers were missed
 
@@ -165,27 +155,30 @@ def place_record(
     past = past or Past()
     record = _find_record(log, past, not_before_ns)
     row = _Row(log, record)
-    why = _why_not_located(record, row, log, frame_bytes)
-    if not why.text and dropped_by_card:
-        why = _Doubt(f"the card dropped data before numbering it ({dropped_by_card})")
-    located = not why.text
-    undelivered = list(past.undelivered) if record.start == past.start else []
-    holes = _merged([*_gaps(row.covered, row.extent), *row.conflicts, *undelivered])
-    missing = _merged([*holes, *([(row.extent, log.expected)] if row.extent < log.expected else [])])
-    out = row.bytes(missing if located else holes)
+    cause = _why_not_located(record, row, log, frame_bytes)
+    if not cause.text and dropped_by_card:
+        cause = _Doubt(f"the card dropped data before numbering it ({dropped_by_card})")
+    holes = _merge([*_gaps(row.covered, row.extent), *row.conflicts])
+    missing = _merge([*holes, (row.extent, log.expected)])
+    if cause.text:
+        out = row.bytes(holes)
+        masked = _merge([(0, log.expected)])
+    else:
+        out = row.bytes(missing)
+        masked = missing
     placed = Placed(
         expected=log.expected,
         received=row.received,
-        missing=missing if located else [(0, log.expected)] if log.expected else [],
-        located=located,
-        reason=why.text,
+        missing=masked,
+        located=not cause.text,
+        reason=cause.text,
         counts=row.counts,
         losses=_losses(missing, row.extent, log.expected),
-        past=_past_after(past, record, _gaps(row.covered, log.expected)),
+        past=_past_after(record, cause),
         at=row.at,
         arrivals=row.arrivals(),
         holes=holes,
-        slipped=why.frames_missing and not dropped_by_card,
+        slipped=cause.frames_missing and not dropped_by_card,
     )
     return placed, out
 
@@ -201,7 +194,7 @@ def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
     reached = np.maximum.accumulate(ends[order])
     fresh = reached - np.maximum(np.append(0, reached[:-1]), starts[order])
     received = int(np.maximum(fresh, 0).sum())
-    complete = record.start_is_certain and record.ends_as_planned and received == log.expected
+    complete = not record.doubt and record.ends_as_planned and received == log.expected
     return Preview(received, complete, record.ended)
 
 
@@ -212,8 +205,7 @@ def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
 class _Record:
     """The row's record among the packets; arrays are [packet]."""
 
-    start: Counters | None  # counters of its first byte; None without any packet
-    start_is_certain: bool
+    start: Counters  # counters of its first byte
     offsets: Counts  # int64, bytes behind the start
     steps: Counts  # int64, packets behind the start
     own: Flags  # counters within the row, and came after the first pulse
@@ -226,101 +218,98 @@ class _Record:
     length: int = 0  # bytes up to the end of the furthest packet
     ended: bool = False  # that packet is short, as only a record's last one is
     ends_as_planned: bool = False  # every sign of an end at the row's last byte
-    clock_jumps: int = 0
     doubt: str = ""  # why the start is not certain
 
 
 def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
     """Select the row's packets by where the record starts: as predicted, or else where a whole record stands."""
     full = find_full_payload(log)
-    jumps = int((np.diff(log.batches[:, 0]) < 0).sum())
-    early = np.zeros(log.count, dtype=np.bool_) if jumps else log.arrivals_ns < not_before_ns
-    if past.start is not None:
-        record = _record_at(log, past.start, full, early, jumps)
-        if record.own.any() or not (~early).any():
-            return record
-    # The largest group of packets that count on from each other, and where it would begin if its end is the row's.
+    early = log.arrivals_ns < not_before_ns
     live = np.flatnonzero(~early)
-    if not live.size:
-        return _record_at(log, past.start or SWITCHED_ON, full, early, jumps)
+    predicted = _select_record(log, past.start or SWITCHED_ON, full, early)
+    if live.size == 0 or (past.start is not None and predicted.own.any()):
+        return predicted
+    record = _select_record(log, _start_of_most(log, live, full), full, early)
+    return replace(record, doubt=_doubt_start(log, past, record))
+
+
+def _start_of_most(log: PacketLog, live: Counts, full: int) -> Counters:
+    """Return the lowest counters of the largest group of packets that count on from each other."""
     seen_first = Counters(int(log.byte_counts[live[0]]), int(log.sequences[live[0]]))
     ahead = counter_differences(log.byte_counts, seen_first.byte_count, BYTE_COUNT_BITS)
     steps = counter_differences(log.sequences, seen_first.sequence, SEQUENCE_BITS)
     _, group, packets = np.unique((ahead - full * steps)[live], return_inverse=True, return_counts=True)
-    own = live[group == int(np.argmax(packets))]
-    lowest = own[int(np.argmin(ahead[own]))]
-    start = Counters(int(log.byte_counts[lowest]), int(log.sequences[lowest]))
-    record = _record_at(log, start, full, early, jumps)
+    largest = live[group == int(np.argmax(packets))]
+    lowest = largest[int(np.argmin(ahead[largest]))]
+    return Counters(int(log.byte_counts[lowest]), int(log.sequences[lowest]))
+
+
+def _doubt_start(log: PacketLog, past: Past, record: _Record) -> str:
+    """Return why a record that was not predicted may begin elsewhere; "" if it came whole, alone and in order."""
     if not record.ends_as_planned:
-        return _doubted(record, "the record is not whole, and its start is unknown")
+        return "the record is not whole, and its start is unknown"
     if past.start is not None:
-        # A card whose counters a reset leaves as they are shows it by whole records that join each other.
-        counts_on = start == past.elsewhere and past.joined + 1 >= JOINS and not (~record.own & ~early).any()
-        return (
-            record if counts_on else _doubted(record, "the record does not begin where the card counts: a second card?")
-        )
+        return "the record does not begin where the card counts: a second card?"
     if past.lost:
-        return _doubted(record, "it is unknown where the last record ended")
-    others = ~record.own & ~early
-    behind = others & (record.offsets < 0) & (record.steps < 0)
-    if (others & ~behind).any() or 2 * int(log.sizes[behind].sum()) >= log.expected:
-        return _doubted(record, "packets of another record came with it")
-    offsets, sizes = record.offsets[record.own], log.sizes[record.own]
-    ended_before = ((sizes < full) & (offsets + sizes < record.length)).any()
+        return "it is unknown where the last record ended"
+    is_other = ~record.own & ~record.early
+    behind = is_other & (record.offsets < 0) & (record.steps < 0)
+    if (is_other & ~behind).any() or 2 * int(log.sizes[behind].sum()) >= log.expected:
+        return "packets of another record came with it"
+    offsets = record.offsets[record.own]
+    sizes = log.sizes[record.own]
+    ended_before = ((sizes < record.full) & (offsets + sizes < record.length)).any()
     _, first_arrival = np.unique(offsets, return_index=True)
     if ended_before or (np.diff(first_arrival) < 0).any():
-        return _doubted(record, "its packets did not come in order, and its start is unknown")
-    return record
+        return "its packets did not come in order, and its start is unknown"
+    return ""
 
 
-def _doubted(record: _Record, doubt: str) -> _Record:
-    return replace(record, start_is_certain=False, doubt=doubt)
-
-
-def _record_at(log: PacketLog, start: Counters, full: int, early: Flags, jumps: int) -> _Record:
+def _select_record(log: PacketLog, start: Counters, full: int, early: Flags) -> _Record:
     """Select the packets of a record that starts with these counters."""
-    sizes, expected = log.sizes, log.expected
+    sizes = log.sizes
+    expected = log.expected
     offsets = counter_differences(log.byte_counts, start.byte_count, BYTE_COUNT_BITS)
     steps = counter_differences(log.sequences, start.sequence, SEQUENCE_BITS)
     on_line = (offsets == full * steps) & (offsets >= 0)
-    own = on_line & (offsets < expected) & ~early
-    length, ended = 0, False
-    if own.any():
-        stops = (offsets + sizes)[own]
+    is_own = on_line & (offsets < expected) & ~early
+    length = 0
+    ended = False
+    if is_own.any():
+        stops = (offsets + sizes)[is_own]
         length = int(stops.max())
-        ended = bool((sizes[own][stops == length] < full).all())
-    near = (offsets < 2 * expected + 2 * full) & (steps > 0) & (steps * full < 4 * expected + 4 * full) & ~early
-    beyond = near & on_line & (offsets >= expected)
-    later = near & ~on_line & (offsets >= max(length, full))
+        ended = bool((sizes[is_own][stops == length] < full).all())
+    is_near = (offsets < 2 * expected + 2 * full) & (steps > 0) & (steps * full < 4 * expected + 4 * full) & ~early
+    beyond = is_near & on_line & (offsets >= expected)
+    later = is_near & ~on_line & (offsets >= max(length, full))
     ends_in_short = expected % full > 0
-    as_planned = length == expected and ended is ends_in_short and not beyond.any()
-    anew = np.zeros_like(own)
-    if start.byte_count > 2 * expected and own.any():
-        anew = (log.byte_counts == full * (log.sequences - 1)) & (log.byte_counts < expected) & ~early & ~own
-        anew &= np.arange(log.count) > int(np.argmax(own))
+    counts_on_anew = np.zeros_like(is_own)
+    if start.byte_count > 2 * expected and is_own.any():
+        counts_anew = (log.byte_counts == full * (log.sequences - 1)) & (log.byte_counts < expected)
+        is_behind = np.arange(log.count) > int(np.argmax(is_own))
+        counts_on_anew = counts_anew & is_behind & ~early & ~is_own
     return _Record(
         start=start,
-        start_is_certain=True,
         offsets=offsets,
         steps=steps,
-        own=own,
+        own=is_own,
         beyond=beyond,
-        later=later & ~anew,
+        later=later & ~counts_on_anew,
         early=early,
         too_early=early & on_line & (offsets < expected),
-        anew=anew,
+        anew=counts_on_anew,
         full=full,
         length=length,
         ended=ended,
-        ends_as_planned=as_planned,
-        clock_jumps=jumps,
+        ends_as_planned=length == expected and ended is ends_in_short and not beyond.any(),
     )
 
 
 def counter_differences(counters: Counts, origin: int, bits: int) -> Counts:
     """Return `counters - origin`, int64 [n], of counters that wrap after `bits` bits; nearest to zero."""
     spare = 64 - bits
-    wrapped = (counters.astype(np.uint64) - np.uint64(origin)) << np.uint64(spare)  # the counter's top bit is the sign
+    # The counter's top bit is the sign.
+    wrapped = (counters.astype(np.uint64) - np.uint64(origin)) << np.uint64(spare)
     return wrapped.view(np.int64) >> np.int64(spare)
 
 
@@ -387,34 +376,12 @@ def _why_not_located(record: _Record, row: _Row, log: PacketLog, frame_bytes: in
     return _Doubt(text, frames_missing=clean)
 
 
-def _past_after(past: Past, record: _Record, undelivered: list[Gap]) -> Past:
-    """Return where the next record begins."""
-    if record.start is None or not record.own.any() or record.later.any() or record.anew.any():
-        return Past(lost=True, restarts=past.restarts)
-    length = record.length
-    # Only a short packet, or the last planned byte of a record of full packets, is a record's end.
-    end_is_known = record.ended or record.ends_as_planned
-    if not end_is_known or record.beyond.any():
-        return Past(lost=True, restarts=past.restarts)
-    next_start = record.start.after(length, -(-length // record.full))
-    if record.start_is_certain:
-        if past.restarts >= RESTARTS:
-            return Past(start=SWITCHED_ON, restarts=past.restarts, undelivered=tuple(undelivered))
-        chained = past.start is not None and past.start != SWITCHED_ON
-        return Past(start=next_start, restarts=0 if chained else past.restarts)
-    # The end of a scan's first record is one wherever that began.
-    if past == Past() and record.ended:
-        return Past(start=next_start)
-    # A whole record at another place than predicted is not trusted: it may be a second card's.
-    lost = Past(lost=True, restarts=past.restarts)
-    if not record.ends_as_planned or length < SMALL_RECORD * record.full or (~record.own & ~record.early).any():
-        return lost
-    if record.start != SWITCHED_ON:
-        joined = past.joined + 1 if record.start == past.elsewhere else 0
-        return replace(lost, elsewhere=next_start, joined=joined)
-    if past.restarts + 1 >= RESTARTS:
-        return Past(start=SWITCHED_ON, restarts=past.restarts + 1, undelivered=tuple(undelivered))
-    return replace(lost, restarts=past.restarts + 1)
+def _past_after(record: _Record, why: _Doubt) -> Past:
+    """Return where the next record begins: known behind a record whose start and end are certain."""
+    is_certain = not why.text or why.frames_missing
+    if not is_certain or not record.own.any() or record.later.any():
+        return Past(lost=True)
+    return Past(start=record.start.after(record.length, -(-record.length // record.full)))
 
 
 def _count_packets(
@@ -437,7 +404,6 @@ def _count_packets(
         disagreeing=int((rest & ~outside).sum()),
         malformed=log.malformed,
         before_pulses=int((record.early & leftover).sum()),
-        clock_jumps=record.clock_jumps,
     )
 
 
@@ -448,12 +414,15 @@ class _Row:
     """Puts the packets of a record in place."""
 
     def __init__(self, log: PacketLog, record: _Record) -> None:
-        self._log, self._record = log, record
-        self._sizes, self._starts = log.sizes, np.cumsum(log.sizes) - log.sizes
+        self._log = log
+        self._record = record
+        self._sizes = log.sizes
+        self._starts = np.cumsum(log.sizes) - log.sizes
         kept = np.arange(log.count) < log.kept
         self._own = record.own & kept
         self.at: Counts = np.full(log.count, -1, dtype=np.int64)
-        self.covered: list[Gap] = []  # sorted, joined
+        # Sorted, joined.
+        self.covered: list[Gap] = []
         self.conflicts: list[Gap] = []
         self.received = self.extent = 0
         self._stops = np.minimum(record.offsets + self._sizes, log.expected)
@@ -464,92 +433,101 @@ class _Row:
 
     def _measure(self) -> None:
         """Find what is covered, and what came late."""
-        mine = np.flatnonzero(self._placed)
-        if not mine.size:
+        placed = np.flatnonzero(self._placed)
+        if not placed.size:
             return
-        starts, stops = self._record.offsets[mine], self._stops[mine]
+        starts = self._record.offsets[placed]
+        stops = self._stops[placed]
         order = np.argsort(starts, kind="stable")
-        a, b = starts[order], np.maximum.accumulate(stops[order])
+        a = starts[order]
+        b = np.maximum.accumulate(stops[order])
         new = np.flatnonzero(np.append(True, a[1:] > b[:-1]))
         self.covered = list(zip(a[new].tolist(), b[np.append(new[1:] - 1, len(b) - 1)].tolist(), strict=True))
-        self.extent, self.received = int(b[-1]), sum(stop - start for start, stop in self.covered)
+        self.extent = int(b[-1])
+        self.received = sum(stop - start for start, stop in self.covered)
         reached = np.maximum.accumulate(np.append(0, stops))[:-1]
         behind = reached - starts
         self.counts.late = int((behind > 0).sum())
         self.counts.late_by_bytes = max(0, int(behind.max()))
-        self.counts.short = int((self._sizes[mine] < self._record.full).sum())
+        self.counts.short = int((self._sizes[placed] < self._record.full).sum())
 
     def _place(self) -> None:
         """Of packets at the same place, select the first and any with more bytes."""
-        own = np.flatnonzero(self._own)
-        offsets = self._record.offsets[own]
+        packets = np.flatnonzero(self._own)
+        offsets = self._record.offsets[packets]
         order = np.argsort(offsets, kind="stable")
         sorted_offsets = offsets[order]
         new = np.append(True, np.diff(sorted_offsets) != 0)[: order.size]
-        self._placed[own] = True
-        self.at[own] = offsets
+        self._placed[packets] = True
+        self.at[packets] = offsets
         if new.all():
             return
         firsts = np.flatnonzero(new)
         for i, j in zip(firsts.tolist(), [*firsts[1:].tolist(), order.size], strict=True):
             if j - i > 1:
-                self._overlap(own[order[i:j]].tolist())
+                self._overlap(packets[order[i:j]].tolist())
 
     def _overlap(self, packets: list[int]) -> None:
         """Compare packets of one place, in order of arrival, with the longest so far."""
         longest = packets[0]
         for k in packets[1:]:
             offset = int(self._record.offsets[k])
-            both = min(int(self._stops[k]), int(self._stops[longest])) - offset
-            if not np.array_equal(self._payload(k)[:both], self._payload(longest)[:both]):
-                self.conflicts.append((offset, offset + both))
-                self._placed[k], self._conflicting[k], self.at[k] = False, True, -1
+            common = min(int(self._stops[k]), int(self._stops[longest])) - offset
+            if not np.array_equal(self._payload(k)[:common], self._payload(longest)[:common]):
+                self.conflicts.append((offset, offset + common))
+                self._placed[k] = False
+                self._conflicting[k] = True
+                self.at[k] = -1
                 if self._stops[k] > self._stops[longest]:
                     self.conflicts.append((offset, int(self._stops[k])))
                     self.conflicts.append((offset, int(self._stops[longest])))
             elif self._stops[k] > self._stops[longest]:
                 longest = k
             else:
-                self._placed[k], self._duplicate[k] = False, True
+                self._placed[k] = False
+                self._duplicate[k] = True
 
     def _payload(self, k: int) -> Bytes:
         return self._log.payload[self._starts[k] : self._starts[k] + self._sizes[k]]
 
     def arrivals(self) -> Counts:
-        """Return the arrival time of each batch and the bytes received by then, int64 [n, 2]."""
-        batches = self._log.batches
-        if not batches.size:
-            return np.zeros((0, 2), dtype=np.int64)
-        reached = np.append(0, np.maximum.accumulate(np.where(self._placed, self._stops, 0)))
-        pairs = np.column_stack([batches[:, 0], reached[batches[:, 1]]])
-        return np.ascontiguousarray(pairs[pairs[:, 1] > 0])
+        """Return the arrival time of each packet behind all before it, and its end, int64 [n, 2]."""
+        stops = np.where(self._placed, self._stops, 0)
+        reached = np.maximum.accumulate(stops)
+        is_new = np.diff(reached, prepend=0) > 0
+        return np.column_stack([self._log.arrivals_ns[is_new], reached[is_new]])
 
     def bytes(self, holes: list[Gap]) -> Bytes:
         """Return the row: the log's own memory if it came whole and in order, otherwise a copy. Zero at the holes.
 
         The log's payload stays as it came: it is stored as the evidence.
         """
-        log, mine = self._log, np.flatnonzero(self._placed)
+        log = self._log
+        placed = np.flatnonzero(self._placed)
         out = log.payload[: log.expected]
-        whole = not holes and self.extent == log.expected
-        if not whole or (self.at[mine] != self._starts[mine]).any():
+        is_whole = not holes and self.extent == log.expected
+        if not is_whole or (self.at[placed] != self._starts[placed]).any():
             out = np.zeros(log.expected, dtype=np.uint8)
-            self._copy(mine, out)
+            self._copy(placed, out)
         out[self.extent :] = 0
         for start, stop in holes:
             out[start:stop] = 0
         return out
 
-    def _copy(self, mine: Counts, out: Bytes) -> None:
+    def _copy(self, placed: Counts, out: Bytes) -> None:
         """Copy runs of packets that are consecutive in the log and in the row."""
-        if not mine.size:
+        if not placed.size:
             return
-        offsets, sizes, starts, stops = self.at[mine], self._sizes[mine], self._starts[mine], self._stops[mine]
+        offsets = self.at[placed]
+        sizes = self._sizes[placed]
+        starts = self._starts[placed]
+        stops = self._stops[placed]
         joined = (starts[1:] == starts[:-1] + sizes[:-1]) & (offsets[1:] == offsets[:-1] + sizes[:-1])
         firsts = np.flatnonzero(np.append(True, ~joined))
-        lasts = np.append(firsts[1:] - 1, len(mine) - 1)
+        lasts = np.append(firsts[1:] - 1, len(placed) - 1)
         for i, j in zip(firsts.tolist(), lasts.tolist(), strict=True):
-            a, b = int(offsets[i]), int(stops[j])
+            a = int(offsets[i])
+            b = int(stops[j])
             out[a:b] = self._log.payload[starts[i] : starts[i] + b - a]
 
 
@@ -567,10 +545,10 @@ def _gaps(covered: list[Gap], extent: int) -> list[Gap]:
     return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
 
 
-def _merged(gaps: list[Gap]) -> list[Gap]:
+def _merge(gaps: list[Gap]) -> list[Gap]:
     """Return the same bytes as sorted ranges that do not touch."""
     out: list[Gap] = []
-    for start, stop in sorted(gaps):
+    for start, stop in sorted(gap for gap in gaps if gap[0] < gap[1]):
         if out and start <= out[-1][1]:
             out[-1] = (out[-1][0], max(out[-1][1], stop))
         else:

@@ -22,7 +22,8 @@ from polysight_shared.config import Board
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
 
-REAL_TIME = 5  # below the kernel's threads, and below the Pi's pulses if both run on one machine
+# Below the kernel's threads, and below the Pi's pulses if both run on one machine.
+REAL_TIME = 5
 NICE = -5
 PRIORITY_REMEDY = (
     "`sudo host/rights.sh USER` (USER: the user who scans), then log out and in again, or restart the machine"
@@ -45,8 +46,8 @@ def receiver_cores(receivers: int, cores: list[int] | None = None) -> list[Core 
     if cores is None:
         cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     usable = cores[1:][::-1]
-    own = len(usable) >= receivers
-    return [Core(usable[k % len(usable)], own) if usable else None for k in range(receivers)]
+    is_own = len(usable) >= receivers
+    return [Core(usable[k % len(usable)], is_own) if usable else None for k in range(receivers)]
 
 
 def take_core(core: int | None, own: bool = True, urgent: bool = True) -> tuple[int | None, str]:
@@ -84,7 +85,8 @@ def take_priority(real_time: int = REAL_TIME, nice: int = NICE) -> tuple[str, st
 
 
 _START_TIMEOUT_S = 30.0
-_ANSWER_TIMEOUT_S = 60.0  # ending a row waits for the disk
+# Ending a row waits for the disk.
+_ANSWER_TIMEOUT_S = 60.0
 
 
 class _Message(msgspec.Struct, frozen=True, tag=True):
@@ -200,7 +202,6 @@ class RowCapture(_Message, frozen=True):
     conflicting: int = 0
     restarted: int = 0
     before_pulses: int = 0
-    clock_jumps: int = 0
     packets_crc32: int = 0
     start_lost: bool = False  # it is unknown where the card's next record begins: reset the card
 
@@ -242,8 +243,9 @@ def send(connection: Connection, message: Request | Answer) -> None:
     try:
         connection.send_bytes(_encoder.encode(message))
     except OSError as e:
-        what, why = f"the receiver's pipe broke: {e}", "the other process ended"
-        raise DeviceError(what, why, "start the scan again", code=ErrorCode.NO_ANSWER) from None
+        problem = f"the receiver's pipe broke: {e}"
+        cause = "the other process ended"
+        raise DeviceError(problem, cause, "start the scan again", code=ErrorCode.NO_ANSWER) from None
 
 
 def next_request(connection: Connection) -> Request:
@@ -294,7 +296,8 @@ class ReceiverProcess:
             self.close()
             raise
         self.granted_bytes = opened.granted_bytes
-        self.scheduling, self.warnings = opened.scheduling, [f"{board.name}: {w}" for w in opened.warnings]
+        self.scheduling = opened.scheduling
+        self.warnings = [f"{board.name}: {w}" for w in opened.warnings]
 
     @property
     def pid(self) -> int:
@@ -360,9 +363,9 @@ class ReceiverProcess:
         try:
             return _answers.decode(self._connection.recv_bytes())
         except (EOFError, OSError):
-            raise self._ended() from None
+            raise self._process_error() from None
 
-    def _ended(self) -> DeviceError:
+    def _process_error(self) -> DeviceError:
         return DeviceError(
             f"{self.board.name}: the receiver process ended with status {self._process.poll()}",
             "it was killed, or it failed; its message is above",
@@ -374,7 +377,7 @@ class ReceiverProcess:
         try:
             send(self._connection, request)
         except DeviceError:
-            raise self._ended() from None
+            raise self._process_error() from None
         deadline = time.monotonic() + timeout_s
         while self._connection.poll(max(0.0, deadline - time.monotonic())):
             answer = self._next()

@@ -28,23 +28,28 @@ from polysight.capture.receiver import take_core, take_priority
 from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets
 from polysight_shared.errors import DeviceError, PolysightError
 
-_MAX_BATCHES = 64  # batches fetched before requests are checked again
-_PREVIEW_SHARE = 20  # previews take at most 1/20 of the time
-_IDLE_MS = 1
-_SLEPT_NS = 200_000  # a poll() of this length has slept: nothing was there when it began
+# Batches fetched before requests are checked again.
+_MAX_BATCHES = 64
+# Previews take at most 1/20 of the time.
+_PREVIEW_SHARE = 20
 _RESTART = "start the scan again"
-_GATHER_MS = 1  # pause in which packets gather in the kernel's buffer: fewer, larger batches
+# Pause in which packets gather in the kernel's buffer: fewer, larger batches.
+_GATHER_MS = 1
 
 
 class _Row:
     """A row during reception."""
 
     def __init__(self, request: messages.BeginRow, segment: Segment, log: PacketLog, past: Past) -> None:
-        self.request, self.segment, self.log, self.past = request, segment, log, past
+        self.request = request
+        self.segment = segment
+        self.log = log
+        self.past = past
         self.stale = self.strangers = self.drops = 0
         self.not_before_ns = 0
         self._reported = (False, False)
-        self._previewed = 0  # packets
+        # Packets.
+        self._previewed = 0
         self._next_preview_ns = 0
         self._preview = Preview(0, request.expected_bytes == 0, ended=False)
 
@@ -57,12 +62,14 @@ class _Row:
             return False
         self._update()
         self._next_preview_ns = time.monotonic_ns() + _PREVIEW_SHARE * (time.monotonic_ns() - began)
-        reported, self._reported = self._reported, (self._preview.complete, self._preview.ended)
+        reported = self._reported
+        self._reported = (self._preview.complete, self._preview.ended)
         return self._reported != reported and any(self._reported)
 
     def progress(self) -> messages.Progress:
         self._update()
-        p, r = self._preview, self.request
+        p = self._preview
+        r = self.request
         return messages.Progress(r.row, r.take, p.received, p.complete, self.log.last_arrival_ns, p.ended)
 
     def _update(self) -> None:
@@ -79,20 +86,19 @@ class Receiver:
         self._socket: socket.socket | None = None
         self._batches: BatchReceiver | None = None
         self._row: _Row | None = None
-        self._past = Past()  # knowledge from earlier records
-        self._memory: NDArray[np.uint8] | None = None  # of the previous row, to be reused
+        # Knowledge from earlier records.
+        self._past = Past()
+        # Of the previous row, to be reused.
+        self._memory: NDArray[np.uint8] | None = None
 
     def serve(self) -> None:
         """Answer requests and receive until the connection closes."""
-        poll, requests = select.poll(), select.poll()
+        poll = select.poll()
+        requests = select.poll()
         poll.register(self._connection.fileno(), select.POLLIN)
         requests.register(self._connection.fileno(), select.POLLIN)
         while True:
-            # During a row the socket is looked at often: that a packet had not come by then is evidence, too.
-            asked_ns = time.monotonic_ns()
-            ready = dict(poll.poll(None if self._row is None else _IDLE_MS))
-            if self._row is not None and time.monotonic_ns() - asked_ns > _SLEPT_NS:
-                self._row.log.note_quiet(asked_ns)
+            ready = dict(poll.poll())
             if self._socket is not None and self._socket.fileno() in ready and self._row is not None:
                 self._receive()
                 requests.poll(_GATHER_MS)
@@ -147,15 +153,17 @@ class Receiver:
             log = PacketLog(request.expected_bytes, self._memory)
         except MemoryError:
             segment.discard()
-            what = f"{request.path}: no memory for a row of {request.expected_bytes} bytes"
-            raise DeviceError(what, "the row is larger than memory", "scan shorter rows, or fewer pulses") from None
+            problem = f"{request.path}: no memory for a row of {request.expected_bytes} bytes"
+            remedy = "scan shorter rows, or fewer pulses"
+            raise DeviceError(problem, "the row is larger than memory", remedy) from None
         strays = PacketLog(0)
         while n := self._batches.receive():
-            strays.add(self._batches.packets[:n], self._batches.lengths[:n], time.monotonic_ns())
+            strays.add(self._batches.packets[:n], self._batches.lengths[:n], 0)
         if request.after_reset:
-            self._past = self._past.after_reset()
+            self._past = Past.after_reset()
         self._row = row = _Row(request, segment, log, self._past)
-        row.stale, row.strangers = strays.count + strays.malformed, self._batches.strangers
+        row.stale = strays.count + strays.malformed
+        row.strangers = self._batches.strangers
         row.drops = kernel_drops(self._socket)
         return messages.Began(row.stale)
 
@@ -163,19 +171,19 @@ class Receiver:
         """Discard the row; the end of its record is unknown then."""
         if self._row is not None:
             self._row.segment.discard()
-        self._row, self._past = None, Past(lost=True, restarts=self._past.restarts)
+        self._row = None
+        self._past = Past(lost=True)
 
     def _receive(self) -> None:
-        row, batches = self._row, self._batches
+        row = self._row
+        batches = self._batches
         if row is None or batches is None:
             return
         for _ in range(_MAX_BATCHES):
-            read_ns = time.monotonic_ns()
             n = batches.receive()
             if n == 0:
-                row.log.note_quiet(read_ns)
                 break
-            row.log.add(batches.packets[:n], batches.lengths[:n], time.monotonic_ns())
+            row.log.add(batches.packets[:n], batches.lengths[:n], batches.times_ns[:n])
         if row.has_news():
             messages.send(self._connection, row.progress())
 
@@ -185,16 +193,21 @@ class Receiver:
             raise DeviceError("no row is being received", "a row ended that had not begun", _RESTART)
         self._receive()
         self._row = None
-        begun, log, path = row.request, row.log, Path(row.request.path)
+        begun = row.request
+        log = row.log
+        path = Path(row.request.path)
         dropped = (Status(request.card_status) & LOST_BEFORE_PACKETS).name or ""
         not_before_ns = max(request.not_before_ns, row.not_before_ns)
         evidence = Evidence(begun.expected_bytes, begun.frame_bytes, not_before_ns, dropped, row.past)
         placed, out = place_record(log, begun.frame_bytes, row.past, not_before_ns, dropped)
-        self._past, self._memory = placed.past, log.payload
+        self._past = placed.past
+        self._memory = log.payload
         crc = row.segment.finish(out)
         facts = {"row": begun.row, "take": begun.take, **placed.facts(), "card_status": request.card_status}
         index_crc = write_index(path.with_suffix(".idx"), facts, placed.arrivals)
-        counts, losses, arrivals = vars(placed.counts).copy(), vars(placed.losses), placed.arrivals
+        counts = vars(placed.counts).copy()
+        losses = vars(placed.losses)
+        arrivals = placed.arrivals
         counts["packets"] = counts.pop("placed")
         return messages.RowCapture(
             row=begun.row,
@@ -223,12 +236,14 @@ class Receiver:
 
 def main(argv: list[str]) -> int:
     """Run the receiver on the inherited socket; its descriptor is the only argument."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the host decides when a row ends
+    # The host decides when a row ends.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     with Connection(int(argv[1])) as connection:
         try:
             Receiver(connection).serve()
         except PolysightError as e:
-            with contextlib.suppress(DeviceError):  # the host may have ended
+            # The host may have ended.
+            with contextlib.suppress(DeviceError):
                 messages.send(connection, messages.Failed(e.what, e.why, e.remedy, e.code))
             return e.exit_status
     return 0

@@ -18,7 +18,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.capture.dca1000 import MAX_PAYLOAD_BYTES, Counters
 from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Evidence, Placed
 from polysight_shared.error_codes import ErrorCode
@@ -27,10 +26,11 @@ from polysight_shared.files import open_to_write, read_bounded
 
 Bytes = NDArray[np.uint8]
 PAIR = np.dtype("<i8")
-MAX_INDEX_BYTES = 256 << 20  # sixteen million batches of packets
+# Sixteen million batches of packets.
+MAX_INDEX_BYTES = 256 << 20
 
 
-def _scan_of(path: Path) -> Path:
+def _find_scan(path: Path) -> Path:
     """The scan folder of `SCAN/raw/BOARD/ROW.*`; of a file elsewhere, its own folder."""
     return path.parents[2] if path.parent.parent.name == "raw" else path.parent
 
@@ -41,14 +41,14 @@ def write_error(path: Path, done: str, e: OSError) -> DeviceError:
     return DeviceError(
         f"{path}: cannot be {done}: {e.strerror}",
         "the disk is full, read-only or fails",
-        f"free space, then `polysight resume {_scan_of(path)}` continues after the last committed row",
+        f"free space, then `polysight resume {_find_scan(path)}` continues after the last committed row",
         code=ErrorCode.DISK_FULL if full else ErrorCode.FILE_UNWRITABLE,
     )
 
 
-def damaged(path: Path) -> tuple[str, str]:
+def _explain_damage(path: Path) -> tuple[str, str]:
     """Return cause and remedy for a row's file that cannot be read."""
-    return "the file is damaged or truncated", f"`polysight validate {_scan_of(path)}` names every damaged file"
+    return "the file is damaged or truncated", f"`polysight validate {_find_scan(path)}` names every damaged file"
 
 
 class Segment:
@@ -79,11 +79,11 @@ class Segment:
 
     def finish(self, data: NDArray[np.uint8]) -> int:
         """Write the bytes durably, close the file, and return their CRC-32. Raises DeviceError if the disk fails."""
-        left = np.ascontiguousarray(data).data
-        crc = zlib.crc32(left)
+        remaining = np.ascontiguousarray(data).data
+        crc = zlib.crc32(remaining)
         try:
-            while left:
-                left = left[self._file.write(left) :]
+            while remaining:
+                remaining = remaining[self._file.write(remaining) :]
             os.fsync(self._file.fileno())
         except OSError as e:
             raise write_error(self.path, "made durable", e) from None
@@ -127,22 +127,26 @@ def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
         facts = json.loads(head)
         pairs = np.frombuffer(tail, dtype=PAIR).reshape(-1, 2).astype(np.int64)
     except (OSError, ValueError, RecursionError) as e:
-        what = f"{path}: not a readable row index: {e}"
-        raise DataError(what, *damaged(path), code=ErrorCode.FILE_DAMAGED) from None
+        problem = f"{path}: not a readable row index: {e}"
+        raise DataError(problem, *_explain_damage(path), code=ErrorCode.FILE_DAMAGED) from None
     if not isinstance(facts, dict) or facts.get("arrivals") != len(pairs):
-        raise DataError(f"{path}: the row index is incomplete", *damaged(path), code=ErrorCode.FILE_DAMAGED)
+        raise DataError(f"{path}: the row index is incomplete", *_explain_damage(path), code=ErrorCode.FILE_DAMAGED)
     return facts, pairs
 
 
-PACKETS = ".pkt"  # suffix, beside the row's file
+# Suffix, beside the row's file.
+PACKETS = ".pkt"
 FORMAT = 2
+"""Format 1 had other knowledge of the records before: such rows are placed as the first of a scan."""
 RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), ("size", "<u2"), ("place", "<i8")])
 """Run of consecutive packets of one size: counters of the first, number of packets, payload of each, and its place.
 
 `place` is an offset in the row's file; or, below zero, `-1 - offset` in this file's own payload.
 """
-BATCH = np.dtype("<i8")  # pairs: time (CLOCK_MONOTONIC of the host, ns), packets received by then
-_MAX_RUN_BYTES = 256 << 20  # of batches and runs
+# Pairs: time (CLOCK_MONOTONIC of the host, ns), packets received by then.
+BATCH = np.dtype("<i8")
+# Of batches and runs.
+_MAX_RUN_BYTES = 256 << 20
 
 
 def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed | None) -> int:
@@ -150,35 +154,44 @@ def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed
 
     Raises DeviceError if the disk fails.
     """
-    kept = log.kept
-    sizes, sequences, counts = log.sizes[:kept], log.sequences[:kept], log.byte_counts[:kept]
-    at = np.full(kept, -1, dtype=np.int64) if placed is None else _in_the_row(placed, sizes)
-    here = at < 0
-    rest = np.concatenate([[0], np.cumsum(np.where(here, sizes, 0))])[:-1]
-    place = np.where(here, -1 - rest, at)
-    ahead = np.where(here[:-1], -sizes[:-1], sizes[:-1])
+    stored = log.kept
+    sizes = log.sizes[:stored]
+    sequences = log.sequences[:stored]
+    counts = log.byte_counts[:stored]
+    places = np.full(stored, -1, dtype=np.int64) if placed is None else _in_the_row(placed, sizes)
+    is_stored_here = places < 0
+    rest = np.concatenate([[0], np.cumsum(np.where(is_stored_here, sizes, 0))])[:-1]
+    place = np.where(is_stored_here, -1 - rest, places)
+    ahead = np.where(is_stored_here[:-1], -sizes[:-1], sizes[:-1])
     joined = (
         (np.diff(sizes) == 0) & (np.diff(sequences) == 1) & (np.diff(counts) == sizes[:-1])
-        & (np.diff(place) == ahead) & (here[1:] == here[:-1])
+        & (np.diff(place) == ahead) & (is_stored_here[1:] == is_stored_here[:-1])
     )  # fmt: skip
-    first = np.flatnonzero(np.append(True, ~joined))[: kept and None]
+    first = np.flatnonzero(np.append(True, ~joined))[: stored and None]
     runs = np.zeros(first.size, dtype=RUN)
-    runs["sequence"], runs["byte_count"], runs["size"] = sequences[first], counts[first], sizes[first]
-    runs["packets"], runs["place"] = np.diff(np.append(first, kept)), place[first]
+    runs["sequence"] = sequences[first]
+    runs["byte_count"] = counts[first]
+    runs["size"] = sizes[first]
+    runs["packets"] = np.diff(np.append(first, stored))
+    runs["place"] = place[first]
     starts = np.cumsum(log.sizes) - log.sizes
-    own = [log.payload[starts[k] : starts[k] + sizes[k]] for k in np.flatnonzero(here).tolist()]
+    stored_payload = [log.payload[starts[k] : starts[k] + sizes[k]] for k in np.flatnonzero(is_stored_here).tolist()]
+    last_of_its_time = np.flatnonzero(np.diff(log.arrivals_ns, append=log.arrivals_ns[-1:] + 1))
+    batches = np.column_stack([log.arrivals_ns[last_of_its_time], last_of_its_time + 1])
     head = {
         "format": FORMAT,
-        "batches": len(log.batches),
+        "batches": len(batches),
         "runs": len(runs),
         "packets": log.count,
-        "kept": kept,
-        "own_bytes": int(sizes[here].sum()),
+        "kept": stored,
+        "own_bytes": int(sizes[is_stored_here].sum()),
         "malformed": log.malformed,
         "evidence": msgspec.to_builtins(evidence),
     }
     line = json.dumps(head, sort_keys=True, separators=(",", ":")).encode("ascii") + b"\n"
-    raw = b"".join([line, log.batches.astype(BATCH).tobytes(), runs.tobytes(), *(part.tobytes() for part in own)])
+    raw = b"".join(
+        [line, batches.astype(BATCH).tobytes(), runs.tobytes(), *(part.tobytes() for part in stored_payload)]
+    )
     return write_durably(path, raw)
 
 
@@ -193,53 +206,46 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
     try:
         line, _, tail = read_bounded(path, PacketLog.max_kept_bytes(row.size) + _MAX_RUN_BYTES).partition(b"\n")
         head: dict[str, Any] = json.loads(line)
-        if head["format"] == 1:
-            head["evidence"]["past"] = _past_of_format_1(head["evidence"].get("past", {}))
         evidence = msgspec.convert(head["evidence"], Evidence)
         size = 2 * BATCH.itemsize * head["batches"]
         batches = np.frombuffer(tail[:size], dtype=BATCH).reshape(-1, 2).astype(np.int64)
         runs = np.frombuffer(tail[size : size + RUN.itemsize * head["runs"]], dtype=RUN)
-        own = np.frombuffer(tail[size + runs.nbytes :], dtype=np.uint8)
+        stored_payload = np.frombuffer(tail[size + runs.nbytes :], dtype=np.uint8)
         if (np.diff(batches[:, 1], prepend=0) < 0).any():
             raise ValueError("the number of packets decreases between two batches")
-        log = _restored(evidence.expected, runs, batches, row, own)
-        whole = (head["packets"], head["own_bytes"]) == (int(batches[-1, 1]) if len(batches) else 0, own.size)
-        if not whole or log.count != head["kept"] or head["format"] not in (1, FORMAT):
+        log = _restore_log(evidence.expected, runs, batches, row, stored_payload)
+        is_whole = (head["packets"], head["own_bytes"]) == (
+            int(batches[-1, 1]) if len(batches) else 0,
+            stored_payload.size,
+        )
+        if not is_whole or log.count != head["kept"] or head["format"] not in (1, FORMAT):
             raise ValueError("its counts are wrong")
         log.malformed = int(head["malformed"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as e:
-        what = f"{path}: not a readable packet log: {e}"
-        raise DataError(what, *damaged(path), code=ErrorCode.FILE_DAMAGED) from None
+        problem = f"{path}: not a readable packet log: {e}"
+        raise DataError(problem, *_explain_damage(path), code=ErrorCode.FILE_DAMAGED) from None
     return evidence, log
-
-
-def _past_of_format_1(past: dict[str, Any]) -> dict[str, Any]:
-    """Return the start of a record from the knowledge as older releases stored it: a base and possible sizes."""
-    base, ends = past.get("base"), past.get("ends", [])
-    if base is None or len(ends) != 1:
-        return {}
-    packets = -(-ends[0] // MAX_PAYLOAD_BYTES)
-    start = Counters(base["byte_count"], base["sequence"]).after(ends[0], packets)
-    return {"start": msgspec.to_builtins(start)}
 
 
 def _in_the_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the offset of each packet's unchanged payload in the row's file, int64 [packet]; -1 if it is not there."""
-    at = placed.at[: sizes.size].copy()
-    at[at + sizes > placed.expected] = -1
+    offsets = placed.at[: sizes.size].copy()
+    offsets[offsets + sizes > placed.expected] = -1
     for start, stop in placed.holes:
-        at[(at < stop) & (at + sizes > start)] = -1
-    return at
+        offsets[(offsets < stop) & (offsets + sizes > start)] = -1
+    return offsets
 
 
-def _restored(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row: Bytes, own: Bytes) -> PacketLog:
+def _restore_log(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row: Bytes, own: Bytes) -> PacketLog:
     """Restore the packet log. Raises ValueError if payload is missing."""
-    many, sizes = runs["packets"].astype(np.int64), runs["size"].astype(np.int64)
-    payload_bytes = sum((many * sizes).tolist())  # each product fits 48 bits; their sum need not fit 64
+    many = runs["packets"].astype(np.int64)
+    sizes = runs["size"].astype(np.int64)
+    # Each product fits 48 bits; their sum need not fit 64.
+    payload_bytes = sum((many * sizes).tolist())
     if expected != row.size or payload_bytes > PacketLog.max_kept_bytes(expected) or (sizes == 0).any():
         raise ValueError("it is of another row, or has more payload than a receiver keeps")
     nth = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
-    each = np.repeat(sizes, many)
+    size_of_each = np.repeat(sizes, many)
     parts = []
     for n, size, place in zip(many.tolist(), sizes.tolist(), runs["place"].tolist(), strict=True):
         source, start = (row, place) if place >= 0 else (own, -1 - place)
@@ -248,8 +254,8 @@ def _restored(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row
             raise ValueError("payload is missing")
     payload = np.concatenate(parts) if parts else np.zeros(0, dtype=np.uint8)
     sequences = np.repeat(runs["sequence"].astype(np.int64), many) + nth
-    counts = np.repeat(runs["byte_count"].astype(np.int64), many) + nth * each
-    kept = batches[batches[:, 1] <= many.sum()] if len(batches) else batches
-    if len(kept) < len(batches) and (not len(kept) or kept[-1, 1] < many.sum()):
-        kept = np.concatenate([kept, [[batches[len(kept), 0], many.sum()]]])
-    return PacketLog.restore(expected, sequences, counts, each, kept, payload)
+    counts = np.repeat(runs["byte_count"].astype(np.int64), many) + nth * size_of_each
+    times = np.repeat(batches[:, 0], np.diff(batches[:, 1], prepend=0))[: many.sum()]
+    if times.size < many.sum():
+        raise ValueError("times are missing")
+    return PacketLog.restore(expected, sequences, counts, size_of_each, times, payload)

@@ -72,11 +72,13 @@ class AppendFile:
 
     def append(self, data: bytes) -> None:
         """Append `data` durably. After a DeviceError the file has its former length."""
-        left, end = memoryview(data), self.length
+        remaining = memoryview(data)
+        end = self.length
         try:
-            while left:
-                written = os.pwrite(self._file.fileno(), left, end)
-                left, end = left[written:], end + written
+            while remaining:
+                written = os.pwrite(self._file.fileno(), remaining, end)
+                remaining = remaining[written:]
+                end = end + written
             os.fsync(self._file.fileno())
         except OSError as e:
             with suppress(OSError):
@@ -89,7 +91,8 @@ class AppendFile:
         self._file.close()
 
 
-DAMAGED = ".damaged"  # suffix of the file with the data that was cut off
+# Suffix of the file with the data that was cut off.
+DAMAGED = ".damaged"
 
 
 @dataclass
@@ -104,7 +107,7 @@ class EventLog:
 
 def read_events(path: Path) -> EventLog:
     """Read an event file up to its first damage; a missing file is empty. Raises DataError if it is unreadable."""
-    raw = _bytes_of(path)
+    raw = _read_bytes(path)
     log = EventLog([], 0)
     try:
         for end in _ends(raw):
@@ -116,7 +119,8 @@ def read_events(path: Path) -> EventLog:
         log.damage = f"event {len(log.events) + 1} is damaged: not msgpack at byte {log.length}"
     tail = raw[log.length :]
     if log.damage and _is_beginning(tail.rstrip(b"\0")):
-        log.damage = ""  # the file had grown, but not all its bytes were on the disk at a power cut
+        # The file had grown, but not all its bytes were on the disk at a power cut.
+        log.damage = ""
     log.torn = bool(tail) and not log.damage
     return log
 
@@ -129,7 +133,7 @@ def _is_beginning(raw: bytes) -> bool:
         return False
 
 
-def _bytes_of(path: Path) -> bytes:
+def _read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except FileNotFoundError:
@@ -178,7 +182,7 @@ class EventWriter:
         if log.damage or log.torn:
             copy = AppendFile(path.with_name(path.name + DAMAGED), create=True)
             try:
-                copy.append(_bytes_of(path)[log.length :])
+                copy.append(_read_bytes(path)[log.length :])
             finally:
                 copy.close()
         self._file = AppendFile(path, create=True)
@@ -188,7 +192,7 @@ class EventWriter:
             self._file.close()
             raise
         self._batch: list[bytes] = []
-        self._crc = zlib.crc32(_bytes_of(path))
+        self._crc = zlib.crc32(_read_bytes(path))
         self.last_seq = max((e.seq for e in log.events), default=0)
 
     def append(self, event: AnyEvent) -> None:

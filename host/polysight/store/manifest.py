@@ -249,7 +249,7 @@ _heads = msgspec.json.Decoder(_Head)
 _decoders = {name: msgspec.json.Decoder(kind) for name, kind in KINDS.items()}
 
 
-def crc_of(fact: Mapping[str, Any]) -> str:
+def compute_crc(fact: Mapping[str, Any]) -> str:
     """CRC-32 (hex) of a fact without its `crc`: JSON, keys sorted, compact separators."""
     body = json.dumps(fact, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return f"{zlib.crc32(body.encode('ascii')):08x}"
@@ -258,7 +258,7 @@ def crc_of(fact: Mapping[str, Any]) -> str:
 def encode_line(fact: Fact | Mapping[str, Any], **chain: int | str) -> bytes:
     """Encode a fact as a line with CRC and line end; `chain` has `count` and `previous`."""
     content = {**msgspec.to_builtins(fact), **chain}
-    line = json.dumps({**content, "crc": crc_of(content)}, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    line = json.dumps({**content, "crc": compute_crc(content)}, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return line.encode("ascii") + b"\n"
 
 
@@ -277,7 +277,7 @@ def decode_line(line: bytes) -> dict[str, Any] | None:
         return None
     crc = content.pop("crc", None)
     try:
-        return content if crc == crc_of(content) else None
+        return content if crc == compute_crc(content) else None
     except ValueError:
         return None
 
@@ -364,9 +364,10 @@ class Manifest:
     def feed(self, raw: bytes) -> list[Fact]:
         """Add what follows the first `length` bytes of the file; return the facts that are new."""
         lines = raw.split(b"\n")
-        tail = lines.pop()  # an incomplete last line
+        # An incomplete last line.
+        tail = lines.pop()
         self.torn = bool(tail)
-        before = len(self.facts)
+        old_facts = len(self.facts)
         for number, line in enumerate(lines, 1):
             head = _check_line(line)
             if head is None and number == len(lines) and not tail:
@@ -380,7 +381,7 @@ class Manifest:
                 self._add_line(head, line)
             self.digest = digest_of(line)
             self.length += len(line) + 1
-        return self.facts[before:]
+        return self.facts[old_facts:]
 
     def _add_line(self, head: _Head, line: bytes) -> None:
         if head.count is not None and head.previous is not None:
@@ -397,16 +398,20 @@ class Manifest:
     def _compare(self, count: int, previous: str) -> None:
         """Compare a line's count and digest with the lines before it, and add faults."""
         missing = count - self.count
-        damaged = self._due < self.count  # the line before
-        if missing > 0 and damaged:  # a damaged line end joins two lines
+        # The line before.
+        damaged = self._due < self.count
+        # A damaged line end joins two lines.
+        if missing > 0 and damaged:
             last = self.faults.pop()
             self.faults.append(manifest_fault(last.facts["line"], last.what, last.facts["lost"] + missing))
         elif missing > 0:
-            what = f"{missing} lines before it are missing" if missing > 1 else "a line before it is missing"
-            self.faults.append(manifest_fault(self._lines, f"{what} (count {count}, {self.count} expected)", missing))
+            problem = f"{missing} lines before it are missing" if missing > 1 else "a line before it is missing"
+            self.faults.append(
+                manifest_fault(self._lines, f"{problem} (count {count}, {self.count} expected)", missing)
+            )
         elif count < self._due:
-            what = f"repeated or out of order (count {count}, {self._due} expected)"
-            self.faults.append(manifest_fault(self._lines, what))
+            problem = f"repeated or out of order (count {count}, {self._due} expected)"
+            self.faults.append(manifest_fault(self._lines, problem))
         elif not damaged and previous != self.digest:
             self.faults.append(manifest_fault(self._lines, "the line before it was replaced", 1))
 
@@ -539,13 +544,14 @@ class ManifestWriter:
                     f"choose another folder, or `polysight resume {path.parent}`",
                     code=ErrorCode.FILE_EXISTS,
                 )
-            what, why = f"{path}: does not exist", f"{path.parent} is no scan folder"
-            raise DeviceError(what, why, "give the folder of a scan", code=ErrorCode.FILE_MISSING)
+            problem = f"{path}: does not exist"
+            cause = f"{path.parent} is no scan folder"
+            raise DeviceError(problem, cause, "give the folder of a scan", code=ErrorCode.FILE_MISSING)
         self._file = AppendFile(path, create)
         if not self._lock():
             self._file.close()
-            what = f"{path}: another program is writing this scan"
-            raise DeviceError(what, "a scan runs", "wait for it, or stop it first", code=ErrorCode.BUSY)
+            problem = f"{path}: another program is writing this scan"
+            raise DeviceError(problem, "a scan runs", "wait for it, or stop it first", code=ErrorCode.BUSY)
         try:
             content = read(path)
             self._count = content.count

@@ -16,8 +16,8 @@ from polysight_shared.errors import DataError, no_such
 
 def is_source(path: Path) -> bool:
     """True if the folder is a scan folder, or `unsynced/<scan>` or `raw/<scan>` of the published data."""
-    known = (MANIFEST, COLLECTION)
-    return path.is_dir() and (any((path / name).exists() for name in known) or any(path.glob("*" + SYNCED)))
+    names = (MANIFEST, COLLECTION)
+    return path.is_dir() and (any((path / name).exists() for name in names) or any(path.glob("*" + SYNCED)))
 
 
 def open_source(path: Path, base: Instrument | Path | None = None, dropped: bool = False) -> Source:

@@ -28,7 +28,8 @@ from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan, plan_raster
 from polysight_shared.tables import decode
 
-COLLECTION, DEVICES = "data_collection_cfg.json", "devices_comm_cfg.json"
+COLLECTION = "data_collection_cfg.json"
+DEVICES = "devices_comm_cfg.json"
 
 
 class ChirpConfig(msgspec.Struct, frozen=True):
@@ -82,13 +83,14 @@ def read_json(path: Path, missing_ok: bool = False) -> dict[str, Any]:
     """Read a JSON object from a file; with `missing_ok`, {} for a missing file. Raises DataError."""
     if missing_ok and not path.exists():
         return {}
-    why, remedy = "the download is not complete", "fetch the file again"
+    cause = "the download is not complete"
+    remedy = "fetch the file again"
     try:
         content = files.read_json(path)
     except (OSError, ValueError) as e:
-        raise DataError(f"{path}: not JSON: {e}", why, remedy, code=ErrorCode.FILE_DAMAGED) from None
+        raise DataError(f"{path}: not JSON: {e}", cause, remedy, code=ErrorCode.FILE_DAMAGED) from None
     if not isinstance(content, dict):
-        raise DataError(f"{path}: not a JSON object", why, remedy, code=ErrorCode.FILE_FOREIGN)
+        raise DataError(f"{path}: not a JSON object", cause, remedy, code=ErrorCode.FILE_FOREIGN)
     return content
 
 
@@ -111,7 +113,8 @@ def rig_of(s: Collection, base: Instrument, path: Path) -> Rig:
     """Return the base rig with the scan's settings; values missing in the JSON stay the base's. Raises ConfigError."""
     c = s.chirp_configs[0]
     grid = {"columns": s.total_x, "rows": s.total_y, "step_x_mm": s.dx, "step_y_mm": s.dy}
-    travel = (  # the grid was within their stage's travel
+    # The grid was within their stage's travel.
+    travel = (
         max(base.stage.travel_x_mm, s.total_x * s.dx + 2 * base.stage.run_up_mm(s.dx)),
         max(base.stage.travel_y_mm, s.total_y * s.dy + 2 * base.stage.run_up_mm(s.dy)),
     )
@@ -146,21 +149,22 @@ def _mount(board: Board, s: Collection, notices: list[str]) -> tuple[MountStep, 
     steps = list(board.mount)
     tx = board.role == "transmit"
     facing = s.txboard_angle_y if tx else s.rxboard_angle_y
-    if facing is not None and (at := _turns(steps, "y")):
-        if facing * (1 if tx else -1) < 0:  # its normal, (sin a, 0, cos a), would point away from the other boards
+    if facing is not None and (turns := _turns(steps, "y")):
+        # Its normal, (sin a, 0, cos a), would point away from the other boards.
+        if facing * (1 if tx else -1) < 0:
             key = "txboard_angle_y" if tx else "rxboard_angle_y"
             notices.append(
                 f"{board.name}: {key} = {facing:g} would turn the board away from the object;"
                 f" read with the other sense of rotation, {-facing:g}"
             )
             facing = -facing
-        steps[at[-1]] = MountStep(turn_deg=facing, about="y")
+        steps[turns[-1]] = MountStep(turn_deg=facing, about="y")
     if not tx:
-        if s.rxboard_angle_z is not None and (at := _turns(steps, "z")):
-            steps[at[-1]] = MountStep(turn_deg=s.rxboard_angle_z, about="z")
-        own = _turns(steps, "y")
-        if board.role == "receive_v" and s.rxboard_v_angle_y is not None and len(own) > 1:
-            steps[own[0]] = MountStep(turn_deg=s.rxboard_v_angle_y, about="y")
+        if s.rxboard_angle_z is not None and (turns := _turns(steps, "z")):
+            steps[turns[-1]] = MountStep(turn_deg=s.rxboard_angle_z, about="z")
+        turns_y = _turns(steps, "y")
+        if board.role == "receive_v" and s.rxboard_v_angle_y is not None and len(turns_y) > 1:
+            steps[turns_y[0]] = MountStep(turn_deg=s.rxboard_v_angle_y, about="y")
         shifts = _shifts(steps)
         if s.rxboard_tilt_offset is not None and len(shifts) > 1:
             steps[shifts[-2]] = MountStep(shift_mm=s.rxboard_tilt_offset)
@@ -185,7 +189,9 @@ def mirrored(rig: Instrument) -> Instrument:
     The mirrored rig records row by row the same path lengths as the rig column by column. A turn about an axis becomes
     the opposite turn about the swapped axis.
     """
-    stage, grid, image = rig.stage, rig.grid, rig.image
+    stage = rig.stage
+    grid = rig.grid
+    image = rig.image
     replace = msgspec.structs.replace
     return replace(
         rig,
@@ -216,8 +222,10 @@ def _mirrored_step(step: MountStep) -> MountStep:
 
 
 Gaps = list[tuple[int, int]]
-PACKET_BYTES = 1456  # payload of a full packet, if there is no log
-_UNEVEN = 0.25  # of the period between positions: largest deviation of a pause from a whole number of periods
+# Payload of a full packet, if there is no log.
+PACKET_BYTES = 1456
+# Of the period between positions: largest deviation of a pause from a whole number of periods.
+_UNEVEN = 0.25
 
 
 class PacketLog(NamedTuple):
@@ -280,7 +288,8 @@ def read_log(path: Path) -> PacketLog | None:
     if not path.exists():
         return None
     lines = [line for line in path.read_text("ascii", "replace").replace(";", ",").split("\n") if line.strip()]
-    if lines and not lines[0].lstrip()[0].isdigit():  # a header
+    # A header.
+    if lines and not lines[0].lstrip()[0].isdigit():
         del lines[0]
     if not lines:
         return None
@@ -290,13 +299,15 @@ def read_log(path: Path) -> PacketLog | None:
         what = f"{path}: not a packet log: {e}"
         raise DataError(what, "a damaged file", "download it again", code=ErrorCode.FILE_DAMAGED) from None
     sequence, first = np.unique(table[:, 0].astype(np.int64), return_index=True)
-    size, at_s = table[first, 1].astype(np.int64), table[first, 2]
+    size = table[first, 1].astype(np.int64)
+    at_s = table[first, 2]
     if size[-1] < size.max():
         at_s[-1] = at_s[-2]
     return PacketLog(sequence, size, at_s)
 
 
-_MAX_ROWS = 16  # that a stream may span: what is missing is filled with zeros
+# That a stream may span: what is missing is filled with zeros.
+_MAX_ROWS = 16
 
 
 def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled: bool) -> Stream:
@@ -338,21 +349,22 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
     else:
         data = raw if end == raw.size else _spread(raw, start, log.size, end)
     count = -(-end // full)
-    there = np.zeros(count, bool)
-    there[start // full] = True
+    arrived_packets = np.zeros(count, bool)
+    arrived_packets[start // full] = True
     if zero_filled:
-        there &= ~_silent(data, full)
-        there[-(-raw.size // full) :] = False
-    arrived = there[start // full]
-    lost = _ranges(~there, full, end)
-    return Stream(data, lost, int(count - there.sum()), start[arrived], log.at_s[arrived], full)
+        arrived_packets &= ~_silent(data, full)
+        arrived_packets[-(-raw.size // full) :] = False
+    arrived = arrived_packets[start // full]
+    lost_ranges = _ranges(~arrived_packets, full, end)
+    return Stream(data, lost_ranges, int(count - arrived_packets.sum()), start[arrived], log.at_s[arrived], full)
 
 
 def _spread(raw: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64], end: int) -> NDArray[np.uint8]:
     """Move the packets of a file without the lost ones to their offsets."""
     data = np.zeros(end, np.uint8)
     source = np.concatenate([[0], np.cumsum(size)])
-    breaks = np.flatnonzero(start[1:] != start[:-1] + size[:-1]) + 1  # runs of packets without a loss
+    # Runs of packets without a loss.
+    breaks = np.flatnonzero(start[1:] != start[:-1] + size[:-1]) + 1
     for a, b in zip([0, *breaks], [*breaks, start.size], strict=True):
         data[start[a] : start[b - 1] + size[b - 1]] = raw[source[a] : source[b]]
     return data
@@ -360,10 +372,10 @@ def _spread(raw: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.i
 
 def _silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
     """Packets that are all zero, bool [packet]."""
-    whole = data.size // packet
-    rows = data[: whole * packet].reshape(whole, packet)
+    whole_packets = data.size // packet
+    rows = data[: whole_packets * packet].reshape(whole_packets, packet)
     wide = rows.view(np.uint64) if packet % 8 == 0 and data.ctypes.data % 8 == 0 else rows
-    tail = [not data[whole * packet :].any()] if data.size % packet else []
+    tail = [not data[whole_packets * packet :].any()] if data.size % packet else []
     return np.append(~np.any(wide, axis=1), np.array(tail, bool))
 
 
@@ -374,7 +386,9 @@ def _first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDA
     counted back from a short last packet if no position is missing, otherwise the first packet that arrived. If the
     result is neither 0 nor 1 but the numbers fit a record from 1, return 1: cards count from 1, a log may from 0.
     """
-    expected, first, last = -(-shape.bytes // full), int(log.sequence[0]), int(log.sequence[-1])
+    expected = -(-shape.bytes // full)
+    first = int(log.sequence[0])
+    last = int(log.sequence[-1])
     begin = first
     if zero_filled is not None:
         begin -= int(np.argmin(np.append(_silent(zero_filled, full), False)))
@@ -400,17 +414,18 @@ def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
     """Find the bursts of a stream; None without a log."""
     if not stream.at_s.size:
         return None
-    frame, end = shape.frame_bytes, stream.data.size
-    after = _pauses(stream.at_s, -(-end // shape.burst_bytes) - 1)
-    ends = np.zeros(after.size, np.int64)
-    before_end = np.minimum(stream.start[after - 1] + stream.packet_bytes, end)
-    for i, (low, high) in enumerate(zip(before_end, stream.start[after] + stream.packet_bytes, strict=True)):
+    frame = shape.frame_bytes
+    end = stream.data.size
+    first_packets = _pauses(stream.at_s, -(-end // shape.burst_bytes) - 1)
+    ends = np.zeros(first_packets.size, np.int64)
+    before_end = np.minimum(stream.start[first_packets - 1] + stream.packet_bytes, end)
+    for i, (low, high) in enumerate(zip(before_end, stream.start[first_packets] + stream.packet_bytes, strict=True)):
         # The burst ends in the packet that straddles the pause: a whole number of bursts if one fits, else of frames.
         begun = ends[i - 1] if i else 0
-        whole = begun + -(-(low - begun) // shape.burst_bytes) * shape.burst_bytes
-        ends[i] = whole if whole < high else -(-low // frame) * frame
+        whole_bursts_end = begun + -(-(low - begun) // shape.burst_bytes) * shape.burst_bytes
+        ends[i] = whole_bursts_end if whole_bursts_end < high else -(-low // frame) * frame
     edges = np.concatenate([[0], ends, [-(-end // frame) * frame]])
-    return Bursts(np.stack([edges[:-1], edges[1:]], axis=1), stream.at_s[np.concatenate([[0], after])])
+    return Bursts(np.stack([edges[:-1], edges[1:]], axis=1), stream.at_s[np.concatenate([[0], first_packets])])
 
 
 def period_s(bursts: Bursts) -> float | None:
@@ -418,7 +433,7 @@ def period_s(bursts: Bursts) -> float | None:
     return float(np.quantile(np.diff(bursts.at_s), 0.25)) if bursts.at_s.size > 1 else None
 
 
-def positions_of(own: Bursts, others: list[Bursts], positions: int, period: float | None) -> NDArray[np.int64] | None:
+def find_positions(own: Bursts, others: list[Bursts], positions: int, period: float | None) -> NDArray[np.int64] | None:
     """Return the position of each burst; None if undetermined.
 
     Positions are evenly spaced in time, so a step of two periods is a position at which no radar started. The boards
@@ -432,8 +447,8 @@ def positions_of(own: Bursts, others: list[Bursts], positions: int, period: floa
     if np.any(np.abs(steps - np.round(steps)) > _UNEVEN):
         return None
     index = np.concatenate([[0], np.cumsum(np.round(steps).astype(np.int64))])
-    at = index[np.searchsorted(events, own.at_s, side="right") - 1]
-    return at if index[-1] == positions - 1 and np.all(np.diff(at) > 0) else None
+    position = index[np.searchsorted(events, own.at_s, side="right") - 1]
+    return position if index[-1] == positions - 1 and np.all(np.diff(position) > 0) else None
 
 
 def _ranges(missing: NDArray[np.bool_], unit: int, end: int) -> Gaps:
@@ -502,16 +517,17 @@ class PublishedScan(_Published):
         self._files: dict[str, dict[int, Path]] = {b.name: self._row_files(b.name) for b in base.boards}
 
     def _row_files(self, board_name: str) -> dict[int, Path]:
-        found = {}
+        files = {}
         for file in (self.path / board_name).glob("*.bin"):
             match = _ROW_FILE.fullmatch(file.name)
             if match is None:
                 continue
-            start, row = (int(match[2 if self.mirrored else 1]), int(match[1 if self.mirrored else 2]))
+            start = int(match[2 if self.mirrored else 1])
+            row = int(match[1 if self.mirrored else 2])
             if row < self._plan.rows:
                 self._check_start(file, start, row)
-                found[row] = file
-        return found
+                files[row] = file
+        return files
 
     def _check_start(self, file: Path, start: int, row: int) -> None:
         expected = self._plan.row(row).column(0)
@@ -540,26 +556,28 @@ class PublishedScan(_Published):
         """
         stream = self._stream(board_name, row)
         if stream is None:
-            what = f"{self.path}: no row {row} of board {board_name}"
-            raise DataError(what, "the download is not complete", "download it again", code=ErrorCode.NO_DATA)
-        shape, frames = self._shape, self._shape.positions * self._shape.pulses
-        lost = stream.packets_lost
-        if stream.data.size >= shape.bytes:  # nothing slipped
-            self._note(board_name, row, RowLosses(lost))
+            problem = f"{self.path}: no row {row} of board {board_name}"
+            raise DataError(problem, "the download is not complete", "download it again", code=ErrorCode.NO_DATA)
+        shape = self._shape
+        frames = self._shape.positions * self._shape.pulses
+        packets_lost = stream.packets_lost
+        # Nothing slipped.
+        if stream.data.size >= shape.bytes:
+            self._note(board_name, row, RowLosses(packets_lost))
             gaps = [(a, min(b, shape.bytes)) for a, b in stream.lost if a < shape.bytes]
             return RowData(pieces_of(stream.data[: shape.bytes]), gaps, frames)
         bursts = find_bursts(stream, shape)
-        at = None
+        positions = None
         if bursts is not None:
-            others = self._others(board_name, row)
-            periods = [p for p in (self._period_s, *map(period_s, (bursts, *others))) if p]
-            at = positions_of(bursts, others, shape.positions, min(periods, default=None))
-        if bursts is None or at is None:
-            self._note(board_name, row, RowLosses(lost, rows_not_placed=1))
+            other_bursts = self._others(board_name, row)
+            periods = [p for p in (self._period_s, *map(period_s, (bursts, *other_bursts))) if p]
+            positions = find_positions(bursts, other_bursts, shape.positions, min(periods, default=None))
+        if bursts is None or positions is None:
+            self._note(board_name, row, RowLosses(packets_lost, rows_not_placed=1))
             return RowData(pieces_of(np.zeros(shape.bytes, np.uint8)), [(0, shape.bytes)], frames)
-        payload, there, short = _place(stream, bursts, at, shape)
-        self._note(board_name, row, RowLosses(lost, shape.positions - at.size, short))
-        edges = np.flatnonzero(np.diff(np.concatenate([[1], there, [1]]).astype(np.int8)))
+        payload, arrived, short = _place(stream, bursts, positions, shape)
+        self._note(board_name, row, RowLosses(packets_lost, shape.positions - positions.size, short))
+        edges = np.flatnonzero(np.diff(np.concatenate([[1], arrived, [1]]).astype(np.int8)))
         gaps = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
         return RowData(pieces_of(payload), gaps, frames)
 
@@ -607,20 +625,23 @@ def _place(
     stream: Stream, bursts: Bursts, positions: NDArray[np.int64], shape: RowShape
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], int]:
     """Return the row's payload, a mask of bytes that arrived, and the number of positions with a wrong frame count."""
-    size, burst, short = stream.data.size, shape.burst_bytes, 0
-    payload, there = np.zeros(shape.bytes, np.uint8), np.zeros(shape.bytes, bool)
+    size = stream.data.size
+    burst = shape.burst_bytes
+    short = 0
+    payload = np.zeros(shape.bytes, np.uint8)
+    is_received = np.zeros(shape.bytes, bool)
     arrived = np.ones(size, bool)
     for a, b in stream.lost:
         arrived[a:b] = False
-    for (a, b), at in zip(bursts.ranges, positions * burst, strict=True):
+    for (a, b), target in zip(bursts.ranges, positions * burst, strict=True):
         if b - a != burst:
             short += 1
             continue
         stop = min(b, size)
-        payload[at : at + stop - a] = stream.data[a:stop]
-        there[at : at + stop - a] = arrived[a:stop]
-    payload[~there] = 0
-    return payload, there, short
+        payload[target : target + stop - a] = stream.data[a:stop]
+        is_received[target : target + stop - a] = arrived[a:stop]
+    payload[~is_received] = 0
+    return payload, is_received, short
 
 
 class PublishedCubes(_Published):
@@ -639,16 +660,17 @@ class PublishedCubes(_Published):
             with HEADER_LOCK:
                 cube = np.load(file, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError) as e:
-            what = f"{file}: not a cube: {e}"
-            raise DataError(
-                what, "the download is not complete", "download it again", code=ErrorCode.FILE_DAMAGED
-            ) from None
-        rig, s = self._instrument, self._settings
+            problem = f"{file}: not a cube: {e}"
+            cause = "the download is not complete"
+            raise DataError(problem, cause, "download it again", code=ErrorCode.FILE_DAMAGED) from None
+        rig = self._instrument
+        s = self._settings
         shape = (len(rig.antennas.rx_mm), s.total_y, s.total_x, rig.chirp.samples)
         if cube.shape != shape:
-            what = f"{file}: shape {cube.shape}, {shape} in its settings"
-            raise DataError(what, "not the settings of this scan", "download both again", code=ErrorCode.MISMATCH)
-        ascending = cube[:, :, row] if self.mirrored else cube[:, row]  # from the smallest x (y) on
+            problem = f"{file}: shape {cube.shape}, {shape} in its settings"
+            raise DataError(problem, "not the settings of this scan", "download both again", code=ErrorCode.MISMATCH)
+        # From the smallest x (y) on.
+        ascending = cube[:, :, row] if self.mirrored else cube[:, row]
         return CubeRow(np.array(ascending[:, :: self._plan.row(row).direction], np.complex64))
 
     def recording_facts(self) -> dict[str, Any]:

@@ -86,7 +86,7 @@ def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
     files: dict[int, dict[str, Path]] = {}
-    kept: list[str] = []
+    kept_files: list[str] = []
     for row in rows.values():
         for name, board in row.boards.items():
             digest = processed.get(name, {}).get(row.row)
@@ -97,12 +97,12 @@ def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
                 if path.stat().st_size == board.bytes and f"{crc32(path.read_bytes()):08x}" == board.crc32:
                     files.setdefault(row.row, {})[name] = path
                 else:
-                    kept.append(f"{board.file}: differs from the committed data")
+                    kept_files.append(f"{board.file}: differs from the committed data")
             elif board.file not in dropped_files(scan):
-                why = "not processed" if digest is None else "differs from the data of the products"
-                kept.append(f"{board.file}: {why}")
-    there = [path for boards in files.values() for path in boards.values()]
-    return Droppable(files, sum(path.stat().st_size for path in there), kept)
+                cause = "not processed" if digest is None else "differs from the data of the products"
+                kept_files.append(f"{board.file}: {cause}")
+    paths = [path for boards in files.values() for path in boards.values()]
+    return Droppable(files, sum(path.stat().st_size for path in paths), kept_files)
 
 
 def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
@@ -117,13 +117,15 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
     _make_durable(products)
     _make_durable(scan.path / SAMPLES)
     inside = products.resolve().is_relative_to(scan.path.resolve())
-    where = str(products.resolve().relative_to(scan.path.resolve()) if inside else products.resolve())
+    products_name = str(products.resolve().relative_to(scan.path.resolve()) if inside else products.resolve())
     with scan.writer() as writer:
         scan.reload()
-        found, recorded, rows = droppable(scan, processed), dropped_files(scan), scan.committed()
-        for index, files in found.files.items():
+        droppable_files = droppable(scan, processed)
+        recorded = dropped_files(scan)
+        rows = scan.committed()
+        for index, files in droppable_files.files.items():
             if any(str(path.relative_to(scan.path)) not in recorded for path in files.values()):
-                writer.append(_fact(rows[index], list(files), where))
+                writer.append(_fact(rows[index], list(files), products_name))
             for path in files.values():
                 try:
                     path.unlink(missing_ok=True)
@@ -134,7 +136,7 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
                         f"mend that, then `polysight drop-raw {scan.path}` deletes the rest",
                         code=ErrorCode.FILE_UNWRITABLE,
                     ) from None
-        for folder in {path.parent for files in found.files.values() for path in files.values()}:
+        for folder in {path.parent for files in droppable_files.files.values() for path in files.values()}:
             sync_folder(folder)
     scan.reload()
 
@@ -188,9 +190,10 @@ def place_again(path: Path) -> PlacedAgain:
     try:
         row = np.fromfile(path, dtype=np.uint8)
     except OSError as e:
-        why = "the path is wrong, or the raw data was dropped"
-        what, remedy = f"{path}: cannot be read: {e.strerror}", "give SCAN/raw/BOARD/ROW.bin"
-        raise DataError(what, why, remedy, code=ErrorCode.FILE_UNREADABLE) from None
+        cause = "the path is wrong, or the raw data was dropped"
+        problem = f"{path}: cannot be read: {e.strerror}"
+        remedy = "give SCAN/raw/BOARD/ROW.bin"
+        raise DataError(problem, cause, remedy, code=ErrorCode.FILE_UNREADABLE) from None
     facts, _ = read_index(path.with_suffix(".idx"))
     evidence, log = read_packets(path.with_suffix(PACKETS), row)
     e = evidence
@@ -207,21 +210,22 @@ def replace_rows(scan: ScanFolder) -> list[Replaced]:
     DeviceError
         if the scan is in use, or the disk fails; the remaining rows are unchanged.
     """
-    found = []
+    reports = []
     with scan.writer() as writer:
         scan.reload()
         for row in scan.committed().values():
             boards = {name: _place(scan, row, board) for name, board in row.boards.items()}
-            found += [report for report, _ in boards.values()]
+            reports += [report for report, _ in boards.values()]
             changed = {name: again for name, (report, again) in boards.items() if report.changed and again is not None}
             if changed:
                 _commit(scan, writer, row, changed)
     scan.reload()
-    return found
+    return reports
 
 
 def _place(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
-    name, path = Path(board.file).parent.name, scan.path / board.file
+    name = Path(board.file).parent.name
+    path = scan.path / board.file
     unchanged = Replaced(row.row, name, board.missing_bytes, board.missing_bytes)
     if not board.packets_crc32:
         return replace(unchanged, left="its packets were not kept"), None
@@ -233,9 +237,9 @@ def _place(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tuple[Replac
         return replace(unchanged, left=str(e), damaged=True), None
     if again.moved:
         return replace(unchanged, left="its frames were placed by their pulses"), None
-    after = sum(b - a for a, b in again.placed.missing)
+    missing_now = sum(b - a for a, b in again.placed.missing)
     same = again.missing == again.placed.missing and f"{crc32(again.out.tobytes()):08x}" == board.crc32
-    return replace(unchanged, after=after, changed=not same), again
+    return replace(unchanged, after=missing_now, changed=not same), again
 
 
 def _commit(scan: ScanFolder, writer: ManifestWriter, row: RowCommitted, changed: dict[str, PlacedAgain]) -> None:
@@ -246,12 +250,16 @@ def _commit(scan: ScanFolder, writer: ManifestWriter, row: RowCommitted, changed
         path = scan.path / boards[name].file
         old_files += [path.with_suffix(suffix) for suffix in (".bin", ".idx", PACKETS)]
         boards[name] = _write(scan, boards[name], again)
-    kept, faults = row.kept_incomplete, row.faults
+    kept_incomplete = row.kept_incomplete
+    faults = row.faults
     if all(board.missing_bytes == 0 for board in boards.values()):
-        kept, faults = [], []
-    elif not kept:
-        kept = ["placed again: some bytes are not certain"]
-    new = msgspec.structs.replace(row, boards=boards, kept_incomplete=kept, faults=faults, replaced_utc=utc_now())
+        kept_incomplete = []
+        faults = []
+    elif not kept_incomplete:
+        kept_incomplete = ["placed again: some bytes are not certain"]
+    new = msgspec.structs.replace(
+        row, boards=boards, kept_incomplete=kept_incomplete, faults=faults, replaced_utc=utc_now()
+    )
     writer.append(new)
     for path in old_files:
         path.unlink(missing_ok=True)
@@ -286,7 +294,8 @@ def _write(scan: ScanFolder, board: BoardRow, again: PlacedAgain) -> BoardRow:
 
 def _free_name(path: Path) -> Path:
     """`0003-1.bin` for `0003.bin`, or the next number that is free."""
-    stem, number = path.stem.split("-")[0], 1
+    stem = path.stem.split("-")[0]
+    number = 1
     while (new := path.with_name(f"{stem}-{number}.bin")).exists():
         number += 1
     return new

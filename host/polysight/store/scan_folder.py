@@ -64,10 +64,12 @@ SERIAL = ("port", "baud")
 """Keys of the stage that are not compared: the Pi has its own. Nor is calibration, of which a scan keeps copies."""
 FORMAT = 1
 EVENTS = "events.msgpack"
-TRUTH = "truth.json"  # of a simulated scene: its plates
+# Of a simulated scene: its plates.
+TRUTH = "truth.json"
 SAMPLES = "samples"
 SAMPLE_ROWS = "rows.jsonl"
-PART = ".part"  # suffix of a row during reception
+# Suffix of a row during reception.
+PART = ".part"
 
 _MAY_BE_LINK = "products"
 MAX_BYTES = 2 << 30
@@ -97,13 +99,14 @@ def check_same_scan(begun: Instrument, given: Instrument, name: str) -> None:
     ConfigError
         with every other key that differs; `name` is the rig file's in the message.
     """
-    table, other = to_builtins(begun), _with(to_builtins(given), connection_of(begun))
-    other["stage"] = {**other["stage"], **{key: table["stage"][key] for key in SERIAL}}
-    other["calibration"] = table["calibration"]
-    found = list(_differences(table, other, ""))
-    if found:
+    table = to_builtins(begun)
+    given_table = _with(to_builtins(given), connection_of(begun))
+    given_table["stage"] = {**given_table["stage"], **{key: table["stage"][key] for key in SERIAL}}
+    given_table["calibration"] = table["calibration"]
+    differences = list(_differences(table, given_table, ""))
+    if differences:
         raise ConfigError(
-            f"{name} is not the rig file of this scan: {'; '.join(found)}",
+            f"{name} is not the rig file of this scan: {'; '.join(differences)}",
             "a scan is resumed with its own settings: only [pi], [limits] and the addresses of the boards may change",
             "restore these values, or start a new scan",
             code=ErrorCode.VALUES_CONFLICT,
@@ -125,8 +128,8 @@ def _differences(begun: Any, given: Any, key: str) -> Iterator[str]:
         for k, pair in enumerate(zip(begun, given, strict=True)):
             yield from _differences(*pair, f"{key}[{k}]")
     elif begun != given:
-        here, there = ("not given" if value is None else repr(value) for value in (begun, given))
-        yield f"{key} is {here} in the scan and {there} there"
+        begun_text, given_text = ("not given" if value is None else repr(value) for value in (begun, given))
+        yield f"{key} is {begun_text} in the scan and {given_text} there"
 
 
 def new_scan_id(now: datetime | None = None) -> str:
@@ -137,8 +140,8 @@ def new_scan_id(now: datetime | None = None) -> str:
 
 def versions() -> dict[str, str]:
     """Return the releases of all software that affects the data."""
-    found = {"python": platform.python_version(), "numpy": np.__version__, "polysight": __version__}
-    return found | {package: _release(package) for package in ("scipy", "scikit-learn")}
+    releases = {"python": platform.python_version(), "numpy": np.__version__, "polysight": __version__}
+    return releases | {package: _release(package) for package in ("scipy", "scikit-learn")}
 
 
 @cache
@@ -222,7 +225,8 @@ class ScanFolder:
         )
         _make_folder(path)
         if (path / MANIFEST).exists() and not manifest.read(path / MANIFEST).length:
-            (path / MANIFEST).unlink()  # left by a start that ended before its first line
+            # Left by a start that ended before its first line.
+            (path / MANIFEST).unlink()
         with ManifestWriter(path / MANIFEST, create=True) as writer:
             writer.append(fact)
         return ScanFolder.load(path)
@@ -287,11 +291,11 @@ class ScanFolder:
             return faults
         # Rows that were later withdrawn, or taken again, were committed then.
         rows = {fact.row for fact in content.facts[:last] if isinstance(fact, RowCommitted)} | {*self._committed()}
-        lost = counted - len(rows)
-        if lost <= sum(fault.facts["lost"] for fault in faults):
+        lost_rows = counted - len(rows)
+        if lost_rows <= sum(fault.facts["lost"] for fault in faults):
             return faults
-        what = f"scan_ended counts {counted} rows, the lines before it commit {len(rows)}"
-        return (*faults, manifest_fault(content.numbers[last], what, lost))
+        problem = f"scan_ended counts {counted} rows, the lines before it commit {len(rows)}"
+        return (*faults, manifest_fault(content.numbers[last], problem, lost_rows))
 
     @property
     def rows_absent(self) -> list[int]:
@@ -326,8 +330,8 @@ class ScanFolder:
         DataError
             if the row is not committed or its index is damaged; when the payload is used: if it is missing or damaged.
         """
-        found = self._committed().get(row)
-        board = None if found is None else found.boards.get(board_name)
+        committed = self._committed().get(row)
+        board = None if committed is None else committed.boards.get(board_name)
         if board is None:
             raise DataError(
                 f"{self.path}: row {row} of {board_name} is not committed",
@@ -342,21 +346,22 @@ class ScanFolder:
 
     def _read_pieces(self, path: Path, board: BoardRow, size: int) -> Iterator[NDArray[np.uint8]]:
         """Read a payload in pieces of `size` bytes (0: everything), all in the same memory, and check its CRC."""
-        digest, memory = 0, np.empty(min(size, board.bytes) or board.bytes or 1, np.uint8)
+        digest = 0
+        memory = np.empty(min(size, board.bytes) or board.bytes or 1, np.uint8)
         try:
             with path.open("rb") as file:
-                found = os.fstat(file.fileno()).st_size
-                for start in range(0, board.bytes if found == board.bytes else 0, memory.size):
+                size_on_disk = os.fstat(file.fileno()).st_size
+                for start in range(0, board.bytes if size_on_disk == board.bytes else 0, memory.size):
                     piece = memory[: board.bytes - start]
                     file.readinto(piece.data)
                     digest = crc32(piece, digest)
                     yield piece
         except OSError as e:
-            what = f"{path}: cannot be read: {e.strerror}"
-            raise DataError(what, "the file was removed", self._remedy(), code=ErrorCode.FILE_MISSING) from None
-        if found != board.bytes or f"{digest:08x}" != board.crc32:
+            problem = f"{path}: cannot be read: {e.strerror}"
+            raise DataError(problem, "the file was removed", self._remedy(), code=ErrorCode.FILE_MISSING) from None
+        if size_on_disk != board.bytes or f"{digest:08x}" != board.crc32:
             raise DataError(
-                f"{path}: differs from the committed data ({found} bytes, {board.bytes} expected)",
+                f"{path}: differs from the committed data ({size_on_disk} bytes, {board.bytes} expected)",
                 "the file was changed, truncated or damaged after the scan",
                 self._remedy(),
                 code=ErrorCode.FILE_DAMAGED,
@@ -369,8 +374,8 @@ class ScanFolder:
         missing = [(int(a), int(b)) for a, b in facts.get("missing", [])]
         damaged = board.index_crc32 and f"{crc32(path.read_bytes()):08x}" != board.index_crc32
         if damaged or sum(b - a for a, b in missing) != board.missing_bytes:
-            what = f"{path}: differs from the committed index"
-            raise DataError(what, "the file was changed", self._remedy(), code=ErrorCode.FILE_DAMAGED)
+            problem = f"{path}: differs from the committed index"
+            raise DataError(problem, "the file was changed", self._remedy(), code=ErrorCode.FILE_DAMAGED)
         return missing
 
     def _remedy(self) -> str:
@@ -384,7 +389,8 @@ def dropped_files(scan: ScanFolder) -> dict[str, RawDropped]:
     """Return the payload files (relative to the scan folder) that were dropped, each with its fact."""
     files: dict[str, RawDropped] = {}
     for fact in scan.content.facts:
-        if isinstance(fact, RowCommitted | RowWithdrawn):  # taken again, with new files
+        # Taken again, with new files.
+        if isinstance(fact, RowCommitted | RowWithdrawn):
             files = {file: dropped for file, dropped in files.items() if dropped.row != fact.row}
         elif isinstance(fact, RawDropped):
             files |= {board.file: fact for board in fact.boards.values()}
@@ -431,19 +437,20 @@ def record_digest(record: Any) -> str:
 
 def damaged_samples(scan: ScanFolder) -> dict[int, list[str]]:
     """Check the kept samples of all committed rows; return the rows without whole samples, with the files to blame."""
-    folder, boards = scan.path / SAMPLES, [board.name for board in scan.instrument.receivers]
+    folder = scan.path / SAMPLES
+    boards = [board.name for board in scan.instrument.receivers]
     lines, _ = read_sample_rows(folder)
     records = {name: open_records(folder / f"{name}.npy") for name in boards}
-    found: dict[int, list[str]] = {}
+    damaged: dict[int, list[str]] = {}
     for row, committed in scan.committed().items():
         saved = lines.get(row, {}).get("boards", {})
         if any(name not in saved or saved[name]["raw"] != raw_digest(committed.boards[name]) for name in boards):
-            found[row] = [f"{SAMPLES}/{SAMPLE_ROWS}"]
+            damaged[row] = [f"{SAMPLES}/{SAMPLE_ROWS}"]
             continue
         bad = [name for name in boards if not _is_whole(records[name], scan.plan.rows, row, saved[name]["crc32"])]
         if bad:
-            found[row] = [f"{SAMPLES}/{name}.npy" for name in bad]
-    return found
+            damaged[row] = [f"{SAMPLES}/{name}.npy" for name in bad]
+    return damaged
 
 
 @contextmanager
@@ -503,8 +510,11 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as e:
-        what, why = f"{folder}: cannot be made: {e.strerror}", "the disk is full or read-only"
-        raise DeviceError(what, why, "free space, or choose another folder", code=ErrorCode.FILE_UNWRITABLE) from None
+        problem = f"{folder}: cannot be made: {e.strerror}"
+        cause = "the disk is full or read-only"
+        raise DeviceError(
+            problem, cause, "free space, or choose another folder", code=ErrorCode.FILE_UNWRITABLE
+        ) from None
     sync_folder(folder.parent)
 
 
@@ -547,19 +557,20 @@ def check_links(folder: Path) -> None:
 
     Only `products` may be such a link, because products are only replaced as a whole. Raises DataError.
     """
-    root, left = folder.resolve(), [folder]
-    while left:
+    root = folder.resolve()
+    folders = [folder]
+    while folders:
         try:
-            with os.scandir(left.pop()) as entries:
+            with os.scandir(folders.pop()) as entries:
                 for entry in entries:
                     path = Path(entry.path)
                     if entry.is_symlink():
                         if path != folder / _MAY_BE_LINK and not _leads_into(path, root):
-                            raise _refused(folder, path, "is a link that leads out of it", ErrorCode.PATH_OUTSIDE)
+                            raise _refuse(folder, path, "is a link that leads out of it", ErrorCode.PATH_OUTSIDE)
                     elif entry.is_dir(follow_symlinks=False):
-                        left.append(path)
+                        folders.append(path)
                     elif not entry.is_file(follow_symlinks=False):
-                        raise _refused(folder, path, "is neither a file nor a folder", ErrorCode.FILE_FOREIGN)
+                        raise _refuse(folder, path, "is neither a file nor a folder", ErrorCode.FILE_FOREIGN)
         except OSError:  # deleted in the meantime, or not readable: reported when a file is read
             continue
 
@@ -571,7 +582,7 @@ def _leads_into(link: Path, root: Path) -> bool:
         return False
 
 
-def _refused(folder: Path, path: Path, what: str, code: ErrorCode) -> DataError:
+def _refuse(folder: Path, path: Path, what: str, code: ErrorCode) -> DataError:
     return DataError(
         f"{folder}: {path.relative_to(folder)} {what}",
         "the folder was made by another program or changed; reading or writing the scan would affect other files",

@@ -64,35 +64,37 @@ def validate(path: Path) -> list[Finding]:
     """List the faults of a scan folder; empty if it is complete and undamaged. Raises DataError if it is no scan."""
     content = manifest.read(path / MANIFEST)
     being_written = manifest.is_being_written(path / MANIFEST)
-    found = []
+    findings = []
     if content.torn:
-        found.append(_note(MANIFEST, "the last line is torn by a kill or power cut", "resume cuts it off"))
+        findings.append(_note(MANIFEST, "the last line is torn by a kill or power cut", "resume cuts it off"))
     try:
         scan = ScanFolder(path, content)
         rows = scan.committed()
     except PolysightError as e:
-        lost = [_lost_lines(fault, "its facts are lost") for fault in content.faults]
-        return [*found, *lost, _error(MANIFEST, e.what, e.remedy)]
-    found += [_lost_lines(fault, _what_is_lost(scan)) for fault in scan.manifest_faults]
+        lost_lines = [_lost_lines(fault, "its facts are lost") for fault in content.faults]
+        return [*findings, *lost_lines, _error(MANIFEST, e.what, e.remedy)]
+    findings += [_lost_lines(fault, _what_is_lost(scan)) for fault in scan.manifest_faults]
     if scan.plan != plan_raster(scan.instrument.grid):
-        found.append(_error(MANIFEST, "the plan is not that of the rig file's grid"))
+        findings.append(_error(MANIFEST, "the plan is not that of the rig file's grid"))
     for row in rows.values():
-        found += _row(scan, row)
+        findings += _row(scan, row)
     if being_written:
         # Files of the row that is being recorded, and its events, are not complete yet.
-        what = f"a program is recording this scan: {len(rows)} of {scan.plan.rows} rows are committed"
-        return [f for f in found if f.level == "error"] + [_note(MANIFEST, what, "validate again when it has ended")]
-    found += _dropped(scan)
-    found += _strays(scan, rows)
-    found += _events(scan)
+        problem = f"a program is recording this scan: {len(rows)} of {scan.plan.rows} rows are committed"
+        return [f for f in findings if f.level == "error"] + [
+            _note(MANIFEST, problem, "validate again when it has ended")
+        ]
+    findings += _check_dropped(scan)
+    findings += _strays(scan, rows)
+    findings += _events(scan)
     missing = scan.plan.rows - sum(0 <= r < scan.plan.rows for r in rows)
     ended = scan.facts(ScanEnded)
     if missing:
         remedy = f"`polysight resume {path}` takes them"
-        found.append(_note(MANIFEST, f"{missing} of {scan.plan.rows} rows are not committed", remedy))
+        findings.append(_note(MANIFEST, f"{missing} of {scan.plan.rows} rows are not committed", remedy))
     elif not ended:
-        found.append(_note(MANIFEST, "no scan_ended: the program ended before it was written"))
-    return found
+        findings.append(_note(MANIFEST, "no scan_ended: the program ended before it was written"))
+    return findings
 
 
 def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
@@ -100,8 +102,8 @@ def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
 
     Raises DeviceError on a read error: the row may be undamaged and must not be taken again.
     """
-    found = {row.row: _row(scan, row) for row in scan.committed().values()}
-    unreadable = [f for faults in found.values() for f in faults if f.code is ErrorCode.FILE_UNREADABLE]
+    findings = {row.row: _row(scan, row) for row in scan.committed().values()}
+    unreadable = [f for faults in findings.values() for f in faults if f.code is ErrorCode.FILE_UNREADABLE]
     if unreadable:
         raise DeviceError(
             f"{scan.path / unreadable[0].where}: {unreadable[0].what}",
@@ -109,7 +111,7 @@ def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
             f"check the disk, then `polysight resume {scan.path}`",
             code=ErrorCode.FILE_UNREADABLE,
         )
-    return {row: [to_text(f) for f in faults] for row, faults in found.items() if faults}
+    return {row: [to_text(f) for f in faults] for row, faults in findings.items() if faults}
 
 
 def damage_of(scan: ScanFolder, path: Path) -> str:
@@ -136,78 +138,79 @@ def _what_is_lost(scan: ScanFolder) -> str:
 
 
 def _row(scan: ScanFolder, row: RowCommitted) -> list[Finding]:
-    where = f"row {row.row}"
+    place = f"row {row.row}"
     if not 0 <= row.row < scan.plan.rows:
-        return [_error(where, f"outside the plan's {scan.plan.rows} rows")]
-    found = []
+        return [_error(place, f"outside the plan's {scan.plan.rows} rows")]
+    findings = []
     planned = scan.plan.row(row.row)
     pulses = planned.points * scan.instrument.burst.pulses
     if row.direction != planned.direction:
-        found.append(_error(where, f"direction {row.direction}, planned {planned.direction}"))
+        findings.append(_error(place, f"direction {row.direction}, planned {planned.direction}"))
     if row.pulses != pulses:
-        found.append(_error(where, f"{row.pulses} pulses, {pulses} planned"))
+        findings.append(_error(place, f"{row.pulses} pulses, {pulses} planned"))
     boards = {board.name for board in scan.instrument.recorded}
     if set(row.boards) != boards:
-        found.append(_error(where, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
+        findings.append(_error(place, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
     for board in row.boards.values():
-        found += board_faults(scan, board, pulses)
-    return found
+        findings += board_faults(scan, board, pulses)
+    return findings
 
 
 def board_faults(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
     """Compare the files of one board's committed row of `frames` frames with the manifest."""
-    where, path = board.file, scan.path / board.file
-    found = []
+    place = board.file
+    path = scan.path / board.file
+    findings = []
     expected = frames * scan.instrument.frame_bytes
     if (board.bytes, board.frames_expected) != (expected, frames):
-        found.append(_error(where, f"{board.bytes} bytes of {board.frames_expected} frames, planned {expected}"))
-    kept = board.file not in dropped_files(scan) or path.exists()
+        findings.append(_error(place, f"{board.bytes} bytes of {board.frames_expected} frames, planned {expected}"))
+    is_kept = board.file not in dropped_files(scan) or path.exists()
     try:
         # Only the committed digest is left of a dropped payload.
-        size, crc = _digest(path) if kept else (board.bytes, int(board.crc32, 16))
+        size, crc = _digest(path) if is_kept else (board.bytes, int(board.crc32, 16))
     except OSError as e:
-        return [*found, _not_read(where, e)]
+        return [*findings, _not_read(place, e)]
     if size != board.bytes:
-        found.append(_error(where, f"{size} bytes, {board.bytes} were committed", _COPY))
+        findings.append(_error(place, f"{size} bytes, {board.bytes} were committed", _COPY))
     elif f"{crc:08x}" != board.crc32:
-        found.append(_error(where, "differs from the committed data (CRC)", _COPY))
+        findings.append(_error(place, "differs from the committed data (CRC)", _COPY))
     index = path.with_suffix(".idx")
-    found += _packets(scan, board, path.with_suffix(PACKETS))
-    where = str(index.relative_to(scan.path))
+    findings += _packets(scan, board, path.with_suffix(PACKETS))
+    place = str(index.relative_to(scan.path))
     if not index.exists():
-        needed = board.missing_bytes > 0 or board.index_crc32 != ""
-        return [*found, _error(where, "absent", _COPY)] if needed else found
+        is_needed = board.missing_bytes > 0 or board.index_crc32 != ""
+        return [*findings, _error(place, "absent", _COPY)] if is_needed else findings
     try:
         index_crc = crc32(index.read_bytes())
     except OSError as e:
-        return [*found, _not_read(where, e)]
+        return [*findings, _not_read(place, e)]
     if board.index_crc32 and f"{index_crc:08x}" != board.index_crc32:
-        return [*found, _error(where, "differs from the committed data (CRC)", _COPY)]
+        return [*findings, _error(place, "differs from the committed data (CRC)", _COPY)]
     try:
         facts, _ = read_index(index)
         gaps = [(int(a), int(b)) for a, b in facts.get("missing", [])]
     except (PolysightError, TypeError, ValueError) as e:
-        return [*found, _error(where, str(e))]
+        return [*findings, _error(place, str(e))]
     ordered = all(a < b for a, b in gaps) and all(x[1] < y[0] for x, y in pairwise(gaps))
     inside = all(a >= 0 and b <= board.bytes for a, b in gaps)
     if not ordered or not inside or sum(b - a for a, b in gaps) != board.missing_bytes:
-        found.append(_error(where, f"its gaps do not make the {board.missing_bytes} missing bytes"))
-    return found
+        findings.append(_error(place, f"its gaps do not make the {board.missing_bytes} missing bytes"))
+    return findings
 
 
 def _packets(scan: ScanFolder, board: BoardRow, path: Path) -> list[Finding]:
     """Compare the row's packet file with its digest; rows of earlier releases have none."""
     if not board.packets_crc32:
         return []
-    where = str(path.relative_to(scan.path))
+    place = str(path.relative_to(scan.path))
     try:
         _, crc = _digest(path)
     except FileNotFoundError:
-        return [_error(where, "absent", _COPY)]
+        return [_error(place, "absent", _COPY)]
     except OSError as e:
-        return [_not_read(where, e)]
+        return [_not_read(place, e)]
     right = f"{crc:08x}" == board.packets_crc32
-    return [] if right else [_error(where, "differs from the committed data (CRC)", _COPY)]
+    return [] if right else [_error(place, "differs from the committed data (CRC)", _COPY)]
 
 
 def _not_read(where: str, e: OSError) -> Finding:
@@ -224,37 +227,35 @@ def _digest(path: Path) -> tuple[int, int]:
     return size, crc
 
 
-def _dropped(scan: ScanFolder) -> list[Finding]:
+def _check_dropped(scan: ScanFolder) -> list[Finding]:
     files = dropped_files(scan)
     if not files:
         return []
     last = list(files.values())[-1]
-    what = f"the raw data of {len({f.row for f in files.values()})} rows was dropped after processing"
-    found = [_note("raw", f"{what} into {last.products} ({last.dropped_utc}); digests are kept")]
+    problem = f"the raw data of {len({f.row for f in files.values()})} rows was dropped after processing"
+    findings = [_note("raw", f"{problem} into {last.products} ({last.dropped_utc}); digests are kept")]
     if (scan.path / SAMPLES).exists():
-        gone, lost = (
-            dropped_rows(scan),
-            "its raw data was dropped: restore the file from a copy, or images leave it out",
-        )
+        rows_without_raw = dropped_rows(scan)
+        remedy_of_samples = "its raw data was dropped: restore the file from a copy, or images leave it out"
         for row, names in damaged_samples(scan).items():
-            what = f"row {row} is damaged or missing (CRC)"
-            found += [_error(name, what, lost) for name in names if row in gone]
+            problem = f"row {row} is damaged or missing (CRC)"
+            findings += [_error(name, problem, remedy_of_samples) for name in names if row in rows_without_raw]
     else:
-        found.append(_note(SAMPLES, "absent: no image can be made again"))
-    left = [file for file in files if (scan.path / file).exists()]
-    if left:
+        findings.append(_note(SAMPLES, "absent: no image can be made again"))
+    leftover_files = [file for file in files if (scan.path / file).exists()]
+    if leftover_files:
         remedy = f"`polysight drop-raw {scan.path}` removes them"
-        found.append(_note("raw", f"{len(left)} files to be dropped are still there", remedy))
-    return found
+        findings.append(_note("raw", f"{len(leftover_files)} files to be dropped are still there", remedy))
+    return findings
 
 
 def _strays(scan: ScanFolder, rows: dict[int, RowCommitted]) -> list[Finding]:
-    known = {scan.path / b.file for r in rows.values() for b in r.boards.values()}
-    known |= {p.with_suffix(suffix) for p in known for suffix in (".idx", PACKETS)}
+    committed_files = {scan.path / b.file for r in rows.values() for b in r.boards.values()}
+    committed_files |= {p.with_suffix(suffix) for p in committed_files for suffix in (".idx", PACKETS)}
     return [
         _note(str(p.relative_to(scan.path)), "belongs to no committed row", "resume replaces it")
         for p in sorted((scan.path / "raw").rglob("*"))
-        if p.is_file() and p not in known and p.suffix in (".bin", ".idx", PACKETS, PART)
+        if p.is_file() and p not in committed_files and p.suffix in (".bin", ".idx", PACKETS, PART)
     ]
 
 
@@ -264,9 +265,9 @@ def _events(scan: ScanFolder) -> list[Finding]:
         log = read_events(path)
     except PolysightError as e:
         return [_error(EVENTS, e.what, e.remedy)]
-    found = []
+    findings = []
     if log.torn:
-        found.append(_note(EVENTS, "the last event is torn by a kill or power cut", _FETCHED))
+        findings.append(_note(EVENTS, "the last event is torn by a kill or power cut", _FETCHED))
     commits = [(fact.row, fact.events) for fact in scan.facts(RowCommitted) if fact.events is not None]
     row, committed = commits[-1] if commits else (0, LogDigest(0, ""))
     # Behind the last commit nothing was synced for certain, and a power cut may leave any of it. Rows of earlier
@@ -274,14 +275,14 @@ def _events(scan: ScanFolder) -> list[Finding]:
     is_known = bool(commits) or not scan.facts(RowCommitted)
     is_committed_damage = bool(log.damage) and not (is_known and log.length >= committed.bytes)
     if log.damage:
-        found.append((_error if is_committed_damage else _note)(EVENTS, log.damage, _FETCHED))
+        findings.append((_error if is_committed_damage else _note)(EVENTS, log.damage, _FETCHED))
     if {e.scan_id for e in log.events} - {scan.scan_id}:
-        found.append(_error(EVENTS, "holds events of another scan"))
+        findings.append(_error(EVENTS, "holds events of another scan"))
     if [e.seq for e in log.events] != list(range(1, len(log.events) + 1)):
-        found.append(_error(EVENTS, "the sequence of the events has gaps"))
+        findings.append(_error(EVENTS, "the sequence of the events has gaps"))
     if commits and not is_committed_damage:
-        found += _committed_events(path, log.length, row, committed)
-    return found
+        findings += _committed_events(path, log.length, row, committed)
+    return findings
 
 
 def _committed_events(path: Path, length: int, row: int, committed: LogDigest) -> list[Finding]:
@@ -291,6 +292,6 @@ def _committed_events(path: Path, length: int, row: int, committed: LogDigest) -
     if length < size:
         return [_error(EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
     with path.open("rb") as f:
-        whole = f"{crc32(f.read(size)):08x}" == committed.crc32
-    what = f"not the events that were there when {when} (CRC)"
-    return [] if whole else [_error(EVENTS, what, "restore it from a copy")]
+        is_whole = f"{crc32(f.read(size)):08x}" == committed.crc32
+    problem = f"not the events that were there when {when} (CRC)"
+    return [] if is_whole else [_error(EVENTS, problem, "restore it from a copy")]

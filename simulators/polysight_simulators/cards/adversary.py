@@ -33,19 +33,22 @@ KINDS = (
     "reset_between",  # before the record
     "miss_frames",  # triggers are missed: the record is shorter
     "end_early",  # the card ends the record and starts another: two short packets in one stream
-    "clock",  # the clock of the arrivals jumps
     "drop_inside",  # the card drops bytes before numbering them, and its status message is lost
     "drop_frames",  # exactly the bytes of one to three frames
+    "two_drops",  # at two places, together the bytes of one or two frames
     "twin",  # a second card with the same address sends a record, too
     "twin_alone",  # and this card's own record is lost
 )
 RADAR = (
     "missed",  # SYNC_IN pulses
     "spurious",  # edges nobody sent; the radar counts its frames and ignores as many pulses at the end
+    "near",  # an edge beside a pulse that the radar missed
     "endless",  # the radar does not count its frames
 )
 """What a radar can do, in :meth:`Adversary.take`: only the times of its frames tell."""
 _FRAME_NS = 128_000
+NEAREST_EDGE_NS = 350_000
+"""An edge nearer to a missed pulse makes that pulse's frame: the stage has moved by a hundredth of a millimetre."""
 _GAP_NS = 20_000  # between packets
 
 
@@ -118,6 +121,10 @@ class Adversary:
         if "missed" in troubles:
             for _ in range(chance.randint(1, min(3, len(edges) - 1))):
                 edges.pop(chance.randrange(len(edges)))
+        if "near" in troubles:
+            t, _ = edges.pop(chance.randrange(len(edges)))
+            beside = t + chance.choice([-1, 1]) * chance.randint(NEAREST_EDGE_NS, 5 * _FRAME_NS)
+            edges.append((beside, draw.integers(1, 256, self._frame, np.uint8)))
         if "spurious" in troubles:
             for _ in range(chance.randint(1, 2)):
                 t = chance.randint(int(pulses_ns[0]), int(pulses_ns[-1]))
@@ -165,7 +172,7 @@ class Adversary:
         arriving = sorted(arriving + twin, key=lambda ka: ka[0]) if twin else arriving
         early_ns = [self._now_ns + k * 1000 for k in range(len(before))]
         made_ns = None if edges_ns is None else [self._made_ns(byte, edges_ns) for byte in made]
-        times_ns = self._times([k for k, _ in arriving], pulse_ns, troubles, made_ns)
+        times_ns = self._times([k for k, _ in arriving], pulse_ns, made_ns)
         sent.arrivals = [Arrival(t, a.packet, a.record) for t, a in zip(early_ns, before, strict=True)]
         sent.arrivals += [Arrival(t, a.packet, a.record) for t, (_, a) in zip(times_ns, arriving, strict=True)]
         self._now_ns = max([pulse_ns, *times_ns]) + 10_000_000
@@ -197,6 +204,13 @@ class Adversary:
                 many = 16 * chance.randint(1, 200)
             cut = chance.randrange(max(1, len(data) - many))
             data = np.delete(data, slice(cut, cut + many))
+        if "two_drops" in troubles:
+            sent.whole = False
+            many = frame * chance.randint(1, 2)
+            part = 16 * chance.randint(1, many // 16 - 1)
+            for size in (part, many - part):
+                cut = chance.randrange(max(1, len(data) - size))
+                data = np.delete(data, slice(cut, cut + size))
         if "reset_between" in troubles:
             self._reset()
         out: list[bytes] = []
@@ -285,9 +299,8 @@ class Adversary:
             return bytes(turned)
         return packet
 
-    def _times(
-        self, numbers: list[int], pulse_ns: int, troubles: tuple[str, ...], made_ns: list[int] | None
-    ) -> list[int]:
+    @staticmethod
+    def _times(numbers: list[int], pulse_ns: int, made_ns: list[int] | None) -> list[int]:
         """Return when the packets arrive: 20 us apart, or each when its last frame is there."""
         times: list[int] = []
         for n, number in enumerate(numbers):
@@ -296,8 +309,4 @@ class Adversary:
                 t = made_ns[min(number, len(made_ns) - 1)]
                 t = max(t, times[-1] + 1000) if times else t
             times.append(t)
-        if "clock" in troubles and len(times) > 2:
-            at = self._chance.randrange(1, len(times))
-            jump = self._chance.choice([-(10**12), 10**12, -5_000_000])
-            times = times[:at] + [t + jump for t in times[at:]]
         return times

@@ -66,8 +66,9 @@ def test_row_with_a_spurious_edge_is_not_complete(paced, payload, tmp_path):
         result = run_scan(paced.instrument, tmp_path / str(number), keep_incomplete=True)
         assert result.exit_status == "success"
         assert errors(result.folder.path) == []
-        faults = facts_of(result.folder, "row_rejected")[:1] + facts_of(result.folder, "row_committed")[:1]
-        if [f.get("faults") for f in faults] == [[{"kind": "slipped", "board": "RV"}]] * 2:
+        slipped = {"kind": "slipped", "board": "RV"}
+        if slipped in facts_of(result.folder, "row_committed")[0].get("faults", []):
             assert check_unmasked(result, payload, "RV").all()
+        if any(slipped in fact["faults"] for fact in facts_of(result.folder, "row_rejected")):
             return
     pytest.fail("not noticed in 20 scans")

@@ -58,6 +58,8 @@ _BLURRED = 0.1
 _DISPLACED = 3
 # A card drops whole samples of its four antennas (inferred).
 _SAMPLE_BYTES = 16
+# Of the pulse period, between two trains.
+_CATCHING_UP = 0.8
 # Bursts whose delays must agree, within the share of a pulse period or the time.
 _AGREEING = 3
 _AGREE = 0.3
@@ -186,6 +188,11 @@ def _find_trains(
     count = pulses_ns.shape[1]
     first_pulse = np.where(in_time, pulse_of_head, pulse_of_head // count * count)
     low = np.where(is_single, frame_bytes * first_pulse + _SAMPLE_BYTES - first_stop, -_NO_BOUND)
+    # Frames that come faster than pulses are sent catch up with a delay, however long it was.
+    to_next_ns = np.diff(came_ns[heads], append=_NO_BOUND)
+    catches_up = (low > 0) & (to_next_ns < _CATCHING_UP * period_ns)
+    low[catches_up] = -_NO_BOUND
+    in_time &= ~catches_up
     return _Trains(
         first_stop=first_stop,
         last_stop=stop[tails],

@@ -49,6 +49,7 @@ from polysight.products import (
     full_dataset,
     image_dataset,
     label_folder,
+    patch_coordinates,
     patch_dataset,
     permittivity_dataset,
     ranges_text,
@@ -679,8 +680,7 @@ def layer_dataset(
         "ambiguous": describe(ambiguous, "1", "another solution fits, or it is open by 5 %"),
         "notes": describe(notes, "", "rivals and other warnings"),
     }
-    numbers = [patch.label for patch in done.segments]
-    return xarray.Dataset(table, {"patch": describe(numbers, "1", "number of the patch")})
+    return xarray.Dataset(table, patch_coordinates(done))
 
 
 def _parse_layer(layer: str | Layer) -> Layer:

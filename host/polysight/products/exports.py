@@ -202,7 +202,7 @@ def patch_dataset(scan: ProcessedScan) -> xarray.Dataset:
     data |= _figure_variables(scan.segments) | _band_variables(scan.segments)
     naming = {"library": scan.materials.library, "model": scan.materials.model}
     attributes = provenance(scan) | {key: text for key, text in naming.items() if text}
-    return xarray.Dataset(data, _axes(scan) | _patch_axes(scan), attributes)
+    return xarray.Dataset(data, _axes(scan) | patch_coordinates(scan), attributes)
 
 
 def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
@@ -262,7 +262,8 @@ def _no_materials(scan: ProcessedScan) -> DataError:
     )
 
 
-def _patch_axes(scan: ProcessedScan) -> dict[str, Any]:
+def patch_coordinates(scan: ProcessedScan) -> dict[str, Any]:
+    """Return number and middle of each patch, as coordinates of a dataset."""
     numbers = np.array([patch.label for patch in scan.segments], np.int32)
     centre_x_mm = _numbers([patch.centre_x_mm for patch in scan.segments])
     centre_y_mm = _numbers([patch.centre_y_mm for patch in scan.segments])

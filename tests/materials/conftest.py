@@ -3,6 +3,7 @@
 Written for these tests alone; the whole chain from raw data is tested elsewhere.
 """
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from scipy import ndimage
 
 from polysight.imaging import Images
-from polysight.materials import Library, TrainingScan, TruthPlate, make_library
+from polysight.materials import Library, MaterialsResult, TrainingScan, TruthPlate, make_library
 from polysight.materials.analyse import KnownScene, Optics, analyse
 from polysight.materials.inversion import RigPrior
 
@@ -102,9 +103,8 @@ def make(
         out.append((np.fft.ifft2(np.fft.fft2(channel) * passed) * light + n).astype(np.complex64))
     common = np.exp(1j * rng.uniform(-3, 3))
     axis = x / 1e3
-    return Synthetic(
-        out[0] * np.complex64(common), out[1] * np.complex64(common), axis - 0.0132, axis + 0.1, tuple(plates)
-    )
+    phase = np.complex64(common)
+    return Synthetic(out[0] * phase, out[1] * phase, axis - 0.0132, axis + 0.1, tuple(plates), theta)
 
 
 @pytest.fixture(scope="session")
@@ -118,9 +118,20 @@ def nine():
 
 
 @pytest.fixture(scope="session")
-def library(synthetic) -> Library:
+def analysed():
+    """`analysed(seed, angle_deg)`: the materials of a placement of the nine, found once."""
+
+    @functools.cache
+    def find(seed: int, angle_deg: float = 55.0) -> MaterialsResult:
+        return make(seed, theta=np.radians(angle_deg)).analyse()
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def library(analysed) -> Library:
     """Six placements that no test scene repeats."""
     return make_library(
-        [TrainingScan(f"train-{s}", synthetic(s).analyse(), True, s, {"made by": "test"}) for s in range(1000, 1006)],
+        [TrainingScan(f"train-{s}", analysed(s), True, s, {"made by": "test"}) for s in range(1000, 1006)],
         note="synthetic images",
     )

@@ -29,20 +29,16 @@ def powders():
 
 
 @pytest.fixture(scope="module")
-def seen(synthetic):
+def seen(synthetic, analysed):
     """Nine plates under both angles: a library of four placements, and the patches file of one to name, by angle."""
-
-    def at(angle, seed):
-        return replace(synthetic(seed, theta=np.radians(angle)), theta=np.radians(angle))
-
     entries = [
-        e
+        entry
         for angle in ANGLES
         for seed in range(1000, 1004)
-        for e in entries_of(TrainingScan(f"{angle:g}-{seed}", at(angle, seed).analyse(), True, seed))
+        for entry in entries_of(TrainingScan(f"{angle:g}-{seed}", analysed(seed, angle), True, seed))
     ]
-    scenes = {angle: at(angle, 1) for angle in ANGLES}
-    packed = {a: pack_patches(s.analyse(), s.x_m, s.y_m, simulated=True) for a, s in scenes.items()}
+    scene = synthetic(1)
+    packed = {angle: pack_patches(analysed(1, angle), scene.x_m, scene.y_m, simulated=True) for angle in ANGLES}
     return Library(tuple(entries)), packed
 
 

@@ -17,5 +17,7 @@ def packaged(path: Path) -> Path:
     So `instrument.toml` and `examples/demo.toml` are found from any folder, and a file of one's own comes
     first.
     """
-    ours = FOLDER / path
-    return ours if not path.is_absolute() and not path.exists() and ours.exists() else path
+    from_package = FOLDER / path
+    if path.is_absolute() or path.exists() or not from_package.exists():
+        return path
+    return from_package

@@ -153,8 +153,8 @@ def _tail(path: Path, most: int) -> str | None:
 
 
 def _newest(folders: Sequence[Path], pattern: str, count: int) -> list[Path]:
-    found = {p.resolve(): p for folder in folders for p in folder.glob(pattern) if p.is_file() and not p.is_symlink()}
-    return sorted(found, key=lambda p: p.stat().st_mtime, reverse=True)[:count]
+    matches = {p.resolve() for folder in folders for p in folder.glob(pattern) if p.is_file() and not p.is_symlink()}
+    return sorted(matches, key=lambda p: (p.stat().st_mtime, p), reverse=True)[:count]
 
 
 def _newest_scans(out: Path) -> list[Path]:
@@ -173,7 +173,9 @@ def _kernel(root: Path) -> str:
     parts = [f"{platform.uname()}", *(f"{name} {resource.getrlimit(getattr(resource, name))}" for name in limits)]
     for name in _KERNEL:
         text = _tail(root / name, _TAIL_BYTES)
-        parts.append(f"== /{name}\n{'not available' if text is None else text.rstrip()}")
+        if text is None:
+            text = "not available"
+        parts.append(f"== /{name}\n{text.rstrip()}")
     return "\n".join(parts) + "\n"
 
 
@@ -182,5 +184,6 @@ def _network(root: Path) -> dict[str, object]:
         names = sorted(p.name for p in (root / "sys/class/net").iterdir())
     except OSError:
         names = []
-    kept = {name: _tail(root / "proc/net" / name, _TAIL_BYTES) for name in ("route", "arp", "dev")}
-    return {"interfaces": [asdict(read_interface(name, root)) for name in names], **kept}
+    interfaces = [asdict(read_interface(name, root)) for name in names]
+    tables = {name: _tail(root / "proc/net" / name, _TAIL_BYTES) for name in ("route", "arp", "dev")}
+    return {"interfaces": interfaces, **tables}

@@ -90,9 +90,11 @@ def run_checks(context: CheckContext) -> Iterator[Finding]:
     """Run every check in order and yield its finding at once."""
     blocked: dict[tuple[str, str], str] = {}  # (check, board) that failed or was skipped: title of the failed check
     for check in CHECKS:
-        rig = context.loaded_rig
-        for board in rig.recorded if check.each_board and rig is not None else (None,):
-            key = (check.name, board.name if board is not None else "")
+        boards: tuple[Board | None, ...] = (None,)
+        if check.each_board and context.loaded_rig is not None:
+            boards = tuple(context.loaded_rig.recorded)
+        for board in boards:
+            key = (check.name, "" if board is None else board.name)
             title = " ".join(key).rstrip()
             if failed := _failed_prerequisite(check, board, blocked):
                 blocked[key] = failed
@@ -118,7 +120,9 @@ def _failed_prerequisite(check: Check, board: Board | None, blocked: dict[tuple[
 
 def _run_check(check: Check, context: CheckContext, board: Board | None) -> Finding:
     try:
-        return check.run(context) if board is None else check.run(context, board)
+        if board is None:
+            return check.run(context)
+        return check.run(context, board)
     except PolysightError as e:
         return Finding.of_error(e)
     except OSError as e:
@@ -151,23 +155,27 @@ def run_doctor(
                 sys.stdout.flush()
     failed = [f.where for f in findings if f.level == "error"]
     simulated = context.hello is not None and is_simulated(context.hello.backend)
-    summary = _summary(findings, failed) + (f" ({SIMULATED})" if simulated else "") + "\n"
+    summary = _summary(findings, failed)
+    if simulated:
+        summary += f" ({SIMULATED})"
     if as_json:
         document = {"ok": not failed, "simulated": simulated, "findings": [finding_facts(f) for f in findings]}
         sys.stdout.write(json.dumps(document, indent=1) + "\n")
     else:
-        sys.stdout.write(summary)
+        sys.stdout.write(f"{summary}\n")
     if bundle is not None:
-        text = "".join(map(_lines, findings)) + summary
+        text = "".join(map(_lines, findings)) + f"{summary}\n"
         write_bundle(bundle, options, context.loaded_rig, findings, text, system.root)
         sys.stderr.write(f"{bundle}: written, without raw data and keys. Read it before you send it\n")
     return int(bool(failed))
 
 
 def _lines(finding: Finding) -> str:
-    head = f"{verdict(finding):{_VERDICT_WIDTH}}{finding.where:{_NAME_WIDTH}} {finding.what}".rstrip() + "\n"
-    more = (("why", finding.why), ("do", finding.do))
-    return head + "".join(f"{'':{_VERDICT_WIDTH + _NAME_WIDTH}} {word}: {text}\n" for word, text in more if text)
+    lines = f"{verdict(finding):{_VERDICT_WIDTH}}{finding.where:{_NAME_WIDTH}} {finding.what}".rstrip() + "\n"
+    for word, text in (("why", finding.why), ("do", finding.do)):
+        if text:
+            lines += f"{'':{_VERDICT_WIDTH + _NAME_WIDTH}} {word}: {text}\n"
+    return lines
 
 
 def _summary(findings: list[Finding], failed: list[str]) -> str:

@@ -94,7 +94,9 @@ def read_interface(name: str, root: Path = Path("/")) -> NetworkInterface:
         # The kernel writes -1 for an interface that is down.
         return None if value < 0 else value
 
-    ring, ring_max = _receive_ring(name) if root == Path("/") else (None, None)
+    ring = ring_max = None
+    if root == Path("/"):
+        ring, ring_max = _receive_ring(name)
     lost = sum(number(f"statistics/{counter}") or 0 for counter in _DROP_COUNTERS)
     return NetworkInterface(name, number("mtu"), number("speed"), ring, ring_max, lost)
 
@@ -224,7 +226,9 @@ def error(what: str, why: str, do: str, **facts: Any) -> Finding:
 
 def verdict(finding: Finding) -> str:
     """Return the word of a finding for people and for `--json`: a check that was skipped is a note here."""
-    return "not checked" if finding.level == "note" else finding.level
+    if finding.level == "note":
+        return "not checked"
+    return finding.level
 
 
 def finding_facts(finding: Finding) -> dict[str, Any]:

@@ -148,15 +148,19 @@ def check_receivers(context: CheckContext) -> Finding:
     """Measure the receivers' packet loss under load; loss at a rate that this rig's cards reach is a warning."""
     rates = card_rates(context.rig)
     results, scheduling = context.system.measure_receivers(context.rig, rates)
-    losses = "; ".join(
-        f"{r.mbit_s:.0f} Mbit/s a card: {'no loss' if not r.lost else f'{100 * r.lost / r.sent:.1f} % lost'}"
-        for r in results
-    )
-    observed = f"receivers ({scheduling}) with all cores busy: {losses}"
+    losses = []
+    for r in results:
+        loss = f"{100 * r.lost / r.sent:.1f} % lost" if r.lost else "no loss"
+        losses.append(f"{r.mbit_s:.0f} Mbit/s a card: {loss}")
+    observed = f"receivers ({scheduling}) with all cores busy: {'; '.join(losses)}"
     facts = {"held": [vars(r) for r in results], "scheduling": scheduling}
-    needed = results[: rates.index(1e6 / (context.rig.card.packet_delay_us + PACKET_TIME_US)) + 1]
-    if any(r.lost for r in needed):
-        remedy = "use a faster machine" if "real-time" in scheduling else PRIORITY_REMEDY
+    # Rates above that of this rig's cards are for information.
+    card_rate = 1e6 / (context.rig.card.packet_delay_us + PACKET_TIME_US)
+    rates_of_cards = results[: rates.index(card_rate) + 1]
+    if any(r.lost for r in rates_of_cards):
+        remedy = PRIORITY_REMEDY
+        if "real-time" in scheduling:
+            remedy = "use a faster machine"
         return warning(observed, "other programs take processor time from the receivers", remedy, **facts)
     return ok(observed, **facts)
 
@@ -247,7 +251,9 @@ def check_pi(context: CheckContext) -> Finding:
     context.hello = hello
     context.hello_at_ns = (before + after) // 2
     context.hello_took_ns = after - before
-    backend = SIMULATED if is_simulated(hello.backend) else f"GPIO backend {hello.backend}"
+    backend = f"GPIO backend {hello.backend}"
+    if is_simulated(hello.backend):
+        backend = SIMULATED
     observed = f"{context.rig.pi.command_address} answers: release {hello.pi_release}, {backend}, state {hello.state}"
     facts = {"release": hello.pi_release, "backend": hello.backend, "state": hello.state}
     if hello.pi_release != __version__:
@@ -363,9 +369,11 @@ def check_stage(context: CheckContext) -> Finding:
             f"{e.remedy}; on the Pi, with its service stopped, run `polysight-pi check` for port and board",
             fault=status.fault,
         )
-    firmware = context.hello.firmware if context.hello is not None else ""
-    where = f"at {status.x_mm:.1f}, {status.y_mm:.1f} mm" if status.homed else "not homed yet"
-    observed = f"answers, sketch {firmware or 'unknown'}, {where}"
+    firmware = "" if context.hello is None else context.hello.firmware
+    position = "not homed yet"
+    if status.homed:
+        position = f"at {status.x_mm:.1f}, {status.y_mm:.1f} mm"
+    observed = f"answers, sketch {firmware or 'unknown'}, {position}"
     facts = {"firmware": firmware, "homed": status.homed}
     if firmware != __version__:
         return error(
@@ -471,9 +479,9 @@ def check_pulses(context: CheckContext) -> Finding:
         if e.number != PiFault.BAD_REQUEST:
             raise
         return error(e.what, "the Pi's release does not know this command", "install the same release on both")
-    seen = "seen" if sent.pulses_seen else "sent, not seen,"
+    counted = "seen" if sent.pulses_seen else "sent, not seen,"
     observed = (
-        f"{sent.pulses} {seen} at rest, at most {sent.width_max_ns / 1e3:.2f} us long,"
+        f"{sent.pulses} {counted} at rest, at most {sent.width_max_ns / 1e3:.2f} us long,"
         f" at most {sent.jitter_ns / 1e3:.2f} us late"
     )
     facts = {k: getattr(sent, k) for k in ("pulses", "pulses_seen", "width_max_ns", "jitter_ns", "fault")}
@@ -542,8 +550,8 @@ def check_level(context: CheckContext, board: Board) -> Finding:
     observed = f"rms {rms.min():.0f}..{rms.max():.0f} counts over the RX, peak {peak} of {FULL_SCALE}"
     facts = {"clipped_chirps": clipped, "chirps": len(words), "rms": [round(float(r), 1) for r in rms], "peak": peak}
     if clipped:
-        fault = error if clipped > _MAX_CLIPPED * len(words) else warning
-        return fault(
+        finding = error if clipped > _MAX_CLIPPED * len(words) else warning
+        return finding(
             f"{observed}; {clipped} of {len(words)} chirps are clipped",
             "a strong reflection reaches the receiver, or its gain is too high",
             "lower the RX gain (radar.rx_gain_db, or the profile in mmWave Studio), or move the reflector away",
@@ -654,13 +662,8 @@ def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
         "later_ns": {name: mean * 1e9 for name, (mean, _) in delay.items()},
         "crystal_ppm": ppm,
     }
-    wiring = (
-        "several GPIO lines, switched one after another" if len(rig.pi.sync_out) > 1 else "cables of unequal length"
-    )
-    why = f"{wiring}, a slow edge, or a start_offset_hz that differs from the programmed one"
-    remedy = (
-        "use one line and a clock buffer (docs/how-to/wiring.md); compare SYNC_IN at the boards with an oscilloscope"
-    )
+    why = "cables of unequal length, a slow edge, or a start_offset_hz that differs from the programmed one"
+    remedy = "use a clock buffer (docs/how-to/wiring.md); compare SYNC_IN at the boards with an oscilloscope"
     if abs(skew) > _SKEW_WARNING_S:
         finding = error if abs(skew) > _SKEW_ERROR_S else warning
         return finding(observed, why, remedy, **facts)

@@ -1,4 +1,4 @@
-"""Model of a row's way from SYNC_IN edges to arrival times: frames, a card that queues, stalls, packets that are lost."""
+"""Model of a row's way from SYNC_IN edges to arrival times: frames, a card that queues, stalls, lost packets."""
 
 from __future__ import annotations
 

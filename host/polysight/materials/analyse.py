@@ -237,8 +237,8 @@ def analyse(
 ) -> MaterialsResult:
     """Find the patches of the images, estimate their permittivities, and name them if there is a classifier.
 
-    A scene without patches or without metal is no error; see `metal` and `refused` of the result.
-    Raises DataError if the image has no valid pixel, or the given metal box or patch number does not exist.
+    A scene without patches, without metal or without a valid pixel is no error; see `metal` and `refused` of the result.
+    Raises DataError if the given metal box or patch number does not exist.
     """
     known = known or KnownScene()
     plane = known.plane
@@ -494,6 +494,9 @@ def _patches(images: Images, known: KnownScene) -> Segmentation:
     if known.segmentation is not None:
         cut = tuple(replace(p, interior=p.interior & images.valid) for p in known.segmentation.patches)
         return replace(known.segmentation, patches=cut)
+    if not images.usable.any():
+        # As of a scan without a direct path in any position: nothing to search, and the verdict says why.
+        return Segmentation(np.zeros(images.h.shape, np.int32), ())
     even = images if known.plane is None else known.plane.apply(images)
     found = segment(even.h, even.v, images.x_m, images.y_m, images.valid)
     filled = known.plane is not None and float(np.median(np.abs(even.h[images.valid]))) > FILLED

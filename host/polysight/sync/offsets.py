@@ -73,9 +73,8 @@ _SPREAD_M = 0.1
 _GAIN_SPREAD = 0.3
 # Noise power of a sample relative to an echo as strong as the direct path.
 _NOISE = 1e-2
-# Gauss-Newton steps from the peak of a spectrum; and those when only the drift has been removed since.
-_FIRST_STEPS = 3
-_LAST_STEPS = 2
+# Gauss-Newton steps to its frequency. In noise the last one stays large, so that no direct path is found.
+_STEPS = 3
 # A second peak this strong, one object distance below the first, is the direct path.
 _COMPARABLE = 0.35
 # Smallest amplitude of a direct path, relative to the row's median.
@@ -563,11 +562,11 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     peaks = ((bins + _FFT // 2) % _FFT - _FFT // 2) / _FFT / FOLD
     floor = median**2 / np.log(2) / (window**2).sum()  # from the median bin, for tones fill few bins
     three, two = complex64(path.drift_estimator), complex64(path.estimator)
-    frequency, estimate, _ = run.refine(aligned.halves, path.folded_steering, three, peaks[0], _FIRST_STEPS)
+    frequency, estimate, _ = run.refine(aligned.halves, path.folded_steering, three, peaks[0], _STEPS)
     drifts = _ratio(estimate[:, 2], estimate[:, 0])[usable]
     drift = float(np.median(drifts)) if usable.any() else 0.0
     flat = complex64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
-    frequency, estimate, step = run.refine(aligned.halves, flat, two, frequency, _LAST_STEPS)
+    frequency, estimate, step = run.refine(aligned.halves, flat, two, frequency, _STEPS)
     _try_others(aligned.halves, peaks, usable, (run, flat, two), frequency, estimate, step)
 
     # An IF outside the receiver's band is an alias; if the last step is large, no tone was found.
@@ -622,7 +621,7 @@ def _try_others(
     if odd.size == 0:
         return
     run, steering, estimator = how
-    other = run.refine(halves[odd], steering, estimator, peaks[1, odd], _FIRST_STEPS)
+    other = run.refine(halves[odd], steering, estimator, peaks[1, odd], _STEPS)
     other_level = np.log(np.maximum(np.abs(other[1][:, 0]), 1e-30))
     better = np.abs(other_level - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
     for whole, part in zip(found, other, strict=True):

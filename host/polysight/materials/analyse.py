@@ -237,7 +237,7 @@ def analyse(
 ) -> MaterialsResult:
     """Find the patches of the images, estimate their permittivities, and name them if there is a classifier.
 
-    A scene without patches, without metal or without a valid pixel is no error; see `metal` and `refused` of the result.
+    A scene without patches, metal or a valid pixel is no error; see `metal` and `refused` of the result.
     Raises DataError if the given metal box or patch number does not exist.
     """
     known = known or KnownScene()

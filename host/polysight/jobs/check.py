@@ -61,7 +61,7 @@ def checked_scans(folders: Sequence[Path]) -> list[tuple[ProcessedScan, CheckRes
     if not checked:
         raise DataError(
             "no processed scan with a check plate", "nothing was processed, or no rig file names a plate",
-            "polysight process SCAN; docs/how-to/check-plate.md", code=ErrorCode.NO_DATA,
+            "`polysight process SCAN --out DIR`; docs/how-to/check-plate.md", code=ErrorCode.NO_DATA,
         )  # fmt: skip
     return checked
 

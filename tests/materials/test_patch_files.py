@@ -18,8 +18,8 @@ def named_again(found, scene, classifier, path):
     """Names of a result's patches, by number, from its file alone."""
     path.write_bytes(pack_patches(found, scene.x_m, scene.y_m, simulated=True))
     seen = read_patches(path)
-    matched = [m for m in match_patches([seen]) if m.label in seen.judged]
-    again = classifier.scan([m.features for m in matched], seen.errors_of([m.label for m in matched]))
+    matched = [m for m in match_patches([seen]) if m.label in seen.evidence]
+    again = classifier.scan([m.features for m in matched], [m.evidence for m in matched])
     return {m.label: n.verdict for m, n in zip(matched, again, strict=True)}
 
 
@@ -30,8 +30,7 @@ def test_a_scan_is_named_again_as_it_was_named(synthetic, library, tmp_path):
     for r in found.patches:
         if r.named is not None:
             assert again[r.patch.label].name == r.named.verdict.name
-            # The discriminant, which names several angles, knows nothing of the share of the library's materials.
-            assert again[r.patch.label].confidence == pytest.approx(r.named.verdict.confidence, abs=0.25)
+            assert again[r.patch.label].probabilities == pytest.approx(r.named.verdict.probabilities, abs=1e-3)
 
 
 @pytest.mark.parametrize("gain", [0.8, 0.9, 1.1, 1.25])
@@ -56,16 +55,19 @@ def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, tm
     path = tmp_path / "patches.npz"
     path.write_bytes(pack_patches(found, scene.x_m, scene.y_m, simulated=True))
     with np.load(path) as z:
-        kept = {k: z[k] for k in z if not k.startswith("errors_")}
+        kept = {k: z[k] for k in z if not k.startswith("evidence_")}
     meta = json.loads(kept["meta"].tobytes())
     del meta["judged"]
     out = io.BytesIO()
     np.savez(out, **{**kept, "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)})
     path.write_bytes(out.getvalue())
     seen = read_patches(path)
-    assert seen.errors is None
-    assert seen.errors_of([1]) is None
+    assert not seen.evidence
     assert len(seen.patches) == len(found.patches)
+    matched = match_patches([seen])
+    names = [n.verdict.name for n in Classifier(library).scan([m.features for m in matched])]
+    true = [m.truth for m in matched]
+    assert not [n for n, t in zip(names, true, strict=True) if n in library.names and n != t]
 
 
 def test_a_budget_of_other_patches_is_refused(synthetic, tmp_path):
@@ -75,7 +77,7 @@ def test_a_budget_of_other_patches_is_refused(synthetic, tmp_path):
     with np.load(path) as z:
         kept = {k: z[k] for k in z}
     out = io.BytesIO()
-    np.savez(out, **{**kept, "errors_own": kept["errors_own"][:-1]})
+    np.savez(out, **{**kept, "evidence_ratio": kept["evidence_ratio"][:-1]})
     path.write_bytes(out.getvalue())
     with refused(ErrorCode.FILE_UNREADABLE, path):
         read_patches(path)

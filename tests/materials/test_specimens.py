@@ -5,16 +5,14 @@ import pytest
 
 from polysight.materials import MODELS, UNKNOWN, Classifier, Entry, Library, specimens
 from polysight.materials.classify import DISCRIMINANT
-from polysight.materials.library import Samples, SceneErrors, feature_matrix
+from polysight.materials.library import Samples, feature_matrix
 from polysight.materials.names import add_explanation
 from polysight.materials.specimens import (
     PUBLISHED_SPREAD,
-    cost_of_none,
     effect,
     features,
     fit_spread,
     relative,
-    without,
 )
 from polysight.polarimetry import fresnel
 from polysight_papers.sensys2026.patches import Errors, draw, groups
@@ -95,22 +93,6 @@ def test_probabilities_mean_what_they_say_of_specimens_never_seen():
     assert np.mean(sure) == pytest.approx(np.mean(right), abs=0.08)
 
 
-def test_what_all_patches_share_is_found_with_the_names():
-    """A leakage that moves every patch as its own ratio asks is taken off; judged alone, the patches are unsure."""
-    model = MODELS[DISCRIMINANT]("H+V+P").fit(drawn((0.005, 0.03), 30, 2, gain=0.003))
-    test = drawn((0.005, 0.03), 1, 7, gain=0.003)
-    t = np.array([test.x[test.patches == p, 2:].mean(axis=0) @ [1, 1j] for p in np.unique(test.patches)])
-    design = relative(np.zeros((t.size, 1)), -(1 - t)[:, None], t[:, None])[..., :, None][:, 0]
-    moved = test.x.copy()
-    for p, q in zip(np.unique(test.patches), t, strict=True):
-        moved[test.patches == p, 2] -= 0.03 * (1 - q).real
-        moved[test.patches == p, 3] -= 0.03 * (1 - q).imag
-    known = SceneErrors(np.zeros((t.size, 3, 3)), design, np.array([[0.03**2]]))
-    found = model.by_scan(moved, test.patches, known)
-    assert found.names.tolist() == list(KINDS)
-    assert (found.distance <= 1).all()
-
-
 def entries(samples):
     """A library of the same patches."""
     out = []
@@ -138,15 +120,7 @@ def test_what_the_library_lacks_gets_no_name_from_any_model(model):
     strange = {"s": 8.0 - 0.5j, "t": 3.0 - 2.5j, "u": 2.8 - 0.02j, "v": 5.6 - 0.5j}
     test = drawn((0.01, 0.05), 1, 9, kinds=strange)
     named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
-    assert [n.verdict.name for n in named] == [UNKNOWN] * len(strange)
-    assert all(n.verdict.confidence > 0.5 for n in named)
-
-
-def test_none_of_these_is_likeliest_where_the_half_space_fits():
-    covariance = 1e-4 * np.eye(3)[None]
-    log_h, t = features(5.0 - 0.5j, [ANGLE])
-    here, away = (cost_of_none(log_h[None] + off, t[None], covariance, [ANGLE])[0] for off in (0.0, 0.1))
-    assert away > here + 10
+    assert not [n.verdict.name for n in named if n.verdict.source == "library"]
 
 
 @pytest.mark.parametrize("own", [10.0, 40.0])
@@ -165,14 +139,6 @@ def test_liquids_of_a_small_library_are_seldom_called_unknown(own, monkeypatch):
         mine = test.take(test.groups == scan)
         rejected += (model.by_scan(mine.x, mine.patches).distance > 1).tolist()
     assert np.mean(rejected) < 0.1
-
-
-def test_deviations_taken_off_are_those_that_were_put_on():
-    (here_h, here_t), (there_h, there_t) = (features(eps, [ANGLE]) for eps in (4.0 - 0.4j, 4.01 - 0.405j))
-    there = relative(there_h - here_h, there_t - here_t, here_t)
-    back_h, back_t = without(there_h, here_t + (there_t - here_t), there)
-    assert back_h == pytest.approx(here_h)
-    assert back_t == pytest.approx(here_t, abs=1e-4)
 
 
 @pytest.mark.parametrize("model", ["knn", "discriminant"])
@@ -196,6 +162,6 @@ def test_a_patch_that_no_material_looks_like_is_told_with_the_nearest():
     named = classifier.scan([x.x[x.patches == p] for p in np.unique(x.patches)])
     known = classifier.permittivities
     for n, eps in zip(named, (7.5 - 0.05j, 9.4 - 18j), strict=True):
-        assert n.verdict.name == UNKNOWN
+        assert n.verdict.source != "library"
         assert n.verdict.nearest in known
         assert f"nearest: {n.verdict.nearest}" in add_explanation(n, eps, None, classifier.permittivities).verdict.why

@@ -448,10 +448,7 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
             "the object was moved between the scans, or these are scans of other objects",
             "scan the same patches in the same places",
         )
-    errors = None
-    if len(scans) == 1:
-        errors = scans[0].errors_of([m.label for m in matched])
-    named = classifier.scan([m.features for m in matched], errors)
+    named = classifier.scan([m.features for m in matched], [m.evidence for m in matched])
     content = {
         "source": _measured_or_simulated(any(s.simulated for s in scans)),
         "incidence_deg": [s.angle_deg for s in scans],
@@ -520,12 +517,11 @@ def _contradictions(
     """Describe unknown patches that match different materials at different angles, one line each."""
     if len(angles_deg) < 2 or all(n.verdict.name != UNKNOWN for n in named):
         return []
-    alone = [
-        Classifier(library, model=model, angles_deg=[a]).scan(
-            [np.split(m.features, len(angles_deg), 1)[i] for m in matched]
-        )
-        for i, a in enumerate(angles_deg)
-    ]
+    alone = []
+    for i, angle_deg in enumerate(angles_deg):
+        features = [np.split(m.features, len(angles_deg), 1)[i] for m in matched]
+        evidence = [None if m.evidence is None else m.evidence[i : i + 1] for m in matched]
+        alone.append(Classifier(library, model=model, angles_deg=[angle_deg]).scan(features, evidence))
     out = []
     for m, together, *each in zip(matched, named, *alone, strict=True):
         names = [n.verdict.name for n in each]

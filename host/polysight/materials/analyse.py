@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise, correct_tilt
-from polysight.materials.classify import DISCRIMINANT, Classifier
+from polysight.materials.classify import Classifier
 from polysight.materials.inversion import (
     EVEN_LIGHT,
     MOVED,
@@ -23,12 +23,10 @@ from polysight.materials.inversion import (
     PatchEstimate,
     PatchMeasurement,
     RigPrior,
-    at_angle,
     invert,
 )
 from polysight.materials.kinds import Kinds, literature, weigh_kinds
 from polysight.materials.labels import TruthPlate, match_truth
-from polysight.materials.library import SceneErrors
 from polysight.materials.measure import (
     AMPLIFIES,
     BELOW_AIR,
@@ -60,7 +58,7 @@ from polysight.materials.metal import (
     metal_in_box,
     no_metal,
 )
-from polysight.materials.names import UNKNOWN, NamedPatch, add_explanation, name_patch
+from polysight.materials.names import UNKNOWN, NamedPatch, add_explanation
 from polysight.materials.result import MaterialsResult, PatchResult, Tilts, features_of
 from polysight.materials.segment import (
     Box,
@@ -73,7 +71,6 @@ from polysight.materials.segment import (
     touches_border,
     whole_plane,
 )
-from polysight.materials.specimens import features, relative, softened
 from polysight.polarimetry import (
     IncidenceChoice,
     PlaneReference,
@@ -277,8 +274,7 @@ def analyse(
         for p in found.patches
     }
     refused |= _impossible(patches, estimates, kinds)
-    errors = scene_errors(inversion, prior, measured) if judged else None
-    named = _names(classifier, kinds, (sh, sv, sp), inversion, judged, theta)
+    named = _names(classifier, (sh, sv, sp), inversion, judged)
     truth = match_truth(found.patches, known.plates)
     at = [(p, p.label) for p in found.patches]
     results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in at)
@@ -286,8 +282,8 @@ def analyse(
         calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, tilts=tilts,
         boxes=dict(known.names), library=() if classifier is None else classifier.names,
         brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
-        errors=None if errors is None else (tuple(labels), errors), apart_mm=apart_mm,
-        drift=seen.change, halo=seen.halo.level, behind=seen.usual_background(measured),
+        evidence={label: e.evidence for label, e in estimates.items() if e.evidence is not None},
+        apart_mm=apart_mm, drift=seen.change, halo=seen.halo.level, behind=seen.usual_background(measured),
         ripple=seen.usual, relief_rad=seen.relief_rad,
     )  # fmt: skip
 
@@ -415,18 +411,13 @@ class Seen:
 
 def _kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
     """Return what the patches may be: the library's materials at the library's angle, if there is one, and others."""
-    if classifier is None or len(classifier.angles_deg) != 1:
+    if classifier is None or len(classifier.kinds) != 1:
         return Kinds(literature(), theta_rad, sheets=True)
-    return Kinds(classifier.kinds, float(np.radians(classifier.angles_deg[0])), sheets=True)
+    return classifier.kinds[0]
 
 
 def _names(
-    classifier: Classifier | None,
-    kinds: Kinds,
-    channels: tuple[Image, Image, Image],
-    inversion: Inversion,
-    judged: list[Patch],
-    theta: npt.NDArray[np.float64],
+    classifier: Classifier | None, channels: tuple[Image, Image, Image], inversion: Inversion, judged: list[Patch]
 ) -> dict[int, NamedPatch]:
     """Name the judged patches from the joint inversion; return patch number to name."""
     if classifier is None or not judged:
@@ -434,16 +425,13 @@ def _names(
     h, v, p = channels
     named = {}
     for patch, estimate in zip(judged, inversion.patches, strict=True):
+        if estimate.evidence is None:
+            continue
         at = patch.interior
-        # Pixels get the corrections of their patch: leakage, tilt, and the common change over the plane.
-        corrected = estimate.inverse_ratio * median_ratio(h[at], v[at])
-        angle = _angle(theta, patch) + inversion.theta_error_rad
-        inverse = at_angle(corrected / p[at].astype(np.complex128), angle, kinds.theta_rad)
-        if classifier.model == DISCRIMINANT:
-            seen = () if estimate.evidence is None else (estimate.evidence,)
-            name = name_patch((kinds,), seen, inverse[:, None])
-        else:
-            (name,) = classifier.scan([features_of(np.abs(h[at]), np.abs(v[at]), 1 / inverse)])
+        # The paper's classifier compares pixels, which get the corrections of their patch.
+        corrected = estimate.evidence.inverse_ratio * median_ratio(h[at], v[at])
+        pixels = features_of(np.abs(h[at]), np.abs(v[at]), p[at].astype(np.complex128) / corrected)
+        (name,) = classifier.scan([pixels], [[estimate.evidence]])
         named[patch.label] = add_explanation(
             name, estimate.permittivity, estimate.covariance, classifier.permittivities
         )
@@ -599,47 +587,3 @@ def permittivity_change(found: MaterialsResult, angles: IncidenceChoice) -> dict
         return {}
     largest, label = max(changes)
     return {"largest_permittivity_change": round(largest, 5), "of_patch": label}
-
-
-REFERENCE_BRIGHTNESS_STD = 0.1
-"""Standard deviation of ln|H| and ln|V| of all patches by a metal plate that lies high or tilted; an assumed prior."""
-
-
-def scene_errors(found: Inversion, prior: RigPrior, seen: Sequence[PatchMeasurement]) -> SceneErrors:
-    """Return the remaining errors of ln|H|, ln|V| and arg P of the patches after the inversion, for naming them.
-
-    Common to all patches are the leakage of p into H (da) and of s into V (db), the metal reference (rho), the angle,
-    and the reference's brightness, which V / H does not determine. Each patch has the errors of its own V / H and of
-    its brightness, equal in both channels.
-    To first order about the solution, for the patches' true features with t = r_p / r_s and fixed permittivity:
-    d ln|H| = Re((1 - t) da), d t = -(1 - t) (t da + db) - t rho - (dt / dtheta) dtheta.
-    """
-    t = np.array([p.inverse_ratio for p in found.patches], np.complex128)
-    none = np.zeros_like(t)
-    by_h = np.stack([1 - t, none, none], axis=1)
-    by_t = np.stack([-(1 - t) * t, -(1 - t), -t], axis=1)
-    scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
-    columns = [relative((unit * scale * by_h).real, unit * scale * by_t, t[:, None]) for unit in (1.0, 1j)]
-    design = np.stack(columns, axis=2).reshape(len(t), 6, 3)
-    bright = np.tile([1.0, 1.0, 0.0], (len(t), 1, 1))
-    design = np.concatenate([design, _by_angle(found, prior, seen)[:, None], bright], axis=1).swapaxes(1, 2)
-    covariance = np.zeros((8, 8))
-    covariance[:7, :7] = found.nuisance_covariance[:7, :7]
-    covariance[7, 7] = REFERENCE_BRIGHTNESS_STD**2
-    own_h = np.zeros((len(t), 3, 3))
-    own_h[:, :2, :2] = found.brightness_std**2
-    noise = np.sqrt([np.trace(s.covariance) / 2 for s in seen]) / softened(t)
-    return SceneErrors(own_h + noise[:, None, None] ** 2 * np.diag([0.0, 1.0, 1.0]), design, covariance)
-
-
-def _by_angle(found: Inversion, prior: RigPrior, seen: Sequence[PatchMeasurement]) -> npt.NDArray[np.float64]:
-    """Return the change of the features by one standard deviation of the angle, at fixed permittivity, [patch, 3]."""
-    out = np.zeros((len(seen), 3))
-    for i, (patch, one) in enumerate(zip(found.patches, seen, strict=True)):
-        if patch.permittivity is not None:
-            step = prior.theta_std_rad
-            (here_h, here_t), (there_h, there_t) = (
-                features(patch.permittivity, [one.theta_rad + found.theta_error_rad + more]) for more in (0.0, step)
-            )
-            out[i] = relative(here_h - there_h, here_t - there_t, here_t)[0]
-    return out

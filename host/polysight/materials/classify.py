@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.materials.discriminant import ErrorDiscriminant
-from polysight.materials.kinds import Kind, literature
+from polysight.materials.kinds import Kind, Kinds, RatioEvidence, literature
 from polysight.materials.library import (
     MEASURES,
     Distances,
@@ -32,7 +32,7 @@ from polysight.materials.library import (
     NamedScan,
     Real,
     Samples,
-    SceneErrors,
+    by_angle,
     channel_distances,
     count_votes,
     find_neighbours,
@@ -40,7 +40,15 @@ from polysight.materials.library import (
     ratio_columns,
     usable,
 )
-from polysight.materials.names import INCLUSIONS, LIKELY, UNKNOWN, NamedPatch, PatchName
+from polysight.materials.names import (
+    UNKNOWN,
+    NamedPatch,
+    PatchName,
+    evidence_of_pixels,
+    name_patch,
+    nothing_named,
+    share_of_pixels,
+)
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -130,14 +138,15 @@ class PaperKnn(Model):
             self._distributions = ErrorDiscriminant().fit(self._samples)
         return self._distributions
 
-    def by_scan(
-        self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
-    ) -> NamedScan:
+    def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
         """Name patches by the majority of their pixels; unknown if they are far from that material's distribution."""
-        found, known = majority(*self.by_pixel(x), patches), self.distributions.by_scan(x, patches, errors, others)
-        row, kind = np.arange(len(found.patches)), np.searchsorted(self.distributions.names, found.names)
-        far = np.zeros(len(row)) if known.distances is None else known.distances[row, kind]
-        return replace(found, distance=np.maximum(found.distance, far))
+        voted = majority(*self.by_pixel(x), patches)
+        distances = self.distributions.by_scan(x, patches).distances
+        if distances is None:
+            return voted
+        material = np.searchsorted(self.distributions.names, voted.names)
+        to_material = distances[np.arange(len(voted.patches)), material]
+        return replace(voted, distance=np.maximum(voted.distance, to_material))
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Name each pixel; return name, and mean distance of its neighbours over the material's threshold."""
@@ -329,8 +338,9 @@ class Classifier:
         self.names = library.names
         # Of the library's patches as half spaces; without metals.
         self.permittivities: dict[str, complex] = self.distributions.permittivities
-        self.kinds = (*self._library_kinds(), *literature(library.names))
-        self._width = max(len(UNKNOWN), *(len(n) for n in library.names))
+        kinds = (*self._library_kinds(), *literature(library.names))
+        # What a patch may be, at each angle.
+        self.kinds = tuple(Kinds(kinds, float(np.radians(angle)), sheets=True) for angle in self.angles_deg)
 
     def _library_kinds(self) -> tuple[Kind, ...]:
         """Return the library's materials as half spaces, with the spread of their specimens and the mean's error."""
@@ -346,56 +356,45 @@ class Classifier:
             out.append(Kind(name, eps, (real, loss)))
         return tuple(out)
 
-    def scan(self, patches: Sequence[Real], errors: SceneErrors | None = None) -> list[NamedPatch]:
-        """Name the patches of one scan, or of several scans of the same patches, together.
+    def scan(
+        self, patches: Sequence[Real], evidence: Sequence[Sequence[RatioEvidence] | None] | None = None
+    ) -> list[NamedPatch]:
+        """Name the patches of one scan, or of several scans of the same patches under different angles.
 
         `patches` are the features of each patch's pixels, [n, 4 * angles] (:func:`feature_matrix`); pixels that are not
-        finite are unknown. `errors` are those of the patches by the scan's error budget.
+        finite are unknown. `evidence` is what each scan says of each patch; None where only the pixels are known.
         """
-        good = [usable(x) for x in patches]
-        some = [i for i, g in enumerate(good) if g.any()]
-        out = [self._named(g, None, PatchName(UNKNOWN, 0.0, {}, np.inf, 0)) for g in good]
-        if not some:
-            return out
-        number = np.concatenate([np.full(int(good[i].sum()), i) for i in some])
-        x = np.concatenate([patches[i][good[i]] for i in some])
-        found = self._model.by_scan(x, number, None if errors is None else errors.of(np.array(some)), INCLUSIONS)
-        for row, i in enumerate(some):
-            at = number == i
-            pixels = found.pixel_names[at], found.pixel_distance[at]
-            out[i] = self._named(good[i], pixels, self._patch_name(found, row))
-            if found.pixel_confidence is not None:
-                confidence = np.zeros(good[i].size)
-                confidence[good[i]] = found.pixel_confidence[at]
-                out[i] = replace(out[i], confidence=confidence)
-        return out
+        if self.model == PAPER:
+            return [self._by_votes(x) for x in patches]
+        named = []
+        for x, of_patch in zip(patches, evidence or [None] * len(patches), strict=True):
+            ratios = by_angle(x)[2]
+            if of_patch is None:
+                of_patch = [evidence_of_pixels(t, at) for t, at in zip(ratios.T, self.kinds, strict=True)]
+            named.append(name_patch(self.kinds, of_patch, ratios))
+        return named
 
-    def _patch_name(self, found: NamedScan, row: int) -> PatchName:
-        far, confidence = float(found.distance[row]), float(found.confidence[row])
-        probabilities: dict[str, float] = {}
-        if found.probabilities is not None and found.materials is not None:
-            every = dict(zip([*map(str, found.materials), UNKNOWN], found.probabilities[row].tolist(), strict=True))
-            order = sorted(every, key=lambda name: -every[name])
-            probabilities = {name: round(every[name], 4) for name in order if every[name] >= LIKELY}
-            if far > 1:  # too far from all materials
-                confidence = max(every[UNKNOWN], 1 - confidence)
-        nearest = str(found.names[row])
-        name = nearest if far <= 1 else UNKNOWN
-        return PatchName(name, confidence, {}, far, 0, probabilities, nearest=nearest)
-
-    def _named(
-        self, good: npt.NDArray[np.bool_], pixels: tuple[npt.NDArray, Real] | None, name: PatchName
-    ) -> NamedPatch:
-        """Return a patch with names and distances of all pixels; `pixels` are those of the usable ones, if any."""
-        every = np.full(good.size, UNKNOWN, f"<U{self._width}")
-        relative = np.full(good.size, np.inf)
-        if pixels is not None:
-            names, distance = pixels
-            every[good], relative[good] = np.where(distance <= 1, names, UNKNOWN), distance
-        kinds, count = np.unique(every, return_counts=True)
-        order = sorted(zip(kinds, count, strict=True), key=lambda i: (-i[1], i[0]))
-        votes = {str(k): c / every.size for k, c in order}
-        return NamedPatch(every, relative, replace(name, votes=votes, pixels=int(good.sum())))
+    def _by_votes(self, x: Real) -> NamedPatch:
+        """Name a patch by the votes of its pixels' nearest neighbours."""
+        good = usable(x)
+        if not good.any():
+            return nothing_named(good.size)
+        voted = self._model.by_scan(x[good], np.zeros(int(good.sum()), np.intp))
+        pixel_names = np.full(good.size, UNKNOWN, f"<U{max(len(UNKNOWN), *map(len, self.names))}")
+        pixel_names[good] = np.where(voted.pixel_distance <= 1, voted.pixel_names, UNKNOWN)
+        pixel_distance = np.full(good.size, np.inf)
+        pixel_distance[good] = voted.pixel_distance
+        nearest = str(voted.names[0])
+        distance = float(voted.distance[0])
+        verdict = PatchName(
+            name=nearest if distance <= 1 else UNKNOWN,
+            confidence=float(voted.confidence[0]),
+            votes=share_of_pixels(pixel_names),
+            distance=distance,
+            pixels=int(good.sum()),
+            nearest=nearest,
+        )
+        return NamedPatch(pixel_names, pixel_distance, verdict)
 
 
 def _model_name(given: str) -> str:

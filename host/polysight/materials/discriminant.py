@@ -1,5 +1,9 @@
 """The discriminant of error sources: materials as distributions over pixels, patches, specimens and scans.
 
+It learns from a library how far specimens, placements and scans of a material lie apart, and judges the library by
+naming scans that were left out. Scans of the rig are named by the joint inversion (`names.py`), which takes the
+materials and their spread from here.
+
 On ln|H|, ln|V| and arg P errors of gain and of phase are additive. A pixel of material m in patch p of scan s is
 
     z = mean_m + F_m d + g_s + u_p + e,
@@ -13,215 +17,78 @@ placement and specimen by expectation maximisation. A decision uses them as foll
 
 * a single pixel has all errors;
 * a patch is named from the mean of its pixels, in which e averages out;
-* the patches of a scan are named together: g_s, and the remaining errors of leakage, angle and reference, are common
-  to them, so that these errors and the names are estimated in turns (expectation maximisation).
-
-The result is a probability of each material and of none of them (`cost_of_none` in `specimens.py`).
-
-A leakage or gain error moves all patches alike, and a patch gives information on it only if its material is known
-(`explanations`). If the library's materials lie in a row, a common error can shift every plate to its neighbour and fit
-nearly as well; iterations that start at zero error find only one of these explanations. Here they start at the error
-that would make any one patch any one material, and each explanation found is weighted with its evidence (Laplace's
-approximation; MacKay, Information Theory, Inference, and Learning Algorithms, chapter 27).
+* g_s and the names of a scan's patches are estimated in turns (expectation maximisation).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.materials.library import Model, NamedScan, Real, Samples, SceneErrors, by_angle
+from polysight.materials.library import Model, NamedScan, Real, Samples, by_angle
 from polysight.materials.specimens import (
     METAL_SPECIMENS,
     METAL_WITHOUT_ERROR,
     apparent_permittivity,
-    cost_of_none,
     effect,
     fit_spread,
     relative,
-    without,
 )
-
-_ROUNDS, _FIRST_ROUNDS = 30, 3
-_TURNS = 2  # alternations of the error and the likelihood of none of the materials
-_STARTS, _TRIED = 100, 6  # the most plausible starts, and the best of them for all patches
-_UNLIKELY = 12.0  # log evidence below the best one's, after the first rounds, to drop an explanation
-_SAME = 1.0  # standard deviations within which two explanations are the same
-_LN_2PI = float(np.log(2 * np.pi))
-
-
-@dataclass(frozen=True)
-class CommonError:
-    """An error common to the patches of a scan, with its covariance and its effect on each patch.
-
-    `design` [patch, d, q] converts the error's q numbers to deviations; `value` [q]; `covariance` [q, q]; `precision`
-    [q, q] is that of the prior.
-    """
-
-    design: Real
-    value: Real
-    covariance: Real
-    precision: Real
-
-    @property
-    def shift(self) -> Real:
-        """Deviations by the error, [patch, d]."""
-        return np.asarray(self.design @ self.value, np.float64)
-
-    @property
-    def spread(self) -> Real:
-        """Their covariances, [patch, d, d]."""
-        return np.asarray(self.design @ self.covariance @ self.design.mT, np.float64)
-
-
-@dataclass(frozen=True)
-class Patches:
-    """Deviations of patches from materials.
-
-    `mean` [patch, materials, d] of their means, `own` [patch, materials, d, d] the covariances of the patches' own
-    errors, `informative` bool [patch]: usable to estimate the common error.
-    """
-
-    mean: Real
-    own: Real
-    informative: npt.NDArray[np.bool_]
-
-
-def explanations(
-    seen: Patches, before: CommonError, none: Callable[[CommonError], Real]
-) -> list[tuple[float, CommonError]]:
-    """Return the common errors that explain a scan, each with its probability, the likeliest first.
-
-    `before` is the prior of the error; `none` returns minus twice the log likelihood [patch] of none of the materials
-    under an error. With fewer than two informative patches the result is the prior.
-    """
-    at = np.flatnonzero(seen.informative)
-    if at.size < 2:
-        return [(1.0, before)]
-    cost = none(before)
-    first = [_alternate(seen, start, cost, _FIRST_ROUNDS) for start in (before, *_starts(seen, before, cost))]
-    found: list[tuple[float, CommonError]] = []
-    for evidence, start in _distinct([(_evidence(seen, e, cost), e) for e in first]):
-        if found and evidence < found[0][0] - _UNLIKELY:
-            continue
-        error, cost_of_none = start, cost
-        for _ in range(_TURNS):
-            cost_of_none = none(error)
-            error = _alternate(seen, error, cost_of_none, _ROUNDS)
-        found.append((_evidence(seen, error, cost_of_none), error))
-    found = _distinct(found)
-    weight = np.exp(np.array([e for e, _ in found]) - found[0][0])
-    return [(float(w), error) for w, (_, error) in zip(weight / weight.sum(), found, strict=True)]
-
-
-def costs(d: Real, covariances: Real) -> tuple[Real, Real]:
-    """Return squared distances and minus twice the log likelihoods of deviations [n, materials, d], [n, materials]."""
-    inverse = np.linalg.inv(covariances)
-    q = np.sum(d * (inverse @ d[..., None])[..., 0], axis=-1)
-    return q, q - np.linalg.slogdet(inverse)[1] + d.shape[2] * _LN_2PI
-
-
-def probabilities(cost: Real, none: Real) -> Real:
-    """Return the probability of every material and, last, of none of them, [n, materials + 1]."""
-    every = np.concatenate([cost, none[:, None]], axis=1)
-    w = np.exp(-0.5 * (every - every.min(axis=1, keepdims=True)))
-    return w / w.sum(axis=1, keepdims=True)
-
-
-def _starts(seen: Patches, before: CommonError, none: Real) -> list[CommonError]:
-    """Return start values: the error that makes one patch one material, for the best of all such pairs."""
-    at = np.flatnonzero(seen.informative)
-    mean, g = seen.mean[at], before.design[at][:, None]  # [patch, materials, d], [patch, 1, d, q]
-    inverse = np.linalg.inv(seen.own[at])
-    constant = -np.linalg.slogdet(inverse)[1] + mean.shape[2] * _LN_2PI
-    weighed = g.mT @ inverse
-    covariance = np.linalg.inv(before.precision + weighed @ g)
-    value = (covariance @ weighed @ mean[..., None])[..., 0]
-
-    def distances(errors: Real) -> Real:
-        """Squared distances [..., patch, materials] under errors [..., q], and of the errors themselves [...]."""
-        off = mean - (before.design[at] @ errors[..., None, :, None])[..., None, :, 0]
-        return np.einsum("...pkd,pkde,...pke->...pk", off, inverse, off, optimize=True)
-
-    prior = np.einsum("pkq,qr,pkr->pk", value, before.precision, value)
-    own = (mean - (g @ value[..., None])[..., 0])[..., None]
-    surprise = prior + (own.mT @ inverse @ own)[..., 0, 0]
-    nearest = np.unravel_index(np.argsort(surprise, axis=None)[:_STARTS], surprise.shape)
-    each = 0.5 * distances(value[nearest]) + constant  # half: the start is about as uncertain as a patch
-    fit = np.minimum(each.min(axis=-1), none[at]).sum(axis=-1) + prior[nearest]
-    starts = zip(fit, value[nearest], covariance[nearest], strict=True)
-    found = [(-float(f), replace(before, value=v, covariance=c)) for f, v, c in starts]
-    return [error for _, error in _distinct(found, _TRIED)]
-
-
-def _alternate(seen: Patches, error: CommonError, none: Real, rounds: int) -> CommonError:
-    """Estimate the error from the patches' deviations, alternating with the probabilities of their materials.
-
-    Patches that are probably none of the materials have little weight.
-    """
-    at = np.flatnonzero(seen.informative)
-    design, precision, g = error.design, error.precision, error.design[at]
-    mean, own = seen.mean[at], seen.own[at]
-    for _ in range(rounds):
-        _, cost = costs(mean - error.shift[at][:, None], own + error.spread[at][:, None])
-        middle, information = _moments(mean, own, probabilities(cost, none[at])[:, :-1])
-        covariance = np.linalg.inv(precision + np.sum(g.mT @ information @ g, axis=0))
-        combined = np.sum(g.mT @ (information @ middle[:, :, None]), axis=0)[:, 0]
-        before, value = error.value, covariance @ combined
-        error = CommonError(design, value, covariance, precision)
-        if np.abs(design @ (value - before)).max() < 1e-7:
-            break
-    return error
-
-
-def _evidence(seen: Patches, error: CommonError, none: Real) -> float:
-    """Return the log evidence of an explanation up to a constant, by Laplace's approximation."""
-    at = np.flatnonzero(seen.informative)
-    _, cost = costs(seen.mean[at] - error.shift[at][:, None], seen.own[at])
-    every = -0.5 * np.concatenate([cost, none[at, None]], axis=1)
-    top = every.max(axis=1)
-    likelihood = float(np.sum(top + np.log(np.exp(every - top[:, None]).sum(axis=1))))
-    prior = -0.5 * float(error.value @ error.precision @ error.value)
-    return likelihood + prior + 0.5 * float(np.linalg.slogdet(error.covariance)[1])
-
-
-def _distinct(found: list[tuple[float, CommonError]], most: int | None = None) -> list[tuple[float, CommonError]]:
-    """Drop explanations that equal a likelier one; return at most `most`, the likeliest first."""
-    out: list[tuple[float, CommonError]] = []
-    for evidence, error in sorted(found, key=lambda f: -f[0]):
-        if len(out) == most:
-            break
-        apart = [(error.value - kept.value, np.linalg.inv(kept.covariance)) for _, kept in out]
-        if all(float(a @ inverse @ a) > _SAME**2 for a, inverse in apart):
-            out.append((evidence, error))
-    return out
-
-
-def _moments(d: Real, covariances: Real, weight: Real) -> tuple[Real, Real]:
-    """Return mean deviation [patch, d] and information [patch, d, d] of patches of uncertain material.
-
-    They are those of the normal distribution with the moments of the mixture, less if it may be none of the materials.
-    """
-    known, weight = weight.sum(axis=1), weight + 1e-12
-    share = weight / weight.sum(axis=1, keepdims=True)
-    middle = np.einsum("pk,pkd->pd", share, d)
-    off = d - middle[:, None]
-    spread = np.einsum("pk,pkde->pde", share, covariances + off[..., :, None] * off[..., None, :])
-    return middle, np.asarray(known[:, None, None] * np.linalg.inv(spread), np.float64)
-
 
 REJECTED = 0.02
 """Share of the known materials' pixels, and of their patches, that are called unknown."""
-NONE = 0.02
-"""Prior probability that a patch is none of the library's materials."""
-_TWO_WAY_ROUNDS = 30
-_BEYOND = 1.001  # least distance of unknown patches
-_LN_2PI = float(np.log(2 * np.pi))
+COMMON_ERROR_ROUNDS = 30
+TWO_WAY_ROUNDS = 30
+# Least distance of unknown patches.
+BEYOND = 1.001
+LN_2PI = float(np.log(2 * np.pi))
+
+
+def costs(d: Real, covariances: Real) -> tuple[Real, Real]:
+    """Return squared distances and minus twice the log likelihoods of deviations [n, materials, d], [n, materials].
+
+    `covariances` are [materials, d, d], or [n, materials, d, d].
+    """
+    inverse = np.linalg.inv(covariances)
+    distance2 = np.sum(d * (inverse @ d[..., None])[..., 0], axis=-1)
+    return distance2, distance2 - np.linalg.slogdet(inverse)[1] + d.shape[2] * LN_2PI
+
+
+def shares_of_materials(cost: Real) -> Real:
+    """Return the probability of each material, [n, materials], if it is one of them; `cost` as of :func:`costs`."""
+    weight = np.exp(-0.5 * (cost - cost.min(axis=1, keepdims=True)))
+    return weight / weight.sum(axis=1, keepdims=True)
+
+
+def estimate_common_error(mean: Real, own: Real, prior: Real, level: float) -> tuple[Real, Real]:
+    """Estimate the error that all patches of a scan share; return its mean [d] and covariance [d, d].
+
+    `mean` [patch, materials, d] are the deviations of patches from the materials, `own` [materials, d, d] the
+    covariances of these, `prior` [d, d] that of the error. Patches whose squared distance to every material is above
+    `level` have little weight. Expectation maximisation: a patch of uncertain material counts with the moments of the
+    mixture. A single patch tells nothing of it.
+    """
+    value = np.zeros(len(prior))
+    covariance = prior
+    if len(mean) < 2:
+        return value, covariance
+    for _ in range(COMMON_ERROR_ROUNDS):
+        distance2, cost = costs(mean - value, own + covariance)
+        share = shares_of_materials(cost)
+        known = scipy.special.expit(level - distance2.min(axis=1))
+        middle = np.einsum("pk,pkd->pd", share, mean)
+        off = mean - middle[:, None]
+        spread = np.einsum("pk,pkde->pde", share, own + off[..., :, None] * off[..., None, :])
+        information = known[:, None, None] * np.linalg.inv(spread)
+        covariance = np.linalg.inv(np.linalg.inv(prior) + information.sum(axis=0))
+        before = value
+        value = covariance @ (information @ middle[..., None]).sum(axis=0)[:, 0]
+        if np.abs(value - before).max() < 1e-7:
+            break
+    return value, covariance
 
 
 class ErrorDiscriminant(Model):
@@ -300,61 +167,42 @@ class ErrorDiscriminant(Model):
     def pixel_probabilities(self, x: Real) -> Real:
         """Return the probability of each material for pixels classified independently, [n, materials]."""
         _, cost = costs(self._deviations(x) - self.level, self._pixel_covariances())
-        return probabilities(cost, np.full(len(x), np.inf))[:, :-1]
+        return shares_of_materials(cost)
 
-    def by_scan(
-        self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
-    ) -> NamedScan:
-        """Name the patches and pixels of one scan, with an estimate of the errors common to all patches.
+    def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
+        """Name the patches and pixels of one scan, with an estimate of the error common to all patches.
 
-        `errors` are added to the library's own; they hold for one angle and are ignored with several. With `others`,
-        the prior of a pixel is its patch's name, except for this share; without, pixels are independent.
+        Pixels are named independently of each other.
         """
-        _, patch = np.unique(patches, return_inverse=True)
-        ids = np.unique(patches)
-        d = self._deviations(x) - self.level
-        mean = np.stack([d[patch == i].mean(axis=0) for i in range(ids.size)])
-        informative = ~self._metal_like(x, patch)
+        ids, patch = np.unique(patches, return_inverse=True)
+        deviations = self._deviations(x) - self.level
+        mean = np.stack([deviations[patch == i].mean(axis=0) for i in range(ids.size)])
         pixels = float(min([self.pixels, *np.bincount(patch).tolist()]))
         own = self._patch_covariances(pixels)
-        mine = np.zeros((ids.size, *self.scan.shape))
-        if errors is not None and errors.own.shape[1:] == mine.shape[1:]:
-            mine = errors.own
-        else:
-            errors = None
-        placed = self.within / pixels + self.between + mine
-        found = explanations(
-            Patches(mean, own + mine[:, None], informative),
-            self._prior(ids.size, errors),
-            lambda error: self._none(x, patch, placed, error),
-        )
-        probability, share, distance2 = np.zeros((ids.size, self.names.size + 1)), 0.0, 0.0
-        for weight, error in found:
-            q, cost = costs(mean - error.shift[:, None], own + (mine + error.spread)[:, None])
-            each = probabilities(cost, self._none(x, patch, placed, error))
-            probability += weight * _reduce_distant(each, q - self.patch_level)
-            known = weight * np.maximum(probabilities(cost, np.full(ids.size, np.inf))[:, :-1], 1e-12)  # if known
-            share, distance2 = share + known, distance2 + known * q
-        far = np.sqrt(distance2 / share / self.patch_level)
-        at, scene = (np.arange(ids.size), np.argmax(share, axis=1)), found[0][1]
-        alone = self._patch_covariances(1.0)[None] + (mine + scene.spread)[:, None]
-        pixel_q, pixel_cost = costs(d - scene.shift[patch][:, None], alone[patch])
-        if others is not None:
-            prior = (1 - others) * probability[:, :-1] + others / self.names.size
-            pixel_cost = pixel_cost - 2 * np.log(prior[patch])
-        of = np.arange(len(x)), pixel_cost.argmin(axis=1)
-        in_library = 1.0 if others is None else 1 - (1 - others) * probability[patch, -1]
+        informative = ~self._metal_like(x, patch)
+        shift, spread = estimate_common_error(mean[informative], own, self.scan, self.patch_level)
+
+        distance2, cost = costs(mean - shift, own + spread)
+        probability = _with_none(shares_of_materials(cost), distance2 - self.patch_level)
+        row = np.arange(ids.size)
+        best = cost.argmin(axis=1)
+        distances = np.sqrt(distance2 / self.patch_level)
+        is_none = probability[:, -1] > probability[row, best]
+        distance = np.where(is_none, np.maximum(distances[row, best], BEYOND), distances[row, best])
+
+        pixel_distance2, pixel_cost = costs(deviations - shift, self._patch_covariances(1.0) + spread)
+        of_pixel = pixel_cost.argmin(axis=1)
+        pixel_distance = np.sqrt(pixel_distance2[np.arange(len(x)), of_pixel] / self.pixel_level)
         return NamedScan(
-            self.names[of[1]],
-            np.sqrt(pixel_q[of] / self.pixel_level),
-            ids,
-            self.names[at[1]],
-            probability[at],
-            np.where(probability[:, -1] > probability[at], np.maximum(far[at], _BEYOND), far[at]),
-            far,
-            probability,
-            self.names,
-            in_library * probabilities(pixel_cost, np.full(len(x), np.inf)).max(axis=1),
+            pixel_names=self.names[of_pixel],
+            pixel_distance=pixel_distance,
+            patches=ids,
+            names=self.names[best],
+            confidence=probability[row, best],
+            distance=distance,
+            distances=distances,
+            probabilities=probability,
+            materials=self.names,
         )
 
     def _fit_patches(self, residual: Real, material: npt.NDArray, plate: npt.NDArray, dof: int) -> None:
@@ -374,35 +222,6 @@ class ErrorDiscriminant(Model):
         every = np.stack([effect(t, self.angles_rad) for t in self._anchor_t])
         apart = every.reshape(*self._anchor_t.shape, 3, 2).transpose(0, 3, 1, 2)
         return self._chosen(apart).swapaxes(1, 2)
-
-    def _prior(self, count: int, errors: SceneErrors | None) -> CommonError:
-        """Return the prior of the error common to `count` patches: mean zero, covariance of scans and `errors`."""
-        width = len(self.scan)
-        design, prior = np.tile(np.eye(width), (count, 1, 1)), self.scan
-        if errors is not None:
-            design = np.concatenate([design, errors.design], axis=2)
-            both = np.zeros((design.shape[2],) * 2)
-            both[:width, :width], both[width:, width:] = prior, errors.covariance
-            prior = both
-        return CommonError(design, np.zeros(len(prior)), prior, np.asarray(np.linalg.inv(prior), np.float64))
-
-    def _none(self, x: Real, patch: npt.NDArray[np.intp], covariances: Real, scene: CommonError) -> Real:
-        """Return minus twice the log likelihood of each patch as any other half space, [patch].
-
-        `covariances` [patch, d, d] of the patches' own errors; the scene's are added, as for the materials.
-        """
-        h, _, t = by_angle(x)
-        log_h = np.stack([np.log(np.maximum(h[patch == i], 1e-6)).mean(axis=0) for i in range(patch.max() + 1)])
-        middle = np.stack([t[patch == i].mean(axis=0) for i in range(patch.max() + 1)])
-        covariances = covariances + scene.spread
-        if self.channels != "H+V+P" or not len(self.angles_rad):  # no model of half spaces: likelihood at the threshold
-            return np.asarray(
-                self.patch_level + np.linalg.slogdet(covariances)[1] + covariances.shape[1] * _LN_2PI, np.float64
-            )
-        log_h, middle = without(log_h, middle, scene.shift.reshape(*middle.shape, 3))
-        return cost_of_none(log_h, middle, covariances, self.angles_rad) - 2 * np.log(
-            NONE / (1 - NONE) * self.names.size
-        )
 
     def _anchor(self, x: Real, of: npt.NDArray[np.intp]) -> None:
         """Set the expansion point of each material's features: the means of its pixels."""
@@ -480,7 +299,7 @@ class ErrorDiscriminant(Model):
 def _two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informative: npt.NDArray) -> tuple[Real, Real]:
     """Least squares of patch means = material + scan: offsets [scans, d], of mean zero, and levels [materials, d]."""
     offset, level = np.zeros((scan.max() + 1, mean.shape[1])), np.zeros((material.max() + 1, mean.shape[1]))
-    for _ in range(_TWO_WAY_ROUNDS):
+    for _ in range(TWO_WAY_ROUNDS):
         for k in np.unique(material):
             at = material == k
             level[k] = (mean[at] - offset[scan[at]] * informative[at, None]).mean(axis=0)
@@ -501,12 +320,12 @@ def _positive(a: Real) -> Real:
     return (vectors * np.maximum(values, 0)) @ vectors.T
 
 
-def _reduce_distant(probability: Real, beyond: Real) -> Real:
-    """Lower the probabilities [n, materials + 1] of distant materials: a patch may be something no model describes.
+def _with_none(probability: Real, beyond: Real) -> Real:
+    """Return the probabilities [n, materials + 1] with, last, that of none of the materials.
 
     `beyond` [n, materials] is the chi-square of a patch minus the threshold that 2 % of a material's patches exceed.
     At the threshold half of the probability goes to none of the materials, far beyond it all, so that a patch called
     unknown for its distance has no likelier name.
     """
-    known = probability[:, :-1] * scipy.special.expit(-beyond)
+    known = probability * scipy.special.expit(-beyond)
     return np.concatenate([known, 1 - known.sum(axis=1, keepdims=True)], axis=1)

@@ -30,7 +30,15 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.materials.kinds import DensityMap, Kinds, RatioEvidence, pair, turned
+from polysight.materials.kinds import (
+    USUAL_LIBRARY_SHARE,
+    DensityMap,
+    Kinds,
+    RatioEvidence,
+    at_angle,
+    pair,
+    turned,
+)
 from polysight.materials.specimens import METAL_WITHOUT_BRIGHTNESS, METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import permittivity_from_ratio
 
@@ -393,20 +401,6 @@ class _Scene:
         return np.concatenate([bright, np.stack(some, axis=-1)], axis=-1)
 
 
-def at_angle(t: Complex, theta_rad: npt.ArrayLike, other_rad: float) -> Complex:
-    """Return t of the same half space at another angle.
-
-    With u = (1 + t) / (1 - t) Eq. 3 is sqrt(eps - sin^2) = u sin^2 / cos.
-    """
-    sine2, other2 = np.sin(theta_rad) ** 2, np.sin(other_rad) ** 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        q = (1 + t) / (1 - t) * sine2 / np.cos(theta_rad)
-        there = np.sqrt(q**2 + sine2 - other2)
-        there = np.where((there * np.conj(q)).real < 0, -there, there) * np.cos(other_rad) / other2
-        moved = (there - 1) / (there + 1)
-    return np.where(np.isfinite(moved), moved, t)
-
-
 def _anneal(model: _Scene, z: Real, before: Real, after: Real, rng: np.random.Generator) -> Real:
     """Move particles of one posterior to another; `before`, `after` [1 + patch] weigh the log likelihoods."""
     parts, weight = model.log_likelihoods(z), before
@@ -515,7 +509,8 @@ def _evidence(model: _Scene, kinds: Kinds, z: Real, i: int) -> RatioEvidence:
     """Return what the scene says of a patch's ratio at the angle of the kinds."""
     t = model.ratios_of_kinds(z, kinds)[:, i]
     covariance = np.cov(pair(t).T) + model.own[i]
-    return RatioEvidence(kinds.theta_rad, complex(t.mean()), covariance, float(model.library_share(z).mean()))
+    share = float(model.library_share(z).mean()) if kinds.ours.any() else USUAL_LIBRARY_SHARE
+    return RatioEvidence(kinds.theta_rad, complex(t.mean()), covariance, share)
 
 
 def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:

@@ -8,7 +8,7 @@ measured ratio under all of them is the prior of the joint inversion, and its pa
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
@@ -17,13 +17,20 @@ import numpy.typing as npt
 import scipy
 
 from polysight.materials.catalogue import load_catalogue, same_material
-from polysight.materials.specimens import LOSS_RANGE, PUBLISHED_SPREAD, REAL_RANGE, SOFT_LOSS
+from polysight.materials.specimens import PUBLISHED_SPREAD
 from polysight.polarimetry import multilayer, permittivity_from_ratio, ratio_from_permittivity
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 Source = Literal["library", "literature"]
 
+REAL_RANGE = (1.2, 30.0)
+LOSS_RANGE = (0.0, 30.0)
+SOFT_LOSS = 0.05
+"""Range of any half space, and the loss above which it is uniform on a logarithmic scale, linear below: from nearly air
+to beyond water."""
+USUAL_LIBRARY_SHARE = 0.5
+"""Expected share of a library's materials in a scan that was processed without it."""
 LITERATURE_SHARE = 0.7
 """Share of the literature in thick plates that are none of the library's materials; others are any half space."""
 METAL_SHARE = 0.1
@@ -80,6 +87,26 @@ class RatioEvidence:
 def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
     """Return t = 1 / P of half spaces (Eq. 2)."""
     return np.asarray(1 / ratio_from_permittivity(permittivity, theta_rad), np.complex128)
+
+
+def at_angle(t: Complex, theta_rad: npt.ArrayLike, other_rad: float) -> Complex:
+    """Return t of the same half space at another angle.
+
+    With u = (1 + t) / (1 - t) Eq. 3 is sqrt(eps - sin^2) = u sin^2 / cos.
+    """
+    sine2, other2 = np.sin(theta_rad) ** 2, np.sin(other_rad) ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        q = (1 + t) / (1 - t) * sine2 / np.cos(theta_rad)
+        there = np.sqrt(q**2 + sine2 - other2)
+        there = np.where((there * np.conj(q)).real < 0, -there, there) * np.cos(other_rad) / other2
+        moved = (there - 1) / (there + 1)
+    return np.where(np.isfinite(moved), moved, t)
+
+
+def at_kinds(evidence: RatioEvidence, kinds: Kinds) -> RatioEvidence:
+    """Return what a scan says of a patch's ratio at the angle of the kinds."""
+    t = at_angle(np.array(evidence.inverse_ratio), evidence.theta_rad, kinds.theta_rad)
+    return replace(evidence, theta_rad=kinds.theta_rad, inverse_ratio=complex(t))
 
 
 def pair(value: npt.ArrayLike) -> Real:

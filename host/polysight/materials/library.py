@@ -244,7 +244,7 @@ def usable(x: Real) -> npt.NDArray[np.bool_]:
 
 def by_angle(x: Real) -> tuple[Real, Real, npt.NDArray[np.complex128]]:
     """Return |H|, |V| and V / H of features [n, 4 * angles], each [n, angles]."""
-    h, v, real, imag = np.moveaxis(x.reshape(len(x), -1, WIDTH), -1, 0)
+    h, v, real, imag = np.moveaxis(x.reshape(len(x), x.shape[1] // WIDTH, WIDTH), -1, 0)
     return h, v, real + 1j * imag
 
 
@@ -446,8 +446,6 @@ class NamedScan:
     ----------
     pixel_names, pixel_distance
         Likeliest material of each pixel, [n], and its distance over the threshold: above 1 is unknown.
-    pixel_confidence
-        Probability of that material, [n]; None for models without probabilities.
     patches
         Patch numbers, sorted, [patches].
     names, confidence, distance
@@ -468,30 +466,6 @@ class NamedScan:
     distances: Real | None = None
     probabilities: Real | None = None
     materials: npt.NDArray | None = None
-    pixel_confidence: Real | None = None
-
-
-@dataclass(frozen=True)
-class SceneErrors:
-    """Errors of a scan's patches in ln|H|, ln|V| and arg P, by its error budget.
-
-    Attributes
-    ----------
-    own
-        float64 [patch, d, d]: covariance of each patch's own error.
-    design
-        float64 [patch, d, q]: effect of the q errors common to all patches (leakage, reference, angle) on each.
-    covariance
-        float64 [q, q] of the common errors.
-    """
-
-    own: Real
-    design: Real
-    covariance: Real
-
-    def of(self, at: npt.NDArray) -> SceneErrors:
-        """Return the errors of some of the patches."""
-        return SceneErrors(self.own[at], self.design[at], self.covariance)
 
 
 class Model(ABC):
@@ -510,16 +484,11 @@ class Model(ABC):
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Classify each pixel independently: return name [n] and distance over the threshold [n]."""
 
-    def by_scan(
-        self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
-    ) -> NamedScan:
+    def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
         """Name the pixels and patches of one scan; `patches` [n] is the patch number of each pixel.
 
-        By default a patch gets the name of most of its pixels. `errors` of the patches, in the order of their numbers,
-        for models that use them. `others`: share of a patch's pixels that may be of another material than the patch;
-        None: pixels are classified independently.
+        By default a patch gets the name of most of its pixels.
         """
-        del errors, others
         return majority(*self.by_pixel(x), patches)
 
 

@@ -15,7 +15,15 @@ import numpy.typing as npt
 import scipy
 
 from polysight.materials.catalogue import load_catalogue
-from polysight.materials.kinds import Kinds, Odds, RatioEvidence, pair, weigh_kinds
+from polysight.materials.kinds import (
+    USUAL_LIBRARY_SHARE,
+    Kinds,
+    Odds,
+    RatioEvidence,
+    at_kinds,
+    pair,
+    weigh_kinds,
+)
 from polysight.materials.measure import format_permittivity
 
 Real = npt.NDArray[np.float64]
@@ -23,6 +31,8 @@ Real = npt.NDArray[np.float64]
 UNKNOWN = "unknown"
 INCLUSIONS = 0.05
 """Share of a patch's pixels that may be of another material; a pixel's prior is its patch's name otherwise."""
+UNKNOWN_BUDGET = 0.03
+"""Relative error of V / H beside the spread of its pixels if the error budget of its scan is not known."""
 LIKELY = 0.005
 """Materials of less probability are not listed."""
 LAYER = "possible layer"
@@ -141,12 +151,19 @@ def name_patch(
     seen
         What the scans say of the patch, in their order.
     inverse_ratios
-        complex [n, scan]: V / H of the pixels at the kinds' angles, NaN where not usable.
+        complex [n, scan]: V / H of the pixels, NaN where not usable.
     """
     good = np.isfinite(inverse_ratios).all(axis=1)
     if not good.any():
         return nothing_named(good.size)
-    odds, first = weigh_kinds(kinds, seen), kinds[0]
+    seen = [at_kinds(evidence, at) for evidence, at in zip(seen, kinds, strict=True)]
+    # Pixels get the corrections of their patch: leakage, tilt, and the common change over the plane.
+    middle = np.median(inverse_ratios[good].real, axis=0) + 1j * np.median(inverse_ratios[good].imag, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correction = np.array([evidence.inverse_ratio for evidence in seen]) / middle
+    inverse_ratios = inverse_ratios * np.where(np.isfinite(correction), correction, 1.0)
+    odds = weigh_kinds(kinds, seen)
+    first = kinds[0]
     names = np.array(first.names)
     foreign, meant = name_of_literature(first, odds)
     share = {str(names[k]): float(odds.kinds[k]) for k in np.flatnonzero(first.ours)}
@@ -177,9 +194,28 @@ def name_patch(
     )
     called = np.where(first.ours, names, np.where(meant, foreign, UNKNOWN))
     pixel_names, far, sure = _name_pixels(kinds, seen, inverse_ratios, odds.kinds, called)
-    count = dict(zip(*np.unique(pixel_names, return_counts=True), strict=True))
-    votes = {str(n): int(c) / pixel_names.size for n, c in sorted(count.items(), key=lambda i: (-i[1], i[0]))}
-    return NamedPatch(pixel_names, far, replace(verdict, votes=votes), sure)
+    return NamedPatch(pixel_names, far, replace(verdict, votes=share_of_pixels(pixel_names)), sure)
+
+
+def share_of_pixels(pixel_names: npt.NDArray[np.str_]) -> dict[str, float]:
+    """Return the share of the pixels with each name, largest first."""
+    names, count = np.unique(pixel_names, return_counts=True)
+    by_share = sorted(zip(names.tolist(), count.tolist(), strict=True), key=lambda row: (-row[1], row[0]))
+    return {name: number / pixel_names.size for name, number in by_share}
+
+
+def evidence_of_pixels(inverse_ratios: npt.NDArray[np.complex128], kinds: Kinds) -> RatioEvidence:
+    """Return what pixels alone say of a patch whose scan's error budget is not known.
+
+    Their spread is not divided by the root of their number: errors inside a patch are as wide as the patch.
+    `inverse_ratios` complex [n] is V / H of the pixels, NaN where not usable.
+    """
+    good = inverse_ratios[np.isfinite(inverse_ratios)]
+    if not good.size:
+        return RatioEvidence(kinds.theta_rad, 0j, np.eye(2), USUAL_LIBRARY_SHARE)
+    middle = complex(np.median(good.real), np.median(good.imag))
+    std = float(np.hypot(np.std(good), UNKNOWN_BUDGET * abs(middle)))
+    return RatioEvidence(kinds.theta_rad, middle, std**2 / 2 * np.eye(2), USUAL_LIBRARY_SHARE)
 
 
 def nothing_named(pixels: int) -> NamedPatch:

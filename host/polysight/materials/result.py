@@ -22,8 +22,9 @@ from msgspec import UNSET
 
 from polysight.imaging import Image, Images, Rise
 from polysight.materials.inversion import Inversion, RigPrior, ratio_error
+from polysight.materials.kinds import RatioEvidence
 from polysight.materials.labels import Labels, TruthPlate
-from polysight.materials.library import Real, SceneErrors, feature_matrix
+from polysight.materials.library import Real, feature_matrix
 from polysight.materials.measure import CommonChange, Permittivity, background, ratio_sigma
 from polysight.materials.metal import MetalReference
 from polysight.materials.names import NamedPatch, PatchName
@@ -131,8 +132,8 @@ class MaterialsResult:
         True if the verdict is `no result`: rows have no name, no ratio and no permittivity then.
     tilts
         Tilts of the plates; `h` and `v` are already corrected for them.
-    errors
-        Numbers of the judged patches, and their errors for naming by the error budget; None without judged patches.
+    evidence
+        Patch number to what its name rests on; not of refused patches and of the metal reference.
     brightness_off
         Patch number to ln of |H| over that of a half space of its permittivity; not for metal-like patches.
     apart_mm
@@ -165,7 +166,7 @@ class MaterialsResult:
     withheld: bool = False
     tilts: Tilts = LEVEL
     brightness_off: Mapping[int, float] = field(default_factory=dict)
-    errors: tuple[tuple[int, ...], SceneErrors] | None = None
+    evidence: Mapping[int, RatioEvidence] = field(default_factory=dict)
     apart_mm: tuple[float, float] = (0.0, 0.0)
     drift: CommonChange | None = None
     halo: float = 0.0
@@ -268,7 +269,6 @@ APART_MM = 20.0
 """Largest distance between the centres of one patch in two scans."""
 NEAR_MM = 4.0
 """Largest distance between pixels of two scans that show the same spot: about the resolution."""
-_ERROR_ARRAYS = ("own", "design", "covariance")  # of `SceneErrors`
 
 
 @dataclass(frozen=True)
@@ -287,28 +287,32 @@ class ScanPatch:
 
 @dataclass(frozen=True)
 class ScanPatches:
-    """The patches of one scan; `errors` of the patches numbered `judged`, by the scan's error budget."""
+    """The patches of one scan; `evidence`: patch number to what its name rests on (earlier releases wrote none)."""
 
     angle_deg: float
     simulated: bool
     patches: tuple[ScanPatch, ...]
-    judged: tuple[int, ...] = ()
-    errors: SceneErrors | None = None
-
-    def errors_of(self, labels: Sequence[int]) -> SceneErrors | None:
-        """Return the errors of these patches, in this order; None if one of them has none."""
-        if self.errors is None or not set(labels) <= set(self.judged):
-            return None
-        return self.errors.of(np.array([self.judged.index(label) for label in labels], np.intp))
+    evidence: Mapping[int, RatioEvidence] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class MatchedPatch:
-    """A patch that several scans show; `features` [n, 4 * scans] of the spots that all of them show."""
+    """A patch that several scans show.
+
+    Attributes
+    ----------
+    label, truth
+        Number in the first scan, and true material, if known.
+    features
+        float64 [n, 4 * scans] of the spots that all of them show.
+    evidence
+        What each scan says of it; None if one of them does not say.
+    """
 
     label: int
     truth: str | None
     features: Real
+    evidence: tuple[RatioEvidence, ...] | None = None
 
 
 def features_of(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
@@ -343,17 +347,18 @@ def pack_patches(found: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike,
         rows.append({"label": r.patch.label, "centre_mm": r.patch.centre_mm, "truth": truth, "pixels": int(ix.size)})
     angle = float(np.degrees(np.mean(found.theta_rad)))
     meta = {"format": PATCHES_FORMAT, "angle_deg": angle, "simulated": simulated, "patches": rows}
-    budget: dict[str, Any] = {}
-    if found.errors is not None:
-        meta["judged"], errors = found.errors
-        budget = {f"errors_{name}": getattr(errors, name) for name in _ERROR_ARRAYS}
+    meta["judged"] = list(found.evidence)
+    evidence = found.evidence.values()
     out = io.BytesIO()
     np.savez_compressed(
         out,
         meta=np.frombuffer(json.dumps(meta).encode("utf-8"), np.uint8),
         places_mm=np.concatenate(places).astype(np.float32),
         features=np.concatenate(features).astype(np.float32),
-        **budget,
+        evidence_theta_rad=np.array([e.theta_rad for e in evidence], np.float64),
+        evidence_ratio=np.array([e.inverse_ratio for e in evidence], np.complex128),
+        evidence_covariance=np.array([e.covariance for e in evidence], np.float64).reshape(-1, 2, 2),
+        evidence_share=np.array([e.library_share for e in evidence], np.float64),
     )
     return out.getvalue()
 
@@ -364,7 +369,7 @@ def read_patches(path: Path) -> ScanPatches:
         with open_npz(path) as z:
             meta = json.loads(z["meta"].tobytes().decode("utf-8"))
             places, features = z["places_mm"].astype(np.float64), z["features"].astype(np.float64)
-            budget = [z[f"errors_{name}"].astype(np.float64) for name in _ERROR_ARRAYS] if "judged" in meta else []
+            evidence = _read_evidence(z, meta["judged"]) if "evidence_ratio" in z else {}
         if meta["format"] != PATCHES_FORMAT:
             raise ValueError(f"its format is {meta['format']!r}, this program reads {PATCHES_FORMAT!r}")
         ends = np.cumsum([0, *(int(r["pixels"]) for r in meta["patches"])])
@@ -373,16 +378,29 @@ def read_patches(path: Path) -> ScanPatches:
         patches = tuple(
             _read_patch(r, places[a:b], features[a:b]) for r, a, b in zip(meta["patches"], ends, ends[1:], strict=False)
         )
-        judged = tuple(int(label) for label in meta.get("judged", ()))
-        errors = SceneErrors(*budget) if budget else None
-        if errors is not None and (len(errors.own), len(errors.design)) != (len(judged), len(judged)):
-            raise ValueError(f"an error budget of {len(errors.own)} patches for {len(judged)}")
-        return ScanPatches(float(meta["angle_deg"]), bool(meta["simulated"]), patches, judged, errors)
+        return ScanPatches(float(meta["angle_deg"]), bool(meta["simulated"]), patches, evidence)
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
         raise DataError(
             f"{path}: the patches cannot be read: {type(e).__name__}: {e}",
             "it is damaged, or of another version", "process the scan again", code=ErrorCode.FILE_UNREADABLE,
         ) from None  # fmt: skip
+
+
+def _read_evidence(arrays: Mapping[str, npt.NDArray], judged: Sequence[int]) -> dict[int, RatioEvidence]:
+    """Return what the names of the judged patches rest on. Raises ValueError if the arrays do not fit."""
+    columns = zip(
+        arrays["evidence_theta_rad"],
+        arrays["evidence_ratio"],
+        arrays["evidence_covariance"],
+        arrays["evidence_share"],
+        strict=True,
+    )
+    rows = [
+        RatioEvidence(float(angle), complex(t), covariance, float(share)) for angle, t, covariance, share in columns
+    ]
+    if any(row.covariance.shape != (2, 2) for row in rows):
+        raise ValueError("covariances are not [patch, 2, 2]")
+    return dict(zip(map(int, judged), rows, strict=True))
 
 
 def _read_patch(row: Mapping[str, Any], places: Real, features: Real) -> ScanPatch:
@@ -401,6 +419,8 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
         partners = [p for other in scans[1:] if (p := _partner(patch, scans[0], other)) is not None]
         if len(partners) < len(scans) - 1:
             continue
+        every = zip(scans, (patch, *partners), strict=True)
+        evidence = tuple(scan.evidence[p.label] for scan, p in every if p.label in scan.evidence)
         places = patch.places_mm - patch.centre_mm
         columns, kept = [patch.features], np.ones(len(places), bool)
         for partner in partners:
@@ -408,7 +428,8 @@ def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
             far, at = scipy.spatial.KDTree(theirs).query(places) if len(theirs) else (np.full(len(places), np.inf), 0)
             kept &= far <= NEAR_MM
             columns.append(partner.features[np.minimum(at, len(theirs) - 1)] if len(theirs) else columns[0])
-        out.append(MatchedPatch(patch.label, patch.truth, np.hstack(columns)[kept]))
+        complete = evidence if len(evidence) == len(scans) else None
+        out.append(MatchedPatch(patch.label, patch.truth, np.hstack(columns)[kept], complete))
     return out
 
 

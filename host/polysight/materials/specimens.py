@@ -1,12 +1,8 @@
-"""Half spaces as seen by the rig: the effect of differences between specimens, and patches of unknown materials.
+"""Half spaces as seen by the rig, and the effect of differences between specimens.
 
 Two plates of the same material differ by some per cent in the real part of the permittivity and by tens of per cent in
 the loss (Fig. 17 of the paper). `(ln eps', ln eps'')` is assumed to be normal; Eq. 2 converts its spread to correlated
 errors of ln|H|, ln|V| and arg P, for all angles together because they show the same specimen.
-
-`cost_of_none` is the likelihood of a patch that is none of the library's materials but any half space: ln eps' is
-uniform from nearly air's to beyond water's, and so is the loss on a scale that is logarithmic above `SOFT_LOSS` and
-linear below. The integral over all half spaces is by Laplace's method about the best fitting one.
 """
 
 from __future__ import annotations
@@ -85,12 +81,6 @@ def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
     """
     along = dt * np.exp(-1j * np.angle(t)) / softened(t)
     return np.stack([log_h, log_h + along.real, -along.imag], axis=-1)
-
-
-def without(log_h: Real, t: Complex, deviations: Real) -> tuple[Real, Complex]:
-    """Subtract deviations [..., angles, 3] from ln|H| and t [..., angles]: inverse of :func:`relative`."""
-    h, v, phase = (deviations[..., i] for i in range(3))
-    return log_h - h, t - softened(t) * ((v - h) - 1j * phase) * np.exp(1j * np.angle(t))
 
 
 def apparent_permittivity(t: Complex, angles_rad: Sequence[float]) -> complex:
@@ -172,48 +162,3 @@ def alike(covariance: Real) -> Real:
 
 def _floor(covariance: Real) -> Real:
     return (1e-9 * np.trace(covariance) + 1e-14) * np.eye(len(covariance))
-
-
-REAL_RANGE = (1.2, 30.0)
-LOSS_RANGE = (0.0, 30.0)
-SOFT_LOSS = 0.05
-_STEPS, _STEP = 8, 1e-4
-_PRIOR = 1 / (np.log(REAL_RANGE[1] / REAL_RANGE[0]) * np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS))
-
-
-def cost_of_none(log_h: Real, t: Complex, covariances: Real, angles_rad: Sequence[float]) -> Real:
-    """Return minus twice the log likelihood of each patch as any half space.
-
-    `log_h` and `t` [patch, angles] are ln|H| and V / H of the patches, `covariances` [patch, 3 * angles, 3 * angles]
-    those of their ln|H|, ln|V|, arg P, without the specimens' spread.
-    """
-    inverse = np.asarray(np.linalg.inv(covariances), np.float64)
-    constant = np.linalg.slogdet(covariances)[1] + covariances.shape[1] * np.log(2 * np.pi)
-    start = np.array([apparent_permittivity(q, angles_rad) for q in t], np.complex128)
-    low = np.array([np.log(REAL_RANGE[0]), 0.0])
-    high = np.array([np.log(REAL_RANGE[1]), np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS)])
-    at: Real = np.stack([np.log(start.real), np.arcsinh(-start.imag / SOFT_LOSS)], axis=1)
-    at = np.asarray(np.clip(at, low, high), np.float64)
-    best, curvature = np.full(len(t), np.inf), np.tile(np.eye(2), (len(t), 1, 1))
-    for _ in range(_STEPS):
-        off, slope = _off(at, log_h, t, angles_rad)
-        weighed = slope.mT @ inverse
-        information = weighed @ slope + 1e-9 * np.eye(2)
-        cost = np.einsum("pd,pde,pe->p", off, inverse, off)
-        better = cost < best
-        best, curvature = np.where(better, cost, best), np.where(better[:, None, None], information, curvature)
-        step = np.linalg.solve(information, weighed @ off[..., None])[..., 0]
-        at = np.asarray(np.clip(at - step, low, high), np.float64)
-    return np.asarray(constant + best - 2 * np.log(_PRIOR * 2 * np.pi) + np.linalg.slogdet(curvature)[1], np.float64)
-
-
-def _off(at: Real, log_h: Real, t: Complex, angles_rad: Sequence[float]) -> tuple[Real, Real]:
-    """Return deviations of half spaces at [patch, 2] from the data, [patch, d], and derivatives, [patch, d, 2]."""
-
-    def deviations(where: Real) -> Real:
-        own_h, own_t = features(np.exp(where[:, 0]) - 1j * SOFT_LOSS * np.sinh(where[:, 1]), angles_rad)
-        return relative(own_h - log_h, own_t - t, t).reshape(len(t), -1)
-
-    here = deviations(at)
-    columns = [(deviations(at + step) - here) / _STEP for step in np.eye(2) * _STEP]
-    return here, np.stack(columns, axis=-1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polysight.materials import MODELS, UNKNOWN, Classifier, Entry, Library, specimens
+from polysight.materials import MODELS, Classifier, Entry, Library, specimens
 from polysight.materials.classify import DISCRIMINANT
 from polysight.materials.library import Samples, feature_matrix
 from polysight.materials.names import add_explanation

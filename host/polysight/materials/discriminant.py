@@ -158,6 +158,17 @@ class ErrorDiscriminant(Model):
         kinds = zip(self.names[dielectric], self._anchor_t[dielectric], strict=True)
         return {str(name): apparent_permittivity(t, self.angles_rad) for name, t in kinds}
 
+    def apart(self) -> Real:
+        """Return the distances of the materials in standard deviations of a patch, [material, material].
+
+        Of the models of all channels only: the features are ln|H|, ln|V| and arg P.
+        """
+        log_h = self._anchor_h[:, None] - self._anchor_h
+        off = self._chosen(relative(log_h, self._anchor_t[:, None] - self._anchor_t, self._anchor_t))
+        of_patch = self._patch_covariances(self.pixels) + self.scan
+        inverse = np.linalg.inv((of_patch[:, None] + of_patch) / 2)
+        return np.sqrt(np.einsum("abd,abde,abe->ab", off, inverse, off))
+
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Classify each pixel independently: return its name, and its distance over the threshold."""
         q, cost = costs(self._deviations(x) - self.level, self._pixel_covariances())

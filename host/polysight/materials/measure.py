@@ -320,8 +320,19 @@ def common_change(
                 value += unit * change
                 std += unit * deviation
                 left = slopes - drift_slopes
-            ripple2[k] += max(0.0, float(np.sum((left**2 - noise**2)[~border])) / max(int(np.sum(~border)) - 2, 1)) / 2
+            ripple2[k] += _excess_scatter(left[~border], noise[~border]) / 2
     return CommonChange(value, std, complex(*np.sqrt(ripple2)))
+
+
+def _excess_scatter(left: Real, noise: Real) -> float:
+    """Return the variance of slopes [plate] beyond their errors; robust: one plate that hardly reflects V is no ripple.
+
+    The mean is known already, so that the median deviation is about zero.
+    """
+    if left.size < 3:
+        return 0.0
+    scatter = 1.4826 * float(np.median(np.abs(left)))
+    return max(0.0, scatter**2 - float(np.median(noise)) ** 2) * left.size / (left.size - 2)
 
 
 def _averaged_drift(y_m: Real, origin_m: float, slopes: Real, noise: Real) -> tuple[Real, Real, Real]:

@@ -1,0 +1,56 @@
+"""`train` says if names are too sure, why, and how many specimens a library needs."""
+
+import numpy as np
+import pytest
+from tests.materials.test_specimens import KINDS, drawn
+
+from polysight.materials import Library, accuracy_lines
+from polysight.materials.train import FREEDOM_NEEDED, fit_samples
+
+CLOSE = {"acrylic": 4.0 - 0.4j, "resin": 4.03 - 0.405j, "rubber": 5.06 - 1.11j}
+
+
+def advice(samples) -> str:
+    return "\n".join(accuracy_lines(Library((), {"angles": {"60": fit_samples(samples)}})))
+
+
+def test_pieces_that_nobody_named_make_an_underconfident_library_that_asks_for_specimens():
+    """They differ by 12 %, which counts as an error of placement for all materials alike."""
+    text = advice(drawn((0.12, 0.6), 6, seed=1, labelled=False))
+    assert "underconfident" in text
+    assert "no second specimen" in text
+    assert f"{FREEDOM_NEEDED} more are needed" in text
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ({"scans": 3}, "known from 3 scans only"),
+        ({"specimen_freedom": 2}, "differ more from those learnt"),
+        ({}, "a scan may be disturbed, or a label wrong"),
+    ],
+)
+def test_names_said_too_surely_are_told_with_the_likeliest_cause(change, cause):
+    fit = fit_samples(drawn((0.03, 0.2), 12, seed=5)) | {"named": 200, "said": 0.97, "right": 0.8} | change
+    text = "\n".join(accuracy_lines(Library((), {"angles": {"60": fit}})))
+    assert "overconfident: names are said with 97 % and 80 % are right" in text
+    assert cause in text
+
+
+def test_a_library_of_many_specimens_needs_none_and_is_neither_over_nor_underconfident():
+    text = advice(drawn((0.03, 0.2), 12, seed=2))
+    assert "confident" not in text
+    assert "needed" not in text
+
+
+def test_materials_that_no_number_of_specimens_separates_are_told():
+    text = advice(drawn((0.03, 0.2), 8, seed=3, kinds=CLOSE))
+    assert "acrylic and resin lie" in text
+    assert "rubber" not in text.split("lie")[0].splitlines()[-1]
+
+
+@pytest.mark.parametrize("scans", [3, 12])
+def test_the_freedom_of_specimens_is_counted_over_the_materials(scans):
+    fit = fit_samples(drawn((0.03, 0.2), scans, seed=4))
+    assert fit["specimen_freedom"] == len(KINDS) * (scans - 1)
+    assert np.isfinite([fit["said"], fit["right"]]).all()

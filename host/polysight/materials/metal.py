@@ -313,7 +313,14 @@ def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
     level = _excess(relative, free, own, HALO_MM, pixel_mm)
     if level == 0:
         return Halo()
-    return Halo(level, {p.label: _excess(relative, free, p.mask, AROUND_MM, pixel_mm) for p in patches})
+    from_metal_mm = _distance_mm(own, pixel_mm)
+    around = {}
+    for patch in patches:
+        around[patch.label] = _excess(relative, free, patch.mask, AROUND_MM, pixel_mm)
+        # The halo reaches under a plate beside the metal, where nothing is free to measure it.
+        if patch.mask.any() and float(from_metal_mm[patch.mask].min()) <= HALO_MM[1]:
+            around[patch.label] = max(around[patch.label], level)
+    return Halo(level, around)
 
 
 def _excess(

@@ -25,11 +25,12 @@ from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import inverse_spread, permittivity_from_ratio
 from polysight_shared.findings import Finding
 
-AMPLITUDE_SHARE, PHASE_SHARE = 0.5, 0.7
-"""Error of a plate's ln|V / H| and of its phase over the scatter of its pixels.
+AMPLITUDE_OF_BLOCKS = 1.2
+PHASE_OF_BLOCKS = 1.7
+"""Error of a plate's ln|V / H| and of its phase over the scatter of its pixels and the root of its independent places.
 
-Speckle averages out; edges, neighbours and ripple are correlated over 10 to 20 mm and do not. On the published picture
-the plates' |P| differ from Table 2's by half of their scatter, the phases by once to twice theirs.
+Speckle averages out; edges, neighbours and ripple are correlated over 10 to 20 mm, `BLOCK_M`, and average as slowly. On
+the published picture the phases differ from plate to plate by more than that.
 """
 USUAL_BLOCKS = 2.0
 """Weight of the scene's usual scatter against a plate's own, in independent places of the plate."""
@@ -370,11 +371,13 @@ def _averaged_drift(y_m: Real, origin_m: float, slopes: Real, noise: Real) -> tu
 def relative_errors(own: Scatter | None, usual: tuple[float, float]) -> tuple[float, float]:
     """Return the standard errors of a plate's ln|V / H| and phase, from its own scatter and the scene's usual one."""
     amplitude, phase = usual
+    blocks = 1.0
     if own is not None:
-        weight = USUAL_BLOCKS + own.blocks
-        amplitude = float(np.sqrt((USUAL_BLOCKS * amplitude**2 + own.blocks * own.amplitude**2) / weight))
-        phase = float(np.sqrt((USUAL_BLOCKS * phase**2 + own.blocks * own.phase**2) / weight))
-    return AMPLITUDE_SHARE * amplitude, PHASE_SHARE * phase
+        blocks = own.blocks
+        weight = USUAL_BLOCKS + blocks
+        amplitude = float(np.sqrt((USUAL_BLOCKS * amplitude**2 + blocks * own.amplitude**2) / weight))
+        phase = float(np.sqrt((USUAL_BLOCKS * phase**2 + blocks * own.phase**2) / weight))
+    return AMPLITUDE_OF_BLOCKS * amplitude / np.sqrt(blocks), PHASE_OF_BLOCKS * phase / np.sqrt(blocks)
 
 
 def measure_patch(
@@ -422,11 +425,6 @@ def measure_patch(
     relative = float(np.hypot(amplitude, local_std)), float(np.hypot(phase, local_std))
     brightness = float(np.median(level)) if level.size else None
     return PatchMeasurement(inverse, std, theta_rad, brightness, relative, rise)
-
-
-def own_std(h: Image, v: Image) -> float:
-    """Return the standard error of V / H of a patch's pixels [n], each part, by what scatters over the plate."""
-    return float(np.hypot(AMPLITUDE_SHARE * inverse_spread(h, v), np.hypot(LEAST_STD, TILT_STD * _phase_spread(h))))
 
 
 def _phase_spread(h: Image) -> float:

@@ -29,12 +29,12 @@ import numpy.typing as npt
 import scipy
 from msgspec import structs
 
-from polysight.imaging import Image, Images, SubBand
+from polysight.imaging import Image, Images, Mask, SubBand
 from polysight.materials.analyse import Optics, level, reference_spread, smooth_inside, to_metal
 from polysight.materials.inversion import ratio_slopes
 from polysight.materials.layers import METAL, THICKNESS_RANGE_M, Bands, Layer, LayerFit, Spectrum, fit_layer
 from polysight.materials.library import Library
-from polysight.materials.measure import NOT_PASSIVE, median_ratio, own_std
+from polysight.materials.measure import LEAST_STD, NOT_PASSIVE, median_ratio, relative_errors, scatter_of
 from polysight.materials.result import MaterialsResult
 from polysight.polarimetry import PlaneReference, inverse_spread, remove_leakage
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, ScanMaterials
@@ -127,8 +127,19 @@ def band_rows(
             at = r.patch.interior & made.valid
             whole = (found.h[at], found.v[at])
             parts[r.patch.label].append(_measure_band(band, h[at], v[at], whole, error))
-    common = {r.patch.label: own_std(found.h[r.patch.interior], found.v[r.patch.interior]) for r in found.patches}
-    return {label: _with_covariance(rows, found, common[label]) for label, rows in parts.items()}
+    own = {r.patch.label: _own_std(found, r.patch.interior) for r in found.patches}
+    return {label: _with_covariance(rows, found, own[label]) for label, rows in parts.items()}
+
+
+def _own_std(found: MaterialsResult, interior: Mask) -> float:
+    """Return the standard error of a patch's V / H, each part, by what scatters over the plate; NaN if not known."""
+    images = found.calibrated
+    scatter = scatter_of(interior, found.h, found.v, images.x_m, images.y_m)
+    if scatter is None:
+        return float("nan")
+    inverse = 1 / median_ratio(found.h[interior], found.v[interior])
+    amplitude, phase = relative_errors(scatter, found.ripple)
+    return float(np.hypot(abs(inverse) * np.hypot(amplitude, phase) / np.sqrt(2), LEAST_STD))
 
 
 def _with_covariance(rows: list[BandFigures], found: MaterialsResult, common: float) -> list[BandFigures]:

@@ -12,13 +12,14 @@ import argparse
 import json
 import os
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.worlds import table_2_classifier
 from polysight.data import packaged
-from polysight.materials import Labels
+from polysight.materials import Labels, Library, fit_library
 from polysight.process import Inputs, analyse_given_images, read_given_images
 from polysight.products import ProcessedScan
 from polysight.results import PatchFigures
@@ -38,6 +39,17 @@ TABLE_2 = {
     "wood_thin": ("wood (thin, smooth)", 2.61, 0.01),
 }
 """Box to the paper's name, real part and loss."""
+WORLD_NAMES = {
+    "rubber": "rubber",
+    "cardboard_rough": "cardboard_rough",
+    "silicone_rubber": "silicone_rubber",
+    "PET_0.5mm": "pet_0.5mm",
+    "ceramic": "ceramic",
+    "acrylic_3mm": "acrylic_3mm",
+    "PCB": "glass_fibre",
+    "wood_thin": "wood_thin",
+}
+"""Box to the name in Table 2 of the independent generator."""
 METAL_BOX = "copper"
 SURE = 0.8
 TWO_SIDED_95 = 1.96
@@ -91,31 +103,58 @@ def process(form: Form, boxes: dict[str, list[int]], library: Path | None) -> tu
     return scan, patch_of
 
 
-def line(box: str, patch: PatchFigures | None) -> tuple[str, bool, bool, bool, bool]:
-    """Return the text of a plate; if its region holds Table 2, and if its name is right, sure and wrong."""
+@dataclass(frozen=True)
+class PlateFigures:
+    """One plate beside Table 2: its line of the table, and the relative half width of the real part's 95 % region."""
+
+    text: str
+    inside: bool = False
+    right: bool = False
+    sure_and_wrong: bool = False
+    half_width: float | None = None
+
+
+def judge_plate(box: str, patch: PatchFigures | None) -> PlateFigures:
+    """Compare a plate with Table 2."""
     name, real, loss = TABLE_2[box]
     if patch is None:
-        return f"  {box:16} not found", False, False, False, False
+        return PlateFigures(f"  {box:16} not found")
     if patch.refused is not None:
-        return f"  {box:16} {real:5.2f} {loss:5.2f}   refused: {patch.refused.what}", False, False, False, False
+        return PlateFigures(f"  {box:16} {real:5.2f} {loss:5.2f}   refused: {patch.refused.what}")
     e = patch.permittivity
     inside = False
+    half_width = None
     estimate = "no permittivity"
     if e is not None and e.spread is not None:
+        half_width = TWO_SIDED_95 * e.spread.real_std / e.real
         inside = abs(e.real - real) <= TWO_SIDED_95 * e.spread.real_std
         estimate = f"{e.real:5.2f} +- {e.spread.real_std:4.2f}  {e.loss:5.2f} +- {e.spread.loss_std:4.2f}"
     sure = patch.confidence or 0.0
     right = patch.name == name
-    wrong = not right and patch.name not in (None, "unknown") and sure >= SURE
     mark = "in" if inside else "OUT"
-    text = f"  {box:16} {real:5.2f} {loss:5.2f}   {estimate:32} {mark:3}  {patch.name} {sure:.2f}"
-    return text, inside, right, wrong, e is not None
+    return PlateFigures(
+        text=f"  {box:16} {real:5.2f} {loss:5.2f}   {estimate:32} {mark:3}  {patch.name} {sure:.2f}",
+        inside=inside,
+        right=right,
+        sure_and_wrong=not right and patch.name not in (None, "unknown") and sure >= SURE,
+        half_width=half_width,
+    )
+
+
+def write_table_2_library(path: Path) -> Path:
+    """Write a library of the paper's Table 2 as half spaces under the picture's angle; return its path."""
+    library = table_2_classifier(float(np.radians(ANGLE_DEG))).library
+    paper_names = {world_name: TABLE_2[box][0] for box, world_name in WORLD_NAMES.items()}
+    entries = [replace(entry, name=paper_names.get(entry.name, entry.name)) for entry in library.entries]
+    fit_library(Library(tuple(entries))).save(path)
+    return path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options."""
     parser.add_argument("--images", type=Path, default=os.environ.get(FOLDER), help=f"folder (default: ${FOLDER})")
     parser.add_argument("--library", type=Path, help="library (default: the simulated one)")
+    parser.add_argument("--table-2", action="store_true", help="library of Table 2 as half spaces instead")
     parser.add_argument("--reasons", type=int, default=4, help="reasons of the verdict to print (default: 4)")
     parser.add_argument("--json", type=Path, help="file for the figures")
 
@@ -129,13 +168,14 @@ def run(args: argparse.Namespace) -> int:
     boxes = json.loads(sources[0].with_suffix(".json").read_text())["boxes_px"]
     figures = {}
     with tempfile.TemporaryDirectory() as scratch:
+        library = write_table_2_library(Path(scratch) / "table-2.npz") if args.table_2 else args.library
         for form in forms_of(sources[0], boxes, Path(scratch)):
-            scan, patch_of = process(form, boxes, args.library)
+            scan, patch_of = process(form, boxes, library)
             by_number = {patch.label: patch for patch in scan.segments}
-            lines = [line(box, by_number.get(patch_of[box])) for box in TABLE_2]
+            plates = [judge_plate(box, by_number.get(patch_of[box])) for box in TABLE_2]
+            widths = [plate.half_width for plate in plates if plate.half_width is not None]
             metal = by_number.get(patch_of[METAL_BOX])
             extra = len(by_number) - len({n for n in patch_of.values() if n})
-            held_count, right, wrong, estimated = (sum(row[k] for row in lines) for k in (1, 2, 3, 4))
             level = scan.verdict.text if scan.verdict else ""
             reference = "copper" if metal is not None and metal.metal_reference else "NOT copper"
             figures[form.name] = {
@@ -143,14 +183,15 @@ def run(args: argparse.Namespace) -> int:
                 "not_plates": extra,
                 "reference": reference,
                 "verdict": level,
-                "regions_hold_table_2": held_count,
-                "estimated": estimated,
-                "names_right": right,
-                "sure_and_wrong": wrong,
+                "regions_hold_table_2": sum(plate.inside for plate in plates),
+                "estimated": len(widths),
+                "median_half_width_percent": round(100 * float(np.median(widths)), 1) if widths else None,
+                "names_right": sum(plate.right for plate in plates),
+                "sure_and_wrong": sum(plate.sure_and_wrong for plate in plates),
             }
             print(f"{form.name}: " + ", ".join(f"{k.replace('_', ' ')} {v}" for k, v in figures[form.name].items()))
             print("  plate            Table 2       permittivity +- std, loss +- std         name")
-            print("\n".join(row[0] for row in lines))
+            print("\n".join(plate.text for plate in plates))
             for reason in (scan.verdict.reasons if scan.verdict else ())[: args.reasons]:
                 print(f"  - {reason.what}")
     if args.json:

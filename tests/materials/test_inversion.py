@@ -10,7 +10,6 @@ from polysight.materials.inversion import (
     PatchMeasurement,
     RigPrior,
     invert,
-    measured_ratio,
     ratio_error,
     slope,
     true_ratio,
@@ -19,6 +18,11 @@ from polysight.polarimetry import fresnel, permittivity_from_ratio
 
 THETA = np.radians(55.0)
 EPS = np.array([2.6 - 0.01j, 3.5 - 0.8j, 4.0 - 0.4j, 4.7 - 0.7j, 5.1 - 1.1j, 4.75 - 2.4j, 6.3 - 0.2j, 7.5 - 0.3j])
+
+
+def measured_ratio(t, a, b, rho=0j):
+    """V / H of a true t, relative to metal that the same rig sees."""
+    return (1 + rho) * (1 + a) / (1 + b) * (t + b) / (1 + a * t)
 
 
 def world(rng, leak, noise=0.003, dull=0.03, angle=0.0, reference=0.0, eps=EPS):

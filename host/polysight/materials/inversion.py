@@ -48,35 +48,55 @@ Complex = npt.NDArray[np.complex128]
 BRIGHTNESS_RANGE = (0.03, 0.7)
 """Range of the standard deviation of ln kappa in a scene, uniform on a logarithmic scale: flat simulated plates differ
 by 3 %, thin, tilted, unevenly lit ones by a factor of two (published pictures)."""
-ODD_BRIGHTNESS, ODD_BRIGHTNESS_STD = 0.1, 1.2
+ODD_BRIGHTNESS = 0.1
+ODD_BRIGHTNESS_STD = 1.2
 """Share of patches whose brightness is none of a half space (thin sheets, shadows), and their ln kappa's spread."""
 METAL_BRIGHTNESS_STD = 0.5
 """Prior standard deviation of the metal's own ln kappa."""
 LIBRARY_SHARE = (0.05, 0.95)
 """Range of the share of a scene's patches that are of the library's materials; the scene tells it."""
-MOVED, MOVED_STD = 0.1, 0.025
+MOVED = 0.1
+MOVED_STD = 0.025
 """Probability that the mount has moved since its leakage was measured, and the leakage's error then: 1 to 3 degrees."""
-TURN, TURN_STD = -0.82, 0.1
+TURN = -0.82
+TURN_STD = 0.1
 """Leakage by a plate's rise across the plane of incidence: -sin(theta) for the published rig, with a tenth for antennas
 whose polarisation turns off axis. A transmitter that is turned to the other side has the other sign."""
-UNEVEN_LIGHT, EVEN_LIGHT = (1.0, 1.0), (0.3, 0.5)
+UNEVEN_LIGHT = (1.0, 1.0)
+EVEN_LIGHT = (0.3, 0.5)
 """Change of ln(V / H) per radian of rise, along x and across, by the patterns of boards that see the plate from other
 points: without and with the correction of the plate's illumination. The independent generator has 0.6 along x."""
 CHI2_95 = 5.991
-"""Squared distance in standard deviations that holds 95 % of a normal distribution of two dimensions."""
+CHI2_997 = 11.8
+"""Squared distances in standard deviations that hold 95 and 99.7 % of a normal distribution of two dimensions."""
 LEAST_DISTANCE = 4.0
 """|t - 1| in its standard deviations below which no permittivity is given."""
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
-_GROUPS = {
-    "metal reference": (4, 5),
-    "leakage": (0, 1, 2, 3, 9),
-    "incidence": (6,),
-    "tilt": (11, 12, 13, 14),
+# Columns of a particle.
+LEAKAGE_H = (0, 1)
+LEAKAGE_V = (2, 3)
+REFERENCE = (4, 5)
+ANGLE = 6
+METAL_BRIGHTNESS = 7
+SIZE_OF_BRIGHTNESS = 8
+HAS_MOVED = 9
+SHARE_OF_LIBRARY = 10
+TURN_BY_RISE = 11
+LIGHT_ACROSS = (12, 13)
+LIGHT_ALONG = 14
+WIDTH = 15
+COLUMNS_OF_SOURCE = {
+    "metal reference": REFERENCE,
+    "leakage": (*LEAKAGE_H, *LEAKAGE_V, HAS_MOVED),
+    "incidence": (ANGLE,),
+    "tilt": (TURN_BY_RISE, *LIGHT_ACROSS, LIGHT_ALONG),
 }
-# a, b, rho (2 each), angle, metal's brightness, size of brightness, moved, library's share, turn, G (3).
-_WIDTH = 15
-_PARTICLES, _MOVES, _DRAWS = 600, 6, 8
-_LEAST_STD = 1e-6  # of a ratio: below it a covariance has no inverse in double precision
+# Particles, moves at each temperature, and draws of a patch's own errors for each particle.
+PARTICLES = 600
+MOVES = 6
+DRAWS = 8
+# Of a ratio: below it a covariance has no inverse in double precision.
+LEAST_RATIO_STD = 1e-6
 
 
 @dataclass(frozen=True)
@@ -109,7 +129,7 @@ class PatchMeasurement:
     @property
     def covariance(self) -> Real:
         """Covariance of real and imaginary part of V / H, float64 [2, 2]."""
-        own = max(self.std, _LEAST_STD)
+        own = max(self.std, LEAST_RATIO_STD)
         return own**2 * np.eye(2) + turned(self.inverse_ratio, np.diag(np.square(self.relative_std)))
 
 
@@ -211,7 +231,7 @@ class Inversion:
     brightness_std
         Usual size of the same in this scene.
     nuisance_covariance
-        float64 [7, 7] of a, b, rho (real and imaginary parts) and the angle, in standard deviations of their prior.
+        float64 [6, 6] of a, b, rho (real and imaginary parts), in standard deviations of their prior.
     """
 
     patches: tuple[PatchEstimate, ...]
@@ -232,17 +252,10 @@ class Inversion:
 
 def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: npt.ArrayLike = 0j) -> Complex:
     """Return t of a measured V / H: the first formula of the module's docstring, solved for t, at the metal's place."""
-    a, b = np.asarray(a, np.complex128), np.asarray(b, np.complex128)
-    c = np.asarray(inverse, np.complex128) * (1 + b) / ((1 + a) * (1 + np.asarray(rho)))
-    return np.asarray((c - b) / (1 - a * c), np.complex128)
-
-
-def measured_ratio(
-    t: npt.ArrayLike, a: Complex | complex, b: Complex | complex, rho: Complex | complex = 0j
-) -> Complex:
-    """Return V / H of a true t: the first formula of the module's docstring, at the metal's place."""
-    t = np.asarray(t, np.complex128)
-    return (1 + rho) * (1 + a) / (1 + b) * (t + b) / (1 + a * t)
+    a = np.asarray(a, np.complex128)
+    b = np.asarray(b, np.complex128)
+    without_reference = np.asarray(inverse, np.complex128) * (1 + b) / ((1 + a) * (1 + np.asarray(rho)))
+    return np.asarray((without_reference - b) / (1 - a * without_reference), np.complex128)
 
 
 def slope(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
@@ -258,28 +271,38 @@ def invert(seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | Non
     """
     model = _Scene(seen, prior, kinds)
     rng = np.random.default_rng(0)
-    start = rng.standard_normal((_PARTICLES, _WIDTH))
-    nothing, everything = np.zeros(model.n + 1), np.ones(model.n + 1)
-    posterior = _anneal(model, start, nothing, everything, rng)
+    of_prior = rng.standard_normal((PARTICLES, WIDTH))
+    no_evidence = np.zeros(model.patch_count + 1)
+    all_evidence = np.ones(model.patch_count + 1)
+    posterior = _anneal(model, of_prior, no_evidence, all_evidence, rng)
     patches = []
-    for i in range(model.n):
-        without = everything.copy()
-        without[i + 1] = 0.0
-        patches.append(_estimate(model, _anneal(model, posterior, everything, without, rng), i, rng))
+    for i in range(model.patch_count):
+        # A patch is measured without the belief that it must be some material itself.
+        without_patch = all_evidence.copy()
+        without_patch[i + 1] = 0.0
+        particles = _anneal(model, posterior, all_evidence, without_patch, rng)
+        patches.append(_estimate(model, particles, i, rng))
     return _solution(model, posterior, tuple(patches))
 
 
 class _Scene:
-    """Likelihood of the common errors. They are deviations from the prior's mean in its standard deviations."""
+    """Likelihood of the common errors.
+
+    A particle z [WIDTH] holds the common errors as deviations from the prior's mean in its standard deviations; its
+    columns are named at the top of the module. Methods take z [..., WIDTH].
+    """
 
     def __init__(self, seen: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None) -> None:
-        self.prior, self.kinds, self.n = prior, kinds, len(seen)
-        self.q = np.array([s.inverse_ratio for s in seen], np.complex128)
+        self.prior = prior
+        self.kinds = kinds
+        self.patch_count = len(seen)
+        self.measured = np.array([s.inverse_ratio for s in seen], np.complex128)
         self.rise = np.array([s.rise for s in seen], np.float64).reshape(-1, 2)
         self.theta = np.array([s.theta_rad for s in seen], np.float64)
         level = np.array([np.nan if s.brightness is None else s.brightness for s in seen], np.float64)
         # Metal-like patches have |H| = 1 with any leakage: they give no information on it.
-        self.bright = np.isfinite(level) & (level > 0) & (np.abs(self.q - 1) > METAL_WITHOUT_BRIGHTNESS)
+        unlike_metal = np.abs(self.measured - 1) > METAL_WITHOUT_BRIGHTNESS
+        self.bright = np.isfinite(level) & (level > 0) & unlike_metal
         self.log_level = np.log(np.where(self.bright, level, 1.0))
         self.own = self._own_covariances(seen)
         self.maps = () if kinds is None else self._maps(kinds)
@@ -288,19 +311,17 @@ class _Scene:
         """Return the covariance of each patch's t by its own errors, [patch, 2, 2]: those of V / H, to first order."""
         if not seen:
             return np.zeros((0, 2, 2))
-        nominal = np.zeros((1, _WIDTH))
-        step = 1e-4 * np.maximum(np.abs(self.q), 1e-3)
-        before = self.ratios(nominal)[0]
-        self.q = self.q + step
-        after = self.ratios(nominal)[0]
-        self.q = self.q - step
-        return turned((after - before) / step, np.stack([s.covariance for s in seen]))
+        nominal = np.zeros((1, WIDTH))
+        step = 1e-4 * np.maximum(np.abs(self.measured), 1e-3)
+        at_measured = self._ratios_of(self.measured, nominal)[0]
+        beside = self._ratios_of(self.measured + step, nominal)[0]
+        return turned((beside - at_measured) / step, np.stack([s.covariance for s in seen]))
 
     def _maps(self, kinds: Kinds) -> tuple[DensityMap, ...]:
         """Return the density of each patch's ratio over its possible values."""
-        drawn = self.ratios(np.random.default_rng(1).standard_normal((_PARTICLES, _WIDTH)))
+        drawn = self.ratios(np.random.default_rng(1).standard_normal((PARTICLES, WIDTH)))
         maps = []
-        for i in range(self.n):
+        for i in range(self.patch_count):
             t = drawn[np.isfinite(drawn[:, i]) & (np.abs(drawn[:, i]) < 3.0), i]
             if not t.size:
                 t = np.zeros(1, np.complex128)
@@ -312,14 +333,14 @@ class _Scene:
         return tuple(maps)
 
     def leakage(self, z: Real) -> tuple[Complex, Complex]:
-        """Return a and b, [..., 1] each."""
+        """Return a and b at the metal's place, [..., 1] each."""
         p = self.prior
-        moved = (
-            z[..., 9, None] > scipy.special.ndtri(1 - p.moved) if p.moved > 0 else np.zeros((*z.shape[:-1], 1), bool)
-        )
-        scale = np.where(moved, max(MOVED_STD, p.leakage_std), p.leakage_std)
-        a = p.leakage[0] + scale * (z[..., 0, None] + 1j * z[..., 1, None])
-        b = p.leakage[1] + scale * (z[..., 2, None] + 1j * z[..., 3, None])
+        scale: Real | float = p.leakage_std
+        if p.moved > 0:
+            moved = z[..., HAS_MOVED, None] > scipy.special.ndtri(1 - p.moved)
+            scale = np.where(moved, max(MOVED_STD, p.leakage_std), p.leakage_std)
+        a = p.leakage[0] + scale * _complex(z, LEAKAGE_H)
+        b = p.leakage[1] + scale * _complex(z, LEAKAGE_V)
         return a, b
 
     def leakage_of_patches(self, z: Real) -> tuple[Complex, Complex]:
@@ -330,55 +351,62 @@ class _Scene:
 
     def turn(self, z: Real) -> Real:
         """Return the turn of the polarisations by a rise across the plane of incidence, [..., 1], per radian."""
-        return self.prior.turn + self.prior.turn_std * z[..., 11, None]
+        return self.prior.turn + self.prior.turn_std * z[..., TURN_BY_RISE, None]
 
     def lighting(self, z: Real) -> Complex:
         """Return the change of ln(V / H) of each patch by its rise relative to the metal's, [..., patch]."""
-        along, across = self.prior.lighting_std
+        std_along, std_across = self.prior.lighting_std
         rise = self.rise - np.array(self.prior.metal_rise)
-        by_across = across * (z[..., 12, None] + 0.1j * z[..., 13, None]) - 4 * self.turn(z)
-        return along * z[..., 14, None] * rise[:, 0] + by_across * rise[:, 1]
+        by_patterns = z[..., LIGHT_ACROSS[0], None] + 0.1j * z[..., LIGHT_ACROSS[1], None]
+        across = std_across * by_patterns - 4 * self.turn(z)
+        along = std_along * z[..., LIGHT_ALONG, None]
+        return along * rise[:, 0] + across * rise[:, 1]
 
     def angle(self, z: Real) -> Real:
         """Return the true angles, [..., patch]."""
-        return self.theta + self.prior.theta_std_rad * z[..., 6, None]
+        return self.theta + self.prior.theta_std_rad * z[..., ANGLE, None]
 
     def ratios(self, z: Real) -> Complex:
         """Return t of every patch, [..., patch]."""
+        return self._ratios_of(self.measured, z)
+
+    def _ratios_of(self, measured: Complex, z: Real) -> Complex:
+        """Return t of measured V / H [patch], [..., patch]."""
         a, b = self.leakage_of_patches(z)
-        rho = self.prior.reference_std * (z[..., 4, None] + 1j * z[..., 5, None])
-        return true_ratio(self.q * np.exp(-self.lighting(z)), a, b, rho)
+        rho = self.prior.reference_std * _complex(z, REFERENCE)
+        return true_ratio(measured * np.exp(-self.lighting(z)), a, b, rho)
 
     def ratios_of_kinds(self, z: Real, kinds: Kinds) -> Complex:
         """Return t that each patch would have at the angle of the kinds, [..., patch]."""
         return at_angle(self.ratios(z), self.angle(z), kinds.theta_rad)
 
-    def permittivities(self, z: Real, ratios: Complex | None = None) -> Complex:
+    def permittivities(self, z: Real) -> Complex:
         """Return the permittivity of every patch, [..., patch]."""
-        t = self.ratios(z) if ratios is None else ratios
-        return np.asarray(permittivity_from_ratio(t, self.angle(z)), np.complex128)
+        return np.asarray(permittivity_from_ratio(self.ratios(z), self.angle(z)), np.complex128)
 
     def brightness_off(self, z: Real) -> Real:
         """Return ln |H| of every patch minus that of Eq. 2 and the metal's, [..., patch]."""
         a, _ = self.leakage_of_patches(z)
-        t, cosine, sine2 = self.ratios(z), np.cos(self.angle(z)), np.sin(self.angle(z)) ** 2
+        t = self.ratios(z)
+        angle = self.angle(z)
+        cosine = np.cos(angle)
         with np.errstate(divide="ignore", invalid="ignore"):
-            q = (1 + t) / (1 - t) * sine2 / cosine
+            q = (1 + t) / (1 - t) * np.sin(angle) ** 2 / cosine
             model = np.log(np.abs((cosine - q) / (cosine + q) * (1 + a * t) / (1 + a)))
-        off = self.log_level - model - METAL_BRIGHTNESS_STD * z[..., 7, None]
+        off = self.log_level - model - METAL_BRIGHTNESS_STD * z[..., METAL_BRIGHTNESS, None]
         return np.where(np.isfinite(off), np.clip(off, -10, 10), 10.0)
 
     def brightness_std(self, z: Real) -> Real:
         """Return the usual size of ln kappa, [...]."""
         low, high = self.prior.brightness_range
-        return low * (high / low) ** scipy.special.ndtr(z[..., 8])
+        return low * (high / low) ** scipy.special.ndtr(z[..., SIZE_OF_BRIGHTNESS])
 
     def library_share(self, z: Real) -> Real:
         """Return the share of the library's materials in this scene, [...]; uniform."""
         if self.kinds is None or not self.kinds.ours.any():
             return np.full(z.shape[:-1], 1e-12)
         low, high = LIBRARY_SHARE
-        return low + (high - low) * scipy.special.ndtr(z[..., 10])
+        return low + (high - low) * scipy.special.ndtr(z[..., SHARE_OF_LIBRARY])
 
     def log_likelihoods(self, z: Real) -> Real:
         """Return log likelihoods [..., 1 + patch]: of all brightnesses, and of each patch to be some material."""
@@ -386,56 +414,70 @@ class _Scene:
         off = self.brightness_off(z)
         usual = (1 - ODD_BRIGHTNESS) / size * np.exp(-0.5 * (off / size) ** 2)
         odd = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (off / ODD_BRIGHTNESS_STD) ** 2)
-        bright = np.where(self.bright, np.log(usual + odd + 1e-300), 0.0).sum(axis=-1, keepdims=True)
+        of_brightness = np.where(self.bright, np.log(usual + odd + 1e-300), 0.0).sum(axis=-1, keepdims=True)
         if self.kinds is None:
-            return np.concatenate([bright, np.zeros((*bright.shape[:-1], self.n))], axis=-1)
+            no_evidence = np.zeros((*of_brightness.shape[:-1], self.patch_count))
+            return np.concatenate([of_brightness, no_evidence], axis=-1)
         if not self.maps:
-            return bright
+            return of_brightness
         t = self.ratios_of_kinds(z, self.kinds)
-        ours = np.log(self.library_share(z))
-        others = np.log1p(-self.library_share(z))
-        some = []
+        library_share = self.library_share(z)
+        log_ours = np.log(library_share)
+        log_others = np.log1p(-library_share)
+        of_patches = []
         for i, density in enumerate(self.maps):
             of_library, of_others = density.at(t[..., i])
-            some.append(np.logaddexp(ours + of_library, others + of_others))
-        return np.concatenate([bright, np.stack(some, axis=-1)], axis=-1)
+            of_patches.append(np.logaddexp(log_ours + of_library, log_others + of_others))
+        return np.concatenate([of_brightness, np.stack(of_patches, axis=-1)], axis=-1)
+
+
+def _complex(z: Real, columns: tuple[int, int]) -> Complex:
+    """Return two columns of particles as real and imaginary part, [..., 1]."""
+    return z[..., columns[0], None] + 1j * z[..., columns[1], None]
 
 
 def _anneal(model: _Scene, z: Real, before: Real, after: Real, rng: np.random.Generator) -> Real:
     """Move particles of one posterior to another; `before`, `after` [1 + patch] weigh the log likelihoods."""
-    parts, weight = model.log_likelihoods(z), before
+    parts = model.log_likelihoods(z)
     change = after - before
     done = 0.0
     while done < 1:
         gain = parts @ change
-        step = _step(gain, 1 - done)
+        step = _choose_step(gain, 1 - done)
         done = 1.0 if step >= 1 - done else done + step
         weight = before + done * change
         chosen = _resample(np.exp(step * (gain - gain.max())), rng)
-        z, parts = z[chosen], parts[chosen]
-        spread = np.linalg.cholesky(np.cov(z.T) + 1e-9 * np.eye(_WIDTH)) * 2.0 / np.sqrt(_WIDTH)
-        for _ in range(_MOVES):
-            tried = z + rng.standard_normal(z.shape) @ spread.T
-            there = model.log_likelihoods(tried)
-            odds = (there - parts) @ weight - 0.5 * np.sum(tried**2 - z**2, axis=1)
-            accepted = np.log(rng.random(len(z))) < odds
-            z, parts = np.where(accepted[:, None], tried, z), np.where(accepted[:, None], there, parts)
+        z = z[chosen]
+        parts = parts[chosen]
+        # Random walk of the usual size in so many dimensions, shaped as the particles lie.
+        spread = np.linalg.cholesky(np.cov(z.T) + 1e-9 * np.eye(WIDTH)) * 2.0 / np.sqrt(WIDTH)
+        for _ in range(MOVES):
+            proposed = z + rng.standard_normal(z.shape) @ spread.T
+            parts_proposed = model.log_likelihoods(proposed)
+            log_odds = (parts_proposed - parts) @ weight - 0.5 * np.sum(proposed**2 - z**2, axis=1)
+            accepted = (np.log(rng.random(len(z))) < log_odds)[:, None]
+            z = np.where(accepted, proposed, z)
+            parts = np.where(accepted, parts_proposed, parts)
     return z
 
 
-def _step(gain: Real, most: float) -> float:
+def _choose_step(gain: Real, most: float) -> float:
     """Return the largest step of the temperature that leaves half of the particles' weight effective."""
 
-    def effective(step: float) -> float:
+    def effective_share(step: float) -> float:
         weight = np.exp(step * (gain - gain.max()))
         return float(weight.sum() ** 2 / np.sum(weight**2)) / gain.size
 
-    if effective(most) >= 0.5:
+    if effective_share(most) >= 0.5:
         return most
-    low, high = 0.0, most
+    low = 0.0
+    high = most
     for _ in range(30):
         middle = (low + high) / 2
-        low, high = (middle, high) if effective(middle) >= 0.5 else (low, middle)
+        if effective_share(middle) >= 0.5:
+            low = middle
+        else:
+            high = middle
     return max(low, 1e-6)
 
 
@@ -446,23 +488,23 @@ def _resample(weight: Real, rng: np.random.Generator) -> npt.NDArray[np.intp]:
 
 
 def _solution(model: _Scene, z: Real, patches: tuple[PatchEstimate, ...]) -> Inversion:
+    """Collect the solution from particles of the posterior."""
     prior = model.prior
-    a, b = (leak[:, 0] for leak in model.leakage(z))
+    a, b = (leakage[:, 0] for leakage in model.leakage(z))
     unit = max(prior.leakage_std, 1e-12)
-    parts = np.stack([a.real, a.imag, b.real, b.imag], axis=1) / unit
-    everything = np.cov(np.concatenate([parts, z[:, 4:7]], axis=1).T)
-    spread = unit * np.sqrt(np.diag(everything)[:4])
-    off = np.where(model.bright, np.median(model.brightness_off(z), axis=0), np.nan)
+    leakage_in_units = np.stack([a.real, a.imag, b.real, b.imag], axis=1) / unit
+    covariance = np.cov(np.concatenate([leakage_in_units, z[:, REFERENCE]], axis=1).T)
+    leakage_variance = unit**2 * np.diag(covariance)[:4]
     return Inversion(
-        patches,
-        (complex(a.mean()), complex(b.mean())),
-        (float(np.hypot(*spread[:2]) / np.sqrt(2)), float(np.hypot(*spread[2:]) / np.sqrt(2))),
-        prior.leakage_std,
-        float(prior.theta_std_rad * z[:, 6].mean()),
-        float(prior.theta_std_rad * np.std(z[:, 6])),
-        np.asarray(off, np.float64),
-        float(np.exp(np.log(model.brightness_std(z)).mean())),
-        everything,
+        patches=patches,
+        leakage=(complex(a.mean()), complex(b.mean())),
+        leakage_std=(float(np.sqrt(leakage_variance[:2].mean())), float(np.sqrt(leakage_variance[2:].mean()))),
+        prior_std=prior.leakage_std,
+        theta_error_rad=float(prior.theta_std_rad * z[:, ANGLE].mean()),
+        theta_std_rad=float(prior.theta_std_rad * np.std(z[:, ANGLE])),
+        brightness_off=np.where(model.bright, np.median(model.brightness_off(z), axis=0), np.nan),
+        brightness_std=float(np.exp(np.log(model.brightness_std(z)).mean())),
+        nuisance_covariance=covariance,
     )
 
 
@@ -471,46 +513,59 @@ def _estimate(model: _Scene, z: Real, i: int, rng: np.random.Generator) -> Patch
     t = model.ratios(z)[:, i]
     middle = complex(t.mean())
     of_ratio = np.cov(pair(t).T) + model.own[i]
-    evidence = None if model.kinds is None else _evidence(model, model.kinds, z, i)
-    distance = min(abs(middle - 1), abs(1 / middle - 1) if middle else np.inf)
-    if not distance >= max(METAL_WITHOUT_PERMITTIVITY, LEAST_DISTANCE * np.sqrt(np.trace(of_ratio) / 2)):
+    evidence = None
+    if model.kinds is not None:
+        evidence = _evidence(model, model.kinds, z, i)
+    from_metal = abs(middle - 1)
+    if middle:
+        from_metal = min(from_metal, abs(1 / middle - 1))
+    # Also if it is not a number.
+    if not from_metal >= max(METAL_WITHOUT_PERMITTIVITY, LEAST_DISTANCE * np.sqrt(np.trace(of_ratio) / 2)):
         return PatchEstimate(middle, of_ratio, None, None, {}, evidence)
-    theta = float(model.angle(z)[:, i].mean())
-    value = complex(permittivity_from_ratio(middle, theta))
-    noise = rng.multivariate_normal(np.zeros(2), model.own[i], (_DRAWS, len(z)), method="cholesky")
+
+    angles = model.angle(z)[:, i]
+    value = complex(permittivity_from_ratio(middle, float(angles.mean())))
+    noise = rng.multivariate_normal(np.zeros(2), model.own[i], (DRAWS, len(z)), method="cholesky")
     drawn_t = t + noise[..., 0] + 1j * noise[..., 1]
-    drawn = np.asarray(permittivity_from_ratio(drawn_t, model.angle(z)[:, i]), np.complex128)
+    drawn = np.asarray(permittivity_from_ratio(drawn_t, angles), np.complex128)
     # Near metal the moments of the far tail do not exist: three standard deviations of the ratio are kept.
     off = pair(drawn_t - middle)
-    kept = np.einsum("...i,ij,...j->...", off, np.linalg.inv(of_ratio), off) < 11.8
+    kept = np.einsum("...i,ij,...j->...", off, np.linalg.inv(of_ratio), off) < CHI2_997
     parts = pair(drawn[kept] - value)
     covariance = np.asarray(parts.T @ parts / len(parts), np.float64)
     # A tail (the mount may have moved) widens a covariance more than the region that holds 95 %.
     distance2 = np.einsum("...i,ij,...j->...", parts, np.linalg.inv(covariance), parts)
     covariance *= float(np.quantile(distance2, 0.95)) / CHI2_95
-    return PatchEstimate(middle, of_ratio, value, covariance, _shares(model, z, i, value), evidence)
+    shares = _shares_of_sources(model, z, i, value)
+    return PatchEstimate(middle, of_ratio, value, covariance, shares, evidence)
 
 
-def _shares(model: _Scene, z: Real, i: int, value: complex) -> dict[str, float]:
+def _shares_of_sources(model: _Scene, z: Real, i: int, value: complex) -> dict[str, float]:
     """Return the share of each source in the variance of a permittivity, to first order; they add up to 1."""
     mean = np.tile(z.mean(axis=0), (len(z), 1))
-    together = model.permittivities(z)[:, i] - value
-    out = {"noise": float(abs(slope(model.ratios(mean[:1])[0, i], model.theta[i])) ** 2 * np.trace(model.own[i]))}
-    for source, columns in _GROUPS.items():
+    of_all = model.permittivities(z)[:, i] - value
+    slope_at_mean = slope(model.ratios(mean[:1])[0, i], model.theta[i])
+    variance = {"noise": float(abs(slope_at_mean) ** 2 * np.trace(model.own[i]))}
+    at_mean = model.permittivities(mean[:1])[0, i]
+    for source, columns in COLUMNS_OF_SOURCE.items():
         alone = mean.copy()
         alone[:, columns] = z[:, columns]
-        effect = model.permittivities(alone)[:, i] - model.permittivities(mean[:1])[0, i]
-        out[source] = max(0.0, float(np.mean((np.conj(effect) * together).real)))
-    total = sum(out.values())
-    return {source: out[source] / total for source in SOURCES} if np.isfinite(total) and total > 0 else {}
+        effect = model.permittivities(alone)[:, i] - at_mean
+        variance[source] = max(0.0, float(np.mean((np.conj(effect) * of_all).real)))
+    total = sum(variance.values())
+    if not (np.isfinite(total) and total > 0):
+        return {}
+    return {source: variance[source] / total for source in SOURCES}
 
 
 def _evidence(model: _Scene, kinds: Kinds, z: Real, i: int) -> RatioEvidence:
     """Return what the scene says of a patch's ratio at the angle of the kinds."""
     t = model.ratios_of_kinds(z, kinds)[:, i]
     covariance = np.cov(pair(t).T) + model.own[i]
-    share = float(model.library_share(z).mean()) if kinds.ours.any() else USUAL_LIBRARY_SHARE
-    return RatioEvidence(kinds.theta_rad, complex(t.mean()), covariance, share)
+    library_share = USUAL_LIBRARY_SHARE
+    if kinds.ours.any():
+        library_share = float(model.library_share(z).mean())
+    return RatioEvidence(kinds.theta_rad, complex(t.mean()), covariance, library_share)
 
 
 def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:
@@ -521,11 +576,12 @@ def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real
     """
     t = np.asarray(t, np.complex128)
     scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
-    with np.errstate(invalid="ignore"):  # pixels without a ratio stay so
-        by = np.stack([-(1 - t) * t, -(1 - t), -t], axis=-1) * scale
-    both = np.stack([by, 1j * by], axis=-1).reshape(*t.shape, 6)
-    values, vectors = np.linalg.eigh(estimate.nuisance_covariance[:6, :6])
-    return np.stack([both.real, both.imag], axis=-2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    # Pixels without a ratio stay so.
+    with np.errstate(invalid="ignore"):
+        by_real_part = np.stack([-(1 - t) * t, -(1 - t), -t], axis=-1) * scale
+    by_error = np.stack([by_real_part, 1j * by_real_part], axis=-1).reshape(*t.shape, 6)
+    values, vectors = np.linalg.eigh(estimate.nuisance_covariance)
+    return np.stack([by_error.real, by_error.imag], axis=-2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def ratio_error(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:

@@ -4,7 +4,7 @@
 returns a `MaterialsResult`. On the way: `segment.py` finds patches, `measure.py` measures
 them, `metal.py` finds and judges the metal reference, `inversion.py` solves for all permittivities and the rig's errors
 together, `kinds.py` says what a patch may be, `names.py` names it, `classify.py` holds the library's models;
-`discriminant.py` has the materials' distributions, and names scans of several angles. `sub_bands.py` and `layers.py`
+`discriminant.py` learns the spread of specimens, placements and scans from a library. `sub_bands.py` and `layers.py`
 fit thin layers. `make_library` makes a library of scans, `fit_concentration` a line through solutions. `labels.py`
 reads boxes with names and true plates, `catalogue.py` the permittivities of the literature, `train.py` the published
 data set.

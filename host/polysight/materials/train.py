@@ -600,7 +600,7 @@ def _confidence_lines(angle: str, fit: Mapping[str, Any]) -> list[str]:
     if abs(misfit) > max(2 * chance, LEAST_MISFIT):
         kind = "overconfident" if misfit > 0 else "underconfident"
         if misfit < 0 and not fit["specimen_freedom"]:
-            why = "no second specimen of a material is known: how they differ counts as an error of placement, of all alike"
+            why = "no second specimen of a material is known: how they differ counts as an error of placement"
         elif misfit < 0:
             why = "its specimens differ less than the published spread says, which counts as 4 specimens"
         elif fit["scans"] < FEW_SCANS:

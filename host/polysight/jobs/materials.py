@@ -514,8 +514,8 @@ def _contradictions(
     matched: Sequence[MatchedPatch],
     named: Sequence[NamedPatch],
 ) -> list[str]:
-    """Describe unknown patches that match different materials at different angles, one line each."""
-    if len(angles_deg) < 2 or all(n.verdict.name != UNKNOWN for n in named):
+    """Describe patches without a name that match different materials at different angles, one line each."""
+    if len(angles_deg) < 2 or all(n.verdict.source == "library" for n in named):
         return []
     alone = []
     for i, angle_deg in enumerate(angles_deg):
@@ -525,7 +525,8 @@ def _contradictions(
     out = []
     for m, together, *each in zip(matched, named, *alone, strict=True):
         names = [n.verdict.name for n in each]
-        if together.verdict.name == UNKNOWN and len(set(names) - {UNKNOWN}) > 1:
+        materials_alone = {n.verdict.name for n in each if n.verdict.source == "library"}
+        if together.verdict.source != "library" and len(materials_alone) > 1:
             answers = ", ".join(f"{name} at {a:g} degrees" for name, a in zip(names, angles_deg, strict=True))
             out.append(f"patch {m.label} contradicts itself: {answers}; was it moved or exchanged between the scans?")
     return out

@@ -157,44 +157,68 @@ def name_patch(
     if not good.any():
         return nothing_named(good.size)
     seen = [at_kinds(evidence, at) for evidence, at in zip(seen, kinds, strict=True)]
+    odds = weigh_kinds(kinds, seen)
+    at_first = kinds[0]
+    names = np.array(at_first.names)
+    foreign_name, in_foreign_name = name_of_literature(at_first, odds)
+    verdict = replace(_verdict(at_first, odds, foreign_name, in_foreign_name), pixels=int(good.sum()))
+
     # Pixels get the corrections of their patch: leakage, tilt, and the common change over the plane.
     middle = np.median(inverse_ratios[good].real, axis=0) + 1j * np.median(inverse_ratios[good].imag, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         correction = np.array([evidence.inverse_ratio for evidence in seen]) / middle
-    inverse_ratios = inverse_ratios * np.where(np.isfinite(correction), correction, 1.0)
-    odds = weigh_kinds(kinds, seen)
-    first = kinds[0]
-    names = np.array(first.names)
-    foreign, meant = name_of_literature(first, odds)
-    share = {str(names[k]): float(odds.kinds[k]) for k in np.flatnonzero(first.ours)}
-    nearest = min(share, key=lambda name: odds.distance[first.names.index(name)], default=None)
-    if foreign:
-        share[foreign] = float(odds.kinds[meant].sum())
-    if first.sheet_share:
-        share[LAYER] = odds.sheet
-    likely = {name: round(p, 4) for name, p in share.items() if p >= LIKELY}
+    corrected = inverse_ratios * np.where(np.isfinite(correction), correction, 1.0)
+    called = np.where(at_first.ours, names, np.where(in_foreign_name, foreign_name, UNKNOWN))
+    pixel_names, pixel_distance, confidence = _name_pixels(kinds, seen, corrected, odds.kinds, called)
+    return NamedPatch(pixel_names, pixel_distance, replace(verdict, votes=share_of_pixels(pixel_names)), confidence)
+
+
+def _verdict(kinds: Kinds, odds: Odds, foreign_name: str, in_foreign_name: npt.NDArray[np.bool_]) -> PatchName:
+    """Return the patch's name and its probabilities, without votes of pixels.
+
+    `foreign_name` is what the literature's materials are called together, `in_foreign_name` bool [kind] those meant.
+    """
+    probability = {}
+    distances = {}
+    literature = {}
+    for k, name in enumerate(kinds.names):
+        distances[name] = float(odds.distance[k])
+        if kinds.ours[k]:
+            probability[name] = float(odds.kinds[k])
+        else:
+            literature[name] = float(odds.kinds[k])
+    nearest = min(probability, key=lambda name: distances[name], default=None)
+    if foreign_name:
+        probability[foreign_name] = float(odds.kinds[in_foreign_name].sum())
+        distances[foreign_name] = float(odds.distance[in_foreign_name].min())
+    if kinds.sheet_share:
+        probability[LAYER] = odds.sheet
+    likely = _likeliest_first(probability)
+    # Names of little probability count as unknown, so that the sum stays one.
     likely[UNKNOWN] = round(1 - sum(likely.values()), 4)
-    likely = dict(sorted(likely.items(), key=lambda item: -item[1]))
+    likely = _likeliest_first(likely, least=0.0)
+
     name = next(iter(likely))
-    distances = {str(n): float(d) for n, d in zip(names, odds.distance, strict=True)}
-    distance = distances.get(name, float(odds.distance[meant].min()) if name == foreign else np.inf)
+    distance = distances.get(name, np.inf)
     if name in (UNKNOWN, LAYER) and nearest is not None:
         distance = distances[nearest]
-    literature = {str(names[k]): round(float(odds.kinds[k]), 4) for k in np.flatnonzero(~first.ours)}
-    verdict = PatchName(
-        name,
-        likely[name],
-        {},
-        distance,
-        int(good.sum()),
-        likely,
+    return PatchName(
+        name=name,
+        confidence=likely[name],
+        votes={},
+        distance=distance,
+        pixels=0,
+        probabilities=likely,
         nearest=nearest,
-        literature={n: p for n, p in sorted(literature.items(), key=lambda item: -item[1]) if p >= LIKELY},
-        from_literature=name == foreign,
+        literature=_likeliest_first(literature),
+        from_literature=name == foreign_name,
     )
-    called = np.where(first.ours, names, np.where(meant, foreign, UNKNOWN))
-    pixel_names, far, sure = _name_pixels(kinds, seen, inverse_ratios, odds.kinds, called)
-    return NamedPatch(pixel_names, far, replace(verdict, votes=share_of_pixels(pixel_names)), sure)
+
+
+def _likeliest_first(probability: Mapping[str, float], least: float = LIKELY) -> dict[str, float]:
+    """Return the probabilities of at least `least`, rounded, largest first."""
+    ordered = sorted(probability.items(), key=lambda item: -item[1])
+    return {name: round(p, 4) for name, p in ordered if p >= least}
 
 
 def share_of_pixels(pixel_names: npt.NDArray[np.str_]) -> dict[str, float]:
@@ -271,22 +295,37 @@ def add_explanation(
     has none. `known` are the library's permittivities.
     """
     name = named.verdict
-    found = _estimate(permittivity, covariance)
-    nearest = name.name if name.name in known else name.nearest
-    like = "" if nearest is None else _with_permittivity(nearest, known.get(nearest))
-    near = f"; nearest: {like}" if like else ""
+    estimate = _estimate(permittivity, covariance)
+    nearest = name.nearest
+    if name.name in known:
+        nearest = name.name
+    nearest_text = ""
+    near = ""
+    if nearest is not None:
+        nearest_text = _with_permittivity(nearest, known.get(nearest))
+        near = f"; nearest: {nearest_text}"
     if name.name == UNKNOWN:
-        why = f"not in the library: {found}{near}" if found else f"not in the library{near}"
+        why = f"not in the library: {estimate}{near}" if estimate else f"not in the library{near}"
     elif name.name == LAYER:
-        why = f"{found} as a half space, but rather a thin plate{near}" if found else f"rather a thin plate{near}"
+        why = f"{estimate} as a half space, but rather a thin plate{near}" if estimate else f"rather a thin plate{near}"
     elif name.from_literature:
-        why = f"{found} is like {_values_of(name.literature)} of the literature; not measured by this library{near}"
+        values = _values_of(name.literature)
+        why = f"{estimate} is like {values} of the literature; not measured by this library{near}"
     else:
-        others = [f"{n} {100 * p:.0f} %" for n, p in name.probabilities.items() if n not in (name.name, UNKNOWN)][:2]
-        match = f"{found} matches the library's {like}" if found else f"it looks like the library's {like}"
-        alone = "; no other material is likely" if name.probabilities else ""  # the KNN has no probabilities
-        why = match + (f"; it could also be {' or '.join(others)}" if others else alone)
+        why = f"{estimate} matches the library's {nearest_text}{_rivals(name)}"
+        if not estimate:
+            why = f"it looks like the library's {nearest_text}{_rivals(name)}"
     return replace(named, verdict=replace(name, why=why))
+
+
+def _rivals(name: PatchName) -> str:
+    """Say which other names are likely; nothing of the KNN, which has no probabilities."""
+    others = [f"{n} {100 * p:.0f} %" for n, p in name.probabilities.items() if n not in (name.name, UNKNOWN)]
+    if others:
+        return f"; it could also be {' or '.join(others[:2])}"
+    if name.probabilities:
+        return "; no other material is likely"
+    return ""
 
 
 def _estimate(permittivity: complex | None, covariance: npt.NDArray[np.float64] | None) -> str:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy
-from msgspec import UNSET
+from msgspec import UNSET, structs
 
 from polysight.imaging import Image, Images, Rise
 from polysight.materials.inversion import Inversion, RigPrior, ratio_error
@@ -201,21 +201,13 @@ class MaterialsResult:
         return float(np.degrees(np.mean(inside)))
 
     def _figures(self, r: PatchResult) -> PatchFigures:
-        label, e, name = r.patch.label, r.permittivity, r.verdict
+        label = r.patch.label
+        e = r.permittivity
         x0, y0, x1, y1 = r.patch.box_mm
         level = np.abs(self.h[r.patch.interior])
         level = level[np.isfinite(level)]
-        tilt = r.refused is None and label in self.tilts.rises
-        return PatchFigures(
+        figures = PatchFigures(
             label=label,
-            name=name.name if name else None,
-            name_source=None if name is None else name.source,
-            confidence=name.confidence if name else None,
-            votes=name.votes if name else {},
-            probabilities=name.probabilities if name else {},
-            literature=name.literature if name else {},
-            why=name.why if name else "",
-            distance=name.distance if name and math.isfinite(name.distance) else None,
             metal_reference=label == self.metal.label,
             metal_like=e.metal_like and r.refused is None,
             box_mm=(round(x0, 3), round(y0, 3), round(x1, 3), round(y1, 3)),
@@ -224,15 +216,42 @@ class MaterialsResult:
             interior_pixels=e.pixels,
             incidence_deg=self.incidence_deg(r.patch),
             ratio=ComplexNumber.of(e.ratio),
-            inverse_ratio_std=e.inverse_std if math.isfinite(e.inverse_std) else None,
-            permittivity=_permittivity_figures(e) if r.refused is None else None,
+            inverse_ratio_std=_finite(e.inverse_std),
             amplitude_h=round(float(np.median(level)), 6) if level.size else None,
             refused=r.refused,
-            truth=None if r.truth is None else _truth_figures(r.truth, self.library),
-            tilt_across_deg=round(float(np.degrees(self.tilts.across_rad(label))), 3) if tilt else UNSET,
             bands=self.bands.get(label, UNSET),
             box=self.boxes.get(label, UNSET),
         )
+        if r.truth is not None:
+            figures = structs.replace(figures, truth=_truth_figures(r.truth, self.library))
+        if r.verdict is not None:
+            figures = _with_name(figures, r.verdict)
+        if r.refused is None:
+            figures = structs.replace(figures, permittivity=_permittivity_figures(e))
+            if label in self.tilts.rises:
+                across_deg = round(float(np.degrees(self.tilts.across_rad(label))), 3)
+                figures = structs.replace(figures, tilt_across_deg=across_deg)
+        return figures
+
+
+def _with_name(figures: PatchFigures, name: PatchName) -> PatchFigures:
+    """Add the name to a patch's figures."""
+    return structs.replace(
+        figures,
+        name=name.name,
+        name_source=name.source,
+        confidence=name.confidence,
+        votes=name.votes,
+        probabilities=name.probabilities,
+        literature=name.literature,
+        why=name.why,
+        distance=_finite(name.distance),
+    )
+
+
+def _finite(value: float) -> float | None:
+    """Return a number for a file; None for infinity and for what is no number."""
+    return value if math.isfinite(value) else None
 
 
 def _permittivity_figures(e: Permittivity) -> PermittivityFigures | None:

@@ -5,7 +5,8 @@ import pytest
 from tests.materials.test_specimens import KINDS, drawn
 
 from polysight.materials import Library, accuracy_lines
-from polysight.materials.train import FREEDOM_NEEDED, fit_samples
+from polysight.materials.train import fit_samples
+from polysight.materials.training_advice import FREEDOM_NEEDED
 
 CLOSE = {"acrylic": 4.0 - 0.4j, "resin": 4.03 - 0.405j, "rubber": 5.06 - 1.11j}
 

@@ -108,7 +108,6 @@ from polysight.materials.train import (
     LabelledScan,
     Score,
     TrainingScan,
-    accuracy_lines,
     angle_in_text,
     calibration_error,
     entries_of_boxes,
@@ -122,6 +121,7 @@ from polysight.materials.train import (
     score,
     score_unseen_materials,
 )
+from polysight.materials.training_advice import accuracy_lines
 
 if TYPE_CHECKING:
     from polysight.materials.paper_knn import PaperKNeighborsClassifier

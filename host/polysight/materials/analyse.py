@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise, correct_tilt
-from polysight.materials.classify import Classifier
+from polysight.materials.classify import PAPER, Classifier
 from polysight.materials.inversion import (
     EVEN_LIGHT,
     MOVED,
@@ -58,7 +58,7 @@ from polysight.materials.metal import (
     metal_in_box,
     no_metal,
 )
-from polysight.materials.names import UNKNOWN, NamedPatch, add_explanation
+from polysight.materials.names import UNKNOWN, NamedPatch, add_explanation, name_patch
 from polysight.materials.result import MaterialsResult, PatchResult, Tilts, features_of
 from polysight.materials.segment import (
     Box,
@@ -242,91 +242,50 @@ def analyse(
     if plane is not None:
         plane.check_axes(images.x_m, images.y_m)
         images = images.within(plane.valid)
-    theta = np.asarray(optics.theta_rad, np.float64)
-    mean_theta = float(np.mean(theta))
-
-    # Find the plates, level them, and divide by metal.
     images, apart_mm = align(images)
-    segmentation = _patches(images, known)
-    images, tilts = level(images, segmentation)
-    metal = _reference(images, known, segmentation)
-    to_reference = to_metal(images, metal, plane)
-    smooth_h = smooth_inside(to_reference.h, segmentation, optics.smooth_px)
-    smooth_v = smooth_inside(to_reference.v, segmentation, optics.smooth_px)
-
-    # Refuse what is no flat plate.
-    dark = background(to_reference.h, to_reference.v, segmentation, images.usable)
-    refused = check_patches(segmentation, smooth_h, smooth_v, dark, metal.mask)
-    refused |= {p.label: STEEP for p in segmentation.patches if p.label in tilts.steep}
-    judged = [p for p in segmentation.patches if p.label not in refused and p.label != metal.label]
-    labels = [p.label for p in judged]
-
-    # Measure the plates, and what the scene says of its own errors.
-    seen = Seen.of((smooth_h, smooth_v), to_reference, judged, segmentation, metal, plane, images, tilts)
+    found = _patches(images, known)
+    images, tilts = level(images, found)
+    reference = _reference(images, known, found)
+    raw = to_metal(images, reference, plane)
+    rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
+    refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
+    refused |= {p.label: STEEP for p in found.patches if p.label in tilts.steep}
+    judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
+    theta = np.asarray(optics.theta_rad, np.float64)
+    seen = Seen.of((rh, rv), raw, judged, found, reference, plane, images, tilts)
     prior = seen.prior(optics.prior, float(np.hypot(*apart_mm)))
-    measured = [seen.measure(p, (smooth_h, smooth_v), _angle(theta, p)) for p in judged]
-    kinds = _kinds(classifier, mean_theta)
+    measured = [seen.measure(p, (rh, rv), _angle(theta, p)) for p in judged]
+    kinds = _kinds(classifier, float(np.mean(theta)))
+    labels = [p.label for p in judged]
     if plane is None:
-        channel_ratio = None
-        if prior.channels_known:
-            channel_ratio = _channel_ratio(images, metal)
+        channel = _channel_ratio(images, reference) if prior.channels_known else None
         others = dict(zip(labels, measured, strict=True))
-        evidence = metal_evidence(others, prior, channel_ratio, Kinds(literature(), mean_theta))
-        metal = replace(metal, evidence=evidence)
-
+        evidence = metal_evidence(others, prior, channel, Kinds(literature(), float(np.mean(theta))))
+        reference = replace(reference, evidence=evidence)
     inversion = invert(measured, prior, kinds)
-    estimates = dict(zip(labels, inversion.patches, strict=True))
-
     # Of the pixels only leakage is removed that is known: an undetermined estimate leans on what the patches may be.
-    leakage = prior.leakage
-    if inversion.leakage_determined:
-        leakage = inversion.leakage
-    calibrated = remove_leakage(to_reference, leakage)
-    h = smooth_inside(calibrated.h, segmentation, optics.smooth_px)
-    v = smooth_inside(calibrated.v, segmentation, optics.smooth_px)
-    p = ratio(h, v)
-    permittivities = {}
-    for patch in segmentation.patches:
-        inside = patch.interior
-        estimate = estimates.get(patch.label)
-        permittivities[patch.label] = permittivity_of_patch(h[inside], v[inside], _angle(theta, patch), estimate)
-    refused |= _impossible(permittivities, estimates, kinds)
-    names = _names(classifier, (h, v, p), inversion, judged)
-    truth = match_truth(segmentation.patches, known.plates)
-    results = [
-        PatchResult(
-            patch=patch,
-            permittivity=permittivities[patch.label],
-            named=names.get(patch.label),
-            truth=truth.get(patch.label),
-            refused=refused.get(patch.label),
-        )
-        for patch in segmentation.patches
-    ]
-    brightness_off = dict(zip(labels, inversion.brightness_off.tolist(), strict=True))
+    calibrated = remove_leakage(raw, inversion.leakage if inversion.leakage_determined else prior.leakage)
+    sh, sv = (smooth_inside(c, found, optics.smooth_px) for c in (calibrated.h, calibrated.v))
+    sp = ratio(sh, sv)
+    estimates = dict(zip(labels, inversion.patches, strict=True))
+    off = dict(zip(labels, inversion.brightness_off.tolist(), strict=True))
+    patches = {
+        p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _angle(theta, p), estimates.get(p.label))
+        for p in found.patches
+    }
+    refused |= _impossible(patches, estimates, kinds)
+    named = _names(classifier, (sh, sv, sp), inversion, judged)
+    truth = match_truth(found.patches, known.plates)
+    at = [(p, p.label) for p in found.patches]
+    results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in at)
     return MaterialsResult(
-        calibrated=calibrated,
-        h=h,
-        v=v,
-        p=p,
-        metal=metal,
-        segmentation=segmentation,
-        patches=tuple(results),
-        theta_rad=theta,
-        inversion=inversion,
-        prior=prior,
-        tilts=tilts,
-        boxes=dict(known.names),
-        library=() if classifier is None else classifier.names,
-        brightness_off={label: ln for label, ln in brightness_off.items() if np.isfinite(ln)},
+        calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, tilts=tilts,
+        boxes=dict(known.names), library=() if classifier is None else classifier.names,
+        brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
         evidence={label: e.evidence for label, e in estimates.items() if e.evidence is not None},
-        apart_mm=apart_mm,
-        drift=seen.change,
-        halo=seen.halo.level,
-        behind=seen.usual_background(measured),
-        ripple=seen.usual,
-        relief_rad=seen.relief_rad,
-    )
+        apart_mm=apart_mm, drift=seen.change, halo=seen.halo.level, behind=seen.usual_background(measured),
+        ripple=seen.usual, relief_rad=seen.relief_rad,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -469,10 +428,14 @@ def _names(
         if estimate.evidence is None:
             continue
         at = patch.interior
-        # The paper's classifier compares pixels, which get the corrections of their patch.
-        corrected = estimate.evidence.inverse_ratio * median_ratio(h[at], v[at])
-        pixels = features_of(np.abs(h[at]), np.abs(v[at]), p[at].astype(np.complex128) / corrected)
-        (name,) = classifier.scan([pixels], [[estimate.evidence]])
+        if classifier.model == PAPER:
+            # The paper's classifier compares pixels, which get the corrections of their patch.
+            corrected = estimate.evidence.inverse_ratio * median_ratio(h[at], v[at])
+            pixels = features_of(np.abs(h[at]), np.abs(v[at]), p[at].astype(np.complex128) / corrected)
+            (name,) = classifier.scan([pixels])
+        else:
+            inverse = 1 / p[at].astype(np.complex128)
+            name = name_patch(classifier.kinds, [estimate.evidence], inverse[:, None])
         named[patch.label] = add_explanation(
             name, estimate.permittivity, estimate.covariance, classifier.permittivities
         )

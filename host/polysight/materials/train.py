@@ -36,11 +36,11 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, fit_weights
-from polysight.materials.discriminant import ErrorDiscriminant
 from polysight.materials.labels import METALS, is_metal, read_labels
 from polysight.materials.library import Entry, Library, Real, Samples, majority
 from polysight.materials.result import MaterialsResult
 from polysight.materials.segment import Box
+from polysight.materials.training_advice import alike_pairs, specimen_freedom
 from polysight.polarimetry import metal_gains
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -552,94 +552,6 @@ def fit_library(library: Library) -> Library:
     return Library(library.entries, {"angles": fits}, library.note)
 
 
-def accuracy_lines(library: Library) -> list[str]:
-    """Say for each angle how often names are right on scans left out of training, or why nobody can know."""
-    lines: list[str] = []
-    for angle, fit in library.fit["angles"].items():
-        alone = ", ".join(fit["not_judged"])
-        if not fit["judged"]:
-            lines.append(
-                f"{angle} degrees: accuracy not known: it is measured on a second scan of a material, and there is none"
-                " but of metal. Scan each material once more, placed anew, and train on all scans"
-            )
-            continue
-        lines += _confidence_lines(angle, fit)
-        lines.append(
-            f"{angle} degrees: on scans left out {100 * fit['pixel_accuracy']:.1f} % of the pixels and"
-            f" {100 * fit['patch_accuracy']:.1f} % of the patches are named right ({fit['model']},"
-            f" {fit['materials'] - len(fit['not_judged'])} materials)"
-            + (f"; not known for materials of one scan: {alone}" if alone else "")
-        )
-    return lines
-
-
-# A standard deviation from n degrees of freedom is known to 1 / sqrt(2 n) of itself: 25 % with 8.
-FREEDOM_NEEDED = 8
-FEW_SCANS = 4
-LEAST_MISFIT = 0.05
-"""Difference between the mean confidence and the share of right names that is told, if it is no chance."""
-ALIKE_STD = 2.0
-"""Distance of two materials in standard deviations of a patch below which names of one may be the other."""
-SHOWN_PAIRS = 3
-
-
-def _confidence_lines(angle: str, fit: Mapping[str, Any]) -> list[str]:
-    """Say if the names' probabilities are too large or too small, why, and how many specimens the library needs."""
-    if fit.get("named") is None:
-        # Libraries of earlier releases do not say.
-        return []
-    missing = max(FREEDOM_NEEDED - fit["specimen_freedom"], 0)
-    # Scans of one and the same piece cannot show how names fare on another.
-    need = (
-        f"{fit['specimen_freedom']} specimens beyond the first of a material tell how far specimens differ;"
-        f" {missing} more are needed to know it to 25 % (scan other pieces: polysight label --specimen NAME=WHICH)"
-    )
-    lines = []
-    chance = np.sqrt(max(fit["right"] * (1 - fit["right"]), 0.05) / max(fit["named"], 1))
-    misfit = fit["said"] - fit["right"]
-    if abs(misfit) > max(2 * chance, LEAST_MISFIT):
-        kind = "overconfident" if misfit > 0 else "underconfident"
-        if misfit < 0 and not fit["specimen_freedom"]:
-            why = "no second specimen of a material is known: how they differ counts as an error of placement"
-        elif misfit < 0:
-            why = "its specimens differ less than the published spread says, which counts as 4 specimens"
-        elif fit["scans"] < FEW_SCANS:
-            why = f"the errors of metal reference and placement are known from {fit['scans']} scans only"
-        elif missing:
-            why = "specimens left out differ more from those learnt than these from each other"
-        else:
-            why = "errors of its scans are not alike: a scan may be disturbed, or a label wrong"
-        lines.append(
-            f"{angle} degrees: {kind}: names are said with {100 * fit['said']:.0f} % and {100 * fit['right']:.0f} % are"
-            f" right: {why}"
-        )
-    if missing:
-        lines.append(f"{angle} degrees: {need}")
-    for one, other, distance in fit["alike"][:SHOWN_PAIRS]:
-        lines.append(
-            f"{angle} degrees: {one} and {other} lie {distance:.1f} standard deviations apart: more specimens do not"
-            " separate them; a second angle may, or one name for both"
-        )
-    return lines
-
-
-def _alike_pairs(samples: Samples) -> list[tuple[str, str, float]]:
-    """Return pairs of materials that a patch hardly tells apart, and their distance in standard deviations."""
-    model = ErrorDiscriminant().fit(samples)
-    distances = model.apart()
-    pairs = []
-    for i, j in zip(*np.triu_indices(len(model.names), 1), strict=True):
-        if distances[i, j] < ALIKE_STD:
-            pairs.append((str(model.names[i]), str(model.names[j]), round(float(distances[i, j]), 2)))
-    return sorted(pairs, key=lambda pair: pair[2])
-
-
-def _specimen_freedom(samples: Samples) -> int:
-    """Return the number of specimens beyond the first of each material, metals left out."""
-    counts = {name: np.unique(samples.plates[samples.names == name]).size for name in np.unique(samples.names)}
-    return sum(count - 1 for name, count in counts.items() if not is_metal(str(name)))
-
-
 def fit_samples(samples: Samples) -> dict[str, Any]:
     """Return model and scores on labelled pixels, as plain values for a library's file.
 
@@ -669,8 +581,8 @@ def fit_samples(samples: Samples) -> dict[str, Any]:
         "said": own.said,
         "right": own.right,
         "scans": int(np.unique(samples.groups).size),
-        "specimen_freedom": _specimen_freedom(samples),
-        "alike": _alike_pairs(samples),
+        "specimen_freedom": specimen_freedom(samples),
+        "alike": alike_pairs(samples),
         "judged": judged,
         "materials": len(own.names),
         "not_judged": list(own.not_judged),

@@ -195,7 +195,7 @@ def _verdict(kinds: Kinds, odds: Odds, foreign_name: str, in_foreign_name: npt.N
         probability[LAYER] = odds.sheet
     likely = _likeliest_first(probability)
     # Names of little probability count as unknown, so that the sum stays one.
-    likely[UNKNOWN] = round(1 - sum(likely.values()), 4)
+    likely[UNKNOWN] = round(1.0 - sum(likely.values()), 4)
     likely = _likeliest_first(likely, least=0.0)
 
     name = next(iter(likely))

@@ -155,7 +155,7 @@ def test_ratio_error_is_that_of_draws():
     prior = RigPrior(2e-3)
     found = invert([PatchMeasurement(0.2 + 0.1j, 0.003, THETA, None)], prior)
     rng, t = np.random.default_rng(6), np.array([0.1 + 0.05j, -0.2j, 0.5])
-    z = rng.multivariate_normal(np.zeros(7), found.nuisance_covariance, 20000)
+    z = rng.multivariate_normal(np.zeros(6), found.nuisance_covariance, 20000)
     a, b = prior.leakage_std * (z[:, 0] + 1j * z[:, 1]), prior.leakage_std * (z[:, 2] + 1j * z[:, 3])
     rho = prior.reference_std * (z[:, 4] + 1j * z[:, 5])
     for value, stated in zip(t, ratio_error(found, prior, t), strict=True):

@@ -42,7 +42,7 @@ def test_water_behind_glass_as_typed(tmp_path, capsys):
     assert main(arguments) == 0
     assert "in the stack   9.37 - j18.00" in capsys.readouterr().out
     assert main(["permittivity", str(folder), "--patch", "9"]) != 0
-    assert "no segment 9" in capsys.readouterr().err
+    assert "no patch 9" in capsys.readouterr().err
 
 
 def sugar() -> list[Entry]:

@@ -7,14 +7,14 @@ import argparse
 import numpy as np
 import pytest
 from benchmarks import shapes
-from benchmarks.shapes import ObjectFigures, angles_deg, judge_object, line_of, squared_distances
+from benchmarks.shapes import ObjectFigures, ScanKind, angles_deg, judge_object, line_of, squared_distances
 
-SMALL_GRID = (64, 44)
+SMALL_SCAN = ScanKind(columns=64, rows=44)
 
 
 @pytest.mark.slow
 def test_a_drawn_sphere_is_found_where_it_is():
-    figures = judge_object("sphere", 100, "none", SMALL_GRID)
+    figures = judge_object("sphere", 100, "none", SMALL_SCAN)
     assert figures.points > 10
     assert figures.stray <= 0.05 * figures.points
     assert figures.normal_deg is not None

@@ -29,13 +29,14 @@ from polysight.products import (
 )
 from polysight.results import ComplexNumber, PatchFigures, PermittivityFigures, Verdict
 from polysight.store import MANIFEST, ScanFolder
+from polysight.surfaces import POINTS, SURFACE
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError
 
 Real = NDArray[np.float64]
 EXPORT = "export"
 """Folder of a scan that a page has exports written into."""
-FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES)
+FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES, SURFACE, POINTS)
 EXPORTS = (".mat", ".csv", ".nc")
 MAX_NEAREST = 5
 # The range profile, to either side.

@@ -28,7 +28,19 @@ _millimetres = number(float, "a length above 0, at most 50 mm", lambda value: 0 
 
 
 _radius = number(float, "a radius of 50 to 500 mm", lambda value: 50 <= value <= 500)
+_turn = number(float, "angles of at most 360 degrees, as 0,30,60", lambda value: abs(value) <= 360)
 _degrees = number(float, "`one`, `pixel` or an angle of 5 to 80 degrees", lambda value: 5 <= value <= 80)
+
+
+def _angles(text: str) -> tuple[float, ...]:
+    """Angles of a turntable, separated by commas."""
+    return tuple(_turn(part) for part in text.split(","))
+
+
+def _axis(text: str) -> tuple[float, float]:
+    """Two lengths in millimetres, separated by a comma."""
+    x, _, z = text.partition(",")
+    return _shift(x), _shift(z)
 
 
 def _incidence(text: str) -> str | float:
@@ -65,7 +77,15 @@ def _process(args: argparse.Namespace) -> int:
 def _surface(args: argparse.Namespace) -> int:
     from polysight.jobs.surface import surface
 
-    return surface(args.data, args.out, rig_file(args.config, args.data), args.reference, args.json)
+    return surface(
+        args.data,
+        args.out,
+        rig_file(args.config, args.data[0]),
+        args.reference,
+        turned_deg=args.turned,
+        axis_mm=args.axis,
+        as_json=args.json,
+    )
 
 
 def _image(args: argparse.Namespace) -> int:
@@ -115,7 +135,20 @@ def add_commands(add: Add) -> None:
         "measure shape and permittivity of curved and tilted objects",
         "polysight surface scans/bottle --out out/bottle",
     )
-    _add_data(sub)
+    _add_data(sub, several=True)
+    sub.add_argument(
+        "--turned",
+        type=_angles,
+        default=(),
+        metavar="DEGREES,...",
+        help="join scans of an object on a turntable, one angle for each scan: 0,30,60",
+    )
+    sub.add_argument(
+        "--axis",
+        type=_axis,
+        metavar="X,Z",
+        help="turntable's axis: mm from the grid's middle, and from the object plane (default: 0,0)",
+    )
     sub.add_argument(
         "--reference",
         type=Path,

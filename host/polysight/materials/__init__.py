@@ -13,11 +13,13 @@ data set.
 from typing import TYPE_CHECKING, Any
 
 from polysight.materials.analyse import (
+    STEEP,
     KnownScene,
     Optics,
     analyse,
     expected_pixel_accuracy,
     image_centre_mm,
+    name_permittivity,
     permittivity_change,
     pixel_accuracy,
 )
@@ -144,6 +146,7 @@ __all__ = [
     "SHORT",
     "SIMULATED_LIBRARY",
     "SPECIMEN",
+    "STEEP",
     "UNKNOWN",
     "Box",
     "CatalogueMaterial",
@@ -211,6 +214,7 @@ __all__ = [
     "match_patches",
     "match_truth",
     "material_of",
+    "name_permittivity",
     "name_taken",
     "no_box",
     "normalise_name",

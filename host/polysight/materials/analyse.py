@@ -25,7 +25,7 @@ from polysight.materials.inversion import (
     RigPrior,
     invert,
 )
-from polysight.materials.kinds import Kinds, literature, weigh_kinds
+from polysight.materials.kinds import Kinds, RatioEvidence, inverse_ratio, literature, turned, weigh_kinds
 from polysight.materials.labels import TruthPlate, match_truth
 from polysight.materials.measure import (
     AMPLIFIES,
@@ -58,7 +58,7 @@ from polysight.materials.metal import (
     metal_in_box,
     no_metal,
 )
-from polysight.materials.names import UNKNOWN, NamedPatch, add_explanation, name_patch
+from polysight.materials.names import UNKNOWN, NamedPatch, PatchName, add_explanation, name_patch
 from polysight.materials.result import MaterialsResult, PatchResult, Tilts, features_of
 from polysight.materials.segment import (
     Box,
@@ -440,6 +440,24 @@ def _names(
             name, estimate.permittivity, estimate.covariance, classifier.permittivities
         )
     return named
+
+
+def name_permittivity(permittivity: complex, covariance: npt.NDArray[np.float64], classifier: Classifier) -> PatchName:
+    """Name a half space by its permittivity and the covariance [2, 2] of its (real, imaginary).
+
+    The library and the literature share the expectation: nothing else of the scene says how common its materials are.
+    """
+    kinds = Kinds(classifier.kinds, float(np.radians(classifier.angles_deg[0])))
+    inverse = complex(inverse_ratio(permittivity, kinds.theta_rad))
+    step = 1e-4
+    slope = (complex(inverse_ratio(permittivity + step, kinds.theta_rad)) - inverse) / step
+    evidence = RatioEvidence(
+        theta_rad=kinds.theta_rad,
+        inverse_ratio=inverse,
+        covariance=turned(slope, covariance),
+        library_share=0.5,
+    )
+    return name_patch((kinds,), (evidence,), np.array([[inverse]])).verdict
 
 
 def _no_material(e: Permittivity) -> Finding | None:

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from polysight.report.style import INK, MUTED, dress, png
-from polysight.surfaces import Segment, Surface
+from polysight.surfaces import Segment, Surface, describe_form, describe_material
 
 # Axis numbers of a view (horizontal, vertical), its title, and the names of the axes.
 VIEWS = (
@@ -72,10 +72,5 @@ def colour_range(surface: Surface) -> tuple[float, float]:
 
 def segment_text(segment: Segment) -> str:
     """One line about a segment: form, permittivity with standard errors, or why it has none."""
-    form = "flat" if segment.radius_mm is None else f"radius {segment.radius_mm:.0f} mm"
-    head = f"{segment.number}: {segment.points} points, {form}, incidence {segment.incidence_deg:.0f}°"
-    if segment.permittivity is None or segment.covariance is None:
-        return f"{head}: {segment.name + ', ' if segment.name else ''}no permittivity ({segment.reason})"
-    eps = segment.permittivity
-    std = [segment.covariance[i][i] ** 0.5 for i in range(2)]
-    return f"{head}: {eps.real:.2f} ± {std[0]:.2f} − j ({-eps.imag:.2f} ± {std[1]:.2f})"
+    head = f"{segment.number}: {segment.points} points, {describe_form(segment)}"
+    return f"{head}, incidence {segment.incidence_deg:.0f}°: {describe_material(segment)}"

@@ -31,6 +31,9 @@ MAX_TURN_RAD = 0.35
 # Windows of one surface whose path curvature is averaged.
 NEIGHBOURHOOD_M = 0.024
 MIN_POINTS = 8
+MIN_NEIGHBOURS = 6
+# A third of a window.
+LEVER_OF_WINDOW_M = 0.011
 # A smaller radius is an edge or a wire: what it diffracts is no reflection.
 MIN_RADIUS_M = 0.012
 
@@ -133,33 +136,38 @@ def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
 def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
     """Replace the curvature of each echo's path by a fit to its neighbours in the same surface.
 
-    The fit takes the slopes of all windows near by, g + Q d at the distance d, for the unknown g and Q.
+    The fit takes the slopes of all windows near by, g + Q d at the distance d, for the unknown g and Q. What it leaves
+    of the slopes is an error of each that its own window does not show: ripple of edges and of other echoes.
     """
     bend = echoes.bend.copy()
+    slope_std = echoes.slope_std.copy()
     for number in np.unique(segment):
         members = np.flatnonzero(segment == number)
-        at = echoes.at_m[members, :2]
-        for index, near in zip(members, scipy.spatial.KDTree(at).query_ball_point(at, NEIGHBOURHOOD_M), strict=True):
-            if len(near) < 6:
+        at_m = echoes.at_m[members, :2]
+        neighbours = scipy.spatial.KDTree(at_m).query_ball_point(at_m, NEIGHBOURHOOD_M)
+        for index, near in zip(members, neighbours, strict=True):
+            if len(near) < MIN_NEIGHBOURS:
                 continue
-            other = members[near]
-            bend[index] = _fit_bend(echoes, int(index), other)
-    return replace(echoes, bend=bend)
+            bend[index], left = fit_bend(echoes, int(index), members[near])
+            slope_std[index] = np.maximum(slope_std[index], left)
+    return replace(echoes, bend=bend, slope_std=slope_std)
 
 
-def _fit_bend(echoes: Echoes, index: int, other: NDArray[np.int_]) -> Array:
-    """Symmetric curvature [2, 2] from the slopes of neighbours, robustly: medians reject edges."""
-    d = (echoes.at_m[other] - echoes.at_m[index])[:, :2]
+def fit_bend(echoes: Echoes, index: int, others: NDArray[np.int_]) -> tuple[Array, Array]:
+    """Symmetric curvature [2, 2] from the slopes of neighbours, and what it leaves of these, root mean square [2]."""
+    d = (echoes.at_m[others] - echoes.at_m[index])[:, :2]
     zero = np.zeros(len(d))
     one = np.ones(len(d))
     # Unknown: g_x, g_y, Q_xx, Q_xy, Q_yy.
     along_x = np.stack([one, zero, d[:, 0], d[:, 1], zero], axis=1)
     along_y = np.stack([zero, one, zero, d[:, 0], d[:, 1]], axis=1)
-    # The windows' own curvatures count as slopes a third of a window away.
-    own = 0.011
-    q = echoes.bend[other].mean(axis=0)
-    prior = own * np.sqrt(len(d)) * np.eye(5)[2:]
-    matrix = np.concatenate([along_x, along_y, prior])
-    right = np.concatenate([*echoes.slope[other].T, own * np.sqrt(len(d)) * np.array([q[0, 0], q[0, 1], q[1, 1]])])
-    found = np.linalg.lstsq(matrix, right, rcond=None)[0]
-    return np.array([[found[2], found[3]], [found[3], found[4]]])
+    slopes = np.concatenate(list(echoes.slope[others].T))
+    # The windows' own curvatures count as slopes at this distance.
+    weight_m = LEVER_OF_WINDOW_M * np.sqrt(len(d))
+    bend = echoes.bend[others].mean(axis=0)
+    matrix = np.concatenate([along_x, along_y, weight_m * np.eye(5)[2:]])
+    right = np.concatenate([slopes, weight_m * np.array([bend[0, 0], bend[0, 1], bend[1, 1]])])
+    fitted = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    left = (slopes - matrix[: len(slopes)] @ fitted).reshape(2, -1)
+    freedom = max(1.0, len(d) - 2.5)
+    return np.array([[fitted[2], fitted[3]], [fitted[3], fitted[4]]]), np.sqrt(np.sum(left**2, axis=1) / freedom)

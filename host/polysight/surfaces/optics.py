@@ -128,17 +128,22 @@ class VisibleNormals:
     alias_deg: tuple[float, float]
 
 
+def mirror_point(optics: Optics, plane_m: float) -> Array:
+    """Return the point of the plane at z = `plane_m` that mirrors TX into H, with the stage at zero: [3]."""
+    tx_m = optics.tx.at_m
+    rx_m = optics.h.at_m
+    share = (plane_m - tx_m[2]) / (2 * plane_m - tx_m[2] - rx_m[2])
+    x, y, _ = tx_m + share * (rx_m - tx_m)
+    return np.array([x, y, plane_m])
+
+
 def visible_normals(rig: Instrument) -> VisibleNormals:
     """Return the normals that a rig's grid shows: those that mirror TX into H from its ends.
 
     The slope of a tilted plane's path is 2 cos(theta) sin(tilt); phases alias where it exceeds lambda / (2 step).
     """
     optics = optics_of(rig)
-    share = (rig.geometry.object_distance_mm / 1e3 - optics.tx.at_m[2]) / (
-        2 * rig.geometry.object_distance_mm / 1e3 - optics.tx.at_m[2] - optics.h.at_m[2]
-    )
-    middle = optics.tx.at_m + share * (optics.h.at_m - optics.tx.at_m)
-    middle[2] = rig.geometry.object_distance_mm / 1e3
+    middle = mirror_point(optics, rig.geometry.object_distance_mm / 1e3)
     half_x = (rig.grid.columns - 1) / 2 * rig.grid.step_x_mm / 1e3
     half_y = (rig.grid.rows - 1) / 2 * rig.grid.step_y_mm / 1e3
     at_m = np.array([[half_x, 0.0, 0.0], [0.0, half_y, 0.0], [0.0, 0.0, 0.0]])

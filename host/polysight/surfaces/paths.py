@@ -93,7 +93,8 @@ class Echoes:
 
     `amplitude`: complex, exp(-j k path) with the path's phase at the centre frequency in it. `amplitude_std`: of its
     real and of its imaginary part. `path_std_m`, `slope_std` [n, 2]: by the rest of the fit. `share`: of a window's
-    power that its echoes explain.
+    power that its echoes explain. `band_rise`: ln of the amplitude in the upper half of the band over that in the lower
+    half.
     """
 
     at_m: Array
@@ -105,6 +106,7 @@ class Echoes:
     path_std_m: Array
     slope_std: Array
     share: Array
+    band_rise: Array
 
     def __len__(self) -> int:
         return len(self.path_m)
@@ -154,6 +156,8 @@ class _Fit:
         phases = np.exp(1j * np.outer(self.omega, gate))
         weights = np.mean((model @ phases) * phases.conj(), axis=1).real
         self.gain = float(weights.sum())
+        self.upper_half = np.arange(weights.size) >= weights.size // 2
+        self.band_rise = float(np.log(weights[self.upper_half].sum() / weights[~self.upper_half].sum()))
         self.weights = weights / self.gain
         self.middle = float(self.weights @ self.omega)
         self.mean_square = float(self.weights @ self.omega**2)
@@ -198,13 +202,14 @@ def _unpack(values: Array) -> tuple[Array, Array, Array]:
 
 @dataclass
 class _Maximum:
-    """Result of :func:`_maximise`: parameters, amplitude, derotated sum of each position, and standard deviations."""
+    """Result of :func:`_maximise`: parameters, amplitude, noise, standard deviations, share and rise over the band."""
 
     values: Array
     amplitude: NDArray[np.complex128]
     rest: Array
     std: Array
     share: Array
+    band_rise: Array
 
 
 def _derotate(fit: _Fit, added: NDArray, paths: Array) -> Iterator[tuple[float, NDArray]]:
@@ -234,14 +239,18 @@ def _maximise(
     values = values.copy()
     limit = np.array([0.02, 0.05, 0.05, 1.5, 1.5, 1.5])
     sums = np.zeros(basis.shape[:2], complex)
+    upper = np.zeros(basis.shape[:2], complex)
     total = np.zeros(len(values), complex)
     for step in range(iterations + 1):
         paths = np.einsum("wnp,wp->wn", basis, values)
         sums = np.zeros(paths.shape, complex)
+        upper = np.zeros(paths.shape, complex)
         rates = np.zeros(paths.shape, complex)
-        for omega, turned in _derotate(fit, added, paths):
+        for index, (omega, turned) in enumerate(_derotate(fit, added, paths)):
             sums += turned
             rates -= 1j * omega * turned
+            if fit.upper_half[index]:
+                upper += turned
         total = (sums * valid).sum(axis=1)
         if step == iterations:
             break
@@ -261,7 +270,17 @@ def _maximise(
     std = np.sqrt(spread * (noise / np.maximum(np.abs(amplitude) ** 2, 1e-30))[:, None])
     energy = np.einsum("wfn,wn->w", np.abs(added) ** 2, valid)
     share = count * np.abs(amplitude) ** 2 * fit.gain**2 / fit.omega.size / np.maximum(energy, 1e-30)
-    return _Maximum(values, amplitude, np.sqrt(noise), std, share)
+    upper_total = (upper * valid).sum(axis=1)
+    lower_total = np.maximum(np.abs(total - upper_total), 1e-30)
+    band_rise = np.log(np.maximum(np.abs(upper_total), 1e-30) / lower_total) - fit.band_rise
+    return _Maximum(
+        values=values,
+        amplitude=amplitude,
+        rest=np.sqrt(noise),
+        std=std,
+        share=share,
+        band_rise=band_rise,
+    )
 
 
 def _echoes(fit: _Fit, windows: _Windows, found: _Maximum) -> Echoes:
@@ -278,6 +297,7 @@ def _echoes(fit: _Fit, windows: _Windows, found: _Maximum) -> Echoes:
         path_std_m=found.std[:, 0],
         slope_std=found.std[:, 1:3],
         share=found.share,
+        band_rise=found.band_rise,
     )
 
 
@@ -419,6 +439,7 @@ def _none() -> Echoes:
         path_std_m=np.zeros(0),
         slope_std=np.zeros((0, 2)),
         share=np.zeros(0),
+        band_rise=np.zeros(0),
     )
 
 
@@ -471,8 +492,8 @@ def _refine(fit: _Fit, windows: _Windows, rest: NDArray, found: list) -> None:
         new = _synthesise(fit, part, better)
         rest[at] = with_echo - new
         echo[again] = new
-        for name in ("values", "amplitude", "rest", "std", "share"):
-            getattr(values, name)[again] = getattr(better, name)
+        for field in fields(_Maximum):
+            getattr(values, field.name)[again] = getattr(better, field.name)
         found[index] = (active, values, echo)
 
 
@@ -491,9 +512,10 @@ def _kept(found: _Maximum, keep: NDArray) -> _Maximum:
 
 
 def measure_echoes(board: Samples, at_m: Array, path_m: Array, slope: Array, bend: Array) -> tuple[Echoes, NDArray]:
-    """Fit echoes of which path, slope and curvature are known roughly, in the windows around `at_m` [n, 3].
+    """Measure the amplitudes of echoes of known path, slope and curvature, in the windows around `at_m` [n, 3].
 
-    Returns the echoes and which of them lie inside the scan (others are not fitted).
+    The path is not fitted: a maximum over paths is too high by the noise, by most where V nearly vanishes.
+    Returns the echoes and which of them lie inside the scan (others are not measured).
     """
     fit = _Fit(board)
     height, width = board.window_shape()
@@ -510,5 +532,6 @@ def measure_echoes(board: Samples, at_m: Array, path_m: Array, slope: Array, ben
         part = chosen[first : first + 100]
         windows = _gather(board, rows[part], columns[part], at_m[part])
         added = _add_up(fit, windows, starts[part])
-        parts.append(_echoes(fit, windows, _maximise(fit, added, windows.valid, windows.offsets, starts[part])))
+        measured = _maximise(fit, added, windows.valid, windows.offsets, starts[part], iterations=0)
+        parts.append(_echoes(fit, windows, measured))
     return (Echoes.join(parts) if parts else _none()), inside

@@ -1,17 +1,25 @@
 """Permittivity of surface segments from the voltages of H and V, referenced to metal of known shape.
 
-Voltages of a point are divided by spreading and path. The ratio of the gains of H and V over the direction of arrival
-comes from a metal sphere (`learn_gains`), or from a flat metal plate, for one direction alone. A segment has one
-permittivity: least squares of b_H (M r)_V = b_V (M r)_H over its points, with r the coefficients of a curved surface.
-Its covariance is that of the scatter of the points, and of what is common to them: leakage, axes, places, gains.
+Voltages of a point are divided by spreading and path. Gains over the direction of arrival come from a metal sphere
+(`learn_gains`), or from a flat metal plate, for one direction alone. A segment has one permittivity: least squares of
+b_H (M r)_V = b_V (M r)_H over its points (`fit_permittivity`), with r the coefficients of a curved surface.
+
+The covariance is derived, source by source (`add_common_errors`): the scatter of the points over blocks of windows;
+leakage, axes and places of the antennas, each moved by one standard error for object and reference together; the
+reference's own error; and the next order of the expansion in the curvature. A common error changes the misses of the
+equations above; one step of Gauss and Newton turns that into a change of the permittivity.
+
+Two figures that the permittivity does not use tell whether one medium reflected at one surface (`judge_medium`): the
+level of H over that of metal, and how both levels change over the band.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from polysight.polarimetry import permittivity_from_ratio
@@ -24,6 +32,7 @@ from polysight.surfaces.optics import (
     reflect_curved,
     reflect_flat,
 )
+from polysight.surfaces.paths import WINDOW_M
 from polysight.surfaces.points import offset_that_sees, predict_echo, spreading, unit_legs
 
 Array = NDArray[np.float64]
@@ -33,17 +42,42 @@ DEGREE = 2
 # Change of ln(H / V) per radian of direction that a flat plate cannot exclude: two boards 20 degrees apart with the
 # pattern cos^2 differ by 0.7.
 UNKNOWN_SLOPE = 0.7
-# Windows of 34 mm every 8 mm: so many share their noise and the ripple of edges.
-OVERLAP = 18
-# A point whose ratio lies so many standard deviations from the segment's does not belong to it.
+# A point whose ratio lies so many usual misses from the segment's does not belong to it.
 OUTLIER = 4.0
+# Blocks of stage positions whose errors count as independent: windows overlap, and ripples of edges and of other echoes
+# are as long as a Fresnel zone (40 to 70 mm).
+BLOCK_M = 2 * WINDOW_M
+# Ripple of V / H that is expected before it is seen, and the number of blocks that this expectation is worth: a small
+# segment has few blocks, which say little of their own scatter.
+EXPECTED_RIPPLE = 0.02
+EXPECTED_BLOCKS = 2.0
+# Error of the curvature, in proportion: that of a sphere of 113 mm is 5 % too large (windows are not small to it).
+CURVATURE_ERROR = 0.1
+# At the border of the zone that a surface reflects to, ln of the level is 0.69 below that inside. Patterns of antennas
+# change the level over the directions by about as much, where no reference takes that out.
+LEVEL_TOLERANCE = 0.35
+LEVEL_TOLERANCE_WITHOUT_GAINS = 0.9
+EPS_STEP = 1e-4
 
 
 @dataclass(frozen=True)
 class Voltages:
-    """What points [n] give: voltages `b` [n, 2] of H and V without path and spreading, their standard deviations,
-    the rows `m` [n, 2 receivers, 2 coefficients], incidence, curvatures in and across the plane of incidence, and the
-    direction of arrival at V [n, 2].
+    """What points [n] give.
+
+    Attributes
+    ----------
+    b, std
+        Voltages of H and V without path and spreading, complex [n, 2], and their standard deviations [n, 2].
+    m
+        Rows of the coefficients of r_s and r_p, complex [n, 2 receivers, 2 coefficients].
+    theta, bend_inside, bend_across
+        Incidence, and curvatures in and across the plane of incidence, [n].
+    arrival
+        Direction of arrival at V, its x and y, [n, 2].
+    band_rise
+        ln of the amplitude in the upper half of the band over that in the lower half, of H and V [n, 2].
+    at_m
+        Stage offsets, [n, 2].
     """
 
     b: Complex
@@ -53,38 +87,89 @@ class Voltages:
     bend_inside: Array
     bend_across: Array
     arrival: Array
+    band_rise: Array
+    at_m: Array
+
+    def __len__(self) -> int:
+        return len(self.theta)
+
+    def __getitem__(self, keep: NDArray) -> Voltages:
+        return Voltages(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
 def voltages_of(seen: Seen, optics: Optics, shape: Shape | None = None) -> Voltages:
     """Return the voltages of points; `shape` is that of H's echoes unless given."""
-    shape = shape_of(seen.h, optics) if shape is None else shape
-    tx, k = optics.tx, optics.wave_number
-    at_v = offset_that_sees(shape.points, shape.normals, seen.v.at_m, tx.at_m, optics.v.at_m)
-    b, rows, std, arrival = [], [], [], None
-    for rx, echoes, at_m in ((optics.h, seen.h, seen.h.at_m), (optics.v, seen.v, at_v)):
-        moved = echoes.moved(at_m, k)
-        path, _, _ = predict_echo(shape.points, shape.normals, shape.curvature, at_m, tx.at_m, rx.at_m)
-        spread = spreading(shape.points, shape.normals, shape.curvature, at_m, tx.at_m, rx.at_m)
-        b.append(moved.amplitude * np.exp(1j * k * path) / spread)
+    if shape is None:
+        shape = shape_of(seen.h, optics)
+    tx_m = optics.tx.at_m
+    k = optics.wave_number
+    solid = (shape.points, shape.normals, shape.curvature)
+    seen_from = {"h": seen.h.at_m, "v": offset_that_sees(*solid[:2], seen.v.at_m, tx_m, optics.v.at_m)}
+    b = []
+    std = []
+    rows = []
+    for channel, echoes in (("h", seen.h), ("v", seen.v)):
+        receiver = optics.receiver(channel)
+        at_m = seen_from[channel]
+        path, _, _ = predict_echo(*solid, at_m, tx_m, receiver.at_m)
+        spread = spreading(*solid, at_m, tx_m, receiver.at_m)
+        b.append(echoes.moved(at_m, k).amplitude * np.exp(1j * k * path) / spread)
         std.append(echoes.amplitude_std / spread)
-        rows.append(polarisation_row(shape.points, shape.normals, at_m, tx, rx))
-        _, back, *_ = unit_legs(shape.points, at_m, tx.at_m, rx.at_m)
-        arrival = back[:, :2]
-    inside, across = principal_bends(shape.points, shape.normals, shape.curvature, seen.h.at_m, tx.at_m)
-    theta = np.arccos(np.clip(shape.cos, 0, 1))
+        rows.append(polarisation_row(shape.points, shape.normals, at_m, optics.tx, receiver))
+    _, back, *_ = unit_legs(shape.points, seen_from["v"], tx_m, optics.v.at_m)
+    inside, across = principal_bends(*solid, seen.h.at_m, tx_m)
     return Voltages(
-        np.stack(b, axis=1), np.stack(std, axis=1), np.stack(rows, axis=1), theta, inside, across, np.asarray(arrival)
+        b=np.stack(b, axis=1),
+        std=np.stack(std, axis=1),
+        m=np.stack(rows, axis=1),
+        theta=np.arccos(np.clip(shape.cos, 0, 1)),
+        bend_inside=inside,
+        bend_across=across,
+        arrival=back[:, :2],
+        band_rise=np.stack([seen.h.band_rise, seen.v.band_rise], axis=1),
+        at_m=seen.h.at_m[:, :2],
     )
+
+
+def reflect_points(eps: NDArray | complex, v: Voltages, wave_number: float) -> Complex:
+    """Coefficients (r_s, r_p) of the curved surface at each point, [n, 2]."""
+    return np.stack(reflect_curved(eps, v.theta, v.bend_inside, v.bend_across, wave_number), axis=1)
+
+
+def receive(v: Voltages, coefficients: Complex) -> Complex:
+    """Voltages of H and V [n, 2] that coefficients [n, 2] give with gains of 1."""
+    return (v.m @ coefficients[..., None])[..., 0]
+
+
+def expansion_parameter(v: Voltages, wave_number: float) -> Array:
+    """K / (k cos^3 theta) of each point: the ratio of successive orders of the reflection at a curved surface."""
+    bend = (np.abs(v.bend_inside) + np.abs(v.bend_across)) / 2
+    return bend / (wave_number * np.cos(v.theta) ** 3)
 
 
 @dataclass(frozen=True)
 class Gains:
-    """ln(gain of H / gain of V) as a polynomial of the direction of arrival, with covariance of its coefficients.
+    """Gains of H and V as polynomials of the direction of arrival, learnt from metal.
 
-    `reach`: largest distance from the reference's directions that counts as covered, radians.
+    Attributes
+    ----------
+    ratio_terms
+        Coefficients of ln(gain of H / gain of V), complex.
+    level_terms
+        Coefficients of ln|gain of H|.
+    band_rise
+        ln of the level in the upper half of the band over that in the lower half, of H and V.
+    middle, degree
+        Middle of the directions, and the degree of the polynomials.
+    std
+        Standard deviation of each part of ln(H / V) within the directions covered.
+    covered
+        Smallest and largest direction, [2] each.
     """
 
-    coefficients: Complex
+    ratio_terms: Complex
+    level_terms: Array
+    band_rise: Array
     middle: Array
     degree: int
     std: float
@@ -92,7 +177,11 @@ class Gains:
 
     def ratio(self, arrival: Array) -> Complex:
         """Gain of H over that of V, [n]."""
-        return np.exp(self._basis(arrival) @ self.coefficients)
+        return np.exp(self._basis(arrival) @ self.ratio_terms)
+
+    def level(self, arrival: Array) -> Array:
+        """ln|gain of H|, [n]."""
+        return self._basis(arrival) @ self.level_terms
 
     def unknown(self, arrival: Array) -> Array:
         """Standard deviation of ln(H / V) by directions that the reference does not cover, [n]."""
@@ -110,43 +199,91 @@ def _polynomials(d: Array, degree: int) -> Array:
     return np.stack(terms, axis=1)
 
 
-def learn_gains(metal: Voltages, wave_number: float) -> Gains:
-    """Fit the gains to points of metal; directions closer than 3 degrees together give one value for all."""
-    r_s, r_p = reflect_curved(np.inf, metal.theta, metal.bend_inside, metal.bend_across, wave_number)
-    expected = metal.m @ np.stack([r_s, r_p], axis=1)[..., None]
-    gain = (metal.b / expected[..., 0])[:, 0] / (metal.b / expected[..., 0])[:, 1]
-    good = np.isfinite(gain) & (np.abs(gain) > 0)
-    gain, arrival = gain[good], metal.arrival[good]
-    weight = 1 / (np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1)[good] + 1e-4)
-    middle = np.average(arrival, axis=0, weights=weight)
-    low, high = np.percentile(arrival, [3, 97], axis=0)
-    degree = DEGREE if float(np.min(high - low)) > 0.1 else 0
-    centre = np.angle(np.sum(weight * gain / np.abs(gain)))
-    log = np.log(np.abs(gain)) + 1j * (np.angle(gain * np.exp(-1j * centre)) + centre)
-    basis = _polynomials(arrival - middle, degree)
-    coefficients = np.zeros(basis.shape[1], complex)
-    spread = 0.0
+def _fit_robustly(basis: Array, values: NDArray, weight: Array) -> tuple[NDArray, NDArray]:
+    """Coefficients of `values` [n] in `basis` [n, terms], and what is left; outliers lose their weight."""
+    coefficients = np.zeros(basis.shape[1], values.dtype)
+    rest = values
     for _ in range(5):
         root = np.sqrt(weight)
-        coefficients = np.linalg.lstsq(basis * root[:, None], log * root, rcond=None)[0]
-        rest = np.abs(log - basis @ coefficients)
-        spread = 1.48 * float(np.median(rest))
-        weight = weight / (1 + (rest / (2 * spread + 1e-9)) ** 2)
-    std = float(spread / np.sqrt(max(1.0, len(log) / OVERLAP)))
-    return Gains(coefficients, middle, degree, std, (low, high))
+        coefficients = np.linalg.lstsq(basis * root[:, None], values * root, rcond=None)[0]
+        rest = values - basis @ coefficients
+        spread = 1.48 * np.median(np.abs(rest))
+        weight = weight / (1 + (np.abs(rest) / (2 * spread + 1e-9)) ** 2)
+    return coefficients, rest
+
+
+def learn_gains(metal: Voltages, wave_number: float) -> Gains:
+    """Fit the gains to points of metal; directions closer than 6 degrees together give one value for all."""
+    coefficients = reflect_points(np.inf, metal, wave_number)
+    gain = metal.b / receive(metal, coefficients)
+    sound = np.asarray(np.isfinite(gain).all(axis=1) & (np.abs(gain) > 0).all(axis=1))
+    metal = metal[sound]
+    gain = gain[sound]
+    ratio = gain[:, 0] / gain[:, 1]
+    weight = 1 / (np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1) + 1e-4)
+    middle = np.average(metal.arrival, axis=0, weights=weight)
+    low, high = np.percentile(metal.arrival, [3, 97], axis=0)
+    degree = DEGREE if float(np.min(high - low)) > 0.1 else 0
+    basis = _polynomials(metal.arrival - middle, degree)
+    # Phases are taken about their mean, so that none wraps.
+    centre = np.angle(np.sum(weight * ratio / np.abs(ratio)))
+    log_ratio = np.log(np.abs(ratio)) + 1j * (np.angle(ratio * np.exp(-1j * centre)) + centre)
+    ratio_terms, rest = _fit_robustly(basis, log_ratio, weight)
+    level_terms, _ = _fit_robustly(basis, np.log(np.abs(gain[:, 0])), weight)
+    # The next order of metal's own correction, r_p / r_s = 1 + first order.
+    first_order = np.abs(coefficients[sound, 1] / coefficients[sound, 0] - 1)
+    next_order = float(np.median(first_order * expansion_parameter(metal, wave_number)))
+    return Gains(
+        ratio_terms=ratio_terms,
+        level_terms=level_terms,
+        band_rise=np.median(metal.band_rise, axis=0),
+        middle=middle,
+        degree=degree,
+        std=float(np.hypot(_misfit_std(rest, metal.at_m), next_order)),
+        covered=(low, high),
+    )
+
+
+def _misfit_std(rest: Complex, at_m: Array) -> float:
+    """Standard deviation of each part of a fitted function: the root mean square of what is left over blocks."""
+    clipped = rest / np.maximum(1, np.abs(rest) / (5 * np.median(np.abs(rest)) + 1e-12))
+    block = number_blocks(at_m, (0.0, 0.0))
+    count = np.bincount(block)
+    sums = np.bincount(block, clipped.real) + 1j * np.bincount(block, clipped.imag)
+    means = sums[count > 0] / count[count > 0]
+    return float(np.sqrt(np.average(np.abs(means) ** 2, weights=count[count > 0]) / 2))
+
+
+def number_blocks(at_m: Array, shift: tuple[float, float]) -> NDArray[np.int_]:
+    """Number of the block of each stage offset [n, 2]; `shift`: of the blocks' borders, in blocks."""
+    cell = np.floor(at_m / BLOCK_M + np.array(shift)).astype(int)
+    _, number = np.unique(cell, axis=0, return_inverse=True)
+    return number.reshape(-1)
 
 
 @dataclass(frozen=True)
-class SegmentResult:
-    """Permittivity of a segment: `eps` and covariance [2, 2] of (real, imaginary); which points count; the scatter of
-    the points over their expected one (1: noise alone); shares of variance by source.
+class PermittivityFit:
+    """Permittivity of a segment, fitted.
+
+    Attributes
+    ----------
+    eps
+        The permittivity.
+    covariance
+        Of (real, imaginary), from the scatter of the points alone.
+    used
+        bool [n]: points that count.
+    noise_share
+        Root mean square of the points' misses over what their noise gives.
+    answer
+        Complex [2, n]: the change of (real, imaginary) is the real part of `answer` times a change of the misses.
     """
 
     eps: complex
     covariance: Array
     used: NDArray[np.bool_]
-    scatter: float
-    sources: dict[str, float]
+    noise_share: float
+    answer: Complex
 
 
 def point_ratio(v: Voltages, gains: Gains) -> Complex:
@@ -163,8 +300,8 @@ def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex
     eps = clip_permittivity(permittivity_from_ratio(ratio, v.theta))
     for _ in range(4):
         r_s, r_p = reflect_flat(eps, v.theta)
-        c_s, c_p = reflect_curved(eps, v.theta, v.bend_inside, v.bend_across, wave_number)
-        eps = clip_permittivity(permittivity_from_ratio(ratio * (r_s / r_p) / (c_s / c_p), v.theta))
+        curved_s, curved_p = reflect_curved(eps, v.theta, v.bend_inside, v.bend_across, wave_number)
+        eps = clip_permittivity(permittivity_from_ratio(ratio * (r_s / r_p) / (curved_s / curved_p), v.theta))
     return eps
 
 
@@ -174,89 +311,130 @@ def clip_permittivity(eps: NDArray) -> Complex:
     return np.clip(np.real(finite), 1.2, 40) + 1j * np.clip(np.imag(finite), -20, 0.5)
 
 
-def _misses(v: Voltages, gains: Gains, eps: complex, wave_number: float) -> tuple[Complex, Array]:
-    """b_H (M r)_V - b_V (M r)_H of each point, relative to its standard deviation's scale; and that scale [n]."""
-    r = np.stack(reflect_curved(eps, v.theta, v.bend_inside, v.bend_across, wave_number), axis=1)
-    expected = (v.m @ r[..., None])[..., 0]
-    ratio = gains.ratio(v.arrival)
-    miss = v.b[:, 0] / ratio * expected[:, 1] - v.b[:, 1] * expected[:, 0]
-    std = np.hypot(v.std[:, 0] / np.abs(ratio) * np.abs(expected[:, 1]), v.std[:, 1] * np.abs(expected[:, 0]))
-    return miss, std
+def find_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Complex:
+    """b_H (M r)_V - b_V (M r)_H of each point, for coefficients r [n, 2]."""
+    expected = receive(v, coefficients)
+    return v.b[:, 0] / gains.ratio(v.arrival) * expected[:, 1] - v.b[:, 1] * expected[:, 0]
 
 
-# What the first order in curvature and the antennas' changing gain over the zone leave of r_p / r_s (compared with the
-# series of spheres and cylinders: 0.003), and what drawn scenes show besides (1 to 2 % of a permittivity, mostly too
-# high): in proportion, and near Brewster's angle as a share of r_s.
-MODEL_RATIO_STD = 0.008
-MODEL_FLOOR_STD = 0.002
-# Errors of a point besides noise: edges, other echoes, curvature; relative to the voltages.
-MODEL_ERROR = 0.02
+def _noise_of_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Array:
+    """Standard deviation of each part of the misses by the noise of both voltages."""
+    expected = np.abs(receive(v, coefficients))
+    std_h = v.std[:, 0] / np.abs(gains.ratio(v.arrival))
+    return np.hypot(std_h * expected[:, 1], v.std[:, 1] * expected[:, 0])
 
 
-def fit_permittivity(v: Voltages, gains: Gains, wave_number: float, start: complex | None = None) -> SegmentResult:
+@dataclass(frozen=True)
+class _Step:
+    """Misses at one permittivity, their noise and weights [n], which points count, and `answer` as of the fit."""
+
+    miss: Complex
+    noise: Array
+    weights: Array
+    used: NDArray[np.bool_]
+    answer: Complex
+
+
+def _linearise(eps: complex, v: Voltages, gains: Gains, ripple: Array, wave_number: float) -> _Step:
+    """Return the step of Gauss and Newton at a permittivity; outliers lose their weight."""
+    coefficients = reflect_points(eps, v, wave_number)
+    miss = find_misses(v, gains, coefficients)
+    rates = []
+    for step in (EPS_STEP, 1j * EPS_STEP):
+        moved = reflect_points(eps + step, v, wave_number)
+        rates.append((find_misses(v, gains, moved) - miss) / EPS_STEP)
+    jacobian = np.stack(rates, axis=1)
+    noise = _noise_of_misses(v, gains, coefficients)
+    scale = np.hypot(noise, ripple)
+    size = np.abs(miss) / scale
+    usual = float(np.median(size)) + 1e-12
+    used = size < OUTLIER * max(usual, 0.3)
+    weights = used / scale**2 / (1 + (size / (2 * usual)) ** 2)
+    information = np.einsum("np,nq,n->pq", jacobian.conj(), jacobian, weights).real
+    inverse = np.linalg.inv(information + 1e-15 * np.eye(2))
+    answer = -np.einsum("pq,nq,n->pn", inverse, jacobian.conj(), weights)
+    return _Step(miss, noise, weights, used, answer)
+
+
+def fit_permittivity(v: Voltages, gains: Gains, wave_number: float) -> PermittivityFit:
     """Weighted least squares of one permittivity over points, by Gauss and Newton; robust by iterated weights."""
-    if start is None:
-        eps = point_permittivity(v, gains, wave_number)
-        start = complex(np.median(eps.real), min(np.median(eps.imag), -0.01))
-    value = np.array([start.real, start.imag])
-    used = np.ones(len(v.theta), bool)
-    information = np.eye(2)
-    scatter = 1.0
-    weights = np.ones(len(v.theta))
-    jacobian = np.zeros((len(v.theta), 2), complex)
-    miss = noise = np.zeros(len(v.theta))
+    of_points = point_permittivity(v, gains, wave_number)
+    eps = complex(np.median(of_points.real), min(np.median(of_points.imag), -0.01))
+    # What is common to a point's surroundings: no point counts for more than its ripple allows.
+    ripple = EXPECTED_RIPPLE * np.abs(v.b[:, 0] / gains.ratio(v.arrival) * v.m[:, 1, 1])
+    step = _linearise(eps, v, gains, ripple, wave_number)
     for _ in range(12):
-        eps = complex(value[0], value[1])
-        miss, noise = _misses(v, gains, eps, wave_number)
-        scale = np.hypot(noise, MODEL_ERROR * np.abs(v.b[:, 0] * v.m[:, 1, 1]))
-        step = 1e-4
-        rate = [(_misses(v, gains, eps + d, wave_number)[0] - miss) / step for d in (step, 1j * step)]
-        size = np.abs(miss) / scale
-        middle = np.median(size) + 1e-12
-        used = size < OUTLIER * max(middle, 0.3)
-        weights = used / scale**2 / (1 + (size / (2 * middle)) ** 2)
-        jacobian = np.stack([*rate], axis=1)
-        information = np.einsum("np,nq,n->pq", jacobian.conj(), jacobian, weights).real
-        right = -np.einsum("np,n,n->p", jacobian.conj(), miss, weights).real
-        move = np.linalg.solve(information + 1e-15 * np.eye(2), right)
-        value = value + np.clip(move, -1, 1)
-        value = np.array([np.clip(value[0], 1.2, 40), np.clip(value[1], -20, 0.5)])
-        if np.abs(move).max() < 1e-6:
+        move = (step.answer @ step.miss).real
+        eps = complex(
+            np.clip(eps.real + np.clip(move[0], -1, 1), 1.2, 40),
+            np.clip(eps.imag + np.clip(move[1], -1, 1), -20, 0.5),
+        )
+        step = _linearise(eps, v, gains, ripple, wave_number)
+        if np.abs(move).max() < 1e-5:
             break
-    # Scatter of the misses, not the assumed noise, gives the error.
-    terms = np.einsum("np,n,n->np", jacobian.conj(), miss, weights).real
-    meat = terms.T @ terms * OVERLAP
-    inverse = np.linalg.inv(information)
-    covariance = inverse @ meat @ inverse
-    scatter = float(np.sqrt(np.average((np.abs(miss) / np.maximum(noise, 1e-30)) ** 2, weights=weights) / 2))
-    return SegmentResult(
-        complex(value[0], value[1]), covariance, used, scatter, {"scatter": float(np.trace(covariance))}
+    excess2 = (np.abs(step.miss) / np.maximum(step.noise, 1e-30)) ** 2
+    return PermittivityFit(
+        eps=eps,
+        covariance=_covariance_of_scatter(step.answer, step.miss, ripple, v.at_m),
+        used=step.used,
+        noise_share=float(np.sqrt(np.average(excess2, weights=step.weights) / 2)),
+        answer=step.answer,
     )
+
+
+def _covariance_of_scatter(answer: Complex, miss: Complex, ripple: Array, at_m: Array) -> Array:
+    """Covariance of (real, imaginary) from the sums of the misses over blocks, with the expected ripple.
+
+    The 95 % region of few blocks is wider than that of a known covariance, by Fisher's distribution.
+    """
+    seen_terms = (answer * miss).real.T
+    expected_terms = np.concatenate([answer.real * ripple, -answer.imag * ripple]).T / np.sqrt(2)
+    seen = np.zeros((2, 2))
+    expected = np.zeros((2, 2))
+    blocks = 0.0
+    shifts = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5))
+    for shift in shifts:
+        block = number_blocks(at_m, shift)
+        count = int(block.max()) + 1
+        seen_sums = np.stack([np.bincount(block, term, count) for term in seen_terms.T], axis=1)
+        expected_sums = np.stack([np.bincount(block, term, count) for term in expected_terms.T], axis=1)
+        seen += seen_sums.T @ seen_sums / len(shifts)
+        for part in (expected_sums[:, :2], expected_sums[:, 2:]):
+            expected += part.T @ part / len(shifts)
+        weight = np.bincount(block, np.sum(np.abs(answer) ** 2, axis=0), count)
+        blocks += weight.sum() ** 2 / np.sum(weight**2) / len(shifts)
+    # Each block gives two numbers, and two were fitted.
+    freedom = max(0.0, 2 * blocks - 2)
+    unbiased = seen * blocks / max(blocks - 1, 0.5)
+    total = freedom + 2 * EXPECTED_BLOCKS
+    mixed = (freedom * unbiased + 2 * EXPECTED_BLOCKS * expected) / total
+    wider = 2 * scipy.stats.f.ppf(0.95, 2, total) / scipy.stats.chi2.ppf(0.95, 2)
+    return mixed * float(wider)
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Standard errors common to a scan: leakage (each part), axes of polarisation, places of the antennas."""
+    """Standard errors common to a scan: leakage (each part), axes of polarisation, places of the antennas (each)."""
 
     leakage: float = 0.041
     axis_rad: float = 0.01
     place_m: float = 0.0005
 
 
-def _perturbed(optics: Optics, uncertainty: Uncertainty) -> list[tuple[str, Optics]]:
+def disturb_optics(optics: Optics, uncertainty: Uncertainty) -> list[tuple[str, Optics]]:
     """Return the rigs that differ by one standard error in one property, with the source's name."""
     rigs = []
-    for name in ("h", "v"):
+    for name in ("tx", "h", "v"):
         antenna: Antenna = getattr(optics, name)
-        for part in (1, 1j):
-            leaking = replace(antenna, leakage=antenna.leakage + uncertainty.leakage * part)
-            rigs.append(("leakage", replace(optics, **{name: leaking})))
         for axis in np.eye(3):
             moved = replace(antenna, at_m=antenna.at_m + uncertainty.place_m * axis)
             rigs.append(("places", replace(optics, **{name: moved})))
-    for name in ("tx", "h", "v"):
-        turned = getattr(optics, name).turned(uncertainty.axis_rad)
-        rigs.append(("axes", replace(optics, **{name: turned})))
+        rigs.append(("axes", replace(optics, **{name: antenna.turned(uncertainty.axis_rad)})))
+    for name in ("h", "v"):
+        antenna = getattr(optics, name)
+        for part in (1, 1j):
+            leaking = replace(antenna, leakage=antenna.leakage + uncertainty.leakage * part)
+            rigs.append(("leakage", replace(optics, **{name: leaking})))
     return rigs
 
 
@@ -264,39 +442,97 @@ Reference = Callable[[Optics], Gains]
 """Gains that a reference gives, if the rig is as stated."""
 
 
-def segment_permittivity(seen: Seen, optics: Optics, reference: Reference, uncertainty: Uncertainty) -> SegmentResult:
-    """Permittivity of the points of one segment, with what is common to them in the covariance.
+@dataclass(frozen=True)
+class DisturbedScan:
+    """Voltages of all points and gains, if the rig differs by one standard error in one property."""
 
-    Each common error moves reference and object together: gains are learnt again for each.
+    source: str
+    voltages: Voltages
+    gains: Gains
+
+
+def disturb_scan(seen: Seen, optics: Optics, reference: Reference, uncertainty: Uncertainty) -> list[DisturbedScan]:
+    """Return the scan as it would be understood with each disturbed rig; reference and object move together."""
+    rigs = disturb_optics(optics, uncertainty)
+    return [DisturbedScan(source, voltages_of(seen, rig), reference(rig)) for source, rig in rigs]
+
+
+def add_common_errors(
+    fit: PermittivityFit, v: Voltages, gains: Gains, disturbed: Sequence[DisturbedScan], wave_number: float
+) -> dict[str, Array]:
+    """Return the covariances [2, 2] of a segment's permittivity by source, all points of the segment together.
+
+    `disturbed` holds the same points as `v`.
     """
-    k = optics.wave_number
-    gains = reference(optics)
-    v = voltages_of(seen, optics)
-    found = fit_permittivity(v, gains, k)
-    used = seen[found.used]
-    covariance = found.covariance.copy()
-    sources = dict(found.sources)
+    coefficients = reflect_points(fit.eps, v, wave_number)
+    miss = find_misses(v, gains, coefficients)
+    changes: list[tuple[str, Complex]] = []
+    for other in disturbed:
+        disturbed_coefficients = reflect_points(fit.eps, other.voltages, wave_number)
+        changes.append((other.source, find_misses(other.voltages, other.gains, disturbed_coefficients) - miss))
 
-    def add(source: str, eps: complex) -> None:
-        d = np.array([eps.real - found.eps.real, eps.imag - found.eps.imag])
-        covariance[:] += np.outer(d, d)
-        sources[source] = sources.get(source, 0.0) + float(d @ d)
+    # An error of ln(H / V) of the reference turns and scales b_H.
+    of_h = miss + v.b[:, 1] * receive(v, coefficients)[:, 0]
+    reference_change = of_h * gains.unknown(v.arrival)
+    flat = np.stack(reflect_flat(fit.eps, v.theta), axis=1)
+    first_order = find_misses(v, gains, flat) - miss
+    model_change = first_order * (expansion_parameter(v, wave_number) + CURVATURE_ERROR)
+    # Their phases are not known.
+    for phase in (1, 1j):
+        changes.append(("reference", phase * reference_change))
+        changes.append(("model", phase * model_change))
 
-    for source, rig in _perturbed(optics, uncertainty):
-        changed = fit_permittivity(voltages_of(used, rig), reference(rig), k, found.eps)
-        add(source, changed.eps)
-    part = voltages_of(used, optics)
-    log_std = float(np.sqrt(np.mean(gains.unknown(part.arrival) ** 2)))
-    for direction in (1, 1j):
-        shifted = replace(gains, coefficients=gains.coefficients + direction * log_std * _constant(gains))
-        add("reference", fit_permittivity(part, shifted, k, found.eps).eps)
-        shifted = replace(gains, coefficients=gains.coefficients + direction * MODEL_RATIO_STD * _constant(gains))
-        add("model", fit_permittivity(part, shifted, k, found.eps).eps)
-        of_s = part.b[:, 0] / gains.ratio(part.arrival) * part.m[:, 1, 1] / part.m[:, 0, 0]
-        b = np.stack([part.b[:, 0], part.b[:, 1] + direction * MODEL_FLOOR_STD * of_s], axis=1)
-        add("model", fit_permittivity(replace(part, b=b), gains, k, found.eps).eps)
-    return replace(found, covariance=covariance, sources=sources)
+    sources = {"scatter": fit.covariance}
+    for source, change in changes:
+        d = (fit.answer @ change).real
+        sources[source] = sources.get(source, 0.0) + np.outer(d, d)
+    return sources
 
 
-def _constant(gains: Gains) -> Array:
-    return (np.arange(len(gains.coefficients)) == 0).astype(float)
+def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.int_], gains: Gains | None) -> NDArray:
+    """True for points [n] at which a surface reflects, False for those that only its edge diffracts to.
+
+    Without path and spreading, a surface of one medium is equally strong everywhere. At the border of the zone that
+    reflects half of that is left, and what an edge diffracts falls on from there. The usual level is the median
+    weighted by power (`amplitude` [n] of H), for edges are seen from many more places than a small plate reflects to.
+    """
+    level = np.log(np.maximum(np.abs(voltages.b[:, 0]), 1e-30))
+    tolerance = LEVEL_TOLERANCE_WITHOUT_GAINS
+    if gains is not None:
+        level = level - gains.level(voltages.arrival)
+        tolerance = LEVEL_TOLERANCE
+    reflecting = np.zeros(len(level), bool)
+    for number in np.unique(segment):
+        members = np.flatnonzero(segment == number)
+        order = members[np.argsort(level[members])]
+        power = np.cumsum(amplitude[order] ** 2)
+        usual = level[order[np.searchsorted(power, power[-1] / 2)]]
+        reflecting[members] = np.abs(level[members] - usual) < tolerance
+    return reflecting
+
+
+def judge_medium(fit: PermittivityFit, v: Voltages, gains: Gains, wave_number: float) -> tuple[float, float]:
+    """Return what one medium does not explain: ln of the level of H over the expected, and the rise over the band.
+
+    A wall or a coating reflects twice: its level is that of no half space, or it changes over the band. The rise is
+    that of H or of V, whichever is larger, less two standard deviations of its own.
+    """
+    used = v[fit.used]
+    expected = receive(used, reflect_points(fit.eps, used, wave_number))
+    level = np.log(np.abs(used.b[:, 0])) - gains.level(used.arrival) - np.log(np.abs(expected[:, 0]))
+    rise = used.band_rise - gains.band_rise
+    usual = np.median(rise, axis=0)
+    scatter = 1.48 * np.median(np.abs(rise - usual), axis=0)
+    blocks = int(number_blocks(used.at_m, (0.0, 0.0)).max()) + 1
+    return float(np.median(level)), float(np.max(np.abs(usual) - 2 * scatter / np.sqrt(blocks)))
+
+
+def point_covariance(v: Voltages, gains: Gains, fit: PermittivityFit, wave_number: float) -> Array:
+    """Covariance of (real, imaginary) of each point's permittivity by its own scatter, [n, 2, 2]."""
+    relative = np.linalg.norm(v.std / np.maximum(np.abs(v.b), 1e-30), axis=1) * max(1.0, fit.noise_share)
+    step = 1e-3
+    changed = replace(v, b=v.b * np.array([1 + step, 1.0]))
+    rate = (point_permittivity(changed, gains, wave_number) - point_permittivity(v, gains, wave_number)) / step
+    # The permittivity is an analytic function of the ratio: the same error in both parts.
+    variance = np.abs(rate) ** 2 * relative**2
+    return variance[:, None, None] * np.eye(2)

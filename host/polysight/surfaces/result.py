@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,20 +16,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.store import open_npz
+from polysight.surfaces.measure import MIN_POINTS as LEAST_POINTS
 from polysight.surfaces.measure import Seen, Shape, shape_of
 from polysight.surfaces.optics import Optics
+from polysight.surfaces.paths import Echoes
 from polysight.surfaces.permittivity import (
-    MODEL_ERROR,
     Gains,
+    PermittivityFit,
+    Reference,
     Uncertainty,
     Voltages,
+    add_common_errors,
+    disturb_optics,
+    disturb_scan,
+    find_reflecting,
+    fit_permittivity,
+    judge_medium,
+    point_covariance,
     point_permittivity,
     point_ratio,
-    segment_permittivity,
     voltages_of,
 )
+from polysight.surfaces.points import tangents
 from polysight_shared.files import write_atomically
 
+# Fields of a surface that are no arrays of points.
+NOT_POINTS = ("scan_id", "simulated", "segments")
 SURFACE = "surface.npz"
 POINTS = "surface.ply"
 # Below this radius the first-order correction of curved surfaces is not enough (tests/surfaces, 8..12 % at 30 mm).
@@ -39,6 +51,9 @@ MIN_POINTS = 20
 METAL_RATIO = 0.15
 # A loss below zero by so many standard deviations is no property of one medium.
 MAX_GAIN_SIGMA = 3.0
+# Level of H over that of the medium fitted, and its rise over the band, logarithms: beyond, no single surface reflects.
+MAX_LEVEL_MISS = 0.2
+MAX_BAND_RISE = 0.02
 
 Array = NDArray[np.float64]
 
@@ -46,7 +61,8 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class Segment:
     """A connected surface. `permittivity` is None where it is not given, and `reason` says why; `covariance` [2][2] is
-    that of (real, imaginary). `radius_mm`: the smallest radius of curvature, None for a plane. `name`: "metal" or "".
+    that of (real, imaginary). `radius_mm`: the smallest radius of curvature, None for a plane. `name`: material, or ""
+    without one; `confidence`: its probability. `turned_deg`: how far a turntable had turned the object.
     """
 
     number: int
@@ -60,6 +76,8 @@ class Segment:
     dominated_by: str = ""
     name: str = ""
     reason: str = ""
+    confidence: float | None = None
+    turned_deg: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -87,31 +105,44 @@ class Surface:
 def analyse_surface(
     seen: Seen,
     optics: Optics,
-    reference: Callable[[Optics], Gains] | None,
+    reference: Reference | None,
     *,
     uncertainty: Uncertainty,
     scan_id: str = "",
     simulated: bool = False,
 ) -> Surface:
     """Return shape and permittivity of the points seen; without a reference, the shape alone."""
-    shape = shape_of(seen.h, optics)
-    count = len(seen)
-    permittivity = np.full(count, complex(np.nan, np.nan))
-    covariance = np.full((count, 2, 2), np.nan)
-    segments = []
     gains = None if reference is None else reference(optics)
-    for number in np.unique(seen.segment):
-        members = seen.segment == number
-        described = _describe(int(number), shape[members])
-        if reference is None or gains is None:
-            segments.append(_refuse(described, "no metal reference: calibrate with a sphere, or give --reference"))
-            continue
-        voltages = voltages_of(seen[members], optics)
-        judged, common = _judge(described, seen[members], voltages, optics, reference, gains, uncertainty)
-        segments.append(judged)
-        if common is not None:
-            permittivity[members] = point_permittivity(voltages, gains, optics.wave_number)
-            covariance[members] = _point_covariance(voltages, gains, optics.wave_number) + common
+    seen = drop_edges(seen, optics, gains)
+    shape = shape_of(seen.h, optics)
+    numbers = np.unique(seen.segment)
+    segments = [describe_segment(int(number), shape[seen.segment == number]) for number in numbers]
+    permittivity = np.full(len(seen), complex(np.nan, np.nan))
+    covariance = np.full((len(seen), 2, 2), np.nan)
+    if reference is None or gains is None:
+        reason = "no metal reference: calibrate with a sphere, or give --reference"
+        segments = [replace(segment, reason=reason) for segment in segments]
+    else:
+        voltages = voltages_of(seen, optics, shape)
+        disturbed = disturb_scan(seen, optics, reference, uncertainty)
+        for index, segment in enumerate(segments):
+            members = seen.segment == segment.number
+            own_voltages = voltages[members]
+            judged, fit = judge_segment(segment, own_voltages, gains, optics.wave_number)
+            segments[index] = judged
+            if fit is None:
+                continue
+            used = np.flatnonzero(members)[fit.used]
+            used_fit = replace(fit, answer=fit.answer[:, fit.used])
+            of_used = [replace(d, voltages=d.voltages[used]) for d in disturbed]
+            sources = add_common_errors(used_fit, voltages[used], gains, of_used, optics.wave_number)
+            segments[index] = with_permittivity(judged, fit.eps, sources)
+            if segments[index].permittivity is None:
+                continue
+            common = sum((c for name, c in sources.items() if name != "scatter"), np.zeros((2, 2)))
+            permittivity[members] = point_permittivity(own_voltages, gains, optics.wave_number)
+            covariance[members] = point_covariance(own_voltages, gains, fit, optics.wave_number) + common
+    position_std_m, normal_std_rad = find_shape_errors(seen.h, shape, optics, uncertainty)
     return Surface(
         scan_id=scan_id,
         simulated=simulated,
@@ -121,17 +152,96 @@ def analyse_surface(
         incidence_deg=np.degrees(np.arccos(np.clip(shape.cos, 0, 1))),
         permittivity=permittivity,
         covariance=covariance,
-        # The path changes by 2 cos(theta) along the normal, its slope by as much per radian.
-        position_std_m=seen.h.path_std_m / (2 * shape.cos),
-        normal_std_deg=np.degrees(np.linalg.norm(seen.h.slope_std, axis=1) / (2 * shape.cos)),
+        position_std_m=position_std_m,
+        normal_std_deg=np.degrees(normal_std_rad),
         segment=seen.segment,
         segments=tuple(segments),
     )
 
 
-def _describe(number: int, shape: Shape) -> Segment:
-    bends = np.linalg.eigvalsh((shape.curvature + np.swapaxes(shape.curvature, 1, 2)) / 2)
-    bend = float(np.max(np.abs(np.median(bends, axis=0))))
+def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m: tuple[float, float]) -> Surface:
+    """Join scans of an object on a turntable into one surface, as the object stood at the angle zero.
+
+    The table turns about a vertical axis through `axis_m`, its x and z in the rig frame; a positive angle turns +z
+    towards +x. Segments stay apart and are numbered in order.
+    """
+    x, z = axis_m
+    axis = np.array([x, 0.0, z])
+    parts: list[dict[str, NDArray]] = []
+    segments: list[Segment] = []
+    for surface, angle_deg in zip(surfaces, angles_deg, strict=True):
+        cos = np.cos(np.radians(angle_deg))
+        sin = np.sin(np.radians(angle_deg))
+        # Takes the object back to where it stood at the angle zero.
+        back = np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]])
+        normals = surface.normals @ back.T
+        # Curvatures are given in tangents that follow from the normal: they turn with these.
+        change = np.swapaxes(tangents(normals), 1, 2) @ (back @ tangents(surface.normals))
+        first = len(segments)
+        part = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name not in NOT_POINTS}
+        part["points_m"] = (surface.points_m - axis) @ back.T + axis
+        part["normals"] = normals
+        part["curvature"] = change @ surface.curvature @ np.swapaxes(change, 1, 2)
+        part["segment"] = surface.segment + first
+        parts.append(part)
+        for segment in surface.segments:
+            moved = replace(
+                segment,
+                number=segment.number + first,
+                centre_m=_triple(back @ (np.array(segment.centre_m) - axis) + axis),
+                normal=_triple(back @ np.array(segment.normal)),
+                turned_deg=float(angle_deg),
+            )
+            segments.append(moved)
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return Surface(
+        scan_id="+".join(surface.scan_id for surface in surfaces),
+        simulated=any(surface.simulated for surface in surfaces),
+        segments=tuple(segments),
+        **joined,
+    )
+
+
+def drop_edges(seen: Seen, optics: Optics, gains: Gains | None) -> Seen:
+    """Return the points at which surfaces reflect, without segments of which hardly any is left."""
+    voltages = voltages_of(seen, optics)
+    reflecting = seen[find_reflecting(voltages, np.abs(seen.h.amplitude), seen.segment, gains)]
+    counts = np.bincount(reflecting.segment, minlength=1)
+    return reflecting[counts[reflecting.segment] >= LEAST_POINTS]
+
+
+def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty: Uncertainty) -> tuple[Array, Array]:
+    """Standard deviations of points along the normal (metres) and of normals (radians, both directions together).
+
+    A normal is judged beside that of the surface at the point: a point that slides along a bent surface is beside it.
+    """
+    tangent = tangents(shape.normals)
+
+    def find_changes(moved: Shape) -> tuple[Array, Array]:
+        away = moved.points - shape.points
+        turn = np.einsum("nij,ni->nj", tangent, moved.normals - shape.normals)
+        slide = np.einsum("nij,ni->nj", tangent, away)
+        bent = np.einsum("njk,nk->nj", shape.curvature, slide)
+        return np.einsum("ni,ni->n", away, shape.normals), turn - bent
+
+    changes = [
+        find_changes(shape_of(echoes, rig)) for source, rig in disturb_optics(optics, uncertainty) if source == "places"
+    ]
+    # Errors of path and slope by noise, one after the other.
+    changes.append(find_changes(shape_of(replace(echoes, path_m=echoes.path_m + echoes.path_std_m), optics)))
+    for axis in np.eye(2):
+        slope = echoes.slope + echoes.slope_std * axis
+        changes.append(find_changes(shape_of(replace(echoes, slope=slope), optics)))
+    position2 = np.sum([along**2 for along, _ in changes], axis=0)
+    turn2 = np.sum([np.sum(turn**2, axis=1) for _, turn in changes], axis=0)
+    return np.sqrt(position2), np.sqrt(turn2)
+
+
+def describe_segment(number: int, shape: Shape) -> Segment:
+    """Return what the shape of a segment's points says."""
+    # The median of the matrices, for noise spreads the two curvatures of each point.
+    usual = np.median(shape.curvature, axis=0)
+    bend = float(np.abs(np.linalg.eigvalsh((usual + usual.T) / 2)).max())
     normal = shape.normals.mean(axis=0)
     normal /= np.linalg.norm(normal)
     return Segment(
@@ -149,50 +259,34 @@ def _triple(vector: Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _refuse(segment: Segment, reason: str, name: str = "") -> Segment:
-    return replace(segment, reason=reason, name=name)
-
-
-def _judge(
-    segment: Segment,
-    seen: Seen,
-    voltages: Voltages,
-    optics: Optics,
-    reference: Callable[[Optics], Gains],
-    gains: Gains,
-    uncertainty: Uncertainty,
-) -> tuple[Segment, Array | None]:
-    """Give a segment its permittivity or the reason why it has none; and the covariance common to its points."""
+def judge_segment(
+    segment: Segment, voltages: Voltages, gains: Gains, wave_number: float
+) -> tuple[Segment, PermittivityFit | None]:
+    """Fit a segment's permittivity, unless there is a reason why it has none."""
     if segment.points < MIN_POINTS:
-        return _refuse(segment, f"{segment.points} points only: too few to average over"), None
-    ratio = np.median(point_ratio(voltages, gains).real) + 1j * np.median(point_ratio(voltages, gains).imag)
+        return replace(segment, reason=f"{segment.points} points only: too few to average over"), None
+    ratios = point_ratio(voltages, gains)
+    ratio = complex(np.median(ratios.real), np.median(ratios.imag))
     if abs(ratio - 1) < METAL_RATIO:
-        return _refuse(segment, "its ratio is that of metal", "metal"), None
+        return replace(segment, reason="its ratio is that of metal", name="metal"), None
     if segment.radius_mm is not None and segment.radius_mm < 1e3 * MIN_RADIUS_M:
         why = f"radius {segment.radius_mm:.0f} mm: below {1e3 * MIN_RADIUS_M:.0f} mm only the shape is reliable"
-        return _refuse(segment, why), None
-    found = segment_permittivity(seen, optics, reference, uncertainty)
-    loss_std = float(np.sqrt(found.covariance[1, 1]))
-    if found.eps.imag > MAX_GAIN_SIGMA * loss_std or found.eps.real < 1.25:
-        why = "no single medium reflects so: a thin wall, a coating, or a second echo at the same place"
-        return _refuse(segment, why), None
-    (aa, ab), (_, bb) = found.covariance.tolist()
-    source = max(found.sources, key=lambda name: found.sources[name])
-    judged = replace(segment, permittivity=found.eps, covariance=((aa, ab), (ab, bb)), dominated_by=source)
-    scatter = found.sources["scatter"]
-    total = float(np.trace(found.covariance))
-    return judged, found.covariance * max(0.0, 1 - scatter / total)
+        return replace(segment, reason=why), None
+    fit = fit_permittivity(voltages, gains, wave_number)
+    level, rise = judge_medium(fit, voltages, gains, wave_number)
+    if abs(level) > MAX_LEVEL_MISS or rise > MAX_BAND_RISE:
+        why = "no single medium reflects so: a thin wall, a coating, an edge, or a second echo at the same place"
+        return replace(segment, reason=why), None
+    return segment, fit
 
 
-def _point_covariance(v: Voltages, gains: Gains, wave_number: float) -> Array:
-    """Covariance of (real, imaginary) of each point's permittivity by its own noise, [n, 2, 2]."""
-    relative = np.sqrt(np.sum((v.std / np.maximum(np.abs(v.b), 1e-30)) ** 2, axis=1) + 2 * MODEL_ERROR**2)
-    step = 1e-3
-    changed = Voltages(v.b * np.array([1 + step, 1.0]), v.std, v.m, v.theta, v.bend_inside, v.bend_across, v.arrival)
-    rate = (point_permittivity(changed, gains, wave_number) - point_permittivity(v, gains, wave_number)) / step
-    # The permittivity is an analytic function of the ratio: the same error in both parts.
-    variance = np.abs(rate) ** 2 * relative**2
-    return variance[:, None, None] * np.eye(2)
+def with_permittivity(segment: Segment, eps: complex, sources: dict[str, Array]) -> Segment:
+    """Add a permittivity with its covariances by source, unless no passive medium has it."""
+    (aa, ab), (_, bb) = sum(sources.values(), np.zeros((2, 2))).tolist()
+    if eps.imag > MAX_GAIN_SIGMA * bb**0.5 or eps.real < 1.25:
+        return replace(segment, reason="no passive medium reflects so: a thin wall, a coating, or an edge")
+    dominant = max(sources, key=lambda name: float(np.trace(sources[name])))
+    return replace(segment, permittivity=eps, covariance=((aa, ab), (ab, bb)), dominated_by=dominant)
 
 
 def plain_segment(segment: Segment) -> dict[str, Any]:
@@ -248,19 +342,37 @@ def point_cloud(surface: Surface) -> bytes:
 
 def summary_lines(surface: Surface) -> list[str]:
     """Text for people: a line for each segment."""
-    head = f"{'simulated ' if surface.simulated else ''}scan {surface.scan_id}: {len(surface.segment)} points"
-    lines = [f"{head} on {len(surface.segments)} surfaces"]
-    for s in surface.segments:
-        x, y, z = (1e3 * value for value in s.centre_m)
-        tilt_x, tilt_y = (float(np.degrees(np.arctan2(n, -s.normal[2]))) for n in s.normal[:2])
-        form = "flat" if s.radius_mm is None else f"radius {s.radius_mm:.0f} mm"
-        line = f"  {s.number}: {s.points} points at ({x:+.0f}, {y:+.0f}, {z:.0f}) mm, {form}"
-        line += f", tilt {tilt_x:+.1f}, {tilt_y:+.1f} degrees, incidence {s.incidence_deg:.1f}"
-        if s.permittivity is not None and s.covariance is not None:
-            std = [float(np.sqrt(s.covariance[i][i])) for i in range(2)]
-            line += f": {s.permittivity.real:.2f} +- {std[0]:.2f} - j ({-s.permittivity.imag:.2f} +- {std[1]:.2f})"
-            line += f", mostly by {s.dominated_by}"
-        else:
-            line += f": {s.name + ', ' if s.name else ''}no permittivity, {s.reason}"
-        lines.append(line)
+    kind = "simulated " if surface.simulated else ""
+    lines = [f"{kind}scan {surface.scan_id}: {len(surface.segment)} points on {len(surface.segments)} surfaces"]
+    for segment in surface.segments:
+        x_mm, y_mm, z_mm = 1e3 * np.array(segment.centre_m)
+        tilts_deg = [np.degrees(np.arctan2(part, -segment.normal[2])) for part in segment.normal[:2]]
+        turned = f", turned by {segment.turned_deg:g} degrees" if segment.turned_deg else ""
+        lines.append(
+            f"  {segment.number}: {segment.points} points at ({x_mm:+.0f}, {y_mm:+.0f}, {z_mm:.0f}) mm{turned}, "
+            f"{describe_form(segment)}, tilt {tilts_deg[0]:+.1f}, {tilts_deg[1]:+.1f} degrees, "
+            f"incidence {segment.incidence_deg:.1f}: {describe_material(segment)}"
+        )
     return lines
+
+
+def describe_form(segment: Segment) -> str:
+    """Return "flat" or the radius of a segment."""
+    if segment.radius_mm is None:
+        return "flat"
+    return f"radius {segment.radius_mm:.0f} mm"
+
+
+def describe_material(segment: Segment) -> str:
+    """Return permittivity, standard errors and name of a segment, or why it has none."""
+    if segment.permittivity is None or segment.covariance is None:
+        name = f"{segment.name}, " if segment.name else ""
+        return f"{name}no permittivity, {segment.reason}"
+    eps = segment.permittivity
+    real_std = segment.covariance[0][0] ** 0.5
+    loss_std = segment.covariance[1][1] ** 0.5
+    text = f"{eps.real:.2f} +- {real_std:.2f} - j ({-eps.imag:.2f} +- {loss_std:.2f})"
+    text += f", mostly by {segment.dominated_by}"
+    if segment.name and segment.confidence is not None:
+        text += f"; {segment.name} ({100 * segment.confidence:.0f} %)"
+    return text

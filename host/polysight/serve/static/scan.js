@@ -30,6 +30,8 @@ function showHead() {
   by("process-open").hidden = !(server.starts && recorded && !live);
   by("report").hidden = !result?.files.some((f) => f.name === "report.html");
   by("report").href = address("file/report.html", scan);
+  by("surface").hidden = !result?.files.some((f) => f.name === "surface.ply");
+  by("surface").href = `/surface?scan=${encodeURIComponent(scanName)}`;
 }
 
 function showReasons() {

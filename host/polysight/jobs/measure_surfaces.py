@@ -1,0 +1,171 @@
+"""Surfaces in the rows that a pipeline holds: specular points, gains, analysis, names, and the files.
+
+Used by `polysight surface`, and by `polysight process` where a patch is neither flat nor level.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from polysight.calibration import SphereFile
+from polysight.materials import Classifier, name_permittivity
+from polysight.pipeline import Pipeline
+from polysight.process import load_classifier
+from polysight.surfaces import (
+    Echoes,
+    Gains,
+    Optics,
+    Reference,
+    Samples,
+    Seen,
+    Segment,
+    Surface,
+    Uncertainty,
+    analyse_surface,
+    learn_gains,
+    optics_of,
+    see_points,
+    voltages_of,
+    write_surface,
+)
+from polysight_shared.config import Instrument
+from polysight_shared.files import write_atomically
+
+# Points of the metal sphere that the calibration file keeps.
+KEPT_POINTS = 240
+# Standard errors of places that were measured by hand, and of those that `calibrate direct-path` measured.
+PLACE_STD_M = 1e-3
+CALIBRATED_PLACE_STD_M = 3e-4
+# Axes of polarisation follow the boards, which are mounted to about a degree.
+AXIS_STD_RAD = 0.0175
+
+
+def samples_of(pipeline: Pipeline) -> tuple[Samples, Samples]:
+    """Return the samples of H and V that a pipeline holds, x from TX to RX."""
+    found = []
+    for board in pipeline.images.boards.values():
+        aperture = board.aperture
+        cube, valid, offsets = board.calibrated(), board.valid, aperture.offsets_m
+        tx_m, rx_m = aperture.antennas.tx_m, aperture.antennas.rx_m
+        if pipeline.source.mirrored:
+            # Recorded by columns: the builder holds the scan mirrored in x = y.
+            swap = [1, 0, 2]
+            cube, valid, offsets = np.swapaxes(cube, 2, 3), valid.T, np.swapaxes(offsets, 0, 1)[..., swap]
+            tx_m, rx_m = tx_m[swap], rx_m[:, swap]
+        found.append(Samples(cube, valid, offsets, aperture.frequencies_hz, tx_m, rx_m, board.model))
+    return found[0], found[1]
+
+
+def uncertainty_of(rig: Instrument, *, places_known: bool) -> Uncertainty:
+    """Return the standard errors of leakage, axes and places of a rig."""
+    polarimetry = rig.polarimetry
+    # Unmeasured, its size is that of a complex number.
+    leakage = polarimetry.leakage_prior / np.sqrt(2)
+    if polarimetry.leakage_std is not None:
+        leakage = polarimetry.leakage_std
+    return Uncertainty(float(leakage), AXIS_STD_RAD, CALIBRATED_PLACE_STD_M if places_known else PLACE_STD_M)
+
+
+def optics_of_rig(rig: Instrument) -> Optics:
+    """Return the antennas of a rig with its leakage, if measured."""
+    polarimetry = rig.polarimetry
+    if polarimetry.leakage_std is None:
+        return optics_of(rig)
+    return optics_of(rig, (complex(*polarimetry.leakage_h), complex(*polarimetry.leakage_v)))
+
+
+def see_rows(pipeline: Pipeline, optics: Optics) -> Seen:
+    """Find the specular points in the rows that a pipeline holds."""
+    h, v = samples_of(pipeline)
+    low, high = pipeline.images.gate_m
+    direct_m = float(h.direct_m.mean())
+    return see_points(h, v, optics, (low + direct_m, high + direct_m))
+
+
+def gains_of(metal: Seen) -> Reference:
+    """Return the gains that points of metal give, for any rig."""
+
+    def learn(optics: Optics) -> Gains:
+        return learn_gains(voltages_of(metal, optics), optics.wave_number)
+
+    return learn
+
+
+def points_of(file: SphereFile) -> Seen:
+    """Return the points of a metal sphere from its calibration file."""
+    h, v = (_echoes_of(np.array(file.points[channel])) for channel in ("h", "v"))
+    return Seen(h, v, np.zeros(len(h), int))
+
+
+def _echoes_of(rows: np.ndarray) -> Echoes:
+    count = len(rows)
+    bend = np.stack([rows[:, [6, 7]], rows[:, [7, 8]]], axis=1)
+    # Files of older versions end before the rise over the band: none is assumed then.
+    band_rise = rows[:, 12] if rows.shape[1] > 12 else np.zeros(count)
+    return Echoes(
+        at_m=rows[:, :3],
+        path_m=rows[:, 3],
+        slope=rows[:, 4:6],
+        bend=bend,
+        amplitude=rows[:, 9] + 1j * rows[:, 10],
+        amplitude_std=rows[:, 11],
+        path_std_m=np.zeros(count),
+        slope_std=np.zeros((count, 2)),
+        share=np.zeros(count),
+        band_rise=band_rise,
+    )
+
+
+def thin_out(metal: Seen) -> Seen:
+    """Return `KEPT_POINTS` points of metal, evenly taken: neighbours overlap."""
+    chosen = np.linspace(0, len(metal) - 1, min(KEPT_POINTS, len(metal))).round().astype(int)
+    return metal[chosen]
+
+
+def analyse_points(pipeline: Pipeline, optics: Optics, seen: Seen, gains: Reference | None = None) -> Surface:
+    """Return the surfaces of a scan's points, named; without `gains` those of the calibration's sphere count."""
+    calibration = pipeline.calibration
+    if gains is None and calibration.sphere is not None:
+        gains = gains_of(points_of(calibration.sphere))
+    made = analyse_surface(
+        seen,
+        optics,
+        gains,
+        uncertainty=uncertainty_of(pipeline.rig, places_known=calibration.places is not None),
+        scan_id=pipeline.source.scan_id,
+        simulated=pipeline.source.simulated,
+    )
+    classifier = load_classifier(pipeline.settings, pipeline.rig)
+    if classifier is None:
+        return made
+    return replace(made, segments=tuple(name_segment(segment, classifier) for segment in made.segments))
+
+
+def name_segment(segment: Segment, classifier: Classifier) -> Segment:
+    """Name a segment by its permittivity, with the library that names flat patches; others stay as they are."""
+    if segment.permittivity is None or segment.covariance is None:
+        return segment
+    named = name_permittivity(segment.permittivity, np.array(segment.covariance), classifier)
+    return replace(segment, name=named.name, confidence=named.confidence)
+
+
+def save_surface(out: Path, made: Surface) -> None:
+    """Write surface.npz, surface.ply and surface.png into a folder."""
+    from polysight.report import surface_figure
+
+    write_surface(out, made)
+    write_atomically(out / "surface.png", surface_figure(made))
+
+
+def add_surfaces(pipeline: Pipeline, out: Path) -> None:
+    """Measure the surfaces of a processed scan with patches that are tilted or curved; write them beside its products.
+
+    The range gate is that of the images, so that only what lies near the object plane is seen.
+    """
+    optics = optics_of_rig(pipeline.rig)
+    seen = see_rows(pipeline, optics)
+    if len(seen):
+        save_surface(out, analyse_points(pipeline, optics, seen))

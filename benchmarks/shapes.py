@@ -35,10 +35,10 @@ from polysight.surfaces import (
     Surface,
     Uncertainty,
     analyse_surface,
+    find_voltages,
     learn_gains,
-    optics_of,
+    make_optics,
     see_points,
-    voltages_of,
 )
 from polysight_shared.config import load_instrument
 from polysight_worlds import (
@@ -149,7 +149,7 @@ class ScanKind:
     @property
     def optics(self) -> Optics:
         """The rig as the host takes it."""
-        optics = optics_of(load_instrument(RIG_FILE))
+        optics = make_optics(load_instrument(RIG_FILE))
         if not self.is_quick:
             return optics
         h_m = self.boards.h[0].position
@@ -190,7 +190,7 @@ def analyse_shapes(
     metal = see_reference(nuisances, scan)
 
     def reference(optics: Optics) -> Gains:
-        return learn_gains(voltages_of(metal, optics), optics.wave_number)
+        return learn_gains(find_voltages(metal, optics), optics.wave_number)
 
     seen = see_shapes((*scene.shapes, *scene.background), nuisances, scan, number=2)
     started = time.process_time()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from tests.support.refusals import refused
 
 from polysight.cli.main import main
 from polysight.jobs.process import make_products, processed_rows, publish_images
+from polysight.materials import STEEP
 from polysight.pipeline import Pipeline
 from polysight.products import read_products
 from polysight.products.processed import FINISHED
@@ -82,6 +84,25 @@ def test_progress_is_reported_before_each_step(scan: Path, tmp_path: Path) -> No
     steps: list[str] = []
     processed_rows(ScanFolder.load(scan), scan, Settings(model="none")).finish(tmp_path, (), steps.append)
     assert steps == ["point response", "materials", "figures and report"]
+
+
+@pytest.mark.parametrize("is_steep", [True, False])
+def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_steep: bool
+) -> None:
+    examine = Pipeline.examine
+
+    def examine_tilted(self: Pipeline, *words: object) -> object:
+        findings = examine(self, *words)  # type: ignore[arg-type]
+        first, *others = findings.found.patches
+        patches = (replace(first, refused=STEEP if is_steep else None), *others)
+        return replace(findings, found=replace(findings.found, patches=patches))
+
+    monkeypatch.setattr(Pipeline, "examine", examine_tilted)
+    folders: list[Path] = []
+    pipeline = processed_rows(ScanFolder.load(scan), scan, Settings(model="none"))
+    pipeline.finish(tmp_path, measure_surfaces=lambda _, out: folders.append(out))
+    assert folders == ([tmp_path] if is_steep else [])
 
 
 def test_another_plane_and_grid_from_the_command_line(scan: Path, tmp_path: Path) -> None:

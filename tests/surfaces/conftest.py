@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from polysight.surfaces import Optics, Samples, Seen, aimed, learn_gains, see_points, voltages_of
+from polysight.surfaces import Optics, Samples, Seen, aim_antenna, find_voltages, learn_gains, see_points
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_worlds.rig import published_boards
 from polysight_worlds.shape_scenes import ShapeNuisances, reference_sphere, scan_offsets, scan_shapes
@@ -26,9 +26,9 @@ def nominal_optics() -> Optics:
     tx_m = boards.tx.position
     half = float(np.sqrt(0.5))
     return Optics(
-        tx=aimed(tx_m, boards.tx.boresight, middle["h"], 0.499, (half, half)),
-        h=aimed(middle["h"], boards.h[0].boresight, tx_m, 0.499, (1.0, 0.0)),
-        v=aimed(middle["v"], boards.v[0].boresight, tx_m, 0.499, (0.0, 1.0)),
+        tx=aim_antenna(tx_m, boards.tx.boresight, middle["h"], 0.499, (half, half)),
+        h=aim_antenna(middle["h"], boards.h[0].boresight, tx_m, 0.499, (1.0, 0.0)),
+        v=aim_antenna(middle["v"], boards.v[0].boresight, tx_m, 0.499, (0.0, 1.0)),
         wave_number=2 * np.pi * float(FREQUENCIES_HZ.mean()) / SPEED_OF_LIGHT_M_S,
     )
 
@@ -73,6 +73,6 @@ def gains(metal):
     """Gains by the metal sphere, for any rig."""
 
     def learn(rig: Optics):
-        return learn_gains(voltages_of(metal, rig), rig.wave_number)
+        return learn_gains(find_voltages(metal, rig), rig.wave_number)
 
     return learn

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from polysight.surfaces import Samples
-from polysight.surfaces.paths import find_echoes
+from polysight.surfaces.paths import find_echoes, find_mirror_path, measure_echoes
 from polysight.surfaces.points import (
-    curvature_of,
+    find_curvature,
+    find_normals,
     locate,
-    normals_at,
     offset_that_sees,
     predict_echo,
     spreading,
@@ -70,8 +70,8 @@ def test_a_sphere_of_rays_is_found_with_point_normal_and_radius():
     scan = with_echo(empty_scan(), FRONT_M, 0.12, 0.5 * np.exp(0.3j))
     echoes = find_echoes(scan, (1.4, 2.0))
     points = locate(echoes.path_m, echoes.slope, echoes.at_m, scan.tx_m, scan.middle_m)
-    normals, _ = normals_at(points, echoes.at_m, scan.tx_m, scan.middle_m)
-    bends = curvature_of(points, normals, echoes.at_m, scan.tx_m, scan.middle_m, echoes.bend)
+    normals, _ = find_normals(points, echoes.at_m, scan.tx_m, scan.middle_m)
+    bends = find_curvature(points, normals, echoes.at_m, scan.tx_m, scan.middle_m, echoes.bend)
     away = points - FRONT_M - 0.12 * BEHIND
     assert np.abs(np.linalg.norm(away, axis=1) - 0.12).max() < 1e-4
     assert np.abs(np.cross(normals, away / 0.12)).max() < np.radians(0.1)
@@ -94,12 +94,12 @@ def test_the_path_of_a_point_gives_the_point_back():
     n = 200
     points = rng.uniform([-0.1, 0.0, 0.4], [0.1, 0.2, 0.6], (n, 3))
     at_m = np.stack([rng.uniform(-0.05, 0.05, n), rng.uniform(-0.05, 0.05, n), np.zeros(n)], axis=1)
-    normals, _ = normals_at(points, at_m, scan.tx_m, scan.middle_m)
+    normals, _ = find_normals(points, at_m, scan.tx_m, scan.middle_m)
     bends = rng.uniform(-2, 15, (n, 2, 2))
     bends = (bends + np.swapaxes(bends, 1, 2)) / 2
     path, slope, bend = predict_echo(points, normals, bends, at_m, scan.tx_m, scan.middle_m)
     assert np.allclose(locate(path, slope, at_m, scan.tx_m, scan.middle_m), points, atol=1e-8)
-    assert np.allclose(curvature_of(points, normals, at_m, scan.tx_m, scan.middle_m, bend), bends, atol=1e-4)
+    assert np.allclose(find_curvature(points, normals, at_m, scan.tx_m, scan.middle_m, bend), bends, atol=1e-4)
     seen_from = offset_that_sees(points, normals, at_m + np.array([0.01, 0.02, 0]), scan.tx_m, scan.middle_m)
     assert np.allclose(seen_from, at_m, atol=1e-8)
 
@@ -110,8 +110,25 @@ def test_a_mirror_spreads_as_its_path():
     image = scan.tx_m * [1, 1, -1] + [0, 0, 1.0]
     share = (0.5 - scan.middle_m[2]) / (image[2] - scan.middle_m[2])
     point = (scan.middle_m + share * (image - scan.middle_m))[None]
-    normals, _ = normals_at(point, at_m, scan.tx_m, scan.middle_m)
+    normals, _ = find_normals(point, at_m, scan.tx_m, scan.middle_m)
     _, _, out_m, back_m = unit_legs(point, at_m, scan.tx_m, scan.middle_m)
     found = spreading(point, normals, np.zeros((1, 2, 2)), at_m, scan.tx_m, scan.middle_m)
     assert np.allclose(normals, [[0, 0, -1]], atol=1e-9)
     assert found[0] == pytest.approx(1 / float(out_m[0] + back_m[0]), rel=1e-6)
+
+
+def test_a_known_path_is_measured_without_the_gain_of_a_search():
+    """Noise alone has the power of a mean over the samples; a maximum over paths would be several times as large."""
+    scan = empty_scan()
+    rng = np.random.default_rng(7)
+    noise = rng.normal(size=scan.cube.shape) + 1j * rng.normal(size=scan.cube.shape)
+    noisy = replace(scan, cube=noise)
+    # Slopes so far apart that their means are independent.
+    slope = np.stack(np.meshgrid(np.linspace(-0.35, 0.35, 6), np.linspace(-0.35, 0.35, 6)), axis=-1).reshape(-1, 2)
+    count = len(slope)
+    path = np.full(count, find_mirror_path(scan, 0.5))
+    echoes, inside = measure_echoes(noisy, np.zeros((count, 3)), path, slope, np.zeros((count, 2, 2)))
+    height, width = scan.window_shape()
+    expected = 2 / (len(scan.rx_m) * FREQUENCIES_HZ.size * height * width)
+    assert inside.all()
+    assert np.mean(np.abs(echoes.amplitude) ** 2) / expected == pytest.approx(1, abs=0.6)

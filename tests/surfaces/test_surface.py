@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from polysight.surfaces import (
     SURFACE,
     Uncertainty,
     analyse_surface,
+    join_turned,
     read_surface,
     reflect_curved,
     reflect_flat,
@@ -101,6 +103,24 @@ def test_the_error_grows_with_what_is_not_known(glass_ball, gains, optics):
         traces.append(np.trace(judged.covariance))
     assert traces == sorted(traces)
     assert traces[-1] > 2 * traces[0]
+
+
+def test_scans_of_a_turntable_are_joined_where_the_object_stood(glass_ball):
+    """The same ball, as a table that has turned by 40 degrees shows it, comes back to its place."""
+    _, _, surface = glass_ball
+    axis = (0.03, 0.55)
+    angle = np.radians(40.0)
+    # A positive angle turns +z towards +x.
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    about = np.array([axis[0], 0.0, axis[1]])
+    turned = replace(surface, points_m=(surface.points_m - about) @ turn.T + about, normals=surface.normals @ turn.T)
+    joined = join_turned([surface, turned], [0.0, 40.0], axis)
+    count = len(surface.points_m)
+    assert np.allclose(joined.points_m[count:], surface.points_m, atol=1e-9)
+    assert np.allclose(joined.normals[count:], surface.normals, atol=1e-9)
+    assert [s.number for s in joined.segments] == list(range(2 * len(surface.segments)))
+    assert set(joined.segment[count:]) <= {s.number for s in joined.segments[len(surface.segments) :]}
+    assert [s.turned_deg for s in joined.segments[len(surface.segments) :]] == [40.0] * len(surface.segments)
 
 
 def test_files_hold_what_was_found(glass_ball, tmp_path):

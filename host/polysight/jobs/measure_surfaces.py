@@ -25,10 +25,10 @@ from polysight.surfaces import (
     Surface,
     Uncertainty,
     analyse_surface,
+    find_voltages,
     learn_gains,
-    optics_of,
+    make_optics,
     see_points,
-    voltages_of,
     write_surface,
 )
 from polysight_shared.config import Instrument
@@ -43,7 +43,7 @@ CALIBRATED_PLACE_STD_M = 3e-4
 AXIS_STD_RAD = 0.0175
 
 
-def samples_of(pipeline: Pipeline) -> tuple[Samples, Samples]:
+def take_samples(pipeline: Pipeline) -> tuple[Samples, Samples]:
     """Return the samples of H and V that a pipeline holds, x from TX to RX."""
     found = []
     for board in pipeline.images.boards.values():
@@ -59,7 +59,7 @@ def samples_of(pipeline: Pipeline) -> tuple[Samples, Samples]:
     return found[0], found[1]
 
 
-def uncertainty_of(rig: Instrument, *, places_known: bool) -> Uncertainty:
+def find_uncertainty(rig: Instrument, *, places_known: bool) -> Uncertainty:
     """Return the standard errors of leakage, axes and places of a rig."""
     polarimetry = rig.polarimetry
     # Unmeasured, its size is that of a complex number.
@@ -69,38 +69,38 @@ def uncertainty_of(rig: Instrument, *, places_known: bool) -> Uncertainty:
     return Uncertainty(float(leakage), AXIS_STD_RAD, CALIBRATED_PLACE_STD_M if places_known else PLACE_STD_M)
 
 
-def optics_of_rig(rig: Instrument) -> Optics:
+def make_rig_optics(rig: Instrument) -> Optics:
     """Return the antennas of a rig with its leakage, if measured."""
     polarimetry = rig.polarimetry
     if polarimetry.leakage_std is None:
-        return optics_of(rig)
-    return optics_of(rig, (complex(*polarimetry.leakage_h), complex(*polarimetry.leakage_v)))
+        return make_optics(rig)
+    return make_optics(rig, (complex(*polarimetry.leakage_h), complex(*polarimetry.leakage_v)))
 
 
 def see_rows(pipeline: Pipeline, optics: Optics) -> Seen:
     """Find the specular points in the rows that a pipeline holds."""
-    h, v = samples_of(pipeline)
+    h, v = take_samples(pipeline)
     low, high = pipeline.images.gate_m
     direct_m = float(h.direct_m.mean())
     return see_points(h, v, optics, (low + direct_m, high + direct_m))
 
 
-def gains_of(metal: Seen) -> Reference:
+def make_reference(metal: Seen) -> Reference:
     """Return the gains that points of metal give, for any rig."""
 
     def learn(optics: Optics) -> Gains:
-        return learn_gains(voltages_of(metal, optics), optics.wave_number)
+        return learn_gains(find_voltages(metal, optics), optics.wave_number)
 
     return learn
 
 
-def points_of(file: SphereFile) -> Seen:
+def load_sphere_points(file: SphereFile) -> Seen:
     """Return the points of a metal sphere from its calibration file."""
-    h, v = (_echoes_of(np.array(file.points[channel])) for channel in ("h", "v"))
+    h, v = (_parse_echoes(np.array(file.points[channel])) for channel in ("h", "v"))
     return Seen(h, v, np.zeros(len(h), int))
 
 
-def _echoes_of(rows: np.ndarray) -> Echoes:
+def _parse_echoes(rows: np.ndarray) -> Echoes:
     count = len(rows)
     bend = np.stack([rows[:, [6, 7]], rows[:, [7, 8]]], axis=1)
     # Files of older versions end before the rise over the band: none is assumed then.
@@ -129,12 +129,12 @@ def analyse_points(pipeline: Pipeline, optics: Optics, seen: Seen, gains: Refere
     """Return the surfaces of a scan's points, named; without `gains` those of the calibration's sphere count."""
     calibration = pipeline.calibration
     if gains is None and calibration.sphere is not None:
-        gains = gains_of(points_of(calibration.sphere))
+        gains = make_reference(load_sphere_points(calibration.sphere))
     made = analyse_surface(
         seen,
         optics,
         gains,
-        uncertainty=uncertainty_of(pipeline.rig, places_known=calibration.places is not None),
+        uncertainty=find_uncertainty(pipeline.rig, places_known=calibration.places is not None),
         scan_id=pipeline.source.scan_id,
         simulated=pipeline.source.simulated,
     )
@@ -165,7 +165,7 @@ def add_surfaces(pipeline: Pipeline, out: Path) -> None:
 
     The range gate is that of the images, so that only what lies near the object plane is seen.
     """
-    optics = optics_of_rig(pipeline.rig)
+    optics = make_rig_optics(pipeline.rig)
     seen = see_rows(pipeline, optics)
     if len(seen):
         save_surface(out, analyse_points(pipeline, optics, seen))

@@ -10,8 +10,8 @@ import numpy as np
 from polysight.calibration import SphereFile, header, open_raw, source_scan, write_calibration
 from polysight.jobs.measure_surfaces import (
     analyse_points,
-    gains_of,
-    optics_of_rig,
+    make_reference,
+    make_rig_optics,
     save_surface,
     see_rows,
     thin_out,
@@ -27,14 +27,14 @@ from polysight.surfaces import (
     Reference,
     Seen,
     Surface,
+    find_shape,
+    find_voltages,
     join_turned,
     learn_gains,
+    make_optics,
     mirror_point,
-    optics_of,
     plain_segment,
-    shape_of,
     summary_lines,
-    voltages_of,
 )
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
@@ -49,7 +49,7 @@ def seen_by(data: Path, config: Path | None) -> tuple[Pipeline, Optics, Seen]:
     """Process the rows of a scan, and find the specular points in it. Raises PolysightError."""
     source = open_source(data, config, dropped=True)
     pipeline = processed_rows(source, data, Settings(config=path_text(config), depth_range_mm=1e3 * DEPTH_M))
-    optics = optics_of_rig(pipeline.rig)
+    optics = make_rig_optics(pipeline.rig)
     say("specular points")
     seen = see_rows(pipeline, optics)
     if not len(seen):
@@ -109,7 +109,7 @@ def check_turns(scans: int, turned_deg: Sequence[float]) -> None:
 
 def find_axis(rig: Instrument, axis_mm: tuple[float, float]) -> tuple[float, float]:
     """Return x and z in the rig frame, metres, of a turntable's axis given from grid's middle and object plane."""
-    optics = optics_of(rig)
+    optics = make_optics(rig)
     middle_m = mirror_point(optics, rig.geometry.object_distance_mm / 1e3)
     return float(middle_m[0]) + axis_mm[0] / 1e3, float(middle_m[2]) + axis_mm[1] / 1e3
 
@@ -120,11 +120,11 @@ def make_surface(data: Path, config: Path | None = None, reference: Path | None 
     gains: Reference | None = None
     if reference is not None:
         _, _, metal = seen_by(reference, config)
-        gains = gains_of(thin_out(metal[metal.segment == 0]))
+        gains = make_reference(thin_out(metal[metal.segment == 0]))
     return analyse_points(pipeline, optics, seen, gains)
 
 
-def _columns_of(echoes: Echoes) -> list[list[float]]:
+def _list_columns(echoes: Echoes) -> list[list[float]]:
     bend = echoes.bend
     columns = [*echoes.at_m.T, echoes.path_m, *echoes.slope.T, bend[:, 0, 0], bend[:, 0, 1], bend[:, 1, 1]]
     columns += [echoes.amplitude.real, echoes.amplitude.imag, echoes.amplitude_std, echoes.band_rise]
@@ -145,7 +145,7 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
             "hang it so that its front is at the middle of the object plane",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
-    shape = shape_of(metal.h, optics)
+    shape = find_shape(metal.h, optics)
     bends = np.linalg.eigvalsh((shape.curvature + np.swapaxes(shape.curvature, 1, 2)) / 2)
     radius_m = 1 / float(np.median(bends))
     centre = np.median(shape.points - radius_mm / 1e3 * shape.normals, axis=0)
@@ -159,7 +159,7 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
             code=ErrorCode.MISMATCH,
         )
     kept = thin_out(metal)
-    gains = learn_gains(voltages_of(kept, optics), optics.wave_number)
+    gains = learn_gains(find_voltages(kept, optics), optics.wave_number)
     file = SphereFile(
         **header("sphere", [source_scan(raw, scan)]),
         radius_mm=radius_mm,
@@ -167,7 +167,7 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
         centre_mm=(1e3 * float(centre[0]), 1e3 * float(centre[1]), 1e3 * float(centre[2])),
         misfit_mm=1e3 * rest_m,
         gain_std=gains.std,
-        points={"h": _columns_of(kept.h), "v": _columns_of(kept.v)},
+        points={"h": _list_columns(kept.h), "v": _list_columns(kept.v)},
     )
     path = write_calibration(file, out)
     low, high = (np.degrees(np.arcsin(edge)) for edge in gains.covered)

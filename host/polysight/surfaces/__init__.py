@@ -7,20 +7,20 @@ files. In order: `paths` (fit of a window), `points` (geometry), `measure` (both
 (polarisation, curved reflection), `permittivity`, `result`.
 """
 
-from polysight.surfaces.measure import Seen, Shape, see_points, shape_of
+from polysight.surfaces.measure import Seen, Shape, find_shape, see_points
 from polysight.surfaces.optics import (
     Antenna,
     Optics,
     VisibleNormals,
-    aimed,
+    aim_antenna,
+    make_optics,
     mirror_point,
-    optics_of,
     reflect_curved,
     reflect_flat,
     visible_normals,
 )
-from polysight.surfaces.paths import Echoes, Samples, path_of_plane
-from polysight.surfaces.permittivity import Gains, Reference, Uncertainty, learn_gains, voltages_of
+from polysight.surfaces.paths import Echoes, Samples, find_mirror_path
+from polysight.surfaces.permittivity import Gains, Reference, Uncertainty, find_voltages, learn_gains
 from polysight.surfaces.result import (
     POINTS,
     SURFACE,
@@ -51,23 +51,23 @@ __all__ = [
     "Surface",
     "Uncertainty",
     "VisibleNormals",
-    "aimed",
+    "aim_antenna",
     "analyse_surface",
     "describe_form",
     "describe_material",
+    "find_mirror_path",
+    "find_shape",
+    "find_voltages",
     "join_turned",
     "learn_gains",
+    "make_optics",
     "mirror_point",
-    "optics_of",
-    "path_of_plane",
     "plain_segment",
     "read_surface",
     "reflect_curved",
     "reflect_flat",
     "see_points",
-    "shape_of",
     "summary_lines",
     "visible_normals",
-    "voltages_of",
     "write_surface",
 ]

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from polysight.surfaces.optics import Optics
 from polysight.surfaces.paths import STRIDE_M, Echoes, Samples, find_echoes, measure_echoes
 from polysight.surfaces.points import (
-    curvature_of,
+    find_curvature,
+    find_normals,
     locate,
-    normals_at,
     offset_that_sees,
     predict_echo,
 )
@@ -66,26 +66,30 @@ class Shape:
         return Shape(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
-def shape_of(echoes: Echoes, optics: Optics) -> Shape:
+def find_shape(echoes: Echoes, optics: Optics) -> Shape:
     """Return places, normals and curvatures of H's echoes."""
-    tx_m, rx_m = optics.tx.at_m, optics.h.at_m
+    tx_m = optics.tx.at_m
+    rx_m = optics.h.at_m
     points = locate(echoes.path_m, echoes.slope, echoes.at_m, tx_m, rx_m)
-    normals, cos = normals_at(points, echoes.at_m, tx_m, rx_m)
-    curvature = curvature_of(points, normals, echoes.at_m, tx_m, rx_m, echoes.bend)
+    normals, cos = find_normals(points, echoes.at_m, tx_m, rx_m)
+    curvature = find_curvature(points, normals, echoes.at_m, tx_m, rx_m, echoes.bend)
     return Shape(points, normals, cos, curvature)
 
 
 def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, float]) -> Seen:
     """Find the specular points of a scan in H, and measure the same points in V."""
     echoes = find_echoes(h, gate_m)
-    echoes = echoes[_is_sound(echoes, shape_of(echoes, optics))]
+    echoes = echoes[_is_sound(echoes, find_shape(echoes, optics))]
     segment = group_echoes(echoes, optics)
-    echoes, segment = echoes[segment >= 0], segment[segment >= 0]
+    echoes = echoes[segment >= 0]
+    segment = segment[segment >= 0]
     echoes = smooth_bends(echoes, segment)
-    keep = _is_wide(shape_of(echoes, optics))
-    echoes, segment = echoes[keep], segment[keep]
-    shape = shape_of(echoes, optics)
-    tx_m, rx_m = optics.tx.at_m, optics.v.at_m
+    keep = _is_wide(find_shape(echoes, optics))
+    echoes = echoes[keep]
+    segment = segment[keep]
+    shape = find_shape(echoes, optics)
+    tx_m = optics.tx.at_m
+    rx_m = optics.v.at_m
     at_m = offset_that_sees(shape.points, shape.normals, echoes.at_m, tx_m, rx_m)
     path, slope, bend = predict_echo(shape.points, shape.normals, shape.curvature, at_m, tx_m, rx_m)
     seen_by_v, inside = measure_echoes(v, at_m, path, slope, bend)
@@ -112,7 +116,7 @@ def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
     count = len(echoes)
     if not count:
         return np.zeros(0, int)
-    shape = shape_of(echoes, optics)
+    shape = find_shape(echoes, optics)
     pairs = scipy.spatial.KDTree(echoes.at_m[:, :2]).query_pairs(2.3 * STRIDE_M, output_type="ndarray")
     first, second = pairs.T
     d = (echoes.at_m[second] - echoes.at_m[first])[:, :2]

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.polarimetry import fresnel
-from polysight.surfaces.points import normals_at, tangents, unit_legs
+from polysight.surfaces.points import find_normals, tangents, unit_legs
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import place, rx_positions_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -75,7 +75,7 @@ class Optics:
         return self.h if channel == "h" else self.v
 
 
-def optics_of(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) -> Optics:
+def make_optics(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) -> Optics:
     """Return the antennas of a rig; the mounts give places and boresights.
 
     Towards their mirror points on the object plane TX has equal parts of s and p, H has s and V p, as the published
@@ -85,9 +85,9 @@ def optics_of(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) -> O
     receivers = [np.array(rx_positions_m(rig, board)).mean(axis=0) for board in rig.receivers]
     tx_m = np.array(tx_position_m(rig))
     half = np.sqrt(0.5)
-    tx = aimed(tx_m, _boresight(rig.transmitter), receivers[0], plane_m, (half, half))
-    h = aimed(receivers[0], _boresight(rig.receivers[0]), tx_m, plane_m, (1.0, 0.0))
-    v = aimed(receivers[1], _boresight(rig.receivers[1]), tx_m, plane_m, (0.0, 1.0))
+    tx = aim_antenna(tx_m, _boresight(rig.transmitter), receivers[0], plane_m, (half, half))
+    h = aim_antenna(receivers[0], _boresight(rig.receivers[0]), tx_m, plane_m, (1.0, 0.0))
+    v = aim_antenna(receivers[1], _boresight(rig.receivers[1]), tx_m, plane_m, (0.0, 1.0))
     sweep = rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2
     return Optics(
         tx, replace(h, leakage=leakage[0]), replace(v, leakage=leakage[1]), 2 * np.pi * sweep / SPEED_OF_LIGHT_M_S
@@ -99,7 +99,7 @@ def _boresight(board: Board) -> Array:
     return ahead / np.linalg.norm(ahead)
 
 
-def aimed(at_m: Array, boresight: Array, partner_m: Array, plane_m: float, parts: tuple[float, float]) -> Antenna:
+def aim_antenna(at_m: Array, boresight: Array, partner_m: Array, plane_m: float, parts: tuple[float, float]) -> Antenna:
     """Return an antenna with given parts of s and p towards the point of the object plane that mirrors its partner."""
     share = (plane_m - at_m[2]) / (2 * plane_m - at_m[2] - partner_m[2])
     target = np.array([*(at_m + share * (partner_m - at_m))[:2], plane_m])
@@ -110,10 +110,9 @@ def aimed(at_m: Array, boresight: Array, partner_m: Array, plane_m: float, parts
     p_axis = np.cross(direction, s_axis)
     p_axis *= np.sign(p_axis[0])
     s_share, p_share = parts
-    wanted = s_share * s_axis + p_share * p_axis
-    other = p_share * s_axis + s_share * p_axis
-    vectors = [_carry(direction, boresight[None], v)[0] for v in (wanted, other)]
-    return Antenna(at_m, boresight, vectors[0], vectors[1])
+    vectors = (s_share * s_axis + p_share * p_axis, p_share * s_axis + s_share * p_axis)
+    at_boresight = [_carry(direction, boresight[None], vector)[0] for vector in vectors]
+    return Antenna(at_m, boresight, at_boresight[0], at_boresight[1])
 
 
 @dataclass(frozen=True)
@@ -142,18 +141,21 @@ def visible_normals(rig: Instrument) -> VisibleNormals:
 
     The slope of a tilted plane's path is 2 cos(theta) sin(tilt); phases alias where it exceeds lambda / (2 step).
     """
-    optics = optics_of(rig)
+    optics = make_optics(rig)
     middle = mirror_point(optics, rig.geometry.object_distance_mm / 1e3)
     half_x = (rig.grid.columns - 1) / 2 * rig.grid.step_x_mm / 1e3
     half_y = (rig.grid.rows - 1) / 2 * rig.grid.step_y_mm / 1e3
     at_m = np.array([[half_x, 0.0, 0.0], [0.0, half_y, 0.0], [0.0, 0.0, 0.0]])
-    normals, cos = normals_at(np.tile(middle, (3, 1)), at_m, optics.tx.at_m, optics.h.at_m)
+    normals, cos = find_normals(np.tile(middle, (3, 1)), at_m, optics.tx.at_m, optics.h.at_m)
     tilts = np.degrees(np.arctan2(np.abs(normals[:, :2]), -normals[:, 2:]))
     wave_m = 2 * np.pi / optics.wave_number
     limits = []
     for step_mm in (rig.grid.step_x_mm, rig.grid.step_y_mm):
         sine = wave_m / (2 * step_mm / 1e3) / (2 * float(cos[2]))
-        limits.append(float(np.degrees(np.arcsin(sine))) if sine < 1 else float("inf"))
+        limit_deg = float("inf")
+        if sine < 1:
+            limit_deg = float(np.degrees(np.arcsin(sine)))
+        limits.append(limit_deg)
     return VisibleNormals(float(tilts[0, 0]), float(tilts[1, 1]), (limits[0], limits[1]))
 
 
@@ -206,15 +208,16 @@ def reflect_curved(
     flat = _reflect_local(eps, theta, around, wave_number)
     after = _reflect_local(eps, theta + ANGLE_STEP, around, wave_number)
     before = _reflect_local(eps, theta - ANGLE_STEP, around, wave_number)
-    cos, sin = np.cos(theta), np.sin(theta)
-    found = []
+    cos = np.cos(theta)
+    sin = np.sin(theta)
+    coefficients = []
     for local, r, other, up, down in zip(middle, flat, flat[::-1], after, before, strict=True):
         first = (up - down) / (2 * ANGLE_STEP)
         second = (up - 2 * r + down) / ANGLE_STEP**2
         inside = 1j * bend_inside / (4 * wave_number * cos) * second
         beside = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other - r) / sin**2)
-        found.append(local + inside + beside)
-    return found[0], found[1]
+        coefficients.append(local + inside + beside)
+    return coefficients[0], coefficients[1]
 
 
 def _reflect_local(
@@ -222,7 +225,8 @@ def _reflect_local(
 ) -> tuple[Complex, Complex]:
     """Coefficients of a single cylindrical wave: no sum over directions."""
     bend_inside, bend_across = bends
-    cos, sin = np.cos(theta), np.sin(theta)
+    cos = np.cos(theta)
+    sin = np.sin(theta)
     if np.any(np.isinf(eps)):
         # The axial field or its derivative vanishes: s in the plane of incidence and p across it stay -1.
         turn_p = bend_inside / (wave_number * cos**3)
@@ -234,14 +238,21 @@ def _reflect_local(
     r_s, r_p = reflect_flat(eps, theta)
 
     # Cylinder across the plane of incidence.
-    outer, inner = bend_inside / (2 * wave_number * cos**2), bend_inside / (2 * wave_number * cos_inside**2)
-    into, out, behind = 1j * cos - outer, -1j * cos - outer, 1j * root * cos_inside - inner
+    outer = bend_inside / (2 * wave_number * cos**2)
+    inner = bend_inside / (2 * wave_number * cos_inside**2)
+    into = 1j * cos - outer
+    out = -1j * cos - outer
+    behind = 1j * root * cos_inside - inner
     local_s = -(into - behind) / (out - behind)
     local_p = (into - behind / eps) / (out - behind / eps)
     # Cylinder along the plane of incidence.
-    k_out, k_in = cos, root * cos_inside
-    outer, inner = bend_across / (2 * wave_number * k_out), bend_across / (2 * wave_number * k_in)
-    into, out, behind = (1j - outer) / k_out, (-1j - outer) / k_out, (1j - inner) / k_in
+    k_out = cos
+    k_in = root * cos_inside
+    outer = bend_across / (2 * wave_number * k_out)
+    inner = bend_across / (2 * wave_number * k_in)
+    into = (1j - outer) / k_out
+    out = (-1j - outer) / k_out
+    behind = (1j - inner) / k_in
     across_s = (into - behind) / (out - behind)
     across_p = -(into - eps * behind) / (out - eps * behind)
     return local_s + across_s - r_s, local_p + across_p - r_p

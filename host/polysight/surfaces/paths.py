@@ -151,8 +151,12 @@ class _Fit:
         self.middle = float(self.omega.mean())
         self.lever = board.rx_m - board.middle_m
         # The largest gain of the range gate for an echo, and the spread of its frequencies.
-        model = np.eye(self.omega.size) if board.model is None else board.model
-        gate = np.linspace(0.05, 0.6, 24) if board.model is None else np.linspace(*_gate_of(board), 24)
+        if board.model is None:
+            model = np.eye(self.omega.size)
+            gate = np.linspace(0.05, 0.6, 24)
+        else:
+            model = board.model
+            gate = np.linspace(*_find_gate(board), 24)
         phases = np.exp(1j * np.outer(self.omega, gate))
         weights = np.mean((model @ phases) * phases.conj(), axis=1).real
         self.gain = float(weights.sum())
@@ -172,14 +176,14 @@ class _Fit:
         return np.exp(-1j * excess[:, :, None] * self.omega)
 
 
-def _gate_of(board: Samples) -> tuple[float, float]:
+def _find_gate(board: Samples) -> tuple[float, float]:
     """Range of excess paths in which the model's gain is looked at: the middle half of its unambiguous range."""
     reach = SPEED_OF_LIGHT_M_S / (board.frequencies_hz[1] - board.frequencies_hz[0])
-    centre = path_of_plane(board, 0.5) - board.direct_m.mean()
+    centre = find_mirror_path(board, 0.5) - board.direct_m.mean()
     return centre - reach / 10, centre + reach / 10
 
 
-def path_of_plane(board: Samples, z_m: float) -> float:
+def find_mirror_path(board: Samples, z_m: float) -> float:
     """Path over a mirror at `z_m`."""
     image = board.tx_m * [1, 1, -1] + [0, 0, 2 * z_m]
     return float(np.linalg.norm(board.middle_m - image))
@@ -187,7 +191,8 @@ def path_of_plane(board: Samples, z_m: float) -> float:
 
 def _basis(offsets: Array) -> Array:
     """Rates of the path by (L, g_x, g_y, Q_xx, Q_xy, Q_yy): [window, position, 6]."""
-    x, y = offsets[..., 0], offsets[..., 1]
+    x = offsets[..., 0]
+    y = offsets[..., 1]
     return np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=-1)
 
 
@@ -534,4 +539,6 @@ def measure_echoes(board: Samples, at_m: Array, path_m: Array, slope: Array, ben
         added = _add_up(fit, windows, starts[part])
         measured = _maximise(fit, added, windows.valid, windows.offsets, starts[part], iterations=0)
         parts.append(_echoes(fit, windows, measured))
-    return (Echoes.join(parts) if parts else _none()), inside
+    if not parts:
+        return _none(), inside
+    return Echoes.join(parts), inside

@@ -23,7 +23,7 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.polarimetry import permittivity_from_ratio
-from polysight.surfaces.measure import Seen, Shape, shape_of
+from polysight.surfaces.measure import Seen, Shape, find_shape
 from polysight.surfaces.optics import (
     Antenna,
     Optics,
@@ -97,10 +97,10 @@ class Voltages:
         return Voltages(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
-def voltages_of(seen: Seen, optics: Optics, shape: Shape | None = None) -> Voltages:
+def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Voltages:
     """Return the voltages of points; `shape` is that of H's echoes unless given."""
     if shape is None:
-        shape = shape_of(seen.h, optics)
+        shape = find_shape(seen.h, optics)
     tx_m = optics.tx.at_m
     k = optics.wave_number
     solid = (shape.points, shape.normals, shape.curvature)
@@ -387,25 +387,25 @@ def _covariance_of_scatter(answer: Complex, miss: Complex, ripple: Array, at_m: 
 
     The 95 % region of few blocks is wider than that of a known covariance, by Fisher's distribution.
     """
-    seen_terms = (answer * miss).real.T
+    measured_terms = (answer * miss).real.T
     expected_terms = np.concatenate([answer.real * ripple, -answer.imag * ripple]).T / np.sqrt(2)
-    seen = np.zeros((2, 2))
+    measured = np.zeros((2, 2))
     expected = np.zeros((2, 2))
     blocks = 0.0
     shifts = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5))
     for shift in shifts:
         block = number_blocks(at_m, shift)
         count = int(block.max()) + 1
-        seen_sums = np.stack([np.bincount(block, term, count) for term in seen_terms.T], axis=1)
+        measured_sums = np.stack([np.bincount(block, term, count) for term in measured_terms.T], axis=1)
         expected_sums = np.stack([np.bincount(block, term, count) for term in expected_terms.T], axis=1)
-        seen += seen_sums.T @ seen_sums / len(shifts)
+        measured += measured_sums.T @ measured_sums / len(shifts)
         for part in (expected_sums[:, :2], expected_sums[:, 2:]):
             expected += part.T @ part / len(shifts)
         weight = np.bincount(block, np.sum(np.abs(answer) ** 2, axis=0), count)
         blocks += weight.sum() ** 2 / np.sum(weight**2) / len(shifts)
     # Each block gives two numbers, and two were fitted.
     freedom = max(0.0, 2 * blocks - 2)
-    unbiased = seen * blocks / max(blocks - 1, 0.5)
+    unbiased = measured * blocks / max(blocks - 1, 0.5)
     total = freedom + 2 * EXPECTED_BLOCKS
     mixed = (freedom * unbiased + 2 * EXPECTED_BLOCKS * expected) / total
     wider = 2 * scipy.stats.f.ppf(0.95, 2, total) / scipy.stats.chi2.ppf(0.95, 2)
@@ -454,7 +454,7 @@ class DisturbedScan:
 def disturb_scan(seen: Seen, optics: Optics, reference: Reference, uncertainty: Uncertainty) -> list[DisturbedScan]:
     """Return the scan as it would be understood with each disturbed rig; reference and object move together."""
     rigs = disturb_optics(optics, uncertainty)
-    return [DisturbedScan(source, voltages_of(seen, rig), reference(rig)) for source, rig in rigs]
+    return [DisturbedScan(source, find_voltages(seen, rig), reference(rig)) for source, rig in rigs]
 
 
 def add_common_errors(

@@ -53,7 +53,7 @@ def locate(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -
     return points
 
 
-def normals_at(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[Array, Array]:
+def find_normals(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[Array, Array]:
     """Normals towards the antennas [n, 3], and cosines of incidence [n]."""
     t, r, *_ = unit_legs(points_m, at_m, tx_m, rx_m)
     both = t + r
@@ -78,7 +78,7 @@ def _terms(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array)
     return bend[:, :2, :2], cross, along, np.linalg.norm(t + r, axis=1)
 
 
-def curvature_of(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
+def find_curvature(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
     """Curvature K [n, 2, 2] in the basis of `tangents`, 1 / m, of echoes whose path has the curvature `bend`."""
     plane, cross, along, twice = _terms(points, normals, at_m, tx_m, rx_m)
     rest = plane - bend

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polysight.store import open_npz
 from polysight.surfaces.measure import MIN_POINTS as LEAST_POINTS
-from polysight.surfaces.measure import Seen, Shape, shape_of
+from polysight.surfaces.measure import Seen, Shape, find_shape
 from polysight.surfaces.optics import Optics
 from polysight.surfaces.paths import Echoes
 from polysight.surfaces.permittivity import (
@@ -30,12 +30,12 @@ from polysight.surfaces.permittivity import (
     disturb_optics,
     disturb_scan,
     find_reflecting,
+    find_voltages,
     fit_permittivity,
     judge_medium,
     point_covariance,
     point_permittivity,
     point_ratio,
-    voltages_of,
 )
 from polysight.surfaces.points import tangents
 from polysight_shared.files import write_atomically
@@ -114,7 +114,7 @@ def analyse_surface(
     """Return shape and permittivity of the points seen; without a reference, the shape alone."""
     gains = None if reference is None else reference(optics)
     seen = drop_edges(seen, optics, gains)
-    shape = shape_of(seen.h, optics)
+    shape = find_shape(seen.h, optics)
     numbers = np.unique(seen.segment)
     segments = [describe_segment(int(number), shape[seen.segment == number]) for number in numbers]
     permittivity = np.full(len(seen), complex(np.nan, np.nan))
@@ -123,7 +123,7 @@ def analyse_surface(
         reason = "no metal reference: calibrate with a sphere, or give --reference"
         segments = [replace(segment, reason=reason) for segment in segments]
     else:
-        voltages = voltages_of(seen, optics, shape)
+        voltages = find_voltages(seen, optics, shape)
         disturbed = disturb_scan(seen, optics, reference, uncertainty)
         for index, segment in enumerate(segments):
             members = seen.segment == segment.number
@@ -204,7 +204,7 @@ def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m
 
 def drop_edges(seen: Seen, optics: Optics, gains: Gains | None) -> Seen:
     """Return the points at which surfaces reflect, without segments of which hardly any is left."""
-    voltages = voltages_of(seen, optics)
+    voltages = find_voltages(seen, optics)
     reflecting = seen[find_reflecting(voltages, np.abs(seen.h.amplitude), seen.segment, gains)]
     counts = np.bincount(reflecting.segment, minlength=1)
     return reflecting[counts[reflecting.segment] >= LEAST_POINTS]
@@ -224,14 +224,13 @@ def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty:
         bent = np.einsum("njk,nk->nj", shape.curvature, slide)
         return np.einsum("ni,ni->n", away, shape.normals), turn - bent
 
-    changes = [
-        find_changes(shape_of(echoes, rig)) for source, rig in disturb_optics(optics, uncertainty) if source == "places"
-    ]
+    rigs = [rig for source, rig in disturb_optics(optics, uncertainty) if source == "places"]
+    changes = [find_changes(find_shape(echoes, rig)) for rig in rigs]
     # Errors of path and slope by noise, one after the other.
-    changes.append(find_changes(shape_of(replace(echoes, path_m=echoes.path_m + echoes.path_std_m), optics)))
+    changes.append(find_changes(find_shape(replace(echoes, path_m=echoes.path_m + echoes.path_std_m), optics)))
     for axis in np.eye(2):
         slope = echoes.slope + echoes.slope_std * axis
-        changes.append(find_changes(shape_of(replace(echoes, slope=slope), optics)))
+        changes.append(find_changes(find_shape(replace(echoes, slope=slope), optics)))
     position2 = np.sum([along**2 for along, _ in changes], axis=0)
     turn2 = np.sum([np.sum(turn**2, axis=1) for _, turn in changes], axis=0)
     return np.sqrt(position2), np.sqrt(turn2)

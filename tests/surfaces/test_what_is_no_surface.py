@@ -1,0 +1,47 @@
+"""Edges and thin walls: no figure comes from them, and normals are those of the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from polysight.surfaces import Uncertainty, analyse_surface
+from polysight_worlds.media import Stack
+from polysight_worlds.shapes import cylinder, plate
+
+EXACT = Uncertainty(leakage=1e-4, axis_rad=1e-4, place_m=1e-6)
+CENTRE_M = (-0.01, 0.104, 0.5)
+MEDIUM = 4.2 - 0.4j
+
+
+def test_the_sharp_edges_of_a_tilted_plate_are_no_surface(see, gains, optics):
+    """The plate is seen from two thirds of the grid; from the rest its edges alone are."""
+    board = plate("board", Stack(below=MEDIUM), CENTRE_M, (0.1, 0.1), tilt_deg=(2.0, -2.0))
+    surface = analyse_surface(see([board]), optics, gains, uncertainty=EXACT)
+    _, a, b = board.project(surface.points_m)
+    turns = np.linalg.norm(surface.normals - board.at(a, b).normal.T, axis=1)
+    assert np.median(np.degrees(turns)) < 1.5
+    for segment in surface.segments:
+        if segment.permittivity is not None:
+            miss = segment.permittivity - MEDIUM
+            d = np.array([miss.real, miss.imag])
+            assert d @ np.linalg.inv(np.array(segment.covariance)) @ d < 13.8  # 99.9 %
+            assert abs(miss) < 0.1 * abs(MEDIUM)
+
+
+def test_edges_alone_give_no_permittivity(see, gains, optics):
+    """So far tilted that no position of the grid sees the plate's mirror point."""
+    board = plate("board", Stack(below=MEDIUM), CENTRE_M, (0.1, 0.1), tilt_deg=(12.0, 0.0))
+    surface = analyse_surface(see([board]), optics, gains, uncertainty=EXACT)
+    assert [s.permittivity for s in surface.segments] == [None] * len(surface.segments)
+    assert all(s.reason for s in surface.segments)
+
+
+@pytest.mark.parametrize("wall_mm", [0.7, 1.6])
+def test_a_thin_wall_gives_no_permittivity(see, gains, optics, wall_mm):
+    wall = Stack(((MEDIUM, wall_mm / 1000),), 1.0)
+    tube = cylinder("tube", wall, (CENTRE_M[0], CENTRE_M[1], 0.57), 0.07, 0.3)
+    surface = analyse_surface(see([tube], 64, 44), optics, gains, uncertainty=EXACT)
+    assert len(surface.points_m)
+    assert [s.permittivity for s in surface.segments] == [None] * len(surface.segments)
+    assert all(s.reason for s in surface.segments)

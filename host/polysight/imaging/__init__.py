@@ -46,7 +46,7 @@ from polysight.imaging.resolution import (
     imaging_facts,
     point_response,
 )
-from polysight.imaging.samples import ReducedRow, reduction, scene_gate_m
+from polysight.imaging.samples import BoardSamples, ReducedRow, reduction, scene_gate_m
 from polysight.imaging.sparse import fill_missing, fill_sub_bands
 
 __all__ = [
@@ -57,6 +57,7 @@ __all__ = [
     "UNKNOWN_PLANE",
     "Antennas",
     "Aperture",
+    "BoardSamples",
     "FieldLimits",
     "Focus",
     "Illumination",

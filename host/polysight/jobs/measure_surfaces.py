@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from polysight.calibration import SphereFile
+from polysight.imaging import BoardSamples
 from polysight.materials import Classifier, name_permittivity
 from polysight.pipeline import Pipeline
 from polysight.process import load_classifier
@@ -45,18 +46,33 @@ AXIS_STD_RAD = 0.0175
 
 def take_samples(pipeline: Pipeline) -> tuple[Samples, Samples]:
     """Return the samples of H and V that a pipeline holds, x from TX to RX."""
-    found = []
-    for board in pipeline.images.boards.values():
-        aperture = board.aperture
-        cube, valid, offsets = board.calibrated(), board.valid, aperture.offsets_m
-        tx_m, rx_m = aperture.antennas.tx_m, aperture.antennas.rx_m
-        if pipeline.source.mirrored:
-            # Recorded by columns: the builder holds the scan mirrored in x = y.
-            swap = [1, 0, 2]
-            cube, valid, offsets = np.swapaxes(cube, 2, 3), valid.T, np.swapaxes(offsets, 0, 1)[..., swap]
-            tx_m, rx_m = tx_m[swap], rx_m[:, swap]
-        found.append(Samples(cube, valid, offsets, aperture.frequencies_hz, tx_m, rx_m, board.model))
-    return found[0], found[1]
+    h, v = (take_board_samples(board, pipeline.source.mirrored) for board in pipeline.images.boards.values())
+    return h, v
+
+
+def take_board_samples(board: BoardSamples, is_mirrored: bool) -> Samples:
+    """Return the samples of one board; a scan recorded by columns is held mirrored in x = y."""
+    antennas = board.aperture.antennas
+    samples = Samples(
+        cube=board.calibrated(),
+        valid=board.valid,
+        offsets_m=board.aperture.offsets_m,
+        frequencies_hz=board.aperture.frequencies_hz,
+        tx_m=antennas.tx_m,
+        rx_m=antennas.rx_m,
+        model=board.model,
+    )
+    if not is_mirrored:
+        return samples
+    swap = [1, 0, 2]
+    return replace(
+        samples,
+        cube=np.swapaxes(samples.cube, 2, 3),
+        valid=samples.valid.T,
+        offsets_m=np.swapaxes(samples.offsets_m, 0, 1)[..., swap],
+        tx_m=samples.tx_m[swap],
+        rx_m=samples.rx_m[:, swap],
+    )
 
 
 def find_uncertainty(rig: Instrument, *, places_known: bool) -> Uncertainty:

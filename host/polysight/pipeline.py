@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,27 +101,14 @@ class Pipeline:
         shown = found if verdict.usable else found.without_result()
         return process.Findings(images, shown, verdict, self.plane, classifier, plates)
 
-    def finish(
-        self,
-        out: Path,
-        plates: materials.Plates = (),
-        progress: Progress = no_progress,
-        measure_surfaces: Callable[[Pipeline, Path], None] | None = None,
-    ) -> process.Products:
-        """Write all products into `out`: images first, so that they stay if a later step fails.
-
-        `measure_surfaces` is called where a patch is neither flat nor level, before the report is written.
-        """
+    def finish(self, out: Path, plates: materials.Plates = (), progress: Progress = no_progress) -> process.Products:
+        """Write all products into `out`: images first, so that they stay if a later step fails."""
         images = self.form_images()
         process.save_images(out, process.imaged_scan(out, self.source, self.rig, images, self.quality))
         progress("point response")
         self.quality.note_imaging(self.images, images)
         progress("materials")
         findings = self.examine(images, plates)
-        has_steep_patch = any(patch.refused is materials.STEEP for patch in findings.found.patches)
-        if has_steep_patch and measure_surfaces is not None:
-            progress("surfaces")
-            measure_surfaces(self, out)
         progress("figures and report")
         unnamed = process.why_unnamed(self.settings, self.rig)
         scan = process.processed_scan(out, self.source, self.rig, findings, self.quality, unnamed)

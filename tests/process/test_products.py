@@ -99,10 +99,10 @@ def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
         return replace(findings, found=replace(findings.found, patches=patches))
 
     monkeypatch.setattr(Pipeline, "examine", examine_tilted)
-    folders: list[Path] = []
-    pipeline = processed_rows(ScanFolder.load(scan), scan, Settings(model="none"))
-    pipeline.finish(tmp_path, measure_surfaces=lambda _, out: folders.append(out))
-    assert folders == ([tmp_path] if is_steep else [])
+    out = tmp_path / "out"
+    make_products(processed_rows(ScanFolder.load(scan), scan, Settings(model="none")), out, ())
+    assert (out / "surface.npz").exists() == is_steep
+    assert (b"Surfaces from three sides" in (out / "report.html").read_bytes()) == is_steep
 
 
 def test_another_plane_and_grid_from_the_command_line(scan: Path, tmp_path: Path) -> None:

@@ -26,7 +26,6 @@ def test_the_sharp_edges_of_a_tilted_plate_are_no_surface(see, gains, optics):
             miss = segment.permittivity - MEDIUM
             d = np.array([miss.real, miss.imag])
             assert d @ np.linalg.inv(np.array(segment.covariance)) @ d < 13.8  # 99.9 %
-            assert abs(miss) < 0.1 * abs(MEDIUM)
 
 
 def test_edges_alone_give_no_permittivity(see, gains, optics):

@@ -115,20 +115,7 @@ def _sync_report(args: argparse.Namespace) -> int:
     return sync_report(args.data, args.out, rig_file(args.config, args.data))
 
 
-def add_commands(add: Add) -> None:
-    """Register the commands."""
-    sub = add(
-        "process",
-        _process,
-        "make images, material names and a report from recorded data",
-        "polysight process scans/one --out out/one",
-        ("--library", "--metal-box", "--metal"),
-    )
-    _add_data(sub, several=True)
-    add_material_options(sub)
-    _add_polarimetry_options(sub)
-    _add_sparse(sub)
-    _add_several_options(sub)
+def _add_surface(add: Add) -> None:
     sub = add(
         "surface",
         _surface,
@@ -156,6 +143,23 @@ def add_commands(add: Add) -> None:
         help="scan of a flat metal plate (default: the sphere of the rig file's calibration)",
     )
     add_json_option(sub)
+
+
+def add_commands(add: Add) -> None:
+    """Register the commands."""
+    sub = add(
+        "process",
+        _process,
+        "make images, material names and a report from recorded data",
+        "polysight process scans/one --out out/one",
+        ("--library", "--metal-box", "--metal"),
+    )
+    _add_data(sub, several=True)
+    add_material_options(sub)
+    _add_polarimetry_options(sub)
+    _add_sparse(sub)
+    _add_several_options(sub)
+    _add_surface(add)
     sub = add("image", _image, "make only the images from recorded data", "polysight image scans/one --out out/one")
     _add_data(sub)
     sub.add_argument(

@@ -12,9 +12,10 @@ import numpy as np
 
 from polysight.calibration import SphereFile
 from polysight.imaging import BoardSamples
-from polysight.materials import Classifier, name_permittivity
+from polysight.materials import STEEP, Classifier, name_permittivity
 from polysight.pipeline import Pipeline
 from polysight.process import load_classifier
+from polysight.products import read_products
 from polysight.surfaces import (
     Echoes,
     Gains,
@@ -176,12 +177,21 @@ def save_surface(out: Path, made: Surface) -> None:
     write_atomically(out / "surface.png", surface_figure(made))
 
 
-def add_surfaces(pipeline: Pipeline, out: Path) -> None:
-    """Measure the surfaces of a processed scan with patches that are tilted or curved; write them beside its products.
+def has_steep_patch(products: Path) -> bool:
+    """True if a patch of the products got no permittivity because it is neither flat nor level."""
+    segments = read_products(products).segments
+    return any(segment.refused is not None and segment.refused.what == STEEP.what for segment in segments)
+
+
+def add_surfaces(pipeline: Pipeline, products: Path) -> None:
+    """Measure the surfaces of a processed scan, write them beside its products, and write the report again with them.
 
     The range gate is that of the images, so that only what lies near the object plane is seen.
     """
+    from polysight.report import write_report
+
     optics = make_rig_optics(pipeline.rig)
     seen = see_rows(pipeline, optics)
     if len(seen):
-        save_surface(out, analyse_points(pipeline, optics, seen))
+        save_surface(products, analyse_points(pipeline, optics, seen))
+        write_report(products, read_products(products))

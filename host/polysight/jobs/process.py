@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from polysight.calibration import Calibration, calibration_of_rig, calibration_of_scan
 from polysight.data import packaged
 from polysight.imaging import PLANE_REACH_M, Focus, Images, PlaneEstimate, focus_sweep, image_grid
-from polysight.jobs.measure_surfaces import add_surfaces
+from polysight.jobs.measure_surfaces import add_surfaces, has_steep_patch
 from polysight.jobs.output import count_steps, current_step, print_lines, say, simulated_scan
 from polysight.materials import Plates, find_truth, read_labels, read_truth
 from polysight.pipeline import Pipeline
@@ -135,7 +135,11 @@ def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
     with making_products(out, pipeline.source.scan_id) as new, current_step("image") as progress:
         _check_dropped(pipeline, out)  # `out` is locked; `drop-raw` may have run since the rows were added
         try:
-            return replace(pipeline.finish(new, plates, progress, add_surfaces), folder=out)
+            products = pipeline.finish(new, plates, progress)
+            if has_steep_patch(new):
+                progress("surfaces")
+                add_surfaces(pipeline, new)
+            return replace(products, folder=out)
         except DataError as e:
             if not (new / IMAGE).exists():
                 raise

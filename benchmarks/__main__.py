@@ -38,7 +38,10 @@ def main(argv: list[str]) -> int:
         words = (module.__doc__ or "").splitlines()[0]
         module.add_arguments(names.add_parser(name, help=words, description=words))
     args = parser.parse_args(argv)
-    chosen = {name: parser.parse_args([name]) for name in NAMES} if args.name is None else {args.name: args}
+    if args.name is None:
+        chosen = {name: parser.parse_args([name]) for name in NAMES}
+    else:
+        chosen = {args.name: args}
     for name, options in chosen.items():
         if args.out is not None and getattr(options, "json", "") is None:
             options.json = args.out / f"{name}.json"

@@ -158,7 +158,8 @@ def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials:
     aligned = align_row(_words(received[:, None]), np.ones((trials, 1), bool), chirp.linear_samples)
     done = reference(aligned, prepare(rig, board), chirp)
     error = np.angle(done.amplitude * np.exp(-1j * phase))[done.found]
-    error = np.angle(np.exp(1j * (error - np.angle(np.exp(1j * error).mean()))))  # the direct path's own, constant
+    # The direct path's own, constant
+    error = np.angle(np.exp(1j * (error - np.angle(np.exp(1j * error).mean()))))
     rms = float(np.sqrt((error**2).mean()))
     bound = np.sqrt(np.mean([_phase_bound(direct, echo, x, (a, b), snr_db) for x in between[:200]]))
     return rms, rms / float(bound)

@@ -87,10 +87,14 @@ class Trial:
     lost: int
     kernel_drops: int
     exact: bool
-    cpu: list[float]  # share of a core, each receiver
-    queue: float  # worst fill of a receive buffer
-    turn_s: float  # worst time to make a row durable and begin the next
-    rows_beside: float  # rows processed a second meanwhile
+    # Share of a core, each receiver
+    cpu: list[float]
+    # Worst fill of a receive buffer
+    queue: float
+    # Worst time to make a row durable and begin the next
+    turn_s: float
+    # Rows processed a second meanwhile
+    rows_beside: float
     load: float
 
     @property
@@ -104,9 +108,14 @@ class Trial:
 
     def line(self) -> str:
         cpu = "+".join(f"{100 * c:.0f}" for c in self.cpu)
-        verdict = (
-            "LOSS" if self.lost else "WRONG BYTES" if not self.exact else "good" if self.paced else "good (senders)"
-        )
+        if self.lost:
+            verdict = "LOSS"
+        elif not self.exact:
+            verdict = "WRONG BYTES"
+        elif self.paced:
+            verdict = "good"
+        else:
+            verdict = "good (senders)"
         return (
             f"{self.wanted:9.0f} {self.rate:9.0f} {self.rate * MBIT_A_PACKET:7.0f} {self.seconds:6.1f}"
             f" {self.packets:10d} {self.lost:8d} {self.kernel_drops:8d} {cpu:>9} {100 * self.queue:6.1f}"

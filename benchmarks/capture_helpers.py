@@ -69,12 +69,15 @@ def number(packets: np.ndarray, first: int) -> None:
     heads = np.empty(len(packets), dtype=[("sequence", "<u4"), ("low", "<u4"), ("high", "<u2")])
     count = k * np.uint64(MAX_PAYLOAD_BYTES)
     heads["sequence"] = (k + np.uint64(1)) & np.uint64(0xFFFFFFFF)
-    heads["low"], heads["high"] = count & np.uint64(0xFFFFFFFF), count >> np.uint64(32)
+    heads["low"] = count & np.uint64(0xFFFFFFFF)
+    heads["high"] = count >> np.uint64(32)
     packets[:, :PACKET_HEADER_BYTES] = heads.view(np.uint8).reshape(len(packets), struct.calcsize("<IIH"))
 
 
-BEHIND_S = 0.005  # a card catches up on its own buffer at most; packets later than this are delayed
-TURN_S = 0.0005  # packets due within this time go together, as the card's own pace is finer than this process can wait
+# A card catches up on its own buffer at most; packets later than this are delayed
+BEHIND_S = 0.005
+# Packets due within this time go together, as the card's own pace is finer than this process can wait
+TURN_S = 0.0005
 
 
 class Sender:

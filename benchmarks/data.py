@@ -30,7 +30,8 @@ from polysight_simulators.scene import OwnLayout, Scene, SimulatedRig, apply_sce
 ROOT = Path(__file__).parents[1]
 RIG = ROOT / "instrument.toml"
 SCENE = ROOT / "examples" / "nine-materials.toml"
-DISTINCT = 4  # rows that are simulated; all others repeat them. Even, so that directions fit
+# Rows that are simulated; all others repeat them. Even, so that directions fit
+DISTINCT = 4
 
 
 QUICK = {"columns": 40, "rows": 20}

@@ -32,7 +32,8 @@ TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 CPU_AT_MOST = 0.15
 MEMORY_AT_MOST_MB = 60.0
 LIMIT_S = 60.0
-ROW_POINTS = 35  # short rows: a machine that is busy with other things ends some of them with a fault
+# Short rows: a machine that is busy with other things ends some of them with a fault
+ROW_POINTS = 35
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -126,7 +127,8 @@ class _Rows:
         self.cpu_s = 0.0
         self.wall_s = 0.0
         self.faults: list[int] = []
-        self.bursts: list[tuple[Capture, list[WireEdge]]] = []  # whole ones, with their edges on SYNC_IN
+        # Whole ones, with their edges on SYNC_IN
+        self.bursts: list[tuple[Capture, list[WireEdge]]] = []
         client.follow("benchmark", 0, lambda _: None)
         client.begin_run(
             BeginRun(

@@ -94,12 +94,16 @@ def process(form: Form, boxes: dict[str, list[int]], library: Path | None) -> tu
         drawn = Labels({name: (b[0], b[1], b[2], b[3]) for name, b in boxes.items()})
     settings = Settings(incidence_deg=ANGLE_DEG, library=path_text(library))
     scan, _, _ = analyse_given_images(pair, settings, Inputs(labels=drawn), rig)
-    labels = scan.labels[::-1]  # row 0 of the boxes is the top
+    # Row 0 of the boxes is the top
+    labels = scan.labels[::-1]
     patch_of = {}
     for name, (x0, y0, x1, y1) in boxes.items():
         inside = labels[y0:y1, x0:x1]
         pixel_counts = np.bincount(inside[inside > 0], minlength=1)
-        patch_of[name] = int(pixel_counts.argmax()) if pixel_counts.sum() > 0.5 * inside.size else 0
+        if pixel_counts.sum() > 0.5 * inside.size:
+            patch_of[name] = int(pixel_counts.argmax())
+        else:
+            patch_of[name] = 0
     return scan, patch_of
 
 

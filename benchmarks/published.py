@@ -22,10 +22,13 @@ from polysight_shared.geometry import rx_positions_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = NDArray[np.complexfloating]
-UPSCALE = 64  # alignment transforms are so many times longer than a chirp
+# Alignment transforms are so many times longer than a chirp
+UPSCALE = 64
 RANGE_BINS = 1024  # of the spectra in which the direct path is looked for
-ZOOM = 100  # points of the closer look, over two bins
-SYNC_RX = 0  # alignment looks at this channel alone
+# Points of the closer look, over two bins
+ZOOM = 100
+# Alignment looks at this channel alone
+SYNC_RX = 0
 
 
 class Synchroniser:
@@ -84,7 +87,8 @@ class Synchroniser:
             turn.imag = -np.sin(turns)
             return (chirps * turn).mean(axis=1)
         out = np.empty_like(chirps)
-        for rx, channel in enumerate(chirps):  # each makes the same factors again, in double precision
+        # Each makes the same factors again, in double precision
+        for rx, channel in enumerate(chirps):
             out[rx] = channel * np.exp(-1j * (2 * np.pi * frequency * self._n + phase))
         return out.mean(axis=1)
 
@@ -149,7 +153,8 @@ class Synchroniser:
         return np.stack([self.reference(self.align(burst))[0] for burst in bursts], axis=1)
 
 
-SETTINGS = (1024, 2048, 4096)  # points of the range FFT, from the cheapest
+# Points of the range FFT, from the cheapest
+SETTINGS = (1024, 2048, 4096)
 
 
 def form_image(

@@ -19,7 +19,8 @@ from polysight.imaging.geometry import Antennas, Aperture, ImageGrid
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 OVERSAMPLING = 32
-BLOCK = 128  # positions at a time: their profiles stay in the second-level cache
+# Positions at a time: their profiles stay in the second-level cache
+BLOCK = 128
 
 
 @numba.njit(fastmath=True, error_model="numpy")
@@ -63,11 +64,13 @@ def _sum(
                         place = (d - first_m) * bins_per_m
                         low = np.int32(place)
                         w = place - np.float32(low)
-                        k = np.uint64(np.uint32(low + np.int32(p) * bins))  # unsigned: no negative indices to look for
+                        # Unsigned: no negative indices to look for
+                        k = np.uint64(np.uint32(low + np.int32(p) * bins))
                         re = here[k] + w * (here[k + np.uint64(1)] - here[k])
                         im = there[k] + w * (there[k + np.uint64(1)] - there[k])
                         turns = -d * cycles_per_m
-                        a = (turns - np.floor(turns + half)) * pi  # half the angle: -pi/2..pi/2
+                        # Half the angle: -pi/2..pi/2
+                        a = (turns - np.floor(turns + half)) * pi
                         q = a * a
                         s = np.float32(-1 / 5040) + q * np.float32(1 / 362880)
                         s = a * (one + q * (np.float32(-1 / 6) + q * (np.float32(1 / 120) + q * s)))

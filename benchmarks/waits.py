@@ -62,7 +62,8 @@ def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
                 for row in rows:
                     pipeline.add_row(row)
                 pipeline.form_images()
-    for took in (same, other_seconds):  # the first round makes kernels
+    # The first round makes kernels
+    for took in (same, other_seconds):
         del took.cpu[0], took.wall[0]
     return same, other_seconds
 

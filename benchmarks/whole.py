@@ -28,7 +28,8 @@ from polysight.pipeline import Pipeline
 from polysight.store import ScanFolder
 from polysight_shared.config import Instrument
 
-LAST_ROWS = 5  # times that the last row is added
+# Times that the last row is added
+LAST_ROWS = 5
 
 
 def process(source: dict[str, Any], live: bool) -> dict[str, Any]:

@@ -22,7 +22,8 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
-pytest.register_assert_rewrite("tests.support")  # before the first import of it: its asserts show their values
+# Before the first import of it: its asserts show their values
+pytest.register_assert_rewrite("tests.support")
 
 from tests.support import preloaded  # noqa: E402
 from tests.support.page.chromium import Browser, find_chromium  # noqa: E402

@@ -101,7 +101,9 @@ def judge(mutant: Mutant, copy: Path) -> str:
     path.write_text(mutated, encoding="utf-8")
     try:
         room_passes = tests_pass(copy, [str(mutant.tests)])
-        return "survived" if room_passes and tests_pass(copy, ["-m", "not slow"]) else "killed"
+        if room_passes and tests_pass(copy, ["-m", "not slow"]):
+            return "survived"
+        return "killed"
     finally:
         path.write_text(original, encoding="utf-8")
 

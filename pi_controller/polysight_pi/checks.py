@@ -153,9 +153,11 @@ def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MOD
     yield chip
     if chip.level == "ok":
         yield attempt(f"trigger line {pi.trigger_in}", _trigger, pi)
-        check_output, measure = _output, measure_width
+        check_output = _output
+        measure = measure_width
         if pi.wiring == "spi":
-            check_output, measure = _spi, measure_clock
+            check_output = _spi
+            measure = measure_clock
         yield attempt(f"SYNC_IN line {pi.sync_out[0]}", check_output, pi)
         yield Finding("ok", pi.pulse_source, where="pulses")
         yield attempt("pulse width", measure, instrument)

@@ -67,9 +67,11 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
     lines = open_lines(instrument, args.wires)
     try:
         if args.wires is None:
-            for sentence in dict.fromkeys(system.prepare_process() + system.prepare_thread()):  # each once
+            # Each once
+            for sentence in dict.fromkeys(system.prepare_process() + system.prepare_thread()):
                 log(sentence)
-        lines.check_width = False  # the width is printed below
+        # The width is printed below
+        lines.check_width = False
         spec = BurstSpec.from_burst(instrument.burst)
         end_ns = lines.now_ns()
         records = []
@@ -291,7 +293,9 @@ def main(argv: list[str] | None = None) -> int:
     open_standard_streams()
     args = _parser().parse_args(expand_home(sys.argv[1:] if argv is None else argv))
     try:
-        return args.action(args) if args.action is _keys else args.action(args, _rig(args))
+        if args.action is _keys:
+            return args.action(args)
+        return args.action(args, _rig(args))
     except PolysightError as e:
         sys.stderr.write(f"error: {e}\n")
         return e.exit_status

@@ -142,4 +142,5 @@ def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterat
             if not reply.events:
                 return
             yield from map(msgspec.to_builtins, reply.events)
-            from_seq = reply.events[-1].seq + 1  # a lost journal leaves a gap in the numbers
+            # A lost journal leaves a gap in the numbers
+            from_seq = reply.events[-1].seq + 1

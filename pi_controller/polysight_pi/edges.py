@@ -110,9 +110,11 @@ class _Leg(NamedTuple):
     """A motion from rest to rest, in the arithmetic of the sketch (motion_step.h)."""
 
     distance: int
-    up_s: list[float]  # time of each step while the stage speeds up
+    # Time of each step while the stage speeds up
+    up_s: list[float]
     cruise_s: float  # of each step at constant speed
-    down_s: list[float]  # time from full speed to each step while it slows down
+    # Time from full speed to each step while it slows down
+    down_s: list[float]
 
     @staticmethod
     def plan(distance: int, motion: RowMotion) -> _Leg:
@@ -163,9 +165,12 @@ class EdgeTimes:
         self._motion = motion
         self._interval_s = abs(motion.step) / motion.feed
         self._edges_ns: list[int] = []
-        self._statuses: list[tuple[int, int]] = []  # points, and the latest time at which they were written
-        self._stops: list[int] = []  # distances at which the stage rested, in a hold
-        self._early_stops: list[int] = []  # those before the first point: of the row, or of the travel to it
+        # Points, and the latest time at which they were written
+        self._statuses: list[tuple[int, int]] = []
+        # Distances at which the stage rested, in a hold
+        self._stops: list[int] = []
+        # Those before the first point: of the row, or of the travel to it
+        self._early_stops: list[int] = []
         self._is_held = False
 
     def note_hold(self) -> None:

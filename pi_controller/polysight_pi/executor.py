@@ -98,7 +98,8 @@ class Executor:
         self.journal = journal
         self._turned = turned
         self._find_late = find_late
-        self.take_over_key = secrets.token_hex(16)  # accepted as the owner of every run: a person at the Pi
+        # Accepted as the owner of every run: a person at the Pi
+        self.take_over_key = secrets.token_hex(16)
         self._turned_s = time.monotonic()
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._command_slots = threading.Semaphore(COMMANDS_WAITING)
@@ -106,9 +107,12 @@ class Executor:
         self._machine = Machine(stage, loop, self.journal, self._inbox.put)
         self._run: m.BeginRun | None = None
         self._last_row: tuple[int, int] | None = None
-        self._takes: dict[int, int] = {}  # the newest one of each row of this scan
-        self._waits_for_journal = False  # a run begins or ends
-        self._deferred: list[Request] = []  # commands behind it
+        # The newest one of each row of this scan
+        self._takes: dict[int, int] = {}
+        # A run begins or ends
+        self._waits_for_journal = False
+        # Commands behind it
+        self._deferred: list[Request] = []
         self._after_row: Request | None = None
         self._replies: list[tuple[Request, m.AnyReply]] = []
         self._pulsing: list[Request] = []
@@ -122,7 +126,8 @@ class Executor:
     def post(self, item: StageNews | BurstSent | m.Pulsed | LoopFault | Callable[[], object]) -> None:
         """Append an item to the queue; return at once. Replies of the stage are dropped if too many wait."""
         if isinstance(item, Reply) and self._inbox.qsize() > LINES_WAITING:
-            return  # the end of a row or of homing is requested again
+            # The end of a row or of homing is requested again
+            return
         self._inbox.put(item)
 
     def submit(self, command: m.AnyCommand, answer: Callable[[m.AnyReply], None]) -> bool:
@@ -271,7 +276,8 @@ class Executor:
         except Exception as e:  # noqa: BLE001 - reported to the client and in the log
             traceback.print_exc()
             reply = make_refusal(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
-        self._count_as_heartbeat(request.command)  # before the deadlines are checked: it may have taken long
+        # Before the deadlines are checked: it may have taken long
+        self._count_as_heartbeat(request.command)
         if reply is not None:
             self._replies.append((request, reply))
 
@@ -294,7 +300,9 @@ class Executor:
             raise RefusedError(PiFault.NOT_OWNER, f"run {run.scan_id} is another program's")
         match command:
             case m.BeginRun():
-                return None if self._postpone(request, command) else self._begin(request, command)
+                if self._postpone(request, command):
+                    return None
+                return self._begin(request, command)
             case m.EndRun():
                 return self._end_run(request, command)
             case m.RunRow():
@@ -303,7 +311,8 @@ class Executor:
                 return self._accept("Abort", command.reason or "requested by the host")
             case m.Pulse():
                 return self._pulse(request, command)
-            case _:  # Home, Hold, Resume
+            case _:
+                # Home, Hold, Resume
                 return self._accept(type(command).__name__)
 
     def _replay(self, request: Request, command: m.Replay) -> None:
@@ -397,12 +406,14 @@ class Executor:
 
     def _end_run(self, request: Request, command: m.EndRun) -> m.Accepted | None:
         if self._run is None and command.scan_id == self.journal.position[0]:
-            return self._accept()  # a repeated request
+            # A repeated request
+            return self._accept()
         self._need_run(command.scan_id)
         self._machine.require("EndRun")
 
         def write(journal: Journal) -> None:
-            journal.broken = False  # there may be space again
+            # There may be space again
+            journal.broken = False
             journal.add(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
             journal.commit()
 
@@ -421,7 +432,8 @@ class Executor:
 
         def finish(error: PolysightError | OSError | None) -> None:
             self._waits_for_journal = False
-            if isinstance(error, JournalFullError) and self.journal.is_broken:  # else it was not opened
+            # Else it was not opened
+            if isinstance(error, JournalFullError) and self.journal.is_broken:
                 if isinstance(request.command, m.BeginRun):
                     self._forget_run()
                 self._machine.happen("lasting fault", error.number, str(error))

@@ -76,7 +76,8 @@ def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
     magic = file.read(len(MAGIC))
     if magic != MAGIC:
         if MAGIC.startswith(magic.rstrip(b"\0")):
-            return  # the power was cut before the first bytes were on the disk
+            # The power was cut before the first bytes were on the disk
+            return
         summary = f"{getattr(file, 'name', 'journal')}: not a journal"
         remedy = "move it out of the journal folder"
         raise DataError(summary, "another program wrote it", remedy, code=ErrorCode.FILE_FOREIGN)
@@ -116,8 +117,10 @@ class JournalFile:
         self.path = path
         self.damage = ""
         self.last_seq = 0  # of the newest record, or of the host's newest event if that is later
-        self.takes: dict[int, int] = {}  # the newest one of each row
-        self._places: list[tuple[int, int]] = []  # sequence number and offset of each record
+        # The newest one of each row
+        self.takes: dict[int, int] = {}
+        # Sequence number and offset of each record
+        self._places: list[tuple[int, int]] = []
         self._synced = True
         try:
             self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -191,7 +194,8 @@ class JournalFile:
             if sync and (data or not self._synced):
                 os.fsync(self._fd)
         except OSError as e:
-            with suppress(OSError):  # the rest is overwritten, or cut off when the file is next opened
+            # The rest is overwritten, or cut off when the file is next opened
+            with suppress(OSError):
                 os.ftruncate(self._fd, self._end)
             raise JournalFullError(self.path, e) from None
         self._end += len(data)
@@ -240,10 +244,12 @@ class Journal:
         self._warn = warn
         self._file: JournalFile | None = None
         self._batch: list[tuple[m.AnyEvent, bytes]] = []
-        self._pending = 0  # events of the batch that are to be written
+        # Events of the batch that are to be written
+        self._pending = 0
         self.broken = False
         self.scan_id = ""
-        self.position = ("", 0)  # current scan and number of its newest published event; replaced as a whole
+        # Current scan and number of its newest published event; replaced as a whole
+        self.position = ("", 0)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)

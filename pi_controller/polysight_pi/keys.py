@@ -34,12 +34,15 @@ class AllowedKeys:
 
     def client_name(self, key: bytes) -> str:
         """Return the name of the client with this public key (32 bytes), or "" if it is not allowed."""
-        with suppress(OSError, ValueError):  # missing or unreadable: keep the last list
+        # Missing or unreadable: keep the last list
+        with suppress(OSError, ValueError):
             stat = (self._folder / ALLOWED).stat()
             if self._seen != (stat.st_mtime_ns, stat.st_size):
                 self._names = read_allowed(self._folder)
                 self._seen = (stat.st_mtime_ns, stat.st_size)
-        return self._names.get(zmq.utils.z85.encode(key).decode("ascii"), "") if len(key) == 32 else ""
+        if len(key) == 32:
+            return self._names.get(zmq.utils.z85.encode(key).decode("ascii"), "")
+        return ""
 
 
 def read_allowed(folder: Path) -> dict[str, str]:

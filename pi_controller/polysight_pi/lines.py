@@ -47,7 +47,8 @@ MESSAGE = 0x40206B00
 WRITE_MODE = 0x40016B01
 MODE_NO_CS = 0x40
 MODE_0 = 0x00
-_TRANSFER = struct.Struct("=QQIIHBBBBBB")  # tx, rx, len, speed_hz, delay_us, bits, cs_change, tx_nbits, rx_nbits, ...
+# Tx, rx, len, speed_hz, delay_us, bits, cs_change, tx_nbits, rx_nbits, ...
+_TRANSFER = struct.Struct("=QQIIHBBBBBB")
 _RIGHTS = "60-polysight.rules sets the device's group (udev), `sudo usermod -aG gpio,spi USER` adds the user to it"
 _REASONS = {
     errno.EBUSY: ("it is in use", "end that program; `systemctl stop polysight-pi` if it is polysight itself"),
@@ -422,11 +423,13 @@ class WireLines:
         self._return = pi.pulses_in
         listen = (pi.trigger_in,)
         join = None
-        if pi.pulses_in is not None:  # the simulated return wire
+        # The simulated return wire
+        if pi.pulses_in is not None:
             listen += (pi.pulses_in,)
             join = (self._output, pi.pulses_in)
         self._client = WireClient(path, listen=listen, join=join)
-        self._waiting: deque[WireEdge] = deque()  # trigger edges received while looking back
+        # Trigger edges received while looking back
+        self._waiting: deque[WireEdge] = deque()
         self._now_ns = self._seqno = 0
         self._active = False
         self._unsent: list[WireEdge] = []

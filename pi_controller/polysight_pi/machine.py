@@ -109,7 +109,8 @@ TIMEOUTS_S: dict[State, float] = {
 END_TIMEOUT_S = 0.5
 # Missing heartbeats after which the host is lost.
 HOST_MISSES = 4
-WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}  # the others have the same name
+# The others have the same name
+WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}
 
 
 @dataclass
@@ -122,15 +123,20 @@ class RunningRow:
     sequence: int  # of the stage's ROW and its `done`
     motion: RowMotion
     edges: EdgeTimes
-    is_underway: bool = False  # True once the stage's `ok` was read: earlier statuses belong to the motion before
+    # True once the stage's `ok` was read: earlier statuses belong to the motion before
+    is_underway: bool = False
     status: m.RowStatus | None = None
     fault: int = 0
     reason: str = ""
-    lasting: bool = False  # the next state is fault
-    points: int = 0  # passed, counted by the stage
-    bursts: int = 0  # reported to the host
+    # The next state is fault
+    lasting: bool = False
+    # Passed, counted by the stage
+    points: int = 0
+    # Reported to the host
+    bursts: int = 0
     was_held: bool = False  # within the row; the stage says so
-    done_ns: int = END_OF_TIME_NS  # latest time at which its `done` was written
+    # Latest time at which its `done` was written
+    done_ns: int = END_OF_TIME_NS
 
     def judge(self, counts: Counts) -> None:
         """Set the result of a row that was not stopped: `done` if all counts agree, else `fault`."""
@@ -174,13 +180,17 @@ class Machine:
         self.state: State = "idle"
         self.row: RunningRow | None = None
         self.homed = self.in_run = False
-        self.fault = 0  # the first one
+        # The first one
+        self.fault = 0
         self.reason = ""  # of that fault
-        self.lost_mm = (0.0, 0.0)  # steps lost before the last homing, which found them
+        # Steps lost before the last homing, which found them
+        self.lost_mm = (0.0, 0.0)
         self.row_timeout_s = math.inf
         self._deadline_s = math.inf
-        self._homing = -1  # sequence of HOME
-        self._homing_underway = False  # True once the stage has accepted it
+        # Sequence of HOME
+        self._homing = -1
+        # True once the stage has accepted it
+        self._homing_underway = False
         self._homing_is_watched = False  # its host sends heartbeats
         self._rests_in_hold = False
         self._resumes_at_rest = False
@@ -214,7 +224,8 @@ class Machine:
             timeout_s = self.row_timeout_s
         self.state = state
         self._deadline_s = self._clock() + timeout_s
-        if state == "ending":  # after the bursts that are still in the queue
+        # After the bursts that are still in the queue
+        if state == "ending":
             self._post(partial(self.happen, "settled"))
 
     def require(self, event: str) -> None:
@@ -323,7 +334,8 @@ class Machine:
             if self.row is not None and reply.sequence == self.row.sequence:
                 self.row.is_underway = True
         elif homing and not self._homing_underway:
-            pass  # sent before HOME was accepted
+            # Sent before HOME was accepted
+            pass
         elif reply.kind == "banner":
             self.happen("stage lost", PiFault.STAGE_LOST, "the stage was reset: it sent its banner")
         elif reply.kind == "alarm" and reply.number == StageError.STOPPED:
@@ -356,7 +368,8 @@ class Machine:
             self.happen("stage lost", PiFault.STAGE_LOST, reason)
         elif self._rests and self._rests % RESTS == 0:
             try:
-                self.stage.link.repeat()  # the stage repeats the end of its motion
+                # The stage repeats the end of its motion
+                self.stage.link.repeat()
             except StageLostError as e:
                 self.happen("stage lost", e.number, str(e))
 

@@ -52,7 +52,8 @@ class Server:
         self._allowed = AllowedKeys(key_dir)
         self._secret = not is_loopback(command_address)
         try:
-            self._zap = authenticator(self._context)  # before the others are bound: it authenticates their connections
+            # Before the others are bound: it authenticates their connections
+            self._zap = authenticator(self._context)
             self._commands = replier(self._context, command_address, key_dir)
             self._events = publisher(self._context, event_address, key_dir)
         except PolysightError:
@@ -172,7 +173,8 @@ class Server:
         try:
             self._commands.send_multipart([*envelope, raw], zmq.NOBLOCK)
         except zmq.ZMQError:
-            return  # the client is gone or does not read; it will retry
+            # The client is gone or does not read; it will retry
+            return
 
     def close(self) -> None:
         """Close the sockets after a moment for messages already sent; leave a thread that hangs inside one alone."""

@@ -95,7 +95,8 @@ class StatusWatch:
         self._asked_s = now_s
         self._unanswered_since_s: float | None = None
         self._looked_s = now_s
-        self.look_s = min(0.05, heartbeat_s / STATUS_PER_HEARTBEAT / 2)  # interval for calling `is_due` and `silent_s`
+        # Interval for calling `is_due` and `silent_s`
+        self.look_s = min(0.05, heartbeat_s / STATUS_PER_HEARTBEAT / 2)
         self.interval_s = 0.0  # between status requests; 0: none
 
     def is_due(self, now_s: float) -> bool:
@@ -168,7 +169,8 @@ class StageLink:
             settings = termios.tcgetattr(self._serial.fileno())
             settings[2] &= ~termios.HUPCL
             termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, settings)
-        except (OSError, ValueError, termios.error) as e:  # SerialException is an OSError
+        except (OSError, ValueError, termios.error) as e:
+            # SerialException is an OSError
             reason = os.strerror(e.errno) if isinstance(e, OSError) and e.errno else str(e)
             raise StageLostError(
                 f"stage port {port} cannot be opened: {reason}",
@@ -183,7 +185,8 @@ class StageLink:
         self._greeted = self._closing = False
         self._sequence = self.bad_lines = 0
         self._last_line = b""
-        self.lost = ""  # the reason, once the link is lost
+        # The reason, once the link is lost
+        self.lost = ""
         self._reader = threading.Thread(target=self._read, name="stage", daemon=True)
         self._reader.start()
         try:
@@ -194,7 +197,8 @@ class StageLink:
 
     def _greet(self, banner_timeout_s: float) -> None:
         self._banner_seen.wait(banner_timeout_s)
-        self._write(b"\n")  # ends a partial line sent earlier
+        # Ends a partial line sent earlier
+        self._write(b"\n")
         hello = self.request("HELLO")
         fields = {**(self._banner.fields if self._banner else {}), **hello.fields}
         self.firmware = fields.get("fw", "")
@@ -297,7 +301,8 @@ class StageLink:
             try:
                 data = self._serial.read(1)
                 data += self._serial.read(self._serial.in_waiting)
-            except (OSError, TypeError) as e:  # pyserial raises TypeError when the port is closed under a read
+            except (OSError, TypeError) as e:
+                # Pyserial raises TypeError when the port is closed under a read
                 self._lose(f"reading failed: {e}")
                 return
             *lines, buffer = (buffer + data).split(b"\n")
@@ -408,7 +413,8 @@ class StageDriver:
                     raise
             if stop:
                 self.link.send_byte(Immediate.STOP)
-            time.sleep(CLEAR_RETRY_S)  # still moving: started by an earlier program, or slowing down
+            # Still moving: started by an earlier program, or slowing down
+            time.sleep(CLEAR_RETRY_S)
 
     def home(self) -> int:
         """Stop, clear alarms, send the settings, switch the motors on and start homing.
@@ -427,7 +433,8 @@ class StageDriver:
         try:
             self.clear(stop=True)
         except StageRefusedError as e:
-            if e.number != StageError.NOT_HOMED:  # homing is the remedy
+            # Homing is the remedy
+            if e.number != StageError.NOT_HOMED:
                 raise
         config = self.config
         settings = {

@@ -92,7 +92,8 @@ class MemoryWatch(threading.Thread):
         self._ports = ports
         self._warn = warn
         self._ended = threading.Event()
-        self._statm = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)  # kept open: descriptors may run out
+        # Kept open: descriptors may run out
+        self._statm = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
         self._most_bytes = max(MAX_BYTES, self.resident_bytes() + SPARE_BYTES)
 
     def resident_bytes(self) -> int:
@@ -118,7 +119,8 @@ class MemoryWatch(threading.Thread):
         """Shut down the TCP connections at the ports (ZeroMQ closes them). Return their number."""
         cut = 0
         for link in Path("/proc/self/fd").iterdir():
-            with suppress(OSError):  # closed meanwhile, or not connected
+            # Closed meanwhile, or not connected
+            with suppress(OSError):
                 if not str(link.readlink()).startswith("socket:"):
                     continue
                 with socket.socket(fileno=os.dup(int(link.name))) as s:

@@ -64,9 +64,11 @@ class BurstSpec(NamedTuple):
 class SpiBurst(NamedTuple):
     """A burst as one SPI transfer on MOSI: each pulse is one set bit, within half a bit of its exact time."""
 
-    data: bytes  # most significant bit first
+    # Most significant bit first
+    data: bytes
     clock_hz: int
-    bits: tuple[int, ...]  # index of each set bit
+    # Index of each set bit
+    bits: tuple[int, ...]
 
     @property
     def bit_ns(self) -> float:
@@ -83,27 +85,35 @@ class BurstRecord(NamedTuple):
     """Result of sending a burst."""
 
     pulses: int
-    first_ns: int  # rising edge of the first pulse: the clock just before the line was set
+    # Rising edge of the first pulse: the clock just before the line was set
+    first_ns: int
     last_ns: int
-    end_ns: int  # end of the last pulse
-    width_max_ns: int = 0  # upper bound: from before the line was set until after it was cleared
-    jitter_ns: int = 0  # largest delay of a rising edge after its deadline
-    fault: int = 0  # PiFault; 0: none
+    # End of the last pulse
+    end_ns: int
+    # Upper bound: from before the line was set until after it was cleared
+    width_max_ns: int = 0
+    # Largest delay of a rising edge after its deadline
+    jitter_ns: int = 0
+    # PiFault; 0: none
+    fault: int = 0
 
 
 class Seen(NamedTuple):
     """Pulses seen at the connector, by the return wire."""
 
     pulses: int
-    width_max_ns: int = 0  # 0: not measured
+    # 0: not measured
+    width_max_ns: int = 0
 
 
 class _Lines(Protocol):
     """Trigger input and SYNC_IN output (lines.py). Methods raise DeviceError when the lines are lost."""
 
     name: str
-    check_width: bool  # True without a hardware one-shot: a pulse that may have been too long is a fault
-    is_real_time: bool  # True if their clock is CLOCK_MONOTONIC
+    # True without a hardware one-shot: a pulse that may have been too long is a fault
+    check_width: bool
+    # True if their clock is CLOCK_MONOTONIC
+    is_real_time: bool
 
     # Time on the clock of edges and pulses.
     def now_ns(self) -> int: ...
@@ -235,12 +245,14 @@ def _send_bits(
         return nothing_sent
     before_ns, after_ns = lines.transfer(burst)
     took_ns = after_ns - before_ns
-    spare_ns = max(0, took_ns - round(burst.duration_ns))  # the controller began at an unknown moment within it
+    # The controller began at an unknown moment within it
+    spare_ns = max(0, took_ns - round(burst.duration_ns))
     first_ns = before_ns + spare_ns // 2 + lead_ns
     last_ns = first_ns + round((burst.bits[-1] - burst.bits[0]) * burst.bit_ns)
     width_ns = round(max(burst.bit_ns, took_ns / (8 * len(burst.data))))
     jitter_ns = before_ns - begin_ns + (spare_ns + 1) // 2
-    if spec.period_ns * burst.clock_hz % 10**9:  # pulses are up to half a bit away from their exact times
+    # Pulses are up to half a bit away from their exact times
+    if spec.period_ns * burst.clock_hz % 10**9:
         jitter_ns += round(burst.bit_ns / 2)
     fault = 0
     if took_ns < MIN_PART * burst.duration_ns:
@@ -336,7 +348,8 @@ class TriggerLoop:
         self._lines = lines
         self._post = post
         self._prepare = prepare
-        self._lock = threading.Lock()  # held while an edge is answered: arm and disarm wait for the burst to end
+        # Held while an edge is answered: arm and disarm wait for the burst to end
+        self._lock = threading.Lock()
         self._stop = threading.Event()
         self._job: Job | None = None
         self._bench: BurstSpec | None = None
@@ -415,7 +428,8 @@ class TriggerLoop:
             self._fail(None, PiFault.TRIGGER_LINE_LOST, f"internal error: {e!r}")
             raise
         finally:
-            with contextlib.suppress(DeviceError):  # lost already: the fault was posted above, or the process ends
+            # Lost already: the fault was posted above, or the process ends
+            with contextlib.suppress(DeviceError):
                 self._lines.close()
 
     def _take(self, edge: Edge) -> None:
@@ -511,6 +525,7 @@ class TriggerWatch:
             self._points = points
             self._statuses = 0
             return False
-        self._points = min(self._points, points)  # the stage counts from 0 in each row
+        # The stage counts from 0 in each row
+        self._points = min(self._points, points)
         self._statuses += 1
         return self._statuses >= SILENT_STATUSES and points - max(edges, self._points) >= SILENT_POINTS

@@ -92,19 +92,24 @@ class Pi(Section, frozen=True):
     gpio_chip: str = "pinctrl-bcm2711"
     trigger_in: GpioLine = 26
     sync_out: tuple[GpioLine, ...] = (22,)
-    wiring: Literal["fanout", "lines", "gpiomem", "spi"] = "fanout"  # "lines", "gpiomem": of old files, never opened
-    one_shot: bool = False  # a hardware one-shot sets the width of the pulses instead of the GPIO line
-    pulses_in: GpioLine | None = None  # return wire of SYNC_IN, MISO with "spi"; None: pulses are sent, not seen
+    # "lines", "gpiomem": of old files, never opened
+    wiring: Literal["fanout", "lines", "gpiomem", "spi"] = "fanout"
+    # A hardware one-shot sets the width of the pulses instead of the GPIO line
+    one_shot: bool = False
+    # Return wire of SYNC_IN, MISO with "spi"; None: pulses are sent, not seen
+    pulses_in: GpioLine | None = None
     command_address: str = "tcp://127.0.0.1:5601"
     event_address: str = "tcp://127.0.0.1:5602"
     journal_dir: str = "journal"
-    key_dir: str = "keys"  # a relative path counts from the rig file's folder
+    # A relative path counts from the rig file's folder
+    key_dir: str = "keys"
     heartbeat_ms: Count = 500
     trigger_bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
     trigger_debounce_us: Annotated[int, msgspec.Meta(ge=0)] = 0
     gpiomem: str = "/dev/gpiomem"  # of old files, not used
     spi_device: str = "/dev/spidev0.0"
-    host_heartbeat_ms: Annotated[int, msgspec.Meta(ge=0)] = 100  # period of the host's heartbeat; 0: none
+    # Period of the host's heartbeat; 0: none
+    host_heartbeat_ms: Annotated[int, msgspec.Meta(ge=0)] = 100
 
     def __post_init__(self) -> None:
         require(len(self.sync_out) > 0, "sync_out needs at least one line")
@@ -230,7 +235,8 @@ class Radar(Section, frozen=True):
         default_factory=dict
     )
     native: dict[str, NativeRadar] = msgspec.field(default_factory=dict)
-    idle_us: Positive = 100.0  # before each chirp
+    # Before each chirp
+    idle_us: Positive = 100.0
     rx_gain_db: int = 32
     rf_gain_target_db: Literal[30, 33, 36] = 30
     tx_backoff_db: Annotated[int, msgspec.Meta(ge=0)] = 0
@@ -312,7 +318,8 @@ class Limits(Section, frozen=True):
     command_timeout_s: Positive = 5.0
     end_of_record_s: Positive = 3.0
     free_disk_bytes: Annotated[int, msgspec.Meta(ge=0)] = 1 << 30
-    rows_waiting: Count = 8  # maximum number of rows that wait for processing while another is recorded
+    # Maximum number of rows that wait for processing while another is recorded
+    rows_waiting: Count = 8
 
 
 class Notify(Section, frozen=True):
@@ -360,7 +367,8 @@ class Instrument(Section, frozen=True):
             f'burst.width_us must be {low_us:g}..{high_us:g} us with wiring = "spi" (a bit of the controller)',
         )
         names = [b.name for b in self.boards]
-        for name in names:  # folders of a scan are named after them
+        # Folders of a scan are named after them
+        for name in names:
             rule = "boards name must be 1..64 letters, digits, spaces, _ - or ., the first a letter, a digit or _"
             require(re.fullmatch(r"\w[\w .-]{0,63}", name) is not None, f"{rule}: {name!r}")
         require(len(set(names)) == len(names), f"board names must differ: {names}")

@@ -21,7 +21,8 @@ class ErrorCode(StrEnum):
     FILE_FOREIGN = "file-foreign"  # of another format, or another program's
     FILE_TOO_LARGE = "file-too-large"
     FILE_EXISTS = "file-exists"
-    PATH_OUTSIDE = "path-outside"  # leads out of the folder it belongs to
+    # Leads out of the folder it belongs to
+    PATH_OUTSIDE = "path-outside"
     DISK_FULL = "disk-full"
     VERSION_UNSUPPORTED = "version-unsupported"
 
@@ -29,8 +30,10 @@ class ErrorCode(StrEnum):
     KEY_UNKNOWN = "key-unknown"
     KEY_MISSING = "key-missing"
     TYPE_WRONG = "type-wrong"
-    VALUE_INVALID = "value-invalid"  # breaks a rule of its own: range, form, finite
-    VALUES_CONFLICT = "values-conflict"  # two values that cannot stand together
+    # Breaks a rule of its own: range, form, finite
+    VALUE_INVALID = "value-invalid"
+    # Two values that cannot stand together
+    VALUES_CONFLICT = "values-conflict"
     NAME_TAKEN = "name-taken"
 
     # Peers and devices
@@ -43,20 +46,26 @@ class ErrorCode(StrEnum):
     # Data
     NO_DATA = "no-data"
     NOT_ENOUGH_DATA = "not-enough-data"
-    MISMATCH = "mismatch"  # two pieces of data that do not belong together
+    # Two pieces of data that do not belong together
+    MISMATCH = "mismatch"
 
     # host/polysight/serve
-    HOST_UNKNOWN = "host-unknown"  # the request's Host is no name of this server
-    ORIGIN_FOREIGN = "origin-foreign"  # the request comes from a page of another site
+    # The request's Host is no name of this server
+    HOST_UNKNOWN = "host-unknown"
+    # The request comes from a page of another site
+    ORIGIN_FOREIGN = "origin-foreign"
     READ_ONLY = "read-only"
     TOKEN_WRONG = "token-wrong"
 
     # host/polysight/acquisition
-    ROW_INCOMPLETE = "row-incomplete"  # all retakes of a row are used up
+    # All retakes of a row are used up
+    ROW_INCOMPLETE = "row-incomplete"
     STAGE_NOT_READY = "stage-not-ready"  # not homed, in a fault, or another host's
-    STAGE_DIFFERS = "stage-differs"  # the Pi's [stage] places rows elsewhere
+    # The Pi's [stage] places rows elsewhere
+    STAGE_DIFFERS = "stage-differs"
 
     # Radar
     RADAR_RESTARTED = "radar-restarted"
     RADAR_NO_FIRMWARE = "radar-no-firmware"
-    RADAR_FAULT = "radar-fault"  # a fatal event, or a failed self-test
+    # A fatal event, or a failed self-test
+    RADAR_FAULT = "radar-fault"

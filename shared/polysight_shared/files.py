@@ -15,7 +15,8 @@ from typing import IO, Any, BinaryIO
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError
 
-MAX_JSON_BYTES = 256 << 20  # a hundred times the manifest of a scan of ten thousand rows
+# A hundred times the manifest of a scan of ten thousand rows
+MAX_JSON_BYTES = 256 << 20
 
 
 def open_regular(path: Path) -> BinaryIO:

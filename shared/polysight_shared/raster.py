@@ -26,7 +26,8 @@ MIN_WIDTH_NS, MAX_WIDTH_NS = map(us_to_ns, WIDTH_US)
 _Points = Annotated[int, msgspec.Meta(ge=1, lt=100_000)]
 _Motion = Annotated[float, msgspec.Meta(ge=0.001, le=1e6)]
 _Steps = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
-_Offset = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # also refuses NaN and infinities
+# Also refuses NaN and infinities
+_Offset = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 INVERTIBLE = ("x_dir", "left_dir", "right_dir", "enable", "pul", "switches", "emergency_stop")
 """Pins of the stage whose level `stage.inverted` inverts against arduino_stage/board.h."""
 _Invertible = Literal["x_dir", "left_dir", "right_dir", "enable", "pul", "switches", "emergency_stop"]
@@ -108,8 +109,10 @@ class Stage(Section, frozen=True):
     centre_x_mm: NonNegative = 400.0
     centre_y_mm: NonNegative = 250.0
     backlash_mm: NonNegative = 0.0
-    home_after_scan: bool = False  # measures lost steps; needs limit switches
-    inverted: tuple[_Invertible, ...] = ()  # pins with the other level than in board.h, sent before the first motion
+    # Measures lost steps; needs limit switches
+    home_after_scan: bool = False
+    # Pins with the other level than in board.h, sent before the first motion
+    inverted: tuple[_Invertible, ...] = ()
 
     def __post_init__(self) -> None:
         require(self.centre_x_mm <= self.travel_x_mm, "centre_x_mm must lie within travel_x_mm")

@@ -47,14 +47,22 @@ class Immediate(IntEnum):
 class Parameter(IntEnum):
     """First argument of `SET`: the setting of the stage; the comment has the unit of the second argument."""
 
-    ACCEL = 0  # steps/s^2
-    HEARTBEAT = 1  # ms of silence after which a moving stage stops
-    TRIGGER = 2  # us, width of the trigger pulse
-    TRAVEL_X = 3  # steps, soft limit 0..TRAVEL_X
-    TRAVEL_Y = 4  # steps
-    TRAVEL_SPEED = 5  # steps/s, between rows
-    PINS = 7  # bits of the pins whose level is inverted, in the order of raster.INVERTIBLE
-    BACKLASH = 6  # steps; rows are approached from below, with at least this run-up; 0 = off
+    # Steps/s^2
+    ACCEL = 0
+    # Ms of silence after which a moving stage stops
+    HEARTBEAT = 1
+    # Us, width of the trigger pulse
+    TRIGGER = 2
+    # Steps, soft limit 0..TRAVEL_X
+    TRAVEL_X = 3
+    # Steps
+    TRAVEL_Y = 4
+    # Steps/s, between rows
+    TRAVEL_SPEED = 5
+    # Bits of the pins whose level is inverted, in the order of raster.INVERTIBLE
+    PINS = 7
+    # Steps; rows are approached from below, with at least this run-up; 0 = off
+    BACKLASH = 6
 
 
 def crc16(body: bytes) -> int:

@@ -83,7 +83,8 @@ def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T
         ) from None
 
 
-_TYPES = {  # names of the types of JSON and TOML for messages
+# Names of the types of JSON and TOML for messages
+_TYPES = {
     "int": "a whole number", "float": "a number", "str": "text", "bool": "true or false",
     "array": "a list", "object": "a table", "null": "nothing",
 }  # fmt: skip

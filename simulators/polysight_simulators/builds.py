@@ -14,7 +14,8 @@ from pathlib import Path
 from polysight_shared.errors import DeviceError
 
 SKETCH_DIR = Path(__file__).resolve().parents[2] / "arduino_stage"
-FOLDER = SKETCH_DIR / "build"  # ignored by git, removed by `make clean`
+# Ignored by git, removed by `make clean`
+FOLDER = SKETCH_DIR / "build"
 _FLAGS = ("-std=gnu++11", "-O2", "-Wall", "-Wextra", "-fno-exceptions", "-fno-rtti")
 
 
@@ -48,14 +49,16 @@ def compiled(product: str, sources: Iterable[Path], command: Sequence[str], on_f
     for path in sorted(sources):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     name = f"{Path(product).stem}-{digest.hexdigest()[:16]}{Path(product).suffix}"
-    if (FOLDER / name).is_file():  # also in a read-only folder
+    # Also in a read-only folder
+    if (FOLDER / name).is_file():
         return FOLDER / name
     result = _folder() / name
     if result.is_file():
         return result
     with tempfile.TemporaryDirectory(prefix=".making-", dir=result.parent) as folder:
         _run([word.replace("{folder}", folder) for word in command], product, on_failure)
-        (Path(folder) / product).replace(result)  # atomically
+        # Atomically
+        (Path(folder) / product).replace(result)
     return result
 
 
@@ -74,7 +77,8 @@ def _run(command: list[str], product: str, on_failure: tuple[str, str]) -> None:
 def _folder() -> Path:
     """Return a writable folder for compiled programs. Raises DeviceError if the last one belongs to another user."""
     places = [FOLDER]
-    with suppress(RuntimeError):  # a user without a home
+    # A user without a home
+    with suppress(RuntimeError):
         places.append(Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "polysight" / "build")
     for folder in places:
         try:

@@ -55,7 +55,8 @@ def is_free(rig: Instrument) -> bool:
                 stack.enter_context(bound_udp(address, port))
             for address, port in tcp:
                 s = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
-                s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # addresses of a rig that just ended are free
+                # Addresses of a rig that just ended are free
+                s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 s.bind((address, int(port)))
         except (OSError, DeviceError):
             return False

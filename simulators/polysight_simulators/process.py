@@ -31,7 +31,8 @@ def die_with_parent(sig: signal.Signals = signal.SIGTERM) -> None:
         return
     parent = os.getppid()
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, int(sig), 0, 0, 0)
-    if os.getppid() != parent:  # the parent ended before the request was made
+    # The parent ended before the request was made
+    if os.getppid() != parent:
         os.kill(os.getpid(), sig)
 
 

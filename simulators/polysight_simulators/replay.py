@@ -28,7 +28,8 @@ from polysight_simulators.process import announce_ready, command_line, run_until
 
 _OF_PULSES = ("overflow", "ddr_full", "missed_pulse", "miss_pulses", *(kind.value for kind in EventKind))
 _OF_RADARS = tuple(key for keys in OF_CONTROL.values() for key in keys)
-BOARD = "card"  # default name of the board
+# Default name of the board
+BOARD = "card"
 IDLE_S = 0.1
 PLAYING_S = 0.002
 _MAX_QUEUED_BYTES = 1 << 20
@@ -44,7 +45,8 @@ class Recording:
         if not path.is_file() or path.stat().st_size == 0:
             raise DataError(f"{path}: nothing to replay", "not a file, or an empty one", "give a recorded .bin file")
         self._data = np.memmap(path, np.uint8, "r")
-        self._left = max_bytes  # None: without end
+        # None: without end
+        self._left = max_bytes
         if not loop:
             self._left = len(self._data) if max_bytes is None else min(max_bytes, len(self._data))
         self._at = 0
@@ -82,7 +84,8 @@ def scan_rows(scan: Path, board: str, row: int | None) -> list[Path]:
             if fact["fact"] == "row_committed" and board in fact["boards"]:
                 files[fact["row"]] = scan / fact["boards"][board]["file"]
         except (ValueError, KeyError, TypeError):
-            continue  # `polysight validate` reports damaged lines
+            # `polysight validate` reports damaged lines
+            continue
     rows = sorted(files)
     if row is not None:
         rows = [r for r in rows if r == row]
@@ -132,7 +135,8 @@ class Player:
     def _feed(self, recording: Recording, now: float) -> None:
         room = _MAX_QUEUED_BYTES - self._endpoint.sender.queued_bytes
         due = int((now - self._fed_to_s) * self._bytes_per_s)
-        if due > room:  # the radar waits for the network, and does not catch up
+        # The radar waits for the network, and does not catch up
+        if due > room:
             due = max(0, room)
             self._fed_to_s = now
         else:
@@ -194,7 +198,8 @@ def _run(args: argparse.Namespace, stop: Event) -> None:
     files = scan_rows(args.source, name, args.row) if args.source.is_dir() else [args.source]
     max_bytes = None if args.frames is None else args.frames * args.frame_bytes
     for path in files:
-        Recording(path)  # raises DataError before the start
+        # Raises DataError before the start
+        Recording(path)
     faults = read_faults(args.faults, args.fault, (name,))[name]
     if useless := [key for key in (*_OF_PULSES, *_OF_RADARS) if getattr(faults, key)]:
         cause = "a replay has no SYNC_IN pulses, radars or frames"

@@ -32,13 +32,15 @@ from polysight_simulators.radars import make_image
 from polysight_simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight_simulators.wires import MAX_SOCKET_PATH
 
-MIN_HEARTBEAT_MS = 2000  # the processes share the cores of a busy machine
+# The processes share the cores of a busy machine
+MIN_HEARTBEAT_MS = 2000
 IMAGE_FILE = "firmware.bin"
 READY_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 5.0
 UNO_TIME_SCALE = 2.0
 _POLL_S = 0.02
-_NATIVE_OFFSET_HZ = 790e3  # puts the published rig's direct path in the middle of its IF window
+# Puts the published rig's direct path in the middle of its IF window
+_NATIVE_OFFSET_HZ = 790e3
 _LOG_LINES = 15
 # One thread for linear algebra: several processes with more threads on few cores are ten times slower.
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
@@ -72,7 +74,8 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     elif table["radar"]["control"] != "native" and scene is not None:
         _as_programmed(table, scene.disturbances.if_offset_hz)
     if table["radar"]["control"] == "native" and not table["radar"]["firmware"]:
-        table["radar"]["firmware"] = str(folder / IMAGE_FILE)  # the boards start with an empty flash
+        # The boards start with an empty flash
+        table["radar"]["firmware"] = str(folder / IMAGE_FILE)
     table["stage"]["port"] = str(folder / "ttySTAGE")
     table["pi"] |= {"journal_dir": str(folder / "journal"), "key_dir": str(folder / "keys")}
     table["stage"]["heartbeat_ms"] = max(MIN_HEARTBEAT_MS, table["stage"]["heartbeat_ms"])
@@ -142,7 +145,8 @@ class RigOptions(NamedTuple):
     seed: int | None = None
     pattern: bool = False
     faults: Path | None = None
-    fault: Sequence[str] = ()  # single ones, KEY=VALUE
+    # Single ones, KEY=VALUE
+    fault: Sequence[str] = ()
     cache: Path | None = None
     real_pacing: bool = False
     uno: bool = False

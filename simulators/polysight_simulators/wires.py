@@ -21,7 +21,8 @@ from polysight_simulators.process import announce_ready, command_line, run_until
 
 MAX_LINE_BYTES = 200
 MAX_PENDING_BYTES = 64 << 20
-MAX_SOCKET_PATH = 107  # sun_path of Linux holds 108 bytes with its terminator
+# sun_path of Linux holds 108 bytes with its terminator
+MAX_SOCKET_PATH = 107
 _READ_BYTES = 1 << 18
 
 
@@ -163,7 +164,8 @@ class WireHub:
                 sender.pending += b"K\n"
             elif line == b"W":
                 sender.motion = True
-                sender.pending += b"K\n" + self._last_motion  # a late client needs the stage's position
+                # A late client needs the stage's position
+                sender.pending += b"K\n" + self._last_motion
             else:
                 raise ProtocolError(f"not a wire line: {line!r}")
 

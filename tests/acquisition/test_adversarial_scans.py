@@ -26,7 +26,8 @@ class AdversarialCard(FakeCard):
     """Sends each row with randomly drawn faults; delayed packets arrive among the packets of later rows."""
 
     def __init__(self, board: Board, row_bytes: int, frame_bytes: int, chance: random.Random) -> None:
-        self._chance, self._frame = chance, frame_bytes
+        self._chance = chance
+        self._frame = frame_bytes
         self.rate = 0.5  # of records with troubles
         self.adversary = Adversary(chance, frame_bytes)
         self.sent: list[tuple[int, int, tuple[str, ...]]] = []
@@ -36,7 +37,10 @@ class AdversarialCard(FakeCard):
         if not self.recording:
             return
         troubled = self._chance.random() < self.rate
-        troubles = tuple(self._chance.sample(KINDS, self._chance.randint(1, 3))) if troubled else ()
+        if troubled:
+            troubles = tuple(self._chance.sample(KINDS, self._chance.randint(1, 3)))
+        else:
+            troubles = ()
         sent = self.adversary.record(
             self.row_bytes // self._frame, troubles, payload_of(self.board.name, row, self.row_bytes)
         )
@@ -54,12 +58,14 @@ class AdversarialCard(FakeCard):
         super()._command(code, sender)
         if code == 1:
             self.adversary.reset_by_host()
-        if code in (5, 6):  # before the row runs; after its stop
+        # Before the row runs; after its stop
+        if code in (5, 6):
             self._send(self.adversary.take_late(0.3))
 
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
-GRIDS = [(3, 3), (91, 1), (7, 4)]  # points, pulses; 91 ends in a full packet
+# Points, pulses; 91 ends in a full packet
+GRIDS = [(3, 3), (91, 1), (7, 4)]
 
 
 def adversarial_rig(number: int) -> FakeRig:
@@ -89,7 +95,8 @@ def check(folder: Path, rig: FakeRig, incomplete: list[int]) -> None:
 
 def test_committed_bytes_are_right_or_masked(request, tmp_path):
     for number in range(100 if request.config.getoption("--long") else 3):
-        rig, folder = adversarial_rig(number), tmp_path / str(number)
+        rig = adversarial_rig(number)
+        folder = tmp_path / str(number)
         try:
             for attempt in range(6):
                 run = resume_scan if attempt else run_scan
@@ -106,7 +113,8 @@ def test_committed_bytes_are_right_or_masked(request, tmp_path):
                 break
             else:
                 for card in rig.cards.values():
-                    card.rate = 0.0  # the trouble is over: the scan comes to its end
+                    # The trouble is over: the scan comes to its end
+                    card.rate = 0.0
                 assert resume_scan(folder).exit_status == "success"
                 check(folder, rig, ScanFolder.load(folder).recording_facts()["rows_incomplete"])
         finally:

@@ -49,7 +49,8 @@ def test_commands_are_obeyed_once(control):
     assert not stop.after_row
     send_command(folder, ScanCommand.STOP)
     assert (stop.after_row, stop.now) == (True, False)
-    send_command(folder, ScanCommand.STOP)  # a double click, or two phones
+    # A double click, or two phones
+    send_command(folder, ScanCommand.STOP)
     assert (stop.after_row, stop.now) == (True, False)
     send_command(folder, ScanCommand.ABORT)
     assert stop.now
@@ -173,7 +174,8 @@ def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished, t
     assert answer[:4] == ["scan_started", "row_committed", "scan_paused", "scan_continued"]
     assert answer[4:] == ["row_committed", "row_committed", "scan_ended"]
     assert validate(scan.path) == []
-    rows, others = ScanFolder.load(scan.path).committed(), ScanFolder.load(finished).committed()
+    rows = ScanFolder.load(scan.path).committed()
+    others = ScanFolder.load(finished).committed()
     assert {r: c.boards for r, c in rows.items()} == {r: c.boards for r, c in others.items()}
 
 

@@ -21,7 +21,8 @@ from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Past, Placed, place_record
 from polysight_simulators.cards import KINDS, RADAR, Adversary, Sent
 
-GRIDS = [  # points, pulses, bytes of a frame
+# Points, pulses, bytes of a frame
+GRIDS = [
     (7, 13, 4096),  # ends in a full packet
     (7, 12, 4096),
     (91, 1, 4096),
@@ -110,7 +111,8 @@ def test_no_wrong_byte_is_kept(request: pytest.FixtureRequest):
 def test_a_perfect_take_after_trouble_is_committed(grid):
     points, count, frame = GRIDS[grid]
     chance = random.Random(grid)
-    card, past = Adversary(chance, frame), Past.after_reset()
+    card = Adversary(chance, frame)
+    past = Past.after_reset()
     pulses = pulse_times(points, count)
     refused = 0
     for number in range(40):

@@ -10,7 +10,8 @@ from tests.support.store.plain_scan import errors
 
 from polysight.acquisition.scan import run_scan
 
-POINTS, PULSES = 8, 6
+POINTS = 8
+PULSES = 6
 
 
 @pytest.fixture
@@ -61,7 +62,8 @@ def test_row_with_a_spurious_edge_is_not_complete(paced, payload, tmp_path):
     """A radar that counts frames sees a spurious edge: as many frames as pulses, but all behind the edge off by one."""
     for take in (1, 2):
         paced.cards["RV"].extra[0, take] = 20
-    for number in range(20):  # a machine too busy to tell sees nothing
+    # A machine too busy to tell sees nothing
+    for number in range(20):
         paced.pi.rows_run.clear()
         result = run_scan(paced.instrument, tmp_path / str(number), keep_incomplete=True)
         assert result.exit_status == "success"

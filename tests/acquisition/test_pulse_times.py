@@ -14,7 +14,8 @@ from polysight.capture.receiver import RowCapture
 from polysight.capture.row_files import read_index, write_index
 
 FRAME = 4096
-BURSTS, PULSES = 20, 16
+BURSTS = 20
+PULSES = 16
 ALL = BURSTS * PULSES
 QUIET = Load()
 LOADS = [QUIET, Load(5, 3), Load(20, 3), Load(200, 2), Load(30, 15)]
@@ -63,7 +64,8 @@ def test_frames_are_kept_up_to_where_frames_and_packets_last_began_together(miss
 
 
 def test_undetermined_frames_are_masked_each_for_its_own_reason():
-    pulses, rng = pulse_times(BURSTS), np.random.default_rng(1)
+    pulses = pulse_times(BURSTS)
+    rng = np.random.default_rng(1)
     arrivals, answer = receive(np.delete(pulses.reshape(-1), 9), pulses, FRAME, rng)
     asleep = arrivals.copy()
     asleep[:, 0] = arrivals[-1, 0]
@@ -89,7 +91,8 @@ def test_undetermined_frames_are_masked_each_for_its_own_reason():
 )
 def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_factory, missed, unsure, cuts):
     """Expected bytes are computed independently: received, not in a hole, of a frame that was placed."""
-    frame, path = 64, tmp_path_factory.mktemp("r") / "0000.part"
+    frame = 64
+    path = tmp_path_factory.mktemp("r") / "0000.part"
     slots = np.delete(np.arange(30), sorted(missed))
     pairs = sorted(cuts)[: len(cuts) // 2 * 2]
     extent = slots.size * frame
@@ -136,13 +139,16 @@ FAULTS = ("missed", "spurious", "near", "lost", "stalled")
 
 def edges_of(pulses: np.ndarray, faults: tuple[str, ...], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return the edges that a radar takes for pulses, and the pulse of each, -2 for a spurious one."""
-    edges, truth = pulses.reshape(-1), np.arange(pulses.size)
+    edges = pulses.reshape(-1)
+    truth = np.arange(pulses.size)
     if "missed" in faults:
         gone = rng.choice(edges.size, rng.integers(1, 4), replace=False)
-        edges, truth = np.delete(edges, gone), np.delete(truth, gone)
+        edges = np.delete(edges, gone)
+        truth = np.delete(truth, gone)
     if "near" in faults:
         k = int(rng.integers(edges.size))
-        edges, truth = edges.copy(), truth.copy()
+        edges = edges.copy()
+        truth = truth.copy()
         edges[k] += rng.choice([-1, 1]) * rng.integers(350, 700) * US
         truth[k] = -2
     if "spurious" in faults:
@@ -151,7 +157,8 @@ def edges_of(pulses: np.ndarray, faults: tuple[str, ...], rng: np.random.Generat
             # An edge within a frame or just behind it starts none; at a missed pulse it makes that pulse's frame.
             if np.abs(np.append(edges, pulses) - extra).min() > 350 * US:
                 at = int(np.searchsorted(edges, extra))
-                edges, truth = np.insert(edges, at, extra), np.insert(truth, at, -2)
+                edges = np.insert(edges, at, extra)
+                truth = np.insert(truth, at, -2)
     return edges[: pulses.size], truth[: pulses.size]
 
 
@@ -168,7 +175,10 @@ def test_whatever_happens_no_frame_is_at_a_wrong_pulse(request):
         frame = int(chance.choice([512, 1456, 4096]))
         pulses = pulse_times(bursts, count)
         edges, truth = edges_of(pulses, faults, rng)
-        lost = frozenset(rng.choice(edges.size * frame // PAYLOAD, 2).tolist()) if "lost" in faults else frozenset()
+        if "lost" in faults:
+            lost = frozenset(rng.choice(edges.size * frame // PAYLOAD, 2).tolist())
+        else:
+            lost = frozenset()
         load = Load(20, 3) if "stalled" in faults else QUIET
         arrivals, answer = receive(edges, pulses, frame, rng, load, lost)
         result = place(pulses, answer, arrivals, frame)

@@ -174,8 +174,11 @@ class Native(RadarControl):
     """A backend with native control that reports a scripted state after each arming."""
 
     def __init__(self, *script: RadarState) -> None:
-        self._script, self.armed, self.closed = script, [], False
-        self.waiting: dict[int, list[str]] = {}  # boards that still wait after the pulses of an arming, from 1
+        self._script = script
+        self.armed = []
+        self.closed = False
+        # Boards that still wait after the pulses of an arming, from 1
+        self.waiting: dict[int, list[str]] = {}
 
     def arm(self, frames: int) -> None:
         self.armed.append(frames)
@@ -200,7 +203,8 @@ def test_radars_are_armed_for_every_take_and_let_go_at_the_end(rig, tmp_path):
     rig.cards["RV"].drop[1, 1] = {3}
     radars = Native(RadarState.ARMED)
     assert run_scan(rig.instrument, tmp_path / "s", radars=radars).exit_status == "success"
-    assert radars.armed == [9] * 5  # four rows and a retake, 3 points x 3 pulses each
+    # Four rows and a retake, 3 points x 3 pulses each
+    assert radars.armed == [9] * 5
     assert radars.closed
 
 
@@ -208,7 +212,8 @@ def test_radar_in_fault_is_not_scanned_with_but_armed_again(rig, tmp_path):
     radars = Native(RadarState.FAULT, RadarState.ARMED)
     result = run_scan(rig.instrument, tmp_path / "s", radars=radars)
     assert (result.exit_status, result.retakes) == ("success", 1)
-    assert rig.pi.rows_run[0] == (0, 2)  # the first take was never sent to the stage
+    # The first take was never sent to the stage
+    assert rig.pi.rows_run[0] == (0, 2)
     (fact,) = facts_of(result.folder, "row_rejected")
     assert fact["faults"] == [{"kind": "radar_stopped", "board": "RH"}, {"kind": "radar_stopped"}]
     assert any("RF core fault 7" in reason for reason in fact["reasons"])
@@ -246,7 +251,8 @@ def test_radar_that_missed_a_pulse_has_its_row_taken_again(rig, tmp_path):
 def test_board_that_sends_nothing_ends_the_row_before_its_end(rig, tmp_path):
     """Bursts are sent and a board sends nothing: the row, which would never end here, is aborted and retaken."""
     rig.cards["RH"].silent_data = True
-    rig.pi.hang_at, rig.pi.hang_after_captures = {0}, True
+    rig.pi.hang_at = {0}
+    rig.pi.hang_after_captures = True
     limits = msgspec.structs.replace(rig.instrument.limits, row_retakes=1)
 
     def progress(p) -> None:

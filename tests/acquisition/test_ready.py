@@ -28,7 +28,8 @@ class HomingPi:
     """Homes forever; fails after `limit_s` with a reason, as the Pi does."""
 
     def __init__(self, limit_s: float) -> None:
-        self.now, self._limit_s = 0.0, limit_s
+        self.now = 0.0
+        self._limit_s = limit_s
         self._began: float | None = None
         self.event_socket = SimpleNamespace(poll=self._poll)
 
@@ -39,7 +40,8 @@ class HomingPi:
         return self.now
 
     def home(self) -> None:
-        self._began = self.now + 10.0  # accepted, and begun later
+        # Accepted, and begun later
+        self._began = self.now + 10.0
 
     def status(self) -> SimpleNamespace:
         answer = {"homed": False, "scan_id": "", "fault": 0, "reason": ""}
@@ -111,11 +113,13 @@ def test_a_pi_that_places_rows_elsewhere_is_refused_before_a_folder_is_made(rig,
 
 
 def test_resuming_after_the_pis_rig_file_changed_is_refused_and_mended_by_its_old_one(rig, tmp_path):
-    stop, right = StopRequest(), rig.pi.stage
+    stop = StopRequest()
+    right = rig.pi.stage
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
     scan = ScanFolder.load(tmp_path / "s")
     assert facts_of(scan, "scan_started")[0]["pi"]["stage"] == right == rig.instrument.stage.placement_settings
-    rows, facts = list(scan.rows()), len(facts_of(scan))
+    rows = list(scan.rows())
+    facts = len(facts_of(scan))
     assert not scan.complete
     rig.pi.stage = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
     with refused(ErrorCode.STAGE_DIFFERS, "centre_x_mm", 400, 405):
@@ -149,7 +153,8 @@ def test_settings_that_do_not_place_rows_may_differ(rig):
 
 def test_a_scan_begun_without_comparison_resumes_with_a_warning(rig, tmp_path):
     """The earlier rows were placed with that Pi's settings; only the same settings continue them."""
-    stop, right = StopRequest(), rig.pi.stage
+    stop = StopRequest()
+    right = rig.pi.stage
     rig.pi.stage = {}
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
     again = StopRequest()

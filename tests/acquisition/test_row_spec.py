@@ -37,7 +37,8 @@ def test_states_and_transitions():
 
 
 def test_every_state_can_be_reached_and_left_or_is_an_end():
-    reached, todo = set(), [RowState.WAITING]
+    reached = set()
+    todo = [RowState.WAITING]
     while todo:
         state = todo.pop()
         if state not in reached:

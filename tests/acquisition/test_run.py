@@ -41,7 +41,8 @@ def digests(scan: ScanFolder) -> dict[str, str]:
 
 
 def test_whole_scan_is_bit_exact_and_valid(rig, payload, tmp_path):
-    rows, seen = [], []
+    rows = []
+    seen = []
     result = run_scan(rig.instrument, tmp_path / "s", on_row=rows.append, progress=seen.append)
     assert (result.exit_status, result.processing_error) == ("success", None)
     assert rows == [0, 1, 2, 3]
@@ -250,10 +251,13 @@ class LateCard(FakeCard):
     """
 
     def __init__(self, board: Board, row_bytes: int, lag_s: float) -> None:
-        self._lag_s, self._record = lag_s, 0  # number of the record
+        # number of the record
+        self._lag_s = lag_s
+        self._record = 0
         self._tail: tuple[int, bytes] | None = None  # of which record, and what
         self._lock = threading.Lock()
-        self.cut: dict[tuple[int, int], int] = {}  # (row, take): so many bytes are all that come
+        # (row, take): so many bytes are all that come
+        self.cut: dict[tuple[int, int], int] = {}
         super().__init__(board, row_bytes)
 
     def send_row(self, row: int, take: int) -> None:
@@ -271,7 +275,8 @@ class LateCard(FakeCard):
         with self._lock:
             if self._tail is None or self._tail[0] != record:
                 return
-            self._rest, self._tail = self._tail[1], None
+            self._rest = self._tail[1]
+            self._tail = None
             self.recording = False
             self.end_frames()
 

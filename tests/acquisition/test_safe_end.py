@@ -46,7 +46,8 @@ def commands(pi) -> list[type]:
 @pytest.mark.parametrize("fault", [102, 109])
 def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig, tmp_path, fault):
     """The Pi ends row 1 with this fault and stays in state `fault`, as after an emergency stop."""
-    rig.pi.fail_rows[1, 1], rig.pi.latched = fault, "stage alarm 14: the emergency stop is pressed"
+    rig.pi.fail_rows[1, 1] = fault
+    rig.pi.latched = "stage alarm 14: the emergency stop is pressed"
     phases = []
     with refused(ErrorCode.STAGE_NOT_READY, explain(fault).what) as e:
         run_scan(rig.instrument, tmp_path / "s", progress=lambda p: phases.append(p.phase))
@@ -62,7 +63,9 @@ def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig,
 
 @pytest.mark.parametrize(("fault", "homes"), [(102, 0), (109, 2)])
 def test_a_scan_that_begins_homes_out_of_faults_that_are_not_the_stages(rig, tmp_path, fault, homes):
-    rig.pi.state, rig.pi.fault, rig.pi.latched = "fault", fault, "told"
+    rig.pi.state = "fault"
+    rig.pi.fault = fault
+    rig.pi.latched = "told"
     if homes:
         assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
     else:
@@ -84,7 +87,9 @@ def test_fault_of_a_row_alone_is_retaken_without_homing(rig, tmp_path):
 def test_pi_that_restarted_between_rows_ends_the_scan_at_once(rig, tmp_path):
     def answer(p) -> None:
         if p.phase == "committed" and p.row == 1:
-            rig.pi.run, rig.pi.homed, rig.pi.state = None, False, "idle"
+            rig.pi.run = None
+            rig.pi.homed = False
+            rig.pi.state = "idle"
 
     with refused(ErrorCode.STAGE_NOT_READY) as e:
         run_scan(rig.instrument, tmp_path / "s", progress=answer)
@@ -108,7 +113,8 @@ def test_run_that_another_host_has_begun_is_left_alone(rig, tmp_path):
 def test_stage_that_is_not_ready_between_rows_is_not_homed(rig, tmp_path, state):
     def answer(p) -> None:
         if p.phase == "committed" and p.row == 1:
-            rig.pi.homed, rig.pi.state = state == "homed", state
+            rig.pi.homed = state == "homed"
+            rig.pi.state = state
 
     with refused(ErrorCode.STAGE_NOT_READY, repr(state)) as e:
         run_scan(rig.instrument, tmp_path / "s", progress=answer)
@@ -135,7 +141,8 @@ def test_homing_that_another_program_started_is_waited_for():
 def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, tmp_path, board):
     """For each board: the Pi gets Abort, and the error is reported before the queued rows are processed."""
     rig.pi.hang_at = {1}
-    answer, said_at_end = [], []
+    answer = []
+    said_at_end = []
     release = threading.Event()
 
     def progress(p) -> None:
@@ -219,7 +226,8 @@ class ClosedPipe(io.TextIOWrapper):
 @pytest.mark.parametrize("kind", [FullDisk, ClosedPipe])
 def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, monkeypatch, kind):
     """In row 1 the terminal closes (SIGHUP), and stdout and stderr fail."""
-    made, streams = [], [kind(), kind()]
+    made = []
+    streams = [kind(), kind()]
     monkeypatch.setattr(processing, "check_inputs", lambda *_: None)
     monkeypatch.setattr(processing, "Pipeline", lambda *_, **__: SimpleNamespace(add_row=lambda _: None))
     monkeypatch.setattr(

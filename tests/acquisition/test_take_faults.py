@@ -72,7 +72,8 @@ def test_a_rejected_take_has_the_kind_and_board_of_its_fault(rig, tmp_path, spoi
 @pytest.mark.parametrize("bit", [Status.DDR_FULL, Status.LVDS_BUFFER_FULL])
 def test_data_that_the_card_dropped_rejects_the_row_and_its_status_is_kept(rig, tmp_path, bit):
     """Every expected byte comes without a gap in the counters: only the status shows the loss."""
-    card, send_row = rig.cards["RV"], rig.cards["RV"].send_row
+    card = rig.cards["RV"]
+    send_row = rig.cards["RV"].send_row
 
     def overflowing(row: int, take: int) -> None:
         if (row, take) == (0, 1):

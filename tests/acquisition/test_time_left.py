@@ -22,7 +22,9 @@ from polysight.page.history import seconds
 from polysight.page.status import remaining
 from polysight_shared.raster import Row
 
-ROW_S, PAUSE_S, HOMING_S = 12.0, 7200.0, 240.0
+ROW_S = 12.0
+PAUSE_S = 7200.0
+HOMING_S = 240.0
 
 
 def test_time_left_is_rows_times_their_time_minus_elapsed_time():
@@ -53,7 +55,8 @@ class Clock:
     """Replaces `time`: it advances only on demand; a sleep during a pause takes PAUSE_S."""
 
     def __init__(self, stop: StopRequest) -> None:
-        self.now, self._stop = 1000.0, stop
+        self.now = 1000.0
+        self._stop = stop
 
     def monotonic(self) -> float:
         return self.now
@@ -65,7 +68,8 @@ class Clock:
 
 def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
     """Rows of 12 s, the first after homing, the third after a pause of two hours."""
-    stop, answer = StopRequest(), []
+    stop = StopRequest()
+    answer = []
     clock = Clock(stop)
     monkeypatch.setattr(running, "time", clock)
 

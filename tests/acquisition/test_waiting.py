@@ -33,7 +33,9 @@ def limited(instrument, **limits):
 
 def test_next_row_waits_for_processing_with_a_notice(rig, tmp_path):
     """Processing hangs on row 0 and one row may wait: row 1 is the last one recorded until processing continues."""
-    release, started, at_wait = threading.Event(), [], []
+    release = threading.Event()
+    started = []
+    at_wait = []
 
     def on_row(_: int) -> None:
         assert release.wait(HANG_S)
@@ -55,7 +57,8 @@ def test_next_row_waits_for_processing_with_a_notice(rig, tmp_path):
 
 
 def test_stop_while_waiting_for_processing(rig, tmp_path):
-    release, stop = threading.Event(), StopRequest()
+    release = threading.Event()
+    stop = StopRequest()
 
     def progress(p) -> None:
         if p.phase == "wait":
@@ -72,7 +75,8 @@ def test_stop_while_waiting_for_processing(rig, tmp_path):
 def test_rows_of_an_earlier_run_hold_nothing_up(rig, tmp_path):
     stop = StopRequest()
     run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=lambda p: p.row == 2 and stop.request())
-    release, waits = threading.Event(), []
+    release = threading.Event()
+    waits = []
 
     def progress(p) -> None:
         waits.extend([p.message] if p.phase == "wait" else [])
@@ -143,7 +147,8 @@ def test_disk_that_cannot_hold_the_row_is_an_error_before_its_first_pulse(rig, t
 
 def test_capture_has_priority_over_processing(rig, tmp_path):
     """A receiver has real-time priority or, if that is not permitted, a nice value lower by at least NICE."""
-    processing, capture = [], []
+    processing = []
+    capture = []
 
     def on_row(_: int) -> None:
         processing.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
@@ -195,8 +200,12 @@ def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
 
 def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
     """A stop requested while the loop waits: Abort is the next command, sent before the loop waits again."""
-    rig.pi.hang_at, rig.pi.hang_after_captures = {0}, True
-    stop, points, asked, aborted = StopRequest(), [], [], []
+    rig.pi.hang_at = {0}
+    rig.pi.hang_after_captures = True
+    stop = StopRequest()
+    points = []
+    asked = []
+    aborted = []
     sleeps: list[float] = []  # of the loop, in ms; None would be for ever
 
     class Poller(zmq.Poller):

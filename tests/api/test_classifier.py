@@ -46,7 +46,8 @@ def test_it_names_as_the_model_of_libraries(library):
     knn = PaperKNeighborsClassifier(5, weight_h=0.7, weight_v=1.3, measure="inverse")
     knn.fit(ratio_columns(samples.x), samples.names)
     ours = model.by_pixel(ratio_columns(X[::29]))[0]
-    assert (knn.predict(X[::29]) == ours).mean() > 0.99  # ties
+    # Ties
+    assert (knn.predict(X[::29]) == ours).mean() > 0.99
 
 
 @pytest.mark.parametrize("model", ["knn", "discriminant"])

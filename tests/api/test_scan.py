@@ -108,7 +108,8 @@ def test_materials_have_names_and_a_runner_up(scan):
     materials = scan.materials()
     assert list(materials["true_name"].values) == ["copper", "PET"]
     assert materials["metal_reference"].values.tolist() == [True, False]
-    assert materials["name"].values[0] == ""  # the reference is not judged by itself
+    # The reference is not judged by itself
+    assert materials["name"].values[0] == ""
     assert materials["runner_up"].values[1] != materials["name"].values[1]
     assert materials.attrs["library"]
 
@@ -156,11 +157,14 @@ def test_the_unreferenced_image_is_what_image_writes(scan, folder, tmp_path):
 
 @pytest.mark.parametrize("name", DATASETS)
 def test_products_give_the_same_datasets_as_the_rows(scan, products, name):
-    from_rows, from_products = getattr(scan, name)(), getattr(open_scan(products), name)()
-    if "label" in from_rows:  # outlines are saved to half a pixel
+    from_rows = getattr(scan, name)()
+    from_products = getattr(open_scan(products), name)()
+    # Outlines are saved to half a pixel
+    if "label" in from_rows:
         differ = from_rows["label"] != from_products["label"]
         assert differ.sum() < 0.2 * (from_rows["label"] > 0).sum()
-        from_rows, from_products = from_rows.drop_vars("label"), from_products.drop_vars("label")
+        from_rows = from_rows.drop_vars("label")
+        from_products = from_products.drop_vars("label")
     xarray.testing.assert_allclose(from_rows, from_products, rtol=1e-6)
     for dataset in (from_rows, from_products):
         del dataset.attrs["processed_utc"]
@@ -170,7 +174,8 @@ def test_products_give_the_same_datasets_as_the_rows(scan, products, name):
 def test_saved_products_of_a_scan_folder_are_used_while_they_hold_its_rows(folder, products, tmp_path):
     scan = shutil.copytree(folder, tmp_path / "scan")
     saved = shutil.copytree(products, scan / "products")
-    shutil.rmtree(scan / "raw")  # only the products can answer
+    # Only the products can answer
+    shutil.rmtree(scan / "raw")
     shutil.rmtree(scan / "samples", ignore_errors=True)
     assert "saved products" in repr(open_scan(scan))
     same_image(open_scan(scan).image(), saved / "image.npz")
@@ -251,7 +256,8 @@ def state(folder: Path) -> dict[str, tuple[int, int]]:
 
 
 def test_nothing_is_written_unless_asked(folder, products, tmp_path, monkeypatch):
-    scan, saved = shutil.copytree(folder, tmp_path / "scan"), shutil.copytree(products, tmp_path / "products")
+    scan = shutil.copytree(folder, tmp_path / "scan")
+    saved = shutil.copytree(products, tmp_path / "products")
     monkeypatch.chdir(tmp_path)
     before = state(tmp_path)
     for path in (scan, saved):
@@ -345,7 +351,8 @@ def test_products_that_say_nothing_of_the_scan_still_open(products, tmp_path):
     assert "number of rows not known" in repr(scan)
     assert "interior" not in scan.patches()
     assert "incidence_deg" not in scan.image()
-    assert scan.simulated is True  # materials.json says so
+    # materials.json says so
+    assert scan.simulated is True
     for name in ("rig", "rows"):
         with refused(ErrorCode.KEY_MISSING, name):
             getattr(scan, name)

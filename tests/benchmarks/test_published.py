@@ -44,7 +44,9 @@ def cube(world: tuple[Instrument, Scene]) -> NDArray[np.complex64]:
 def truth(world: tuple[Instrument, Scene], cube: NDArray[np.complex64]) -> NDArray[np.complex128]:
     """Matched filter of that object at its true positions, in double precision, from every twelfth sample."""
     rig, _ = world
-    antennas, grid, chirp = Antennas.of(rig, rig.by_name("RH")), image_grid(rig), rig.chirp
+    antennas = Antennas.of(rig, rig.by_name("RH"))
+    grid = image_grid(rig)
+    chirp = rig.chirp
     chosen = np.arange(*chirp.linear_samples, 12)
     frequencies = chirp.first_sample_hz + chirp.hz_per_sample * chosen
     travel = mean_burst_travel_mm(rig.burst, rig.stage)
@@ -88,7 +90,8 @@ def test_imager_makes_the_matched_filters_image(
 def test_synchroniser_looks_at_one_channel_in_single_precision(world: tuple[Instrument, Scene], tuned: bool) -> None:
     """As the authors' code does; four channels in double precision cost 2.4 times as much and flatter us."""
     rig, scene = world
-    radar, method = SimulatedRig(rig, scene), Synchroniser(rig, rig.by_name("RH"), tuned)
+    radar = SimulatedRig(rig, scene)
+    method = Synchroniser(rig, rig.by_name("RH"), tuned)
     x, y = row_offsets_mm(radar, next(iter(plan_raster(rig.grid))))
     payload = radar.chirps("RH", x, y, 0)[: rig.burst.pulses].view(np.uint8).ravel()
     burst = method.decode(payload, rig.burst.pulses)
@@ -117,7 +120,8 @@ def test_synchroniser_makes_a_disturbed_scan_like_the_ideal_one(
     """Fully disturbed chirps, two a position, through both of its stages into its imager."""
     rig, scene = world
     board = rig.by_name("RH")
-    radar, method = SimulatedRig(rig, scene), Synchroniser(rig, board, tuned)
+    radar = SimulatedRig(rig, scene)
+    method = Synchroniser(rig, board, tuned)
     plan = plan_raster(rig.grid)
     synced = np.empty((4, plan.rows, plan.columns, rig.chirp.samples), np.complex64)
     for row in plan:

@@ -19,7 +19,8 @@ MODULES = {"sync": sync, "image": image, "whole": whole, "waits": waits, "accura
 def test_quick_trial(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for variable in THREADS:  # main sets them; here they are put back
+    # Main sets them; here they are put back
+    for variable in THREADS:
         monkeypatch.setenv(variable, "1")
     assert main(["--out", str(tmp_path), name, "--quick", "--folder", str(tmp_path)]) == 0
     found = json.loads((tmp_path / f"{name}.json").read_text())

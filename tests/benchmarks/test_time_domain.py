@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from polysight.imaging import backproject, image_grid
 from polysight.imaging.geometry import Antennas, Aperture
 
-ROWS, COLUMNS, EVERY = 6, 7, 2
+ROWS = 6
+COLUMNS = 7
+EVERY = 2
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,8 @@ TRUE_KHZ = (235.0, 700.0)
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory, make_rig, scan_of):
     """One power cycle of a rig with other filters than its rig file says, at several start frequencies."""
-    folder, made = tmp_path_factory.mktemp("sweep"), []
+    folder = tmp_path_factory.mktemp("sweep")
+    made = []
     for k, offset_hz in enumerate(OFFSETS_HZ):
 
         def programmed(table, offset_hz=offset_hz):
@@ -44,7 +45,8 @@ def found(scans, tmp_path_factory):
 def test_unknown_corners_are_recovered(scans, found):
     file = read_calibration(found, FilterFile, "hpf")
     for board in file.boards.values():
-        corners, errors = np.array(board.corners_khz), np.array(board.standard_error_khz)
+        corners = np.array(board.corners_khz)
+        errors = np.array(board.standard_error_khz)
         np.testing.assert_allclose(corners, TRUE_KHZ, rtol=0.15)
         assert np.all(np.abs(corners - TRUE_KHZ) < 6 * errors)
         assert board.programmed_khz == [175.0, 350.0]
@@ -77,4 +79,5 @@ def test_bins_hold_the_mean_signal_of_enough_chirps_each():
     assert binned(1e5 * few, few, 0 * few)[0].size == 0
     enough = np.ones(MIN_CHIRPS)
     assert binned(-1e5 * enough, enough, 0 * enough)[0].size == 0
-    assert binned(1e5 * enough, enough, enough / 2)[0].size == 0  # noise
+    # Noise
+    assert binned(1e5 * enough, enough, enough / 2)[0].size == 0

@@ -140,7 +140,8 @@ def taken_with(plate, make_rig, set_rig, tmp_path):
 
     def make(metal, change=lambda _table: None):
         folder = shutil.copytree(plate, tmp_path / f"scan-{len(list(tmp_path.iterdir()))}")
-        inside = shutil.copytree(metal.parent, folder / "calibration") / metal.name  # where a scan keeps its files
+        # Where a scan keeps its files
+        inside = shutil.copytree(metal.parent, folder / "calibration") / metal.name
         set_rig(folder, make_rig(change, **SMALL, calibration={"metal": str(inside)}))
         return ScanFolder.load(folder)
 
@@ -157,7 +158,8 @@ def test_a_scan_without_metal_is_refused(tmp_path, make_rig, scan_of):
 
 def test_an_object_plane_calibrated_after_the_plate_is_refused(plate, make_rig):
     """The rig file is the same, but the active positions are not."""
-    reference, rig = load_reference(plate), make_rig(**SMALL)
+    reference = load_reference(plate)
+    rig = make_rig(**SMALL)
     reference.check_rig(ImagedWith.of(rig, {}))
     deeper = msgspec.structs.replace(rig.geometry, object_distance_mm=rig.geometry.object_distance_mm + 0.2)
     with refused(ErrorCode.MISMATCH):
@@ -177,7 +179,8 @@ def test_processing_refuses_the_calibration_of_another_rig(whole, taken_with):
     moved = Pipeline(taken_with(whole, MATTERS["V moved"][0]))
     with refused(ErrorCode.MISMATCH, "RV"):
         metal_plane(moved)
-    assert metal_plane(moved, in_scene=True) is None  # metal in the scene has the scene's rig
+    # Metal in the scene has the scene's rig
+    assert metal_plane(moved, in_scene=True) is None
 
 
 def metal_plane(pipeline, bands=1, in_scene=False):
@@ -185,7 +188,8 @@ def metal_plane(pipeline, bands=1, in_scene=False):
 
 
 def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band(plate, banded, taken_with):
-    found, expected = load_calibration({"metal": banded}).reference(), load_reference(plate, bands=BANDS)
+    found = load_calibration({"metal": banded}).reference()
+    expected = load_reference(plate, bands=BANDS)
     assert len(found.bands) == len(expected.bands) == BANDS
     for read, made in zip((found, *found.bands), (expected, *expected.bands), strict=True):
         for name in ("h", "v", "valid"):

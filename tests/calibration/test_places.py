@@ -16,12 +16,14 @@ from polysight_shared.geometry import specular_midpoint_m
 SHIFTS = {"RH": (1.5, -1.0, 0.8), "RV": (-1.2, 0.7, -1.4)}
 DEEPER_MM = 1.7
 POINTS = [(-60.0, -50.0), (60.0, -45.0), (0.0, 0.0), (-55.0, 55.0), (50.0, 60.0)]
-LAID_MM, TURN_DEG = (4.0, -3.0), 0.5
+LAID_MM = (4.0, -3.0)
+TURN_DEG = 0.5
 
 
 def laid(points):
     """Where a target's points come to lie."""
-    c, s = np.cos(np.radians(TURN_DEG)), np.sin(np.radians(TURN_DEG))
+    c = np.cos(np.radians(TURN_DEG))
+    s = np.sin(np.radians(TURN_DEG))
     return [(c * x - s * y + LAID_MM[0], s * x + c * y + LAID_MM[1]) for x, y in points]
 
 
@@ -39,7 +41,8 @@ def case(tmp_path_factory, make_rig, scan_of):
         "grid": {"columns": 18, "rows": 12, "step_x_mm": 13.0, "step_y_mm": 13.0},
         "image": {"columns": 64, "rows": 64, "pixel_mm": 2.5},
     }
-    believed, true = make_rig(**tables), make_rig(displaced, **tables)
+    believed = make_rig(**tables)
+    true = make_rig(displaced, **tables)
     points = [{"position_mm": [float(x), float(y)], "amplitude": [0.5, 0.0]} for x, y in laid(POINTS)]
     folder = scan_of(tmp_path_factory.mktemp("places") / "scan", true, believed, points=points, seed=5)
     target = folder.parent / "target.toml"
@@ -54,7 +57,8 @@ def found(case, tmp_path_factory):
     out = tmp_path_factory.mktemp("out") / "c"
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     shown = output_of("calibrate", "direct-path", folder, "--target", target, "--out", out)
-    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before  # the scan is not touched
+    # The scan is not touched
+    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
     return shown, next(out.iterdir())
 
 
@@ -79,7 +83,8 @@ def test_a_displaced_rig_is_recovered_within_its_standard_errors(case, file):
     for name, board in file.boards.items():
         antennas = Antennas.of(true, true.by_name(name))
         direct_mm = np.linalg.norm(antennas.rx_m[0] - antennas.tx_m) * 1e3
-        assert abs(board.direct_path_was_mm - direct_mm) > 0.5  # what was wrong
+        # What was wrong
+        assert abs(board.direct_path_was_mm - direct_mm) > 0.5
         assert board.direct_path_mm == pytest.approx(direct_mm, abs=5 * board.direct_path_standard_error_mm)
 
 

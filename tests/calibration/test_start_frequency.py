@@ -28,7 +28,8 @@ def offset(value_hz):
 def test_whatever_the_true_if_its_alias_in_the_band_gives_the_offset_to_the_middle(make_rig, if_mode):
     """Law: true IF + change of offset = middle, if the rig file's expectation is within half a sample rate of it."""
     rig = make_rig(offset(123e3), chirp={"if_mode": if_mode})
-    board, rate = rig.receivers[0], rig.chirp.sample_rate_hz
+    board = rig.receivers[0]
+    rate = rig.chirp.sample_rate_hz
     middle = 0.45 * rate if if_mode == "complex1x" else 0.0
     rng = np.random.default_rng(3)
     for true_hz in rng.uniform(-4e6, 6e6, 50):
@@ -41,7 +42,8 @@ def test_whatever_the_true_if_its_alias_in_the_band_gives_the_offset_to_the_midd
 def test_jitter_across_the_bands_edge_does_not_tear_the_mean_apart(make_rig, if_mode):
     """Law: wrapped into the band and unwrapped again, IFs are what they were, whole sample rates apart at most."""
     rig = make_rig(chirp={"if_mode": if_mode})
-    rate, rng = rig.chirp.sample_rate_hz, np.random.default_rng(5)
+    rate = rig.chirp.sample_rate_hz
+    rng = np.random.default_rng(5)
     for centre in np.linspace(-1, 1, 9) * rate:
         true_hz = centre + 0.03 * rate * rng.standard_normal(64)
         seen = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
@@ -53,7 +55,8 @@ def test_by_geometry_alone_the_expectation_is_in_the_middle(make_rig):
     rig = make_rig(offset(50e3))
     board = rig.receivers[1]
     better = msgspec.structs.replace(board, start_offset_hz=by_geometry(rig, board))
-    assert direct_if_hz(rig, better) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=200)  # steps of 54 Hz
+    # Steps of 54 Hz
+    assert direct_if_hz(rig, better) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=200)
 
 
 def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_rig, scan_of, tmp_path, capsys):

@@ -20,7 +20,8 @@ from polysight_simulators.loopback import on_free_subnet
 
 def small_rig() -> Instrument:
     """A free subnet, a grid whose rows are small, and little patience."""
-    grid, card = {"columns": 12, "rows": 2}, {"receive_buffer_bytes": 1 << 20}
+    grid = {"columns": 12, "rows": 2}
+    card = {"receive_buffer_bytes": 1 << 20}
     return on_free_subnet(rig_with(grid=grid, limits={"command_timeout_s": 1.5}, card=card))
 
 

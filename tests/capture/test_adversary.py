@@ -21,7 +21,8 @@ from polysight.capture.placement import Past, Placed, place_record
 from polysight_simulators.cards import KINDS, Adversary, Sent
 
 STEPS = 20
-GRIDS = [  # bytes of a frame, frames of a row
+# Bytes of a frame, frames of a row
+GRIDS = [
     (64, 91),  # ends in a full packet
     (64, 910),
     (4096, 91),
@@ -33,7 +34,8 @@ GRIDS = [  # bytes of a frame, frames of a row
     (1456, 7),
     (512, 30),
 ]
-MAX_REFUSED = 1  # perfect records in a row, after anything that may have happened
+# Perfect records in a row, after anything that may have happened
+MAX_REFUSED = 1
 
 
 def logged(sent: Sent, expected: int, batch: int) -> PacketLog:
@@ -68,11 +70,22 @@ class Rows(RuleBasedStateMachine):
         self.frame, self.frames = grid
         self.size = self.frame * self.frames
         chance = random.Random(seed)
-        count = 0 if fresh else 2**48 - chance.randint(1, 40_000) if near_wrap else chance.randrange(2**48)
-        sequence = 1 if fresh else 2**32 - chance.randint(1, 60) if near_wrap else chance.randrange(2**32)
+        if fresh:
+            count = 0
+        elif near_wrap:
+            count = 2**48 - chance.randint(1, 40_000)
+        else:
+            count = chance.randrange(2**48)
+        if fresh:
+            sequence = 1
+        elif near_wrap:
+            sequence = 2**32 - chance.randint(1, 60)
+        else:
+            sequence = chance.randrange(2**32)
         self.card = Adversary(chance, self.frame, count, sequence)
         self.past = Past(Counters(count, sequence))
-        self.sure = True  # the next record's start is known
+        # The next record's start is known
+        self.sure = True
         self.refused = 0
 
     def take(self, troubles: tuple[str, ...], batch: int, pulses_known: bool) -> tuple[Sent, Placed]:
@@ -130,7 +143,9 @@ class Rows(RuleBasedStateMachine):
     def resume(self):
         """The host's program is started anew: it knows nothing, and resets the card."""
         self.card.reset_by_host()
-        self.past, self.sure, self.refused = Past.after_reset(), True, 0
+        self.past = Past.after_reset()
+        self.sure = True
+        self.refused = 0
 
 
 def test_no_byte_is_wrong_and_none_is_masked_without_reason(request: pytest.FixtureRequest):

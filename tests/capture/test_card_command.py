@@ -57,7 +57,8 @@ def test_every_hop_of_every_card(cards, card):
             assert receiver["verdict"] == "not checked"
         elif receiver["verdict"] == "ok":
             assert "real-time priority" in receiver["found"]
-        else:  # a right is missing: which, and what to do
+        else:
+            # A right is missing: which, and what to do
             assert (receiver["verdict"], receiver["why"] != "") == ("warning", True)
             assert "limits.d" in receiver["remedy"]
     text = card().out
@@ -75,7 +76,8 @@ def test_a_mute_card_is_named_and_its_neighbour_is_sound(cards, card):
     assert "did not answer ALIVE" in hops["RV"]["card"]["found"]
     assert hops["RV"]["card"]["remedy"]
     assert hops["RV"]["receiver"]["verdict"] == "not checked"
-    assert [s["silent_hop"] for s in json.loads(done.out)] == ["card", "", "card"]  # nobody plays LS
+    # Nobody plays LS
+    assert [s["silent_hop"] for s in json.loads(done.out)] == ["card", "", "card"]
     assert made.endpoints["RV"].counts["requests"] > 0
     text = card().out
     assert "error       card" in text
@@ -154,7 +156,8 @@ def programmed(made, name: str, folder: Path, typed: str, *words: str) -> str:
 
 def test_a_new_card_gets_its_boards_addresses(cards, rig, tmp_path):
     """From the address all cards are sold with to the board's own, typed, and seen there after a power cycle."""
-    old, board = rig.by_name("LS"), rig.by_name("RV")
+    old = rig.by_name("LS")
+    board = rig.by_name("RV")
     made = cards(more=(old,))
     at = f"{old.card_address}:{old.command_port}"
     text = programmed(made, "LS", tmp_path, board.card_address, "RV", "--at", at)

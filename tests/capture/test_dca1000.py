@@ -66,7 +66,8 @@ def two_lane(x: np.ndarray) -> bytes:
     for f in range(frames):
         for r in range(rx):
             for n in range(0, samples, 2):
-                a, b = x[r, f, n], x[r, f, n + 1]
+                a = x[r, f, n]
+                b = x[r, f, n + 1]
                 words += [a.real, b.real, a.imag, b.imag]
     return np.array(words, dtype="<i2").tobytes()
 

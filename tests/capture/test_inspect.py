@@ -233,7 +233,8 @@ def test_the_command_reads_the_layout_that_is_given(polysight, tmp_path):
 
 def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
     both = [packet for packet in encode_packets(row(4, False).tobytes(), 1, 0) for _ in range(2)]
-    write_pcap(tmp_path / "both", both, cards=(CARD, OTHER))  # known by its first bytes, not by its name
+    # Known by its first bytes, not by its name
+    write_pcap(tmp_path / "both", both, cards=(CARD, OTHER))
     done = polysight("both")
     assert done.status == 3
     assert "192.168.33.180 and 192.168.33.181" in done.err

@@ -9,8 +9,10 @@ from tests.support.capture.records import FULL, Card, encode_packet, is_original
 from polysight.capture.dca1000 import Counters, decode_packet_header
 from polysight.capture.placement import PacketCounts, Past
 
-GRIDS = [(4096, 62), (4096, 91), (64, 910), (512, 30), (1456, 7)]  # bytes of a frame, frames of a row
-STARTS = [(145_600_000, 100_001), (50_000_000, 5), (2**47, 2**32 - 7)]  # counters of the first record
+# Bytes of a frame, frames of a row
+GRIDS = [(4096, 62), (4096, 91), (64, 910), (512, 30), (1456, 7)]
+# Counters of the first record
+STARTS = [(145_600_000, 100_001), (50_000_000, 5), (2**47, 2**32 - 7)]
 OWN_NAMES = ("duplicates", "conflicting", "leftover", "restarted", "outside", "disagreeing", "malformed")
 
 
@@ -32,7 +34,8 @@ def test_packets_after_a_reset_within_a_row_are_counted_as_restarted(grid, start
     many = -(-size // FULL)
     assume(many > 2)
     at = 1 + int(cut * (many - 2))
-    card, past = Card(size, *start), Past(Counters(*start))
+    card = Card(size, *start)
+    past = Past(Counters(*start))
     for _ in range(rows):
         placed, _ = place(size, card.record().packets, past, frame, batch)
         assert not others_than(placed.counts)
@@ -57,7 +60,8 @@ def test_frames_of_a_first_row_that_was_cut_by_a_reset_are_not_placed_by_their_a
 
 def test_frames_of_a_row_with_conflicts_are_not_moved():
     """Only a row about which nothing else is unclear is written anew."""
-    size, frame = 62 * 4096, 4096
+    size = 62 * 4096
+    frame = 4096
     start = Counters(70_000, 9)
     first, _ = place(size, Card(size - frame, 70_000, 9).record().packets, start, frame)
     assert first.slipped
@@ -70,7 +74,8 @@ def test_frames_of_a_row_with_conflicts_are_not_moved():
 
 def spoilt(packets: list[bytes], kind: str, k: int) -> list[bytes]:
     """A perfect row's packets with one anomaly at packet k."""
-    head, payload = packets[k][:10], packets[k][10:]
+    head = packets[k][:10]
+    payload = packets[k][10:]
     extra = {
         "duplicates": packets[k],
         "conflicting": head + payload[::-1],

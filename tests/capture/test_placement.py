@@ -28,8 +28,10 @@ from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Evidence, Losses, Past, place_record
 from polysight.capture.row_files import read_packets, write_packets
 
-SLOW = [HealthCheck.too_slow]  # a busy machine is no fault
-COUNT, SEQUENCE = 1 << 48, 1 << 32
+# A busy machine is no fault
+SLOW = [HealthCheck.too_slow]
+COUNT = 1 << 48
+SEQUENCE = 1 << 32
 near_wrap = st.one_of(st.just(0), st.integers(0, COUNT - 1), st.integers(COUNT - 40_000, COUNT - 1))
 near_sequence_wrap = st.one_of(st.integers(0, SEQUENCE - 1), st.integers(SEQUENCE - 30, SEQUENCE - 1))
 
@@ -179,7 +181,9 @@ def test_counters_go_on_and_are_not_proportional(frames, frame, records, count, 
         assert placed.missing == ([(0, head * FULL)] if head else [])
         assert placed.losses.head_bytes == head * FULL
         assert is_original_or_masked(record, placed, out)
-        count, sequence, start = count + len(record.data), sequence + len(record.packets), placed.past
+        count = count + len(record.data)
+        sequence = sequence + len(record.packets)
+        start = placed.past
 
 
 def test_losses_are_counted_by_kind():
@@ -192,7 +196,8 @@ def test_losses_are_counted_by_kind():
 
 def test_logging_allocates_nothing_that_stays():
     """A packet makes no object: a thousand batches leave as many blocks of memory as ten."""
-    size, batch = 256 * FULL, 256
+    size = 256 * FULL
+    batch = 256
     record = Record.make(size, 0, 1)
     block = np.frombuffer(b"".join(record.packets), dtype=np.uint8).reshape(batch, 10 + FULL).copy()
     lengths = np.full(batch, 10 + FULL, dtype=np.uint32)
@@ -373,7 +378,9 @@ def test_a_lost_start_is_known_again_after_a_reset(size):
 
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
 def test_of_a_card_that_counts_anew_in_every_record_every_second_take_is_kept(size):
-    card, past, accepted = Card(size), Past.after_reset(), []
+    card = Card(size)
+    past = Past.after_reset()
+    accepted = []
     for _ in range(6):
         card.reset()
         record = card.record()
@@ -418,7 +425,8 @@ def test_placing_leaves_the_logged_payload_as_it_came(trouble, tmp_path):
     size = len(record.data) + end
     elsewhere = encode_packet(99, 5 * size, bytes([9] * 99))
     packets = [*record.packets, *([other] if "conflict" in trouble else []), elsewhere]
-    log, past = log_of(size, packets), Past.after_reset()
+    log = log_of(size, packets)
+    past = Past.after_reset()
     came = log.payload[: log.payload_bytes].copy()
     placed, out = place_record(log, FRAME, past)
     assert (log.payload[: came.size] == came).all()

@@ -24,7 +24,8 @@ from polysight_pi.journal import JournalFile
 from polysight_shared.messages import Capture, RunStopped, pack
 from polysight_simulators.scene import decode_scene, simulate
 
-FRAMES, SAMPLES = 96, 256
+FRAMES = 96
+SAMPLES = 256
 
 
 def read_row(path: Path) -> tuple[dict, np.ndarray, np.ndarray]:
@@ -57,7 +58,8 @@ def test_segments(board, tmp_path):
     counts = rng.integers(-900, 900, (2, 4, FRAMES, SAMPLES))
     truth = counts[0] + 1j * counts[1]
     sent = counts.transpose(2, 3, 0, 1).astype("<i2").tobytes()
-    gone, path = (20 * 1456, 21 * 1456), tmp_path / "0000.bin"
+    gone = (20 * 1456, 21 * 1456)
+    path = tmp_path / "0000.bin"
     with ReceiverProcess(board, 1 << 20) as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as card:
         card.bind((board.card_address, 1024))
         receiver.begin_row(0, 1, len(sent), 4096, path)
@@ -139,7 +141,8 @@ def test_journal(tmp_path):
     journal.close()
     raw = (tmp_path / "s.journal").read_bytes()
     assert raw[:8] == b"PSJRNL1\n"
-    at, found = 8, []
+    at = 8
+    found = []
     while at < len(raw):
         length, seq, crc = struct.unpack_from("<III", raw, at)
         payload = raw[at + 12 : at + 12 + length]

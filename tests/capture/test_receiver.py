@@ -50,7 +50,8 @@ def send(card: socket.socket, board: Board, some: list[bytes]) -> None:
 def test_rows_are_bit_exact_and_counters_go_on(board, card, tmp_path):
     size = 300 * 4096
     first, second, third = (noise(size, s) for s in (1, 2, 3))
-    count, sequence = 2**48 - 1_000_000, 2**32 - 100
+    count = 2**48 - 1_000_000
+    sequence = 2**32 - 100
     n = -(-size // FULL)
     with ReceiverProcess(board, 4 << 20) as receiver:
         assert receiver.granted_bytes >= 1 << 20
@@ -59,7 +60,8 @@ def test_rows_are_bit_exact_and_counters_go_on(board, card, tmp_path):
             assert receiver.begin_row(k, 1, size, 4096, path) == 0
             some = encode_packets(data, sequence + k * n, count + k * size)
             if k == 1:
-                some = [*some[2:50], some[51], some[50], some[51], *some[52:]]  # head lost, reordered, duplicate
+                # Head lost, reordered, duplicate
+                some = [*some[2:50], some[51], some[50], some[51], *some[52:]]
                 send(card, board, [*some, b"tiny"])
                 wait_for(lambda: receiver.report().received == size - 2 * FULL, "packets")
             else:
@@ -195,7 +197,8 @@ def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
             card.sendto(packet, (other.host_address, other.data_port))
         os.kill(swamped.pid, signal.SIGCONT)
         wait_for(lambda: quiet.report().received == 20 * FULL, "packets")
-        hit, spared = swamped.end_row(), quiet.end_row()
+        hit = swamped.end_row()
+        spared = quiet.end_row()
         assert hit.kernel_drops == 2000 - hit.packets > 0
         assert spared.kernel_drops == 0
         assert hit.tail_bytes == 2000 * FULL - hit.bytes

@@ -37,7 +37,9 @@ def test_the_error_of_a_pixel_is_that_of_draws(processed):
     """Of P as it is drawn with its standard deviation, in each part."""
     pixels = Pixels(processed / "one" / "products")
     at = pixels.nearest(*CENTRE)
-    p, sigma = complex(pixels.p[at]), float(pixels.p_std[at]) / 20  # small: the law is of first order
+    # small: the law is of first order
+    p = complex(pixels.p[at])
+    sigma = float(pixels.p_std[at]) / 20
     rng = np.random.default_rng(1)
     drawn = permittivity_from_ratio(
         p + sigma * (rng.standard_normal(4000) + 1j * rng.standard_normal(4000)), pixels.theta_rad
@@ -85,7 +87,8 @@ def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed):
     answer = [pair.sigmas for pair in found.figures.patches if pair.sigmas is not None]
     assert answer
     assert max(answer) < 3
-    assert (found.sigmas > 5).mean() < 0.05  # few pixels that are independent of each other
+    # Few pixels that are independent of each other
+    assert (found.sigmas > 5).mean() < 0.05
     back = compare(processed / "two", processed / "one")
     both = np.isfinite(found.p) & np.isfinite(back.p)
     assert np.array_equal(found.p[both], -back.p[both])
@@ -108,7 +111,8 @@ def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
     write_image(tmp_path / "changed" / "image.npz", replace(saved.images, v=v, p=p))
     found = compare(processed / "one", tmp_path / "changed")
     answer = np.nan_to_num(found.sigmas)
-    assert found.figures.scatter == 0.1  # a copy, which shares its errors
+    # A copy, which shares its errors
+    assert found.figures.scatter == 0.1
     expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.images.p_sigma) / 0.1
     assert np.allclose(answer[inside], expected[inside], rtol=1e-4)
     assert answer[inside].min() > 0.5

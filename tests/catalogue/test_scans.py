@@ -50,7 +50,8 @@ def test_images_without_materials_are_no_result(root):
 
 
 def test_a_scan_that_has_not_ended_runs_or_pauses_while_its_program_lives(root):
-    scan, listed = root / "week/lost", Scans(root)
+    scan = root / "week/lost"
+    listed = Scans(root)
     with open_control(scan):
         assert listed.summary("week/lost").state == "running"
         with (scan / MANIFEST).open("ab") as f:

@@ -38,7 +38,8 @@ def test_help_has_an_example_that_works(parser):
     _, found, examples = text.partition("example")
     assert found, f"`{parser.prog} --help` shows no example"
     lines = re.findall(r"^(?:s?: *|  +)((?:polysight|python -m)\S*(?: .*)?)$", examples, re.MULTILINE)
-    lines = [re.split(r", |   ", line)[0].strip() for line in lines]  # a remark may follow
+    # A remark may follow
+    lines = [re.split(r", |   ", line)[0].strip() for line in lines]
     assert any(line.startswith(parser.prog) for line in lines), f"no example of {parser.prog} in {examples!r}"
     assert [f for line in lines for f in command_faults(line)] == []
 

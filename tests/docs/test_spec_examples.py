@@ -64,10 +64,12 @@ def test_wire_examples_hold_what_the_page_says(kind, raw, content):
         size, seq, crc = struct.unpack_from("<III", raw)
         assert size == len(raw) - 12
         assert crc == messages.zlib.crc32(raw[4:8] + raw[12:])
-        kind, raw = "event", raw[12:]
+        kind = "event"
+        raw = raw[12:]
         assert seq == content["seq"]
     message = msgspec.to_builtins(READERS[kind](raw))
-    assert {key: message[key] for key in content} == content  # later minor versions add fields
+    # Later minor versions add fields
+    assert {key: message[key] for key in content} == content
     assert {"type", "version"} <= set(content)
 
 
@@ -85,7 +87,10 @@ def declared(union: object) -> list[type]:
 def test_the_page_names_every_message_and_field(message):
     page = "\n".join(line for line in text("wire.md").splitlines() if f"`{message.__name__}`" in line)
     assert page, message
-    common = {f.name for f in msgspec.structs.fields(messages.Event)} if issubclass(message, messages.Event) else set()
+    if issubclass(message, messages.Event):
+        common = {f.name for f in msgspec.structs.fields(messages.Event)}
+    else:
+        common = set()
     for field in msgspec.structs.fields(message):
         assert field.name in common | {"version"} or f"`{field.name}`" in page, (message.__name__, field.name)
 
@@ -95,7 +100,8 @@ def test_types_follow_from_names_as_the_page_says():
     for union in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply):
         for message in declared(union):
             for field in msgspec.structs.fields(message):
-                is_float = getattr(field.type, "__origin__", field.type) is float  # whatever its bounds
+                # Whatever its bounds
+                is_float = getattr(field.type, "__origin__", field.type) is float
                 assert is_float == field.name.endswith(("_mm", "_mm_s", "_us")), (message.__name__, field.name)
 
 
@@ -113,7 +119,8 @@ def test_what_may_be_left_out():
 
 def test_stage_line_examples_are_a_dialogue():
     example = text("stage-line.md").split("## Example")[1].split("```")[1]
-    sent, answered = [], []
+    sent = []
+    answered = []
     for line in re.findall(r"^(?:->|<-) \S.*\*[0-9A-F]{4}$", example, re.MULTILINE):
         raw = line[3:].encode("ascii") + b"\n"
         if line.startswith("->"):
@@ -177,7 +184,10 @@ def test_sub_blocks_are_those_of_the_published_rig():
     for one in sent:
         number = f"0x{one.ID:04X}"
         answer = table[number]
-        raw = shown("mmwavelink.md", number) if answer == "see below" else bytes.fromhex(answer.strip("`"))
+        if answer == "see below":
+            raw = shown("mmwavelink.md", number)
+        else:
+            raw = bytes.fromhex(answer.strip("`"))
         assert raw == one.block().data, number
     order = [row[0] for row in rows("mmwavelink.md", "Sub-blocks")]
     places = [order.index(f"0x{one.ID:04X}") for one in sent]

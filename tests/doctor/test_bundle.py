@@ -61,7 +61,8 @@ def bundle(place: Path) -> dict[str, bytes]:
 def test_the_bundle_has_no_key(place: Path, bundle: dict[str, bytes]) -> None:
     secret = (place / "secret").read_text()
     keys = [w for f in (place / "keys").iterdir() for w in f.read_text().split('"') if len(w) == 40]
-    assert len({*keys}) == 4  # two public, two secret
+    # Two public, two secret
+    assert len({*keys}) == 4
     assert secret in keys
     for text in bundle.values():
         for key in (*keys, TOKEN):

@@ -38,7 +38,8 @@ def test_a_bad_rig_file_is_the_first_and_only_error(tmp_path, broken, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("error       config")
     skipped = [line for line in lines if line.startswith("not checked")]
-    assert len(skipped) == len(CHECKS) - 2  # all but the rig file and this machine's clock
+    # All but the rig file and this machine's clock
+    assert len(skipped) == len(CHECKS) - 2
     assert all("config" in line for line in skipped)
     assert "config" in lines[-1]
 
@@ -108,7 +109,8 @@ def test_the_disk_probe_leaves_nothing_behind(tmp_path, monkeypatch):
 
 def test_the_published_scan_takes_two_hours(tmp_path):
     found = check_time(context_of(RIG, tmp_path))
-    assert found.facts["seconds"] == pytest.approx(200 * 38, rel=0.05)  # 35 s a row, and its ends
+    # 35 s a row, and its ends
+    assert found.facts["seconds"] == pytest.approx(200 * 38, rel=0.05)
     assert found.facts["bytes"] == 2 * 70_000 * 65_536
 
 
@@ -197,4 +199,5 @@ def test_the_receivers_are_measured_with_packets_at_each_rate():
     assert scheduling
     assert [(r.wanted, r.sent) for r in results] == [(500.0, 200), (1000.0, 400)]
     assert all(r.reached > 0 for r in results)
-    assert results[1].lost < results[0].sent  # packets of the second record are not taken for leftovers of the first
+    # Packets of the second record are not taken for leftovers of the first
+    assert results[1].lost < results[0].sent

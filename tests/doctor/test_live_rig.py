@@ -89,7 +89,8 @@ def test_a_card_that_is_mute(live):
         found = live.doctor(pulse=True)
     assert_failed(found, "card RV")
     assert skipped(found, "card RV") == ["buffer RV", "radar RV", "level RV", "direct path RV", "trigger skew"]
-    assert found["direct path RH"].level == "ok"  # the other board is checked to its end
+    # The other board is checked to its end
+    assert found["direct path RH"].level == "ok"
 
 
 def test_a_receive_buffer_that_is_too_small(live):
@@ -101,7 +102,8 @@ def test_a_sync_in_wire_that_is_cut(live):
     with live.cut(live.instrument.pi.sync_out[0]):
         found = live.doctor(pulse=True)
     assert_failed(found, "radar RH", "radar RV")
-    assert found["pulses"].level == "ok"  # the Pi cannot know
+    # The Pi cannot know
+    assert found["pulses"].level == "ok"
 
 
 def test_a_scan_in_progress_is_not_disturbed(live):

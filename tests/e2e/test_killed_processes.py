@@ -36,8 +36,10 @@ pytestmark = pytest.mark.slow
 KILLED_AT = REPO / "tests/support/killed_at.py"
 NO_RESULT = 7
 SCENE = small_scene(6, 4, step_mm=(20.0, 20.0), pulses=4, seed=4)
-METAL = ["--metal", "0,0,50,50"]  # the aperture is too small for the plate to be found by itself
-ROWS, FILES = 4, 8
+# The aperture is too small for the plate to be found by itself
+METAL = ["--metal", "0,0,50,50"]
+ROWS = 4
+FILES = 8
 Place = tuple[str, str, int]
 HOST_PLACES = [
     *(("rename", ".bin", n) for n in range(1, FILES + 1)),  # rows durable, not named: before, and between two boards
@@ -99,14 +101,16 @@ class Killed:
 
     def __init__(self, rig: Any) -> None:
         self.rig = rig
-        self.met: Counter[str] = Counter()  # kinds of places that programs came to, each with who
+        # Kinds of places that programs came to, each with who
+        self.met: Counter[str] = Counter()
         self.armed = 0
         self.restart_pi(counted(PI_PLACES))
         assert self.scan(rig.folder / "undisturbed", counted(HOST_PLACES)).wait().status == 0
         self.note("host", self.hits)
         self.note("Pi", self.pi_hits)
         self.restart_pi()
-        self.rows, self.image = rows(rig.folder / "undisturbed"), image(rig.folder / "undisturbed")
+        self.rows = rows(rig.folder / "undisturbed")
+        self.image = image(rig.folder / "undisturbed")
 
     def start(self, places: Sequence[Place], *command: str | Path) -> tuple[Any, Path]:
         """A command that kills itself at the first of these places it comes to; and where it writes what it met."""
@@ -118,7 +122,10 @@ class Killed:
 
     def scan(self, folder: Path, places: Sequence[Place] = (), *more: str) -> Any:
         """Start a scan, or go on with it when its manifest has a first line."""
-        command = ("resume", folder) if begun(folder) else ("scan", "--config", self.rig.config, "--out", folder)
+        if begun(folder):
+            command = ("resume", folder)
+        else:
+            command = ("scan", "--config", self.rig.config, "--out", folder)
         program, self.hits = self.start(places, "polysight", *command, *(more or ["--no-process"]))
         return program
 
@@ -257,7 +264,8 @@ def test_every_kind_of_place_is_come_to(killed: Killed):
         return [place for place in counted(places) if not killed.met[f"{who} {place[0]}:{place[1]}"]]
 
     for number, place in ((100, ("pwrite", "manifest.jsonl", 4)), (101, ("pwrite", "events.msgpack", 3))):
-        if never("resume", RESUME_PLACES):  # run alone, or not by the kills above: of a torn manifest, of torn events
+        # Run alone, or not by the kills above: of a torn manifest, of torn events
+        if never("resume", RESUME_PLACES):
             killed.check(Kill(number, host=True, pi=False, place=place))
     for who, places in (("host", HOST_PLACES), ("Pi", PI_PLACES), ("resume", RESUME_PLACES)):
         assert never(who, places) == [], f"{who}: {killed.met}"

@@ -55,7 +55,8 @@ class View:
         while not condition(state := self.state()):
             assert self._program.process.poll() is None, self._program.err
             assert idle_s() < deadline, f"not within {LIMIT_S:g} s: {what}; the view says {state}"
-            time.sleep(0.2)  # what looks on here costs the scan time
+            # What looks on here costs the scan time
+            time.sleep(0.2)
         return state
 
     def wait_headline(self, headline: str) -> dict[str, Any]:

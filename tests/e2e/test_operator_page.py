@@ -27,7 +27,9 @@ class Lab:
     """A rig, a server for its scans, and a browser."""
 
     def __init__(self, rig: Rig, browser: Browser) -> None:
-        self.rig, self.browser, self.scans = rig, browser, rig.folder / "scans"
+        self.rig = rig
+        self.browser = browser
+        self.scans = rig.folder / "scans"
         self.scans.mkdir()
         self.serve()
 
@@ -126,7 +128,8 @@ def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
     lab.wait_rows(folder, rows + 1)
     lab.click("pause")
     lab.wait_headline("Paused")
-    lab.click("stop")  # while nothing moves: however slow this machine is, rows are left
+    # While nothing moves: however slow this machine is, rows are left
+    lab.click("stop")
     lab.wait_headline("Stopped on request")
     lab.ended(folder)
     stopped = len(ScanFolder.load(folder).committed())
@@ -174,7 +177,8 @@ def test_a_scan_has_the_priority_of_a_terminals_not_of_the_reading_process(lab):
     lab.click("start")
     lab.browser.wait("document.getElementById('told').innerText.includes('fourth is being scanned')", "the refusal")
     assert not (lab.scans / "fifth").exists()
-    lab.browser.errors.clear()  # the refused request
+    # The refused request
+    lab.browser.errors.clear()
     lab.open("/watch?scan=fourth")
     lab.click("stop")
     lab.wait_headline("Stopped on request")

@@ -16,7 +16,9 @@ from polysight.acquisition.scan import ScanResult, run_scan
 from polysight.store.validation import validate
 from polysight_shared.config import load_instrument
 
-COLUMNS, ROWS, CHIRPS = 8, 3, 4
+COLUMNS = 8
+ROWS = 3
+CHIRPS = 4
 PORTS = {"LS": 5000, "RH": 5001, "RV": 5002}
 
 
@@ -62,17 +64,20 @@ def test_native_radars_make_a_frame_of_many_chirps_at_each_pulse(bench):
     data = result.folder.read_row("RH", 0)
     assert data.frames_expected == COLUMNS * CHIRPS
     words = data.payload.view("<u4") & 0x0FFFFFFF
-    assert (words == range(words[0], words[0] + words.size)).all()  # the pattern counts on through every chirp
+    # The pattern counts on through every chirp
+    assert (words == range(words[0], words[0] + words.size)).all()
     first, *rows = facts_of(result.folder, "radars")
     for answer in first["boards"].values():
         assert answer["state"] == "configured"
         assert answer["rf_firmware"] != ""
         assert answer["calibration"]["passed"]
         assert answer["boot"] == {"power_up_us": 1856.08, "boot_errors": 0, "tests_failed": 0, "cure": ""}  # from RAM
-        assert any("no image header" in line for line in answer["events"])  # the flash was empty
+        # The flash was empty
+        assert any("no image header" in line for line in answer["events"])
     assert len({answer["die_id"] for answer in first["boards"].values()}) == 3
     assert "direct_if_hz" in first
     assert [r["row"] for r in rows if all(b["state"] == "done" for b in r["boards"].values())] == [0, 1, 2]
     for fact in rows:
-        assert all(any("4001080001000000" in sent for sent in b["sent"]) for b in fact["boards"].values())  # the start
+        # The start
+        assert all(any("4001080001000000" in sent for sent in b["sent"]) for b in fact["boards"].values())
         assert all(b["temperatures_c"]["rx1"] for b in fact["boards"].values())

@@ -14,7 +14,8 @@ from polysight.materials import Library
 from polysight_simulators.scene import decode_scene, simulate
 
 SCRIPTS = REPO / "examples" / "scripts"
-LIMIT = 20  # lines from raw data to the image, imports included
+# Lines from raw data to the image, imports included
+LIMIT = 20
 
 
 def run(name: str) -> dict:

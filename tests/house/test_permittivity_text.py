@@ -25,7 +25,10 @@ def built_by_hand(text: str) -> list[int]:
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.JoinedStr):
             for part, after in zip(node.values, node.values[1:], strict=False):
-                written = part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else ""
+                if isinstance(part, ast.Constant) and isinstance(part.value, str):
+                    written = part.value
+                else:
+                    written = ""
                 if isinstance(after, ast.FormattedValue) and BY_HAND.search(written):
                     found.append(node.lineno)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and OTHERS.search(node.value):

@@ -33,7 +33,8 @@ def test_the_repository_has_no_links():
 def test_a_project_holds_its_one_package(folder, package):
     packages = {p.parent.name for p in (ROOT / folder).glob("*/__init__.py")}
     assert packages == {package}
-    assert not list((ROOT / folder).glob("*.py")) or folder == "host"  # setup.py
+    # setup.py
+    assert not list((ROOT / folder).glob("*.py")) or folder == "host"
 
 
 @pytest.mark.parametrize("folder", PROJECTS)

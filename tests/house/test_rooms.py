@@ -111,7 +111,9 @@ def imports(file: Path) -> list[tuple[int, str]]:
 
 def room_of(file: Path) -> str:
     """The room of the host that a file stands in; "" elsewhere."""
-    return file.relative_to(HOST).parts[0] if file.is_relative_to(HOST) else ""
+    if file.is_relative_to(HOST):
+        return file.relative_to(HOST).parts[0]
+    return ""
 
 
 def test_neighbours_import_only_from_a_rooms_front():
@@ -137,7 +139,8 @@ def test_no_module_is_taken_from_behind_a_front():
                 past.append(f"{file.relative_to(ROOT)}:{node.lineno} a relative import")
             elif parts[0] == "polysight" and len(parts) == 2 and parts[1] not in (room_of(file), *ENTERED_BY_MODULE):
                 room = HOST / parts[1]
-                if not room.is_dir():  # pipeline.py
+                # pipeline.py
+                if not room.is_dir():
                     continue
                 front = (room / "__init__.py").read_text(encoding="utf-8")
                 modules = [

@@ -40,7 +40,8 @@ def library(request):
 @pytest.fixture
 def aperture(make_rig):
     rig = make_rig(15, 6, 4.0, 4.0, (12, 10))
-    grid, antennas = image_grid(rig), Antennas.of(rig, rig.receivers[0])
+    grid = image_grid(rig)
+    antennas = Antennas.of(rig, rig.receivers[0])
     return Aperture(antennas, scan_offsets_m(rig), np.linspace(76.3e9, 79.7e9, 7), grid)
 
 
@@ -55,7 +56,8 @@ def test_images_and_samples_are_those_of_numpy(aperture, library, make):
     rng = np.random.default_rng(0)
     samples = (rng.standard_normal(aperture.shape) + 1j * rng.standard_normal(aperture.shape)).astype(np.complex64)
     pixels = (rng.standard_normal(aperture.grid.shape) + 0j).astype(np.complex64)
-    echo, weights = samples[:, :, 0, 0], rng.uniform(size=aperture.shape[2:]).astype(np.float32)
+    echo = samples[:, :, 0, 0]
+    weights = rng.uniform(size=aperture.shape[2:]).astype(np.float32)
     plain = make(aperture)
     other = make(aperture) if make is DirectImager else make(aperture, xp=xp, device=device)
 
@@ -74,7 +76,8 @@ def test_images_and_samples_are_those_of_numpy(aperture, library, make):
 def test_backproject_and_project_run_on_the_library_of_their_samples(library):
     xp, device = library
     rng = np.random.default_rng(1)
-    f, reference = 76e9 + 1e8 * np.arange(9), rng.uniform(0, 1, 7)
+    f = 76e9 + 1e8 * np.arange(9)
+    reference = rng.uniform(0, 1, 7)
     places = [rng.uniform(-0.5, 0.5, (7, 3)) for _ in range(3)]
     samples, pixels = (rng.standard_normal(shape) + 1j for shape in ((7, 9), 7))
     for function, array in ((backproject, samples), (project, pixels)):

@@ -13,7 +13,8 @@ PLACES_MM = [(-60, -55), (-10, -60), (58, -50), (-62, 5), (3, -4), (60, 8), (-55
 def _swept(make_rig, points_rows, depth_mm=0.0, tilt_deg=(0.0, 0.0), noise=0.3):
     """Points on a plane `depth_mm` behind the rig file's, with the tilt `tilt_deg` along x and y."""
     rig = make_rig(88, 41, 8.0, 8.0, pixels=(75, 75))
-    grid, rng = image_grid(rig), np.random.default_rng(1)
+    grid = image_grid(rig)
+    rng = np.random.default_rng(1)
     centre = np.array([grid.x_m.mean(), grid.y_m.mean()])
     xy = np.array(PLACES_MM) / 1e3 + rng.uniform(-1e-3, 1e-3, (len(PLACES_MM), 2))
     z = grid.z_m + depth_mm / 1e3 + xy @ np.tan(np.radians(tilt_deg))
@@ -67,4 +68,5 @@ def test_interpolation_between_planes_is_exact_at_all_planes():
         np.testing.assert_allclose(_at_depth(stack, depths, np.full((3, 4), depth)), plane, rtol=1e-9)
     smooth = (depths**2)[:, None, None] * np.ones((3, 4))
     between = np.full((3, 4), -3.7e-3)
-    np.testing.assert_allclose(_at_depth(smooth, depths, between), between**2, rtol=1e-9)  # parabolas are exact
+    # Parabolas are exact
+    np.testing.assert_allclose(_at_depth(smooth, depths, between), between**2, rtol=1e-9)

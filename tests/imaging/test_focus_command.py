@@ -36,7 +36,8 @@ def test_focus_of_a_too_narrow_scan_writes_figure_and_numbers_that_are_not_certa
 
 @pytest.mark.parametrize("by_columns", [False, True])
 def test_x_and_y_are_the_rigs_for_scans_by_rows_and_by_columns(tmp_path, capsys, monkeypatch, by_columns):
-    at_mm, tilt = (15.0, -9.0), (2.0, -1.0)
+    at_mm = (15.0, -9.0)
+    tilt = (2.0, -1.0)
     scene = decode_scene({**SCENE, "points": [{"position_mm": at_mm}]}, "t").with_disturbances(ideal=True)
     data = simulate(RIG, scene, tmp_path, layout="authors", by_columns=by_columns)
     found_by_the_builder = tilt[::-1] if by_columns else tilt  # which images the rig mirrored in x = y

@@ -32,7 +32,8 @@ GRIDS = [
 def aperture(make_rig):
     def make(columns, rows, step_x, step_y, pixels, pixel, shifts_m=None, board=1) -> Aperture:
         rig = make_rig(columns, rows, step_x, step_y, pixels, pixel)
-        plan, grid = plan_raster(rig.grid), image_grid(rig)
+        plan = plan_raster(rig.grid)
+        grid = image_grid(rig)
         antennas = Antennas.of(rig, rig.receivers[board])
         offsets = scan_offsets_m(rig)
         if shifts_m is not None:
@@ -60,14 +61,20 @@ def _samples(aperture, rng):
 def test_spectral_and_row_by_row_equal_the_direct_sum(aperture, grid, shifts):
     rng = np.random.default_rng(1)
     a = aperture(*grid, shifts_m=None if shifts == "serpentine" else rng.uniform(-1e-3, 1e-3, grid[1]))
-    samples, d = _samples(a, rng), a.antennas.mirror_m(a.grid.z_m) - a.antennas.direct_m
+    samples = _samples(a, rng)
+    d = a.antennas.mirror_m(a.grid.z_m) - a.antennas.direct_m
     echo = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(d, a.frequencies_hz)).astype(np.complex64)
     weights = rng.uniform(0, 1, a.shape[2:]).astype(np.float32)
     images = [make(a).image(samples) for make in IMAGERS]
     echoes = [make(a).constant(echo, weights) for make in IMAGERS]
     for (spectral, rows, direct), peak in ((images, np.prod(a.shape)), (echoes, weights.sum() * echo.size)):
         # Relative to a point's peak; rounding errors average out less over few positions.
-        bound = 1e-6 if a.shape[3] > 300 else 5e-6 if a.shape[2] * a.shape[3] > 20 else 4e-5
+        if a.shape[3] > 300:
+            bound = 1e-6
+        elif a.shape[2] * a.shape[3] > 20:
+            bound = 5e-6
+        else:
+            bound = 4e-5
         assert np.abs(spectral - direct).max() < bound * peak
         assert np.abs(rows - direct).max() < bound * peak
 
@@ -77,8 +84,11 @@ def test_spectral_and_row_by_row_equal_the_direct_sum(aperture, grid, shifts):
 def test_every_imager_is_the_adjoint_of_its_forward_model(aperture, grid, make):
     rng = np.random.default_rng(2)
     a = aperture(*grid)
-    imager, pixels, samples = make(a), _noise(rng, a.grid.shape), _noise(rng, a.shape)
-    forward, back = np.vdot(imager.samples(pixels), samples), np.vdot(pixels, imager.image(samples))
+    imager = make(a)
+    pixels = _noise(rng, a.grid.shape)
+    samples = _noise(rng, a.shape)
+    forward = np.vdot(imager.samples(pixels), samples)
+    back = np.vdot(pixels, imager.image(samples))
     assert abs(forward - back) < 1e-5 * np.linalg.norm(pixels) * np.linalg.norm(imager.image(samples))
 
 
@@ -102,8 +112,10 @@ def test_a_common_phase_is_kept(aperture, make):
 def test_a_row_added_again_replaces_the_earlier_one_in_any_order(aperture):
     rng = np.random.default_rng(5)
     a = aperture(15, 6, 4.0, 4.0, (12, 10), 2.0)
-    samples, wrong = _samples(a, rng), _noise(rng, a.shape)
-    none, starts = np.zeros(15, np.float32), a.offsets_m[:, 0, 0]
+    samples = _samples(a, rng)
+    wrong = _noise(rng, a.shape)
+    none = np.zeros(15, np.float32)
+    starts = a.offsets_m[:, 0, 0]
     imager = IncrementalImager(a)
     for r in rng.permutation(6):
         imager.add_row(r, wrong[:, :, r], none, starts[r] + 1e-4)
@@ -127,7 +139,8 @@ def test_another_geometry_gets_other_kernels(aperture):
     samples = _noise(rng, a.shape)
     lower = Aperture(a.antennas, a.offsets_m, a.frequencies_hz, replace(a.grid, z_m=a.grid.z_m + 5e-3))
     for geometry in (a, lower):
-        spectral, direct = SpectralImager(geometry).image(samples), DirectImager(geometry).image(samples)
+        spectral = SpectralImager(geometry).image(samples)
+        direct = DirectImager(geometry).image(samples)
         assert np.abs(spectral - direct).max() < 3e-5 * np.abs(direct).max()
 
 
@@ -164,7 +177,8 @@ def test_a_micrometre_of_jitter_is_imaged_spectrally(aperture):
     a.offsets_m[..., 0] += rng.uniform(-3e-7, 3e-7, a.offsets_m.shape[:2])
     assert irregular(a) is None
     samples = DirectImager(a).samples(np.eye(10, 12))
-    got, exact = SpectralImager(a).image(samples), DirectImager(a).image(samples)
+    got = SpectralImager(a).image(samples)
+    exact = DirectImager(a).image(samples)
     assert np.abs(got - exact).max() < 2e-4 * np.abs(exact).max()
 
 

@@ -36,7 +36,8 @@ def _peak(image, x_m, y_m):
     def vertex(left, mid, right):
         return 0.5 * (left - right) / (left - 2 * mid + right)
 
-    dx, dy = vertex(*a[iy, ix - 1 : ix + 2]), vertex(*a[iy - 1 : iy + 2, ix])
+    dx = vertex(*a[iy, ix - 1 : ix + 2])
+    dy = vertex(*a[iy - 1 : iy + 2, ix])
     pixel = x_m[1] - x_m[0]
     return x_m[ix] + dx * pixel, y_m[iy] + dy * pixel
 
@@ -60,7 +61,9 @@ def test_resolution_is_that_of_the_aperture(make_rig, points_rows):
     raw = np.abs(_build(rig, lambda b: points_rows(rig, b, [point], [1.0]), taper="boxcar").finish().h_raw)
     width_x, width_y = ((line > line.max() / np.sqrt(2)).sum() * 0.5 for line in (raw[40], raw[:, 40]))
     cos = np.cos(np.radians(54.93))
-    length, wave, height = 164.0, 3.814, 488.0
+    length = 164.0
+    wave = 3.814
+    height = 488.0
     assert width_y == pytest.approx(0.886 * wave * height / (2 * length * cos), rel=0.15)
     assert width_x == pytest.approx(0.886 * wave * height / (2 * length * cos**3), rel=0.15)
 
@@ -103,7 +106,8 @@ def test_the_image_of_a_sheet_has_its_reflection_coefficient(make_rig, plane_row
     spectrum = Spectrum.of(chirp)
     expected = multilayer([4 - 0.4j, 1.0], [3e-3, np.inf], spectrum.frequency_hz[0], np.radians(55))[0]
     mean = (expected * spectrum.weight[0]).sum()
-    assert abs(mean.imag) > 0.1  # large enough to detect a wrong sign
+    # Large enough to detect a wrong sign
+    assert abs(mean.imag) > 0.1
     for flat in (images.h, images.v):
         np.testing.assert_allclose(flat[images.valid], mean, atol=0.02 * abs(mean))
 
@@ -125,7 +129,8 @@ def test_rows_may_come_in_any_order_and_a_row_added_again_replaces_the_earlier_o
     point = np.array(specular_midpoint_m(rig, rig.receivers[0]))
     board = rig.receivers[0]
     rows = list(points_rows(rig, board, [point], [1.0]))
-    forward, backward = ImageBuilder(rig), ImageBuilder(rig)
+    forward = ImageBuilder(rig)
+    backward = ImageBuilder(rig)
     backward.add_row(board.name, 3, synced_row(np.ones_like(rows[3][1].samples)))
     for index, row in rows:
         forward.add_row(board.name, index, row)
@@ -168,7 +173,8 @@ def test_random_offsets_of_every_chirp_do_not_change_the_image(make_rig, points_
         n = np.arange(256)
         for index, row in points_rows(rig, board, points, amplitudes):
             clean = row.samples * steering[:, None]
-            df, phase = rng.uniform(0.3, 0.45, (31, pulses)), rng.uniform(-np.pi, np.pi, (31, pulses))
+            df = rng.uniform(0.3, 0.45, (31, pulses))
+            phase = rng.uniform(-np.pi, np.pi, (31, pulses))
             frames = clean[:, :, None] * np.exp(1j * (2 * np.pi * df[..., None] * n + phase[..., None]))
             frames += 0.15 * (rng.standard_normal(frames.shape) + 1j * rng.standard_normal(frames.shape))
             yield (
@@ -195,11 +201,13 @@ def _random_rows(rig, synced_row, rng):
 def test_the_live_image_after_every_row_is_the_image_of_the_rows_so_far(make_rig, synced_row):
     rig = make_rig(15, 9, pixels=(16, 14))
     rng = np.random.default_rng(8)
-    live, plain = ImageBuilder(rig, live=True), ImageBuilder(rig)
+    live = ImageBuilder(rig, live=True)
+    plain = ImageBuilder(rig)
     for name, index, row in _random_rows(rig, synced_row, rng):
         for builder in (live, plain):
             builder.add_row(name, index, row)
-        now, made = live.current(), plain.finish()
+        now = live.current()
+        made = plain.finish()
         pairs = [(now.h_raw, made.h_raw), (now.v_raw, made.v_raw)]
         pairs += zip(now.illumination.footprints, made.illumination.footprints, strict=True)
         for got, want in pairs:
@@ -214,7 +222,9 @@ def test_measured_offsets_of_rows_improve_the_focus(make_rig, points_rows):
     board = rig.receivers[0]
     point = np.array(specular_midpoint_m(rig, board))
     shifts = [1.2e-3 * (row.index % 2) for row in plan_raster(rig.grid)]
-    good, known, ignored = ImageBuilder(rig), ImageBuilder(rig), ImageBuilder(rig)
+    good = ImageBuilder(rig)
+    known = ImageBuilder(rig)
+    ignored = ImageBuilder(rig)
     for index, row in points_rows(rig, board, [point], [1.0]):
         good.add_row(board.name, index, row)
     for index, row in points_rows(rig, board, [point], [1.0], shifts_m=shifts):
@@ -229,11 +239,13 @@ def test_measured_offsets_of_rows_improve_the_focus(make_rig, points_rows):
 
 def test_jittered_positions_are_imaged_exactly_with_a_notice(make_rig, points_rows, caplog):
     rig = make_rig(15, 9, pixels=(9, 9))
-    board, rng = rig.receivers[0], np.random.default_rng(9)
+    board = rig.receivers[0]
+    rng = np.random.default_rng(9)
     grid = image_grid(rig)
     point = np.array([grid.x_m[4], grid.y_m[4], grid.z_m])
     jitter = rng.normal(0, 3e-4, (rig.grid.rows, rig.grid.columns, 3))
-    known, ignored = ImageBuilder(rig, live=True), ImageBuilder(rig)
+    known = ImageBuilder(rig, live=True)
+    ignored = ImageBuilder(rig)
     for index, row in points_rows(rig, board, [point], [1.0], jitter_m=jitter):
         ignored.add_row(board.name, index, row)
         plan_row = plan_raster(rig.grid).row(index)
@@ -260,7 +272,8 @@ def test_a_masked_position_equals_one_that_was_not_scanned(make_rig, synced_row)
     rig = make_rig(15, 9, pixels=(16, 14))
     rng = np.random.default_rng(12)
     kept = rng.uniform(size=(9, 15)) > 0.4
-    masked, never = ImageBuilder(rig, live=True), ImageBuilder(rig)
+    masked = ImageBuilder(rig, live=True)
+    never = ImageBuilder(rig)
     for name, index, row in _random_rows(rig, synced_row, rng):
         masked.add_row(name, index, row)
         met = kept[index][:: plan_raster(rig.grid).row(index).direction]
@@ -274,7 +287,8 @@ def test_a_masked_position_equals_one_that_was_not_scanned(make_rig, synced_row)
 def test_points_anywhere_are_found_within_a_tenth_of_a_pixel_and_their_phase_within_0_05_rad(make_rig, points_rows):
     """Place: the peak on a ten times finer grid. Phase: at the true place."""
     rig = make_rig(61, 41, pixels=(60, 50))
-    rng, grid = np.random.default_rng(10), image_grid(rig)
+    rng = np.random.default_rng(10)
+    grid = image_grid(rig)
     for board in rig.receivers:
         for _ in range(3):
             point = np.array([rng.uniform(*grid.x_m[[5, -6]]), rng.uniform(*grid.y_m[[5, -6]]), grid.z_m])
@@ -290,8 +304,11 @@ def test_points_anywhere_are_found_within_a_tenth_of_a_pixel_and_their_phase_wit
 def test_the_image_is_the_float64_matched_filter_over_all_samples(make_rig, synced_row):
     """All 192 samples of every chirp summed in double precision, against 9 frequencies in single."""
     rig = make_rig(31, 21, 8.0, 8.0, pixels=(12, 10))
-    board, chirp = rig.receivers[1], rig.chirp
-    antennas, grid, plan = Antennas.of(rig, board), image_grid(rig), plan_raster(rig.grid)
+    board = rig.receivers[1]
+    chirp = rig.chirp
+    antennas = Antennas.of(rig, board)
+    grid = image_grid(rig)
+    plan = plan_raster(rig.grid)
     a, b = chirp.linear_samples
     f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
     shift = np.stack([np.pad(row_offsets_m(rig, row), ((0, 0), (0, 1))) for row in plan])

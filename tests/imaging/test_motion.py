@@ -6,7 +6,8 @@ import pytest
 
 from polysight.imaging.samples import REACH, burst_filters, undo_burst_motion
 
-COUNT, MIDDLE = 61, slice(REACH, -REACH)
+COUNT = 61
+MIDDLE = slice(REACH, -REACH)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,8 @@ def test_every_wave_keeps_its_amplitude_and_phase(fast, turns, centre):
     """For any part of its phase change that burst alignment has removed."""
     still = np.exp(2j * np.pi * turns * np.arange(COUNT))
     average = burst_mean(turns - centre, fast) * np.exp(2j * np.pi * centre * np.arange(COUNT))
-    valid, turn = np.ones(COUNT, bool), np.full(COUNT, 2 * np.pi * centre)
+    valid = np.ones(COUNT, bool)
+    turn = np.full(COUNT, 2 * np.pi * centre)
     undone = undo_burst_motion(average, valid, turn, burst_filters(fast))
     np.testing.assert_allclose(undone[MIDDLE], still[MIDDLE], atol=6e-3)
     assert turns == centre or abs(average[30]) < 1 - 1.2 * (turns - centre) ** 2
@@ -48,7 +50,8 @@ def test_masked_positions_have_no_influence_and_ends_are_not_changed(fast):
     samples = (rng.standard_normal((2, COUNT)) + 1j * rng.standard_normal((2, COUNT))).astype(np.complex64)
     valid = np.ones(COUNT, bool)
     valid[[20, 21, 40]] = False
-    turn, filters = rng.uniform(-1, 1, COUNT), burst_filters(fast)
+    turn = rng.uniform(-1, 1, COUNT)
+    filters = burst_filters(fast)
     first = undo_burst_motion(samples, valid, turn, filters)
     other = np.where(valid, samples, 1e6).astype(np.complex64)
     np.testing.assert_array_equal(undo_burst_motion(other, valid, turn, filters)[:, valid], first[:, valid])
@@ -59,7 +62,8 @@ def test_masked_positions_have_no_influence_and_ends_are_not_changed(fast):
 def test_a_row_in_the_other_direction_is_filtered_equally(fast):
     rng = np.random.default_rng(2)
     samples = (rng.standard_normal((2, COUNT)) + 1j * rng.standard_normal((2, COUNT))).astype(np.complex64)
-    valid, turn = rng.uniform(size=COUNT) < 0.9, rng.uniform(-1, 1, COUNT)
+    valid = rng.uniform(size=COUNT) < 0.9
+    turn = rng.uniform(-1, 1, COUNT)
     filters = burst_filters(fast)
     there = undo_burst_motion(samples, valid, turn, filters)
     back = undo_burst_motion(samples[:, ::-1], valid[::-1], -turn[::-1], filters)

@@ -14,7 +14,8 @@ import scipy.io
 from polysight.imaging import backproject
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-BRIGHT_M = np.array([-15.6, 21.6, 0.0])  # the strongest reflector of this degree, on the ground
+# The strongest reflector of this degree, on the ground
+BRIGHT_M = np.array([-15.6, 21.6, 0.0])
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,8 @@ def test_recorded_pulses_of_an_aircraft_focus_to_their_bandwidth_and_aperture(re
     angle = np.ptp(np.arctan2(antenna[:, 1], antenna[:, 0]))
     in_range = 0.886 * SPEED_OF_LIGHT_M_S / (2 * np.ptp(f) * np.cos(elevation))
     across = 0.886 * SPEED_OF_LIGHT_M_S / f.mean() / (2 * angle * np.cos(elevation))
-    along_x, along_y = _cut(recorded, 0, 0.02), _cut(recorded, 1, 0.06)
+    along_x = _cut(recorded, 0, 0.02)
+    along_y = _cut(recorded, 1, 0.06)
     assert abs(int(np.argmax(along_x)) - 30) * 0.02 < 0.1
     assert abs(int(np.argmax(along_y)) - 30) * 0.06 < 0.3
     assert _half_power_width(along_x, 0.02) == pytest.approx(in_range, rel=0.2)

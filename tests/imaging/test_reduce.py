@@ -28,7 +28,8 @@ def test_few_samples_give_every_matched_filter_output_of_all(rig, echo_m, pixel_
     weight = scipy.signal.get_window("hann", b - a + 2, fftbins=False)[1:-1]
     all_samples = (weight / weight.sum() * x[a:b] * np.exp(-2j * np.pi * _sweep(chirp)[a:b] * pixel_m / C)).sum()
     few = (gate.matrix @ x * np.exp(-2j * np.pi * gate.frequencies_hz * pixel_m / C)).sum()
-    assert abs(few - all_samples) < 1e-3  # the echo leaks into the estimate of the direct path
+    # The echo leaks into the estimate of the direct path
+    assert abs(few - all_samples) < 1e-3
     assert len(gate.frequencies_hz) <= 10
 
 
@@ -53,10 +54,13 @@ def test_the_model_predicts_an_echo_after_the_gate(rig, echo_m):
 def test_decimated_samples_give_what_all_samples_give(rig, gate_m, noise):
     """In the gate, of the direct path, of clutter behind it, in noise; and echoes from elsewhere are seen as little."""
     a, b = rig.chirp.linear_samples
-    gate, sweep = reduction(rig.chirp, gate_m), _sweep(rig.chirp)[a:b]
-    every, few = gate.maps(_sweep(rig.chirp))[:, a:b], gate.maps(block_sweep_of(rig.chirp))
+    gate = reduction(rig.chirp, gate_m)
+    sweep = _sweep(rig.chirp)[a:b]
+    every = gate.maps(_sweep(rig.chirp))[:, a:b]
+    few = gate.maps(block_sweep_of(rig.chirp))
     level = np.abs(every[:-1] @ np.exp(2j * np.pi * gate_m[0] / C * sweep)).max()
-    for off_m in (-0.1, 0.0, 0.1):  # the middle of the band that noise and echoes give
+    # The middle of the band that noise and echoes give
+    for off_m in (-0.1, 0.0, 0.1):
         middle_m = sum(gate_m) / 4 + off_m
         decimated = decimation(b - a, middle_m * rig.chirp.hz_per_sample / C)
 
@@ -81,13 +85,15 @@ def test_the_direct_path_vanishes_and_is_measured(rig, window):
 
 def test_the_gate_contains_every_pixel_at_every_position(make_rig):
     rig = make_rig()
-    grid, plan = image_grid(rig), plan_raster(rig.grid)
+    grid = image_grid(rig)
+    plan = plan_raster(rig.grid)
     for board in rig.receivers:
         antennas = Antennas.of(rig, board)
         low, high = scene_gate_m((antennas,), plan, grid)
         rng = np.random.default_rng(0)
         u = rng.uniform(-0.06, 0.06, (2, 500))
-        x, y = rng.choice(grid.x_m, 500) - u[0], rng.choice(grid.y_m, 500) - u[1]
+        x = rng.choice(grid.x_m, 500) - u[0]
+        y = rng.choice(grid.y_m, 500) - u[1]
         excess = antennas.excess_m(x, y, grid.z_m)
         assert low - 1e-4 <= excess.min()
         assert excess.max() <= high + 1e-9

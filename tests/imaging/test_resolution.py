@@ -21,13 +21,17 @@ def test_without_a_taper_the_measured_response_is_the_geometrys_limit(make_rig, 
     board = _full(make_rig(columns, rows, step, step, pixels=(31, 31)), taper="boxcar")
     response = point_response(board.aperture, board.weights)
     np.testing.assert_allclose(response.width_mm, response.limit_mm, rtol=0.08)
-    assert max(response.sidelobe_db) < -11  # a sinc's first sidelobe is -13.3 dB
+    # A sinc's first sidelobe is -13.3 dB
+    assert max(response.sidelobe_db) < -11
 
 
 def test_the_limit_is_that_of_the_plane_wave_formula_and_the_papers_is_not(make_rig):
     board = _full(make_rig(41, 41, 4.0, 4.0, pixels=(31, 31)), taper="boxcar")
     response = point_response(board.aperture, board.weights)
-    cos, wave, height, length = np.cos(np.radians(54.93)), 3.82, 488.0, 160.0
+    cos = np.cos(np.radians(54.93))
+    wave = 3.82
+    height = 488.0
+    length = 160.0
     plane = (0.886 * wave * height / (2 * length * cos**3), 0.886 * wave * height / (2 * length * cos))
     np.testing.assert_allclose(response.limit_mm, plane, rtol=0.1)
     np.testing.assert_allclose(response.paper_mm, wave * 499 / length, rtol=0.03)
@@ -48,7 +52,9 @@ def test_a_taper_trades_width_for_sidelobes(make_rig):
         board = _full(msgspec.structs.replace(rig, image=msgspec.structs.replace(rig.image, apodisation=name)))
         return point_response(board.aperture, board.weights)
 
-    none, kaiser, taylor = of("none"), of("kaiser"), of("taylor")
+    none = of("none")
+    kaiser = of("kaiser")
+    taylor = of("taylor")
     for tapered in (kaiser, taylor):
         assert min(np.subtract(tapered.width_mm, none.width_mm)) > 0
         assert max(tapered.sidelobe_db) < max(none.sidelobe_db) - 8
@@ -69,7 +75,8 @@ def test_missing_positions_cost_what_is_reported(make_rig, points_rows):
     summed = np.abs(board.image()[0]).max() * float(board.count) / (board.valid.size * 4)
     whole = np.abs(board.image()[0]).max()
     assert -20 * np.log10(summed / whole) == pytest.approx(facts.loss_db, abs=1e-3)
-    assert whole == pytest.approx(1, abs=0.03)  # image amplitudes do not change
+    # Image amplitudes do not change
+    assert whole == pytest.approx(1, abs=0.03)
 
 
 def test_without_data_there_is_no_response(make_rig):

@@ -48,7 +48,8 @@ def test_points_of_a_sparse_scan_are_reconstructed_without_aliases(board, name):
     truth[tuple(np.transpose(AT))] = AMPLITUDES
     matched = samples.image()[0]
 
-    def outside(image):  # strongest pixel away from the points
+    # Strongest pixel away from the points
+    def outside(image):
         away = np.ones(image.shape, bool)
         for j, i in AT:
             away[j - 3 : j + 4, i - 3 : i + 4] = False

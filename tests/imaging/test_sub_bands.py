@@ -35,7 +35,8 @@ def test_the_model_of_a_layer_averages_over_the_same_frequencies(count):
     spectrum = Spectrum.of(CHIRP, count)
     for band, hz, weight in zip(sub_bands(CHIRP, count), spectrum.frequency_hz, spectrum.weight, strict=True):
         middle = (band.first_hz + band.last_hz) / 2
-        assert np.sum(hz * weight) == pytest.approx(middle, abs=2 * CHIRP.hz_per_sample)  # whole samples
+        # Whole samples
+        assert np.sum(hz * weight) == pytest.approx(middle, abs=2 * CHIRP.hz_per_sample)
         assert band.first_hz - 2 * CHIRP.hz_per_sample <= hz.min()
         assert hz.max() <= band.last_hz + 2 * CHIRP.hz_per_sample
 

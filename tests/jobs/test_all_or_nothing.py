@@ -77,7 +77,8 @@ def test_everything_or_nothing_is_written_and_the_command_can_be_repeated(before
     whole = Path(shutil.copytree(before, tmp_path / "whole"))
     with FaultyDisk(whole)() as disk:
         assert command(whole) == 0
-    old, new = written(before), written(whole)
+    old = written(before)
+    new = written(whole)
     assert old.keys() != new.keys() or old != new
     (last_rename,) = [step.split()[1] for step in disk.done if step.startswith("rename")][-1:]
     (committing,) = [name for name in new if name.endswith(f"/{last_rename}") and new[name] != old.get(name)]

@@ -124,7 +124,8 @@ def test_a_program_killed_after_its_mark_has_finished_its_scan(tmp_path):
 @pytest.mark.usefixtures("worker")
 def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
     (folder,) = scans(tmp_path / "in", "a")
-    library, rig = tmp_path / "library.npz", tmp_path / "rig.toml"
+    library = tmp_path / "library.npz"
+    rig = tmp_path / "rig.toml"
     library.write_bytes(b"1")
     rig.write_text("1")
 
@@ -198,9 +199,11 @@ def test_ended_early_its_programs_end_too(tmp_path):
     scans(tmp_path / "in", "slow", "slow2")
     todo = jobs(tmp_path / "in", "slow", "slow2")
     results = many.run_here(todo, 2)
-    first = next(results)  # slow2, which is not slow
+    # Slow2, which is not slow
+    first = next(results)
     assert (first.name, first.status) == ("slow2", "done")
-    results.close()  # else this takes the 600 s that it sleeps, more than a test may
+    # Else this takes the 600 s that it sleeps, more than a test may
+    results.close()
     assert not is_finished(todo[0])
 
 
@@ -244,7 +247,8 @@ def test_a_wrong_folder_fails_and_the_status_says_so(tmp_path, capsys):
     command = ["process", str(tmp_path / "in" / "a"), str(tmp_path / "in" / "bad"), "--out", str(tmp_path / "out")]
     assert main([*command, "--jobs", "1"]) == 1
     assert "2 scans: 1 done, 1 failed" in capsys.readouterr().out
-    assert main([*command[:2], "--out", str(tmp_path / "one")]) != 0  # a single one as ever: no worker, its own error
+    # A single one as ever: no worker, its own error
+    assert main([*command[:2], "--out", str(tmp_path / "one")]) != 0
     assert "out/one" not in capsys.readouterr().out
     (tmp_path / "file").touch()
     assert main([*command[:3], "--out", str(tmp_path / "file")]) == 2
@@ -357,7 +361,8 @@ def test_real_scans_end_to_end(tmp_path, capsys):
     assert (tmp_path / "out" / "plate" / "report.html").exists()
     mark = json.loads((tmp_path / "out" / "plate" / FINISHED).read_text())
     assert {"versions", "products", "options", "data"} == set(mark["made_with"])
-    assert len(mark["made_with"]["options"]["config"]) == 64  # digest of the rig file
+    # Digest of the rig file
+    assert len(mark["made_with"]["options"]["config"]) == 64
     (broken / "data_collection_cfg.json").unlink()
     assert main(command) == 0
     assert "1 skipped" in capsys.readouterr().out

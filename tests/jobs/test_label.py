@@ -31,7 +31,8 @@ def boxes(folder):
 
 def answering(*answers):
     """Answers to questions, and the questions that were asked."""
-    left, questions = list(answers), []
+    left = list(answers)
+    questions = []
 
     def ask(question):
         questions.append(question)
@@ -48,7 +49,8 @@ def test_patches_get_names_by_their_numbers(products, capsys):
     found = boxes(products)
     assert list(found.boxes) == ["copper", "\u6a61\u6728"]
     assert (found.unit, found.metal, found.by_hand) == ("mm", "copper", True)
-    assert found.boxes["copper"] == pytest.approx((-41.0, -11.0, -29.0, 11.0))  # 9 mm inside the patch
+    # 9 mm inside the patch
+    assert found.boxes["copper"] == pytest.approx((-41.0, -11.0, -29.0, 11.0))
     assert "left out, without a name: 3" in answer
     assert "\u6a61\u6728" in answer
     assert (products / "labels.png").read_bytes().startswith(b"\x89PNG")
@@ -78,7 +80,8 @@ def test_a_patch_told_to_be_metal_is_called_so(products):
 
 def test_a_box_where_nothing_shines_is_pointed_out(products, capsys):
     found = find_products(products)
-    dim = np.where(found.x_m > 0.02, 0.01, 1.0).astype(np.float32)  # -40 dB
+    # -40 dB
+    dim = np.where(found.x_m > 0.02, 0.01, 1.0).astype(np.float32)
     write_image(products / "image.npz", replace(found.images, h=found.h * dim, v=found.v * dim, p_sigma=None))
     assert main(["label", str(products), "--box", "oak=-40,-10,-20,10", "--metal", "oak"]) == 0
     assert "note: dark" not in capsys.readouterr().out
@@ -121,7 +124,8 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
     assert list(boxes(products).boxes) == ["metal", "PET", "PET#2"]
     assert boxes(products).metal == "metal"
     assert "named PET 80 %" in questions[1]
-    assert "the name pet" in capsys.readouterr().out  # pet beside PET
+    # Pet beside PET
+    assert "the name pet" in capsys.readouterr().out
     assert label(products, Edits(), ask=answering("yes", "oak", "glass", "", "nothing", "glass")[0]) == 0
     assert boxes(products).metal == "glass"
     before = (products / "labels.json").read_bytes()
@@ -132,7 +136,8 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
 
 
 def test_without_a_terminal_patches_are_listed(products, capsys):
-    assert main(["label", str(products)]) == 0  # pytest's stdin is no terminal
+    # Pytest's stdin is no terminal
+    assert main(["label", str(products)]) == 0
     answer = capsys.readouterr().out
     assert "x -41.0 to -29.0, y -11.0 to 11.0 mm  the metal reference" in answer
     assert "--from-patches" in answer

@@ -22,7 +22,8 @@ def test_without_a_terminal_rows_are_counted_in_lines(capsys, monkeypatch):
     monkeypatch.setattr(output, "monotonic", lambda: next(now))
     rows = count_steps(range(40), 40, "rows")
     assert next(rows) == 0
-    assert capsys.readouterr().err == "40 rows ...\n"  # before the first is done
+    # Before the first is done
+    assert capsys.readouterr().err == "40 rows ...\n"
     assert list(rows) == list(range(1, 40))
     lines = capsys.readouterr().err.splitlines()
     assert 3 <= len(lines) <= 10

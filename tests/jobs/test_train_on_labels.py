@@ -22,7 +22,8 @@ from polysight_simulators.scene import decode_scene, simulate
 pytestmark = pytest.mark.slow
 MINE = "h\u00e4rtes \u6a61\u6728"
 PLACES = (-40.0, 10.0), (40.0, -10.0)
-BOXES = ("copper=-60,-10,-20,30", f"{MINE}=20,-30,60,10")  # 5 mm inside the plates
+# 5 mm inside the plates
+BOXES = ("copper=-60,-10,-20,30", f"{MINE}=20,-30,60,10")
 
 
 def scene(seed: int) -> dict[str, Any]:
@@ -52,7 +53,8 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
     assert f"do: polysight label {first}" in capsys.readouterr().err
     for scan, images in ((first, first / "products"), (second, elsewhere)):
         assert main(["image", str(scan), "--out", str(images)]) == 0
-    for folder in (first, elsewhere):  # a scan folder, and products without their rows
+    # A scan folder, and products without their rows
+    for folder in (first, elsewhere):
         assert main(["label", str(folder), *drawn(), "--specimen", f"{MINE}=board 7"]) == 0
     assert main(["train", str(first), str(elsewhere), "--out", str(library)]) == 0
     answer = capsys.readouterr().out
@@ -81,7 +83,8 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
 
 
 def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
-    scan, out = scans[2], tmp_path / "out"
+    scan = scans[2]
+    out = tmp_path / "out"
     labels = tmp_path / "labels.json"
     boxes = {"reference": [-60, -10, -20, 30], MINE: [20, -30, 60, 10]}
     labels.write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "reference"}), encoding="utf-8")

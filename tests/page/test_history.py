@@ -34,7 +34,8 @@ def begun(finished):
 
 
 def test_counts_are_those_of_the_scan_folder(finished):
-    history, scan = answer(facts_of(finished)), ScanFolder.load(finished)
+    history = answer(facts_of(finished))
+    scan = ScanFolder.load(finished)
     rows = scan.committed()
     assert history.takes == {row: r.take for row, r in rows.items()}
     assert history.ended is not None
@@ -45,7 +46,8 @@ def test_counts_are_those_of_the_scan_folder(finished):
 
 
 def test_trigger_health_is_the_worst_of_all_bursts(finished):
-    history, events = answer(facts_of(finished)), read_events(finished / EVENTS).events
+    history = answer(facts_of(finished))
+    events = read_events(finished / EVENTS).events
     history.add_events(events)
     captures = [e for e in events if isinstance(e, Capture)]
     assert history.trigger.width_max_ns == max(c.width_max_ns for c in captures)
@@ -83,10 +85,8 @@ def test_a_pause_is_no_time_of_a_row(begun):
 
 def test_time_left_before_the_first_row_is_the_plan_s(finished):
     started = facts_of(finished)[0]
-    real, simulated = (
-        begin_history(started | {"simulated": False}),
-        begin_history(started | {"simulated": True}),
-    )
+    real = begin_history(started | {"simulated": False})
+    simulated = begin_history(started | {"simulated": True})
     row_s = real.row_seconds
     assert row_s is not None
     assert row_s[1] == "plan"

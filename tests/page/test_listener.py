@@ -32,7 +32,8 @@ def pi(tmp_path):
     context = zmq.Context()
     events = publisher(context, "tcp://127.0.0.1:*", tmp_path)
     address = events.getsockopt_string(zmq.LAST_ENDPOINT)
-    addresses = {"event_address": address, "command_address": "tcp://127.0.0.1:1"}  # nobody could answer there
+    # Nobody could answer there
+    addresses = {"event_address": address, "command_address": "tcp://127.0.0.1:1"}
     instrument = msgspec.structs.replace(RIG, pi=msgspec.structs.replace(RIG.pi, **addresses))
     listener = PiListener(instrument, "mine")
 

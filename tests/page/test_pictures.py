@@ -16,7 +16,8 @@ from polysight.page.watch import range_profile_db
 from polysight.sync.chain import SyncedRow
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-NY, NX = 8, 11
+NY = 8
+NX = 11
 
 
 def pixels(png: bytes) -> np.ndarray:
@@ -26,7 +27,8 @@ def pixels(png: bytes) -> np.ndarray:
 @pytest.fixture
 def images() -> Images:
     one = np.full((NY, NX), 0.01, np.complex64)
-    one[0, -1] = 1.0  # smallest y, largest x
+    # Smallest y, largest x
+    one[0, -1] = 1.0
     axes = (np.arange(NX, dtype=float), np.arange(NY, dtype=float))
     return Images(one, one.copy(), *axes, np.ones((NY, NX), bool))
 

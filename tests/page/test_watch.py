@@ -176,14 +176,18 @@ CUTS = st.lists(st.floats(0, 1), max_size=12)
 @pytest.mark.parametrize(("name", "tail"), [(MANIFEST, ManifestTail), (EVENTS, EventTail)])
 def test_any_pieces_give_the_whole(finished, tmp_path_factory, name, tail):
     raw = (finished / name).read_bytes()
-    whole = manifest.parse(raw).facts if name == MANIFEST else read_events(finished / name).events
+    if name == MANIFEST:
+        whole = manifest.parse(raw).facts
+    else:
+        whole = read_events(finished / name).events
     assert len(whole) > 4
 
     @settings(max_examples=20)
     @given(CUTS)
     def pieces(cuts: list[float]) -> None:
         path = tmp_path_factory.mktemp("pieces") / name
-        tailing, found = tail(path), []
+        tailing = tail(path)
+        found = []
         ends = sorted({int(c * len(raw)) for c in cuts} | {len(raw)})
         for before, end in zip([0, *ends], ends, strict=False):
             with path.open("ab") as f:

@@ -71,7 +71,8 @@ def dataset(tmp_path_factory):
 def out(dataset, tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(authors_items, "ALL", 240)  # pixels of a task, and weights tried: it is the page that is tested
+        # Pixels of a task, and weights tried: it is the page that is tested
+        patch.setattr(authors_items, "ALL", 240)
         patch.setattr(classify, "GRID", (1.0,))
         assert main(["reproduce", "--authors", str(dataset), "--out", str(folder)]) == 0
     return folder
@@ -90,7 +91,8 @@ def test_table_2_is_recovered_from_both_kinds_of_files(out):
         true = ROWS[number].permittivity
         seen = complex(*row["without_leakage"].values())
         assert abs(seen - true) < 0.08 * abs(true)
-        assert abs(complex(*row["as_is"].values()) - true) > abs(seen - true)  # the files hold leakage
+        # The files hold leakage
+        assert abs(complex(*row["as_is"].values()) - true) > abs(seen - true)
 
 
 def test_the_figures_stand_beside_the_published_values(out):
@@ -101,7 +103,8 @@ def test_the_figures_stand_beside_the_published_values(out):
     assert solids["scores"][1]["pixels"] > 0.9
     assert solids["judged_with_scans_left_out"] == 4
     labels = json.loads((out / "fig18.json").read_text())["solids, labels/"]
-    assert labels["scores"][1] is None  # two scans are too few to leave one out
+    # Two scans are too few to leave one out
+    assert labels["scores"][1] is None
     channels = json.loads((out / "fig20.json").read_text())
     assert channels["H, materials/"]["by_pixel"] < channels["H+V+P, materials/"]["by_pixel"]
     sugar = json.loads((out / "fig21.json").read_text())[MATERIALS]
@@ -141,7 +144,8 @@ def test_every_row_of_table_2_means_itself_and_a_stranger_none():
     assert row_of("pet_1mm") == 6
     assert row_of("Cane Sugar (3.8%, \\w glass)") == 29
     assert row_of("unobtainium") is None
-    assert row_of("PLA") is None  # two rows
+    # Two rows
+    assert row_of("PLA") is None
 
 
 def test_images_made_here_are_turned_to_lie_as_the_authors_own(dataset, tmp_path):

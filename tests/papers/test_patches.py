@@ -40,7 +40,8 @@ def test_errors_have_the_size_and_the_share_that_was_asked_for(shared):
         within = values.var(axis=2, ddof=1).mean()
         between = values.mean(axis=2).var() - within / 8
         assert within == pytest.approx((1 - shared) * std**2, rel=0.1, abs=1e-7)
-        assert between == pytest.approx(2 * shared * std**2, rel=0.1, abs=3e-6)  # the patch's and the reference's
+        # The patch's and the reference's
+        assert between == pytest.approx(2 * shared * std**2, rel=0.1, abs=3e-6)
 
 
 def test_h_and_v_err_independently():
@@ -85,7 +86,8 @@ def test_no_classifier_passes_the_bound_and_the_better_one_comes_near():
     assert alone < known < patch
     for share, bound in (("pixels", alone), ("in_scan", known), ("by_patch", patch)):
         mean = np.mean([getattr(s, share) for s in found])
-        assert bound - 0.08 < mean < bound + 0.03, share  # chance of twelve draws
+        # Chance of twelve draws
+        assert bound - 0.08 < mean < bound + 0.03, share
 
 
 def test_the_bound_is_one_without_errors_and_falls_to_chance():

@@ -71,7 +71,8 @@ def config(instrument: Instrument, write_config: Callable[[Instrument], Path]) -
 @pytest.fixture
 def hub(tmp_path: Path) -> Iterator[Path]:
     """A wire hub; gives its socket."""
-    path, stop = tmp_path / "w", threading.Event()
+    path = tmp_path / "w"
+    stop = threading.Event()
     with closing(WireHub(path, lambda _: None)) as hub:
         thread = threading.Thread(target=hub.serve, args=(stop, 0.02))
         thread.start()

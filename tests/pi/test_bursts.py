@@ -103,7 +103,8 @@ def test_the_spacing_includes_the_previous_burst():
 
 class Loop:
     def __init__(self, points=3, lines=None):
-        self.lines, self.posted = lines or FakeLines(), queue.SimpleQueue()
+        self.lines = lines or FakeLines()
+        self.posted = queue.SimpleQueue()
         self.loop = TriggerLoop(self.lines, self.posted.put, lambda: None)
         self.job = self.loop.arm(points, SPEC)
         self.loop.start()
@@ -151,7 +152,8 @@ def test_fault_table_of_the_loop(edges, number, bursts):
         fault = x.next()
         assert isinstance(fault, LoopFault)
         assert (fault.number, fault.job) == (number, x.job)
-        x.edge(900, 99)  # nothing is answered after a fault
+        # Nothing is answered after a fault
+        x.edge(900, 99)
         x.edge(901, 100)
         while x.loop.strays < 2:
             pass
@@ -211,7 +213,8 @@ def test_an_exception_inside_a_pulse_leaves_the_outputs_low_and_is_a_fault(monke
 
 def test_disarming_ends_a_running_burst_after_its_pulse():
     def disarm(n):
-        if n == 4:  # the third pulse is awaited
+        # The third pulse is awaited
+        if n == 4:
             threading.Thread(target=lambda: counted.put(x.loop.disarm())).start()
             while x.loop._job is not None:
                 pass
@@ -291,7 +294,10 @@ class Controller:
     is_real_time = True
 
     def __init__(self, rate: float = 1.0, late_ns: int = 30_000, bufsiz: int = 4096) -> None:
-        self.t, self.rate, self.late_ns, self.bufsiz = 0, rate, late_ns, bufsiz
+        self.t = 0
+        self.rate = rate
+        self.late_ns = late_ns
+        self.bufsiz = bufsiz
         self.sent: list[tuple[int, SpiBurst]] = []
 
     def now_ns(self) -> int:
@@ -305,7 +311,8 @@ class Controller:
     def close(self) -> None: ...
 
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:
-        before, self.t = self.t, self.t + self.late_ns + round(burst.duration_ns / self.rate)
+        before = self.t
+        self.t = self.t + self.late_ns + round(burst.duration_ns / self.rate)
         self.sent.append((before + self.late_ns, burst))
         return before, self.t
 
@@ -358,7 +365,9 @@ def test_a_burst_that_would_come_too_soon_is_not_sent():
 @pytest.fixture(params=["one-shot", "spi"])
 def instrument(instrument, request):
     """The shipped wiring, and its alternative."""
-    return instrument if request.param == "one-shot" else timed_by_spi(instrument)
+    if request.param == "one-shot":
+        return instrument
+    return timed_by_spi(instrument)
 
 
 @pytest.fixture

@@ -92,7 +92,8 @@ def test_line_release(rig_with, tmp_path):
     pi_4 = "Raspberry Pi 4 Model B Rev 1.4"
     assert of("QEMU Virtual Machine") == []
     assert of(pi_4, wiring="spi", sync_out=(10,)) == [], "the kernel ends a transfer, and its last bits are low"
-    assert of(pi_4) == ["warning"]  # an older kernel
+    # An older kernel
+    assert of(pi_4) == ["warning"]
     parameters = tmp_path / "pinctrl_bcm2835" / "parameters"
     parameters.mkdir(parents=True)
     for value, level in (("Y", "warning"), ("N", "ok")):
@@ -126,7 +127,8 @@ def test_journal_and_disk(tmp_path, monkeypatch):
 
 
 def test_keys(tmp_path):
-    folder, addresses = tmp_path / "keys", ("tcp://127.0.0.1:1", "tcp://0.0.0.0:2")
+    folder = tmp_path / "keys"
+    addresses = ("tcp://127.0.0.1:1", "tcp://0.0.0.0:2")
     assert attempt("keys", checks._keys, folder, addresses[:1]).level == "ok"
     found = attempt("keys", checks._keys, folder, addresses)
     assert (found.level, found.do) == ("error", "polysight-pi keys")
@@ -148,13 +150,15 @@ def test_addresses_and_bursts(tmp_path, gpio_rig):
     assert attempt("plan", checks._plan, slow).level == "error", "the burst does not end before the next point"
 
 
-SET_VALUES = 3 << 30 | 16 << 16 | 0xB4 << 8 | 0x0F  # <linux/gpio.h>: _IOWR(0xB4, 0x0F, two 64-bit words)
+# <linux/gpio.h>: _IOWR(0xB4, 0x0F, two 64-bit words)
+SET_VALUES = 3 << 30 | 16 << 16 | 0xB4 << 8 | 0x0F
 
 
 @pytest.mark.parametrize(("width_ns", "sent_ns"), [(25, 0), (1000, 0), (1001, 1001), (4000, 4000)])
 def test_a_short_pulse_is_two_calls_with_nothing_between_them(gpio_rig, monkeypatch, width_ns, sent_ns):
     """The clock stands still between them; a longer pulse is waited for."""
-    clock, log = SimpleNamespace(t=0), []
+    clock = SimpleNamespace(t=0)
+    log = []
 
     def ioctl(fd, number, values):
         bits, mask = struct.unpack("=QQ", values)

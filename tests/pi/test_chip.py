@@ -33,7 +33,9 @@ from polysight_simulators import gpio, uno
 
 require_stand_in_chip()
 
-TRIGGER, SYNC, MOSI = 26, 22, 10
+TRIGGER = 26
+SYNC = 22
+MOSI = 10
 POINTS = 4
 replace = msgspec.structs.replace
 
@@ -42,7 +44,8 @@ replace = msgspec.structs.replace
 def rig(gpio_rig):
     """Pulses behind a one-shot: this machine may be too busy for 4 us."""
     burst = replace(gpio_rig.burst, pulses=4, period_us=2000.0)
-    grid, pi = replace(gpio_rig.grid, columns=POINTS), replace(gpio_rig.pi, one_shot=True)
+    grid = replace(gpio_rig.grid, columns=POINTS)
+    pi = replace(gpio_rig.pi, one_shot=True)
     return replace(gpio_rig, pi=pi, burst=burst, grid=grid)
 
 
@@ -90,7 +93,8 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires):
     assert host.ask(m.Hello()).backend == "gpiod"
     host.accepted(host.begin())
     host.home()
-    for take in range(1, 6):  # a machine that was too busy for a row reports so, and the row is retaken
+    # A machine that was too busy for a row reports so, and the row is retaken
+    for take in range(1, 6):
         before = len(wires.rises(SYNC))
         done = host.row(0, take)
         captures = [e for e in host.of(m.Capture) if e.take == take]
@@ -199,8 +203,10 @@ def test_settings_reach_the_chip_and_glitches_do_not_reach_us(hub, wires, tmp_pa
         assert process.stdout.readline() == "True polysight RISING PULL_UP MONOTONIC 0:00:00.002000\n"
         assert process.stdout.readline() == "True polysight OUTPUT\n"
         wires.drive(WireEdge(0, TRIGGER, 0))
-        wires.drive(WireEdge(10_000_000, TRIGGER, 1), WireEdge(10_500_000, TRIGGER, 0))  # 0.5 ms: a glitch
-        wires.drive(WireEdge(20_000_000, TRIGGER, 1), WireEdge(25_000_000, TRIGGER, 0))  # 5 ms
+        # 0.5 ms: a glitch
+        wires.drive(WireEdge(10_000_000, TRIGGER, 1), WireEdge(10_500_000, TRIGGER, 0))
+        # 5 ms
+        wires.drive(WireEdge(20_000_000, TRIGGER, 1), WireEdge(25_000_000, TRIGGER, 0))
         assert process.stdout.readline() == "edge 1 None\n"
     finally:
         process.kill()
@@ -241,10 +247,12 @@ def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, homed, hub,
     assert (done.status, done.timed_by) == ("done", "spi"), done.reason
     status, _, err = program.end()
     assert status == 0, err
-    n, period_ns = spi_rig.burst.pulses, spi_rig.burst.period_us * 1e3
+    n = spi_rig.burst.pulses
+    period_ns = spi_rig.burst.period_us * 1e3
     wires.until(lambda: len([e for e in wires.edges if e.line == MOSI]) == 2 * n * spi_rig.grid.columns)
     edges = [e for e in wires.edges if e.line == MOSI]
-    rises, falls = edges[::2], edges[1::2]
+    rises = edges[::2]
+    falls = edges[1::2]
     assert [e.value for e in edges] == [1, 0] * (n * spi_rig.grid.columns)
     assert all(abs(b.t_ns - a.t_ns - 1000 * rate) <= 1 for a, b in zip(rises, falls, strict=True))
     for i, c in enumerate(host.of(m.Capture)):
@@ -309,7 +317,9 @@ def test_every_point_of_a_row_is_a_burst(gpio_rig, hub, wires, start, write_conf
     """
     if lacking := uno.missing():
         pytest.skip(f"no emulated UNO without {' '.join(lacking)}: {uno.ENABLING_COMMAND}")
-    points, pulses, period_ns = 100, 16, 1_500_000
+    points = 100
+    pulses = 16
+    period_ns = 1_500_000
     place = {"centre_x_mm": points + 3.0, "centre_y_mm": 2.0}
     rig = replace(
         gpio_rig,
@@ -340,7 +350,9 @@ def test_every_point_of_a_row_is_a_burst(gpio_rig, hub, wires, start, write_conf
         assert abs(drift) <= c.jitter_ns, "deadlines are absolute: only the last pulse's own lateness shows"
 
 
-PR_CAPBSET_DROP, CAP_IPC_LOCK, CAP_SYS_NICE = 24, 14, 23
+PR_CAPBSET_DROP = 24
+CAP_IPC_LOCK = 14
+CAP_SYS_NICE = 23
 
 
 def may_schedule():
@@ -363,7 +375,8 @@ def test_all_threads_are_scheduled_and_the_trigger_thread_first(start, gpio_rig)
     wait_for(lambda: PRIORITY in priorities(program.popen.pid), "the trigger thread")
     found = priorities(program.popen.pid)
     assert found.count(PRIORITY) == 1
-    assert found.count(OTHERS_PRIORITY) >= 3  # main, stage, executor
+    # Main, stage, executor
+    assert found.count(OTHERS_PRIORITY) >= 3
     assert "real-time" not in program.end()[2]
 
 
@@ -371,7 +384,8 @@ def test_rights_that_are_missing_are_reported_once_and_the_program_runs(start, g
     def without_rights():
         libc = ctypes.CDLL(None)
         for capability in (CAP_SYS_NICE, CAP_IPC_LOCK):
-            libc.prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)  # root's; others have none
+            # Root's; others have none
+            libc.prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)
         for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK):
             resource.setrlimit(limit, (0, 0))
 

@@ -81,7 +81,8 @@ def test_commands_without_the_service(command, instrument, write_config, hub, st
     config = write_config(at_stage_port(on_free_subnet(instrument), stage.port))
     status, out, _ = command("pulse", "--config", config, "--wires", hub, "--count", 3, "--json")
     assert (status, [r["pulses"] for r in json.loads(out)]) == (0, [4, 4, 4])
-    for axis in "xy":  # before the first homing, which `jog` needs
+    # Before the first homing, which `jog` needs
+    for axis in "xy":
         assert json.loads(command("buzz", axis, "--config", config, "--json")[1]) == {"x_mm": 0.0, "y_mm": 0.0}
     assert [c.args for c in stage.seen if c.verb == "BUZZ"] == [(0,), (1,)]
     assert command("jog", "--config", config, "--dx", 3)[0] != 0
@@ -92,11 +93,13 @@ def test_commands_without_the_service(command, instrument, write_config, hub, st
 
 def test_commands_beside_the_service(command, instrument, write_config, start, hub):
     """Commands that need lines, stage or ports are refused because the service runs; the error has its address."""
-    rig = on_free_subnet(instrument)  # ports that stay the same from one program to the next
+    # Ports that stay the same from one program to the next
+    rig = on_free_subnet(instrument)
     start(rig, "--wires", hub)
     config = write_config(rig)
     assert command("home", "--config", config)[1] == "stage at x 0.000 mm, y 0.000 mm\n"
-    _, out, _ = command("events", "--config", config, "--count", 10)  # statuses of the stage are among them
+    # Statuses of the stage are among them
+    _, out, _ = command("events", "--config", config, "--count", 10)
     assert "Heartbeat" in [json.loads(line)["type"] for line in out.splitlines()]
     for name in ("check", "pulse", "jog"):
         status, _, err = command(name, "--config", config, *(("--wires", hub) if name != "jog" else ()))

@@ -25,7 +25,8 @@ SPEEDS_AND_ACCELERATIONS = [(20, 200), (60, 200), (20, 100), (100, 400)]
 STATUS_S = 0.125
 # 107: edges that stay away for two statuses, as those that are late after a hold may.
 FAULTS = (PiFault.EDGE_TIME, PiFault.EDGE_DURING_BURST, PiFault.POINTS_MISMATCH, PiFault.TRIGGER_LINE_LOST)
-LINK_S = 0.001  # the USB serial port; the time of the line's bytes is known and subtracted
+# The USB serial port; the time of the line's bytes is known and subtracted
+LINK_S = 0.001
 
 
 class Happening(NamedTuple):
@@ -231,7 +232,8 @@ def test_drawn_edge_faults_are_found(speed_mm_s, accel_mm_s2, is_held, request):
         for _ in range(20):
             kind, edges_ns = draw_fault(rng, recorder, interval_ns)
             if are_equal(edges_ns, sound_ns, 0.012 * interval_ns):
-                continue  # a spurious edge in the place of the lost one
+                # A spurious edge in the place of the lost one
+                continue
             finished = replay(recorder, edges_ns)
             assert finished.status == "fault", (kind, [t_ns - sound_ns[0] for t_ns in edges_ns])
             assert finished.fault in FAULTS, finished

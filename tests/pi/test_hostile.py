@@ -33,7 +33,8 @@ from polysight_shared.errors import ProtocolError
 from polysight_shared.raster import RasterPlan
 from polysight_shared.stage_line import Reply
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
+INF = float("inf")
 VALUES: tuple[Any, ...] = (
     NAN, INF, -INF, -1, 0, 1, 2**31, 2**40, 2**63, 2**64 - 1, -(2**63), 1e308, -1e308, 5e-324, True, None, b"\0", "",
     "a\0b", "a\n", "..", "/etc/passwd", "../x", "x" * 300, "x" * 5000, "\u202e", [], [1], {}, {"a": 1}, [[[[[[]]]]]],
@@ -43,8 +44,10 @@ BEGIN = m.BeginRun(
     scan_id="scan", plan=RasterPlan(8, 4, 2.0, 2.0), pulses=4, period_us=1500.0, width_us=1.0, speed_mm_s=20.0
 )
 PULSE = m.Pulse(pulses=1, period_us=1500.0, width_us=1.0)
-REPLAY, ALIVE = m.Replay(scan_id="scan", from_seq=1), m.Alive(scan_id="scan")
-RUN, END = m.RunRow(scan_id="scan", row_index=0, take=1), m.EndRun(scan_id="scan", exit_status="abort")
+REPLAY = m.Replay(scan_id="scan", from_seq=1)
+ALIVE = m.Alive(scan_id="scan")
+RUN = m.RunRow(scan_id="scan", row_index=0, take=1)
+END = m.EndRun(scan_id="scan", exit_status="abort")
 
 
 def draw(rng: random.Random, valid: list[Any]) -> bytes:
@@ -64,7 +67,10 @@ def draw(rng: random.Random, valid: list[Any]) -> bytes:
             raw[rng.randrange(len(raw))] = rng.randrange(256)
         return bytes(raw)
     for _ in range(rng.randint(1, 3)):
-        inner = node["plan"] if "plan" in node and isinstance(node["plan"], dict) and rng.random() < 0.5 else node
+        if "plan" in node and isinstance(node["plan"], dict) and rng.random() < 0.5:
+            inner = node["plan"]
+        else:
+            inner = node
         inner[rng.choice(sorted(inner) or ["x"])] = copy.deepcopy(rng.choice(VALUES))
     return msgpack.packb(node, use_bin_type=True) or b""
 
@@ -81,7 +87,9 @@ class Stranger:
 
     def ask(self, raw: bytes, limit_s: float = 60.0) -> m.AnyReply | None:
         self.socket.send(raw)
-        return m.unpack_reply(self.socket.recv()) if self.socket.poll(round(limit_s * 1e3)) else None
+        if self.socket.poll(round(limit_s * 1e3)):
+            return m.unpack_reply(self.socket.recv())
+        return None
 
     def close(self) -> None:
         self._context.destroy(linger=0)
@@ -172,15 +180,18 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
     host.accepted(m.Abort(owner="mine"))
     host.until_state("ready")
     wires.close()
-    n, period_ns = instrument.burst.pulses, round(instrument.burst.period_us * 1e3)
+    n = instrument.burst.pulses
+    period_ns = round(instrument.burst.period_us * 1e3)
     rises = wires.rises(instrument.pi.sync_out[0])
     whole = [burst for i in range(0, len(rises), n) if len(burst := rises[i : i + n]) == n]
     assert len(whole) >= taken * instrument.grid.columns
     assert all(t - b[0] == k * period_ns for b in whole for k, t in enumerate(b))
 
 
-FLOOD = 100_000  # lines
-HUGE = 9_999_999_999  # ten digits, the most that a line may hold
+# Lines
+FLOOD = 100_000
+# Ten digits, the most that a line may hold
+HUGE = 9_999_999_999
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -219,7 +230,8 @@ def test_a_flood_of_lines_keeps_commands_answered(pi, stage):
         Reply("banner", fields={"fw": "x" * 60, "proto": "2"}), Reply("alarm", number=999), Reply("alarm", number=15),
         Reply("done", 7), Reply("ok", 7), Reply("error", None, 1),
     )  # fmt: skip
-    raw, ended = b"".join(line.encode() for line in lines) * 14, threading.Event()
+    raw = b"".join(line.encode() for line in lines) * 14
+    ended = threading.Event()
 
     def flood() -> None:
         for _ in range(FLOOD // 98):
@@ -237,10 +249,14 @@ def test_a_flood_of_lines_keeps_commands_answered(pi, stage):
     assert isinstance(pi.host.ask(m.Abort()), m.Accepted)
 
 
-MORE, LONG, COMMAND = 1, 2, 4
-ENOUGH_BYTES = 2 << 30  # a client that could send so much was not stopped
+MORE = 1
+LONG = 2
+COMMAND = 4
+# A client that could send so much was not stopped
+ENOUGH_BYTES = 2 << 30
 TURNS_A_SECOND = 400  # of 600 kB: twice what a Pi's network carries; loopback fills a busy machine's memory at once
-HIGHEST_BYTES = 400 << 20  # MemoryMax of the unit is 512 MiB
+# MemoryMax of the unit is 512 MiB
+HIGHEST_BYTES = 400 << 20
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
 
 
@@ -287,7 +303,9 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     program, host = start(instrument, "--wires", hub)
     host.accepted(host.begin())
     host.home()
-    pid, highest, ended = program.popen.pid, [0], threading.Event()
+    pid = program.popen.pid
+    highest = [0]
+    ended = threading.Event()
 
     def watch() -> None:
         while not ended.wait(0.02):
@@ -307,19 +325,22 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     sent = 0
     while not has_cut() and sent < ENOUGH_BYTES:
         with connected((program.ready[1], program.events[1])[which], kind) as peer, suppress(ConnectionError):
-            peer.settimeout(0.1)  # a connection that was cut may stall before it is closed
+            # A connection that was cut may stall before it is closed
+            peer.settimeout(0.1)
             left = b""
             while sent < ENOUGH_BYTES and not is_cut(peer):
                 with suppress(TimeoutError):
                     left = left or more()
                     taken = peer.send(left)
-                    sent, left = sent + taken, left[taken:]
+                    sent = sent + taken
+                    left = left[taken:]
     cut_ns = time.monotonic_ns()
     ended.set()
     watcher.join()
     assert 0 < sent < ENOUGH_BYTES
     assert highest[0] < HIGHEST_BYTES
-    host.wait(m.Heartbeat, lambda beat: beat.t_mono_ns > cut_ns)  # events were cut off, too: they come again
+    # Events were cut off, too: they come again
+    host.wait(m.Heartbeat, lambda beat: beat.t_mono_ns > cut_ns)
     # What is left of the messages may have the connections cut once more, and a command or an event with them.
     host.limit_s = 5.0
     takes = itertools.count(1)

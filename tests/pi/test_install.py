@@ -156,7 +156,8 @@ def bench(tmp_path):
 
 def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_home(bench, tmp_path):
     """`make pi-install` as a whole, with every command that changes a machine replaced."""
-    root, log = tmp_path / "root", tmp_path / "log"
+    root = tmp_path / "root"
+    log = tmp_path / "log"
     (tmp_path / "home/polysight/notes").write_text("mine")
     make = ["make", "pi-install", "HOST=pi@here", f"VENV={tmp_path}", f"BIN={tmp_path}/bin", f"OUT={tmp_path}/out"]
     for rig_file in (None, "mine"):
@@ -201,7 +202,8 @@ def test_a_machine_that_is_no_pi_is_not_changed(install, bench, tmp_path):
 
 def test_a_release_that_cannot_be_installed_changes_nothing(install, tmp_path):
     assert install().returncode == 0
-    opt, log = tmp_path / "root/opt/polysight", tmp_path / "log"
+    opt = tmp_path / "root/opt/polysight"
+    log = tmp_path / "log"
     before = sorted(p.name for p in (opt / "releases").iterdir())
     (opt / "venv/bin/python").write_text(STUB + "exit 1\n")
     log.unlink()

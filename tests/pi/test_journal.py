@@ -98,7 +98,8 @@ def test_a_batch_is_neither_stored_nor_published_until_committed(tmp_path):
 def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
     j = JournalFile(tmp_path / "a.journal")
     j.write([b"kept"])
-    real, left = os.pwrite, [room]
+    real = os.pwrite
+    left = [room]
 
     def full(fd, data, offset):
         if not left[0]:
@@ -175,7 +176,8 @@ def test_damage_in_the_middle_is_reported_and_the_original_kept(tmp_path):
     path = tmp_path / "a.journal"
     raw = bytearray(written(path, [b"one", b"two", b"three", b"four"]))
     at = raw.index(b"two")
-    for number in ("", "2"):  # a second damage does not replace the first one's copy
+    # A second damage does not replace the first one's copy
+    for number in ("", "2"):
         raw[at] ^= 1
         path.write_bytes(raw)
         j = JournalFile(path)
@@ -224,7 +226,8 @@ def test_no_scan_begins_without_space_for_its_journal(tmp_path, monkeypatch):
         folder.check_room("scan", 70_001)
     folder.journal_path("there").write_bytes(bytes(69_000 * CAPTURE_BYTES))
     free = SPARE_BYTES + 1_000 * CAPTURE_BYTES
-    folder.check_room("there", 70_000)  # only the rest needs space
+    # Only the rest needs space
+    folder.check_room("there", 70_000)
     with refused(ErrorCode.DISK_FULL):
         folder.check_room("another", 70_000)
     folder.close()
@@ -255,7 +258,8 @@ def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
 
 def test_a_full_disk_refuses_the_beginning_and_the_end_of_a_run(pi, monkeypatch):
     """`Accepted` says that the event is on the disk."""
-    host, stop = pi.host, m.EndRun(scan_id="scan", exit_status="success")
+    host = pi.host
+    stop = m.EndRun(scan_id="scan", exit_status="success")
 
     def refused_when_full(command):
         monkeypatch.setattr(journal_module.os, "pwrite", full)

@@ -35,7 +35,9 @@ def same(event: m.AnyEvent, other: tuple[type[m.AnyEvent], dict[str, Any]]) -> b
 
 @pytest.mark.parametrize("seed", range(5))
 def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
-    at, ended, added = 0, False, events()
+    at = 0
+    ended = False
+    added = events()
     while not ended:
         at += 1
         path = tmp_path / str(at)

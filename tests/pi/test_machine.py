@@ -161,7 +161,9 @@ def test_a_stage_that_falls_silent_is_noticed_in_time(phase, answer_s, heartbeat
     heartbeat_s = heartbeat_ms / 1e3
     watch = StatusWatch(heartbeat_s, 0.0)
     watch.interval_s = heartbeat_s / STATUS_PER_HEARTBEAT
-    dead_s, t, answers = 2.0 + phase * heartbeat_s, 0.0, []
+    dead_s = 2.0 + phase * heartbeat_s
+    t = 0.0
+    answers = []
     while True:
         t += watch.look_s
         if answers and answers[0] <= t:
@@ -216,7 +218,8 @@ def test_a_wire_that_comes_off_is_noticed_while_the_row_runs():
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), max_size=30))
 def test_a_wire_with_edges_is_never_reported_off(steps):
     """Statuses and edges in any order, statuses up to three points ahead of the edges seen when one follows soon."""
-    watch, edges = TriggerWatch(), 0
+    watch = TriggerWatch()
+    edges = 0
     for ahead, more in steps:
         edges += more + 1  # between two statuses at least one edge came
         assert not watch.is_silent(edges + ahead, edges)
@@ -273,13 +276,15 @@ def test_any_order_of_events(start, actions):
         with suppress(RefusedError):
             ACTIONS[action](bench)
             bench.run_posted()
-            if before[0] and action not in ("home", "row"):  # these clear it
+            # These clear it
+            if before[0] and action not in ("home", "row"):
                 assert (machine.fault, machine.reason) == before, "the first fault wins"
             assert bench.armed <= (machine.row is not None), "edges are answered only during a row"
             assert (machine.row is not None) == (machine.state in ROW_STATES)
             assert (machine.row is not None) == (len(bench.of(m.RowStarted)) == len(bench.of(m.RowFinished)) + 1)
     if machine.row is not None:
-        machine.happen("Resume")  # a held row waits for somebody
+        # A held row waits for somebody
+        machine.happen("Resume")
         bench.later(400.0)
         assert machine.row is None, "every row ends"
 
@@ -316,7 +321,8 @@ def test_the_rules_are_whole():
     assert len(set(named)) == len(named)
     assert {s for s, _ in named} == states
     assert {s for r in RULES for s in r.leads_to.split()} <= states | {"same"}
-    reached, todo = set(), ["idle"]
+    reached = set()
+    todo = ["idle"]
     while todo:
         state = todo.pop()
         if state not in reached:
@@ -355,7 +361,8 @@ def test_the_pi_takes_a_raster_when_the_rig_file_is_taken(columns, rows, speed, 
         RIG.stage, speed_mm_s=float(speed), accel_mm_s2=float(accel), backlash_mm=float(backlash),
         centre_x_mm=float(centre), travel_speed_mm_s=100.0,
     )  # fmt: skip
-    grid, burst = replace(RIG.grid, columns=columns, rows=rows), Burst(pulses=1, period_us=MIN_PERIOD_US)
+    grid = replace(RIG.grid, columns=columns, rows=rows)
+    burst = Burst(pulses=1, period_us=MIN_PERIOD_US)
     run = m.BeginRun(
         scan_id="s", plan=plan_raster(grid), pulses=1, period_us=burst.period_us, width_us=burst.width_us,
         speed_mm_s=stage.speed_mm_s,
@@ -370,8 +377,10 @@ def test_the_pi_takes_a_raster_when_the_rig_file_is_taken(columns, rows, speed, 
 
 def test_the_run_up_is_what_the_host_counts_with():
     """A row from rest to rest: its points and the run-up at both ends, at a speed that is reached."""
-    grid, stage = RIG.grid, RIG.stage
-    v, a = stage.speed_mm_s, stage.accel_mm_s2
+    grid = RIG.grid
+    stage = RIG.stage
+    v = stage.speed_mm_s
+    a = stage.accel_mm_s2
     length = (grid.columns - 1) * grid.step_x_mm + 2 * stage.run_up_mm(grid.step_x_mm)
     assert row_motion_s(grid, stage) == pytest.approx(length / v + v / a)
     assert stage.run_up_mm(2.0, 20.0) == pytest.approx(20.0**2 / (2 * a) + 2.0)
@@ -387,5 +396,6 @@ def test_the_pi_sends_the_pulses_that_the_rig_file_may_hold(period, width):
             return False
 
     edges = (MIN_PERIOD_US, *WIDTH_US)
-    if min(abs(x - e) for e in edges for x in (period, width)) > 1e-3:  # the Pi counts in whole nanoseconds
+    # The Pi counts in whole nanoseconds
+    if min(abs(x - e) for e in edges for x in (period, width)) > 1e-3:
         assert sent() == (not rule_of(lambda: Burst(pulses=1, period_us=period, width_us=width)))

@@ -40,7 +40,8 @@ class SlowDriver(FakeDriver):
 
     def __init__(self, bench: Bench) -> None:
         super().__init__()
-        self.bench, self.row_takes_s = bench, 0.0
+        self.bench = bench
+        self.row_takes_s = 0.0
 
     def row(self, *_: Any) -> int:
         self.bench.t += self.row_takes_s
@@ -64,7 +65,8 @@ class Bench:
     def turn(self, *items: Any) -> None:
         for item in items:
             self.executor.post(item)
-        for _ in range(2):  # a command that the journal answers
+        # A command that the journal answers
+        for _ in range(2):
             self.executor.post(lambda: None)  # so that no turn waits
             self.executor._turn()
             self.journal_thread.do_waiting()
@@ -151,7 +153,8 @@ def test_another_machine_does_not_take_a_pi_whose_host_lives(bench):
 def test_replies_are_short_while_a_row_runs_and_whole_before_and_after(bench):
     bench.ready()
     for _ in range(60):
-        bench.begin()  # each adds an event
+        # Each adds an event
+        bench.begin()
     assert len(bench.ask(m.Replay(scan_id="s", from_seq=1)).events) == 61
     bench.run_row()
     paged: list[int] = []
@@ -185,7 +188,8 @@ def owner_in_row(pi, stage):
 @pytest.fixture
 def hang(pi):
     """Lets the executor hang, until the returned event is set."""
-    hangs, released = threading.Event(), threading.Event()
+    hangs = threading.Event()
+    released = threading.Event()
 
     def hang():
         pi.service.executor.post(lambda: (hangs.set(), released.wait(HANG_S)))
@@ -218,7 +222,8 @@ def test_an_old_row_does_not_move_the_stage_again(host, stage):
     for row, take in ((1, 1), (1, 2), (1, 3), (2, 1)):
         old = m.RunRow(scan_id="scan", row_index=row, take=take)
         assert host.refused(old) == PiFault.BAD_REQUEST
-    host.accepted(m.RunRow(scan_id="scan", row_index=1, take=4))  # repeated: it was the last one
+    # Repeated: it was the last one
+    host.accepted(m.RunRow(scan_id="scan", row_index=1, take=4))
     assert stage.rows_run == 4
     assert sum(isinstance(e, m.RowStarted) for e in host.replay()) == 4
     host.accepted(host.begin())
@@ -310,7 +315,8 @@ def test_the_watchdog_is_fed_by_the_executor_alone(pi, hang, monkeypatch, tmp_pa
         while select.select([listener], [], [], 0)[0]:
             listener.recv(100)
         listener.settimeout(2 * executors.TURN_S)
-        pi.host.ask(m.Status())  # the server is alive
+        # The server is alive
+        pi.host.ask(m.Status())
         with pytest.raises(TimeoutError):
             listener.recv(100)
         released.set()

@@ -24,7 +24,8 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     assert hello.stage == instrument.stage.placement_settings
     assert hello.t_unix_ns > 1_600_000_000 * 10**9
     done = host.row(1)
-    burst, n = instrument.burst, instrument.grid.columns
+    burst = instrument.burst
+    n = instrument.grid.columns
     assert (done.status, done.points, done.edges, done.bursts) == ("done", n, n, n)
     assert (done.pulses, done.fault, done.timed_by) == (n * burst.pulses, 0, "one-shot")
     assert done.pulses_seen
@@ -33,7 +34,8 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     assert [type(e) for e in seen] == [m.RunStarted, m.RowStarted] + n * [m.Capture] + [m.RowFinished]
     captures = host.of(m.Capture)
     assert [c.point for c in captures] == list(range(n))
-    assert [c.column for c in captures] == list(reversed(range(n)))  # odd rows run towards -x
+    # Odd rows run towards -x
+    assert [c.column for c in captures] == list(reversed(range(n)))
     for c in captures:
         assert c.last_pulse_ns - c.first_pulse_ns == (burst.pulses - 1) * round(burst.period_us * 1e3)
         assert (c.pulses, c.width_max_ns, c.jitter_ns) == (burst.pulses, round(burst.width_us * 1e3), 0)
@@ -51,10 +53,12 @@ def test_only_pins_count_as_hardware():
 
 
 def test_stage_gets_the_row_in_steps_and_a_heartbeat(host, stage):
-    stage.pace_s = 0.1  # the row takes longer than two quarters of a heartbeat
+    # The row takes longer than two quarters of a heartbeat
+    stage.pace_s = 0.1
     host.row(0)
     row = next(c for c in stage.seen if c.verb == "ROW")
-    half, y = 3.5 * 2 * 200, 250 * 200 - 1.5 * 2 * 200
+    half = 3.5 * 2 * 200
+    y = 250 * 200 - 1.5 * 2 * 200
     assert row.args == (400 * 200 - half, 400, 8, y, 4000)
     sets = {c.args[0]: c.args[1] for c in stage.seen if c.verb == "SET"}
     assert sets == {0: 40000, 1: 1000, 2: 20, 3: 160000, 4: 100000, 5: 8000, 6: 0, 7: 0}
@@ -153,7 +157,8 @@ def test_counts_that_differ_fault_the_row_alone(host, stage, wrong):
     number = PiFault.EDGE_TIME if wrong == "skip" else PiFault.POINTS_MISMATCH
     assert (done.status, done.fault) == ("fault", number)
     assert host.of(m.Fault)[0].number == number
-    stage.skip, stage.extra = set(), False
+    stage.skip = set()
+    stage.extra = False
     assert host.until_state("ready").fault == number
     assert host.row(0, take=2).status == "done"
     assert host.ask(m.Status()).fault == 0
@@ -163,7 +168,8 @@ def test_stage_alarm_in_a_row_is_a_fault_until_homed(host, stage):
     stage.alarm_at = {3: StageError.LIMIT_SWITCH}
     done = host.row(0)
     assert (done.status, done.fault) == ("fault", PiFault.STAGE_ALARM)
-    assert done.bursts == len(host.of(m.Capture)) <= 3  # edges still under way at the alarm are not answered
+    # Edges still under way at the alarm are not answered
+    assert done.bursts == len(host.of(m.Capture)) <= 3
     assert not host.until_state("fault").homed
     assert host.refused(m.RunRow(scan_id="scan", row_index=0, take=2)) == PiFault.NOT_READY
     host.home()
@@ -201,7 +207,8 @@ def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
 
 
 def test_a_heartbeat_counts_for_its_run_alone(pi):
-    host, alive = pi.host, m.Alive(scan_id="scan")
+    host = pi.host
+    alive = m.Alive(scan_id="scan")
     assert host.refused(alive) == PiFault.NOT_READY
     host.accepted(host.begin())
     assert host.accepted(alive).state == "idle"
@@ -239,7 +246,8 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(pi, 
     raised = []
     monkeypatch.setattr("threading.excepthook", lambda args: raised.append(args.exc_type))
     monkeypatch.setattr("polysight_pi.machine.Machine.on_burst", fail)
-    stage.pace_s = 0.2  # the reply to the row goes out before its first edge comes
+    # The reply to the row goes out before its first edge comes
+    stage.pace_s = 0.2
     host.start_row()
     pi.thread.join(HANG_S)
     assert raised == [ZeroDivisionError, DeviceError], "in the executor's thread, and out of `serve`"

@@ -26,7 +26,8 @@ from polysight_shared.faults import PiFault
 from polysight_shared.stage_line import Immediate
 
 SAFE_WITHIN_S = 0.5
-LATE_S = 0.6  # instead of 3 s, so that the tests are short
+# Instead of 3 s, so that the tests are short
+LATE_S = 0.6
 OWNER = "mine"
 
 
@@ -180,7 +181,9 @@ def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
 @pytest.mark.parametrize("which", ["command", "event"])
 def test_sockets_that_hang_stop_the_motion(pi, stage, monkeypatch, which):
     monkeypatch.setattr("polysight_pi.service.LATE_S", LATE_S)
-    server, host, go_on = pi.service.server, pi.host, threading.Event()
+    server = pi.service.server
+    host = pi.host
+    go_on = threading.Event()
     host.accepted(host.begin())
     host.home()
     stage.pace_s = 0.05
@@ -239,8 +242,11 @@ def test_leaving_subscribers_keep_no_command_waiting(start, instrument, hub, req
 def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, request, record_testsuite_property):
     """From the last heartbeat, or the command to abort, to STOP: within half a second, wherever the disk hangs."""
     moments = 100 if request.config.getoption("--long") else 4
-    host, rng, longest_s = pi.host, random.Random(36), 0.0
-    heartbeat_ms = 90  # silent for four of these
+    host = pi.host
+    rng = random.Random(36)
+    longest_s = 0.0
+    # Silent for four of these
+    heartbeat_ms = 90
     stage.pace_s = 0.02
     stage.endless = True
     host.accepted(host.begin(owner=OWNER, heartbeat_ms=heartbeat_ms))

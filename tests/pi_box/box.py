@@ -15,8 +15,13 @@ from typing import Any, NamedTuple
 
 MEMORY_WRITE = "memory_region_ops_write"
 GPIO_BASE = 0x3F200000
-FTDI = "0403"  # vendor of the stage's USB serial chip
-SELECT, SET, CLEAR, LEVEL = 0x00, 0x1C, 0x28, 0x34  # offsets of registers, BCM2835 ARM Peripherals, 6.1
+# Vendor of the stage's USB serial chip
+FTDI = "0403"
+# offsets of registers, BCM2835 ARM Peripherals, 6.1
+SELECT = 0x00
+SET = 0x1C
+CLEAR = 0x28
+LEVEL = 0x34
 # Only what hangs reaches these: a busy computer has needed 5 minutes to boot.
 BOOT_LIMIT_S = 3600.0
 COMMAND_LIMIT_S = 1800.0
@@ -29,7 +34,8 @@ class Write(NamedTuple):
 
     t_s: float
     high: bool
-    lines: int  # bit n: line n
+    # Bit n: line n
+    lines: int
 
 
 def free_port() -> int:
@@ -82,14 +88,19 @@ class Box:
     """
 
     def __init__(self, image: Path, work: Path, stage: Path) -> None:
-        self.work, self.stage = work, stage
-        self.console, self._trace = work / "console.log", work / "trace.log"
-        self.ssh_port, self.command_port, self.event_port = free_port(), free_port(), free_port()
+        self.work = work
+        self.stage = stage
+        self.console = work / "console.log"
+        self._trace = work / "trace.log"
+        self.ssh_port = free_port()
+        self.command_port = free_port()
+        self.event_port = free_port()
         forward = {22: self.ssh_port, 5601: self.command_port, 5602: self.event_port}
         forwards = "".join(f",hostfwd=tcp:127.0.0.1:{outer}-:{inner}" for inner, outer in forward.items())
         command = ["qemu-system-aarch64", "-M", "raspi3b", "-display", "none", "-msg", "timestamp=on"]
         command += ["-kernel", str(image / "vmlinuz"), "-initrd", str(image / "initrd"), "-dtb", str(image / "pi.dtb")]
-        clock = f"systemd.clock_usec={time.time_ns() // 1000}"  # a Pi has no battery for its clock either, but the net
+        # A Pi has no battery for its clock either, but the net
+        clock = f"systemd.clock_usec={time.time_ns() // 1000}"
         command += ["-append", f"{KERNEL_LINE} {clock}", "-serial", f"file:{self.console}", "-D", str(self._trace)]
         command += ["-drive", f"if=sd,format=raw,snapshot=on,file={image / 'root.img'}"]
         # Restricted: nothing but the forwarded ports leads in or out; what a release needs is on the card.

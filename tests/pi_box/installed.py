@@ -45,7 +45,9 @@ class InstalledPi:
     """The box with a release on it, the stage at its USB port, and the host's folder of keys."""
 
     def __init__(self, box: Box, uno: Uno, work: Path) -> None:
-        self.box, self.uno, self.work = box, uno, work
+        self.box = box
+        self.uno = uno
+        self.work = work
         self.rig = rig_of_the_box()
         self.keys = work / "keys"
 

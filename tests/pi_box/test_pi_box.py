@@ -24,7 +24,8 @@ from polysight_shared.faults import PiFault
 from polysight_shared.sockets import HandshakeMonitor, requester
 
 SYNC_OUT = 22
-INPUT, OUTPUT = 0, 1
+INPUT = 0
+OUTPUT = 1
 TRIES = 5
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
@@ -136,7 +137,8 @@ def test_a_bench_burst_is_made_of_one_rise_and_one_fall_a_pulse(pi: InstalledPi,
         assert [w.lines for w in writes] == [1 << SYNC_OUT] * len(writes), "no other line is touched"
         before = [False, *(w.high for w in writes)]
         edges = [w for w, was in zip(writes, before, strict=False) if w.high != was]
-        rises, falls = edges[::2], edges[1::2]
+        rises = edges[::2]
+        falls = edges[1::2]
         assert len(rises) == len(falls) == replies[0].pulses > 0
         assert (replies[0].pulses == i.pulses) == (replies[0].fault == 0)
         assert pi.box.level(SYNC_OUT) == 0
@@ -199,7 +201,8 @@ def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed:
     homed.wait(m.RowStarted)
     in_row_mm_s = pi.rig.stage.speed_mm_s
     pi.box.wait(lambda: pi.uno.speed_mm_s == pytest.approx(in_row_mm_s, rel=0.01), "the row is under way")
-    killed, begun = pid_of(pi), time.monotonic()
+    killed = pid_of(pi)
+    begun = time.monotonic()
     pi.systemctl("kill --signal=KILL polysight-pi")
     last_seen_mm = pi.uno.x_mm
     pi.box.wait(lambda: not pi.uno.moving, "the stage rests")
@@ -218,7 +221,8 @@ def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed:
 
 def test_a_service_that_hangs_is_started_anew(pi: InstalledPi):
     """The executor feeds systemd's watchdog."""
-    hung, begun = pid_of(pi), time.monotonic()
+    hung = pid_of(pi)
+    begun = time.monotonic()
     pi.systemctl("kill --signal=STOP polysight-pi")
     pi.box.wait(lambda: pid_of(pi) not in (hung, "0"), "another process")
     pi.until_ready()
@@ -250,7 +254,8 @@ def test_update_and_roll_back(pi: InstalledPi):
     """Rig file, keys and journals stay; a service that runs goes on with the release that is in use."""
     files = "/etc/polysight/instrument.toml /etc/polysight/keys/* /var/lib/polysight/journal/*.journal"
     kept = f"sudo sh -c 'sha256sum {files}'"
-    before, first = pi.box.run(kept), pid_of(pi)
+    before = pi.box.run(kept)
+    first = pid_of(pi)
     begun = time.monotonic()
     pi.install()
     print_figure(f"update: {seconds(begun)}")

@@ -28,8 +28,10 @@ class Uno:
     """
 
     def __init__(self, config: Path, work: Path) -> None:
-        self.port, wires = work / "ttyUNO", work / "wires"
-        self.motion: WireMotion | None = None  # the last change of it
+        self.port = work / "ttyUNO"
+        wires = work / "wires"
+        # The last change of it
+        self.motion: WireMotion | None = None
         self._heard_s = time.monotonic()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(str(wires))

@@ -25,7 +25,11 @@ from polysight_simulators.scene import decode_scene, simulate
 
 RIG = ["--config", str(RIG_FILE)]
 SMALL = ["--columns", "40", "--rows", "30"]
-PULSES, ROWS, COLUMNS, SNR_DB, GAP_S = 8, 2, 12, 12.0, 20.0
+PULSES = 8
+ROWS = 2
+COLUMNS = 12
+SNR_DB = 12.0
+GAP_S = 20.0
 
 
 def test_text_and_json_have_the_same_plan(capsys):
@@ -104,10 +108,13 @@ def taken_by_a_pi(scan, rig, gap_s: float) -> None:
     facts[0]["pi"] = {"release": "test"}
     (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
     (scan / EVENTS).unlink(missing_ok=True)
-    events, t, seq = EventWriter(scan / EVENTS), 0.0, 0
+    events = EventWriter(scan / EVENTS)
+    t = 0.0
+    seq = 0
     for row in plan_raster(Changes(columns=COLUMNS, rows=ROWS).apply(rig).grid):
         for point in range(row.points):
-            seq, ns = seq + 1, round(t * 1e9)
+            seq = seq + 1
+            ns = round(t * 1e9)
             events.append(
                 Capture(
                     scan_id="quiet", seq=seq, t_mono_ns=ns, row_index=row.index, take=1, point=point,
@@ -133,12 +140,14 @@ def planned(capsys):
 def test_noise_and_standstill_are_measured_in_the_scan(scan, rig, planned):
     without = planned()
     alike = planned("--like", scan)
-    assert alike["position_snr_db"] == pytest.approx(SNR_DB + 12.04, abs=0.7)  # 16 chirps
+    # 16 chirps
+    assert alike["position_snr_db"] == pytest.approx(SNR_DB + 12.04, abs=0.7)
     assert "simulated scan quiet" in alike["noise_source"]
     assert abs(without["position_snr_db"] - alike["position_snr_db"]) > 5
     assert alike["time_s"]["standstill"] == without["time_s"]["standstill"]  # without a Pi there are no times
     small = Changes(columns=COLUMNS, rows=ROWS, pulses=PULSES).apply(rig)
-    grid, stage = small.grid, small.stage
+    grid = small.grid
+    stage = small.stage
     ramps_s = row_motion_s(grid, stage) - (COLUMNS - 1) * grid.step_x_mm / stage.speed_mm_s
     motion_s = ramps_s + turn_s(grid, stage) + tail_s(small)
     taken_by_a_pi(scan, rig, GAP_S)

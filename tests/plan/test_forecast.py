@@ -48,10 +48,12 @@ def test_image_noise_is_that_of_a_weighted_sum(rig):
     small = Changes(columns=16, rows=12).apply(rig)
     aperture, taper = aperture_of(small)
     rng = np.random.default_rng(1)
-    rx, samples = len(aperture.antennas.rx_m), slice(*small.chirp.linear_samples)
+    rx = len(aperture.antennas.rx_m)
+    samples = slice(*small.chirp.linear_samples)
     window = np.hanning(samples.stop - samples.start + 2)[1:-1]
     weight = taper[None, :, :, None] * window
-    noise_power = 10 ** (-3 / 10) / small.burst.pulses  # 3 dB a chirp
+    # 3 dB a chirp
+    noise_power = 10 ** (-3 / 10) / small.burst.pulses
     trials = []
     for _ in range(60):
         shape = (rx, *taper.shape, window.size)
@@ -63,12 +65,14 @@ def test_image_noise_is_that_of_a_weighted_sum(rig):
 
 def test_the_loss_by_motion_is_that_of_the_sum_over_the_pulses(rig):
     moving = Changes(speed_mm_s=100.0, period_us=1200.0).apply(rig)
-    burst, antennas = predict_burst(moving), Antennas.of(moving, moving.receivers[0])
+    burst = predict_burst(moving)
+    antennas = Antennas.of(moving, moving.receivers[0])
     middle = np.array(specular_midpoint_m(moving, moving.receivers[0]))
     f = moving.chirp.first_sample_hz + moving.chirp.hz_per_sample * 96
     x = -(moving.grid.columns - 1) / 2 * 2e-3 + 100e-3 * 1.2e-3 * (np.arange(16) - 7.5)
     from_stage = middle - np.outer(x, [1, 0, 0])
-    away_tx, away_rx = from_stage - antennas.tx_m, from_stage - antennas.rx_m[0]
+    away_tx = from_stage - antennas.tx_m
+    away_rx = from_stage - antennas.rx_m[0]
     path = np.linalg.norm(away_tx, axis=1) + np.linalg.norm(away_rx, axis=1)
     loss = -20 * np.log10(abs(np.mean(np.exp(2j * np.pi * f * path / 299792458.0))))
     assert burst.travel_mm == pytest.approx(1.8)
@@ -83,7 +87,8 @@ def test_ghosts_are_at_the_same_place_as_in_a_backprojected_image(rig, axis):
     changed = Changes(**({"step_x_mm": step, "columns": n} if axis == 0 else {"step_y_mm": step, "rows": n})).apply(rig)
     free_m = field_limits(changed).alias_free_mm[axis] / 1e3
     f = np.array([rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * 192])
-    slope, a = PhaseSlope(rig, axis), Antennas.of(rig, rig.receivers[0])
+    slope = PhaseSlope(rig, axis)
+    a = Antennas.of(rig, rig.receivers[0])
     # From the middle of the aperture's middle half the object and its ghost lie symmetrically.
     middle = np.array(specular_midpoint_m(rig, rig.receivers[0]))
     unit = np.eye(3)[axis]

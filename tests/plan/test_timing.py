@@ -22,7 +22,8 @@ class Stage:
 
     def __init__(self, rig: Instrument) -> None:
         s = rig.stage
-        self.board, self._sequence = PythonStage(Rig(s.steps_per_mm)), 0
+        self.board = PythonStage(Rig(s.steps_per_mm))
+        self._sequence = 0
         self.command("HELLO")
         for parameter, value in (
             (Parameter.ACCEL, s.accel_mm_s2 * s.steps_per_mm),
@@ -107,7 +108,8 @@ def test_moves_take_no_less_than_at_full_speed_and_no_less_than_acceleration_all
 
 def test_a_row_of_whole_packets_has_no_wait_for_the_last_packet(rig):
     # 350 columns x 13 frames x 4096 bytes = 12,800 packets of 1456 bytes.
-    whole, short = Changes(pulses=13).apply(rig), Changes(pulses=16).apply(rig)
+    whole = Changes(pulses=13).apply(rig)
+    short = Changes(pulses=16).apply(rig)
     assert whole_packets(whole)
     assert not whole_packets(short)
     assert tail_s(whole) == 0.0

@@ -29,7 +29,8 @@ SCENE = scene_of(
     step_mm=(14.0, 12.0),
     image={"columns": 40, "rows": 30, "pixel_mm": 4.0},
 )
-METAL = ["--metal", "-36,0,30,40"]  # the leading minus does not make it an option
+# The leading minus does not make it an option
+METAL = ["--metal", "-36,0,30,40"]
 
 
 @pytest.fixture(scope="module")

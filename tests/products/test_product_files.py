@@ -17,7 +17,9 @@ from polysight_shared.files import write_atomically
 def test_image_product_round_trips(tmp_path):
     rng = np.random.default_rng(0)
     h, v, p = (rng.standard_normal((3, 5, 7)) + 1j * rng.standard_normal((3, 5, 7))).astype(np.complex64)
-    x, y, valid = np.linspace(-0.1, 0.1, 7), np.linspace(0.0, 0.1, 5), rng.uniform(size=h.shape) < 0.8
+    x = np.linspace(-0.1, 0.1, 7)
+    y = np.linspace(0.0, 0.1, 5)
+    valid = rng.uniform(size=h.shape) < 0.8
     path = tmp_path / "products" / "image.npz"
     images = Images(h, v, x, y, valid, p)
     write_image(path, images)

@@ -26,11 +26,14 @@ from polysight_shared.errors import DataError, os_error
 from polysight_shared.files import write_atomically
 from polysight_shared.tables import to_builtins
 
-HERE = published_rig()  # rig file in the current folder
-USED = msgspec.structs.replace(  # rig of the scan: another slope, another window
+# Rig file in the current folder
+HERE = published_rig()
+# Rig of the scan: another slope, another window
+USED = msgspec.structs.replace(
     HERE, chirp=msgspec.structs.replace(HERE.chirp, slope_hz_per_s=HERE.chirp.slope_hz_per_s * 0.4, adc_start_us=9.0)
 )
-WATER, STACK = 9.4 - 18j, ["glass,5.5,0.05,3", "water,?"]
+WATER = 9.4 - 18j
+STACK = ["glass,5.5,0.05,3", "water,?"]
 ANGLE_DEG = 55.0
 
 
@@ -79,7 +82,8 @@ def test_a_rig_file_may_replace_the_chirp_unless_sub_bands_contradict_it(folder,
         assert "patch 3" in message
         assert "instrument.toml" in message
     materials = json.loads((folder / MATERIALS).read_text())
-    del materials["segments"][0]["bands"]  # nothing contradicts the given chirp
+    # Nothing contradicts the given chirp
+    del materials["segments"][0]["bands"]
     write_json(folder / MATERIALS, materials)
     assert abs(found(capsys, folder, "--config", "instrument.toml") - WATER) > 1
 
@@ -126,7 +130,8 @@ def test_a_full_disk_is_reported_with_the_path(tmp_path, monkeypatch):
 
 
 def test_gains_are_relative_to_each_boards_first_rx():
-    none, axis = np.zeros((1, 1), np.complex64), np.zeros(1)
+    none = np.zeros((1, 1), np.complex64)
+    axis = np.zeros(1)
     gains = {
         "RH": np.array([2.0, 20.0, 2.0j, -0.2], np.complex128),
         "RV": np.array([5j, 5j], np.complex128),

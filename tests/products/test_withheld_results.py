@@ -24,7 +24,8 @@ from polysight_shared.error_codes import ErrorCode
 
 @pytest.mark.parametrize("level", ["good", "care", "none"])
 def test_every_export_holds_the_verdict_and_p_sigma(tmp_path, level):
-    folder, out = judged_products(tmp_path / "one", level), tmp_path / "out"
+    folder = judged_products(tmp_path / "one", level)
+    out = tmp_path / "out"
     assert main(["export", str(folder), "--netcdf", "--mat", "--csv", "--out", str(out)]) == 0
     reasons = json.loads((folder / "materials.json").read_text(encoding="utf-8"))["verdict"]["reasons"]
     sigma = read_image(folder / "image.npz").p_sigma
@@ -42,7 +43,8 @@ def test_every_export_holds_the_verdict_and_p_sigma(tmp_path, level):
 
 def test_without_a_result_no_export_names_anything(tmp_path):
     """Even if the files contain names, as written by a faulty program."""
-    folder, out = judged_products(tmp_path / "one", "none", careless=True), tmp_path / "out"
+    folder = judged_products(tmp_path / "one", "none", careless=True)
+    out = tmp_path / "out"
     assert any(name in (folder / "materials.json").read_text(encoding="utf-8") for name in NAMES)
     assert main(["export", str(folder), "--mat", "--csv", "--out", str(out)]) == 0
     text = (out / "materials.csv").read_text(encoding="utf-8")
@@ -86,7 +88,8 @@ def test_loss_is_minus_imag_in_the_covariance_too(tmp_path):
 
 def test_products_of_earlier_releases_are_read_as_before(tmp_path):
     folder = judged_products(tmp_path / "one", None)
-    scan, products = open_scan(folder), read_products(folder)
+    scan = open_scan(folder)
+    products = read_products(folder)
     assert scan.verdict is None
     assert products.images.p_sigma is None
     assert "p_sigma" not in scan.image()
@@ -102,7 +105,9 @@ def test_products_of_earlier_releases_are_read_as_before(tmp_path):
 
 
 def test_p_sigma_has_the_shape_of_the_image(tmp_path):
-    one, axis, valid = np.ones((2, 2), np.complex64), np.array([0.0, 0.1]), np.ones((2, 2), bool)
+    one = np.ones((2, 2), np.complex64)
+    axis = np.array([0.0, 0.1])
+    valid = np.ones((2, 2), bool)
     with refused(ErrorCode.MISMATCH, "p_sigma"):
         write_image(tmp_path / "i.npz", Images(one, one, axis, axis, valid, one, np.ones((3, 2))))
     write_json(tmp_path / "materials.json", {"segments": []})

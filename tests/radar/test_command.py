@@ -211,7 +211,8 @@ def test_a_trace_has_both_directions_and_every_change_of_a_line(rig_file, tmp_pa
     assert (lines[0]["trace"], lines[0]["board"], lines[0]["place"]) == (1, "RH", "FTRH")
     assert [r["level"] for r in lines if r.get("line") == "NRST"] == [0, 1]
     levels = [r["level"] for r in lines if r.get("line") == "HOST_INTR"]
-    assert levels == [n % 2 for n in range(len(levels))]  # each a change
+    # Each a change
+    assert levels == [n % 2 for n in range(len(levels))]
     text = "".join(r.get("in", "") for r in lines)
     assert text.count("badccdab") == levels.count(1)
     assert all(a["t"] <= b["t"] for a, b in pairwise(lines[1:]))

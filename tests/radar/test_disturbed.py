@@ -82,6 +82,7 @@ def test_a_flipped_bit_never_changes_a_setting(at: int, bit: int):
         radar.arm(FRAMES)
     except DeviceError:
         assert radar.state is State.FAULT
-        radar.arm(FRAMES)  # nothing flips any more
+        # Nothing flips any more
+        radar.arm(FRAMES)
     assert radar.state is State.ARMED
     assert board.settings == clean_board.settings

@@ -129,7 +129,8 @@ def test_a_new_board_runs_from_ram_and_its_flash_stays_empty(clock, fault_at):
     assert board.cores.ram == DATA
     radar.arm(4)
     radar.fail("asked to")
-    radar.arm(4)  # a reset empties the RAM
+    # A reset empties the RAM
+    radar.arm(4)
     assert board.executed.count(0x4080) == 2 * len(file_chunks(DATA))
 
 

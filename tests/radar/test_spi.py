@@ -58,7 +58,8 @@ def test_a_lost_answer_is_retried_with_the_same_sequence_number(link, board, sen
     board.inject(fault)
     link.call(LOW_POWER_OFF)
     assert [(m.sequence, m.retry) for m in commands(sent)] == [(2, False), (2, True)]
-    assert board.executed == [*before, LOW_POWER_OFF.ID]  # obeyed once
+    # Obeyed once
+    assert board.executed == [*before, LOW_POWER_OFF.ID]
     assert "sent 2 times" in link.warnings[-1]
     link.call(LOW_POWER_OFF)
     assert commands(sent)[-1].sequence == 3

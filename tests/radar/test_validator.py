@@ -195,7 +195,8 @@ def test_expected_if_is_slope_times_path_plus_offset(rig):
         at = rig.by_name(name)
         mean_m = math.fsum(direct_path_m(rig, at)) / 4
         expected = rig.chirp.slope_hz_per_s * mean_m / 299_792_458 + at.start_offset_hz
-        assert direct_if_hz(rig, at) == pytest.approx(expected, abs=120.0)  # two roundings of 53.6 Hz
+        # Two roundings of 53.6 Hz
+        assert direct_if_hz(rig, at) == pytest.approx(expected, abs=120.0)
 
 
 @pytest.mark.parametrize(("mode", "offset", "holds"), [

@@ -115,16 +115,19 @@ def test_a_pair_is_compared_once_for_all_its_maps(view, scans, monkeypatch):
     shutil.rmtree(scans / "one" / "products")
     judged_products(scans / "one" / "products", "care")
     assert ask(view, "/api/compare/p?a=one&b=two")[0] == 200
-    assert len(done) == 3  # other products are compared again
+    # Other products are compared again
+    assert len(done) == 3
 
 
 def test_of_two_starts_at_once_one_is_refused(view, scans, monkeypatch):
-    both, real = threading.Barrier(2, timeout=3.0), control._check_free
+    both = threading.Barrier(2, timeout=3.0)
+    real = control._check_free
 
     def together(site: object) -> None:
         real(site)
         with suppress(threading.BrokenBarrierError):
-            both.wait()  # neither sees the other's program unless checking and starting are one step
+            # Neither sees the other's program unless checking and starting are one step
+            both.wait()
 
     monkeypatch.setattr(control, "_check_free", together)
     found: list[int] = []

@@ -59,7 +59,8 @@ def test_other_sites_may_not_ask(scans):
         for origin in ("https://evil.example", "null", own, f"{own}:1", f"https://127.0.0.1:{view.port}"):
             status, reported = post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=origin)
             assert (status, reported["code"]) == (403, ErrorCode.ORIGIN_FOREIGN), origin
-        for where in ("cross-site", "same-site"):  # same-site: another port of this machine
+        # Same-site: another port of this machine
+        for where in ("cross-site", "same-site"):
             assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Sec_Fetch_Site=where)[0] == 403
             assert ask(view, "/api/scans", Sec_Fetch_Site=where)[0] == 403
         for path, expected in (("/", 200), ("/api/scans", 403), ("/api/bar/phase", 403)):
@@ -75,7 +76,8 @@ def test_other_sites_may_not_ask(scans):
 def test_beyond_loopback_reading_needs_the_token_too(scans):
     access = Access(TOKEN, loopback=False, control=True)
     with served_folder(scans, access=access) as view:
-        assert ask(view, "/")[0] == 200  # an empty page that asks for the token
+        # An empty page that asks for the token
+        assert ask(view, "/")[0] == 200
         for path in (
             "scans",
             "scan?scan=one",
@@ -94,12 +96,14 @@ def test_beyond_loopback_reading_needs_the_token_too(scans):
         assert get(view, "/api/scans", Cookie=cookie)["scans"]
         assert ask(view, "/api/notes?scan=one", "POST", {}, Cookie=cookie)[0] == 403  # it reads, and does nothing else
         assert get(view, "/api/scans", Host=f"192.168.7.7:{view.port}", Cookie=cookie)["scans"]
-        assert get(view, "/api/page", Host="192.168.7.7:9000", Cookie=cookie)["known"]  # a port that is forwarded
+        # A port that is forwarded
+        assert get(view, "/api/page", Host="192.168.7.7:9000", Cookie=cookie)["known"]
 
 
 def test_large_bodies_are_refused_and_nothing_is_kept(scans):
     with served_folder(scans, TOKEN) as view:
-        before, large = digest_of(scans), b"x" * (guard.BODY_BYTES + 1)
+        before = digest_of(scans)
+        large = b"x" * (guard.BODY_BYTES + 1)
         status, _, _ = ask(view, "/api/notes?scan=one", "POST", large, **{TOKEN_HEADER: TOKEN})
         assert status == 413
         head = f"POST /api/notes?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n{TOKEN_HEADER}: {TOKEN}\r\n"
@@ -260,7 +264,8 @@ NO_HEADS = (b"", b"\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b
 
 def hostile(port: int) -> list[bytes]:
     """Requests that nobody well-meaning sends, as bytes; some with the right token."""
-    own, token = f"Host: 127.0.0.1:{port}", f"{TOKEN_HEADER}: {TOKEN}"
+    own = f"Host: 127.0.0.1:{port}"
+    token = f"{TOKEN_HEADER}: {TOKEN}"
 
     def request(line: str, *headers: str, body: bytes = b"") -> bytes:
         return "\r\n".join([f"{line} HTTP/1.1", *headers, "", ""]).encode("latin-1") + body
@@ -295,7 +300,8 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, t
             for data in part:
                 s = socket.create_connection(("127.0.0.1", view.port), LIMIT_S)
                 s.sendall(data)
-                held.append(s)  # left open: nobody reads the answer, nobody closes
+                # Left open: nobody reads the answer, nobody closes
+                held.append(s)
 
         threads = [threading.Thread(target=send, args=(requests[k::8],)) for k in range(8)]
         for thread in threads:
@@ -323,7 +329,8 @@ def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
 
     from polysight.serve import Place
 
-    for wrong in ("key.pem", "certificate.pem"):  # twice the same, and so neither belongs to the other
+    # Twice the same, and so neither belongs to the other
+    for wrong in ("key.pem", "certificate.pem"):
         with refused(ErrorCode.FILE_FOREIGN, tmp_path / wrong):
             Place("127.0.0.1", 0, (), tmp_path / wrong, tmp_path / wrong).check()
     place = Place("127.0.0.1", 0, (), tmp_path / "certificate.pem", tmp_path / "key.pem")

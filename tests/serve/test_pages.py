@@ -37,7 +37,8 @@ class Page:
     """A page of a served folder, in a browser."""
 
     def __init__(self, browser: Browser, view: Served) -> None:
-        self.browser, self.view = browser, view
+        self.browser = browser
+        self.view = view
 
     def open(self, path: str, size: tuple[int, int, bool] = DESK, token: str = TOKEN) -> None:
         """Go there, and wait until it shows something."""
@@ -47,7 +48,12 @@ class Page:
     def press(self, *keys: str) -> None:
         """Keys, with the focus where it is."""
         for key in keys:
-            text = {"text": "\r"} if key == "Enter" else {"text": key} if len(key) == 1 else {}
+            if key == "Enter":
+                text = {"text": "\r"}
+            elif len(key) == 1:
+                text = {"text": key}
+            else:
+                text = {}
             self.browser.call("Input.dispatchKeyEvent", type="keyDown", key=key, code=key, **CODES.get(key, {}), **text)
             self.browser.call("Input.dispatchKeyEvent", type="keyUp", key=key, code=key, **CODES.get(key, {}))
 
@@ -131,7 +137,8 @@ def test_every_page_fits_and_can_be_read(page, path, size, tmp_path):
         page.browser.call("Emulation.setEmulatedMedia", features=[scheme])
         page.open(path, size)
         page.whole()
-        assert page.browser.value(CONTRAST) == []  # WCAG AA
+        # WCAG AA
+        assert page.browser.value(CONTRAST) == []
         assert page.browser.value(NAMELESS) == []
         assert page.browser.value("document.querySelectorAll('h1').length") == 1
         page.browser.screenshot(tmp_path / "page.png")
@@ -146,7 +153,10 @@ def test_long_names_and_tags_fit(page, scans, size):
     write_notes(scans / long, Notes("", ("t" * 40,)))
     for path in ("/", "/compare?a=one&b=two", f"/scan?scan={long}"):
         page.browser.visit(f"{page.view.address}{path}#token={TOKEN}", size)
-        ready = "document.querySelectorAll('#list li').length == 3" if path == "/" else PAGES.get(path)
+        if path == "/":
+            ready = "document.querySelectorAll('#list li').length == 3"
+        else:
+            ready = PAGES.get(path)
         page.browser.wait(ready or PAGES["/scan?scan=one"], path)
         assert page.browser.value("document.documentElement.scrollWidth - innerWidth") <= 0, path
 
@@ -212,7 +222,8 @@ def test_what_is_named_to_harm_is_shown_as_text(page, scans):
     products = scans / "one" / "products"
     answer = json.loads((products / "materials.json").read_text())
     for segment in answer["segments"]:
-        segment["name"], segment["why"] = evil, evil
+        segment["name"] = evil
+        segment["why"] = evil
     answer["metal_reference"]["how"] = evil
     (products / "materials.json").write_text(json.dumps(answer))
     (scans / "one" / "operator.json").write_text(json.dumps({"notes": evil, "tags": [evil[:40]]}))
@@ -280,7 +291,8 @@ def test_a_wrong_number_is_said_in_the_words_of_the_page(page):
     assert "Positions in a row" in said
     assert "columns" not in said
     assert page.browser.value("document.getElementById('start').disabled")
-    page.browser.errors.clear()  # the refused request
+    # The refused request
+    page.browser.errors.clear()
 
 
 def test_metal_is_drawn_for_processing_again(page):
@@ -395,4 +407,5 @@ def test_two_hundred_scans_are_shown_at_once(browser, tmp_path):
         browser.wait("document.querySelectorAll('#list li').length == 200", "all of them")
         page.whole()
         drawn = [url for url in browser.requests if "thumbnail" in url]
-        assert len(drawn) < 100  # pictures come as they are scrolled to
+        # Pictures come as they are scrolled to
+        assert len(drawn) < 100

@@ -46,7 +46,8 @@ def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
     found = find_program(tmp_path, "export")
     assert found.status == 3
     assert "why:" in found.log
-    assert "--version" not in found.log  # the log of the earlier one stays in the file
+    # The log of the earlier one stays in the file
+    assert "--version" not in found.log
 
 
 @pytest.fixture
@@ -58,7 +59,8 @@ def sleeping(tmp_path: Path) -> Iterator[Path]:
     finally:
         os.killpg(child.pid, 9)
         child.wait()
-    assert find_program(tmp_path, "scan").status is None  # killed: it could not say
+    # Killed: it could not say
+    assert find_program(tmp_path, "scan").status is None
 
 
 def test_a_program_is_known_by_its_number_and_its_begin(sleeping):
@@ -66,7 +68,8 @@ def test_a_program_is_known_by_its_number_and_its_begin(sleeping):
     file = sleeping / PROGRAM / "scan.json"
     answer = json.loads(file.read_text())
     file.write_text(json.dumps(answer | {"ticks": answer["ticks"] - 1}))
-    assert not find_program(sleeping, "scan").running  # another process has the number now
+    # Another process has the number now
+    assert not find_program(sleeping, "scan").running
 
 
 def test_one_program_of_a_kind_runs_in_a_folder(programs, sleeping):
@@ -129,7 +132,8 @@ def test_a_scan_starts_with_its_plan_and_without_a_pi_says_why(tmp_path):
         assert "polysight" not in reason
         assert reason in find_program(folder, "scan").log
         assert get(view, "/api/scans")["scans"][0]["tags"] == ["t"]
-        assert post(view, "/api/start", {"name": "week/one"})[0] == 200  # once more, by the same name
+        # Once more, by the same name
+        assert post(view, "/api/start", {"name": "week/one"})[0] == 200
         assert get(view, "/api/scan?scan=week/one")["notes"] == "n"
         ended(folder, "scan")
 

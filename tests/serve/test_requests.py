@@ -99,7 +99,9 @@ def plain(value: Any, root: Path) -> Any:
     """Paths as text, `%` for the folder of scans."""
     if isinstance(value, list):
         return [plain(item, root) for item in value]
-    return str(value).replace(str(root), "%") if isinstance(value, str | Path) else value
+    if isinstance(value, str | Path):
+        return str(value).replace(str(root), "%")
+    return value
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,8 @@ class DeadFolder:
     """Replaces functions by ones that do not return for folders named `dead`, as long as it is dead."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.back, self._patch = threading.Event(), monkeypatch
+        self.back = threading.Event()
+        self._patch = monkeypatch
 
     def stop(self, module: Any, name: str) -> None:
         real: Callable[..., Any] = getattr(module, name)
@@ -96,7 +97,8 @@ def test_a_list_shows_a_folder_that_does_not_answer_and_what_it_knew_of_it(dead,
     dead.stop(scans, "is_scan")
     assert [s.name for s in known.list()] == [s.name for s in before]
     assert {s.name: s.state for s in known.list()}["dead"] == "silent"
-    listed, threads = Scans(root), threading.active_count()
+    listed = Scans(root)
+    threads = threading.active_count()
     silent = {"alive": "products", "dead": "silent", "other": "products"}
     for _ in range(3):
         wait_for(lambda: {s.name: s.state for s in listed.list()} == silent, "that only one folder is silent")

@@ -90,7 +90,8 @@ def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, wa
         opened(browser, view)
     browser.wait("document.body.classList.contains('lost')", "that the view is gone is said")
     assert browser.text("headline") == STATES["offline"].headline
-    time.sleep(0.5)  # some of its attempts to come back fail
+    # Some of its attempts to come back fail
+    time.sleep(0.5)
     with served(watch, host=host, port=int(port)):
         browser.wait("!document.body.classList.contains('lost')", "the way back")
         browser.wait("document.getElementById('headline').innerText == 'The scan is finished'", "the state")

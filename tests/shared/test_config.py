@@ -38,7 +38,8 @@ def test_mounts_reproduce_the_published_antenna_positions(rig: Instrument):
 
 def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instrument):
     for board in rig.receivers:
-        rx, mid = rx_positions_m(rig, board)[0], specular_midpoint_m(rig, board)
+        rx = rx_positions_m(rig, board)[0]
+        mid = specular_midpoint_m(rig, board)
         out = math.degrees(math.atan2(math.hypot(mid[0] - rx[0], mid[1] - rx[1]), mid[2] - rx[2]))
         assert out == pytest.approx(incidence_deg(rig, board), abs=1e-9)
 

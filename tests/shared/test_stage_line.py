@@ -60,7 +60,10 @@ def test_every_single_bit_flip_of_a_reply_is_refused(reply: Reply):
 def test_immediate_bytes_differ_from_all_others_in_two_bits_and_resume_in_three():
     used_in_lines = set(b"0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ-* \n")
     for byte in Immediate:
-        others = used_in_lines if byte == Immediate.RESUME else used_in_lines | set(range(0x20, 0x7F))
+        if byte == Immediate.RESUME:
+            others = used_in_lines
+        else:
+            others = used_in_lines | set(range(0x20, 0x7F))
         nearest = min((byte ^ other).bit_count() for other in others | set(Immediate) - {byte})
         assert nearest >= (3 if byte == Immediate.RESUME else 2)
 
@@ -75,7 +78,8 @@ def test_random_bytes_are_refused_or_sealed(raw: bytes):
 
 
 def test_crc_is_xmodem():
-    assert crc16(b"123456789") == 0x31C3  # check value of CRC-16/XMODEM
+    # Check value of CRC-16/XMODEM
+    assert crc16(b"123456789") == 0x31C3
 
 
 @pytest.mark.parametrize("bad", [Command(70000, "HOME"), Command(1, "home"), Command(1, "MOVE", (2**31,))])

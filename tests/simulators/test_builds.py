@@ -36,7 +36,8 @@ def test_without_a_writable_home_the_temporary_folder_serves(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(builds, "FOLDER", tmp_path / "site-packages" / "arduino_stage" / "build")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(source))  # a file
+    # A file
+    monkeypatch.setenv("XDG_CACHE_HOME", str(source))
     monkeypatch.setattr(builds.tempfile, "tempdir", str(tmp_path))
     assert _compile(source).parent.parent == tmp_path
 

@@ -31,7 +31,8 @@ from polysight_simulators.loopback import is_free, on_subnet
 from polysight_simulators.scene import pattern_frames
 
 TIME_SCALE = 20.0
-SYNC = 22  # pi.sync_out of the shipped rig file
+# pi.sync_out of the shipped rig file
+SYNC = 22
 CONFIGURE = bytes.fromhex("01010102031e")
 PACKET = bytes.fromhex("be05350c0000")
 COMPLETED = bytes.fromhex("5aa50a000001aaee")
@@ -132,7 +133,8 @@ def pulse(start: Start, tmp_path: Path) -> Iterator[Callable[..., None]]:
     def send(first: int, n: int, line: int = SYNC) -> None:
         if not clients:
             clients.append(WireClient(tmp_path / "w.sock"))
-            clients.append(WireClient(tmp_path / "w.sock", (SYNC, 23)))  # joined last, and so is told last
+            # Joined last, and so is told last
+            clients.append(WireClient(tmp_path / "w.sock", (SYNC, 23)))
         edges = []
         for k in range(first, first + n):
             edges += [WireEdge(k * PERIOD_NS, line, 1), WireEdge(k * PERIOD_NS + 1000, line, 0)]
@@ -171,7 +173,8 @@ def test_a_record_goes_on_while_the_stage_moves_or_owes_a_burst(
     stage = WireClient(tmp_path / "w.sock")
     stage.send(WireMotion(0, 0, 0, 20_000), WireEdge(0, 26, 1))
     pulse(1, 2)
-    host.commands.settimeout(0.4)  # four times the 2 s of wire time after which the record would be over
+    # Four times the 2 s of wire time after which the record would be over
+    host.commands.settimeout(0.4)
     with pytest.raises(TimeoutError):
         host.message()
     stage.send(WireEdge(10 * PERIOD_NS, 26, 1), WireMotion(20 * PERIOD_NS, 0, 0, 0))
@@ -247,7 +250,8 @@ def test_the_eeproms_addresses_are_taken_over_the_network_after_a_power_cycle(
     _, source = bench.data.recvfrom(4096)
     assert source == (new, 1024)
     with bound_udp(old, bench.board.command_port):
-        pass  # the old address is free again
+        # The old address is free again
+        pass
 
 
 def test_single_packets_leave_no_faster_than_their_delay_and_one_by_one(rig: Instrument, sockets: ExitStack) -> None:
@@ -292,7 +296,8 @@ def test_packets_in_calls_of_many_keep_the_delay_as_a_mean_also_after_a_pause(
         began = now[0]
         sender.put_packets(np.zeros((1000, 1466), np.uint8))
         while (wait := sender.flush(lambda: now[0], 25e-6)) is not None:
-            now[0] += wait + 1e-4  # woken a little late
+            # Woken a little late
+            now[0] += wait + 1e-4
         assert 956 * 25e-6 <= now[0] - began <= 1000 * 25e-6 + 0.01
 
 

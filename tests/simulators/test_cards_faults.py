@@ -128,7 +128,8 @@ def test_the_ddr_overflow_has_its_own_bit_and_leaves_no_gap_in_the_sequence(
 
 
 def test_the_link_is_down_for_a_time(rig: Instrument, sockets: ExitStack) -> None:
-    bench = Bench(rig, sockets, link_down=[[10, 0.015]])  # ten pulses
+    # Ten pulses
+    bench = Bench(rig, sockets, link_down=[[10, 0.015]])
     bench.request(*START)
     bench.pulses(15)
     assert bench.request(*ALIVE) == []

@@ -16,7 +16,8 @@ from polysight_simulators.cards.sync_in import Pulse, StageTrack, SyncInput
 from polysight_simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
 
 RIG = published_rig()
-DEAD_NS = 278_500  # ramp end 128.5 us + 150 us
+# Ramp end 128.5 us + 150 us
+DEAD_NS = 278_500
 
 
 def pulses(times: list[int]) -> list[Pulse]:
@@ -78,7 +79,8 @@ def test_without_burst_motion_all_pulses_of_a_burst_are_at_its_middle() -> None:
     for track in (moving, frozen):
         track.add(WireMotion(0, 400_000, 250_000, 20_000))
         track.trigger(trigger)
-        track.trigger(trigger + 100_000_000)  # the next trigger may be known already
+        # The next trigger may be known already
+        track.trigger(trigger + 100_000_000)
     x, _ = moving.offsets_mm(times)
     held, _ = frozen.offsets_mm(times)
     assert np.ptp(x) == pytest.approx(0.45)

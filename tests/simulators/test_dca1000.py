@@ -131,7 +131,8 @@ def test_the_usual_packet_size_gives_1456_bytes_and_malformed_requests_change_no
 
 def test_a_wrong_lane_configuration_records_nothing_and_is_reported() -> None:
     card = Card(HOME)
-    card.command(bytes.fromhex("5aa5 0300 0600 01020102031e aaee"), 0.0)  # 2-lane
+    # 2-lane
+    card.command(bytes.fromhex("5aa5 0300 0600 01020102031e aaee"), 0.0)
     card.command(START, 0.0)
     assert card.lvds(stream(5000), 1.0) == []
     assert card.tick(29.9) == []

@@ -17,7 +17,8 @@ from polysight_simulators.cards.fault_draws import NetworkFaults, OverflowFaults
 from polysight_simulators.cards.sync_in import Pulse
 from polysight_simulators.faults import Faults, read_faults
 
-SIZE = 20  # bytes of a packet, 10 of them its header
+# Bytes of a packet, 10 of them its header
+SIZE = 20
 EVERYTHING = Faults(
     loss=0.1, duplicate=0.1, reorder=0.1, late=0.1, late_packets=7, truncate=0.1, lose_packets=(3, 50), corrupt=0.2,
     corrupt_header=0.2,

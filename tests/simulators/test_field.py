@@ -184,7 +184,8 @@ def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None
     f = np.linspace(76.3e9, 79.75e9, 400)
     path_m = np.linspace(-1.0, 1.0, 2001)
     later = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(path_m, f)) * np.hanning(f.size)
-    inside_m = 2 * thick_m * np.sqrt(eps - np.sin(theta) ** 2)  # Snell
+    # Snell
+    inside_m = 2 * thick_m * np.sqrt(eps - np.sin(theta) ** 2)
     for board in rig.receivers:
         reflect = board_reflectivity(board, Scene("one sheet", plates=(sheet,)).with_disturbances(ideal=True))
         seen = np.abs(later @ np.array([complex(reflect(sheet, hz, theta)) for hz in f]))

@@ -73,7 +73,8 @@ def test_the_reference_cube_is_the_ideal_signal_less_the_direct_path() -> None:
     empty = radar()
     cube = reference_cube(RIG, rig.scene, remove_direct=False)["RV"]
     travel = rig.burst_mm(-1)[0]
-    x = np.array([rig.rig.grid.step_x_mm * (8 - 4) + travel])  # odd rows start at the largest x
+    # Odd rows start at the largest x
+    x = np.array([rig.rig.grid.step_x_mm * (8 - 4) + travel])
     y = np.array([rig.rig.grid.step_y_mm * (1 - 2.5)])
     echo = rig.signals("RV", x, y) - empty.signals("RV", x, y)
     assert cube.shape == (4, 6, 9, 256)
@@ -100,7 +101,8 @@ def test_pulses_do_not_depend_on_the_batch() -> None:
     whole = default_radar().chirps("RH", x, y)
     other = default_radar()
     parts = [other.chirps("RH", x[a:b], y[a:b]) for a, b in ((0, 1), (1, 17), (17, 70))]
-    assert np.abs(whole.astype(int) - np.concatenate(parts)).max() <= 1  # a rounding of float32
+    # A rounding of float32
+    assert np.abs(whole.astype(int) - np.concatenate(parts)).max() <= 1
     late = default_radar().chirps("RH", x[40:], y[40:], first_pulse=40)
     assert np.abs(whole[40:].astype(int) - late).max() <= 1
 
@@ -156,7 +158,8 @@ def test_h_and_v_have_independent_timing_relative_to_the_transmitter() -> None:
     pulses = np.arange(n)
     tx, h, v = (sync_delay_s(d, 1, rig.rig.by_name(b), pulses) for b in ("LS", "RH", "RV"))
     correlation = np.corrcoef(h - tx, v - tx)[0, 1]
-    assert abs(correlation - 0.5) < 0.06  # the transmitter's share is common
+    # The transmitter's share is common
+    assert abs(correlation - 0.5) < 0.06
 
 
 def test_one_ppm_of_crystal_is_76_khz_and_a_slope_error() -> None:

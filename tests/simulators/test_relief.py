@@ -96,7 +96,8 @@ def test_height_turns_the_phase_by_2_k_cos_theta() -> None:
         field_exact(rig, setup(plates=[{**PLATE, "height_mm": h}])[1], board, np.zeros((1, 2)), f)[0, 0]
         for h in (0.0, 0.2)
     )
-    assert np.angle(high / flat) == pytest.approx(2 * WAVE * cos * 0.2e-3, abs=0.01)  # positive is farther: later
+    # Positive is farther: later
+    assert np.angle(high / flat) == pytest.approx(2 * WAVE * cos * 0.2e-3, abs=0.01)
 
 
 def test_a_shifted_plane_equals_another_object_distance_but_does_not_change_the_rig() -> None:

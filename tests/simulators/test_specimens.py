@@ -154,7 +154,8 @@ def test_the_direct_path_is_stronger_weaker_or_absent(loss_db: Any, gain: float)
 
 @pytest.mark.parametrize("loss_db", ["gone", -100.0, True])
 def test_an_invalid_direct_path_is_refused_and_true_means_on(loss_db: Any) -> None:
-    if loss_db is True:  # "on" is the default, as of every disturbance
+    # "on" is the default, as of every disturbance
+    if loss_db is True:
         assert scene(disturbances={"direct_loss_db": loss_db}).disturbances.direct_gain == 1.0
         return
     with pytest.raises(ConfigError) as caught:

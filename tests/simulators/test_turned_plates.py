@@ -55,4 +55,5 @@ def test_a_tilted_dielectric_changes_as_in_vector_physical_optics(permittivity):
         h, v = turned_reflection(plate(rise_deg, **material), 78e9, np.array(THETA))
         expected.append(complex(v) / complex(h))
     change, predicted = (np.array(ratios[1:]) / ratios[0] - 1 for ratios in (seen, expected))
-    assert change == pytest.approx(predicted, rel=0.12, abs=2e-3)  # first order; boards see it from 53 to 58 degrees
+    # First order; boards see it from 53 to 58 degrees
+    assert change == pytest.approx(predicted, rel=0.12, abs=2e-3)

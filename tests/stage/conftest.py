@@ -87,7 +87,8 @@ def host(make_uno: Callable[..., EmulatedUno]) -> Host:
 @pytest.fixture(params=["pc", "sanitized", "python", "uno", "port"])
 def talker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Driver]:
     """Any stage, just switched on."""
-    kind, closed = request.param, ExitStack()
+    kind = request.param
+    closed = ExitStack()
     if kind == "pc":
         driver = FirmwareDriver(request.getfixturevalue("firmware_program"))
     elif kind == "sanitized":
@@ -98,7 +99,8 @@ def talker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Driver]:
     elif kind == "uno":
         driver = UnoDriver(*request.getfixturevalue("uno_programs"), tmp_path)
     else:
-        real, dialogue = request.config.getoption("--stage-port"), request.node.callspec.params.get("path")
+        real = request.config.getoption("--stage-port")
+        dialogue = request.node.callspec.params.get("path")
         if real:
             driver = PortDriver(real)
         elif request.config.getoption("--long") or (dialogue is not None and dialogue.stem in ("hold", "sequence")):

@@ -51,7 +51,8 @@ def test_every_damaged_line_is_refused(talker):
         line = Command(talker.sequence + 1, verb, args).encode()
         flips = [line[: i // 8] + bytes([line[i // 8] ^ 1 << i % 8]) + line[i // 8 + 1 :] for i in range(8 * len(line))]
         for damaged in flips + [line[:i] + line[i + 1 :] for i in range(len(line) - 1)]:
-            talker.rx(damaged + b"\n")  # the empty line ends a line whose end is damaged
+            # The empty line ends a line whose end is damaged
+            talker.rx(damaged + b"\n")
             replies = talker.replies()
             assert replies, f"{damaged!r}: no answer"
             assert all(r.kind == "error" and r.sequence is None for r in replies), f"{damaged!r}: {replies}"
@@ -59,7 +60,8 @@ def test_every_damaged_line_is_refused(talker):
         assert talker.status() == at_rest
         talker.run_ms(20)
         assert talker.still()
-        assert talker.command(verb, *args).kind == "ok"  # undamaged it is obeyed
+        # Undamaged it is obeyed
+        assert talker.command(verb, *args).kind == "ok"
 
 
 CHUNK = 4096
@@ -77,7 +79,8 @@ def test_random_bytes(talker, request: pytest.FixtureRequest):
     talker.run_ms(200)
     assert talker.still()
     talker.resync()
-    assert talker.command("CLEAR").kind == "ok"  # a STOP may have been among them
+    # A STOP may have been among them
+    assert talker.command("CLEAR").kind == "ok"
     done, _ = talker.motion("MOVE", 500, 400, 4000)
     assert (done.kind, done.integer("x"), done.integer("y")) == ("done", 500, 400)
 

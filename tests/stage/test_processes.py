@@ -65,7 +65,8 @@ def test_rows_over_the_port(start: Start, speed: float):
     assert times == sorted(times)
     assert {e.line for e in stage.rising} == {26}
     spacing = [b.t_ns - a.t_ns for a, b in itertools.pairwise(stage.rising[:5])]
-    assert all(abs(s - 100_000_000) <= 16_000 for s in spacing)  # 400 steps at 4000 steps/s
+    # 400 steps at 4000 steps/s
+    assert all(abs(s - 100_000_000) <= 16_000 for s in spacing)
     before = [messages[messages.index(e) - 1] for e in stage.rising]
     at = [m for m in before if isinstance(m, WireMotion)]
     assert [m.t_ns for m in at] == [e.t_ns for e in stage.rising]

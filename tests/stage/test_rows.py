@@ -13,7 +13,8 @@ from tests.support.stage.drivers import edges, motions
 
 from polysight_shared.stage_line import Command, Immediate
 
-MM = 200  # steps
+# Steps
+MM = 200
 UM = 5  # per step
 ACCEL = 40_000
 
@@ -38,7 +39,10 @@ def test_random_rows(stage, seed: int):
     rng = random.Random(seed)
     stage.ready()
     for _ in range(4):
-        rate = rng.choice([31, 100, 640, 3999, 4000, 7001, 20_000]) if rng.random() < 0.5 else rng.randint(500, 20_000)
+        if rng.random() < 0.5:
+            rate = rng.choice([31, 100, 640, 3999, 4000, 7001, 20_000])
+        else:
+            rate = rng.randint(500, 20_000)
         pitch = rng.choice([-1, 1]) * rng.randint(40, 1200 if rate >= 500 else 150)
         points = rng.randint(1, 40 if rate >= 500 else 4)
         width_us = rng.randint(1, 40)
@@ -51,7 +55,8 @@ def test_random_rows(stage, seed: int):
         assert done.integer("held") == 0
         rising = check_row(wires, x0, pitch, points, y, width_us)
         # Even spacing: each edge within one timer tick of its ideal time, errors never add up.
-        first, spacing_ns = rising[0].t_ns, abs(pitch) / rate * 1e9
+        first = rising[0].t_ns
+        spacing_ns = abs(pitch) / rate * 1e9
         assert all(abs(e.t_ns - first - i * spacing_ns) <= 500 for i, e in enumerate(rising))
         # Constant speed from one pitch before the first point to one pitch after the last.
         latest = {m.t_ns: m for m in motions(wires)}  # of several at one time, the last holds
@@ -70,7 +75,11 @@ def test_random_rows(stage, seed: int):
 def test_hold_resumes_on_the_exact_grid(stage, seed: int):
     rng = random.Random(seed)
     stage.ready()
-    x0, pitch, points, y, rate = 40_000, rng.choice([-300, 300]), 30, 500, 5000
+    x0 = 40_000
+    pitch = rng.choice([-300, 300])
+    points = 30
+    y = 500
+    rate = 5000
     stage.motion("MOVE", x0 - pitch, y, 10_000)
     stage.wires.clear()
     assert stage.command("ROW", x0, pitch, points, y, rate).kind == "ok"
@@ -127,7 +136,8 @@ def test_stop_ends_the_triggers_and_keeps_the_position(stage):
 def _act(rng: random.Random, sequence: int) -> tuple[str, object]:
     kind = rng.choices(["command", "byte", "run", "rest", "press", "slip", "reset"], [40, 15, 30, 10, 2, 2, 1])[0]
     if kind == "command":
-        x, y = rng.randint(-500, 20_000), rng.randint(-200, 9_000)
+        x = rng.randint(-500, 20_000)
+        y = rng.randint(-200, 9_000)
         verb, args = rng.choice(
             [
                 ("HELLO", ()),
@@ -170,7 +180,12 @@ def test_same_words_and_same_wires(both, seed: int):
         sequence += rng.random() < 0.9
         script.append(_act(rng, sequence))
     for i, (name, argument) in enumerate(script):
-        arguments = argument if isinstance(argument, tuple) else () if argument is None else (argument,)
+        if isinstance(argument, tuple):
+            arguments = argument
+        elif argument is None:
+            arguments = ()
+        else:
+            arguments = (argument,)
         for driver in drivers:
             getattr(driver, name)(*arguments)
         where = f"seed {seed}, action {i}: {name} {argument}"

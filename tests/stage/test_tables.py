@@ -60,7 +60,8 @@ def test_parameters_and_bytes():
 
 
 def test_limits():
-    protocol, board = constants("protocol.h"), constants("board.h")
+    protocol = constants("protocol.h")
+    board = constants("board.h")
     assert protocol["MAX_LINE_BYTES"] == stage_line.MAX_LINE_BYTES
     assert protocol["PROTOCOL_VERSION"] == stage_line.PROTOCOL_VERSION
     assert f'"{stage_python.FIRMWARE}"' in (SKETCH / "protocol.h").read_text(encoding="ascii")
@@ -81,7 +82,8 @@ def test_limits():
 
 
 def test_defaults_are_those_of_the_rig_file():
-    board, stage = constants("board.h"), Stage(port="")
+    board = constants("board.h")
+    stage = Stage(port="")
     k = stage.steps_per_mm
     assert board["STEPS_PER_MM"] == k
     assert board["DEFAULT_ACCEL"] == stage.accel_mm_s2 * k
@@ -122,15 +124,18 @@ def test_examples_of_the_page_are_valid_lines():
 
 def test_sketch_fits_an_uno(built: tuple[Path, str]):
     sizes = dict(re.findall(r"^(Program|Data): +(\d+) bytes", built[1], re.MULTILINE))
-    assert int(sizes["Program"]) < 32_256  # flash without the boot loader
-    assert int(sizes["Data"]) < 1_536  # a quarter of the memory is left for the stack
+    # Flash without the boot loader
+    assert int(sizes["Program"]) < 32_256
+    # A quarter of the memory is left for the stack
+    assert int(sizes["Data"]) < 1_536
 
 
 def test_no_floating_point_anywhere(built: tuple[Path, str]):
     """No routine of the compiler's soft floating point is linked."""
     elf = str(built[0] / "arduino_stage.elf")
     symbols = subprocess.run(["avr-nm", elf], capture_output=True, text=True, check=True).stdout
-    assert " __vector_11" in symbols  # the step interrupt: these are the right symbols
+    # The step interrupt: these are the right symbols
+    assert " __vector_11" in symbols
     assert not re.findall(r"\b__\w*(?:sf|fp|float)\w*", symbols)
 
 
@@ -157,8 +162,11 @@ def test_sketch_folder_is_what_the_arduino_ide_wants():
             assert (SKETCH / included).is_file(), f"{source.name} includes {included}"
 
 
-SIGNATURE = bytes([0x1E, 0x95, 0x0F])  # ATmega328P
-IN_SYNC, OK, END = b"\x14", b"\x10", b"\x20"
+# ATmega328P
+SIGNATURE = bytes([0x1E, 0x95, 0x0F])
+IN_SYNC = b"\x14"
+OK = b"\x10"
+END = b"\x20"
 
 
 class BootLoader:
@@ -167,7 +175,8 @@ class BootLoader:
     def __init__(self) -> None:
         self._far, near = os.openpty()
         tty.setraw(near)
-        self.port, self._near = os.ttyname(near), near
+        self.port = os.ttyname(near)
+        self._near = near
         self.flash = bytearray(b"\xff" * 32_768)
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
@@ -182,21 +191,28 @@ class BootLoader:
         address = 0
         while (command := self._take(1)) != b"\x00":
             answer = b""
-            if command == b"A":  # get parameter
+            # Get parameter
+            if command == b"A":
                 self._take(1)
                 answer = b"\x03"
-            elif command == b"B":  # set device
+            elif command == b"B":
+                # Set device
                 self._take(20)
-            elif command == b"E":  # set extended parameters
+            elif command == b"E":
+                # Set extended parameters
                 self._take(self._take(1)[0] - 1)
-            elif command == b"U":  # load address, in words
+            elif command == b"U":
+                # Load address, in words
                 address = 2 * int.from_bytes(self._take(2), "little")
-            elif command == b"V":  # universal
+            elif command == b"V":
+                # Universal
                 self._take(4)
                 answer = b"\x00"
-            elif command == b"u":  # read signature
+            elif command == b"u":
+                # Read signature
                 answer = SIGNATURE
-            elif command in (b"d", b"t"):  # program page, read page
+            elif command in (b"d", b"t"):
+                # Program page, read page
                 size = int.from_bytes(self._take(3)[:2], "big")
                 page = slice(address, address + size)
                 if command == b"d":

@@ -11,10 +11,16 @@ from polysight_shared.stage_line import Command, Immediate, Parameter
 from polysight_simulators.stage import homing_zero
 from polysight_simulators.uno import HZ
 
-US, MS = HZ // 1_000_000, HZ // 1000
-TRIGGER, X_PUL, RIGHT_PUL = 2, 5, 4  # the left motor steps just before the right one
-BATCH = 20  # rows
-TOP_RATE = 20_000  # steps/s
+US = HZ // 1_000_000
+MS = HZ // 1000
+# the left motor steps just before the right one
+TRIGGER = 2
+X_PUL = 5
+RIGHT_PUL = 4
+# Rows
+BATCH = 20
+# Steps/s
+TOP_RATE = 20_000
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -30,7 +36,8 @@ def test_random_rows(host, batch: int):
     rng = random.Random(batch)
     host.set(Parameter.TRAVEL_SPEED, TOP_RATE)
     steps_to_trigger = set()
-    x, y = 0, 0
+    x = 0
+    y = 0
     for _ in range(BATCH):
         accel = rng.choice([200_000, 400_000, 1_000_000])
         rate = rng.choice([4000, TOP_RATE, rng.randint(3000, TOP_RATE)])
@@ -57,10 +64,12 @@ def test_random_rows(host, batch: int):
             host.uno.feed(Immediate.RESUME.sent)
         host.uno.rest()
         (done,) = host.replies()
-        x, held = done.integer("x"), done.integer("held")
+        x = done.integer("x")
+        held = done.integer("held")
         assert (done.kind, done.integer("points"), done.integer("pulses")) == ("done", points, points)
         assert held <= holds
-        rising, falling = host.uno.edges[::2], host.uno.edges[1::2]
+        rising = host.uno.edges[::2]
+        falling = host.uno.edges[1::2]
         assert [e.value for e in host.uno.edges] == [1, 0] * points
         assert [host.at(e) for e in rising] == [(x0 + i * pitch, y) for i in range(points)]
         steps_to_trigger |= {e.cycle - e.step_cycle for e in rising}
@@ -96,7 +105,8 @@ def test_backlash_comes_from_below_and_runs_up(host):
         host.motion("ROW", 9000, pitch, 5, y, 4000)
         ys = [host.at(e)[1] for e in host.uno.edges if e.pin == RIGHT_PUL and e.value]
         assert len(ys) >= 700
-        assert ys[-700:] == list(range(y - 699, y + 1))  # the last of y's steps go upwards
+        # The last of y's steps go upwards
+        assert ys[-700:] == list(range(y - 699, y + 1))
         xs = [host.at(e)[0] for e in host.uno.edges if e.pin == X_PUL and e.value]
         first = xs.index(9000) if pitch > 0 else len(xs) - 1 - xs[::-1].index(9000)
         before = xs[first - 700 : first]
@@ -122,7 +132,8 @@ def test_a_short_hold_is_told_and_costs_no_step(host):
 def test_no_command_is_lost_silently(host, chatty: bool):
     """A host that does not wait for answers: every line is answered, or a loss is reported."""
     lines = [host.line("MOVE", 10 + i, 0, 4000) if i % 7 == 0 else host.line("CLEAR") for i in range(100)]
-    gap = b"?\n" * 12 if chatty else b""  # six times as many bytes of answer: the board is kept busy writing
+    # Six times as many bytes of answer: the board is kept busy writing
+    gap = b"?\n" * 12 if chatty else b""
     host.uno.feed(b"".join(gap + line for line in lines))
     host.uno.settle()
     host.uno.rest()
@@ -133,7 +144,8 @@ def test_no_command_is_lost_silently(host, chatty: bool):
     wanted = set(range(host.sequence - 99, host.sequence + 1))
     assert answered <= wanted
     assert answered == wanted or any(r.number == 3 for r in unread)
-    assert (answered == wanted) != chatty  # this was a test of the loss
+    # This was a test of the loss
+    assert (answered == wanted) != chatty
     # The conversation goes on: greet, then any number may follow.
     host.uno.feed(b"\n")
     host.replies()

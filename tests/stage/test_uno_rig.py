@@ -34,7 +34,8 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
         # The journey there is short, and a busy machine is no silent host.
         stage=replace(rig.stage, centre_x_mm=15.0, centre_y_mm=4.0, heartbeat_ms=5000),
     )
-    config, scene = tmp_path / "rig.toml", tmp_path / "scene.toml"
+    config = tmp_path / "rig.toml"
+    scene = tmp_path / "scene.toml"
     config.write_text(tomli_w.dumps(to_builtins(rig)))
     scene.write_text(SCENE)
     with closing(Bench(tmp_path)) as bench:
@@ -43,8 +44,10 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
         options = ("--out", tmp_path / "scan", "--no-process")
         ended = bench.polysight("scan", "--config", simulated.wait_ready(), *options, limit_s=LIMIT_S)
         assert ended.status == 0, ended.err
-    simulate(rig, load_scene(scene), tmp_path / "ideal")  # the same scan without a stage, at the plan's positions
-    scan, ideal = ScanFolder.load(tmp_path / "scan"), ScanFolder.load(tmp_path / "ideal")
+    # The same scan without a stage, at the plan's positions
+    simulate(rig, load_scene(scene), tmp_path / "ideal")
+    scan = ScanFolder.load(tmp_path / "scan")
+    ideal = ScanFolder.load(tmp_path / "ideal")
     assert sorted(scan.committed()) == [0, 1]
     for board in ("RH", "RV"):
         for row in (0, 1):

@@ -9,10 +9,14 @@ import pytest
 from polysight_shared.stage_line import Immediate, Parameter
 from polysight_simulators.uno import HZ
 
-US, MS = HZ // 1_000_000, HZ // 1000
-TRIGGER, X_PUL, DRIVERS_OFF = 2, 5, 7
+US = HZ // 1_000_000
+MS = HZ // 1000
+TRIGGER = 2
+X_PUL = 5
+DRIVERS_OFF = 7
 WATCHDOG_MS = 250 * 1.1  # its oscillator is one of 10 %
-TOP_RATE = 20_000  # steps/s
+# Steps/s
+TOP_RATE = 20_000
 CHATTER = {
     "silence": lambda _: b"",
     "yes": lambda _: b"y\n" * 6,
@@ -54,7 +58,8 @@ def test_chatter_is_no_heartbeat(host, kind: str):
     host.uno.run_ms(500)
     assert host.uno.edges == []
     host.obeyed("CLEAR")
-    assert host.command("MOVE", 0, 0, 4000).number == 8  # home first
+    # Home first
+    assert host.command("MOVE", 0, 0, 4000).number == 8
 
 
 @pytest.mark.parametrize("verb", ["MOVE", "ROW", "HOME"])
@@ -69,7 +74,8 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
     host.uno.edges.clear()
     host.uno.hang()
     hung = host.uno.cycle
-    for _ in range(20):  # a host that notices nothing
+    # A host that notices nothing
+    for _ in range(20):
         host.uno.feed(bytes([Immediate.STATUS]))
         host.uno.run_ms(25)
     assert host.uno.troubles == ["watchdog"]
@@ -106,7 +112,8 @@ def test_a_glitch_is_no_switch(host, request: pytest.FixtureRequest, mask: int):
     rng = random.Random(mask)
     host.set(Parameter.ACCEL, 400_000)
     host.uno.edges.clear()
-    points, glitches = 120, 0
+    points = 120
+    glitches = 0
     wanted = 1000 if request.config.getoption("--long") else 250
     while glitches < wanted:
         host.obeyed("ROW", 4000, 400, points, 500, TOP_RATE)
@@ -173,7 +180,8 @@ def test_homing_overruns_the_switch_by_little(host, accel: int):
     host.uno.rest()
     host.replies()
     lowest = min(e.x for e in host.uno.edges)
-    assert -250 <= lowest <= 0  # steps behind the closing point; 200 are 1 mm
+    # Steps behind the closing point; 200 are 1 mm
+    assert -250 <= lowest <= 0
     assert host.motion("ROW", 6000 if accel > 400 else 60_000, 200, 3, 500, 1000).integer("points") == 3
 
 

@@ -14,12 +14,17 @@ from polysight_shared.stage_line import Immediate, Parameter
 from polysight_simulators.uno import HZ, firmware
 
 SKETCH = REPO / "arduino_stage"
-US, MS = HZ // 1_000_000, HZ // 1000
-TRIGGER, X_PUL = 2, 5
+US = HZ // 1_000_000
+MS = HZ // 1000
+TRIGGER = 2
+X_PUL = 5
 STEP_VECTOR = 11
-TOP_RATE = 20_000  # steps/s
-MARGIN = 16  # cycles left of a step's time at TOP_RATE, whichever compiler made the image
-IDE_COMPILERS = (".arduino15/packages/arduino/tools/avr-gcc/*/bin", "arduino-*/hardware/tools/avr/bin")  # below a home
+# Steps/s
+TOP_RATE = 20_000
+# Cycles left of a step's time at TOP_RATE, whichever compiler made the image
+MARGIN = 16
+# Below a home
+IDE_COMPILERS = (".arduino15/packages/arduino/tools/avr-gcc/*/bin", "arduino-*/hardware/tools/avr/bin")
 
 
 def other_compilers() -> list[Path]:
@@ -54,7 +59,8 @@ def busiest_step(host: Host) -> int:
             host.uno.rest()
             assert host.replies()[-1].kind == "done"
         cost = host.uno.cost()
-        assert max(v for k, v in cost.interrupts.items() if k != STEP_VECTOR) <= 128  # 8 us: what a step may wait
+        # 8 us: what a step may wait
+        assert max(v for k, v in cost.interrupts.items() if k != STEP_VECTOR) <= 128
         most = max(most, cost.interrupts[STEP_VECTOR])
         assert cost.step_pulse >= 4 * US
         assert cost.direction_setup >= 20 * US
@@ -107,7 +113,8 @@ def test_hold_and_stop_begin_within_20_ms(host, byte: Immediate, rate: int):
     sent = host.uno.cycle
     host.uno.rest()
     times = [e.cycle for e in host.uno.edges if e.value]
-    ramp = -(-rate * rate // (2 * accel))  # steps in which the stage slows down
+    # Steps in which the stage slows down
+    ramp = -(-rate * rate // (2 * accel))
     begins = times[-ramp - 1]
     assert sent <= begins <= sent + 20 * MS
     # Seen from outside: 20 ms after the byte the steps come slower, and they stop after the time of the ramp.

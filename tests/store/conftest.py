@@ -38,7 +38,8 @@ class Undisturbed(SmallScan):
 
     def __init__(self, samples: Samples, folder: Path) -> None:
         super().__init__(samples, folder)
-        self._of, self._folder = samples, folder
+        self._of = samples
+        self._folder = folder
         assert self.run().exit_status == "success"
         self.digests, self.final_image = self.rows(), self.image()
 

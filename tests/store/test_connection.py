@@ -28,7 +28,12 @@ def begun() -> Instrument:
 
 
 def leaves(node: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else None
+    if isinstance(node, dict):
+        items = node.items()
+    elif isinstance(node, list):
+        items = enumerate(node)
+    else:
+        items = None
     if items is None:
         yield path, node
     for key, value in items or ():
@@ -36,7 +41,9 @@ def leaves(node: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[
 
 
 def other(value: Any) -> Any:
-    return not value if isinstance(value, bool) else value + (1 if isinstance(value, int | float) else "1")
+    if isinstance(value, bool):
+        return not value
+    return value + (1 if isinstance(value, int | float) else "1")
 
 
 def may_change(path: tuple[str | int, ...]) -> bool:
@@ -51,7 +58,8 @@ def does_not_matter(path: tuple[str | int, ...]) -> bool:
 
 def test_every_key_is_taken_up_or_refused_by_name(begun):
     """Each number, text and switch of the rig file, changed alone."""
-    taken, refused = 0, 0
+    taken = 0
+    refused = 0
     for path, value in leaves(to_builtins(begun)):
         table = copy.deepcopy(to_builtins(begun))
         node: Any = table
@@ -92,7 +100,8 @@ def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
     """For every reader, and for a later resume that says nothing; what the scan was begun with is still there."""
     small = undisturbed.copy(tmp_path / "moved")
     scan = ScanFolder.load(small.path)
-    begun, now = scan.instrument, moved(scan.instrument)
+    begun = scan.instrument
+    now = moved(scan.instrument)
     with small._connected():
         assert resume_scan(small.path, rig_now=now).folder.instrument == now
         assert resume_scan(small.path).folder.instrument == now

@@ -23,7 +23,8 @@ from polysight_shared.messages import RowStarted
 
 pytestmark = pytest.mark.timeout(3600)  # with --long
 PAGE = bytes(4096)
-PACKET = 1456  # bytes of a row's last record
+# Bytes of a row's last record
+PACKET = 1456
 
 
 def lines(path: Path) -> list[bytes]:
@@ -64,7 +65,8 @@ def is_row(event: object) -> bool:
 @pytest.mark.parametrize("record", [-2, -1], ids=["row_committed", "scan_ended"])
 def test_manifest(undisturbed, tmp_path, sample, record, tail):
     whole = lines(undisturbed.path / "manifest.jsonl")
-    before, last = b"".join(whole[: len(whole) + record]), whole[record]
+    before = b"".join(whole[: len(whole) + record])
+    last = whole[record]
     for cut in sample(range(len(last)), 8):
         scan = undisturbed.copy(tmp_path / "s")
         (scan.path / "manifest.jsonl").write_bytes(before + last[:cut] + tail)
@@ -81,10 +83,12 @@ def test_bit_of_the_manifest(undisturbed, tmp_path, sample, record):
     for bit in sample(range(8 * len(whole[record])), 8):
         scan = undisturbed.copy(tmp_path / "s")
         turn(scan.path / "manifest.jsonl", 8 * at + bit)
-        end = bit // 8 == len(whole[record]) - 1  # the line end: this line and the next are one
+        # The line end: this line and the next are one
+        end = bit // 8 == len(whole[record]) - 1
         named = faults(scan) + [n for n in faults(scan, "note") if "torn" in n or "damaged" in n]
         assert len(named) == 1
-        kept = record == -1 or (record == -2 and end)  # the last line is cut off, others stay where they are
+        # The last line is cut off, others stay where they are
+        kept = record == -1 or (record == -2 and end)
         again = resumed(scan, undisturbed, damaged_lines=0 if kept else 1)
         assert again == {1: {0, 1} if end else {0}, -2: {2}, -1: set()}[record]
 
@@ -106,7 +110,8 @@ def ends_of_events(raw: bytes) -> list[int]:
 def test_event_log(undisturbed, tmp_path, sample, record, tail):
     """What the host has lost, the Pi's journal has; no row is taken again."""
     raw = (undisturbed.path / "events.msgpack").read_bytes()
-    start, stop = ends_of_events(raw)[-1 - record], ends_of_events(raw)[-record]
+    start = ends_of_events(raw)[-1 - record]
+    stop = ends_of_events(raw)[-record]
     for cut in sample(range(start, stop), 8):
         scan = undisturbed.copy(tmp_path / "s")
         (scan.path / "events.msgpack").write_bytes(raw[:cut] + tail)
@@ -145,7 +150,8 @@ def test_journal_of_the_pi(undisturbed, tmp_path, sample, record, tail):
     with path.open("rb") as file:
         starts = [offset for offset, _, _ in records(file)]
     raw = path.read_bytes()
-    start, stop = starts[-record], [*starts, len(raw)][len(starts) - record + 1]
+    start = starts[-record]
+    stop = [*starts, len(raw)][len(starts) - record + 1]
     for cut in sample(range(start, stop), 8):
         scan = undisturbed.copy(tmp_path / "s")
         journal_of(scan).write_bytes(raw[:cut] + tail)
@@ -170,7 +176,8 @@ def test_journal_that_is_lost_as_a_whole(undisturbed, tmp_path, left):
     else:
         journal_of(scan).write_bytes(left)
     manifest_path = scan.path / "manifest.jsonl"
-    manifest_path.write_bytes(b"".join(lines(manifest_path)[:-2]))  # row 2 is to be taken yet
+    # Row 2 is to be taken yet
+    manifest_path.write_bytes(b"".join(lines(manifest_path)[:-2]))
     events = len(read_events(scan.path / "events.msgpack").events)
     goes_on_behind(scan, undisturbed, lost=events, rows={2})
 
@@ -200,7 +207,8 @@ def test_committed_row_cut_short(undisturbed, tmp_path, sample, suffix):
         if suffix == ".bin":
             with refused(ErrorCode.FILE_DAMAGED):
                 _ = ScanFolder.load(scan.path).read_row("RV", 1).payload
-        assert resumed(scan, undisturbed, image=not cut) == {1}  # row 1 is taken last now
+        # Row 1 is taken last now
+        assert resumed(scan, undisturbed, image=not cut) == {1}
         withdrawn = facts_of(scan.path, "row_withdrawn")
         assert [(f["row"], f["take"]) for f in withdrawn] == [(1, 1)]
         assert name in withdrawn[0]["reasons"][0]

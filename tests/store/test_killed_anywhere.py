@@ -17,7 +17,8 @@ from tests.support.store.small_scan import Samples, SmallScan
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 
-POWER_CUTS = 12  # draws of what is left, for each place
+# Draws of what is left, for each place
+POWER_CUTS = 12
 pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # who is killed closes nothing
     pytest.mark.timeout(3600),  # with --long

@@ -14,7 +14,9 @@ from polysight_shared.geometry import direct_path_m, incidence_deg, rx_positions
 from polysight_shared.raster import plan_raster
 from polysight_simulators.scene import AuthorsLayout
 
-COLUMNS, ROWS, PULSES = 9, 4, 3
+COLUMNS = 9
+ROWS = 4
+PULSES = 3
 BASE = published_rig()
 RIG = msgspec.structs.replace(
     BASE,
@@ -67,7 +69,8 @@ def check(data, sent):
 def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path, seed, zero_filling, by_columns):
     rng = np.random.default_rng(seed)
     plan = plan_of(by_columns)
-    skipped, lost = {}, {}
+    skipped = {}
+    lost = {}
     for row in plan:
         for board in ("RH", "RV"):
             gone = np.flatnonzero(rng.random(plan.columns) < 0.25)
@@ -84,7 +87,8 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
             gone = skipped[board, row.index]
             missing = len(gone) * BURST + sum(b - a for a, b in lost[board, row.index])
             assert mask.reshape(plan.columns, -1)[sorted(gone)].all()
-            assert mask.sum() in (missing, mask.size)  # the transmitter's board was never missing: it tells all places
+            # The transmitter's board was never missing: it tells all places
+            assert mask.sum() in (missing, mask.size)
             assert mask.sum() == missing or len(gone) > plan.columns - 3
     answer = scan.recording_facts()["recording"].boards
     for board in ("RH", "RV"):
@@ -161,18 +165,21 @@ def test_an_end_that_all_boards_miss_masks_the_row(tmp_path):
 def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling):
     folder, sent = record(tmp_path, zero_filling=zero_filling)
     short = 4
-    file, log = folder / "RH" / "0_0.bin", folder / "RH" / "0_0_log.csv"
+    file = folder / "RH" / "0_0.bin"
+    log = folder / "RH" / "0_0_log.csv"
     cut = slice(short * BURST + FRAME, short * BURST + 2 * FRAME)  # one of its frames was never made
     raw = np.delete(np.fromfile(file, np.uint8), cut)
     file.write_bytes(raw.tobytes())
     times = np.loadtxt(log, delimiter=",")
-    late_s, times[-1, 2] = times[-1, 2] - times[-2, 2], times[-2, 2]
+    late_s = times[-1, 2] - times[-2, 2]
+    times[-1, 2] = times[-2, 2]
     lines = []
     for k, start in enumerate(range(0, raw.size, PACKET)):
         end = min(start + PACKET, raw.size) - 1
         true_end = end if end < cut.start else end + FRAME
         at = times[true_end // PACKET, 2] if true_end // PACKET < len(times) else times[-1, 2]
-        at += late_s if end + 1 == raw.size else 0.0  # the card holds what is left, not a whole packet, back
+        # The card holds what is left, not a whole packet, back
+        at += late_s if end + 1 == raw.size else 0.0
         lines.append(f"{k + 1},{end + 1 - start},{at:.6f}")
     log.write_text("\n".join(lines))
     scan = open_source(folder, BASE)

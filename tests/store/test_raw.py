@@ -34,7 +34,8 @@ from polysight.store.validation import damaged_rows
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, ScanError
 
-ROWS, BOARDS = 4, 2
+ROWS = 4
+BOARDS = 2
 SCENE = small_scene(8, ROWS, metal=False)
 
 
@@ -73,7 +74,8 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     quality = scan / "products" / "quality.json"
     write_json(quality, {**json.loads(quality.read_text()), "key_of_a_later_release": 1})
-    products, digests = contents(scan / "products"), processed_digests(scan / "products")
+    products = contents(scan / "products")
+    digests = processed_digests(scan / "products")
     assert len(payloads(scan)) == ROWS * BOARDS
     done = polysight("drop-raw", scan, typed="drop\n")
     assert done.returncode == 0, done.stderr
@@ -84,7 +86,8 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     assert dropped.pop("raw_dropped")["scan_id"] == ScanFolder.load(scan).scan_id
     assert (kept, dropped) == (products, said)
     products = contents(scan / "products")
-    assert len(list(scan.glob("raw/*/*.idx"))) in (0, ROWS * BOARDS)  # arrivals and gaps stay, where there were any
+    # Arrivals and gaps stay, where there were any
+    assert len(list(scan.glob("raw/*/*.idx"))) in (0, ROWS * BOARDS)
     facts = facts_of(scan, "raw_dropped")
     assert [f["row"] for f in facts] == list(range(ROWS))
     said = {(name, f["row"]): board["crc32"] for f in facts for name, board in f["boards"].items()}
@@ -112,12 +115,15 @@ def test_products_replaced_after_a_drop_in_between_keep_its_mark(scan):
 
 @pytest.mark.parametrize("what", ["image only", "being made", "being processed", "sample", "no samples", "settings"])
 def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what):
-    before, samples = payloads(scan), scan / "samples"
+    before = payloads(scan)
+    samples = scan / "samples"
     with ExitStack() as others:
-        code, named = ErrorCode.BUSY, "products"
+        code = ErrorCode.BUSY
+        named = "products"
         if what == "image only":  # as after a kill of `process`
             (scan / "products" / REPORT).unlink()
-            code, named = ErrorCode.FILE_MISSING, REPORT
+            code = ErrorCode.FILE_MISSING
+            named = REPORT
         elif what == "being made":
             others.enter_context(making_products(scan / "products", ScanFolder.load(scan).scan_id))
         elif what == "being processed":
@@ -125,14 +131,17 @@ def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what)
             named = "rows.jsonl"
         elif what == "sample":
             flip(samples / "RH.npy", row=2)
-            code, named = ErrorCode.FILE_DAMAGED, "samples/RH.npy"
+            code = ErrorCode.FILE_DAMAGED
+            named = "samples/RH.npy"
         elif what == "no samples":
             shutil.rmtree(samples)
-            code, named = ErrorCode.FILE_MISSING, "rows.jsonl"
+            code = ErrorCode.FILE_MISSING
+            named = "rows.jsonl"
         else:
             head = samples / "samples.json"
             head.write_text(head.read_text().replace('"making": 1', '"making": 0'))
-            code, named = ErrorCode.FILE_DAMAGED, "samples.json"
+            code = ErrorCode.FILE_DAMAGED
+            named = "samples.json"
         with refused(code, named):
             drop_raw(scan, None, yes=True)
     assert payloads(scan) == before
@@ -227,8 +236,10 @@ class PowerCut(BaseException):
 @pytest.mark.parametrize("cut_after", range(ROWS * (BOARDS + 1)))
 def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, monkeypatch, cut_after):
     """The steps are a line in the manifest and a removal for each board, row after row; it ends before each of them."""
-    digests, steps = processed_digests(scan / "products"), iter(range(ROWS * (BOARDS + 1)))
-    unlink, append = Path.unlink, AppendFile.append
+    digests = processed_digests(scan / "products")
+    steps = iter(range(ROWS * (BOARDS + 1)))
+    unlink = Path.unlink
+    append = AppendFile.append
 
     def before(step):
         def call(*args, **kwargs):
@@ -275,7 +286,8 @@ def test_a_line_torn_anywhere_drops_nothing(scan):
     drop(ScanFolder.load(copy), processed_digests(copy / "products"), copy / "products")
     raw = (copy / MANIFEST).read_bytes()
     line = raw.splitlines(keepends=True)[-1]
-    for name in ("0000.bin", "0001.bin", "0002.bin"):  # the rows before the last are gone
+    # The rows before the last are gone
+    for name in ("0000.bin", "0001.bin", "0002.bin"):
         for board in ("RH", "RV"):
             (scan / "raw" / board / name).unlink()
     for length in range(0, len(line), 7):

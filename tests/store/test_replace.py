@@ -27,14 +27,17 @@ def scan_with(folder: Path, lost: int, wrong: bool = False) -> tuple[ScanFolder,
     """One row of each board, with a packet lost and a leftover; `wrong`: as a worse placement masked all of it."""
     rig = rig_with(grid={"columns": 3, "rows": 1}, limits={"free_disk_bytes": 0})
     scan = ScanFolder.create(folder, rig, plan_raster(rig.grid))
-    size, frame = rig.row_bytes, rig.frame_bytes
-    record, before = Record.make(size, 5000, 7), Record.make(2000, 3000, 5)
+    size = rig.row_bytes
+    frame = rig.frame_bytes
+    record = Record.make(size, 5000, 7)
+    before = Record.make(2000, 3000, 5)
     packets = [before.packets[1], *record.packets[:lost], *record.packets[lost + 1 :], record.packets[4]]
     boards = {}
     with scan.writer() as writer:
         for board in rig.recorded:
             path = scan.row_path(board.name, 0)
-            log, evidence = log_of(size, packets), Evidence(size, frame, past=Past())
+            log = log_of(size, packets)
+            evidence = Evidence(size, frame, past=Past())
             placed, out = place_record(log, frame)
             packets_crc = write_packets(path.with_suffix(PACKETS), log, evidence, placed)
             path.write_bytes(out.tobytes())
@@ -91,7 +94,8 @@ def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
     assert [r.changed for r in replace_rows(scan)] == [False, False]
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # who is killed closes nothing
+# Who is killed closes nothing
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("fault", ["killed within", "power cut", "worst power cut"])
 def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fault):
     scan, data = scan_with(tmp_path / "count" / "scan", lost=9, wrong=True)
@@ -107,7 +111,8 @@ def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fau
         assert errors(scan.path) == [], counting.done[at - 1]
         replace_rows(scan)
         holds(scan, data, [(9 * 1456, 10 * 1456)])
-    gc.collect()  # files that nobody closed are this test's, not the next one's
+    # Files that nobody closed are this test's, not the next one's
+    gc.collect()
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx", PACKETS])

@@ -61,7 +61,8 @@ def test_flipped_bit_is_never_a_fact(some, data):
 
 def test_after_every_truncation_the_lines_before_it_stand_and_the_chain_goes_on(tmp_path):
     some = [{"fact": "scan_paused"}, {"fact": "row_withdrawn", "row": 0}, {"fact": "scan_ended", "reason": "é"}]
-    path, ends = tmp_path / "manifest.jsonl", [0]
+    path = tmp_path / "manifest.jsonl"
+    ends = [0]
     with ManifestWriter(path, create=True) as writer:
         for fact in some:
             writer.append(fact)

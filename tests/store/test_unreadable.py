@@ -45,7 +45,8 @@ def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed, monkeypatch, 
         if path == bad:
             raise OSError(number, os.strerror(number))
 
-    opened, read = Path.open, Path.read_bytes
+    opened = Path.open
+    read = Path.read_bytes
     monkeypatch.setattr(Path, "open", lambda path, *how, **more: fails(path) or opened(path, *how, **more))
     monkeypatch.setattr(Path, "read_bytes", lambda path: fails(path) or read(path))
     with refused(ErrorCode.FILE_UNREADABLE, os.strerror(number)) as e:
@@ -105,7 +106,8 @@ def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed, tmp_path,
         if scan.begun:
             assert errors(scan.path) == []
         before = scan.rows() if scan.begun else {}
-        assert scan.run().exit_status == "success"  # there is space again
+        # There is space again
+        assert scan.run().exit_status == "success"
         assert validate(scan.path) == []
         assert scan.rows() == undisturbed.digests
         assert before.items() <= undisturbed.digests.items()

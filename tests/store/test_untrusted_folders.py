@@ -125,7 +125,8 @@ def larger_row(head, runs):
 
 def overflow(head, _runs):
     head["runs"] = 1 << 16
-    return claims(1 << 16, 0xFFFFFFFF, 0x8000)  # 2**63 bytes in all: 64 bits call that negative
+    # 2**63 bytes in all: 64 bits call that negative
+    return claims(1 << 16, 0xFFFFFFFF, 0x8000)
 
 
 def claims(runs: int, packets: int, size: int) -> np.ndarray:
@@ -147,7 +148,8 @@ def test_a_packet_log_that_claims_too_much_is_refused(scan, change):
     path = (scan.path / board.file).with_suffix(PACKETS)
     line, _, tail = path.read_bytes().partition(b"\n")
     head = json.loads(line)
-    at, end = 16 * head["batches"], 16 * head["batches"] + RUN.itemsize * head["runs"]
+    at = 16 * head["batches"]
+    end = 16 * head["batches"] + RUN.itemsize * head["runs"]
     runs = change(head, np.frombuffer(tail[at:end], RUN))
     path.write_bytes(json.dumps(head).encode() + b"\n" + tail[:at] + runs.tobytes() + tail[end:])
     with refused(ErrorCode.FILE_DAMAGED):
@@ -159,7 +161,8 @@ LINKS = ["manifest.jsonl", "events.msgpack", "raw/RH/0000.bin", "raw/RH/9999.idx
 
 @pytest.mark.parametrize("name", LINKS)
 def test_a_scan_with_a_link_out_of_it_is_refused_before_anything_is_read_or_written(scan, tmp_path, name):
-    victim, link = tmp_path / "victim", scan.path / name
+    victim = tmp_path / "victim"
+    link = scan.path / name
     victim.mkdir()
     (victim / "mine.txt").write_text("mine")
     target = victim
@@ -187,7 +190,8 @@ def test_a_pipe_in_a_scan_is_refused(scan):
 
 
 def test_the_target_of_a_link_is_not_emptied_for_new_products(tmp_path):
-    victim, out = tmp_path / "victim", tmp_path / "products"
+    victim = tmp_path / "victim"
+    out = tmp_path / "products"
     (victim / "folder").mkdir(parents=True)
     (tmp_path / ".products.new").symlink_to(victim)
     with pytest.raises(PolysightError), making_products(out, "scan"):
@@ -239,7 +243,8 @@ def test_a_manifest_with_another_form_of_calibration_is_refused(scan, answer):
 
 def test_a_row_that_is_larger_than_was_committed_is_refused_by_its_size(scan):
     name, board = next(iter(scan.committed()[0].boards.items()))
-    os.truncate(scan.path / board.file, 1 << 42)  # a hole: the file takes no space, its bytes would
+    # A hole: the file takes no space, its bytes would
+    os.truncate(scan.path / board.file, 1 << 42)
     with refused(ErrorCode.FILE_DAMAGED, 1 << 42):
         _ = scan.read_row(name, 0).payload
     assert board.file in str(droppable(scan, {name: {0: board.crc32}}).kept)

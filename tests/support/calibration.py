@@ -22,7 +22,8 @@ def filter_file(corner_khz: float = 180.5) -> FilterFile:
 
 def metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:
     """The images of a noisy plate, made with this rig."""
-    rng, grid = np.random.default_rng(seed), image_grid(rig)
+    rng = np.random.default_rng(seed)
+    grid = image_grid(rig)
     y, x = np.meshgrid(np.linspace(0, 1, grid.y_m.size), np.linspace(0, 1, grid.x_m.size), indexing="ij")
     gain = (1 + 0.2 * y) * np.exp(1j * x)
     noise = 1 + 0.02 * (rng.standard_normal((2, *x.shape)) + 1j * rng.standard_normal((2, *x.shape)))

@@ -74,7 +74,8 @@ def write_material(
     values = []
     for what in (material, Material(METAL, None)):
         h, v = draw_pixels(what, angle_deg, pixels, errors, rng)
-        h, v = (h * gain_h).astype(np.complex64), (v * gain_v).astype(np.complex64)
+        h = (h * gain_h).astype(np.complex64)
+        v = (v * gain_v).astype(np.complex64)
         values.append([h / v, h, v])
     content = {
         "name": material.name,

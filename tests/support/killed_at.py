@@ -18,10 +18,14 @@ from typing import Any
 
 def kill_at(hits: Path, operation: str, suffix: str, nth: int) -> None:
     """Arm this process."""
-    real, left = getattr(os, operation), [nth]
+    real = getattr(os, operation)
+    left = [nth]
 
     def call(what: Any, *more: Any, **named: Any) -> Any:
-        name = str(Path(f"/proc/self/fd/{what}").readlink()) if isinstance(what, int) else str(more[0])
+        if isinstance(what, int):
+            name = str(Path(f"/proc/self/fd/{what}").readlink())
+        else:
+            name = str(more[0])
         if name.endswith(suffix):
             with hits.open("a", encoding="utf-8") as f:
                 f.write(f"{operation}:{suffix}\n")

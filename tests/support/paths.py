@@ -10,4 +10,5 @@ RIG_FILE = REPO / "instrument.toml"
 EXAMPLES = REPO / "examples"
 BIN = Path(sys.executable).parent  # of the environment that runs the tests
 POLYSIGHT = BIN / "polysight"
-REAL_CAPTURES = REPO.parent / "shared/data/dca1000-real"  # packets of a real card, where somebody has them
+# Packets of a real card, where somebody has them
+REAL_CAPTURES = REPO.parent / "shared/data/dca1000-real"

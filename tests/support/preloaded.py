@@ -70,7 +70,9 @@ def name_of(words: list[str]) -> str:
     if program.name in ("polysight", "polysight-pi"):
         return program.name
     is_module = program.name.startswith("python") and len(words) > 2 and words[1] == "-m"
-    return words[2] if is_module and words[2].partition(".")[0] in PACKAGES else ""
+    if is_module and words[2].partition(".")[0] in PACKAGES:
+        return words[2]
+    return ""
 
 
 def is_ours(function: Callable[[], object] | None) -> bool:
@@ -89,7 +91,10 @@ class Popen(subprocess.Popen):
     def _execute_child(self, *values: Any, **named: Any) -> None:
         start = super()._execute_child  # type: ignore[misc]
         of = inspect.signature(start).bind(*values, **named).arguments
-        words = [] if isinstance(of["args"], str | bytes | os.PathLike) else [os.fsdecode(word) for word in of["args"]]
+        if isinstance(of["args"], str | bytes | os.PathLike):
+            words = []
+        else:
+            words = [os.fsdecode(word) for word in of["args"]]
         environment = dict(os.environ if of["env"] is None else of["env"])
         folder = os.fsdecode(of["cwd"] or Path.cwd())
         is_plain = not of["shell"] and of["executable"] is None and of["process_group"] == -1
@@ -247,7 +252,8 @@ def become(request: Request, files: list[int], starter: int) -> None:
 def show_in_process_list(words: list[str]) -> None:
     """Write the words over this process's own arguments, see proc(5), `arg_start`."""
     fields = Path("/proc/self/stat").read_bytes().rpartition(b")")[2].split()
-    start, end = int(fields[45]), int(fields[46])
+    start = int(fields[45])
+    end = int(fields[46])
     text = b"\0".join(map(os.fsencode, words))
     ctypes.memmove(start, text.ljust(end - start, b"\0"), end - start)
 

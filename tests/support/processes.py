@@ -83,7 +83,8 @@ class Program:
     """A command in a process group of its own, its output in files."""
 
     def __init__(self, command: Sequence[str | Path], folder: Path, cwd: Path, env: dict[str, str] | None) -> None:
-        self._out, self._err = folder / f"out-{time.monotonic_ns()}", folder / f"err-{time.monotonic_ns()}"
+        self._out = folder / f"out-{time.monotonic_ns()}"
+        self._err = folder / f"err-{time.monotonic_ns()}"
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self.process = subprocess.Popen(
                 [str(word) for word in command],
@@ -165,7 +166,9 @@ class Bench:
 
     def here(self, *arguments: str | Path) -> Ended:
         """Run a host command in this process, which saves a second for starting a program."""
-        out, err, before = io.StringIO(), io.StringIO(), signal.getsignal(signal.SIGTERM)
+        out = io.StringIO()
+        err = io.StringIO()
+        before = signal.getsignal(signal.SIGTERM)
         try:
             with chdir(self.folder), redirect_stdout(out), redirect_stderr(err):
                 status = main([str(word) for word in arguments])

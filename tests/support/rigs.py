@@ -11,7 +11,8 @@ from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.tables import decode, to_builtins
 from tests.support.paths import RIG_FILE
 
-MID_BAND_OFFSET_HZ = 790e3  # start offset of a receiver that puts the direct path mid-band
+# Start offset of a receiver that puts the direct path mid-band
+MID_BAND_OFFSET_HZ = 790e3
 Change = Callable[[dict[str, Any]], None]
 
 

@@ -58,7 +58,8 @@ class Rig(Bench):
 
     def wait_mid_row(self, scan: Program, rows: int) -> None:
         """Wait until this number of rows is committed, and the Pi has journalled an event of the next row."""
-        begun = 0  # bytes of the journal
+        # Bytes of the journal
+        begun = 0
 
         def there() -> bool:
             nonlocal begun

@@ -88,7 +88,8 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     base = factory.getbasetemp()
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "once"
     shared.mkdir(exist_ok=True)
-    folder, whole = shared / name, shared / f"{name}.whole"
+    folder = shared / name
+    whole = shared / f"{name}.whole"
     with (shared / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not whole.exists():
@@ -120,7 +121,8 @@ class Costs:
     def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
         """Add what passed since the last report to this one."""
         report = yield
-        before_s, self._last_s = self._last_s, _now_s()
+        before_s = self._last_s
+        self._last_s = _now_s()
         spent_s = [now - before for now, before in zip(self._last_s, before_s, strict=True)]
         report.user_properties = [*(p for p in report.user_properties if p[0] != _NAME), (_NAME, spent_s)]
         return report

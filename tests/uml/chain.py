@@ -28,8 +28,10 @@ from polysight_shared.wires import WireEdge, parse
 
 LINES = 28
 LIMIT_S = 600.0
-WIRES, PORT = Path("/run/wires"), Path("/run/ttySTAGE")
-SIOCSIFFLAGS, IFF_UP = 0x8914, 1
+WIRES = Path("/run/wires")
+PORT = Path("/run/ttySTAGE")
+SIOCSIFFLAGS = 0x8914
+IFF_UP = 1
 
 
 def loopback_up() -> None:
@@ -91,7 +93,8 @@ def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     host.accepted(m.Home())
     host.wait(m.StageStatus, lambda e: e.state == "idle" and (e.x_mm, e.y_mm) == (0.0, 0.0), LIMIT_S)
     host.until_state("ready")
-    list(chip.changes())  # what came before the row does not count
+    # What came before the row does not count
+    list(chip.changes())
     host.accepted(m.RunRow(scan_id="scan", row_index=0, take=1))
     finished = host.wait(m.RowFinished, limit_s=LIMIT_S)
     captures = [e for e in host.events if isinstance(e, m.Capture)]

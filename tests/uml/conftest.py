@@ -32,7 +32,8 @@ def kernel(request: pytest.FixtureRequest) -> Path:
         pytest.skip("not asked for: `make test-uml` builds a user-mode Linux (minutes, once) and runs these too")
     if lacking := missing():
         pytest.skip(f"no emulated UNO without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
-    emulator(), firmware()  # compiled here: in the guest everything is read-only
+    # Compiled here: in the guest everything is read-only
+    emulator(), firmware()
     built = subprocess.run([str(HERE / "build_kernel.sh")], stdout=subprocess.PIPE, text=True, check=False)
     assert built.returncode == 0, "the kernel was not built: see above"
     return Path(built.stdout.splitlines()[-1])

@@ -75,19 +75,24 @@ class SimChip:
 def _events(page: bytes) -> Iterator[tuple[int, bytes]]:
     """Time and payload of the events of a page of the ring buffer (Linux, Documentation/trace/ring-buffer-design)."""
     t_ns, committed = struct.unpack_from("<QQ", page)
-    at, end = 16, 16 + (committed & 0xFFFFFFFF)
+    at = 16
+    end = 16 + (committed & 0xFFFFFFFF)
     while at < end:
         head, word = struct.unpack_from("<II", page, at)
-        kind, delta = head & 31, head >> 5
+        kind = head & 31
+        delta = head >> 5
         at += 4
-        if kind == 29:  # padding
+        # Padding
+        if kind == 29:
             return
-        if kind == 31:  # absolute time
+        # Absolute time
+        if kind == 31:
             t_ns = delta | word << 27
             at += 4
             continue
         t_ns += delta | (word << 27 if kind == 30 else 0)
-        if kind == 30:  # more than 2^27 ns since the last event
+        # More than 2^27 ns since the last event
+        if kind == 30:
             at += 4
             continue
         length = 4 * kind if kind else word - 4

@@ -15,8 +15,12 @@ import pytest
 from polysight_pi.edges import TOLERANCE
 from polysight_shared.faults import PiFault
 
-PULSES, PERIOD_NS, SYNC_OUT = 16, 1_500_000, 22  # of instrument.toml
-SPACING_NS = 100_000_000  # 2 mm at 20 mm/s
+# of instrument.toml
+PULSES = 16
+PERIOD_NS = 1_500_000
+SYNC_OUT = 22
+# 2 mm at 20 mm/s
+SPACING_NS = 100_000_000
 TAKES = 6
 FAULTS_OF_A_LATE_PROGRAM = (PiFault.EDGE_DURING_BURST, PiFault.PERIOD_TOO_SHORT, PiFault.PROGRAM_LATE)
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3000)]
@@ -47,7 +51,8 @@ def bursts_of(result: dict[str, Any]) -> list[tuple[Capture, list[Pulse]]]:
     changes = result["changes"]
     assert {line for _, line, _ in changes} == {SYNC_OUT}
     rises = [i for i, (_, _, value) in enumerate(changes) if value]
-    assert all(changes[i + 1][2] == 0 for i in rises)  # each goes low again before the next
+    # Each goes low again before the next
+    assert all(changes[i + 1][2] == 0 for i in rises)
     pulses = iter([Pulse(changes[i][0], changes[i + 1][0]) for i in rises])
     bursts = []
     for capture in itertools.starmap(Capture, result["captures"]):

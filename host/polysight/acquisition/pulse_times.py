@@ -78,13 +78,19 @@ _NO_BOUND = 1 << 60
 class PlacedFrames:
     """Pulse numbers of the frames of a row."""
 
-    slots: Times  # int64 [frame]: the pulse number of each received frame; -1 if uncertain
-    missed: list[int]  # numbers of the pulses that were certainly missed
+    # int64 [frame]: the pulse number of each received frame; -1 if uncertain
+    slots: Times
+    # Numbers of the pulses that were certainly missed
+    missed: list[int]
     pulses: int  # in the row
-    reason: str = ""  # why the times say nothing; "" if they do
-    contradicted: bool = False  # frames are at other pulses than their number says: none is certain
-    disturbed: bool = False  # `reason` is that the times contradict each other, not that they are missing
-    doubtful: list[int] = field(default_factory=list)  # frames of a whole row that came at no pulse's time
+    # Why the times say nothing; "" if they do
+    reason: str = ""
+    # Frames are at other pulses than their number says: none is certain
+    contradicted: bool = False
+    # `reason` is that the times contradict each other, not that they are missing
+    disturbed: bool = False
+    # Frames of a whole row that came at no pulse's time
+    doubtful: list[int] = field(default_factory=list)
 
     @property
     def uncertain(self) -> int:
@@ -152,10 +158,14 @@ class _DisturbedError(_UndeterminedError):
 class _Trains(NamedTuple):
     """The packets of each frame that came one after another; arrays are [train]."""
 
-    first_stop: Times  # int64, bytes of the record up to the end of its first packet
-    last_stop: Times  # int64, up to the end of its last packet
-    low: Times  # int64, lower bound of the shift at its first packet, bytes
-    high: Times  # int64, upper bound of the shift at its last packet, bytes
+    # int64, bytes of the record up to the end of its first packet
+    first_stop: Times
+    # int64, up to the end of its last packet
+    last_stop: Times
+    # int64, lower bound of the shift at its first packet, bytes
+    low: Times
+    # int64, upper bound of the shift at its last packet, bytes
+    high: Times
     punctual: Flags  # of one frame, and at the time of a pulse
     astray: Flags  # of one frame, and at no pulse's time
 

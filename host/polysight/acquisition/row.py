@@ -95,7 +95,8 @@ class TakeFault:
 
     kind: FaultKind
     text: str
-    board: str = ""  # "" if the fault is the whole row's
+    # "" if the fault is the whole row's
+    board: str = ""
     number: int = 0  # of a `PI_FAULT`
 
     def __str__(self) -> str:
@@ -120,12 +121,16 @@ class Take:
 
     row: Row
     number: int
-    finished: RowFinished | None = None  # None if the Pi did not report how the row ended
+    # None if the Pi did not report how the row ended
+    finished: RowFinished | None = None
     captures: dict[str, RowCapture] = field(default_factory=dict)
-    aborted: TakeFault | None = None  # why the host aborted the row, or did not begin it
+    # Why the host aborted the row, or did not begin it
+    aborted: TakeFault | None = None
     events: list[ReceivedCapture] = field(default_factory=list)
-    radars: dict[str, BoardState] = field(default_factory=dict)  # latest states
-    not_done: list[str] = field(default_factory=list)  # radars that did not confirm the end of all frames
+    # Latest states
+    radars: dict[str, BoardState] = field(default_factory=dict)
+    # Radars that did not confirm the end of all frames
+    not_done: list[str] = field(default_factory=list)
     frames: dict[str, PlacedFrames] = field(default_factory=dict)  # by arrival times, of rows with a certain length
 
     def faults(self, pulses_per_point: int) -> list[TakeFault]:
@@ -168,7 +173,9 @@ class Take:
         frames = self.frames.get(name)
         if frames is None or frames.reason:
             return None
-        return frames if self.captures[name].slipped or frames.contradicted else None
+        if self.captures[name].slipped or frames.contradicted:
+            return frames
+        return None
 
     def count_untimed(self, name: str, pulses_per_point: int) -> int:
         """Number of a board's frames whose pulse follows from their count alone, not from their arrival times."""
@@ -181,19 +188,33 @@ class Take:
         """Return the fault of one board's data; None if it is complete."""
         placed = self.find_displaced(name)
         radar = self.radars.get(name, BoardState(RadarState.UNKNOWN))
-        held_text = "; the row was held, and a card ends its record after 2 s without data" if self.note else ""
+        if self.note:
+            held_text = "; the row was held, and a card ends its record after 2 s without data"
+        else:
+            held_text = ""
         if capture.packets == 0:
             detail = f": its radar was {radar.detail}, and may not have obeyed" if radar.detail else ""
             return TakeFault(FaultKind.NO_DATA, f"no data{detail}", name)
         if placed is not None:
-            missed = FaultKind.PULSES_MISSED if placed.slots.size < placed.pulses else FaultKind.SLIPPED
+            if placed.slots.size < placed.pulses:
+                missed = FaultKind.PULSES_MISSED
+            else:
+                missed = FaultKind.SLIPPED
             kind = FaultKind.HELD if held_text else missed
             return TakeFault(kind, describe(placed, pulses_per_point) + held_text, name)
         if not capture.located:
             frames = self.frames.get(name)
-            unplaced = f"; missed pulses cannot be located: {frames.reason}" if frames is not None else ""
+            if frames is not None:
+                unplaced = f"; missed pulses cannot be located: {frames.reason}"
+            else:
+                unplaced = ""
             waits = "; the radar still waits for pulses" if radar.state is RadarState.ARMED else ""
-            kind = FaultKind.RADAR_WAITS if waits else FaultKind.HELD if held_text else _classify_unlocated(capture)
+            if waits:
+                kind = FaultKind.RADAR_WAITS
+            elif held_text:
+                kind = FaultKind.HELD
+            else:
+                kind = _classify_unlocated(capture)
             return TakeFault(kind, capture.reason + unplaced + waits + held_text, name)
         if capture.conflicting and capture.missing:
             text = f"{capture.conflicting} packets have other bytes than packets with equal counters"
@@ -215,7 +236,9 @@ class Take:
     @property
     def note(self) -> str:
         """The Pi's remark on a completed row: that it was held during the sweep."""
-        return self.finished.reason if self.finished is not None and self.all_pulses_sent else ""
+        if self.finished is not None and self.all_pulses_sent:
+            return self.finished.reason
+        return ""
 
     @property
     def stopped_radars(self) -> dict[str, BoardState]:
@@ -232,7 +255,9 @@ def _classify_unlocated(capture: RowCapture) -> FaultKind:
     """Return why a board's data cannot be located in the row."""
     if capture.lost_before_packets:
         return FaultKind.CARD_DROPPED
-    return FaultKind.FRAMES_MISSING if capture.slipped else FaultKind.UNLOCATED
+    if capture.slipped:
+        return FaultKind.FRAMES_MISSING
+    return FaultKind.UNLOCATED
 
 
 def commit_row(
@@ -250,7 +275,10 @@ def commit_row(
         frames = take.frames.get(name)
         moved = frames_to_move(capture, frames)
         untimed = take.count_untimed(name, scan.instrument.burst.pulses) if capture.located else 0
-        missed = frames.pulses - frames.slots.size if capture.slipped and frames is not None else None
+        if capture.slipped and frames is not None:
+            missed = frames.pulses - frames.slots.size
+        else:
+            missed = None
         if moved is not None:
             capture = rewrite_row(final.with_suffix(PART), capture, moved, scan.instrument.frame_bytes)
             take.captures[name] = capture
@@ -324,7 +352,8 @@ def retakes_exhausted(take: Take, faults: list[TakeFault], scan: ScanFolder, tak
     elif take.silent_boards:
         silent = [silent_radar(scan.instrument.by_name(name), take.captures[name]) for name in take.silent_boards]
         states = [f"{n}'s radar was {take.radars[n].detail}" for n in take.silent_boards if n in take.radars]
-        cause, remedy = "; ".join([f"{e.what}: {e.why}" for e in silent] + states), silent[0].remedy
+        cause = "; ".join([f"{e.what}: {e.why}" for e in silent] + states)
+        remedy = silent[0].remedy
     elif take.finished is not None and take.finished.fault:
         explained = explain(take.finished.fault)
         cause = explained.why
@@ -467,7 +496,12 @@ class RowTaker:
         is_held = False
         while take.finished is None:
             self._poll(take)
-            fault = ON_REQUEST if self._stop.now else None if take.aborted else self._fatal_fault(take, silence)
+            if self._stop.now:
+                fault = ON_REQUEST
+            elif take.aborted:
+                fault = None
+            else:
+                fault = self._fatal_fault(take, silence)
             if take.finished is None and fault and not take.aborted:
                 take.aborted = fault
                 deadline = time.monotonic() + _ABORT_TIMEOUT_S

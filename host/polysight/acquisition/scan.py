@@ -622,7 +622,8 @@ def resume_scan(
             )
         if not hello.stage or (scan.started.pi is not None and scan.started.pi.stage):
             warnings = check_same_stage(scan.instrument.stage, hello, f"{folder}")
-        else:  # the earlier rows were placed by that Pi, not by the host's rig file
+        else:
+            # The earlier rows were placed by that Pi, not by the host's rig file
             differences = stage_differences(scan.instrument.stage, hello)
             warnings = [f"not compared when the scan began: {d}" for d in differences]
         writer.append(

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from polysight.products import ProcessedScan
 from polysight.report import draw_overview, figure_label, font_families
 
-_PANEL_IN = 3.8  # width of one picture
+# Width of one picture
+_PANEL_IN = 3.8
 
 
 class NotebookFigure(Figure):

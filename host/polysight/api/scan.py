@@ -134,11 +134,11 @@ def open_scan(
     )
     if is_given_images(path):
         return Scan(path, None, _analyse_images(path, rig, settings), settings)
-    anew = fresh or settings != Settings()
+    process_again = fresh or settings != Settings()
     if (path / IMAGE).exists() and not (path / MANIFEST).exists():
-        return _products_only(path, settings, anew)
+        return _products_only(path, settings, process_again)
     source = _open_source(path, rig)
-    saved = None if anew else find_products(path)
+    saved = None if process_again else find_products(path)
     if saved is not None and isinstance(source, ScanFolder) and not _is_current(saved, source):
         saved = None
     return Scan(path, source, saved, settings)
@@ -456,8 +456,8 @@ class Scan:
         if self._source is None:
             raise self._unknown("surface")
         config = None if self._settings.config is None else Path(self._settings.config)
-        made = make_surface(self.folder, config, None if reference is None else Path(reference))
-        return surface_dataset(made)
+        surface = make_surface(self.folder, config, None if reference is None else Path(reference))
+        return surface_dataset(surface)
 
     def plot(self, *, metal_referenced: bool = True) -> Figure:
         """Figure of |H|, |V|, |P| (dB), and of the materials' names if metal-referenced; axes in mm.

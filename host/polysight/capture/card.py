@@ -443,7 +443,10 @@ def _reach(survey: CardSurvey, card: CardClient) -> Iterator[Finding]:
     faulty = ""
     if error is not None:
         faulty = "card" if survey.version else _FAULTY_HOP.get(silent_hop(address), "card")
-    interface = "loopback" if address.startswith("127.") else route_interface(address) or "unknown interface"
+    if address.startswith("127."):
+        interface = "loopback"
+    else:
+        interface = route_interface(address) or "unknown interface"
     for hop, text in (("route", interface), ("link", interface), ("card", f"replies, FPGA {survey.version}")):
         if error is not None and hop == faulty:
             yield _wrong(hop, error)
@@ -498,7 +501,9 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
             got = receiver.end_row(card.take_status())
     except DeviceError as e:
         return _wrong("radar", e)
-    return _wrong("radar", silent_radar(card.board, got)) if got.packets == 0 else _streams(got)
+    if got.packets == 0:
+        return _wrong("radar", silent_radar(card.board, got))
+    return _streams(got)
 
 
 def _streams(got: RowCapture) -> Finding:

@@ -65,7 +65,9 @@ def kind_of(head: bytes) -> str:
         return "empty"
     text = head.decode("utf-8", "ignore")
     printable = all(c.isprintable() or c.isspace() for c in text)
-    return "text" if len(text.encode()) > len(head) - 4 and printable else "unknown bytes"
+    if len(text.encode()) > len(head) - 4 and printable:
+        return "text"
+    return "unknown bytes"
 
 
 @dataclass(frozen=True)

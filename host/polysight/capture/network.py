@@ -329,7 +329,9 @@ def has_link(interface: str, root: Path = _ROOT) -> bool | None:
         # `carrier` of an interface that is down is not readable.
         pass
     try:
-        return False if (folder / "operstate").read_text(encoding="ascii").strip() == "down" else None
+        if (folder / "operstate").read_text(encoding="ascii").strip() == "down":
+            return False
+        return None
     except OSError:
         return None
 

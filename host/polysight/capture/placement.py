@@ -42,7 +42,8 @@ class Past:
     """Where the next record begins, from the records before it. `Past()` is the state *first*."""
 
     start: Counters | None = None  # of the next record's first byte; None: unknown
-    lost: bool = False  # unknown, and packets of earlier records may still come
+    # Unknown, and packets of earlier records may still come
+    lost: bool = False
 
     @staticmethod
     def after_reset() -> Past:
@@ -55,17 +56,25 @@ class PacketCounts:
     """Packets of one row by result: every packet is in exactly one of the first eight; the others are subsets."""
 
     placed: int = 0
-    duplicates: int = 0  # every byte was there already, and equal
-    conflicting: int = 0  # other bytes than a packet with equal counters: masked where they overlap
+    # Every byte was there already, and equal
+    duplicates: int = 0
+    # Other bytes than a packet with equal counters: masked where they overlap
+    conflicting: int = 0
     leftover: int = 0  # of an earlier record
-    restarted: int = 0  # after the card restarted within the row and reset its counters
+    # After the card restarted within the row and reset its counters
+    restarted: int = 0
     outside: int = 0  # behind the record's last expected byte, or not kept for lack of memory
-    disagreeing: int = 0  # byte count and sequence contradict each other
+    # Byte count and sequence contradict each other
+    disagreeing: int = 0
     malformed: int = 0  # no payload, or longer than the card's packets
-    late: int = 0  # placed, after a packet that follows it
-    late_by_bytes: int = 0  # largest delay of these, bytes
-    short: int = 0  # placed, not full; normally only the last of a record
-    before_pulses: int = 0  # leftover, identified by arrival before the row's first pulse
+    # Placed, after a packet that follows it
+    late: int = 0
+    # Largest delay of these, bytes
+    late_by_bytes: int = 0
+    # Placed, not full; normally only the last of a record
+    short: int = 0
+    # Leftover, identified by arrival before the row's first pulse
+    before_pulses: int = 0
 
 
 @dataclass(frozen=True)
@@ -82,17 +91,27 @@ class Losses:
 class Placed:
     """Result of placing one record."""
 
-    expected: int  # bytes
-    received: int  # bytes
-    missing: list[Gap]  # byte ranges (start, stop) that are missing or uncertain: sorted, not touching
-    located: bool  # the place of every byte is certain; if not, `missing` is the whole record
-    reason: str  # why it is not located
+    # Bytes
+    expected: int
+    # Bytes
+    received: int
+    # Byte ranges (start, stop) that are missing or uncertain: sorted, not touching
+    missing: list[Gap]
+    # The place of every byte is certain; if not, `missing` is the whole record
+    located: bool
+    # Why it is not located
+    reason: str
     counts: PacketCounts
-    losses: Losses  # missing bytes by kind; for a record that is not located, by its counters only
-    past: Past  # knowledge for the next record
-    at: Counts  # int64 [packet]: offset of its payload in the row, -1 outside the row
-    arrivals: Counts  # int64 [n, 2]: time (monotonic, ns), bytes received by then
-    holes: list[Gap] = field(default_factory=list)  # missing ranges below the furthest byte, in the card's order
+    # Missing bytes by kind; for a record that is not located, by its counters only
+    losses: Losses
+    # Knowledge for the next record
+    past: Past
+    # int64 [packet]: offset of its payload in the row, -1 outside the row
+    at: Counts
+    # int64 [n, 2]: time (monotonic, ns), bytes received by then
+    arrivals: Counts
+    # Missing ranges below the furthest byte, in the card's order
+    holes: list[Gap] = field(default_factory=list)
     slipped: bool = False  # not located only because whole frames are missing: triggers were missed
 
     @property
@@ -205,20 +224,31 @@ def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
 class _Record:
     """The row's record among the packets; arrays are [packet]."""
 
-    start: Counters  # counters of its first byte
-    offsets: Counts  # int64, bytes behind the start
-    steps: Counts  # int64, packets behind the start
-    own: Flags  # counters within the row, and came after the first pulse
-    beyond: Flags  # counts on from this record behind the row's last byte
+    # Counters of its first byte
+    start: Counters
+    # int64, bytes behind the start
+    offsets: Counts
+    # int64, packets behind the start
+    steps: Counts
+    # Counters within the row, and came after the first pulse
+    own: Flags
+    # Counts on from this record behind the row's last byte
+    beyond: Flags
     later: Flags  # of a record behind this one
-    early: Flags  # came before the row's first pulse
+    # Came before the row's first pulse
+    early: Flags
     too_early: Flags  # of these, the ones with counters of the row
-    anew: Flags  # has counters of a card that restarted within the row
-    full: int  # payload of a full packet, bytes
-    length: int = 0  # bytes up to the end of the furthest packet
+    # Has counters of a card that restarted within the row
+    anew: Flags
+    # Payload of a full packet, bytes
+    full: int
+    # Bytes up to the end of the furthest packet
+    length: int = 0
     ended: bool = False  # that packet is short, as only a record's last one is
-    ends_as_planned: bool = False  # every sign of an end at the row's last byte
-    doubt: str = ""  # why the start is not certain
+    # Every sign of an end at the row's last byte
+    ends_as_planned: bool = False
+    # Why the start is not certain
+    doubt: str = ""
 
 
 def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:

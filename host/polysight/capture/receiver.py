@@ -113,7 +113,8 @@ class BeginRow(_Message, frozen=True):
     expected_bytes: int
     frame_bytes: int
     path: str
-    after_reset: bool = False  # the card was reset just before: its counters begin anew
+    # The card was reset just before: its counters begin anew
+    after_reset: bool = False
 
 
 class EndRow(_Message, frozen=True):
@@ -155,8 +156,10 @@ class Progress(_Message, frozen=True):
     take: int
     received: int
     complete: bool
-    last_arrival_ns: int  # monotonic clock; 0 before the first packet
-    ended: bool = False  # the furthest packet is short, as only the last of a record is
+    # Monotonic clock; 0 before the first packet
+    last_arrival_ns: int
+    # The furthest packet is short, as only the last of a record is
+    ended: bool = False
 
 
 class RowCapture(_Message, frozen=True):

@@ -32,7 +32,9 @@ MAX_INDEX_BYTES = 256 << 20
 
 def _find_scan(path: Path) -> Path:
     """The scan folder of `SCAN/raw/BOARD/ROW.*`; of a file elsewhere, its own folder."""
-    return path.parents[2] if path.parent.parent.name == "raw" else path.parent
+    if path.parent.parent.name == "raw":
+        return path.parents[2]
+    return path.parent
 
 
 def write_error(path: Path, done: str, e: OSError) -> DeviceError:
@@ -158,7 +160,10 @@ def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed
     sizes = log.sizes[:stored]
     sequences = log.sequences[:stored]
     counts = log.byte_counts[:stored]
-    places = np.full(stored, -1, dtype=np.int64) if placed is None else _in_the_row(placed, sizes)
+    if placed is None:
+        places = np.full(stored, -1, dtype=np.int64)
+    else:
+        places = _in_the_row(placed, sizes)
     is_stored_here = places < 0
     rest = np.concatenate([[0], np.cumsum(np.where(is_stored_here, sizes, 0))])[:-1]
     place = np.where(is_stored_here, -1 - rest, places)

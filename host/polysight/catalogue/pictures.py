@@ -127,11 +127,11 @@ class Pixels(ProcessedScan):
 
     def nearest(self, x_mm: float, y_mm: float) -> tuple[int, int]:
         """Row and column of the pixel at a place. Raises DataError outside the image."""
-        left, right, low, high = self.extent_mm
-        if not (left <= x_mm <= right and low <= y_mm <= high):
+        x_min, right, low, high = self.extent_mm
+        if not (x_min <= x_mm <= right and low <= y_mm <= high):
             raise DataError(
                 f"x = {x_mm:.6g} mm, y = {y_mm:.6g} mm lies outside the image",
-                f"it reaches from x {left:.1f} to {right:.1f} mm, and from y {low:.1f} to {high:.1f} mm",
+                f"it reaches from x {x_min:.1f} to {right:.1f} mm, and from y {low:.1f} to {high:.1f} mm",
                 "give a place in it, in mm from its centre", code=ErrorCode.VALUE_INVALID,
             )  # fmt: skip
         return int(np.abs(self.y_mm - y_mm).argmin()), int(np.abs(self.x_mm - x_mm).argmin())
@@ -206,7 +206,10 @@ def draw_products(pixels: Pixels, name: str, limits: Limits | None = None) -> Pi
             f"no picture is called {name[:40]!r}", "the name is wrong", f"one of {', '.join(MAPS)}",
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
-    values = _derived_values(pixels, name) if MAPS[name].needs_metal else _channel_values(pixels)[name]
+    if MAPS[name].needs_metal:
+        values = _derived_values(pixels, name)
+    else:
+        values = _channel_values(pixels)[name]
     return draw_values(values if limits is None else replace(values, limits=limits))
 
 
@@ -283,7 +286,9 @@ def _below_brightest(channel: NDArray[np.complex64], visible: NDArray[np.bool_])
 
 def percentile(values: Real, mask: NDArray[np.bool_], percent: float, default: float = 0.0) -> float:
     """A percentile of the values under a mask; `default` if it is empty."""
-    return float(np.percentile(values[mask], percent)) if mask.any() else default
+    if mask.any():
+        return float(np.percentile(values[mask], percent))
+    return default
 
 
 def _fade(level_db: Real) -> Real:

@@ -130,13 +130,13 @@ def list_files(folder: Path) -> list[File]:
     """Downloadable files of a scan's products and exports."""
     products = read_products(folder).folder
     files = []
-    for of, place in (("products", products), (EXPORT, folder / EXPORT)):
+    for group, place in (("products", products), (EXPORT, folder / EXPORT)):
         if place.is_symlink() or not place.is_dir():
             continue
         for path in sorted(place.iterdir()):
             is_listed = path.name in FILES or path.suffix in EXPORTS
             if is_listed and path.is_file() and not path.is_symlink():
-                files.append(File(of, path.name, path.stat().st_size))
+                files.append(File(group, path.name, path.stat().st_size))
     return files
 
 
@@ -257,7 +257,10 @@ def _library_ratios(path: Path, changed_ns: int, angle_deg: float) -> dict[str, 
     ratios = {}
     for name, values in patches.items():
         means = np.array(values)
-        spread = float(np.sqrt(np.mean(np.abs(means - means.mean()) ** 2) / 2)) if len(means) > 1 else 0.0
+        if len(means) > 1:
+            spread = float(np.sqrt(np.mean(np.abs(means - means.mean()) ** 2) / 2))
+        else:
+            spread = 0.0
         ratios[name] = (complex(means.mean()), spread)
     return ratios
 
@@ -314,11 +317,15 @@ def _restore_rows(scan: Path, changed_ns: int) -> Pipeline | None:
     del changed_ns
     pipeline = Pipeline(ScanFolder.load(scan), samples="read")
     rows = list(pipeline.source.rows())
-    return pipeline if rows and all(map(pipeline.samples.restore, rows)) else None
+    if rows and all(map(pipeline.samples.restore, rows)):
+        return pipeline
+    return None
 
 
 def _db(value: complex) -> float | None:
-    return round(float(20 * np.log10(abs(value))), 2) if value and np.isfinite(value) else None
+    if value and np.isfinite(value):
+        return round(float(20 * np.log10(abs(value))), 2)
+    return None
 
 
 def _number(value: float) -> float | None:

@@ -77,7 +77,9 @@ def read_notes(folder: Path) -> Notes:
     try:
         with path.open("rb") as f:
             raw = f.read(MAX_NOTES_BYTES + 1)
-        return Notes() if len(raw) > MAX_NOTES_BYTES else msgspec.json.decode(raw, type=Notes)
+        if len(raw) > MAX_NOTES_BYTES:
+            return Notes()
+        return msgspec.json.decode(raw, type=Notes)
     except FileNotFoundError:
         return Notes()
     except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as e:
@@ -336,7 +338,9 @@ def find_program(folder: Path, kind: str) -> Program | None:
 
 def _read_status(path: Path) -> int | None:
     try:
-        return int(path.read_text(encoding="ascii")[:8]) if is_plain(path) else None
+        if is_plain(path):
+            return int(path.read_text(encoding="ascii")[:8])
+        return None
     except (OSError, ValueError):
         return None
 
@@ -382,7 +386,9 @@ def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
     if summary.state == "begun":
         # A killed program changes no file.
         failure = explain_failure(find_program(folder, "scan"))
-        return summary if failure is None else replace(summary, state="failed", reason=failure.what)
+        if failure is None:
+            return summary
+        return replace(summary, state="failed", reason=failure.what)
     if summary.state not in ("lost", "paused"):
         return summary
     life = read_life(folder)
@@ -399,7 +405,9 @@ def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
         if life is not None and life.is_here:
             return replace(summary, state="frozen")
         return replace(summary, state="lost")
-    return summary if summary.state == "paused" else replace(summary, state="running")
+    if summary.state == "paused":
+        return summary
+    return replace(summary, state="running")
 
 
 def _modified_s(folder: Path) -> float:
@@ -446,7 +454,10 @@ class Scans:
         again when that has returned.
         """
         with self._lock:
-            entries = [self.only] if self.only is not None else [name for name, _ in _folders(self.root)]
+            if self.only is not None:
+                entries = [self.only]
+            else:
+                entries = [name for name, _ in _folders(self.root)]
             self._read_all(deque(entry for entry in entries if entry not in self._reading))
             scans: list[Summary] = []
             for entry in entries:
@@ -463,9 +474,9 @@ class Scans:
         while waiting:
             worker = threading.Thread(target=self._read_entries, args=(waiting,), name="list", daemon=True)
             worker.start()
-            left = -1
-            while worker.is_alive() and left != len(waiting):
-                left = len(waiting)
+            count_before = -1
+            while worker.is_alive() and count_before != len(waiting):
+                count_before = len(waiting)
                 worker.join(READ_S)
 
     def _read_entries(self, waiting: deque[str]) -> None:

@@ -40,8 +40,8 @@ def _report(args: argparse.Namespace) -> int:
 def _permittivity(args: argparse.Namespace) -> int:
     from polysight.jobs.materials import permittivity
 
-    given = {"--bands": args.bands, "--amplitude": args.amplitude, "--config": args.config}
-    useless = [name for name, value in given.items() if value is not None]
+    options = {"--bands": args.bands, "--amplitude": args.amplitude, "--config": args.config}
+    useless = [name for name, value in options.items() if value is not None]
     if useless and not args.layer:
         raise ConfigError(
             f"{' and '.join(useless)} without --layer would do nothing",

@@ -16,7 +16,8 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 
 RIG = Path("instrument.toml")
-_FIRST = 3  # options before "more options"
+# Options before "more options"
+_FIRST = 3
 _FARTHEST_MM = 10_000
 
 
@@ -41,7 +42,8 @@ class CommandParser(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         """The help text."""
-        groups = self._action_groups[2:]  # the first two are argparse's own
+        # The first two are argparse's own
+        groups = self._action_groups[2:]
         grouped = [a for group in groups for a in group._group_actions]
         named = [a for a in self._actions if a.option_strings and a not in grouped]
         named.sort(key=lambda a: (not a.required, not set(self.most_used) & set(a.option_strings), a.dest == "help"))
@@ -177,7 +179,8 @@ def joined(words: Sequence[str]) -> list[str]:
         elif out and out[-1].startswith("--") and "=" not in out[-1]:
             out[-1] += f"={word}"
         else:
-            out.append(f" {word}")  # a blank in front: no option
+            # A blank in front: no option
+            out.append(f" {word}")
     return out
 
 

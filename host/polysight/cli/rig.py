@@ -244,8 +244,8 @@ def _inspect(args: argparse.Namespace) -> int:
 
     if args.placement:
         return inspect_placement(args.file, args.json)
-    given = {name: value for name in ("lanes", "samples", "q_first") if (value := getattr(args, name)) is not None}
-    return inspect_file(args.file, args.config, args.plot, args.card, args.json, given)
+    options = {name: value for name in ("lanes", "samples", "q_first") if (value := getattr(args, name)) is not None}
+    return inspect_file(args.file, args.config, args.plot, args.card, args.json, options)
 
 
 def _add_inspect(add: Add) -> None:
@@ -457,7 +457,8 @@ def _reproduce(args: argparse.Namespace) -> int:
     from polysight.jobs.demo import require_package
 
     if args.config != packaged(RIG):
-        load_instrument(args.config)  # refuse a wrong one now, not with the first item that needs it
+        # Refuse a wrong one now, not with the first item that needs it
+        load_instrument(args.config)
     require_package("polysight_papers", "papers")
     sys.stderr.write("polysight reproduce: starting\n")  # its figures' libraries take seconds to load
     sys.stderr.flush()

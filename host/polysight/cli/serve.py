@@ -26,7 +26,8 @@ def add_commands(add: Add) -> None:
 
 def _serve(args: argparse.Namespace) -> int:
     _check_extra()
-    sys.stderr.write("polysight serve: starting\n")  # what it shows takes seconds to load
+    # What it shows takes seconds to load
+    sys.stderr.write("polysight serve: starting\n")
     from polysight.serve import serve
 
     config = args.config

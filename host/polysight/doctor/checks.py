@@ -88,7 +88,8 @@ CHECKS = (
 
 def run_checks(context: CheckContext) -> Iterator[Finding]:
     """Run every check in order and yield its finding at once."""
-    blocked: dict[tuple[str, str], str] = {}  # (check, board) that failed or was skipped: title of the failed check
+    # (check, board) that failed or was skipped: title of the failed check
+    blocked: dict[tuple[str, str], str] = {}
     for check in CHECKS:
         boards: tuple[Board | None, ...] = (None,)
         if check.each_board and context.loaded_rig is not None:

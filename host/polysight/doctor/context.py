@@ -49,24 +49,28 @@ from polysight_shared.messages import HelloReply, Pulsed
 if TYPE_CHECKING:
     from polysight.calibration import DirectSignal
 
-_STA_UNSYNC = 0x40  # struct timex, adjtimex(2)
+# Struct timex, adjtimex(2)
+_STA_UNSYNC = 0x40
 _SIOCETHTOOL = 0x8946
 _ETHTOOL_GRINGPARAM = 0x10
 _DROP_COUNTERS = ("rx_missed_errors", "rx_fifo_errors", "rx_dropped")
 _PROBE_BYTES = 64 << 20
 _PROBE_S = 2.0
 
-_LAST_PACKET_S = 2.5  # a card sends its short last packet two seconds after the last data
+# A card sends its short last packet two seconds after the last data
+_LAST_PACKET_S = 2.5
 _POLL_S = 0.05
 
 
 def clock_is_synchronised() -> bool | None:
     """Return the kernel's synchronisation flag (adjtimex(2)); None if the system does not provide it."""
-    timex = ctypes.create_string_buffer(512)  # larger than struct timex; modes = 0 only reads
+    # Larger than struct timex; modes = 0 only reads
+    timex = ctypes.create_string_buffer(512)
     adjtimex = getattr(ctypes.CDLL(None, use_errno=True), "adjtimex", None)
     if adjtimex is None or adjtimex(timex) < 0:
         return None
-    *_, status = struct.unpack_from("@illlli", timex.raw)  # modes, offset, freq, maxerror, esterror, status
+    # Modes, offset, freq, maxerror, esterror, status
+    *_, status = struct.unpack_from("@illlli", timex.raw)
     return not status & _STA_UNSYNC
 
 
@@ -97,8 +101,8 @@ def read_interface(name: str, root: Path = Path("/")) -> NetworkInterface:
     ring = ring_max = None
     if root == Path("/"):
         ring, ring_max = _receive_ring(name)
-    lost = sum(number(f"statistics/{counter}") or 0 for counter in _DROP_COUNTERS)
-    return NetworkInterface(name, number("mtu"), number("speed"), ring, ring_max, lost)
+    dropped = sum(number(f"statistics/{counter}") or 0 for counter in _DROP_COUNTERS)
+    return NetworkInterface(name, number("mtu"), number("speed"), ring, ring_max, dropped)
 
 
 def _receive_ring(name: str) -> tuple[int, int] | tuple[None, None]:
@@ -132,7 +136,8 @@ def write_speed(folder: Path) -> float:
 
 # Time of a packet beyond its configured delay: delays of 5, 10, 25, 50 us give 706, 545, 325, 193 Mbit/s (TI).
 PACKET_TIME_US = 11.0
-_RATE_S = 1.5  # duration of each rate
+# Duration of each rate
+_RATE_S = 1.5
 _DRAIN_S = 5.0
 _SENDER = Path(__file__).with_name("send_packets.py")
 _BUSY_LOOP = "while True: sum(range(100_000))"
@@ -201,12 +206,12 @@ def _measure_rate(rate: float, first: int, packets: int, receivers: list[Receive
     took_s = [float(sender.communicate()[0] or "inf") for sender in senders]
     deadline = time.monotonic() + _DRAIN_S
     while not all(r.poll().complete for r in receivers) and time.monotonic() < deadline:
-        before = [r.report().received for r in receivers]
+        received_before = [r.report().received for r in receivers]
         time.sleep(0.2)
-        if [r.report().received for r in receivers] == before:
+        if [r.report().received for r in receivers] == received_before:
             break
-    lost = sum(packets - r.end_row().packets for r in receivers)
-    return LoadResult(rate, packets / max(took_s), packets * len(receivers), lost)
+    lost_packets = sum(packets - r.end_row().packets for r in receivers)
+    return LoadResult(rate, packets / max(took_s), packets * len(receivers), lost_packets)
 
 
 def ok(what: str, **facts: Any) -> Finding:

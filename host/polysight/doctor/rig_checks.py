@@ -58,7 +58,8 @@ from polysight_shared.messages import MAX_PULSES_AT_REST, MAX_PULSES_AT_REST_S, 
 from polysight_shared.raster import RasterPlan, check_burst_fits
 from polysight_shared.sockets import HOST_KEYS, is_loopback
 
-_SPEED_MARGIN = 2.0  # disk speed relative to the data rate
+# Disk speed relative to the data rate
+_SPEED_MARGIN = 2.0
 _MAX_CLOCK_OFFSET_S = 1.0  # between host and Pi
 _CLOCK_LOST_S = 60.0
 _SET_CLOCK = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery for its clock"
@@ -68,12 +69,15 @@ _MIN_MTU = 1500
 _MIN_SPEED_MBIT = 1000
 _MIN_RING = 512
 _MAX_CLIPPED = 0.01  # of the chirps
-_MIN_RMS = 4.0  # counts
+# Counts
+_MIN_RMS = 4.0
 _MIN_DETECTED = 0.9  # of the chirps, for the direct path
-_MAX_DELAY_S = 10e-9  # 5 ns trigger clock and some ppm of the crystals
+# 5 ns trigger clock and some ppm of the crystals
+_MAX_DELAY_S = 10e-9
 _SKEW_WARNING_S = 10e-9
 _SKEW_ERROR_S = 20e-9
-_MAX_JITTER_S = 4e-9  # two trigger clocks of 5 ns give a standard deviation of 2 ns
+# Two trigger clocks of 5 ns give a standard deviation of 2 ns
+_MAX_JITTER_S = 4e-9
 
 
 def check_config(context: CheckContext) -> Finding:
@@ -245,12 +249,12 @@ def check_keys(context: CheckContext) -> Finding:
 
 def check_pi(context: CheckContext) -> Finding:
     """Check that the Pi answers, has this release, and the same stage settings."""
-    before = context.system.wall_ns()
+    sent_ns = context.system.wall_ns()
     hello = context.pi.hello()
-    after = context.system.wall_ns()
+    answered_ns = context.system.wall_ns()
     context.hello = hello
-    context.hello_at_ns = (before + after) // 2
-    context.hello_took_ns = after - before
+    context.hello_at_ns = (sent_ns + answered_ns) // 2
+    context.hello_took_ns = answered_ns - sent_ns
     backend = f"GPIO backend {hello.backend}"
     if is_simulated(hello.backend):
         backend = SIMULATED
@@ -292,7 +296,8 @@ def check_trigger(context: CheckContext) -> Finding:
             "only a moving stage gives trigger edges",
             f"`polysight doctor --move` homes it and runs {_POINTS} points: keep clear of the stage",
         )
-    context.hello = context.pi.hello()  # a scan may have started since then, and begin_run would end it
+    # A scan may have started since then, and begin_run would end it
+    context.hello = context.pi.hello()
     if (busy := check_free(context)).level == "error":
         return busy
     row = _run_row(context)
@@ -646,7 +651,8 @@ def check_skew(context: CheckContext) -> Finding:
 def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
     """Judge the receivers' start times. Relative to the transmitter they are as exact as the start frequencies."""
     h, v = rig.receivers
-    delay = {b.name: signals[b.name].start_delay_s(rig) for b in (h, v)}  # mean and standard error, s
+    # Mean and standard error, s
+    delay = {b.name: signals[b.name].start_delay_s(rig) for b in (h, v)}
     skew = delay[v.name][0] - delay[h.name][0]
     uncertainty = float(np.hypot(delay[h.name][1], delay[v.name][1]))
     jitter = max(float(unwrapped(signals[b.name].if_hz, rig).std()) for b in (h, v)) / rig.chirp.slope_hz_per_s

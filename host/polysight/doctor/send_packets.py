@@ -8,7 +8,8 @@ import struct
 import sys
 import time
 
-_MAX_LAG_S = 0.005  # a card catches up no more than its own buffer
+# A card catches up no more than its own buffer
+_MAX_LAG_S = 0.005
 
 
 def main(card: str, card_port: int, host: str, port: int, first: int, packets: int, rate: float, size: int) -> None:

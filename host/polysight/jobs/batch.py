@@ -135,7 +135,8 @@ def make_jobs(scans: Sequence[tuple[Path, Settings]], out: Path) -> list[Job]:
     return list(jobs.values())
 
 
-PRODUCTS_VERSION = 4  # counts changes of what products of the same data hold
+# Counts changes of what products of the same data hold
+PRODUCTS_VERSION = 4
 _OWN_FILES = (MANIFEST, TRUTH, "raw/*/*.bin", "raw/*/*.idx")
 _PUBLISHED_FILES = ("*_cfg.json", TRUTH, "*/*.bin", "*/*_log.csv", "*_synced.npy")
 
@@ -178,7 +179,8 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
         return sorted([*folder.glob("*.npy"), *folder.glob("*.json")])
     patterns = _OWN_FILES if (folder / MANIFEST).exists() else _PUBLISHED_FILES
     files: list[Path] = []
-    with suppress(PolysightError):  # the scan's own program will say what is wrong with it
+    # The scan's own program will say what is wrong with it
+    with suppress(PolysightError):
         source = open_source(folder, config, dropped=True)
         if isinstance(source, ScanFolder) and dropped_rows(source):
             patterns = (*patterns, f"{SAMPLES}/*")
@@ -210,7 +212,8 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     log = job.out.with_name(job.name + ".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    alive, promise = os.pipe()  # nothing is written: the child sees its end when this program is gone
+    # Nothing is written: the child sees its end when this program is gone
+    alive, promise = os.pipe()
     try:
         environment[ALIVE] = str(alive)
         with log.open("wb") as output:
@@ -481,7 +484,8 @@ def main() -> int:
         sys.stderr.write(f"{e.filename or job.out}: {e.strerror or e}\n")
         return 1
     if status == NoResult.exit_status:
-        status = 0  # the scan is processed: its products say that nothing can be named
+        # The scan is processed: its products say that nothing can be named
+        status = 0
     if status == 0:
         seconds = round(time.monotonic() - began, 1)
         mark = {"made_with": job.made_with, "seconds": seconds, "memory_gb": peak_memory_bytes() / 1e9}

@@ -75,7 +75,10 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     points = read_target(target)
     rig_file = None if config is None else load_instrument(config)
     source = open_raw(scan, rig_file)
-    rig = source.instrument if rig_file is None else with_places_of(source.instrument, rig_file)
+    if rig_file is None:
+        rig = source.instrument
+    else:
+        rig = with_places_of(source.instrument, rig_file)
     calibration = calibration_of_scan(source)
     filters = {b.name: calibration.high_pass(b.name) for b in rig.receivers}
     say("places of boards and plane")
@@ -210,27 +213,27 @@ def leakage_of_scans(
     """
     settings = Settings(config=path_text(config))
     pipeline, images = imaged(plate, settings)
-    whole = plane_of(pipeline, images)
+    plate_reference = plane_of(pipeline, images)
     theta = specular_incidence_rad(pipeline.rig)
-    mask = whole.valid & images.valid
+    mask = plate_reference.valid & images.valid
     turned = []
     names = [pipeline.source.scan_id]
     simulated = pipeline.source.simulated
     for degrees, folder in strips:
-        other, strip_images = imaged(folder, settings)
-        whole.check_rig(other.calibration.imaged_with(other.rig), str(plate))
-        whole.check_axes(strip_images.x_m, strip_images.y_m)
+        strips_pipeline, strip_images = imaged(folder, settings)
+        plate_reference.check_rig(strips_pipeline.calibration.imaged_with(strips_pipeline.rig), str(plate))
+        plate_reference.check_axes(strip_images.x_m, strip_images.y_m)
         mask = mask & strip_images.valid
         turned.append((float(np.radians(degrees)), strip_images.h, strip_images.v))
-        names.append(other.source.scan_id)
-        simulated = simulated or other.source.simulated
+        names.append(strips_pipeline.source.scan_id)
+        simulated = simulated or strips_pipeline.source.simulated
     if int(mask.sum()) < LEAST_PIXELS:
         raise DataError(
             f"the scans show metal at {int(mask.sum())} common pixels only",
             "plate and strips must cover the same part of the plane",
             "scan them in the same place, larger than the grid on every side",
         )
-    leakage = leakage_from_images((whole.h, whole.v), turned, mask, theta)
+    leakage = leakage_from_images((plate_reference.h, plate_reference.v), turned, mask, theta)
     largest = max(abs(leakage.h), abs(leakage.v))
     if largest > MAX_LEAKAGE:
         raise DataError(
@@ -239,7 +242,7 @@ def leakage_of_scans(
             "correct the angle, DEG of --strips DEG=SCAN, or scan the strips again",
             code=ErrorCode.VALUE_INVALID,
         )
-    std = _leakage_std((whole.h, whole.v), turned, mask, theta)
+    std = _leakage_std((plate_reference.h, plate_reference.v), turned, mask, theta)
     facts = {"scans": names, "simulated": simulated, "pixels": int(mask.sum()), "leakage_std": std}
     return leakage, {**facts, "incidence_deg": float(np.degrees(theta))}
 
@@ -253,7 +256,7 @@ def _leakage_std(
     and is no smaller over the whole than half of what it is in a quarter.
     """
     rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
-    middle = [float(np.median(at[mask])) for at in (rows, columns)]
+    middle = [float(np.median(index[mask])) for index in (rows, columns)]
     parts = []
     for up in (rows > middle[0], rows <= middle[0]):
         for right in (columns > middle[1], columns <= middle[1]):

@@ -134,8 +134,8 @@ def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
     deadline = time.monotonic() + _START_LIMIT_S
     with selectors.DefaultSelector() as selector:
         selector.register(rig.stdout, selectors.EVENT_READ)
-        while (left := deadline - time.monotonic()) > 0:
-            if not selector.select(left):
+        while (seconds_left := deadline - time.monotonic()) > 0:
+            if not selector.select(seconds_left):
                 continue
             line = rig.stdout.readline()
             if line.startswith("ready "):

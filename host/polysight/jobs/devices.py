@@ -36,7 +36,8 @@ from polysight_shared.config import Board, Instrument, load_instrument
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.findings import Finding
 
-_ASK_S = 1.5  # limit of one question to a card that is perhaps just starting, all attempts together
+# Limit of one question to a card that is perhaps just starting, all attempts together
+_ASK_S = 1.5
 _PAUSE_S = 0.2
 
 
@@ -173,7 +174,8 @@ def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
         else:
             if was_off:
                 return version
-        time.sleep(_PAUSE_S)  # an interface that is down answers at once
+        # An interface that is down answers at once
+        time.sleep(_PAUSE_S)
     missing = "the card was not switched off"
     if was_off:
         missing = f"not seen at {board.card_address}:{board.command_port}"

@@ -159,7 +159,8 @@ def save_labels(place: Path, products: ProcessedScan, labels: Labels) -> tuple[L
     checked = replace(
         checked, by_hand=True, description=f"boxes of scan {products.scan_id}, in mm from the image centre"
     )
-    from polysight.report import label_figure  # matplotlib, which is not needed to list or to refuse
+    # Matplotlib, which is not needed to list or to refuse
+    from polysight.report import label_figure
 
     picture = label_figure(products, checked.boxes, checked.metal)
     # The boxes last: where they are, their picture is.
@@ -247,7 +248,8 @@ def apply_edits(labels: Labels, found: Sequence[FoundPatch], edits: Edits) -> tu
         specimens.pop(name, None)
         if name == metal:
             metal = None
-    if edits.from_patches and edits.metal in boxes:  # a patch's number: it is called metal, unless it gets a name
+    # A patch's number: it is called metal, unless it gets a name
+    if edits.from_patches and edits.metal in boxes:
         renamed = {old for old, _ in (_split(text, boxes) for text in edits.renames)}
         if edits.metal not in renamed:
             edits = replace(edits, renames=(*edits.renames, f"{edits.metal}={METAL}"))

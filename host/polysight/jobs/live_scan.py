@@ -100,7 +100,8 @@ class ScanBar:
             self._bars.update(self._points, description=text, total=p.row_points, completed=p.points, visible=True)
         if p.phase in ("warning", "retake", "home", "check", "connect", "stop", "held", "wait"):
             self._console.print(f"{p.phase}: {p.message}", highlight=False)
-        if p.phase == "end" and p.committed < p.rows:  # processing may still take a while; the error comes behind it
+        # Processing may still take a while; the error comes behind it
+        if p.phase == "end" and p.committed < p.rows:
             self._console.print(f"{p.phase}: {p.message}", highlight=False)
         if not self._console.is_terminal and p.phase == "committed":
             tenth = 10 * p.committed // max(1, p.rows)
@@ -130,7 +131,8 @@ def _run_rows(folder: Path, processing: LiveProcessing | None, run_rows: RunScan
 
         def show(progress: ScanProgress) -> None:
             if progress.phase != "connect":
-                control.open()  # the scan folder is there, and locked by this program
+                # The scan folder is there, and locked by this program
+                control.open()
             bar.update(progress)
 
         result = run_rows(None if processing is None else processing.add_row, show, stop)
@@ -209,7 +211,8 @@ def scan(
     def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
         def show(progress: ScanProgress) -> None:
             if truth is not None and progress.phase == "row" and not (folder / TRUTH).exists():
-                with suppress(OSError):  # noted below: a row is worth more
+                # Noted below: a row is worth more
+                with suppress(OSError):
                     shutil.copyfile(truth, folder / TRUTH)
             on_progress(progress)
 

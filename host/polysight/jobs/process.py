@@ -133,7 +133,8 @@ def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
     are. Raises PolysightError.
     """
     with making_products(out, pipeline.source.scan_id) as new, current_step("image") as progress:
-        _check_dropped(pipeline, out)  # `out` is locked; `drop-raw` may have run since the rows were added
+        # `out` is locked; `drop-raw` may have run since the rows were added
+        _check_dropped(pipeline, out)
         try:
             products = pipeline.finish(new, plates, progress)
             if has_steep_patch(new):
@@ -320,7 +321,8 @@ def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
     source = open_source(data, settings.path("config"), dropped=True)
     check_products_folder(out, source.scan_id)
     if isinstance(source, ScanFolder) and raw_dropped(out):
-        require_raw(source)  # products in `out` may be all that is left of it
+        # Products in `out` may be all that is left of it
+        require_raw(source)
     pipeline = processed_rows(source, data, settings)
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:
@@ -358,7 +360,8 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     grid = builder.grid
     board = builder.boards[source.instrument.receivers[0].name]
     pictures = (board.image()[0], board.image(replace(grid, z_m=grid.z_m + depth_m))[0])
-    if source.mirrored:  # the builder's image is that of the mirrored rig
+    # The builder's image is that of the mirrored rig
+    if source.mirrored:
         sharpest = sharpest.transposed()
         plates = plates.transposed()
         pictures = (pictures[0].T, pictures[1].T)
@@ -379,9 +382,9 @@ def _focus_lines(head: str, distance_mm: float, sharpest: Focus, plates: PlaneEs
         std = 1e3 * plates.offset_std_m
         tilt = np.degrees(plates.tilt_rad)
         tilt_std = np.degrees(plates.tilt_std_rad)
-        how = "the phase of their echoes" if plates.by_phase else "the range of their echoes"
+        method = "the phase of their echoes" if plates.by_phase else "the range of their echoes"
         lines += [
-            f"{head}: {plates.plates} flat plates lie {mm:+.2f} +- {std:.2f} mm from the rig file's plane, by {how}:"
+            f"{head}: {plates.plates} flat plates lie {mm:+.2f} +- {std:.2f} mm from the rig file's plane, by {method}:"
             f" object_distance_mm = {distance_mm + mm:.2f}",
             f"tilt: {tilt[0]:+.2f} +- {tilt_std[0]:.2f} degrees along x, {tilt[1]:+.2f} +- {tilt_std[1]:.2f} along y",
         ]

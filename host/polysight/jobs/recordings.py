@@ -32,7 +32,8 @@ from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, PolysightError, os_error
 
-_SHOWN = 8  # missing ranges that are printed
+# Missing ranges that are printed
+_SHOWN = 8
 BOTTOM_DB = -20.0  # of the plot of a range profile
 
 
@@ -111,7 +112,8 @@ def find_scan(file: Path) -> ScanFolder | None:
     try:
         return ScanFolder.load(folders[2])
     except PolysightError:
-        return None  # `polysight validate` says what is wrong with it
+        # `polysight validate` says what is wrong with it
+        return None
 
 
 def inspect_file(

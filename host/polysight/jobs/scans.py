@@ -174,7 +174,9 @@ def _shown_name(name: str | None) -> str:
 
 def _error(std: float | None) -> str:
     """Standard error of a complex number as text."""
-    return "(its error is not known)" if std is None else f"+- {std:.3g} (real and imaginary part)"
+    if std is None:
+        return "(its error is not known)"
+    return f"+- {std:.3g} (real and imaginary part)"
 
 
 def _value(value: float | None) -> str:
@@ -191,7 +193,8 @@ def _complex(number: ComplexNumber | PermittivityDifference) -> str:
     return f"{number.real:.3g} {sign} {abs(number.imag):.3g}j"
 
 
-WORD = "drop"  # confirms the removal of raw rows
+# Confirms the removal of raw rows
+WORD = "drop"
 
 
 def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
@@ -280,7 +283,8 @@ def _keep(products: Path, scan: ScanFolder) -> None:
 def processed_digests(folder: Path) -> Digests:
     """Return the CRCs of the processed rows, by board. Raises DataError."""
     products = read_products(folder)
-    _ = products.images  # raises when it cannot be read
+    # Raises when it cannot be read
+    _ = products.images
     boards = products.quality.boards
     digests = {name: board.raw_crc32 for name, board in boards.items() if board.raw_crc32 is not UNSET}
     if not digests or len(digests) < len(boards):

@@ -86,7 +86,9 @@ RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "puls
 
 def sentence(text: str) -> str:
     """Return the text with a capital letter first; a command stays as it is."""
-    return text if text.startswith("polysight") else text[:1].upper() + text[1:]
+    if text.startswith("polysight"):
+        return text
+    return text[:1].upper() + text[1:]
 
 
 def notice_of_error(error: PolysightError, level: Level = "warning") -> Finding:

@@ -274,7 +274,10 @@ def make_motion(inputs: Inputs) -> Motion:
     if inputs.history is None:
         return Motion(now_s=now_s)
     pi = inputs.pi
-    left_s, basis = remaining(inputs.history, inputs.signs.now_s) if inputs.signs.alive else (None, "")
+    if inputs.signs.alive:
+        left_s, basis = remaining(inputs.history, inputs.signs.now_s)
+    else:
+        left_s, basis = (None, "")
     stage = None
     if pi.x_mm is not None and pi.y_mm is not None:
         stage = (round(pi.x_mm, 1), round(pi.y_mm, 1))

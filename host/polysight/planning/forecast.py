@@ -55,9 +55,11 @@ Real = NDArray[np.float64]
 MAX_STEPS_PER_S = 20_000  # of the stage's firmware (docs/spec/stage-line.md, timing)
 SIMULATED_DIRECT_SNR_DB = 5.5
 _PUBLISHED_SPEED_MM_S = 20.0
-_PUBLISHED_PHASE_RAD = 0.022  # standard deviation of the phase of the object's peak, paper section 9.1
+# Standard deviation of the phase of the object's peak, paper section 9.1
+_PUBLISHED_PHASE_RAD = 0.022
 _MAX_BURST_LOSS_DB = 0.5
-_WIRE_BYTES = 1470 + 42 + 24  # a full packet on Ethernet: headers, preamble, checksum, gap
+# A full packet on Ethernet: headers, preamble, checksum, gap
+_WIRE_BYTES = 1470 + 42 + 24
 _ETHERNET_BYTES_PER_US = 125.0
 _FAST_TIME_WINDOW = "hann"  # as in host.imaging.ImageBuilder
 

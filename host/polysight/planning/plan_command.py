@@ -57,7 +57,8 @@ _MAX_TRAVEL_WAVELENGTHS = 0.5
 _MAX_FRAMES = 65535  # of a row (host/polysight/radar/commands.py)
 
 _WIDTH = 118
-_NOISE_ROWS = 5  # rows from which the noise is measured
+# Rows from which the noise is measured
+_NOISE_ROWS = 5
 _SIMULATED = "the simulated rig's (not measured on hardware; set it with --like SCAN or --snr-db)"
 
 
@@ -169,7 +170,8 @@ def _grids(rig: Instrument) -> Iterator[Instrument]:
             try:
                 yield steps.apply(rig)
             except ConfigError:
-                continue  # the aperture, rounded to whole steps, exceeds the travel
+                # The aperture, rounded to whole steps, exceeds the travel
+                continue
 
 
 def _bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iterator[Instrument]:
@@ -231,7 +233,9 @@ def _duration(seconds: float) -> str:
 
 
 def _size(count: float) -> str:
-    return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
+    if count >= 1e9:
+        return f"{count / 1e9:.2f} GB"
+    return f"{count / 1e6:.0f} MB"
 
 
 def _pair(values: tuple[float, float], digits: int = 1) -> str:
@@ -372,7 +376,8 @@ def measure_noise(source: RawSource) -> Noise:
 
     Raises DataError if the scan has no rows, or bursts of a single chirp.
     """
-    from polysight.report import SyncReport  # here: importing matplotlib takes a second
+    # Here: importing matplotlib takes a second
+    from polysight.report import SyncReport
 
     rig = source.instrument
     rows = list(source.rows())
@@ -473,9 +478,10 @@ def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
         sys.stdout.write(json.dumps(content, indent=1) + "\n")
     elif plans:
         lines = rig_lines(plans[0].rig, original)
-        differences = (
-            f"Its lines in the rig file, all that differ:\n\n{lines}" if lines else "It is the rig file's plan.\n"
-        )
+        if lines:
+            differences = f"Its lines in the rig file, all that differ:\n\n{lines}"
+        else:
+            differences = "It is the rig file's plan.\n"
         sys.stdout.write(
             f"Best plans within {options.minutes:g} minutes for this aperture, least noise in the image first"
             f" (dB: point over noise; motion: wavelengths during a burst)\n\n{_table(plans)}\n"

@@ -231,7 +231,10 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
     if scan.verdict is not None and not scan.verdict.usable:
         raise scan.verdict.error("the images are kept")
     image = image_dataset(scan)
-    theta_rad = np.asarray(image["incidence_rad"]) if "incidence_rad" in image else np.float64(np.nan)
+    if "incidence_rad" in image:
+        theta_rad = np.asarray(image["incidence_rad"])
+    else:
+        theta_rad = np.float64(np.nan)
     p = np.where(scan.valid, scan.p, np.nan).astype(np.complex128)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         value = permittivity_from_ratio(p, theta_rad)
@@ -368,7 +371,8 @@ def join_complex(dataset: xarray.Dataset) -> xarray.Dataset:
         name, _, suffix = str(full_name).rpartition("_")
         if variable.attrs.get(_PART) == "real" and f"{name}_imag" in dataset:
             both = np.empty(variable.shape, np.complex64 if variable.dtype == np.float32 else np.complex128)
-            both.real, both.imag = variable.values, dataset[f"{name}_imag"].values
+            both.real = variable.values
+            both.imag = dataset[f"{name}_imag"].values
             attrs = {key: text for key, text in variable.attrs.items() if key != _PART}
             attrs["long_name"] = str(attrs.get("long_name", name)).removesuffix(", real part")
             made[name] = (variable.dims, both, attrs)
@@ -448,13 +452,13 @@ def _check_hdf5(path: Path) -> None:
     sizes: list[int] = []
     external: list[str] = []
     with h5py.File(path, "r") as file:
-
-        def check(name: str) -> None:  # called by HDF5, must not raise
+        # Called by HDF5, must not raise
+        def check(name: str) -> None:
             outside = isinstance(file.get(name, getlink=True), h5py.ExternalLink)
-            found = None if outside else file.get(name)
-            if isinstance(found, h5py.Dataset):
-                outside = bool(found.external) or found.is_virtual
-                sizes.append((found.size or 0) * found.dtype.itemsize)
+            content = None if outside else file.get(name)
+            if isinstance(content, h5py.Dataset):
+                outside = bool(content.external) or content.is_virtual
+                sizes.append((content.size or 0) * content.dtype.itemsize)
             if outside:
                 external.append(name)
 
@@ -551,7 +555,9 @@ def _struct(node: Any) -> Any:
         for i, v in enumerate(node):
             cells[0, i] = _struct(v)
         return cells
-    return float(node) if isinstance(node, int) and not isinstance(node, bool) else node
+    if isinstance(node, int) and not isinstance(node, bool):
+        return float(node)
+    return node
 
 
 def _name(key: str) -> str:

@@ -40,7 +40,8 @@ LABELS_PICTURE = "labels.png"
 SURFACES = (SURFACE, POINTS, "surface.png")
 PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, REPORT, "figures", *SURFACES)
 _BY_HAND = b'"by_hand": true'
-_HERE = -100  # AT_FDCWD of renameat2(2)
+# AT_FDCWD of renameat2(2)
+_HERE = -100
 _EXCHANGE = 2
 
 
@@ -134,11 +135,13 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
     DeviceError
         if the new folder cannot replace `out`; the error names the new folder, which is kept.
     """
-    place = out.resolve()  # the target of a link
+    # The target of a link
+    place = out.resolve()
     new = place.with_name(f".{place.name}.new")
     old = place.with_name(f".{place.name}.old")
     if old.exists() and not place.exists():
-        old.rename(place)  # a program was killed between the two renames of _replace
+        # A program was killed between the two renames of _replace
+        old.rename(place)
     shutil.rmtree(old, ignore_errors=True)  # or after them
     check_products_folder(out, scan_id)
     lock = _lock(out, new)
@@ -267,7 +270,8 @@ def scan_folder_of(folder: Path) -> Path | None:
     above = folder.resolve().parent
     if not is_source(above):
         return None
-    return folder.parent if folder.parent.resolve() == above else above  # the parent of `.` is `.`
+    # The parent of `.` is `.`
+    return folder.parent if folder.parent.resolve() == above else above
 
 
 def label_folder(folder: Path) -> Path:
@@ -300,7 +304,8 @@ def _hand_labels(products: Path, scan_id: str) -> dict[str, bytes]:
             return {}
         files = (path, products / LABELS_PICTURE)
         return {f.name: f.read_bytes() for f in files if f.exists()}
-    except (OSError, DataError):  # damaged: not known to belong to this scan
+    except (OSError, DataError):
+        # Damaged: not known to belong to this scan
         return {}
 
 

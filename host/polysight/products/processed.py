@@ -52,9 +52,13 @@ from polysight_shared.raster import RasterPlan, plan_raster
 from polysight_shared.tables import decode
 
 SCAN = "scan.json"
-IMAGE, QUALITY, MATERIALS, LABELS = "image.npz", "quality.json", "materials.json", "labels.json"
+IMAGE = "image.npz"
+QUALITY = "quality.json"
+MATERIALS = "materials.json"
+LABELS = "labels.json"
 REPORT = "report.html"
-FINISHED = ".finished.json"  # settings of the products, written by batch processing
+# Settings of the products, written by batch processing
+FINISHED = ".finished.json"
 _ARRAYS = {
     "h": np.complex64,
     "v": np.complex64,
@@ -64,7 +68,8 @@ _ARRAYS = {
     "valid": np.bool_,
     "p_sigma": np.float32,
 }
-_OPTIONAL = ("p_sigma",)  # arrays of image.npz that earlier releases did not write
+# Arrays of image.npz that earlier releases did not write
+_OPTIONAL = ("p_sigma",)
 
 
 class PlatesNamed(NamedTuple):
@@ -326,7 +331,9 @@ class ProcessedScan:
         """True if the data was simulated; None if unknown."""
         if self.facts.simulated is not UNSET:
             return self.facts.simulated
-        return None if self.materials is None or self.materials.simulated is UNSET else self.materials.simulated
+        if self.materials is None or self.materials.simulated is UNSET:
+            return None
+        return self.materials.simulated
 
     @property
     def stamped(self) -> bool:
@@ -343,7 +350,9 @@ class ProcessedScan:
         """Rig of the images; None if unknown."""
         path = self.folder / SCAN
         try:
-            return decode(self.facts.instrument, Instrument, f"{path}: instrument") if self.facts.instrument else None
+            if self.facts.instrument:
+                return decode(self.facts.instrument, Instrument, f"{path}: instrument")
+            return None
         except ConfigError as e:
             raise damaged(path, e.what) from None
 
@@ -365,14 +374,17 @@ class ProcessedScan:
     @cached_property
     def plan(self) -> RasterPlan | None:
         """Raster of the scan; None if unknown."""
-        return None if self.rig is None or self.by_columns else plan_raster(self.rig.grid)
+        if self.rig is None or self.by_columns:
+            return None
+        return plan_raster(self.rig.grid)
 
     @cached_property
     def labels(self) -> Labels:
         """Patch number of each pixel, 0 for none, int32 [ny, nx]; saved outlines are accurate to half a pixel."""
         if self.found is not None:
             return self.found.segmentation.labels
-        x_m, y_m = self.images.x_m, self.images.y_m
+        x_m = self.images.x_m
+        y_m = self.images.y_m
         labels = np.zeros((y_m.size, x_m.size), np.int32)
         points = np.stack(np.meshgrid(axis_mm(x_m), axis_mm(y_m)), axis=-1).reshape(-1, 2)
         for patch in self.segments:

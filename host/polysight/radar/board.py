@@ -153,7 +153,8 @@ class BringUp:
         patch_after = self._main_patch()
         self._verify(patch_after, patch_before, image)
         self._refuse_damaged()
-        if self._board.die_id:  # only readable after the RF power-up
+        # Only readable after the RF power-up
+        if self._board.die_id:
             self._rf_up()
             self._read_die()
         return f"main core's patch {patch_after} from flash (before: {patch_before})"
@@ -310,7 +311,8 @@ class BringUp:
             elif self._board.firmware is not None:
                 self._verify(_patch(v), self._flash_patch, self._board.firmware)
         if self._board.die_id:
-            self._read_die()  # before the RF part of a wrong board is powered
+            # Before the RF part of a wrong board is powered
+            self._read_die()
         return f"RF {facts.rf_firmware}, main {facts.main_firmware}"
 
     def _send(self, commands: Sequence[c.Command]) -> str:
@@ -360,7 +362,8 @@ class BringUp:
         except DeviceError as error:
             if self._board.die_id or error.code is not ErrorCode.REFUSED_BY_PEER:
                 raise
-            self._board.log_event(error.what)  # a firmware without this command
+            # A firmware without this command
+            self._board.log_event(error.what)
             return "unknown"
         die = "-".join(f"{word:08x}" for word in struct.unpack_from("<4I", data))
         self._board.facts.die_id = die
@@ -614,7 +617,8 @@ class RadarBoard:
             if self.poll() in (State.ARMED, State.RUNNING):
                 self._stop()
         except DeviceError:
-            pass  # the link is closed in any case
+            # The link is closed in any case
+            pass
         finally:
             self.words.close()
 

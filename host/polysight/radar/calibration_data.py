@@ -24,9 +24,12 @@ from polysight_shared.files import read_bounded
 # ICD 70
 PARTS = 3
 PART_BYTES = 224
-RESTORED = 0x14E0  # ADC offset, both filters, RX gain, I/Q: recommended by TI (ICD 72)
-ALL = 0x1FF0  # calibrations of the RF init (ICD 63)
-NO_DIE = "-".join(["00000000"] * 4)  # a die id that does not identify a board
+# ADC offset, both filters, RX gain, I/Q: recommended by TI (ICD 72)
+RESTORED = 0x14E0
+# Calibrations of the RF init (ICD 63)
+ALL = 0x1FF0
+# A die id that does not identify a board
+NO_DIE = "-".join(["00000000"] * 4)
 _MAX_FILE_BYTES = 2**16
 _REMEDY = "delete the file: the board then calibrates itself, and a new file is written"
 

@@ -22,8 +22,10 @@ from polysight_shared.geometry import direct_path_m
 from polysight_shared.raster import MIN_PERIOD_US, WIDTH_US
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-START_HZ_PER_CODE = 3.6e9 / 2**26  # ICD 81
-SLOPE_HZ_PER_S_PER_CODE = 3.6e9 * 900 / 2**26 * 1e6  # ICD 83: 48.279 kHz/us
+# ICD 81
+START_HZ_PER_CODE = 3.6e9 / 2**26
+# ICD 83: 48.279 kHz/us
+SLOPE_HZ_PER_S_PER_CODE = 3.6e9 * 900 / 2**26 * 1e6
 CHIRP_TICK_US = 0.01
 FRAME_TICK_US = 0.005
 # ICD 178
@@ -94,10 +96,12 @@ class Fixed(Command):
         return self.content
 
 
-RF_POWER_UP = Fixed(0x4000, "RfPowerUp")  # ICD 269; must never be sent again (ICD 20)
+# ICD 269; must never be sent again (ICD 20)
+RF_POWER_UP = Fixed(0x4000, "RfPowerUp")
 RF_INIT = Fixed(0x00C0, "RfInit")
 GET_RF_VERSION = Fixed(0x0220, "GetRfVersion")
-GET_DIE_ID = Fixed(0x0223, "GetDieId")  # ICD 188
+# ICD 188
+GET_DIE_ID = Fixed(0x0223, "GetDieId")
 GET_MAIN_VERSION = Fixed(0x40E0, "GetMainVersion")
 GET_TEMPERATURES = Fixed(0x02EA, "GetTemperatures")
 # Read back profile 0, chirp 0 and the frame; the answers have the form of Profile, Chirp and Frame (ICD 175-176).
@@ -386,11 +390,13 @@ def program(rig: Instrument, board: Board) -> Program:
         transmits=bool(tx),
     )
     for command in (*commands.basic, *commands.waveform):
-        command.block()  # raises ValueError for a value that exceeds its field
+        # Raises ValueError for a value that exceeds its field
+        command.block()
     return commands
 
 
-BAND_HZ = (0x5471C71B * START_HZ_PER_CODE, 0x5A000000 * START_HZ_PER_CODE)  # 76..81 GHz, to the code (ICD 81)
+# 76..81 GHz, to the code (ICD 81)
+BAND_HZ = (0x5471C71B * START_HZ_PER_CODE, 0x5A000000 * START_HZ_PER_CODE)
 INTER_FRAME_US = 300.0
 AFTER_FRAME_US = 150.0
 FRAME_PERIOD_US = (MIN_PERIOD_US, 1.342e6)
@@ -399,7 +405,8 @@ TRIGGER_UNCERTAINTY_S = 5e-9  # of one board against the pulse (ICD 92)
 PASSBAND = 0.9  # of the sample rate
 MAX_SLOPE_CODE = 5510
 _LARGEST = 1.7e308
-MAX_RATE_HZ = {"complex1x": 22.5e6, "complex2x": 45e6}  # regular ADC mode, 20 MHz IF (ICD 85)
+# Regular ADC mode, 20 MHz IF (ICD 85)
+MAX_RATE_HZ = {"complex1x": 22.5e6, "complex2x": 45e6}
 
 
 class Constraint(NamedTuple):

@@ -96,7 +96,8 @@ class RadarControl(ABC):
 
 
 _POLL_S = 0.005
-_REOPEN_TIMEOUT_S = 5.0  # USB needs some time to find a chip again
+# USB needs some time to find a chip again
+_REOPEN_TIMEOUT_S = 5.0
 _REOPEN_INTERVAL_S = 0.25
 _STATES = {
     State.ARMED: RadarState.ARMED,
@@ -241,7 +242,8 @@ class NativeRadars(RadarControl):
         for board in self._boards.values():
             try:
                 board.arm(frames)
-            except DeviceError:  # a chip that was disconnected and came back leaves a dead link
+            except DeviceError:
+                # A chip that was disconnected and came back leaves a dead link
                 if self._reopen(board):
                     with suppress(DeviceError):
                         board.arm(frames)
@@ -274,7 +276,8 @@ class NativeRadars(RadarControl):
 
     def _reopen(self, board: RadarBoard) -> bool:
         """Reopen a failed board's link; return False after the timeout."""
-        with suppress(OSError):  # the device is gone
+        # The device is gone
+        with suppress(OSError):
             board.close()
         deadline = self._clock.now() + _REOPEN_TIMEOUT_S
         while True:
@@ -350,7 +353,8 @@ class LineServers(RadarControl):
         self._servers = dict(servers)
         self._timeout_s = timeout_s
         self._sockets: dict[str, socket.socket] = {}
-        self._reset: set[str] = set()  # boards whose server broke the connection since the last line
+        # Boards whose server broke the connection since the last line
+        self._reset: set[str] = set()
         try:
             for board in self._servers:
                 self._connect(board)
@@ -430,7 +434,8 @@ class LineServers(RadarControl):
         """Wait until the other machine acknowledged the line, or the connection ended."""
         connection = self._sockets[board]
         ended = select.poll()
-        ended.register(connection, 0)  # a reset, or the end of both directions
+        # A reset, or the end of both directions
+        ended.register(connection, 0)
         while _unacknowledged(connection):
             if ended.poll(_POLL_MS):
                 return

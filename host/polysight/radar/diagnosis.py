@@ -128,7 +128,8 @@ def _judge_supplies(board: RadarBoard) -> Row:
 FORM = 1
 INTERRUPT = "HOST_INTR"
 RESET = "NRST"
-MAX_BYTES = 2**26  # a scan of some thousand rows
+# A scan of some thousand rows
+MAX_BYTES = 2**26
 _MAX_S = 1e7
 
 
@@ -156,7 +157,8 @@ class TracedWords:
         self._began = clock.now()
         self._file = file.open("w", encoding="utf-8")
         self._level: bool | None = None
-        self._looks = 0  # queries of the interrupt without a change since the last line
+        # Queries of the interrupt without a change since the last line
+        self._looks = 0
         self.file = file
         self.ended = ""
         self._write({"trace": FORM, **facts})
@@ -194,7 +196,8 @@ class TracedWords:
     def close(self) -> None:
         """Close link and file; may be called twice."""
         self._words.close()
-        with suppress(OSError):  # closing tries to write the rest
+        # Closing tries to write the rest
+        with suppress(OSError):
             self._file.close()
 
     @contextmanager

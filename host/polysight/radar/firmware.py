@@ -20,17 +20,22 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.files import read_bounded
 
-TO_RAM = 0  # lost at the next reset (ICD 302)
-TO_FLASH = 4  # the first of four areas in the board's serial flash
-CHUNK_TIMEOUT_S = 10.0  # TI's limit for each part; the first one is acknowledged after erasing the flash
+# Lost at the next reset (ICD 302)
+TO_RAM = 0
+# The first of four areas in the board's serial flash
+TO_FLASH = 4
+# TI's limit for each part; the first one is acknowledged after erasing the flash
+CHUNK_TIMEOUT_S = 10.0
 MAX_BYTES = 2**20  # of a flash area, more than any image of TI
-GENERATION = 2  # major ROM version of AWR2243
+# Major ROM version of AWR2243
+GENERATION = 2
 FAMILIES = {  # by major ROM version
     1: "AWR1243 or another of the first generation",
     GENERATION: "AWR2243",
     6: "xWR6243, 57..64 GHz",
 }
-_CORES = ("main", "RF")  # an image has a part for each
+# An image has a part for each
+_CORES = ("main", "RF")
 
 _MAGIC = b"MSTR"
 _END = b"MEND"

@@ -46,7 +46,8 @@ MAX_MESSAGES = 64  # of one poll
 MAX_POLL_S = 0.25
 _MAX_WARNINGS = 100
 _SYNC_SEARCH_BYTES = 252
-_FLUSH_BYTES = 244  # read after an invalid header, to resynchronise with the device
+# Read after an invalid header, to resynchronise with the device
+_FLUSH_BYTES = 244
 _REMEDY = "check the board's power, the 60-pin connector and the USB cable, then `polysight resume SCAN`"
 
 

@@ -20,7 +20,8 @@ from polysight_shared.errors import ProtocolError
 
 HOST_SYNC = bytes.fromhex("34122143")
 DEVICE_SYNC = bytes.fromhex("badccdab")
-READY_TO_READ = bytes.fromhex("78566587") + b"\xff" * 12  # "CNYS": written by the host when the interrupt is high
+# "CNYS": written by the host when the interrupt is high
+READY_TO_READ = bytes.fromhex("78566587") + b"\xff" * 12
 SYNC_BYTES = 4
 HEADER_BYTES = 12
 CRC_BYTES = 4
@@ -266,7 +267,8 @@ class InitBit(NamedTuple):
     of_transmitter: bool = False
 
 
-INIT_BITS = {  # ICD 217, where 0 is "fail"
+# ICD 217, where 0 is "fail"
+INIT_BITS = {
     1: InitBit("clock PLL"),
     2: InitBit("synthesizer VCO1"),
     3: InitBit("synthesizer VCO2"),
@@ -296,7 +298,8 @@ def failed_calibrations(event: Event, transmits: bool, run: int) -> list[str]:
     return [calibration.name for calibration in failed if transmits or not calibration.of_transmitter]
 
 
-_CPU_FAULTS = (  # ICD 212, 317
+# ICD 212, 317
+_CPU_FAULTS = (
     "undefined instruction",
     "instruction fetch abort",
     "data access abort",
@@ -305,7 +308,8 @@ _CPU_FAULTS = (  # ICD 212, 317
     "register read-back error",
     "power save error",
 )
-_RF_CODES = (  # ICD 213
+# ICD 213
+_RF_CODES = (
     "undefined",
     "the ramp generator was not triggered by a pulse",
     "burst starts and ends do not match",
@@ -317,10 +321,14 @@ _RF_CODES = (  # ICD 213
     "test source not ready in time",
 )
 _RF_ERRORS = {1: "RF firmware assert", 2: "RF firmware abort", 3: "ESM group 1", 4: "ESM group 2", 7: "monitoring"}
-_ANALOG = {0: "1.8 V supply", 1: "1.3 V / 1.0 V RF supply", 2: "VCO LDO shorted", 3: "PA LDO shorted"}  # ICD 223
-_RF_TESTS = 0x07FFFFFF  # bits 0..26 of 0x5001, 1 = passed
-_RF_GROUP1_FATAL = 1 << 25  # programmable filter, double bit error (ICD 216); its parity error is reserved there
-_MAIN_GROUP1_FATAL = 1 << 22  # FRC lockstep (ICD 320)
+# ICD 223
+_ANALOG = {0: "1.8 V supply", 1: "1.3 V / 1.0 V RF supply", 2: "VCO LDO shorted", 3: "PA LDO shorted"}
+# Bits 0..26 of 0x5001, 1 = passed
+_RF_TESTS = 0x07FFFFFF
+# Programmable filter, double bit error (ICD 216); its parity error is reserved there
+_RF_GROUP1_FATAL = 1 << 25
+# FRC lockstep (ICD 320)
+_MAIN_GROUP1_FATAL = 1 << 22
 
 # Boot status (ICD table 7.3), bit: meaning. The first group means an empty flash or a damaged image.
 _FLASH_BITS = {
@@ -364,7 +372,8 @@ _OTHER_BITS = {
 }
 _BOOT_BITS = _FLASH_BITS | _HARDWARE_BITS | _OTHER_BITS
 
-REFUSALS = {  # API error codes, ICD 338-349, of the commands sent here
+# API error codes, ICD 338-349, of the commands sent here
+REFUSALS = {
     1: "wrong message number",
     2: "no sub-block in the message",
     3: "wrong sub-block number",

@@ -21,7 +21,8 @@ from polysight_shared.errors import ConfigError, DeviceError
 # The FT4232H over USB.
 VENDOR = 0x0451
 PRODUCT = 0xFD03
-PATH = "usb:"  # prefix of a USB path, "usb:1-4.2"; without it, a serial number
+# Prefix of a USB path, "usb:1-4.2"; without it, a serial number
+PATH = "usb:"
 _READ_TIMEOUT_S = 0.5
 _LATENCY_MS = 1
 _CHECK = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists the chips"
@@ -32,11 +33,13 @@ _HEAD = struct.Struct("<ccH")
 _TIMEOUT_S = 30.0
 
 # Pins and MPSSE commands.
-SPI_DIRECTION = 0b0100_1011  # clock, data out, chip select, PMIC reset are outputs
+# Clock, data out, chip select, PMIC reset are outputs
+SPI_DIRECTION = 0b0100_1011
 SELECTED_WRITE = 0xC0
 SELECTED_READ = 0xC2
 IDLE = 0xC8
-INTERRUPT_DIRECTION = 0b0101_1011  # bit 5, the interrupt, is an input
+# Bit 5, the interrupt, is an input
+INTERRUPT_DIRECTION = 0b0101_1011
 INTERRUPT_IDLE = 0b0001_0011
 INTERRUPT_BIT = 5
 RESET_DIRECTION = 0b1111_1001
@@ -277,8 +280,10 @@ class FtdiPort:
         device = self._ftdi.usb_dev
         try:
             self._ftdi.close(freeze=True)
-        except (*self._library.errors, TypeError):  # lost, or not opened completely by pyftdi
-            self._library.tools.release_device(device)  # otherwise pyftdi counts it as open
+        except (*self._library.errors, TypeError):
+            # Lost, or not opened completely by pyftdi
+            # Otherwise pyftdi counts it as open
+            self._library.tools.release_device(device)
 
 
 _CAUSES = {
@@ -338,7 +343,8 @@ class _Library(NamedTuple):
         """Return the chip with this serial number or path. Raises DeviceError if there is none, or more than one."""
         name = place.removeprefix(PATH)
         try:
-            backends = (import_module(name).get_backend() for name in self.tools.BACKENDS)  # pyftdi's, in its order
+            # Pyftdi's, in its order
+            backends = (import_module(name).get_backend() for name in self.tools.BACKENDS)
             backend = next((b for b in backends if b is not None), None)
             chips = list(self.find(find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend))
             paths = {f"{d.bus}-{'.'.join(map(str, d.port_numbers or ()))}": d for d in chips}

@@ -191,9 +191,11 @@ class PermittivityFigures(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def spread(self) -> "PermittivitySpread | None":
         """Error of (eps', eps''); None if it is not known."""
-        given = self.covariance
-        if given is not None:
-            real, mixed, imag = given[0][0], given[0][1], given[1][1]
+        covariance = self.covariance
+        if covariance is not None:
+            real = covariance[0][0]
+            mixed = covariance[0][1]
+            imag = covariance[1][1]
             if real is not None and mixed is not None and imag is not None:
                 return PermittivitySpread(math.sqrt(real), math.sqrt(imag), -mixed + 0.0)
         if self.real_std is None or self.imag_std is None:
@@ -375,7 +377,9 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
         self,
     ) -> Annotated[Text, Column("dominated_by", "what most of the permittivity's error comes from", "")]:
         """Largest source of the permittivity's error."""
-        return None if self.permittivity is None else self.permittivity.dominated_by
+        if self.permittivity is None:
+            return None
+        return self.permittivity.dominated_by
 
     refused: Finding | None = None
 
@@ -414,7 +418,9 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def p_phase_deg(self) -> Annotated[Number, Column("p_phase_deg", "phase of P", "degree", "", title="∠P", digits=1)]:
         """Phase of P."""
-        return None if self.p is None else math.degrees(math.atan2(self.p.imag, self.p.real))
+        if self.p is None:
+            return None
+        return math.degrees(math.atan2(self.p.imag, self.p.real))
 
     inverse_ratio_std: Annotated[
         Number,
@@ -445,12 +451,16 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def true_permittivity_real(self) -> Annotated[Number, Column("true_permittivity_real", variable="")]:
         """Its real part."""
-        return None if self.true_permittivity is None else self.true_permittivity.real
+        if self.true_permittivity is None:
+            return None
+        return self.true_permittivity.real
 
     @property
     def true_permittivity_loss(self) -> Annotated[Number, Column("true_permittivity_loss", variable="")]:
         """Its loss."""
-        return None if self.true_permittivity is None else -self.true_permittivity.imag
+        if self.true_permittivity is None:
+            return None
+        return -self.true_permittivity.imag
 
     tilt_across_deg: float | UnsetType = UNSET
     bands: list[BandFigures] | UnsetType = UNSET
@@ -461,7 +471,9 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def pixels_used(self) -> Annotated[int, Column("", "pixels", "1", "", title="Pixels")]:
         """Pixels behind the numbers; in old products the pixels of the whole patch."""
-        return self.pixels if self.interior_pixels is None else self.interior_pixels
+        if self.interior_pixels is None:
+            return self.pixels
+        return self.interior_pixels
 
     @property
     def _spread(self) -> PermittivitySpread | None:
@@ -470,8 +482,8 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def _second(self) -> tuple[Text, Number]:
         shares = self.probabilities or self.votes
-        others = {name: share for name, share in shares.items() if name != self.name}
-        return max(others.items(), key=lambda item: item[1], default=(None, None))
+        other_shares = {name: share for name, share in shares.items() if name != self.name}
+        return max(other_shares.items(), key=lambda item: item[1], default=(None, None))
 
     def withheld(self) -> Self:
         """Return only place and size: without name, measured values and truth."""

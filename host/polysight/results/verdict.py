@@ -63,14 +63,14 @@ class Verdict(msgspec.Struct, frozen=True):
 
     def lines(self, most: int | None = None) -> list[str]:
         """Return text for a terminal: the level, then each reason and remedy; at most `most` reasons."""
-        shown = self.reasons[:most]
+        shown_reasons = self.reasons[:most]
         out = [f"verdict:  {self.text}"]
-        for r in shown:
+        for r in shown_reasons:
             out.append(f"  - {r.what}: {r.why}" if r.why else f"  - {r.what}")
             if r.do:
                 out.append(f"    do: {r.do}")
-        if len(shown) < len(self.reasons):
-            out.append(f"  - and {len(self.reasons) - len(shown)} more, see the report")
+        if len(shown_reasons) < len(self.reasons):
+            out.append(f"  - and {len(self.reasons) - len(shown_reasons)} more, see the report")
         return out
 
     def error(self, kept: str = "") -> NoResult:
@@ -124,7 +124,8 @@ DIRECT_LEVELS = (0.4, 3.0)
 """Range of metal's brightness relative to the direct path; in published data both are equal within a factor of 1.5."""
 DIRECT_PHASE_CARE_RAD = 0.05
 """Standard deviation of the object's phase from position to position; usually 0.004."""
-PLANE_FAR_MM, PLANE_TILT_DEG = 3.0, 0.5
+PLANE_FAR_MM = 3.0
+PLANE_TILT_DEG = 0.5
 """Distance and tilt of the plates' plane against the rig file, above which the result needs care."""
 PLANE_GATE_MM = 13.0
 """Distance at which the plates lie at the edge of the range gate."""
@@ -192,7 +193,10 @@ class Coverage(msgspec.Struct, frozen=True):
 def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Finding]:
     """Judge rows, frames and manifest against the plan; `masked_share` of the recorded positions is masked."""
     out = []
-    absent = 1 - coverage.rows_recorded / coverage.rows_planned if coverage.rows_planned else 1.0
+    if coverage.rows_planned:
+        absent = 1 - coverage.rows_recorded / coverage.rows_planned
+    else:
+        absent = 1.0
     if coverage.rows_recorded < coverage.rows_planned:
         level = "none" if absent > FEW_POSITIONS else "care"
         missing = coverage.rows_planned - coverage.rows_recorded
@@ -205,14 +209,17 @@ def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Fin
         reason("care", fault, "a recorded row is missing in the images", "run `polysight validate SCAN`", 6.0)
         for fault in coverage.manifest
     ]
-    frames = 1 - coverage.frames_received / coverage.frames_planned if coverage.frames_planned else 1.0
-    lost = max(masked_share, frames - absent)
-    if lost > SOME_POSITIONS:
+    if coverage.frames_planned:
+        frames = 1 - coverage.frames_received / coverage.frames_planned
+    else:
+        frames = 1.0
+    lost_share = max(masked_share, frames - absent)
+    if lost_share > SOME_POSITIONS:
         out.append(reason(
-            "none" if lost > FEW_POSITIONS else "care",
-            f"{100 * lost:.1f} % of the recorded positions or frames are masked",
+            "none" if lost_share > FEW_POSITIONS else "care",
+            f"{100 * lost_share:.1f} % of the recorded positions or frames are masked",
             "packets were lost, or the direct path was not found there",
-            "look at each board's frames in the report; `polysight doctor` checks the network", 4 + lost,
+            "look at each board's frames in the report; `polysight doctor` checks the network", 4 + lost_share,
         ))  # fmt: skip
     return out
 
@@ -287,11 +294,10 @@ def level_reasons(levels: Mapping[str, float | None]) -> list[Finding]:
             weak = level > DIRECT_LEVELS[1]
             state = "weak" if weak else "strong"
             what = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+.0f} dB relative to it"
-            why = (
-                "something in its way weakens the direct path; the object disturbs its estimate"
-                if weak
-                else "the object is far weaker than the direct path: the antennas point elsewhere, or it is not metal"
-            )
+            if weak:
+                why = "something in its way weakens the direct path; the object disturbs its estimate"
+            else:
+                why = "the object is far weaker than the direct path: the antennas point elsewhere, or it is not metal"
             do = "clear the line of sight from transmitter to receivers, and check the antennas' direction"
             out.append(reason("care", what, why, do, 3.5))
     return out
@@ -317,11 +323,18 @@ def signal_reasons(refused: Mapping[int, str], patches: int, left_out: int = 0) 
     by_reason: dict[str, list[int]] = {}
     for label, what in refused.items():
         by_reason.setdefault(what, []).append(label)
-    aside = [reason(
-        "good", f"{left_out} region{'s' * (left_out > 1)} of a plate's size within 25 dB of the brightest: no patch",
-        "no brighter than the background scatters: sidelobes, clutter or very weak plates",
-        "draw a box where a plate lies (polysight label; process --labels)", 0.5,
-    )] if left_out else []  # fmt: skip
+    if left_out:
+        aside = [
+            reason(
+                "good",
+                f"{left_out} region{'s' * (left_out > 1)} of a plate's size within 25 dB of the brightest: no patch",
+                "no brighter than the background scatters: sidelobes, clutter or very weak plates",
+                "draw a box where a plate lies (polysight label; process --labels)",
+                0.5,
+            )
+        ]
+    else:
+        aside = []
     return aside + [
         reason(
             "care",
@@ -380,9 +393,10 @@ def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> 
     if measured or relative_error < LEAKAGE_SHARE:
         return []
     source = "estimated from the scene" if determined else "never measured; its prior is used"
-    share = (
-        f"uncertain by {100 * relative_error:.0f} %" if is_known(relative_error) else "uncertain by an unknown share"
-    )
+    if is_known(relative_error):
+        share = f"uncertain by {100 * relative_error:.0f} %"
+    else:
+        share = "uncertain by an unknown share"
     return [reason(
         "care",
         f"leakage was {source}: permittivities are uncertain by {share}, names less reliable",
@@ -406,7 +420,8 @@ def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], 
             "they are at the edge of the range gate",
             "measure geometry.object_distance_mm and correct the rig file", 7.0,
         )]  # fmt: skip
-    out, tilt = [], max(abs(t) for t in tilt_deg)
+    out = []
+    tilt = max(abs(t) for t in tilt_deg)
     if abs(offset_mm) > PLANE_FAR_MM:
         out.append(reason(
             "care", f"the plates lie {offset_mm:+.1f} mm off the rig file's plane; the angle was corrected for it",
@@ -507,9 +522,9 @@ def tilt_reasons(across_deg: Mapping[int, float]) -> list[Finding]:
     if not tilted:
         return []
     worst = max(tilted, key=lambda label: abs(tilted[label]))
-    more = "" if len(tilted) == 1 else f" ({len(tilted)} patches in all)"
+    remark = "" if len(tilted) == 1 else f" ({len(tilted)} patches in all)"
     return [reason(
-        "care", f"patch {worst} rises by {tilted[worst]:+.1f} degrees across the plane of incidence{more}",
+        "care", f"patch {worst} rises by {tilted[worst]:+.1f} degrees across the plane of incidence{remark}",
         "the polarisation turns with it: 5 to 13 % of a permittivity per degree, corrected to about a quarter",
         "lay plates and metal flat; shim the tilted one", 1.3,
     )]  # fmt: skip
@@ -532,7 +547,8 @@ def brightness_reasons(off: Mapping[int, float]) -> list[Finding]:
     out = []
     for label, ln in off.items():
         if is_known(ln) and abs(ln) > BRIGHTNESS_CARE:
-            share, than = 100 * abs(float(np.expm1(ln))), "brighter" if ln > 0 else "darker"
+            share = 100 * abs(float(np.expm1(ln)))
+            than = "brighter" if ln > 0 else "darker"
             out.append(reason(
                 "care", f"patch {label} is {share:.0f} % {than} than a half space of its permittivity",
                 "it may be thin, layered, rough, or partly in a shadow; the permittivity of a thin plate is then wrong",

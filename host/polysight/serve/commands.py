@@ -346,7 +346,10 @@ def _check_free(site: Site) -> None:
 
 def _is_starting(site: Site, s: Summary) -> bool:
     """True if the scan's program runs without a sign of life yet, or is processing."""
-    program = find_program(site.scans.root / s.name, "scan") if s.state in ("begun", "lost") else None
+    if s.state in ("begun", "lost"):
+        program = find_program(site.scans.root / s.name, "scan")
+    else:
+        program = None
     return program is not None and program.running
 
 

@@ -191,7 +191,9 @@ def _stamp_products(folder: Path) -> tuple[Path, str]:
 def _draw(products: Path, stamp: str, name: str, limits: tuple[float, float] | None) -> Picture:
     del stamp
     pixels = Pixels(products)
-    return thumbnail(pixels) if name == THUMBNAIL else draw_products(pixels, name, limits)
+    if name == THUMBNAIL:
+        return thumbnail(pixels)
+    return draw_products(pixels, name, limits)
 
 
 @lru_cache(maxsize=MAX_COMPARISONS)

@@ -99,10 +99,14 @@ DAMAGED = ".damaged"
 class EventLog:
     """Content of an event file."""
 
-    events: list[AnyEvent]  # up to the first that is torn or damaged
-    length: int  # their bytes
-    torn: bool = False  # the beginning of an event or zeros follow, as after a kill or power cut
-    damage: str = ""  # description of anything else that follows
+    # Up to the first that is torn or damaged
+    events: list[AnyEvent]
+    # Their bytes
+    length: int
+    # The beginning of an event or zeros follow, as after a kill or power cut
+    torn: bool = False
+    # Description of anything else that follows
+    damage: str = ""
 
 
 def read_events(path: Path) -> EventLog:

@@ -405,7 +405,10 @@ class Manifest:
             last = self.faults.pop()
             self.faults.append(manifest_fault(last.facts["line"], last.what, last.facts["lost"] + missing))
         elif missing > 0:
-            problem = f"{missing} lines before it are missing" if missing > 1 else "a line before it is missing"
+            if missing > 1:
+                problem = f"{missing} lines before it are missing"
+            else:
+                problem = "a line before it is missing"
             self.faults.append(
                 manifest_fault(self._lines, f"{problem} (count {count}, {self.count} expected)", missing)
             )

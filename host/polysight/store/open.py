@@ -61,4 +61,6 @@ def open_source(path: Path, base: Instrument | Path | None = None, dropped: bool
             code=ErrorCode.KEY_MISSING,
         )
     rig = load_instrument(base) if isinstance(base, Path) else base
-    return PublishedCubes(path, rig) if any(path.glob("*" + SYNCED)) else PublishedScan(path, rig)
+    if any(path.glob("*" + SYNCED)):
+        return PublishedCubes(path, rig)
+    return PublishedScan(path, rig)

@@ -259,12 +259,16 @@ class RowShape:
 class Stream:
     """Data that the card sent in one row."""
 
-    data: NDArray[np.uint8]  # [n], zero where lost
-    lost: Gaps  # byte ranges that never arrived
+    # [n], zero where lost
+    data: NDArray[np.uint8]
+    # Byte ranges that never arrived
+    lost: Gaps
     packets_lost: int
-    start: NDArray[np.int64]  # offset of each packet that arrived; empty without a log
+    # Offset of each packet that arrived; empty without a log
+    start: NDArray[np.int64]
     at_s: NDArray[np.float64]  # its arrival time
-    packet_bytes: int  # payload of a full packet
+    # Payload of a full packet
+    packet_bytes: int
 
 
 class Bursts(NamedTuple):
@@ -345,7 +349,10 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
         )
     if zero_filled:
         end = max(end, raw.size)
-        data = raw if end == raw.size else np.concatenate([raw, np.zeros(end - raw.size, np.uint8)])
+        if end == raw.size:
+            data = raw
+        else:
+            data = np.concatenate([raw, np.zeros(end - raw.size, np.uint8)])
     else:
         data = raw if end == raw.size else _spread(raw, start, log.size, end)
     count = -(-end // full)
@@ -430,7 +437,9 @@ def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
 
 def period_s(bursts: Bursts) -> float | None:
     """Return the time between positions (most must follow one another); None for fewer than two bursts."""
-    return float(np.quantile(np.diff(bursts.at_s), 0.25)) if bursts.at_s.size > 1 else None
+    if bursts.at_s.size > 1:
+        return float(np.quantile(np.diff(bursts.at_s), 0.25))
+    return None
 
 
 def find_positions(own: Bursts, others: list[Bursts], positions: int, period: float | None) -> NDArray[np.int64] | None:
@@ -448,7 +457,9 @@ def find_positions(own: Bursts, others: list[Bursts], positions: int, period: fl
         return None
     index = np.concatenate([[0], np.cumsum(np.round(steps).astype(np.int64))])
     position = index[np.searchsorted(events, own.at_s, side="right") - 1]
-    return position if index[-1] == positions - 1 and np.all(np.diff(position) > 0) else None
+    if index[-1] == positions - 1 and np.all(np.diff(position) > 0):
+        return position
+    return None
 
 
 def _ranges(missing: NDArray[np.bool_], unit: int, end: int) -> Gaps:
@@ -465,10 +476,12 @@ SYNCED = "_synced.npy"
 class RowLosses:
     """Losses of one board's recording of one row."""
 
-    packets_lost: int = 0  # sent by the card and not received
+    # Sent by the card and not received
+    packets_lost: int = 0
     positions_missing: int = 0  # at which the radar did not start
     positions_short: int = 0  # with fewer frames than pulses; masked, because the missed pulse is unknown
-    rows_not_placed: int = 0  # 1 if unknown positions are missing: the whole row is masked
+    # 1 if unknown positions are missing: the whole row is masked
+    rows_not_placed: int = 0
 
 
 class _Published:

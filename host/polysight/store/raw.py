@@ -46,7 +46,8 @@ class Droppable:
 
     files: dict[int, dict[str, Path]]  # by row and board
     bytes: int
-    kept: list[str] = field(default_factory=list)  # files that must be kept, with the reason
+    # Files that must be kept, with the reason
+    kept: list[str] = field(default_factory=list)
 
 
 def require_raw(scan: ScanFolder) -> None:
@@ -167,11 +168,15 @@ class Replaced:
 
     row: int
     board: str
-    before: int  # missing bytes as committed
-    after: int  # missing bytes now
-    left: str = ""  # why the row was left unchanged
+    # Missing bytes as committed
+    before: int
+    # Missing bytes now
+    after: int
+    # Why the row was left unchanged
+    left: str = ""
     changed: bool = False
-    damaged: bool = False  # left unchanged because its files differ from the commit or are unreadable
+    # Left unchanged because its files differ from the commit or are unreadable
+    damaged: bool = False
 
 
 @dataclass(frozen=True)
@@ -180,9 +185,12 @@ class PlacedAgain:
 
     evidence: Evidence
     placed: Placed
-    out: np.ndarray  # uint8, the payload
-    missing: list[tuple[int, int]]  # the committed gaps
-    moved: bool  # the committed frames were moved to their pulses: the row is left unchanged
+    # uint8, the payload
+    out: np.ndarray
+    # The committed gaps
+    missing: list[tuple[int, int]]
+    # The committed frames were moved to their pulses: the row is left unchanged
+    moved: bool
 
 
 def place_again(path: Path) -> PlacedAgain:

@@ -192,7 +192,9 @@ class ScanFolder:
     def _latest(self) -> Instrument:
         """Return the scan's rig with the connection settings of the last resume. Raises ConfigError."""
         connections = [fact.rig for fact in self.facts(ScanResumed) if fact.rig]
-        return with_connection(self._begun, connections[-1]) if connections else self._begun
+        if connections:
+            return with_connection(self._begun, connections[-1])
+        return self._begun
 
     @staticmethod
     def create(
@@ -540,7 +542,8 @@ def inside(folder: Path, name: str, within: str = "") -> Path:
         target = path.resolve()
         is_inside = ".." not in Path(name).parts and target.is_relative_to(home / within)
         is_inside = is_inside and target != root and root.is_relative_to(home)
-    except (OSError, ValueError):  # a name that no file can have
+    except (OSError, ValueError):
+        # A name that no file can have
         is_inside = False
     if not is_inside:
         raise DataError(
@@ -571,14 +574,16 @@ def check_links(folder: Path) -> None:
                         folders.append(path)
                     elif not entry.is_file(follow_symlinks=False):
                         raise _refuse(folder, path, "is neither a file nor a folder", ErrorCode.FILE_FOREIGN)
-        except OSError:  # deleted in the meantime, or not readable: reported when a file is read
+        except OSError:
+            # Deleted in the meantime, or not readable: reported when a file is read
             continue
 
 
 def _leads_into(link: Path, root: Path) -> bool:
     try:
         return link.resolve().is_relative_to(root)
-    except (OSError, RuntimeError):  # links in a circle
+    except (OSError, RuntimeError):
+        # Links in a circle
         return False
 
 

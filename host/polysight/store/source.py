@@ -41,9 +41,12 @@ class RowData:
     """One board's recording of one row. It is read when needed: in pieces, which stay in the cache, or as a whole."""
 
     pieces: Pieces  # of the payload as sent by the card, [frames_expected * bytes of a chirp]; zero where missing
-    missing: list[tuple[int, int]]  # byte ranges (start, stop) that never arrived: sorted, not touching, half open
-    frames_expected: int  # chirps in `payload`: points of the row x chirps of a position; most frames are one chirp
-    crc32: str = ""  # digest of the recorded payload, hexadecimal; "" if the recording has none
+    # Byte ranges (start, stop) that never arrived: sorted, not touching, half open
+    missing: list[tuple[int, int]]
+    # Chirps in `payload`: points of the row x chirps of a position; most frames are one chirp
+    frames_expected: int
+    # Digest of the recorded payload, hexadecimal; "" if the recording has none
+    crc32: str = ""
 
     @cached_property
     def payload(self) -> NDArray[np.uint8]:
@@ -70,7 +73,8 @@ class RowData:
 class CubeRow:
     """One board's row of a scan that another program has synchronised; the card's data is not available."""
 
-    cube: NDArray[np.complex64]  # [rx, position, sample], in the order of recording, with that program's reference
+    # [rx, position, sample], in the order of recording, with that program's reference
+    cube: NDArray[np.complex64]
     missing_bytes: int = 0
     crc32: str = ""
 

@@ -133,7 +133,10 @@ def _what_is_lost(scan: ScanFolder) -> str:
     absent = scan.rows_absent
     if not absent:
         return ""
-    rows = f"row {absent[0]} is" if len(absent) == 1 else f"rows {', '.join(map(str, absent))} are"
+    if len(absent) == 1:
+        rows = f"row {absent[0]} is"
+    else:
+        rows = f"rows {', '.join(map(str, absent))} are"
     return f"facts are lost: {rows} not committed; `polysight resume {scan.path}` takes them again"
 
 
@@ -179,7 +182,9 @@ def board_faults(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding
     place = str(index.relative_to(scan.path))
     if not index.exists():
         is_needed = board.missing_bytes > 0 or board.index_crc32 != ""
-        return [*findings, _error(place, "absent", _COPY)] if is_needed else findings
+        if is_needed:
+            return [*findings, _error(place, "absent", _COPY)]
+        return findings
     try:
         index_crc = crc32(index.read_bytes())
     except OSError as e:
@@ -210,11 +215,16 @@ def _packets(scan: ScanFolder, board: BoardRow, path: Path) -> list[Finding]:
     except OSError as e:
         return [_not_read(place, e)]
     right = f"{crc:08x}" == board.packets_crc32
-    return [] if right else [_error(place, "differs from the committed data (CRC)", _COPY)]
+    if right:
+        return []
+    return [_error(place, "differs from the committed data (CRC)", _COPY)]
 
 
 def _not_read(where: str, e: OSError) -> Finding:
-    code = ErrorCode.FILE_MISSING if isinstance(e, FileNotFoundError) else ErrorCode.FILE_UNREADABLE
+    if isinstance(e, FileNotFoundError):
+        code = ErrorCode.FILE_MISSING
+    else:
+        code = ErrorCode.FILE_UNREADABLE
     return _error(where, f"cannot be read: {e.strerror}", _COPY, code)
 
 
@@ -294,4 +304,6 @@ def _committed_events(path: Path, length: int, row: int, committed: LogDigest) -
     with path.open("rb") as f:
         is_whole = f"{crc32(f.read(size)):08x}" == committed.crc32
     problem = f"not the events that were there when {when} (CRC)"
-    return [] if is_whole else [_error(EVENTS, problem, "restore it from a copy")]
+    if is_whole:
+        return []
+    return [_error(EVENTS, problem, "restore it from a copy")]

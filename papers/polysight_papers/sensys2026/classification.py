@@ -37,7 +37,8 @@ TASKS = ("solids", "solids, two angles", "liquids", "powders")
 OTHER_DRAWS = tuple(range(21, 29))
 """Seeds of further draws, for the random spread of one draw."""
 Panel = tuple[Score, npt.NDArray[np.float64], str]
-TRIALS = 4000  # draws for a bound
+# Draws for a bound
+TRIALS = 4000
 
 
 def _draws(quick: bool) -> int:
@@ -134,7 +135,8 @@ class TaskScores:
     knn_pixel: Score
     discriminant: Score
     discriminant_pixel: Score
-    h: Score  # the KNN on |H| alone, scans left out
+    # The KNN on |H| alone, scans left out
+    h: Score
     h_pixel: Score
 
     @staticmethod
@@ -371,7 +373,8 @@ def pixel_bound(
         cost = np.zeros((TRIALS, len(materials)))
         for c, s in enumerate(std):
             noise = s * np.sqrt(variance) * rng.standard_normal((TRIALS, 1))
-            if c % 3 == 2:  # a direction: its angle to each material's
+            # A direction: its angle to each material's
+            if c % 3 == 2:
                 difference = np.angle(mean[k, c] * np.exp(1j * noise) / mean[None, :, c])
             else:
                 difference = np.real(mean[k, c]) + noise - np.real(mean[None, :, c])

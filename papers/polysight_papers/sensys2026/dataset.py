@@ -46,13 +46,15 @@ SAME_ANGLE_DEG = 2.5
 MATERIALS = "materials/"
 LABELS = "labels/"
 IMAGES = "images made here"
-_ALIKE = 0.35  # least correlation of two images of one scan
+# Least correlation of two images of one scan
+_ALIKE = 0.35
 
 # Names of materials.
 _FILLING = {"with", "w", "in", "on", "mm", "percent", "sample", "sheet", "plate", "the", "of", "box", "container"}
 _ALIASES = {"fibre": "fiber", "fiberglass": "fiber glass", "plywood": "wood", "soya": "soy", "salts": "salt"}
 _CONTAINERS = {"glass", "plastic"}
-_ENOUGH = 0.5  # least share of common words
+# Least share of common words
+_ENOUGH = 0.5
 
 PIXELS = 16
 """Pixels of a patch, at even intervals, as in our own libraries."""
@@ -251,7 +253,8 @@ def words(name: str) -> frozenset[str]:
         if word in _FILLING:
             continue
         if word[0].isdigit():
-            number = f"0.{word[1:]}" if re.fullmatch(r"0\d+", word) else word  # "pet_05mm"
+            # "pet_05mm"
+            number = f"0.{word[1:]}" if re.fullmatch(r"0\d+", word) else word
             out.append(f"{float(number):g}")
         else:
             out += ["metal"] if word in METALS else str(_ALIASES.get(word, word)).split()
@@ -364,7 +367,8 @@ def authors_library(data: AuthorsData) -> Library:
 def _without_leakage(entry: Entry, leak_hv: complex, leak_vh: complex) -> Entry:
     """Return an entry with at most `PIXELS` pixels, with the cross-polar leakage removed."""
     picked = np.unique(np.linspace(0, entry.p.size - 1, min(PIXELS, entry.p.size)).round().astype(int))
-    v = entry.v[picked].astype(np.complex128)  # a common phase of H and V has no effect
+    # A common phase of H and V has no effect
+    v = entry.v[picked].astype(np.complex128)
     h, v = correct_leakage(entry.p[picked] * v, v, leak_hv, leak_vh)
     return replace(
         entry,

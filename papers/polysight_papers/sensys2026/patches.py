@@ -156,7 +156,8 @@ def draw(
         (a, a_ref), (b, b_ref) = parts
         return np.broadcast_to(r, shape[:2])[..., None] * (1 + a) / (1 + a_ref) * np.exp(1j * (b - b_ref))
 
-    own_rng = np.random.default_rng([seed, 1])  # the same specimens under every angle
+    # The same specimens under every angle
+    own_rng = np.random.default_rng([seed, 1])
     eps = specimens(materials, errors.spread, own_rng.standard_normal((2, scans, len(materials))))
     r_s, r_p = fresnel(eps, np.radians(angle_deg))
     return Pixels(materials, angle_deg, channel(-r_s), channel(-r_p))
@@ -192,7 +193,8 @@ LIBRARY_SCANS = 24
 TEST_SCANS = 160
 """Enough for a calibration error of 0.01 to 0.03 with exact probabilities (4 to 23 names a scan)."""
 _TEST_SEED = 500
-_GRID = 21  # nodes a dimension of the specimens' distribution, to 3.5 standard deviations
+# Nodes a dimension of the specimens' distribution, to 3.5 standard deviations
+_GRID = 21
 Real = npt.NDArray[np.float64]
 
 

@@ -239,7 +239,8 @@ def places(seed: int, count: int = 3) -> list[tuple[float, float]]:
         if all(max(abs(x - a), abs(y - b)) >= APART_MM for a, b in centres):
             centres.append((x, y))
         elif rng.random() < 0.05:
-            centres.clear()  # two plates may leave no room for a third
+            # Two plates may leave no room for a third
+            centres.clear()
     return centres
 
 

@@ -35,7 +35,8 @@ OFFSETS_HZ = (200e3, 250e3, 350e3, 450e3, 600e3, 870e3, 1.1e6, 1.3e6, 1.5e6, 1.7
 USUAL_HZ = 870e3
 SKIRT_HZ = (60e3, 200e3)
 """Range of the smear of a bent chirp, relative to its tone."""
-_PADDED = 4096  # length of spectra
+# Length of spectra
+_PADDED = 4096
 
 
 @dataclass(frozen=True)

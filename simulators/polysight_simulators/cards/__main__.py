@@ -87,7 +87,8 @@ def _source(args: argparse.Namespace, rig: Instrument, scene: Scene | None, name
     radars = SimulatedRig(rig, scene, args.seed, args.cache)
     recorded = [b.name for b in rig.recorded if b.name in names]
     if recorded:
-        radars.prepare(*recorded)  # before the first burst of a scan
+        # Before the first burst of a scan
+        radars.prepare(*recorded)
     return radars
 
 

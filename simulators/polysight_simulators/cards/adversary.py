@@ -69,7 +69,8 @@ class Sent:
     data: bytes  # that the row should contain
     first_pulse_ns: int
     arrivals: list[Arrival] = field(default_factory=list)  # in this order
-    whole: bool = True  # the card sent the complete record, with consecutive counters
+    # The card sent the complete record, with consecutive counters
+    whole: bool = True
     troubles: tuple[str, ...] = ()
 
 
@@ -94,7 +95,8 @@ class Adversary:
         self._now_ns = 1_000_000_000
         self._number = 0
         self._twin = Packetiser(payload_bytes, chance.randrange(1 << 32), chance.randrange(1 << 48))
-        self._late: list[Arrival] = []  # packets that arrive in a later record
+        # Packets that arrive in a later record
+        self._late: list[Arrival] = []
         self.resets = 0
 
     def take_late(self, share: float) -> list[Arrival]:

@@ -51,15 +51,19 @@ from polysight_simulators.radars import RadarBoard
 
 Rows = NDArray[np.uint8]
 _UDP_SEGMENT = 103  # linux/udp.h: the kernel cuts one buffer into equal datagrams
-_CALL_BYTES = 65_000  # below the largest UDP datagram
+# Below the largest UDP datagram
+_CALL_BYTES = 65_000
 _CALL_SEGMENTS = 44
-_UNREAD_BYTES = 128 << 10  # unread at the receiver, below which the next 44 packets (about 100 kB) are sent
+# Unread at the receiver, below which the next 44 packets (about 100 kB) are sent
+_UNREAD_BYTES = 128 << 10
 _POLL_S = 0.001
 _WAIT_TIMEOUT_S = 2.0  # for a receiver that does not read; then its packets are lost, as with a real card
 _MAX_QUEUED_BYTES = 64 << 20
-_CATCH_UP_S = 0.01  # largest delay that is made up for when sending many packets per call
+# Largest delay that is made up for when sending many packets per call
+_CATCH_UP_S = 0.01
 _MAX_SPIN_S = 0.02  # in one call: commands wait in the meantime
-_SPIN_S = 0.001  # waits below this spin, because a process cannot reliably sleep that short
+# Waits below this spin, because a process cannot reliably sleep that short
+_SPIN_S = 0.001
 
 
 class ReceiveQueue:
@@ -299,11 +303,13 @@ def _can_segment(s: socket.socket) -> bool:
     return True
 
 
-NO_DATA_FLOOR_S = 10.0  # wall time: with a large time scale the card's 30 s would end before the stage has moved
+# Wall time: with a large time scale the card's 30 s would end before the stage has moved
+NO_DATA_FLOOR_S = 10.0
 if TYPE_CHECKING:
     from polysight_simulators.scene import SignalSource
 
-FRAMES_PER_CALL = 64  # bounds memory
+# Bounds memory
+FRAMES_PER_CALL = 64
 MAC = b"\x12\x34\x56\x78\x90\x12"
 Clock = Callable[[], float]
 
@@ -561,7 +567,8 @@ class SimulatedCard:
         self._events = PulseEvents(faults)
         self._pulse_faults = PulseFaults(faults, seed, board.name)
         self._overflow = OverflowFaults(faults, seed, board.name)
-        self._down_ns = (0, 0)  # start and end of the link's outage, wire time
+        # Start and end of the link's outage, wire time
+        self._down_ns = (0, 0)
         self._last_pulse_ns = 0
         self._pulses = 0
         self.last_data_wall_s = 0.0

@@ -18,10 +18,13 @@ from polysight_shared.errors import ProtocolError
 REQUEST_HEADER = 0xA55A
 REQUEST_FOOTER = 0xEEAA
 SOURCE_PORT = 1024  # of replies and data (seen)
-DATA_HEADER_BYTES = 10  # u32 sequence, u48 byte count
-PACKET_OVERHEAD_BYTES = 14  # "packet size 1470" carries 1456 bytes of payload
+# U32 sequence, u48 byte count
+DATA_HEADER_BYTES = 10
+# "packet size 1470" carries 1456 bytes of payload
+PACKET_OVERHEAD_BYTES = 14
 TAIL_S = 2.0  # from the last LVDS data to the short last packet (seen)
-FPGA_VERSION = 2 | 8 << 7  # 2.8: bytes 02 04 (seen)
+# 2.8: bytes 02 04 (seen)
+FPGA_VERSION = 2 | 8 << 7
 DELAY_TICK_S = 8e-9
 TIMER_S = 30
 _MIN_PACKET = 48
@@ -275,7 +278,8 @@ class Card:
         elif code == Code.CONFIGURE_FPGA:
             # The card also answers bodies of wrong length or content (seen).
             if well_formed and len(body) == 6 and all(1 <= b <= n for b, n in zip(body, _CHOICES, strict=False)):
-                raw_ethernet = (body[0], *body[2:5]) == (1, 1, 2, 3)  # raw, capture, ethernet, 16 bit
+                # Raw, capture, ethernet, 16 bit
+                raw_ethernet = (body[0], *body[2:5]) == (1, 1, 2, 3)
                 self._suits_radar = raw_ethernet and self._lanes in (None, _LANES[body[1]])
                 self._timer_s = body[5]
         elif code == Code.CONFIGURE_PACKET:

@@ -44,7 +44,8 @@ class CardServer:
         self._track = track
         self._trigger_ns = self._pulse_ns = 0
         self._selector = selectors.DefaultSelector()
-        self._bound: dict[SimulatedCard, tuple[int, int]] = {}  # number of the card's binding, its descriptor then
+        # Number of the card's binding, its descriptor then
+        self._bound: dict[SimulatedCard, tuple[int, int]] = {}
         self._select_cards()
         self._selector.register(wires, selectors.EVENT_READ)
         for server in (*control, *chips):
@@ -102,7 +103,8 @@ class CardServer:
     def _take_edges(self) -> bool:
         """Read the wires; return True if there were pulses."""
         rising: dict[int, list[int]] = {card.line: [] for card in self._cards}
-        self._unread = True  # the client may have buffered lines
+        # The client may have buffered lines
+        self._unread = True
         for _ in range(EDGES_PER_TURN):
             message = self._wires.receive(0.0)
             if message is None:
@@ -130,7 +132,8 @@ class CardServer:
         """Send data and end the record in time; return the seconds until this card has more to do."""
         endpoint = card.endpoint
         wait = endpoint.flush()
-        if wait is None and endpoint.due and not self._take_edges():  # pending data delays the end
+        # Pending data delays the end
+        if wait is None and endpoint.due and not self._take_edges():
             card.tick(self.more_expected)
             wait = endpoint.flush()
         if wait is not None:

@@ -29,7 +29,8 @@ from polysight_simulators.radars.cores import (
     ones_sum,
 )
 
-FUNCTIONAL = 4  # sense-on-power mode
+# Sense-on-power mode
+FUNCTIONAL = 4
 ANSWER_S = 1e-4
 DATA_S = 1e-3
 
@@ -137,7 +138,8 @@ class RadarBoard:
     def _forget(self) -> None:
         self._in = bytearray()
         self._out = bytearray()
-        self._waiting: deque[bytes] = deque()  # messages not read by the host yet
+        # Messages not read by the host yet
+        self._waiting: deque[bytes] = deque()
         self._later: list[tuple[float, bytes]] = []
         self._offered = False
         self._ready_at = 0.0
@@ -287,7 +289,8 @@ class RadarBoard:
             self._send(frame(direction, NACK, number, b"", 0, sequence, wide), 0.0)
             return
         if flags & 3 == 3 and self._last[0] == sequence and self._last[1]:
-            self._send(self._last[1], 0.0)  # a retry: repeat the answer, without executing the command again
+            # A retry: repeat the answer, without executing the command again
+            self._send(self._last[1], 0.0)
             return
         delay = ANSWER_S
         error = 0
@@ -298,7 +301,9 @@ class RadarBoard:
             block, size = struct.unpack_from("<HH", body)
             refused = fault in (Fault.REFUSE, Fault.REFUSE_BARE)
             if refused:
-                error, data, extra = (6, b"", 0.0)
+                error = 6
+                data = b""
+                extra = 0.0
             else:
                 error, data, extra = self.cores.execute(block, body[4:size], remaining)
             if error:
@@ -308,9 +313,11 @@ class RadarBoard:
             body = body[size:]
         self._busy_until = self.now() + delay
         if error and (self.cores.first_generation or fault is Fault.REFUSE_BARE):
-            answer = frame(direction, RESPONSE, 0, b"", 1, sequence, wide)  # like an AWR1243
+            # Like an AWR1243
+            answer = frame(direction, RESPONSE, 0, b"", 1, sequence, wide)
         elif error:
-            answer = frame(direction, RESPONSE, 0, struct.pack("<4H", 0, 8, error, block), 1, sequence, wide)  # ICD 4.4
+            # ICD 4.4
+            answer = frame(direction, RESPONSE, 0, struct.pack("<4H", 0, 8, error, block), 1, sequence, wide)
         else:
             answer = frame(direction, RESPONSE, number, blocks, 1 if blocks else 0, sequence, wide)
         self._last = (sequence, answer)

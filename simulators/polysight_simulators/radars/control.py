@@ -31,11 +31,14 @@ _OUT = 1 << 1
 _SELECT = 1 << 3
 _BARE = (0x85, 0x87, 0x8A, 0x8C, 0x8D, 0x97)
 _CHANNELS = "ABCD"
-_PIN_S = 0.2e-6  # duration of a pin command (FTDI AN_114)
-_CLOCKS_S = 0.2e-6  # two clocks, the minimum before and between chip selects (ICD 3.2.4); required here: twice that
+# Duration of a pin command (FTDI AN_114)
+_PIN_S = 0.2e-6
+# Two clocks, the minimum before and between chip selects (ICD 3.2.4); required here: twice that
+_CLOCKS_S = 0.2e-6
 _HEAD = struct.Struct("<ccH")
 LINE = b"Retrigger"
-_NO_LINGER = struct.pack("ii", 1, 0)  # closing sends a reset
+# Closing sends a reset
+_NO_LINGER = struct.pack("ii", 1, 0)
 
 
 class UsbChip:
@@ -71,13 +74,15 @@ class UsbChip:
             for pins in data:
                 self._board.reset(held=not (pins >> 6 & 1 and pins >> 7 & 1))
         else:
-            self._high_s = float("inf") if name == "A" and self._pins & _SELECT else self._high_s  # USB is slow
+            # USB is slow
+            self._high_s = float("inf") if name == "A" and self._pins & _SELECT else self._high_s
             self._pending[name] += data
             commands: dict[str, Callable[[bytearray], int]] = {"A": self._spi, "B": self._gpio}
             while self._pending[name]:
                 used = commands[name](self._pending[name])
                 if used == 0:
-                    return  # incomplete command
+                    # Incomplete command
+                    return
                 del self._pending[name][:used]
 
     def give(self, name: str, size: int) -> bytes:
@@ -224,7 +229,8 @@ class _Server:
                         self._clients[descriptor] = client, self._execute(client, rest + data)
                         continue
                 except (OSError, DeviceError):
-                    pass  # disconnected or unplugged: close the connection
+                    # Disconnected or unplugged: close the connection
+                    pass
                 self._drop(descriptor)
 
     def _accept(self) -> None:
@@ -256,7 +262,8 @@ class RadarSocket(_Server):
         self.chip = UsbChip(board)
 
     def _accept(self) -> None:
-        for descriptor in list(self._clients):  # the new client replaces the old one
+        # The new client replaces the old one
+        for descriptor in list(self._clients):
             self._drop(descriptor)
         super()._accept()
 

@@ -111,14 +111,16 @@ SAVE = 0x00AB
 RESTORE = 0x008B
 CHUNK_BYTES = 224
 CHUNKS = 3
-SIZES = {  # data bytes of each sub-block
+# Data bytes of each sub-block
+SIZES = {
     0x0080: 8, 0x0082: 8, 0x0083: 4, 0x0085: 4, 0x0086: 12, 0x0089: 12, RESTORE: 228, 0x008D: 16, SAVE: 4, 0x00C0: 0,
     PROFILE: 44, CHIRP: 20, FRAME: 24, STREAM_SET: 20, STREAM: 4, 0x0120: 4, 0x0121: 4, 0x0122: 0, 0x0140: 4,
     0x0220: 0, 0x0223: 0, 0x02CC: 4, 0x02EA: 0, 0x4000: 0, 0x4041: 12, 0x4042: 8, 0x4043: 4,
     0x4044: 4, 0x4045: 4, 0x4046: 4, 0x404C: 12, 0x40C0: 8, 0x40E0: 0,
 }  # fmt: skip
 _BEFORE_FRAMES = (0x0080, 0x0082, 0x0086, 0x00C0, PROFILE, CHIRP, 0x4041, 0x4042, 0x4043, 0x4044, 0x4045)
-_WITHOUT_RF = (0x4080, 0x404C, 0x4000, 0x40E0)  # commands before the RF power-up
+# Commands before the RF power-up
+_WITHOUT_RF = (0x4080, 0x404C, 0x4000, 0x40E0)
 
 
 @dataclass
@@ -135,8 +137,10 @@ class Cores:
     fault_at: str = "power-up"
     first_generation: bool = False
     hardware_bits: int = 0
-    rf_tests: int = 0x07FFFFFF  # self-tests of the RF core that passed
-    passes: int = 0x1FFE  # calibrations of the RF init
+    # Self-tests of the RF core that passed
+    rf_tests: int = 0x07FFFFFF
+    # Calibrations of the RF init
+    passes: int = 0x1FFE
     main_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
     rf_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
     destroyed: bool = False
@@ -156,7 +160,8 @@ class Cores:
         self.frames_left = 0
         self.armed = False
         self.frame_ends = -1.0
-        self._file: tuple[int, int] | None = None  # file type, missing bytes
+        # File type, missing bytes
+        self._file: tuple[int, int] | None = None
         self._restored: dict[int, bytes] = {}
         self._part = b""
         for table in (self.settings, self.profiles, self.chirps):
@@ -307,7 +312,8 @@ class Cores:
         self.armed = True
         self.frame_ends = -1.0
         self.armings += 1
-        if trigger == 1:  # software trigger: they run at once (ICD table 5.27)
+        # Software trigger: they run at once (ICD table 5.27)
+        if trigger == 1:
             self.armed = False
             self.frames_left = 0
             self.event(FRAME_END, b"", frames * period * 5e-9)

@@ -98,7 +98,10 @@ def synced_cube(
     seed = scene.seed if seed is None else seed
     board = rig.by_name(board_name)
     d = scene.disturbances
-    f = sample_frequencies_hz(rig) if frequencies_hz is None else np.asarray(frequencies_hz, np.float64)
+    if frequencies_hz is None:
+        f = sample_frequencies_hz(rig)
+    else:
+        f = np.asarray(frequencies_hz, np.float64)
     channels = list(range(len(rig.antennas.rx_mm))) if rx is None else list(rx)
     field = build_field(rig, scene, board, f, cache_dir, channels)
     all_m = antennas(rig, board).direct_m

@@ -57,9 +57,12 @@ from polysight_simulators.scene.optics import (
 from polysight_simulators.scene.scene_file import Facets, Scene, draw_specimens, facets, slopes
 from polysight_simulators.scene.shapes import shape_field
 
-FADE_M = 0.06  # length of the kernel's fade-out beyond the scene
-TAPS = 12  # taps of the windowed sinc
-MARGIN_M = 0.012  # offsets beyond the aperture, for the taps of the sinc
+# Length of the kernel's fade-out beyond the scene
+FADE_M = 0.06
+# Taps of the windowed sinc
+TAPS = 12
+# Offsets beyond the aperture, for the taps of the sinc
+MARGIN_M = 0.012
 OVERSAMPLING = 2
 
 
@@ -156,9 +159,12 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
     return axes[0], axes[1]
 
 
-_ANGLE_TOLERANCE = 1e-4  # error of the Chebyshev series in the local angle
-_RELIEF_TOLERANCE = 2e-4  # error of the interpolation in dpath/dz
-_LEVEL_MM = 2.0  # range of heights that share a kernel
+# Error of the Chebyshev series in the local angle
+_ANGLE_TOLERANCE = 1e-4
+# Error of the interpolation in dpath/dz
+_RELIEF_TOLERANCE = 2e-4
+# Range of heights that share a kernel
+_LEVEL_MM = 2.0
 
 
 def cheb_nodes(q: int) -> Real:
@@ -439,7 +445,8 @@ def _frequencies(scene: Scene, levels: list[tuple[_Plane, _Level]], samples_hz: 
     shortest_m = float(min(low for low, _ in ranges))
     longest_m = float(max(high for _, high in ranges))
     inside = 0.0
-    for p in scene.plates:  # inner echoes extend the response
+    # Inner echoes extend the response
+    for p in scene.plates:
         depth = sum((layer.thickness_mm or 0.0) / 1e3 * abs(np.sqrt(layer.epsilon)) for layer in p.stack)
         inside = max(inside, 4 * depth)
     # Shapes extend beyond their fronts' heights; some 0.15 m on either side hold their specular points.
@@ -505,7 +512,8 @@ def _oversampled(spectrum: NDArray[np.complex64], axis: Axis, along: int) -> NDA
     return line[(*lead, slice(0, axis.outputs))]
 
 
-_PHYSICS = 3  # version of the content of cached fields
+# Version of the content of cached fields
+_PHYSICS = 3
 
 _KAISER_BETA = 8.0
 

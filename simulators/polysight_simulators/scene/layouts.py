@@ -31,7 +31,8 @@ from polysight_simulators.scene.radar import sample_frequencies_hz
 from polysight_simulators.scene.scene_file import Scene, apply_scene
 
 Gaps = list[tuple[int, int]]
-_HEADER_BYTES = 10  # sequence number and byte count before each payload
+# Sequence number and byte count before each payload
+_HEADER_BYTES = 10
 
 
 class Layout(Protocol):
@@ -96,7 +97,8 @@ def _calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, s
         try:
             (path / copy).parent.mkdir(exist_ok=True)
             (path / copy).write_bytes(source.read_bytes())
-            images = source.with_suffix(".npz")  # gains of a metal reference
+            # Gains of a metal reference
+            images = source.with_suffix(".npz")
             if images.exists():
                 (path / "calibration" / images.name).write_bytes(images.read_bytes())
         except OSError as e:

@@ -117,10 +117,12 @@ def strips(psi_rad: float, theta_rad: NDArray[np.floating] | float) -> tuple[Com
     cos = np.cos(np.asarray(theta_rad, dtype=np.float64))
     u_x = np.sin(psi_rad)
     u_y = np.cos(psi_rad)
-    incident = u_y + u_x * cos  # tangential: E_y = 1, E_x = cos(theta)
+    # Tangential: E_y = 1, E_x = cos(theta)
+    incident = u_y + u_x * cos
     current = incident / (u_y**2 / (2 * cos) + u_x**2 * cos / 2)
     r_s = -current * u_y / (2 * cos)
-    r_p = -current * u_x * cos / 2 / cos  # tangential E_x back to the wave's amplitude
+    # Tangential E_x back to the wave's amplitude
+    r_p = -current * u_x * cos / 2 / cos
     return r_s.astype(np.complex128), r_p.astype(np.complex128)
 
 

@@ -55,11 +55,13 @@ def high_pass(if_hz: Real, chirp: Chirp) -> tuple[Complex, Complex]:
     log_slope = np.zeros(np.shape(f), np.complex128)
     for corner in (chirp.hpf1_khz * 1e3, chirp.hpf2_khz * 1e3):
         u = corner / f
-        section = np.empty(np.shape(f), np.complex128)  # 1 / (1 - j u), without a complex division
+        # 1 / (1 - j u), without a complex division
+        section = np.empty(np.shape(f), np.complex128)
         section.real = 1.0 / (1.0 + u * u)
         section.imag = u * section.real
         h *= section
-        log_slope.real += section.imag * u / f  # -j u section / f
+        # -j u section / f
+        log_slope.real += section.imag * u / f
         log_slope.imag -= section.real * u / f
     return h, h * log_slope
 
@@ -141,14 +143,16 @@ def per_chirp(receiver: Receiver, delay_s: Real, phase_rad: Real, hpf: bool) -> 
     turns = (receiver.phase + phase_rad[:, None]) / (2 * np.pi) - f * delay_s[:, None]
     turns -= np.rint(turns)
     factor = np.empty(turns.shape, np.complex64)
-    angle = (2 * np.pi * turns).astype(np.float32)  # less than a turn: single precision is enough
+    # Less than a turn: single precision is enough
+    angle = (2 * np.pi * turns).astype(np.float32)
     factor.real = np.cos(angle)
     factor.imag = np.sin(angle)
     shift = receiver.if_error_hz - chirp.slope_hz_per_s * delay_s[:, None]
     return factor, shift if hpf else np.zeros_like(shift)
 
 
-_BATCH = 64  # chirps per batch: their arrays fit in the cache
+# Chirps per batch: their arrays fit in the cache
+_BATCH = 64
 _FULL_SCALE = 32767
 _LEAKAGE_DELAY_S = 0.2e-9  # from TX to RX on the transmit board: some centimetres
 _LEAKAGE_AMPLITUDE = 2.0
@@ -322,7 +326,8 @@ class SimulatedRig:
         d = self.scene.disturbances
         receiver = self._receiving(board.name)
         chirp = self.rig.chirp
-        frames = pulses // self.rig.burst.chirps  # all chirps of a frame start with one pulse
+        # All chirps of a frame start with one pulse
+        frames = pulses // self.rig.burst.chirps
         delay = sync_delay_s(d, self.seed, board, frames) - sync_delay_s(d, self.seed, self.rig.transmitter, frames)
         if d.random_phase:
             turns = pulse_uniform(stream_key(self.seed, "phase", board.name), pulses)
@@ -336,7 +341,8 @@ class SimulatedRig:
             gains = echo_drift(self.rig, d, board, pulses[inside])[:, None] * receiver.receiver.gains
             nodes[inside] = receiver.field.at(x_m[inside], y_m[inside]) * gains[:, :, None]
         # One small product per chirp: BLAS runs larger ones in threads, which is slow beside other processes.
-        ideal = np.matmul(nodes[:, None], receiver.expand)  # [chirp, 2, rx, sample]
+        # [chirp, 2, rx, sample]
+        ideal = np.matmul(nodes[:, None], receiver.expand)
         ideal += receiver.direct
         if not d.hpf:
             out += factor[:, None] * ideal[:, 0]
@@ -399,7 +405,8 @@ def pattern_frames(board: int, first: int, n: int, samples: int) -> NDArray[np.i
     """
     words = samples * 4
     count = np.arange(n * words, dtype="<u4")
-    count += np.uint32(first * words % (1 << 28))  # may wrap at 32 bits without effect on 28 bits
+    # May wrap at 32 bits without effect on 28 bits
+    count += np.uint32(first * words % (1 << 28))
     count &= np.uint32((1 << 28) - 1)
     count |= np.uint32(board << 28)
     return count.view("<i2").reshape(n, samples, 8)

@@ -198,12 +198,14 @@ def _write_scan(
 ) -> Path:
     """Write a scan with its truth.json of these facts; return its folder."""
     require_empty(writer.folder)
-    radar.prepare()  # before the first file: a scene that cannot be simulated leaves no folder
+    # Before the first file: a scene that cannot be simulated leaves no folder
+    radar.prepare()
     writer.start()
     _write_rows(writer, radar, plan, boards, by_columns, progress)
     content = {**facts, "samples_clipped": radar.clipped}
     (writer.folder / "truth.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    writer.end()  # last: whatever ends the program before leaves an unfinished scan
+    # Last: whatever ends the program before leaves an unfinished scan
+    writer.end()
     return writer.folder
 
 

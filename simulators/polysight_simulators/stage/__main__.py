@@ -94,7 +94,8 @@ class SerialPort:
         except BlockingIOError:
             return False
         rose = False
-        for _, mask, _, _ in _EVENT.iter_unpack(events):  # a watch on one file: no names follow
+        # A watch on one file: no names follow
+        for _, mask, _, _ in _EVENT.iter_unpack(events):
             if mask & _IN_OPEN:
                 rose |= not self._dtr
                 self._dtr = True
@@ -108,14 +109,16 @@ class SerialPort:
         """Received bytes; empty when there are none."""
         try:
             return os.read(self._master, 512)
-        except OSError:  # EAGAIN, or EIO while no client is there
+        except OSError:
+            # EAGAIN, or EIO while no client is there
             return b""
 
     def write(self, data: bytes) -> None:
         """Send bytes; those that a client does not read in time are lost, as on a serial line."""
         try:
             os.write(self._master, data)
-        except OSError:  # EAGAIN: full
+        except OSError:
+            # EAGAIN: full
             return
 
     def flush(self) -> None:
@@ -146,7 +149,8 @@ def serve(
         wall = now
         ticks += leap * time_scale * TICK_HZ * 1e-9
         now_ms = (now - started) // NS_PER_MS
-        if port.opened():  # opening the port resets the board; its boot loader ignores bytes until it ends
+        # Opening the port resets the board; its boot loader ignores bytes until it ends
+        if port.opened():
             boots_at = now + boot_ms * NS_PER_MS
             running = False
         is_open = port.is_open

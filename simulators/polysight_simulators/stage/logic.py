@@ -20,7 +20,8 @@ FIRST_LEG = 2000
 STEPS_PER_MM = 200
 PULL_OFF = 400
 MAX_RELEASE = 4000
-HOME_ACCEL = 40_000  # steps/s^2
+# Steps/s^2
+HOME_ACCEL = 40_000
 QUIET_MS = 4
 _RANGES = {
     Parameter.ACCEL: (100, 1_000_000),
@@ -95,7 +96,8 @@ class StageLogic:
             Parameter.BACKLASH: 0,
             Parameter.PINS: 0,
         }
-        self.activity = "idle"  # idle, move, travel, row, home
+        # Idle, move, travel, row, home
+        self.activity = "idle"
         self.alarm: StageError | None = None
         self.homed = self.held = self.row_command = self.heard = self.status_requested = False
         self._stopping: StageError | None = None

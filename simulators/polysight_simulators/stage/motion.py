@@ -19,7 +19,8 @@ SWITCH_X = 1
 SWITCH_Y = 2
 EMERGENCY = 4
 SWITCHES = SWITCH_X | SWITCH_Y
-LOOKS = 5  # equal readings after which a switch changes (debouncing)
+# Equal readings after which a switch changes (debouncing)
+LOOKS = 5
 
 
 class Leg(NamedTuple):

@@ -17,7 +17,8 @@ from polysight_simulators.stage.logic import MOTION_VERBS, Event, Refused, Stage
 from polysight_simulators.stage.motion import NS_PER_TICK, SWITCH_X, SWITCH_Y, TICK_HZ, StepEngine
 
 FIRMWARE = "0.1.0"
-REPORT_TICKS = TICK_HZ // 100  # interval of motion messages while the speed changes: 10 ms
+# Interval of motion messages while the speed changes: 10 ms
+REPORT_TICKS = TICK_HZ // 100
 _TAIL = re.compile(rb"\*([^*]{4})")
 
 
@@ -56,7 +57,8 @@ class PythonStage:
         self._armed = self._was_homed = False
         self._line = bytearray()
         self._greeted = self._fresh = False
-        self._last: Command | None = None  # the last answered line: its repetition gets the same answer
+        # The last answered line: its repetition gets the same answer
+        self._last: Command | None = None
         self._last_answer = b""
         self._last_is_motion = False
         self._motion_sequence = 0
@@ -168,7 +170,8 @@ class PythonStage:
         if ticks:
             self._next = self.tick + ticks
             self._armed = True
-            if self._engine.cruise:  # a leg without a ramp
+            # A leg without a ramp
+            if self._engine.cruise:
                 self._report_motion()
 
     def _inputs(self) -> int:

@@ -29,9 +29,11 @@ class PinEdge(NamedTuple):
     """An edge of a watched pin, at an exact cycle of the 16 MHz clock."""
 
     cycle: int
-    pin: int  # Arduino number; A0 is 14
+    # Arduino number; A0 is 14
+    pin: int
     value: int
-    x: int  # motor steps, counted at the pins from where the stage stood when it was switched on
+    # Motor steps, counted at the pins from where the stage stood when it was switched on
+    x: int
     left: int
     right: int
     step_cycle: int  # of the last rising PUL edge
@@ -41,9 +43,12 @@ class Cost(NamedTuple):
     """Worst cases since the last call of :meth:`EmulatedUno.cost`, in cycles."""
 
     interrupts: dict[int, int]  # by vector number: from entry to the end of reti
-    step_pulse: int  # shortest
-    direction_setup: int  # shortest time from DIR to PUL
-    direction_hold: int  # ... and from PUL to DIR
+    # Shortest
+    step_pulse: int
+    # Shortest time from DIR to PUL
+    direction_setup: int
+    # ... and from PUL to DIR
+    direction_hold: int
 
 
 class EmulatedUno:
@@ -71,10 +76,13 @@ class EmulatedUno:
     ) -> None:
         self.edges: list[PinEdge] = []
         self.received = bytearray()
-        self.troubles: list[str] = []  # resets, lost bytes, crashes
+        # Resets, lost bytes, crashes
+        self.troubles: list[str] = []
         self.cycle = 0
-        self.motors = (start[0], start[1], start[1])  # x, left, right
-        self.sent = 0  # bytes to the pseudo terminal
+        # X, left, right
+        self.motors = (start[0], start[1], start[1])
+        # Bytes to the pseudo terminal
+        self.sent = 0
         self._counted: dict[int, int] = {}
         self._cost_pins = (0, 0, 0)
         command = [str(program), "--parent", str(os.getpid()), "--start", f"{start[0]},{start[1]}"]

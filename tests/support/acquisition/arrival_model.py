@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-US, MS = 1_000, 1_000_000
+US = 1_000
+MS = 1_000_000
 PAYLOAD = 1456
 FRAME_NS = 128 * US
 
@@ -51,7 +52,8 @@ def receive(
         frame = (stop - 1) // frame_bytes
         made = sent[frame] + FRAME_NS * (stop - frame * frame_bytes) / frame_bytes
         if stop == end and end % PAYLOAD:
-            made += 2_000 * MS  # the card waits 2 s before it sends a packet that is not full
+            # The card waits 2 s before it sends a packet that is not full
+            made += 2_000 * MS
         made = max([made, *(b for a, b in stalls if a <= made < b)])
         ready = max(made, ready + 25 * US)
         if k not in lost:

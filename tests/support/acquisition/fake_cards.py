@@ -23,13 +23,15 @@ class FakeCard:
     """Answers commands from source port 1024 and sends a row on demand; its counters go on from record to record."""
 
     def __init__(self, board: Board, row_bytes: int) -> None:
-        self.board, self.row_bytes = board, row_bytes
+        self.board = board
+        self.row_bytes = row_bytes
         self.commands = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.commands.bind((board.card_address, board.command_port))
         self.commands.settimeout(0.05)
         self.out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.out.bind((board.card_address, 1024))
-        self.sequence, self.count = 1, 0
+        self.sequence = 1
+        self.count = 0
         self.recording = False
         self.mute = False
         self.silent_data = False
@@ -37,8 +39,10 @@ class FakeCard:
         # faults by (row, take): packets to leave out, frames to leave out (as a radar that missed triggers)
         self.drop: dict[tuple[int, int], set[int]] = {}
         self.short: dict[tuple[int, int], int] = {}
-        self.missed: dict[tuple[int, int], set[int]] = {}  # pulses, of rows that are sent at their pace
-        self.extra: dict[tuple[int, int], int] = {}  # before this pulse an edge nobody sent; frames are counted
+        # Pulses, of rows that are sent at their pace
+        self.missed: dict[tuple[int, int], set[int]] = {}
+        # Before this pulse an edge nobody sent; frames are counted
+        self.extra: dict[tuple[int, int], int] = {}
         self._rest = b""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -57,8 +61,11 @@ class FakeCard:
 
     def _command(self, code: int, sender: tuple[str, int]) -> None:
         self.recording = {1: False, 5: True, 6: False}.get(code, self.recording)
-        if code == 1:  # reset
-            self.sequence, self.count, self._rest = 1, 0, b""
+        # Reset
+        if code == 1:
+            self.sequence = 1
+            self.count = 0
+            self._rest = b""
         self.out.sendto(struct.pack("<HHHH", 0xA55A, code, 0x0402 if code == 0x0E else 0, 0xEEAA), sender)
 
     def report_status(self, bits: int = 0x0100) -> None:
@@ -68,7 +75,8 @@ class FakeCard:
 
     def send_frame(self, row: int, take: int, slot: int, frame_bytes: int) -> None:
         """Send the frame of one pulse, unless the radar missed it; packets are sent when they are full."""
-        extra, last = self.extra.get((row, take)), slot == self.row_bytes // frame_bytes - 1
+        extra = self.extra.get((row, take))
+        last = slot == self.row_bytes // frame_bytes - 1
         if slot == extra:
             self._rest += bytes(frame_bytes)
         if slot not in self.missed.get((row, take), ()) and not (last and extra is not None):
@@ -83,7 +91,8 @@ class FakeCard:
         self.report_status()
 
     def _send_packet(self, size: int) -> None:
-        body, self._rest = self._rest[:size], self._rest[size:]
+        body = self._rest[:size]
+        self._rest = self._rest[size:]
         if body:
             packet = encode_packet(self.sequence, self.count, body)
             self.out.sendto(packet, (self.board.host_address, self.board.data_port))

@@ -20,28 +20,41 @@ class FakePi:
     """A Pi that speaks only the wire protocol; a row makes every card send its data."""
 
     def __init__(self, rig: Instrument, cards: list[FakeCard]) -> None:
-        self.rig, self.cards = rig, cards
+        self.rig = rig
+        self.cards = cards
         self.journal: dict[str, list[m.AnyEvent]] = {}
         self.stage = rig.stage.placement_settings  # in the reply to Hello; {} as of older releases
         self.homed = False
         self.run: m.BeginRun | None = None
         self.state: m.State = "idle"
-        self.homings, self.home_fails, self.lost_mm = 0, set(), (0.0, 0.0)
-        self.lose_events = 0  # number of events that PUB loses
+        self.homings = 0
+        self.home_fails = set()
+        self.lost_mm = (0.0, 0.0)
+        # Number of events that PUB loses
+        self.lose_events = 0
         self.lose_replies = 0
-        self.fail_rows: dict[tuple[int, int], int] = {}  # (row, take): fault number
-        self.fault, self.latched = 0, ""  # number and reason of the first fault
-        self.hang_at: set[int] = set()  # rows that never end; half of their data is sent
-        self.paced = False  # frames are sent at the times of their pulses
+        # (row, take): fault number
+        self.fail_rows: dict[tuple[int, int], int] = {}
+        # number and reason of the first fault
+        self.fault = 0
+        self.latched = ""
+        # Rows that never end; half of their data is sent
+        self.hang_at: set[int] = set()
+        # Frames are sent at the times of their pulses
+        self.paced = False
         self.hang_after_captures = False  # such rows send their bursts before they hang
-        self.notes: dict[tuple[int, int], str] = {}  # reason in RowFinished of a completed row
-        self.wanted_end = False  # the hanging row must end
+        # Reason in RowFinished of a completed row
+        self.notes: dict[tuple[int, int], str] = {}
+        # The hanging row must end
+        self.wanted_end = False
         self.commands: list[m.AnyCommand] = []
         self.rows_run: list[tuple[int, int]] = []
-        self._ran: set[tuple[int, int]] = set()  # since the last BeginRun
+        # Since the last BeginRun
+        self._ran: set[tuple[int, int]] = set()
         self.hanging: tuple[Row, int] | None = None
         self.context = zmq.Context()
-        self.rep = self.context.socket(zmq.ROUTER)  # unlike REP it may leave a request without a reply
+        # Unlike REP it may leave a request without a reply
+        self.rep = self.context.socket(zmq.ROUTER)
         self.rep.bind(rig.pi.command_address)
         self.pub = self.context.socket(zmq.PUB)
         self.pub.bind(rig.pi.event_address)
@@ -105,21 +118,30 @@ class FakePi:
         if isinstance(c, m.EndRun) and (self.hanging is not None or self.run is None):
             return m.Refused(number=111, what="a row is running" if self.run else "no run is begun")
         if isinstance(c, m.BeginRun):
-            self.run, self._ran = c, set()
+            self.run = c
+            self._ran = set()
             self._emit(m.RunStarted, plan=c.plan, resumed=bool(self.journal.get(c.scan_id)))
         elif isinstance(c, m.EndRun):
             self._emit(m.RunStopped, exit_status=c.exit_status, reason=c.reason)
         elif isinstance(c, m.Home):
-            self.homed, self.state, self.fault, self.latched = True, "ready", 0, ""
+            self.homed = True
+            self.state = "ready"
+            self.fault = 0
+            self.latched = ""
             self.homings += 1
             if self.homings in self.home_fails:
-                self.homed, self.state, self.fault, self.latched = False, "fault", 102, "the switch was not found"
+                self.homed = False
+                self.state = "fault"
+                self.fault = 102
+                self.latched = "the switch was not found"
         elif isinstance(c, m.Replay):
             events = self.journal.get(c.scan_id, [])
-            few = events[c.from_seq - 1 :][: min(c.limit, 3)]  # never more than a few, as of a Pi whose row runs
+            # Never more than a few, as of a Pi whose row runs
+            few = events[c.from_seq - 1 :][: min(c.limit, 3)]
             return m.ReplayReply(events=few, last_seq=len(events))
         elif isinstance(c, m.RunRow):
-            if (c.row_index, c.take) not in self._ran:  # else a repeated request
+            # Else a repeated request
+            if (c.row_index, c.take) not in self._ran:
                 self._ran.add((c.row_index, c.take))
                 self.rows_run.append((c.row_index, c.take))
                 self._todo = c
@@ -154,8 +176,11 @@ class FakePi:
                 card.send_row(row.index, c.take)
         fault = self.fail_rows.get((c.row_index, c.take), 0)
         n = row.points
-        if fault in (101, 102, 107, 109):  # lasting ones
-            self.fault, self.state, self.homed = fault, "fault", fault in (107, 109)
+        # Lasting ones
+        if fault in (101, 102, 107, 109):
+            self.fault = fault
+            self.state = "fault"
+            self.homed = fault in (107, 109)
         self._emit(
             m.RowFinished, row_index=row.index, take=c.take, status="fault" if fault else "done", points=n, edges=n,
             bursts=n, pulses=n * self.run.pulses, fault=fault, reason=self.notes.get((c.row_index, c.take), ""),
@@ -172,7 +197,9 @@ class FakePi:
     def _run_at_its_pace(self, row: Row, take: int) -> None:
         """Send bursts 60 ms apart with pulses 1.5 ms apart, on its own clock, and each frame 0.1 ms after its pulse."""
         assert self.run is not None
-        n, period, ahead = self.run.pulses, 1_500_000, 77_000_000_000
+        n = self.run.pulses
+        period = 1_500_000
+        ahead = 77_000_000_000
         begin = time.monotonic_ns() + 20_000_000
         for point in range(row.points):
             first = begin + point * 60_000_000

@@ -35,7 +35,8 @@ class Cards:
         self.endpoints[name] = endpoint
         if recording is not None:
             plays = (Recording(path) for path in repeat(recording))
-            self._players[name] = Player(endpoint, plays, 5e6, time.monotonic)  # bytes/s
+            # Bytes/s
+            self._players[name] = Player(endpoint, plays, 5e6, time.monotonic)
 
     @staticmethod
     def network_of(board: Board) -> Network:

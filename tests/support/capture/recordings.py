@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-CARD, OTHER = b"\xc0\xa8\x21\xb4", b"\xc0\xa8\x21\xb5"
+CARD = b"\xc0\xa8\x21\xb4"
+OTHER = b"\xc0\xa8\x21\xb5"
 
 
 def row(
@@ -29,7 +30,8 @@ def row(
             x[r, c] = tones * np.exp(1j * r) + noise[0] + 1j * noise[1]
     if dead is not None:
         x[dead] = 0
-    parts = np.stack([x.imag, x.real] if q_first else [x.real, x.imag])  # [part, rx, chirp, sample]
+    # [part, rx, chirp, sample]
+    parts = np.stack([x.imag, x.real] if q_first else [x.real, x.imag])
     if lanes == 4:
         words = parts.transpose(2, 3, 0, 1)
     else:

@@ -10,7 +10,8 @@ from polysight.capture.dca1000 import Counters
 from polysight.capture.packet_log import PacketLog
 from polysight.capture.placement import Past, Placed, place_record
 
-FULL = 1456  # bytes of samples in a full packet
+# Bytes of samples in a full packet
+FULL = 1456
 
 
 def encode_packet(sequence: int, byte_count: int, payload: bytes) -> bytes:
@@ -44,10 +45,14 @@ class Card:
     """Makes consecutive records; `reset` restarts the counters."""
 
     def __init__(self, size: int, count: int = 0, sequence: int = 1) -> None:
-        self._size, self._count, self._sequence, self._seed = size, count, sequence, 0
+        self._size = size
+        self._count = count
+        self._sequence = sequence
+        self._seed = 0
 
     def reset(self) -> None:
-        self._count, self._sequence = 0, 1
+        self._count = 0
+        self._sequence = 1
 
     def record(self, resets: tuple[int, ...] = ()) -> Record:
         """Return the next record; the counters restart before each of the packets `resets`."""

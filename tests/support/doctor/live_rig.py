@@ -132,7 +132,8 @@ def answering(rig: Instrument, hello: m.HelloReply, version: str = m.WIRE_VERSIO
         last_seq=0, fault=0, reason="",
     )  # fmt: skip
     context: zmq.Context = zmq.Context()
-    replies, stop = context.socket(zmq.REP), threading.Event()
+    replies = context.socket(zmq.REP)
+    stop = threading.Event()
     replies.bind(rig.pi.command_address)
 
     def serve() -> None:

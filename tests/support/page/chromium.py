@@ -20,7 +20,9 @@ from websockets.sync.client import connect
 
 from tests.support.processes import HANG_S, LIMIT_S, idle_s, wait_for
 
-DESK, PHONE = (1400, 900, False), (390, 844, True)  # width, height, whether it is a phone
+# width, height, whether it is a phone
+DESK = (1400, 900, False)
+PHONE = (390, 844, True)
 
 
 def find_chromium() -> str | None:
@@ -135,7 +137,8 @@ class Browser:
     def visit(self, url: str, size: tuple[int, int, bool] = DESK) -> None:
         """Go to a page, without the errors and requests of the one before."""
         self.size(*size)
-        self.open("about:blank")  # a page that differs by its fragment only is not loaded anew
+        # A page that differs by its fragment only is not loaded anew
+        self.open("about:blank")
         self.wait("location.href == 'about:blank'", "an empty page")
         self.errors.clear()
         self.requests.clear()

@@ -93,7 +93,8 @@ class Served:
         front = Front(site.scans, access, site.starts and access.control, make_reader_app(site))
         self._server = make_server(front, place or Place())
         site.is_ending = lambda: self._server.should_exit
-        self._server.config.host, self._server.config.port = host, port
+        self._server.config.host = host
+        self._server.config.port = port
         self._thread = threading.Thread(target=self._server.run)
         self._thread.start()
         wait_for(lambda: self._server.started, "the server serves")

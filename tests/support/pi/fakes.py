@@ -32,7 +32,8 @@ class FakeDriver:
         self.x_mm = self.y_mm = 0.0
         self.firmware = "fake"
         self.number = 0
-        self.link = self  # what it asks of an open link
+        # What it asks of an open link
+        self.link = self
 
     def connect(self) -> None: ...
     def clear(self) -> None: ...
@@ -59,7 +60,9 @@ class FakeLines:
     is_real_time = True
 
     def __init__(self, late: Callable[[int], int] = lambda _: 0, long: Callable[[int], int] = lambda _: 0) -> None:
-        self.t, self.late, self.long = 0, late, long
+        self.t = 0
+        self.late = late
+        self.long = long
         self.check_width = True
         self.seen: Callable[[int], int] | None = None
         self.sleeps = 0
@@ -115,7 +118,8 @@ def gone() -> DeviceError:
 
 
 STEPS_PER_MM = 200
-ACCEL = 40000  # steps/s^2
+# Steps/s^2
+ACCEL = 40000
 
 
 def _rest_after(row: Command) -> tuple[int, int]:
@@ -197,7 +201,8 @@ class FakeStage:
             os.write(self.master, raw)
 
     def _serve(self) -> None:
-        open_before, buffer = False, b""
+        open_before = False
+        buffer = b""
         poller = select.poll()
         poller.register(self.master, select.POLLIN)
         while not self._closed.is_set():
@@ -206,7 +211,8 @@ class FakeStage:
             if is_open and not open_before:
                 self.moving = False
                 if self.banner:
-                    time.sleep(0.05)  # a boot, and the port's flush on opening
+                    # A boot, and the port's flush on opening
+                    time.sleep(0.05)
                     self.say(Reply("banner", fields={"fw": "fake", "proto": "2"}))
             open_before = is_open
             if not is_open:
@@ -226,7 +232,14 @@ class FakeStage:
     def _immediate(self, c: int) -> None:
         self.bytes_seen.append(c)
         if c == Immediate.STATUS:
-            state = "hold" if self.held else "row" if self.moving else "alarm" if self.alarm else "idle"
+            if self.held:
+                state = "hold"
+            elif self.moving:
+                state = "row"
+            elif self.alarm:
+                state = "alarm"
+            else:
+                state = "idle"
             fields = {"state": state, "x": self.x, "y": self.y, "points": self.points, "pulses": self.points}
             self.say(Reply("status", fields={k: str(v) for k, v in fields.items()} | {"alarm": str(self.alarm)}))
         elif c == Immediate.HOLD:
@@ -254,7 +267,10 @@ class FakeStage:
         self.seen.append(c)
         number = self._refusal(c)
         fields = {"steps": self.steps} if c.verb == "HELLO" else {}
-        reply = Reply("error", c.sequence, number) if number else Reply("ok", c.sequence, fields=fields)
+        if number:
+            reply = Reply("error", c.sequence, number)
+        else:
+            reply = Reply("ok", c.sequence, fields=fields)
         self._last = (c.sequence, reply)
         self.say(reply)
         if not number:
@@ -284,7 +300,8 @@ class FakeStage:
         try:
             number = self._row(c) if c.verb == "ROW" else self._elsewhere(c)
         except PolysightError:
-            return  # the wires are gone
+            # The wires are gone
+            return
         self.moving = self.held = False
         if self._closed.is_set():
             return

@@ -36,7 +36,8 @@ class HostSide:
         self.subscriber = subscriber(self.context, event_address, key_dir)
         self.instrument = instrument
         self.events: list[Any] = []
-        self.wait(m.Heartbeat)  # the subscription has arrived
+        # The subscription has arrived
+        self.wait(m.Heartbeat)
 
     def ask(self, command: Any) -> Any:
         """The reply to a command, or to bytes."""

@@ -13,7 +13,8 @@ from tests.support.pi.fakes import FakeDriver, FakeLines
 
 SPEC = BurstSpec(2, 1_500_000, 1000)
 ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
-INTERVAL_NS = 100_000_000  # 2 mm at 20 mm/s
+# 2 mm at 20 mm/s
+INTERVAL_NS = 100_000_000
 
 
 class FakeJournal:
@@ -31,7 +32,9 @@ class Bench:
 
     def __init__(self) -> None:
         self.t = 100.0
-        self.lines, self.stage, self.journal = FakeLines(), FakeDriver(), FakeJournal()
+        self.lines = FakeLines()
+        self.stage = FakeDriver()
+        self.journal = FakeJournal()
         self.posted: list[Any] = []
         self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)  # not started: edges are given to it
         parts: Any = (self.stage, self.loop, self.journal, self.posted.append, lambda: self.t)

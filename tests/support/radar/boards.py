@@ -29,7 +29,8 @@ class BoardWords:
     """The word link of a simulated board, without USB."""
 
     def __init__(self, board: RadarBoard, clock: VirtualClock) -> None:
-        self.board, self.clock = board, clock
+        self.board = board
+        self.clock = clock
         self.closed = False
 
     def write(self, words: Sequence[int]) -> None:
@@ -57,7 +58,8 @@ class Restarts(BoardWords):
 
     def __init__(self, board: RadarBoard, clock: VirtualClock, after: int) -> None:
         super().__init__(board, clock)
-        self.left, self.later = after, 0
+        self.left = after
+        self.later = 0
 
     def write(self, words: Sequence[int]) -> None:
         super().write(words)

@@ -18,24 +18,33 @@ from usb.core import USBError
 
 from polysight_simulators.radars import UsbChip
 
-VENDOR, PRODUCT = 0x0451, 0xFD03
+VENDOR = 0x0451
+PRODUCT = 0xFD03
 _PACKET = 512
 _STATUS = b"\x31\x60"
-_RESET, _SET_BITMODE, _SET_LATENCY = 0x00, 0x0B, 0x09
-BIT_BANG, MPSSE = 1, 2
+_RESET = 0x00
+_SET_BITMODE = 0x0B
+_SET_LATENCY = 0x09
+BIT_BANG = 1
+MPSSE = 2
 
 
 class Chip:
     """One chip at a place of the bus."""
 
     def __init__(self, chip: UsbChip, serial: str, path: tuple[int, ...] = (1,), bus: int = 1) -> None:
-        self.chip, self.serial, self.path, self.bus = chip, serial, path, bus
-        self.address, self.plugged = 0, False
+        self.chip = chip
+        self.serial = serial
+        self.path = path
+        self.bus = bus
+        self.address = 0
+        self.plugged = False
         self.modes: dict[int, tuple[int, int]] = {}
         self.latency_ms: dict[int, int] = {}
         self.errors: list[str] = []
         self.transfers = 0
-        self.pull_at: int | None = None  # the transfer at which it is pulled
+        # The transfer at which it is pulled
+        self.pull_at: int | None = None
 
 
 class Bus(IBackend):
@@ -51,13 +60,16 @@ class Bus(IBackend):
 
     def __init__(self) -> None:
         self.chips: list[Chip] = []
-        self.packet, self._addresses = _PACKET - 2, 1
+        self.packet = _PACKET - 2
+        self._addresses = 1
         self.refuses = 0
 
     def plug(self, chip: Chip) -> None:
         """Plug a chip in, at an address that no chip had before."""
         self._addresses += 1
-        chip.address, chip.plugged, chip.pull_at = self._addresses, True, None
+        chip.address = self._addresses
+        chip.plugged = True
+        chip.pull_at = None
         chip.modes.clear()
         if chip not in self.chips:
             self.chips.append(chip)
@@ -133,7 +145,9 @@ class Bus(IBackend):
     def ctrl_transfer(self, dev_handle, bmRequestType, bRequest, wValue, wIndex, data, timeout):
         chip = self._check(dev_handle)
         if bmRequestType & 0x80:
-            return self._string(chip, wValue & 0xFF, data) if bRequest == 6 else self._fill(data, _STATUS)
+            if bRequest == 6:
+                return self._string(chip, wValue & 0xFF, data)
+            return self._fill(data, _STATUS)
         channel = wIndex & 0xFF
         if bRequest == _SET_BITMODE:
             chip.modes[channel] = (wValue >> 8, wValue & 0xFF)
@@ -144,7 +158,8 @@ class Bus(IBackend):
         return len(data)
 
     def bulk_write(self, dev_handle, ep, intf, data, timeout) -> int:
-        chip, channel = self._check(dev_handle), (ep + 1) // 2
+        chip = self._check(dev_handle)
+        channel = (ep + 1) // 2
         wanted = MPSSE if channel <= 2 else BIT_BANG
         if chip.modes.get(channel, (0, 0))[0] != wanted:
             chip.errors.append(f"written to channel {channel} in mode {chip.modes.get(channel)}")
@@ -152,7 +167,8 @@ class Bus(IBackend):
         return len(data)
 
     def bulk_read(self, dev_handle, ep, intf, buff, timeout) -> int:
-        chip, channel = self._check(dev_handle), (ep - 0x81) // 2 + 1
+        chip = self._check(dev_handle)
+        channel = (ep - 0x81) // 2 + 1
         room = min(self.packet, _PACKET - 2, len(buff) - 2)
         return self._fill(buff, _STATUS + chip.chip.give("ABCD"[channel - 1], room))
 
@@ -167,7 +183,10 @@ class Bus(IBackend):
 
     def _string(self, chip: Chip, number: int, data: array) -> int:
         text = {1: "TI", 2: "AR-DevPack-EVM-012", 3: chip.serial}.get(number)
-        raw = b"\x04\x03\x09\x04" if text is None else bytes((2 + 2 * len(text), 3)) + text.encode("utf-16-le")
+        if text is None:
+            raw = b"\x04\x03\x09\x04"
+        else:
+            raw = bytes((2 + 2 * len(text), 3)) + text.encode("utf-16-le")
         return self._fill(data, raw)
 
     @staticmethod

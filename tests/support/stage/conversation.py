@@ -34,8 +34,12 @@ class Conversation:
             return ast.literal_eval("b" + text)
         if text != "again":
             words = text.split()
-            self.sequence = int(words.pop(0)[1:]) if re.fullmatch(r"N\d+", words[0]) else self.sequence + 1
-            verb, args = words[0], tuple(map(int, words[1:]))
+            if re.fullmatch(r"N\d+", words[0]):
+                self.sequence = int(words.pop(0)[1:])
+            else:
+                self.sequence = self.sequence + 1
+            verb = words[0]
+            args = tuple(map(int, words[1:]))
             self.by_verb[verb] = self.sequence
             self.last = Command(self.sequence, verb, args).encode()
         return self.last
@@ -92,7 +96,8 @@ def _steps(path: Path) -> list[tuple[int, str, list[str]]]:
         line = line.partition(" //")[0].strip()
         if not line or line.startswith("//"):
             continue
-        sign, text = line[:2], line[3:].strip()
+        sign = line[:2]
+        text = line[3:].strip()
         if sign == "->" and steps and steps[-1][1] == sign:
             steps[-1][2].append(text)
         else:

@@ -63,7 +63,8 @@ class Driver:
 
     def replies(self) -> list[Reply]:
         """Everything received since the last call."""
-        lines, self.received = self.received.splitlines(keepends=True), b""
+        lines = self.received.splitlines(keepends=True)
+        self.received = b""
         return [Reply.decode(line) for line in lines]
 
     def line(self, verb: str, *args: int) -> bytes:
@@ -89,7 +90,8 @@ class Driver:
 
     def status(self) -> Reply:
         """Ask for the status; everything else that was received is kept."""
-        kept, self.received = self.received, b""
+        kept = self.received
+        self.received = b""
         self.rx(bytes([Immediate.STATUS]))
         self.until(lambda: b"status " in self.received)
         status = next(line for line in self.received.splitlines(keepends=True) if line.startswith(b"status "))

@@ -50,11 +50,14 @@ class FaultyDisk:
     """
 
     def __init__(self, folder: Path, fault: Fault | None = None, at: int = 0, seed: int = 0) -> None:
-        self._folder, self._fault, self.at = str(folder), fault, at
+        self._folder = str(folder)
+        self._fault = fault
+        self.at = at
         self._random = random.Random(seed)
         self._dead = self._space = False
         self.done: list[str] = []
-        self._durable: dict[Path, bytes] = {}  # what of a touched file is on the disk for certain
+        # What of a touched file is on the disk for certain
+        self._durable: dict[Path, bytes] = {}
         # Names that are not synced yet: their folder, and how to lose them.
         self._undo: list[tuple[Path, Callable[[], object]]] = []
 
@@ -125,7 +128,8 @@ class FaultyDisk:
                     patch.setattr(os, name, call)
                 patch.setattr(io, "open", self._opened)
                 yield self
-        finally:  # Killed passes through here
+        finally:
+            # Killed passes through here
             # Drawn losses ("power cut") were never applied; with them two tests find foreign events after a resume.
             if self._dead and self._fault in ("power cut", "worst power cut"):
                 self.lose_power()
@@ -177,7 +181,8 @@ class FaultyDisk:
             self._undo.append((Path(path).parent, Path(path).rmdir))
 
     def _rename(self, a: Any, b: Any, **named: Any) -> None:
-        a, b = Path(a), Path(b)
+        a = Path(a)
+        b = Path(b)
         self._hit("rename", b)
         before = b.read_bytes() if b.exists() else None
         REAL.rename(a, b, **named)
@@ -211,7 +216,8 @@ class _SeenFile(io.FileIO):
         super().__init__(path, mode)
 
     def write(self, data: Any) -> int:
-        path, start = Path(str(self.name)), self.tell()
+        path = Path(str(self.name))
+        start = self.tell()
         self._disk._touch(path)
         self._disk._hit("write", path, lambda: REAL.pwrite(self.fileno(), bytes(data)[: len(data) // 2], start))
         return super().write(data)

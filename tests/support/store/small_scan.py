@@ -67,15 +67,19 @@ class SmallPi:
         self.published: list[bytes] = []
         self._journal = Journal(folder, self.published.extend)
         self._plan = plan_raster(instrument.grid)
-        self._scan_id, self._seen = "", 0
+        self._scan_id = ""
+        self._seen = 0
         self._take: Any = None
         self.state: m.State = "ready"
         self.fault = ""
         self.gaps_filled = 0
-        self.event_socket = os.eventfd(1)  # always something to look at
+        # Always something to look at
+        self.event_socket = os.eventfd(1)
 
     def follow(self, scan_id: str, last_seq: int, on_event: Any) -> None:
-        self._scan_id, self._seen, self._take = scan_id, last_seq, on_event
+        self._scan_id = scan_id
+        self._seen = last_seq
+        self._take = on_event
 
     def _commit(self, kind: type[m.AnyEvent], *events: dict[str, Any]) -> None:
         """As the executor: a failing journal puts the Pi into fault."""
@@ -84,7 +88,8 @@ class SmallPi:
         try:
             self._journal.commit()
         except JournalFullError as e:
-            self.state, self.fault = "fault", str(e)
+            self.state = "fault"
+            self.fault = str(e)
 
     def begin_run(self, run: m.BeginRun) -> None:
         try:
@@ -101,7 +106,8 @@ class SmallPi:
 
     def run_row(self, scan_id: str, row_index: int, take: int) -> None:
         assert scan_id == self._scan_id
-        row, n = self._plan.row(row_index), self._instrument.burst.pulses
+        row = self._plan.row(row_index)
+        n = self._instrument.burst.pulses
         self._commit(m.RowStarted, {"row": row, "take": take})
         points = [
             dict[str, Any](
@@ -136,7 +142,9 @@ class SmallPi:
         self.events()
 
     def home(self) -> None:
-        self.state, self.fault, self._journal.broken = "ready", "", False
+        self.state = "ready"
+        self.fault = ""
+        self._journal.broken = False
 
     def come_to_rest(self, reason: str) -> None:
         """Do nothing: nothing moves."""
@@ -185,7 +193,8 @@ class SmallRig:
     def _end(self, name: str, segment: Segment) -> RowCapture:
         row, take = self._row
         data = self._samples.of(name, row)
-        log, evidence = PacketLog(len(data)), Evidence(len(data), self._samples.instrument.frame_bytes)
+        log = PacketLog(len(data))
+        evidence = Evidence(len(data), self._samples.instrument.frame_bytes)
         for k, packet in enumerate(encode_packets(data, 1, 0)):
             log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), k + 1)
         placed, out = place_record(log, evidence.frame_bytes)
@@ -210,7 +219,8 @@ class SmallScan:
 
     def __init__(self, samples: Samples, folder: Path) -> None:
         self._samples = samples
-        self.path, self.journals = folder / "scan", folder / "journal"
+        self.path = folder / "scan"
+        self.journals = folder / "journal"
         self.messages: list[str] = []
         self.acknowledged: set[int] = set()
 
